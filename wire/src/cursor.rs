@@ -1,0 +1,234 @@
+//! The one reader of bytes that came from somebody else.
+//!
+//! Every length field opens a sub-cursor, so an inner length cannot escape the outer one; every
+//! read says what it was reading, where, and why it failed. Offsets are relative to the slice the
+//! outermost cursor was made from.
+
+/// Byte order of the bytes that follow.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Endianness {
+    /// Most significant byte first.
+    Big,
+    /// Least significant byte first.
+    Little,
+}
+
+/// Why a parse failed.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Reason {
+    /// The bytes end before the field does.
+    Truncated,
+    /// A length or count that its container cannot hold.
+    BadLength,
+    /// A fixed marker (magic, version, encapsulation) that is not what it must be.
+    BadMarker,
+    /// Text that is not UTF-8 or lacks its terminator.
+    BadText,
+    /// A value outside what the field may hold.
+    BadValue,
+    /// More of something than the parser is willing to hold.
+    OverLimit,
+}
+
+impl Reason {
+    /// Label value of a metric: a bounded set of words.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Truncated => "truncated",
+            Self::BadLength => "bad_length",
+            Self::BadMarker => "bad_marker",
+            Self::BadText => "bad_text",
+            Self::BadValue => "bad_value",
+            Self::OverLimit => "over_limit",
+        }
+    }
+}
+
+/// One failed read.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct WireError {
+    /// What was being read, in the specification's words.
+    pub what: &'static str,
+    /// Byte offset where it should have begun.
+    pub offset: usize,
+    /// Why it could not be read.
+    pub reason: Reason,
+}
+
+impl core::fmt::Display for WireError {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        write!(f, "{} at offset {}: {}", self.what, self.offset, self.reason.label())
+    }
+}
+
+impl core::error::Error for WireError {}
+
+/// A bounded position in borrowed bytes.
+#[derive(Clone, Copy, Debug)]
+pub struct Cursor<'a> {
+    rest: &'a [u8],
+    offset: usize,
+    endianness: Endianness,
+}
+
+impl<'a> Cursor<'a> {
+    /// At the start of `bytes`.
+    #[must_use]
+    pub const fn new(bytes: &'a [u8], endianness: Endianness) -> Self {
+        Self { rest: bytes, offset: 0, endianness }
+    }
+
+    /// Bytes not read yet.
+    #[must_use]
+    pub const fn rest(&self) -> &'a [u8] {
+        self.rest
+    }
+
+    /// How many bytes are left.
+    #[must_use]
+    pub const fn remaining(&self) -> usize {
+        self.rest.len()
+    }
+
+    /// Position relative to the outermost cursor's start.
+    #[must_use]
+    pub const fn offset(&self) -> usize {
+        self.offset
+    }
+
+    /// Byte order of the multi-byte reads.
+    #[must_use]
+    pub const fn endianness(&self) -> Endianness {
+        self.endianness
+    }
+
+    /// The error for a field that begins here.
+    #[must_use]
+    pub const fn error(&self, what: &'static str, reason: Reason) -> WireError {
+        WireError { what, offset: self.offset, reason }
+    }
+
+    /// The next `len` bytes.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] when fewer remain.
+    pub fn take(&mut self, what: &'static str, len: usize) -> Result<&'a [u8], WireError> {
+        let (head, rest) =
+            self.rest.split_at_checked(len).ok_or(self.error(what, Reason::Truncated))?;
+        self.rest = rest;
+        self.offset += len;
+        Ok(head)
+    }
+
+    /// The next `N` bytes as an array.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] when fewer remain.
+    pub fn array<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], WireError> {
+        let (head, rest) =
+            self.rest.split_first_chunk::<N>().ok_or(self.error(what, Reason::Truncated))?;
+        self.rest = rest;
+        self.offset += N;
+        Ok(*head)
+    }
+
+    /// A cursor over the next `len` bytes; this one moves past them.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] when fewer remain.
+    pub fn sub(&mut self, what: &'static str, len: usize) -> Result<Self, WireError> {
+        let offset = self.offset;
+        Ok(Self { rest: self.take(what, len)?, offset, endianness: self.endianness })
+    }
+
+    /// One octet.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] at the end.
+    pub fn u8(&mut self, what: &'static str) -> Result<u8, WireError> {
+        Ok(u8::from_ne_bytes(self.array(what)?))
+    }
+
+    /// Two octets in the cursor's byte order.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] when fewer remain.
+    pub fn u16(&mut self, what: &'static str) -> Result<u16, WireError> {
+        let bytes = self.array(what)?;
+        Ok(match self.endianness {
+            Endianness::Big => u16::from_be_bytes(bytes),
+            Endianness::Little => u16::from_le_bytes(bytes),
+        })
+    }
+
+    /// Four octets in the cursor's byte order.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] when fewer remain.
+    pub fn u32(&mut self, what: &'static str) -> Result<u32, WireError> {
+        let bytes = self.array(what)?;
+        Ok(match self.endianness {
+            Endianness::Big => u32::from_be_bytes(bytes),
+            Endianness::Little => u32::from_le_bytes(bytes),
+        })
+    }
+
+    /// Four octets, signed.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] when fewer remain.
+    pub fn i32(&mut self, what: &'static str) -> Result<i32, WireError> {
+        Ok(self.u32(what)?.cast_signed())
+    }
+
+    /// Eight octets in the cursor's byte order.
+    ///
+    /// # Errors
+    /// [`Reason::Truncated`] when fewer remain.
+    pub fn u64(&mut self, what: &'static str) -> Result<u64, WireError> {
+        let bytes = self.array(what)?;
+        Ok(match self.endianness {
+            Endianness::Big => u64::from_be_bytes(bytes),
+            Endianness::Little => u64::from_le_bytes(bytes),
+        })
+    }
+
+    /// Skips to the next multiple of `alignment` counted from the outermost start, or to the end
+    /// when the padding is cut off: trailing padding may be missing, what follows may not.
+    pub fn align(&mut self, alignment: usize) {
+        let padding = self.offset.wrapping_neg() & (alignment - 1);
+        let padding = padding.min(self.rest.len());
+        self.rest = self.rest.split_at_checked(padding).map_or(&[], |(_, rest)| rest);
+        self.offset += padding;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sub_cursor_cannot_escape_its_length() {
+        let mut outer = Cursor::new(&[1, 2, 3, 4, 5, 6], Endianness::Little);
+        outer.u8("skip").unwrap();
+        let mut inner = outer.sub("inner", 3).unwrap();
+        assert_eq!(inner.u16("value"), Ok(0x0302));
+        assert_eq!(
+            inner.u16("value"),
+            Err(WireError { what: "value", offset: 3, reason: Reason::Truncated })
+        );
+        assert_eq!(outer.rest(), &[5, 6]);
+    }
+
+    #[test]
+    fn alignment_counts_from_the_outermost_start() {
+        let mut cursor = Cursor::new(&[0; 7], Endianness::Big);
+        cursor.u8("x").unwrap();
+        cursor.align(4);
+        assert_eq!(cursor.offset(), 4);
+        cursor.u8("x").unwrap();
+        cursor.align(4);
+        assert_eq!((cursor.offset(), cursor.remaining()), (7, 0));
+    }
+}
