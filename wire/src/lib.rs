@@ -1,2 +1,23 @@
+//! RTPS as ROS 2 speaks it, read without joining: zero-copy, bounded parsers, the walk that decides
+//! what the kernel filter keeps, and the layout of what kernel and user space exchange.
+//!
+//! No I/O, no clock, no log, no `unsafe`: bytes and a caller-given time in, typed values out.
+//! The kernel program builds this crate without `alloc`.
+
 #![no_std]
-//! x
+#![forbid(unsafe_code)]
+
+#[cfg(feature = "alloc")]
+extern crate alloc;
+#[cfg(test)]
+extern crate std;
+
+pub mod cursor;
+pub mod guid;
+pub mod record;
+pub mod time;
+
+pub use cursor::{Cursor, Endianness, Reason, WireError};
+pub use guid::{EntityId, Guid, GuidPrefix};
+pub use record::Record;
+pub use time::{Duration, RtpsTime, Timestamp};

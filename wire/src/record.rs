@@ -1,0 +1,234 @@
+//! What the kernel filter tells user space about one submessage: the shared binary layout.
+//!
+//! The same [`Record`]s come out of the kernel's ring buffer and out of the user-space walk over
+//! captured, replayed or shared-memory datagrams; the model cannot tell the difference. Words are
+//! in the host's byte order except where they hold wire bytes (GUIDs, addresses).
+
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
+use crate::guid::{EntityId, Guid, GuidPrefix};
+use crate::time::RtpsTime;
+
+/// Submessage kinds (RTPS 2.5, 9.4.5.1.1) and the two that only this ABI knows.
+pub mod kind {
+    /// ACKNACK: reader acknowledges and asks again.
+    pub const ACKNACK: u8 = 0x06;
+    /// HEARTBEAT: writer says what it has.
+    pub const HEARTBEAT: u8 = 0x07;
+    /// GAP: writer says what will never come.
+    pub const GAP: u8 = 0x08;
+    /// DATA: one sample.
+    pub const DATA: u8 = 0x15;
+    /// DATA_FRAG: some fragments of one sample.
+    pub const DATA_FRAG: u8 = 0x16;
+    /// Not a submessage: the fragmented datagram [`super::Record::datagram`] is complete, all
+    /// records that were sent ahead for it now count.
+    pub const COMPLETE: u8 = 0xf0;
+    /// Not a submessage: from `offset` on, user space has to walk this fragmented datagram itself;
+    /// its remaining IP fragments are captured. See [`super::Record::handover`].
+    pub const HANDOVER: u8 = 0xf1;
+}
+
+/// Bits of [`Record::flags`].
+pub mod flag {
+    /// The datagram came in several IP fragments.
+    pub const FRAGMENTED: u16 = 1 << 0;
+    /// The datagram was not complete yet when this was written: it counts once the
+    /// [`super::kind::COMPLETE`] record or a later record of the same datagram without this bit
+    /// has come.
+    pub const AHEAD: u16 = 1 << 1;
+    /// Sent by this host.
+    pub const OUTGOING: u16 = 1 << 2;
+    /// `destination` is IPv6 (otherwise IPv4-mapped).
+    pub const IPV6: u16 = 1 << 3;
+    /// `payload_len` is an upper bound: the inline QoS was longer than the walk follows.
+    pub const INLINE_QOS_UNREAD: u16 = 1 << 4;
+    /// `stamp_seconds` and `stamp_nanoseconds` hold the payload's bytes 4..12.
+    pub const STAMP: u16 = 1 << 5;
+}
+
+/// One submessage of one writer or reader. 120 bytes.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[repr(C)]
+pub struct Record {
+    /// Nanoseconds: from the kernel filter CLOCK_MONOTONIC at the frame that completed the datagram
+    /// (converted to the Unix epoch before the model sees it), elsewhere the Unix epoch.
+    pub time: u64,
+    /// Writer GUID, 16 wire bytes.
+    pub writer: [u32; 4],
+    /// Reader GUID: INFO_DST's prefix and the submessage's reader id, both zero when unspecified.
+    pub reader: [u32; 4],
+    /// DATA, DATA_FRAG: writer SN. HEARTBEAT: firstSN. GAP: gapStart. ACKNACK: base.
+    pub sequence_number: u64,
+    /// INFO_TS in force, `seconds << 32 | fraction`; 0 = none. See [`RtpsTime`].
+    pub source_timestamp: u64,
+    /// Destination address, 16 wire bytes, IPv4-mapped for IPv4.
+    pub destination: [u32; 4],
+    /// Destination UDP port.
+    pub destination_port: u16,
+    /// Length of the whole UDP payload.
+    pub datagram_len: u16,
+    /// Interface index the frame was seen on; 0 = unknown.
+    pub interface: u32,
+    /// Names one fragmented datagram among those of the last seconds; 0 when not fragmented.
+    pub datagram: u32,
+    /// One of [`kind`].
+    pub kind: u8,
+    /// The submessage header's flags octet.
+    pub submessage_flags: u8,
+    /// Bits of [`flag`].
+    pub flags: u16,
+    /// DATA, DATA_FRAG: bytes of serialized payload in this submessage, encapsulation included.
+    /// HEARTBEAT: lastSN high word. GAP: gapList base high word. HANDOVER: walk offset.
+    pub payload_len: u32,
+    /// DATA, DATA_FRAG: encapsulation identifier and options, as a big-endian number; 0 where the
+    /// payload's first bytes are not in this submessage. HEARTBEAT: lastSN low. GAP: base low.
+    /// HANDOVER: IP identification.
+    pub encapsulation: u32,
+    /// Payload bytes 4..8 as a number in the encapsulation's byte order: `Header.stamp.sec` where
+    /// the type begins with a header. HEARTBEAT: count. GAP, ACKNACK: numBits.
+    pub stamp_seconds: u32,
+    /// Payload bytes 8..12 likewise: `Header.stamp.nanosec`. GAP, ACKNACK: bitmap word 0.
+    pub stamp_nanoseconds: u32,
+    /// DATA_FRAG: fragmentStartingNum, 1-based. GAP, ACKNACK: bitmap word 1.
+    pub fragment_start: u32,
+    /// DATA_FRAG: fragmentsInSubmessage << 16 | fragmentSize. GAP, ACKNACK: bitmap word 2.
+    pub fragments: u32,
+    /// DATA_FRAG: sampleSize. GAP, ACKNACK: bitmap word 3.
+    pub sample_size: u32,
+    /// DATA, DATA_FRAG: PID_STATUS_INFO of the inline QoS, 0 = alive. GAP, ACKNACK: bitmap word 4.
+    pub status_info: u32,
+}
+
+const _: () = assert!(size_of::<Record>() == 120 && align_of::<Record>() == 8);
+
+impl Record {
+    /// Sequence numbers a GAP's or ACKNACK's bitmap can hold in a record; longer sets (up to 256)
+    /// make the walk ask for the whole datagram instead.
+    pub const BITMAP_BITS: u32 = 160;
+
+    /// The writer.
+    #[must_use]
+    pub fn writer(&self) -> Guid {
+        zerocopy::transmute!(self.writer)
+    }
+
+    /// The reader, or unknown for all matched readers.
+    #[must_use]
+    pub fn reader(&self) -> Guid {
+        zerocopy::transmute!(self.reader)
+    }
+
+    /// INFO_TS in force.
+    #[must_use]
+    pub const fn source_timestamp(&self) -> RtpsTime {
+        RtpsTime(self.source_timestamp)
+    }
+
+    /// DATA_FRAG: how many consecutive fragments this submessage holds.
+    #[must_use]
+    pub const fn fragments_in_submessage(&self) -> u32 {
+        self.fragments >> 16
+    }
+
+    /// DATA_FRAG: size of every fragment but the sample's last.
+    #[must_use]
+    pub const fn fragment_size(&self) -> u32 {
+        self.fragments & 0xffff
+    }
+
+    /// HEARTBEAT's lastSN, GAP's gapList base.
+    #[must_use]
+    pub const fn second_sequence_number(&self) -> u64 {
+        (self.payload_len as u64) << 32 | self.encapsulation as u64
+    }
+
+    /// GAP's and ACKNACK's set: bit `i` set means `base + i` is meant (RTPS 2.5, 9.4.2.6).
+    pub fn bitmap(&self) -> impl Iterator<Item = u32> + use<> {
+        let words = [
+            self.stamp_nanoseconds,
+            self.fragment_start,
+            self.fragments,
+            self.sample_size,
+            self.status_info,
+        ];
+        let bits = self.stamp_seconds.min(Self::BITMAP_BITS);
+        (0..bits).filter(move |bit| {
+            let word = words.get((bit / 32) as usize).copied().unwrap_or(0);
+            word >> (31 - bit % 32) & 1 == 1
+        })
+    }
+
+    /// `std_msgs/Header.stamp` if the payload begins with one: seconds and nanoseconds. `None` when
+    /// the payload's first bytes were not seen or cannot be a stamp.
+    #[must_use]
+    pub const fn header_stamp(&self) -> Option<(i32, u32)> {
+        if self.flags & flag::STAMP == 0 || self.stamp_nanoseconds >= 1_000_000_000 {
+            return None;
+        }
+        Some((self.stamp_seconds.cast_signed(), self.stamp_nanoseconds))
+    }
+
+    /// [`kind::HANDOVER`]'s context.
+    #[must_use]
+    pub fn handover(&self) -> Handover {
+        Handover {
+            source: self.writer().prefix,
+            destination: self.reader().prefix,
+            source_address: zerocopy::transmute!([
+                self.stamp_seconds,
+                self.stamp_nanoseconds,
+                self.fragment_start,
+                self.fragments
+            ]),
+            identification: self.encapsulation,
+            offset: self.payload_len,
+        }
+    }
+}
+
+/// Where and with which receiver state (RTPS 2.5, 8.3.4) a handed-over walk goes on.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Handover {
+    /// Source GUID prefix in force.
+    pub source: GuidPrefix,
+    /// INFO_DST's prefix in force.
+    pub destination: GuidPrefix,
+    /// Source IP address, IPv4-mapped for IPv4.
+    pub source_address: [u8; 16],
+    /// IPv4 identification or IPv6 fragment identification.
+    pub identification: u32,
+    /// Offset in the UDP payload of the next submessage header.
+    pub offset: u32,
+}
+
+/// How the kernel filter treats a writer or reader: the value of its interest map. No entry means
+/// unknown: its first datagrams are captured, within a budget.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+#[repr(u32)]
+pub enum Verdict {
+    /// Classified and of no interest.
+    Ignore = 0,
+    /// One record per submessage, nothing copied.
+    Meter = 1,
+    /// Whole datagrams to user space.
+    Capture = 2,
+}
+
+/// GUID in the words of [`Record`] and of the interest map's key.
+#[must_use]
+pub fn guid_words(guid: Guid) -> [u32; 4] {
+    zerocopy::transmute!(guid)
+}
+
+/// GUID from the words of [`Record`].
+#[must_use]
+pub fn guid_from_words(words: [u32; 4]) -> Guid {
+    zerocopy::transmute!(words)
+}
+
+/// Entity id from one word of wire bytes.
+#[must_use]
+pub fn entity_from_word(word: u32) -> EntityId {
+    EntityId(word.to_ne_bytes())
+}
