@@ -1,1 +1,7 @@
-//! x
+//! ros2probe: watches a ROS 2 robot from copies of its RTPS traffic, without joining the domain.
+//!
+//! Three layers, dependencies pointing inwards: `capture` (I/O) and `surface` (metrics, HTTP)
+//! around `model` (discovery and statistics, deterministic).
+
+pub mod config;
+pub mod model;
