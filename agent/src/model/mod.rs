@@ -1,0 +1,4 @@
+//! The core: a plain state machine. Time and bytes in, facts out; no I/O, no clock, no thread.
+
+pub mod histogram;
+pub mod snapshot;

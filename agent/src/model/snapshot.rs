@@ -1,0 +1,281 @@
+//! What the agent knows at one moment, for whoever asks: immutable, sorted, complete.
+//!
+//! The model builds one about once a second; surfaces read it without ever blocking the model.
+//! Nothing here computes: every number was settled when the snapshot was taken.
+
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::histogram::Histogram;
+
+/// All facts at `at`. Lists are sorted by their identity.
+#[derive(Clone, Debug, Default)]
+pub struct Snapshot {
+    /// When it was taken, in the source's clock (capture time on replays).
+    pub at: Timestamp,
+    /// Participants that are alive.
+    pub participants: Vec<ParticipantFacts>,
+    /// ROS nodes of live participants.
+    pub nodes: Vec<NodeFacts>,
+    /// DDS topics with at least one endpoint, and those that had one within the grace period.
+    pub topics: Vec<TopicFacts>,
+    /// Writers seen sending whose announcement was not seen.
+    pub unknown_writers: Vec<UnknownWriterFacts>,
+    /// Watchlist entries, in configuration order.
+    pub watches: Vec<WatchFacts>,
+    /// Discovery churn since the start.
+    pub churn: Vec<ChurnCount>,
+    /// Parse failures since the start.
+    pub decode_errors: Vec<DecodeErrorCount>,
+    /// Sizes, limits and evictions of the model's tables.
+    pub tables: Vec<TableFacts>,
+    /// Datagrams looked at in user space.
+    pub datagrams: u64,
+    /// Records taken in, from the kernel or from user-space walks.
+    pub records: u64,
+    /// Topics that the watchlist matched but the cap kept out.
+    pub topics_rejected: u64,
+}
+
+/// One DDS participant.
+#[derive(Clone, Debug)]
+pub struct ParticipantFacts {
+    /// Its GUID (entity 000001c1).
+    pub guid: Guid,
+    /// Domain, when announced or derivable from the discovery port.
+    pub domain_id: u32,
+    /// Vendor in words, or the two bytes in hex.
+    pub vendor: String,
+    /// ROS enclave; `None` means it is no ROS participant.
+    pub enclave: Option<String>,
+    /// Host name when announced.
+    pub host: Option<String>,
+    /// Process id when announced or encoded in the GUID.
+    pub process_id: Option<u32>,
+    /// Process name when announced.
+    pub process_name: Option<String>,
+    /// When its first announcement was seen.
+    pub first_seen: Timestamp,
+    /// When anything of it was last seen.
+    pub last_seen: Timestamp,
+    /// Lease in nanoseconds; `None` = infinite.
+    pub lease_nanoseconds: Option<u64>,
+    /// Announces security: its user data may be encrypted.
+    pub secured: bool,
+}
+
+/// One ROS node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NodeFacts {
+    /// Domain of its participant.
+    pub domain_id: u32,
+    /// Fully qualified name, `/robot1/lidar`.
+    pub name: String,
+    /// Its participant.
+    pub participant: Guid,
+    /// Its writers.
+    pub writers: Vec<Guid>,
+    /// Its readers.
+    pub readers: Vec<Guid>,
+}
+
+/// One topic of one domain.
+#[derive(Clone, Debug)]
+pub struct TopicFacts {
+    /// Domain.
+    pub domain_id: u32,
+    /// ROS name for topics, the DDS name where it follows no ROS convention.
+    pub name: String,
+    /// DDS name.
+    pub dds_name: String,
+    /// What kind of ROS channel: `topic`, `service_request`, `service_reply`, `service_event`,
+    /// `action_feedback`, `action_status`, `discovery`, `dds`.
+    pub kind: &'static str,
+    /// Hidden by ROS convention (a token begins with `_`).
+    pub hidden: bool,
+    /// Message types announced on it, ROS form, sorted; more than one is a fault.
+    pub message_types: Vec<String>,
+    /// RIHS01 type hashes announced, sorted.
+    pub type_hashes: Vec<String>,
+    /// Live writers.
+    pub publishers: Vec<EndpointFacts>,
+    /// Live readers.
+    pub subscriptions: Vec<EndpointFacts>,
+    /// Present when somebody is or was interested in the topic: the sum over its writers, also
+    /// those that have gone.
+    pub measurement: Option<Measurement>,
+    /// The last endpoint has gone; kept for the grace period.
+    pub vanished: bool,
+}
+
+/// One writer or reader.
+#[derive(Clone, Debug)]
+pub struct EndpointFacts {
+    /// GUID.
+    pub guid: Guid,
+    /// Node name when `ros_discovery_info` told.
+    pub node: Option<String>,
+    /// `RELIABLE`, `BEST_EFFORT`, ...
+    pub reliability: String,
+    /// `VOLATILE`, `TRANSIENT_LOCAL`, ...
+    pub durability: String,
+    /// `KEEP_LAST (10)`, `KEEP_ALL`, `UNKNOWN`.
+    pub history: String,
+    /// Deadline in nanoseconds; `None` = infinite.
+    pub deadline_nanoseconds: Option<u64>,
+    /// Lifespan in nanoseconds; `None` = infinite.
+    pub lifespan_nanoseconds: Option<u64>,
+    /// `AUTOMATIC`, `MANUAL_BY_TOPIC`, ...
+    pub liveliness: String,
+    /// Liveliness lease in nanoseconds; `None` = infinite.
+    pub liveliness_lease_nanoseconds: Option<u64>,
+    /// ROS type.
+    pub message_type: String,
+    /// RIHS01 hash.
+    pub type_hash: Option<String>,
+    /// When it was announced.
+    pub first_seen: Timestamp,
+    /// What was measured of this writer while its topic was watched.
+    pub measurement: Option<Measurement>,
+}
+
+/// What was counted while the topic was watched. Counters never go down while the topic lives.
+#[derive(Clone, Debug, Default)]
+pub struct Measurement {
+    /// Samples received whole, each once.
+    pub messages: u64,
+    /// Their payload bytes, encapsulation included (as `ros2 topic bw` counts).
+    pub bytes: u64,
+    /// Samples settled as lost: a sequence gap that nothing excused or filled in time.
+    pub lost: u64,
+    /// Samples that filled a gap later, by retransmission or reordering.
+    pub recovered: u64,
+    /// Samples and fragments seen again.
+    pub duplicates: u64,
+    /// Samples whose fragments never became complete (also counted in `lost` once settled).
+    pub incomplete: u64,
+    /// Samples excused by GAP or HEARTBEAT firstSN.
+    pub irrelevant: u64,
+    /// Time of the last new sample.
+    pub last_message: Option<Timestamp>,
+    /// Messages a second over the last window; for people, never for rules.
+    pub rate_hz: f64,
+    /// Payload bytes a second over the same window.
+    pub bandwidth: f64,
+    /// Seconds between consecutive samples of one writer.
+    pub interarrival: Histogram,
+    /// Capture time minus INFO_TS, seconds. Needs synchronised clocks across hosts.
+    pub source_latency: Histogram,
+    /// Capture time minus `std_msgs/Header.stamp`, seconds, where the type begins with a header.
+    pub header_latency: Histogram,
+    /// Samples whose time lay after their capture time (clocks apart); not in the histograms.
+    pub negative_latency: u64,
+}
+
+/// A writer that sends without a known announcement.
+#[derive(Clone, Debug)]
+pub struct UnknownWriterFacts {
+    /// GUID.
+    pub guid: Guid,
+    /// Vendor of the participant, if its SPDP was seen.
+    pub vendor: Option<String>,
+    /// First record.
+    pub first_seen: Timestamp,
+    /// Measured like any writer.
+    pub measurement: Measurement,
+}
+
+/// State of one watchlist entry's expectations on one topic.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum WatchState {
+    /// All expectations hold (or there are none) and messages flow.
+    Ok,
+    /// At least one expectation is broken, after hysteresis.
+    Violated,
+    /// Publishers exist but nothing came for longer than `max_silence_s`.
+    Silent,
+    /// No publisher is known.
+    NotPublished,
+    /// Published, but nobody subscribes: writers may send nothing at all.
+    NoSubscriber,
+}
+
+impl WatchState {
+    /// All states, for exporting one series each.
+    pub const ALL: [Self; 5] =
+        [Self::Ok, Self::Violated, Self::Silent, Self::NotPublished, Self::NoSubscriber];
+
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Violated => "violated",
+            Self::Silent => "silent",
+            Self::NotPublished => "not_published",
+            Self::NoSubscriber => "no_subscriber",
+        }
+    }
+}
+
+/// One watchlist entry and the topics it covers now.
+#[derive(Clone, Debug)]
+pub struct WatchFacts {
+    /// The name or glob as configured.
+    pub pattern: String,
+    /// Domain restriction.
+    pub domain_id: Option<u32>,
+    /// Covered topics with their state; a literal name that does not exist yet is listed with
+    /// [`WatchState::NotPublished`].
+    pub topics: Vec<WatchedTopicFacts>,
+}
+
+/// One watched topic under one entry.
+#[derive(Clone, Debug)]
+pub struct WatchedTopicFacts {
+    /// Domain.
+    pub domain_id: u32,
+    /// ROS name.
+    pub topic: String,
+    /// Where it stands.
+    pub state: WatchState,
+    /// Which expectations are broken: `min_rate_hz`, `max_loss_ratio`, ...
+    pub violations: Vec<&'static str>,
+}
+
+/// One kind of discovery event.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ChurnCount {
+    /// Domain.
+    pub domain_id: u32,
+    /// `participant`, `writer`, `reader`, `node`.
+    pub entity: &'static str,
+    /// `appeared`, `changed`, `disposed`, `expired`, `cascaded`.
+    pub event: &'static str,
+    /// How often.
+    pub count: u64,
+}
+
+/// Parse failures of one kind.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DecodeErrorCount {
+    /// What was being read: `frame`, `rtps`, `spdp`, `sedp`, `entities`.
+    pub stage: &'static str,
+    /// [`ros2probe_wire::Reason::label`].
+    pub reason: &'static str,
+    /// How often.
+    pub count: u64,
+}
+
+/// One bounded table.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TableFacts {
+    /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
+    /// `reassembly`, `interest`.
+    pub table: &'static str,
+    /// Entries (bytes for `reassembly`).
+    pub size: u64,
+    /// Cap.
+    pub limit: u64,
+    /// Entries given up because of the cap.
+    pub evictions: u64,
+}
