@@ -58,7 +58,13 @@ pub struct WireError {
 
 impl core::fmt::Display for WireError {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        write!(f, "{} at offset {}: {}", self.what, self.offset, self.reason.label())
+        write!(
+            f,
+            "{} at offset {}: {}",
+            self.what,
+            self.offset,
+            self.reason.label()
+        )
     }
 }
 
@@ -76,7 +82,11 @@ impl<'a> Cursor<'a> {
     /// At the start of `bytes`.
     #[must_use]
     pub const fn new(bytes: &'a [u8], endianness: Endianness) -> Self {
-        Self { rest: bytes, offset: 0, endianness }
+        Self {
+            rest: bytes,
+            offset: 0,
+            endianness,
+        }
     }
 
     /// Bytes not read yet.
@@ -106,7 +116,11 @@ impl<'a> Cursor<'a> {
     /// The error for a field that begins here.
     #[must_use]
     pub const fn error(&self, what: &'static str, reason: Reason) -> WireError {
-        WireError { what, offset: self.offset, reason }
+        WireError {
+            what,
+            offset: self.offset,
+            reason,
+        }
     }
 
     /// The next `len` bytes.
@@ -114,8 +128,10 @@ impl<'a> Cursor<'a> {
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
     pub fn take(&mut self, what: &'static str, len: usize) -> Result<&'a [u8], WireError> {
-        let (head, rest) =
-            self.rest.split_at_checked(len).ok_or(self.error(what, Reason::Truncated))?;
+        let (head, rest) = self
+            .rest
+            .split_at_checked(len)
+            .ok_or(self.error(what, Reason::Truncated))?;
         self.rest = rest;
         self.offset += len;
         Ok(head)
@@ -126,8 +142,10 @@ impl<'a> Cursor<'a> {
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
     pub fn array<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], WireError> {
-        let (head, rest) =
-            self.rest.split_first_chunk::<N>().ok_or(self.error(what, Reason::Truncated))?;
+        let (head, rest) = self
+            .rest
+            .split_first_chunk::<N>()
+            .ok_or(self.error(what, Reason::Truncated))?;
         self.rest = rest;
         self.offset += N;
         Ok(*head)
@@ -139,7 +157,11 @@ impl<'a> Cursor<'a> {
     /// [`Reason::Truncated`] when fewer remain.
     pub fn sub(&mut self, what: &'static str, len: usize) -> Result<Self, WireError> {
         let offset = self.offset;
-        Ok(Self { rest: self.take(what, len)?, offset, endianness: self.endianness })
+        Ok(Self {
+            rest: self.take(what, len)?,
+            offset,
+            endianness: self.endianness,
+        })
     }
 
     /// One octet.
@@ -199,7 +221,10 @@ impl<'a> Cursor<'a> {
     pub fn align(&mut self, alignment: usize) {
         let padding = self.offset.wrapping_neg() & (alignment - 1);
         let padding = padding.min(self.rest.len());
-        self.rest = self.rest.split_at_checked(padding).map_or(&[], |(_, rest)| rest);
+        self.rest = self
+            .rest
+            .split_at_checked(padding)
+            .map_or(&[], |(_, rest)| rest);
         self.offset += padding;
     }
 }
@@ -216,7 +241,11 @@ mod tests {
         assert_eq!(inner.u16("value"), Ok(0x0302));
         assert_eq!(
             inner.u16("value"),
-            Err(WireError { what: "value", offset: 3, reason: Reason::Truncated })
+            Err(WireError {
+                what: "value",
+                offset: 3,
+                reason: Reason::Truncated
+            })
         );
         assert_eq!(outer.rest(), &[5, 6]);
     }

@@ -48,7 +48,9 @@ pub mod flag {
 }
 
 /// One submessage of one writer or reader. 120 bytes.
-#[derive(Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(
+    Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
 #[repr(C)]
 pub struct Record {
     /// Nanoseconds: from the kernel filter CLOCK_MONOTONIC at the frame that completed the datagram

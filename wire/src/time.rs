@@ -13,7 +13,10 @@ impl Timestamp {
 
     /// Seconds with fraction, for people and for Prometheus.
     #[must_use]
-    #[expect(clippy::cast_precision_loss, reason = "microseconds survive until the year 2255")]
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "microseconds survive until the year 2255"
+    )]
     pub fn seconds(self) -> f64 {
         self.0 as f64 / 1e9
     }
@@ -71,18 +74,27 @@ mod tests {
 
     #[test]
     fn a_tenth_of_a_second_is_not_429_milliseconds() {
-        assert_eq!(Duration::from_wire(0, 0x1999_999a), Duration::Finite(100_000_000));
+        assert_eq!(
+            Duration::from_wire(0, 0x1999_999a),
+            Duration::Finite(100_000_000)
+        );
     }
 
     #[test]
     fn infinite_in_both_spellings() {
         assert_eq!(Duration::from_wire(i32::MAX, u32::MAX), Duration::Infinite);
-        assert_eq!(Duration::from_wire(i32::MAX, 0x7fff_ffff), Duration::Infinite);
+        assert_eq!(
+            Duration::from_wire(i32::MAX, 0x7fff_ffff),
+            Duration::Infinite
+        );
     }
 
     #[test]
     fn no_time_is_not_the_epoch() {
         assert_eq!(RtpsTime(0).timestamp(), None);
-        assert_eq!(RtpsTime(1 << 32 | 1 << 31).timestamp(), Some(Timestamp(1_500_000_000)));
+        assert_eq!(
+            RtpsTime(1 << 32 | 1 << 31).timestamp(),
+            Some(Timestamp(1_500_000_000))
+        );
     }
 }
