@@ -13,6 +13,7 @@ extern crate alloc;
 extern crate std;
 
 pub mod cursor;
+pub mod frame;
 pub mod guid;
 pub mod record;
 pub mod time;

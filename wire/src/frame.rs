@@ -1,0 +1,262 @@
+//! From a captured frame to a UDP datagram, or to the piece of one that an IP fragment carries.
+//!
+//! Views only: nothing is copied, nothing is kept between frames, checksums are not verified
+//! (transmit offload leaves them unset in captures). Reassembly is somebody else's business, and
+//! so is everything that is not UDP over IP: it is named and left alone.
+//!
+//! A capture may hold less of a frame than was on the wire. Every length reported here is the true
+//! one; the bytes beside it may be fewer.
+
+mod ip;
+
+use crate::cursor::{Cursor, Endianness, Reason, WireError};
+
+/// Link layer of a capture, by its pcap `LINKTYPE_` number.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct Link(pub u16);
+
+impl Link {
+    /// BSD loopback: address family in the byte order of the capturing host.
+    pub const NULL: Self = Self(0);
+    /// Ethernet, also what Linux gives for `lo` and for Wi-Fi in managed mode.
+    pub const ETHERNET: Self = Self(1);
+    /// Raw IP as some BSDs number it.
+    pub const RAW_BSD: Self = Self(12);
+    /// Raw IP as OpenBSD numbers it.
+    pub const RAW_OPENBSD: Self = Self(14);
+    /// Raw IP, version by the first nibble.
+    pub const RAW: Self = Self(101);
+    /// OpenBSD loopback: address family in network byte order.
+    pub const LOOP: Self = Self(108);
+    /// Linux cooked capture.
+    pub const LINUX_SLL: Self = Self(113);
+    /// Raw IPv4.
+    pub const IPV4: Self = Self(228);
+    /// Raw IPv6.
+    pub const IPV6: Self = Self(229);
+    /// Linux cooked capture, version 2: with the interface's index.
+    pub const LINUX_SLL2: Self = Self(276);
+
+    /// Whether [`parse`] knows this link layer.
+    #[must_use]
+    pub const fn is_supported(self) -> bool {
+        matches!(
+            self,
+            Self::NULL
+                | Self::ETHERNET
+                | Self::RAW_BSD
+                | Self::RAW_OPENBSD
+                | Self::RAW
+                | Self::LOOP
+                | Self::LINUX_SLL
+                | Self::IPV4
+                | Self::IPV6
+                | Self::LINUX_SLL2
+        )
+    }
+}
+
+/// Whom a frame is for, as Linux says it (`PACKET_*` in `linux/if_packet.h`).
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct PacketType(pub u8);
+
+impl PacketType {
+    /// Addressed to this host. Also what is assumed where the link layer does not say.
+    pub const HOST: Self = Self(0);
+    /// Link-layer broadcast.
+    pub const BROADCAST: Self = Self(1);
+    /// Link-layer multicast.
+    pub const MULTICAST: Self = Self(2);
+    /// Addressed to somebody else.
+    pub const OTHER_HOST: Self = Self(3);
+    /// Sent by this host.
+    pub const OUTGOING: Self = Self(4);
+}
+
+/// One captured frame.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Frame<'a> {
+    /// Index of the interface, where the link header carries it (cooked v2).
+    pub interface: Option<u32>,
+    /// Direction, where the link header carries it (cooked v1 and v2).
+    pub packet_type: PacketType,
+    /// The IP packet; `None` when the frame carries something else (ARP, LLDP, a third tag).
+    pub packet: Option<Packet<'a>>,
+}
+
+/// One IP packet.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Packet<'a> {
+    /// Source address; IPv4 as `::ffff:a.b.c.d`.
+    pub source: [u8; 16],
+    /// Destination address; IPv4 as `::ffff:a.b.c.d`.
+    pub destination: [u8; 16],
+    /// What it carries.
+    pub payload: Payload<'a>,
+}
+
+/// What an IP packet carries.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Payload<'a> {
+    /// A whole UDP datagram.
+    Datagram(Datagram<'a>),
+    /// A part of a UDP datagram.
+    Fragment(Fragment<'a>),
+    /// Another protocol, by its IP protocol number.
+    Other(u8),
+}
+
+/// A whole UDP datagram.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Datagram<'a> {
+    /// Port it was sent from.
+    pub source_port: u16,
+    /// Port it was sent to.
+    pub destination_port: u16,
+    /// Payload after the UDP header, as much as was captured.
+    pub payload: &'a [u8],
+    /// True length of the payload.
+    pub length: u32,
+}
+
+/// A part of a UDP datagram, UDP header included where the part begins at zero.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Fragment<'a> {
+    /// IP identification: what the parts of one datagram have in common (16 bits in IPv4).
+    pub id: u32,
+    /// Where the part begins, in bytes from the UDP header's start.
+    pub offset: u32,
+    /// Whether parts follow; the part without this flag tells the datagram's length.
+    pub more: bool,
+    /// The part, as much of it as was captured.
+    pub bytes: &'a [u8],
+    /// True length of the part.
+    pub length: u32,
+}
+
+impl Fragment<'_> {
+    /// Where the next part begins. Never beyond 65535.
+    #[must_use]
+    pub const fn end(&self) -> u32 {
+        self.offset.saturating_add(self.length)
+    }
+}
+
+const ETHER_TYPE_IPV4: u16 = 0x0800;
+const ETHER_TYPE_IPV6: u16 = 0x86dd;
+/// 802.1Q, 802.1ad and the older tag of stacked VLANs.
+const ETHER_TYPES_VLAN: [u16; 3] = [0x8100, 0x88a8, 0x9100];
+const MOST_VLAN_TAGS: usize = 2;
+
+/// Reads one frame of a capture. `length` is the frame's length on the wire.
+///
+/// # Errors
+/// A header that is cut off or contradicts itself, or a link layer nobody taught us.
+pub fn parse(link: Link, bytes: &[u8], length: u32) -> Result<Frame<'_>, WireError> {
+    let mut cursor = Cursor::new(bytes, Endianness::Big);
+    let length = true_length(bytes, length);
+    let mut interface = None;
+    let mut packet_type = PacketType::HOST;
+    let packet = match link {
+        Link::ETHERNET => {
+            cursor.take("ethernet addresses", 12)?;
+            let ether_type = cursor.u16("ether type")?;
+            network(ether_type, cursor, length)?
+        }
+        Link::LINUX_SLL => {
+            let [_, kind] = cursor.array("cooked packet type")?;
+            packet_type = PacketType(kind);
+            cursor.take("cooked link address", 12)?;
+            let protocol = cursor.u16("cooked protocol")?;
+            network(protocol, cursor, length)?
+        }
+        Link::LINUX_SLL2 => {
+            let protocol = cursor.u16("cooked protocol")?;
+            cursor.take("cooked reserved", 2)?;
+            interface = Some(cursor.u32("cooked interface index")?);
+            cursor.take("cooked hardware type", 2)?;
+            packet_type = PacketType(cursor.u8("cooked packet type")?);
+            cursor.take("cooked link address", 9)?;
+            network(protocol, cursor, length)?
+        }
+        Link::NULL | Link::LOOP => {
+            // AF_INET is 2 everywhere; AF_INET6 is 10 on Linux, 24, 28 or 30 on the BSDs. Small
+            // numbers, so the byte order shows by itself.
+            let family = u32::from_be_bytes(cursor.array("loopback address family")?);
+            match family.min(family.swap_bytes()) {
+                2 => Some(ip::v4(cursor, length)?),
+                10 | 24 | 28 | 30 => Some(ip::v6(cursor, length)?),
+                _ => None,
+            }
+        }
+        Link::RAW | Link::RAW_BSD | Link::RAW_OPENBSD => raw(cursor, length)?,
+        Link::IPV4 => Some(ip::v4(cursor, length)?),
+        Link::IPV6 => Some(ip::v6(cursor, length)?),
+        Link(_) => return Err(cursor.error("link type", Reason::BadValue)),
+    };
+    Ok(Frame {
+        interface,
+        packet_type,
+        packet,
+    })
+}
+
+/// Reads what an `AF_PACKET` socket of type `SOCK_DGRAM` hands over: no link header, the protocol
+/// and the packet type beside it.
+///
+/// Of a doubly tagged frame the kernel strips the outer tag only. What arrives then begins with the
+/// inner tag, while what is sent begins with the IP header though its protocol names a tag.
+///
+/// # Errors
+/// As [`parse`].
+pub fn parse_cooked(
+    protocol: u16,
+    packet_type: PacketType,
+    bytes: &[u8],
+    length: u32,
+) -> Result<Option<Packet<'_>>, WireError> {
+    let cursor = Cursor::new(bytes, Endianness::Big);
+    let length = true_length(bytes, length);
+    if packet_type == PacketType::OUTGOING && ETHER_TYPES_VLAN.contains(&protocol) {
+        return raw(cursor, length);
+    }
+    network(protocol, cursor, length)
+}
+
+fn network(
+    mut ether_type: u16,
+    mut cursor: Cursor<'_>,
+    length: usize,
+) -> Result<Option<Packet<'_>>, WireError> {
+    for _ in 0..MOST_VLAN_TAGS {
+        if !ETHER_TYPES_VLAN.contains(&ether_type) {
+            break;
+        }
+        cursor.take("VLAN tag", 2)?;
+        ether_type = cursor.u16("ether type")?;
+    }
+    match ether_type {
+        ETHER_TYPE_IPV4 => ip::v4(cursor, length).map(Some),
+        ETHER_TYPE_IPV6 => ip::v6(cursor, length).map(Some),
+        _ => Ok(None),
+    }
+}
+
+fn raw(cursor: Cursor<'_>, length: usize) -> Result<Option<Packet<'_>>, WireError> {
+    match cursor.rest().first().map(|first| first >> 4) {
+        Some(4) => ip::v4(cursor, length).map(Some),
+        Some(6) => ip::v6(cursor, length).map(Some),
+        Some(_) => Ok(None),
+        None => Err(cursor.error("IP version", Reason::Truncated)),
+    }
+}
+
+/// A capture that claims less than it holds is wrong about the claim.
+fn true_length(bytes: &[u8], length: u32) -> usize {
+    usize::try_from(length)
+        .unwrap_or(usize::MAX)
+        .max(bytes.len())
+}
+
+#[cfg(test)]
+mod tests;

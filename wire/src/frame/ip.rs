@@ -1,0 +1,206 @@
+//! IPv4 (RFC 791) and IPv6 (RFC 8200) down to UDP (RFC 768).
+//!
+//! Packets that the receiving kernel would discard for their lengths are errors here, so that
+//! nothing is counted which no socket can have got.
+
+use super::{Datagram, Fragment, Packet, Payload};
+use crate::cursor::{Cursor, Reason, WireError};
+
+const UDP: u8 = 17;
+const UDP_HEADER: usize = 8;
+/// Fragments address a datagram with 16 bits.
+const LARGEST_DATAGRAM: u32 = 65_535;
+/// RFC 8200 names each header once and destination options twice; a few more do no harm.
+const MOST_EXTENSION_HEADERS: usize = 8;
+
+/// Reads an IPv4 packet. `length` is the true length of what the cursor's outermost slice shows.
+pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, WireError> {
+    let start = cursor;
+    let available = length.saturating_sub(cursor.offset());
+    let version = cursor.u8("IPv4 version")?;
+    if version >> 4 != 4 {
+        return Err(start.error("IPv4 version", Reason::BadMarker));
+    }
+    let header_length = usize::from(version & 0x0f) * 4;
+    cursor.u8("IPv4 traffic class")?;
+    let total_length = usize::from(cursor.u16("IPv4 total length")?);
+    let id = u32::from(cursor.u16("IPv4 identification")?);
+    let fragmentation = cursor.u16("IPv4 fragment offset")?;
+    cursor.u8("IPv4 time to live")?;
+    let protocol = cursor.u8("IPv4 protocol")?;
+    cursor.u16("IPv4 checksum")?;
+    let source = mapped(cursor.array("IPv4 source")?);
+    let destination = mapped(cursor.array("IPv4 destination")?);
+    if protocol != UDP {
+        // Before the lengths are judged: segmentation offload shows TCP with a total length of 0.
+        return Ok(Packet {
+            source,
+            destination,
+            payload: Payload::Other(protocol),
+        });
+    }
+    let options = header_length
+        .checked_sub(20)
+        .ok_or(start.error("IPv4 header length", Reason::BadLength))?;
+    let body_length = total_length
+        .checked_sub(header_length)
+        .filter(|_| total_length <= available)
+        .ok_or(start.error("IPv4 total length", Reason::BadLength))?;
+    cursor.take("IPv4 options", options)?;
+    let body = Body::new(cursor, body_length)?;
+    let more = fragmentation & 0x2000 != 0;
+    let offset = u32::from(fragmentation & 0x1fff) * 8;
+    let payload = if more || offset != 0 {
+        Payload::Fragment(body.fragment(id, offset, more)?)
+    } else {
+        Payload::Datagram(body.datagram(false)?)
+    };
+    Ok(Packet {
+        source,
+        destination,
+        payload,
+    })
+}
+
+/// Reads an IPv6 packet. `length` is the true length of what the cursor's outermost slice shows.
+pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, WireError> {
+    let start = cursor;
+    let available = length.saturating_sub(cursor.offset());
+    if cursor.u8("IPv6 version")? >> 4 != 6 {
+        return Err(start.error("IPv6 version", Reason::BadMarker));
+    }
+    cursor.take("IPv6 flow label", 3)?;
+    let payload_length = usize::from(cursor.u16("IPv6 payload length")?);
+    let mut next_header = cursor.u8("IPv6 next header")?;
+    cursor.u8("IPv6 hop limit")?;
+    let source = cursor.array("IPv6 source")?;
+    let destination = cursor.array("IPv6 destination")?;
+    let packet = |payload| Packet {
+        source,
+        destination,
+        payload,
+    };
+    if !matches!(next_header, UDP | 0 | 43 | 44 | 51 | 60) {
+        return Ok(packet(Payload::Other(next_header)));
+    }
+    if payload_length.saturating_add(40) > available {
+        return Err(start.error("IPv6 payload length", Reason::BadLength));
+    }
+    let mut body = Body::new(cursor, payload_length)?;
+    for _ in 0..MOST_EXTENSION_HEADERS {
+        match next_header {
+            UDP => return Ok(packet(Payload::Datagram(body.datagram(true)?))),
+            // Hop-by-hop options, routing, destination options: length in units of 8 after the
+            // first 8 octets.
+            0 | 43 | 60 => {
+                let [following, units] = body.peek("IPv6 extension header")?;
+                body.skip("IPv6 extension header", 8 + usize::from(units) * 8)?;
+                next_header = following;
+            }
+            // Authentication header (RFC 4302): units of 4, minus 2.
+            51 => {
+                let [following, units] = body.peek("IPv6 authentication header")?;
+                body.skip("IPv6 authentication header", 8 + usize::from(units) * 4)?;
+                next_header = following;
+            }
+            44 => {
+                let [following, _, high, low, id @ ..] = body.peek::<8>("IPv6 fragment header")?;
+                body.skip("IPv6 fragment header", 8)?;
+                // The offset's unit is 8 octets, and it stands in the upper 13 bits: masked, the
+                // field is already in bytes.
+                let field = u16::from_be_bytes([high, low]);
+                let (offset, more) = (u32::from(field & 0xfff8), field & 1 != 0);
+                if offset == 0 && !more {
+                    // An atomic fragment (RFC 6946) is a whole packet.
+                    next_header = following;
+                } else if following == UDP {
+                    let fragment = body.fragment(u32::from_be_bytes(id), offset, more)?;
+                    return Ok(packet(Payload::Fragment(fragment)));
+                } else {
+                    return Ok(packet(Payload::Other(following)));
+                }
+            }
+            other => return Ok(packet(Payload::Other(other))),
+        }
+    }
+    Err(start.error("IPv6 extension headers", Reason::OverLimit))
+}
+
+/// What follows a header: captured bytes that may be fewer than the true length.
+struct Body<'a> {
+    cursor: Cursor<'a>,
+    length: usize,
+}
+
+impl<'a> Body<'a> {
+    /// Cuts off what the link layer appended (Ethernet pads to 60 octets).
+    fn new(mut cursor: Cursor<'a>, length: usize) -> Result<Self, WireError> {
+        let captured = length.min(cursor.remaining());
+        Ok(Self {
+            cursor: cursor.sub("IP payload", captured)?,
+            length,
+        })
+    }
+
+    fn peek<const N: usize>(&self, what: &'static str) -> Result<[u8; N], WireError> {
+        let mut ahead = self.cursor;
+        ahead.array(what)
+    }
+
+    fn skip(&mut self, what: &'static str, count: usize) -> Result<(), WireError> {
+        self.length = self
+            .length
+            .checked_sub(count)
+            .ok_or(self.cursor.error(what, Reason::BadLength))?;
+        self.cursor.take(what, count)?;
+        Ok(())
+    }
+
+    fn fragment(self, id: u32, offset: u32, more: bool) -> Result<Fragment<'a>, WireError> {
+        let wrong = self.cursor.error("IP fragment", Reason::BadLength);
+        let length = u32::try_from(self.length).map_err(|_| wrong)?;
+        let ragged = more && !length.is_multiple_of(8);
+        if length == 0 || ragged || offset.saturating_add(length) > LARGEST_DATAGRAM {
+            return Err(wrong);
+        }
+        Ok(Fragment {
+            id,
+            offset,
+            more,
+            bytes: self.cursor.rest(),
+            length,
+        })
+    }
+
+    /// `zero_is_all`: IPv6 allows a UDP length of zero for jumbograms (RFC 2675), and Linux takes
+    /// it for "the rest of the packet".
+    fn datagram(mut self, zero_is_all: bool) -> Result<Datagram<'a>, WireError> {
+        let start = self.cursor;
+        let source_port = self.cursor.u16("UDP source port")?;
+        let destination_port = self.cursor.u16("UDP destination port")?;
+        let mut udp_length = usize::from(self.cursor.u16("UDP length")?);
+        self.cursor.u16("UDP checksum")?;
+        if udp_length == 0 && zero_is_all {
+            udp_length = self.length;
+        }
+        let length = udp_length
+            .checked_sub(UDP_HEADER)
+            .filter(|_| udp_length <= self.length)
+            .ok_or(start.error("UDP length", Reason::BadLength))?;
+        let payload = self
+            .cursor
+            .take("UDP payload", length.min(self.cursor.remaining()))?;
+        let length =
+            u32::try_from(length).map_err(|_| start.error("UDP length", Reason::BadLength))?;
+        Ok(Datagram {
+            source_port,
+            destination_port,
+            payload,
+            length,
+        })
+    }
+}
+
+fn mapped([a, b, c, d]: [u8; 4]) -> [u8; 16] {
+    [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, a, b, c, d]
+}
