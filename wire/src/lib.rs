@@ -17,6 +17,7 @@ pub mod frame;
 pub mod guid;
 pub mod record;
 pub mod time;
+pub mod walk;
 
 pub use cursor::{Cursor, Endianness, Reason, WireError};
 pub use guid::{EntityId, Guid, GuidPrefix};

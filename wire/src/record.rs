@@ -185,6 +185,10 @@ impl Record {
             ]),
             identification: self.encapsulation,
             offset: self.payload_len,
+            timestamp: [
+                (self.source_timestamp >> 32) as u32,
+                self.source_timestamp as u32,
+            ],
         }
     }
 }
@@ -202,6 +206,8 @@ pub struct Handover {
     pub identification: u32,
     /// Offset in the UDP payload of the next submessage header.
     pub offset: u32,
+    /// INFO_TS in force: seconds and fraction; zero = none.
+    pub timestamp: [u32; 2],
 }
 
 /// How the kernel filter treats a writer or reader: the value of its interest map. No entry means

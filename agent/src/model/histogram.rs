@@ -68,7 +68,11 @@ impl Histogram {
 
     /// `(upper bound, values in this bucket)`, not cumulative; the last bound is infinite.
     pub fn buckets(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
-        BOUNDS.iter().copied().chain([f64::INFINITY]).zip(self.counts.iter().copied())
+        BOUNDS
+            .iter()
+            .copied()
+            .chain([f64::INFINITY])
+            .zip(self.counts.iter().copied())
     }
 }
 
@@ -82,7 +86,10 @@ mod tests {
         histogram.observe(0.001);
         histogram.observe(0.0011);
         histogram.observe(99.0);
-        let filled: Vec<_> = histogram.buckets().filter(|(_, count)| *count > 0).collect();
+        let filled: Vec<_> = histogram
+            .buckets()
+            .filter(|(_, count)| *count > 0)
+            .collect();
         assert_eq!(filled, [(0.001, 1), (0.002, 1), (f64::INFINITY, 1)]);
         assert_eq!(histogram.range(), Some((0.001, 99.0)));
     }
@@ -93,6 +100,9 @@ mod tests {
         one.observe(0.01);
         two.observe(3.0);
         one.merge(&two);
-        assert_eq!((one.count(), one.sum(), one.range()), (2, 3.01, Some((0.01, 3.0))));
+        assert_eq!(
+            (one.count(), one.sum(), one.range()),
+            (2, 3.01, Some((0.01, 3.0)))
+        );
     }
 }

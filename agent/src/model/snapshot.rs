@@ -201,8 +201,13 @@ pub enum WatchState {
 
 impl WatchState {
     /// All states, for exporting one series each.
-    pub const ALL: [Self; 5] =
-        [Self::Ok, Self::Violated, Self::Silent, Self::NotPublished, Self::NoSubscriber];
+    pub const ALL: [Self; 5] = [
+        Self::Ok,
+        Self::Violated,
+        Self::Silent,
+        Self::NotPublished,
+        Self::NoSubscriber,
+    ];
 
     /// Label value.
     #[must_use]

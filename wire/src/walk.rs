@@ -1,0 +1,1001 @@
+//! The walk over one datagram's submessages that decides what happens to it.
+//!
+//! Written once: the kernel filter compiles [`step`] and [`fate`] for the BPF target and reads from
+//! a socket buffer; user space reads from a slice. So what the unit tests, the fuzzer and the
+//! replays exercise is what runs in the kernel. That target dictates the style: reads of fixed
+//! size, state in one plain struct, masks instead of branches for the byte order, no formatting.
+//!
+//! It follows the receiver state of RTPS 2.5, 8.3.4 (INFO_SRC, INFO_DST, INFO_TS) and skips what it
+//! does not know by its length. It does not look inside payloads beyond their first twelve bytes.
+
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
+use crate::guid::EntityId;
+use crate::record::{Handover, Record, flag, kind};
+
+/// Where a walk reads from: a slice, or a socket buffer in the kernel.
+pub trait Bytes {
+    /// `N` words of wire bytes at `offset` of the UDP payload, in memory order; `None` when they
+    /// are not all here. Every read of the walk is 4-aligned relative to the payload's start, as
+    /// submessages are (RTPS 2.5, 9.4.5.1).
+    fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]>;
+}
+
+impl Bytes for &[u8] {
+    fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]> {
+        let tail = self.get(usize::try_from(offset).ok()?..)?;
+        <[u32; N]>::read_from_prefix(tail)
+            .ok()
+            .map(|(words, _)| words)
+    }
+}
+
+/// Size of the RTPS message header, where the first submessage begins.
+pub const HEADER_LEN: u32 = 20;
+/// `RTPS` as it lies in memory.
+pub const MAGIC: u32 = u32::from_ne_bytes(*b"RTPS");
+
+/// Parameters of one inline QoS that the walk reads before it gives up on its length.
+const INLINE_QOS_PARAMETERS: u32 = 12;
+const PID_SENTINEL: u32 = 0x0001;
+const PID_STATUS_INFO: u32 = 0x0071;
+
+const INFO_TS: u32 = 0x09;
+const INFO_SRC: u32 = 0x0c;
+const INFO_DST: u32 = 0x0e;
+const PAD: u32 = 0x01;
+
+/// One datagram on its way through [`step`].
+#[derive(Clone, Copy, Default, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[repr(C)]
+pub struct Walk {
+    /// The current submessage; what concerns the whole datagram is set once.
+    pub record: Record,
+    /// Source GUID prefix in force.
+    pub source: [u32; 3],
+    /// INFO_DST's prefix in force; zero = any.
+    pub destination: [u32; 3],
+    /// Offset of the next submessage header.
+    pub offset: u32,
+    /// Length of the whole UDP payload.
+    pub datagram_len: u32,
+    /// `seconds << 32 | fraction` of INFO_TS in force, in two words; zero = none.
+    pub timestamp: [u32; 2],
+}
+
+/// What one step found.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[repr(u32)]
+pub enum Step {
+    /// The datagram ends here.
+    End = 0,
+    /// The next submessage header begins beyond the bytes at hand.
+    Later = 1,
+    /// The next submessage begins here, but what the walk needs of it does not end here.
+    Split = 2,
+    /// A submessage contradicts the datagram's length; the rest is unreadable.
+    Malformed = 3,
+    /// Nothing that becomes a record.
+    Passed = 4,
+    /// [`Walk::record`] holds a submessage of an endpoint.
+    Endpoint = 5,
+    /// As [`Step::Endpoint`], but a GAP's set is too long for one record.
+    LongGap = 6,
+}
+
+/// Picks a byte order without branching: `word` was read from memory as it lay on the wire.
+#[derive(Clone, Copy)]
+struct Order(u32);
+
+impl Order {
+    /// From a submessage's flags: E set means little-endian.
+    #[inline(always)]
+    const fn of(flags: u32) -> Self {
+        Self((flags & 1).wrapping_neg())
+    }
+
+    #[inline(always)]
+    const fn word(self, wire: u32) -> u32 {
+        let big = u32::from_be(wire);
+        (big & !self.0) | (big.swap_bytes() & self.0)
+    }
+
+    /// The `u16` pair in one word: `(first, second)`.
+    #[inline(always)]
+    const fn halves(self, wire: u32) -> (u32, u32) {
+        let big = u32::from_be(wire);
+        let (first, second) = (big >> 16, big & 0xffff);
+        (self.half(first), self.half(second))
+    }
+
+    #[inline(always)]
+    const fn half(self, big: u32) -> u32 {
+        let swapped = (big >> 8) | ((big & 0xff) << 8);
+        (big & !self.0) | (swapped & self.0)
+    }
+
+    #[inline(always)]
+    const fn long(self, high: u32, low: u32) -> u64 {
+        (self.word(high) as u64) << 32 | self.word(low) as u64
+    }
+}
+
+impl Walk {
+    /// At the first submessage of a message whose header's GUID prefix is `source`. The caller has
+    /// checked the magic.
+    #[inline(always)]
+    pub fn begin(&mut self, source: [u32; 3], datagram_len: u32) {
+        self.source = source;
+        self.destination = [0; 3];
+        self.offset = HEADER_LEN;
+        self.datagram_len = datagram_len;
+        self.timestamp = [0; 2];
+        self.record.datagram_len = datagram_len as u16;
+    }
+
+    /// Whether `len` bytes at `offset` lie in the datagram and among the first `present` bytes.
+    #[inline(always)]
+    const fn reach(&self, offset: u32, len: u32, present: u32) -> Reach {
+        // Offsets stay below 2^17: a 16-bit length from a position below 2^16.
+        let end = offset + len;
+        if end > self.datagram_len {
+            Reach::Outside
+        } else if end > present {
+            Reach::Elsewhere
+        } else {
+            Reach::Here
+        }
+    }
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Reach {
+    Here,
+    Elsewhere,
+    Outside,
+}
+
+/// Reads `N` words at `offset` or leaves [`step`] with what is wrong.
+macro_rules! read {
+    ($walk:expr, $bytes:expr, $present:expr, $offset:expr, $count:literal) => {{
+        let offset: u32 = $offset;
+        match $walk.reach(offset, 4 * $count, $present) {
+            Reach::Here => match $bytes.words::<$count>(offset) {
+                Some(words) => words,
+                None => return Step::Malformed,
+            },
+            Reach::Elsewhere => return Step::Split,
+            Reach::Outside => return Step::Malformed,
+        }
+    }};
+}
+
+/// Reads the submessage at `walk.offset`, of which bytes up to `present` of the payload are at
+/// hand. Moves the offset on unless it returns [`Step::Later`], [`Step::Split`] or [`Step::End`].
+#[inline(always)]
+pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
+    let start = walk.offset;
+    // A tail shorter than a submessage header is padding.
+    if start + 4 > walk.datagram_len {
+        return Step::End;
+    }
+    if start >= present {
+        return Step::Later;
+    }
+    let [header] = read!(walk, bytes, present, start, 1);
+    // id, flags, octetsToNextHeader: the first two are octets.
+    let id = u32::from_be(header) >> 24;
+    let flags = u32::from_be(header) >> 16 & 0xff;
+    let order = Order::of(flags);
+    let (_, octets) = order.halves(header);
+    let body = start + 4;
+    // RTPS 2.5, 9.4.5.1.3: zero means "to the end", except for PAD and INFO_TS.
+    let end = if octets == 0 && id != PAD && id != INFO_TS {
+        walk.datagram_len
+    } else {
+        body + octets
+    };
+    if end > walk.datagram_len {
+        return Step::Malformed;
+    }
+    let found = if id == kind::DATA as u32 || id == kind::DATA_FRAG as u32 {
+        data(walk, bytes, present, order, id, flags, body, end)
+    } else if id == kind::HEARTBEAT as u32 {
+        heartbeat(walk, bytes, present, order, flags, body, end)
+    } else if id == kind::GAP as u32 || id == kind::ACKNACK as u32 {
+        sequence_set(walk, bytes, present, order, id, flags, body, end)
+    } else {
+        receiver_state(walk, bytes, present, order, id, flags, body, end)
+    };
+    if found as u32 != Step::Split as u32 {
+        walk.offset = if found as u32 == Step::Malformed as u32 {
+            walk.datagram_len
+        } else {
+            end
+        };
+    }
+    found
+}
+
+/// INFO_TS, INFO_SRC, INFO_DST; anything else is passed over by its length.
+#[inline(always)]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "a struct would go over the BPF stack"
+)]
+fn receiver_state<B: Bytes>(
+    walk: &mut Walk,
+    bytes: &B,
+    present: u32,
+    order: Order,
+    id: u32,
+    flags: u32,
+    body: u32,
+    end: u32,
+) -> Step {
+    if id == INFO_TS {
+        if flags & 0x02 != 0 {
+            walk.timestamp = [0; 2];
+            return Step::Passed;
+        }
+        if body + 8 > end {
+            return Step::Malformed;
+        }
+        let [seconds, fraction] = read!(walk, bytes, present, body, 2);
+        walk.timestamp = [order.word(seconds), order.word(fraction)];
+    } else if id == INFO_DST {
+        if body + 12 > end {
+            return Step::Malformed;
+        }
+        walk.destination = read!(walk, bytes, present, body, 3);
+    } else if id == INFO_SRC {
+        // unused, version and vendor, prefix; the timestamp is reset (RTPS 2.5, 8.3.8.9.4).
+        if body + 20 > end {
+            return Step::Malformed;
+        }
+        walk.source = read!(walk, bytes, present, body + 8, 3);
+        walk.timestamp = [0; 2];
+    }
+    Step::Passed
+}
+
+/// Sets what all endpoint submessages share. `reader` and `writer` are entity ids as read.
+#[inline(always)]
+fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
+    let (source, destination) = (walk.source, walk.destination);
+    let record = &mut walk.record;
+    record.writer = [source[0], source[1], source[2], writer];
+    record.reader = [destination[0], destination[1], destination[2], reader];
+    record.kind = id as u8;
+    record.submessage_flags = flags as u8;
+    record.flags &= flag::FRAGMENTED | flag::OUTGOING | flag::IPV6;
+    record.source_timestamp = 0;
+    record.payload_len = 0;
+    record.encapsulation = 0;
+    record.stamp_seconds = 0;
+    record.stamp_nanoseconds = 0;
+    record.fragment_start = 0;
+    record.fragments = 0;
+    record.sample_size = 0;
+    record.status_info = 0;
+}
+
+/// DATA and DATA_FRAG (RTPS 2.5, 9.4.5.3 and 9.4.5.4).
+#[inline(always)]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "a struct would go over the BPF stack"
+)]
+fn data<B: Bytes>(
+    walk: &mut Walk,
+    bytes: &B,
+    present: u32,
+    order: Order,
+    id: u32,
+    flags: u32,
+    body: u32,
+    end: u32,
+) -> Step {
+    let fragment = id == kind::DATA_FRAG as u32;
+    let fixed = if fragment { 32 } else { 20 };
+    if body + fixed > end {
+        return Step::Malformed;
+    }
+    let [extra, reader, writer, high, low] = read!(walk, bytes, present, body, 5);
+    endpoint(walk, id, flags, writer, reader);
+    walk.record.sequence_number = order.long(high, low);
+    walk.record.source_timestamp = (walk.timestamp[0] as u64) << 32 | walk.timestamp[1] as u64;
+    if fragment {
+        let [start, counts, size] = read!(walk, bytes, present, body + 20, 3);
+        let (in_submessage, fragment_size) = order.halves(counts);
+        walk.record.fragment_start = order.word(start);
+        walk.record.fragments = in_submessage << 16 | fragment_size;
+        walk.record.sample_size = order.word(size);
+    }
+    // octetsToInlineQos counts from behind itself (RTPS 2.5, 9.4.5.3.3).
+    let (_, to_inline_qos) = order.halves(extra);
+    let mut at = body + 4 + to_inline_qos;
+    if at < body + fixed || at > end {
+        return Step::Malformed;
+    }
+    if flags & 0x02 != 0 {
+        let mut seen = 0;
+        loop {
+            if seen == INLINE_QOS_PARAMETERS {
+                walk.record.flags |= flag::INLINE_QOS_UNREAD;
+                walk.record.payload_len = end - at;
+                return Step::Endpoint;
+            }
+            if at + 4 > end {
+                return Step::Malformed;
+            }
+            let [parameter] = read!(walk, bytes, present, at, 1);
+            let (pid, len) = order.halves(parameter);
+            if pid == PID_STATUS_INFO && len >= 4 {
+                if at + 8 > end {
+                    return Step::Malformed;
+                }
+                let [status] = read!(walk, bytes, present, at + 4, 1);
+                // Big-endian whatever E says (RTPS 2.5, 9.6.3.9).
+                walk.record.status_info = u32::from_be(status);
+            }
+            at += 4;
+            if pid == PID_SENTINEL {
+                break;
+            }
+            at += (len + 3) & !3;
+            if at > end {
+                return Step::Malformed;
+            }
+            seen += 1;
+        }
+    }
+    // Neither Data nor Key: a disposal that says everything inline (Fast DDS).
+    if !fragment && flags & 0x0c == 0 {
+        return Step::Endpoint;
+    }
+    walk.record.payload_len = end - at;
+    // The payload's head: in every DATA, and in the first fragment only.
+    if (!fragment || walk.record.fragment_start == 1) && at + 12 <= end {
+        let [encapsulation, seconds, nanoseconds] = read!(walk, bytes, present, at, 3);
+        let encapsulation = u32::from_be(encapsulation);
+        // Identifiers are big-endian; the lowest bit means little-endian contents (10.5).
+        let contents = Order::of(encapsulation >> 16);
+        walk.record.encapsulation = encapsulation;
+        walk.record.stamp_seconds = contents.word(seconds);
+        walk.record.stamp_nanoseconds = contents.word(nanoseconds);
+        walk.record.flags |= flag::STAMP;
+    }
+    Step::Endpoint
+}
+
+/// HEARTBEAT (RTPS 2.5, 9.4.5.6).
+#[inline(always)]
+fn heartbeat<B: Bytes>(
+    walk: &mut Walk,
+    bytes: &B,
+    present: u32,
+    order: Order,
+    flags: u32,
+    body: u32,
+    end: u32,
+) -> Step {
+    if body + 28 > end {
+        return Step::Malformed;
+    }
+    let [
+        reader,
+        writer,
+        first_high,
+        first_low,
+        last_high,
+        last_low,
+        count,
+    ] = read!(walk, bytes, present, body, 7);
+    endpoint(walk, kind::HEARTBEAT as u32, flags, writer, reader);
+    walk.record.sequence_number = order.long(first_high, first_low);
+    walk.record.payload_len = order.word(last_high);
+    walk.record.encapsulation = order.word(last_low);
+    walk.record.stamp_seconds = order.word(count);
+    Step::Endpoint
+}
+
+/// GAP and ACKNACK (RTPS 2.5, 9.4.5.5 and 9.4.5.2): both end in a SequenceNumberSet (9.4.2.6).
+#[inline(always)]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "a struct would go over the BPF stack"
+)]
+fn sequence_set<B: Bytes>(
+    walk: &mut Walk,
+    bytes: &B,
+    present: u32,
+    order: Order,
+    id: u32,
+    flags: u32,
+    body: u32,
+    end: u32,
+) -> Step {
+    let gap = id == kind::GAP as u32;
+    let set = if gap { body + 16 } else { body + 8 };
+    if set + 12 > end {
+        return Step::Malformed;
+    }
+    let [reader, writer] = read!(walk, bytes, present, body, 2);
+    let [base_high, base_low, bits] = read!(walk, bytes, present, set, 3);
+    let bits = order.word(bits);
+    if bits > 256 || set + 12 + ((bits + 31) >> 5) * 4 > end {
+        return Step::Malformed;
+    }
+    if gap {
+        let [start_high, start_low] = read!(walk, bytes, present, body + 8, 2);
+        endpoint(walk, id, flags, writer, reader);
+        walk.record.sequence_number = order.long(start_high, start_low);
+        walk.record.payload_len = order.word(base_high);
+        walk.record.encapsulation = order.word(base_low);
+    } else {
+        // An ACKNACK's sender is the reader; its writer is INFO_DST's.
+        endpoint(walk, id, flags, writer, reader);
+        walk.record.reader = [walk.source[0], walk.source[1], walk.source[2], reader];
+        walk.record.writer = [
+            walk.destination[0],
+            walk.destination[1],
+            walk.destination[2],
+            writer,
+        ];
+        walk.record.sequence_number = order.long(base_high, base_low);
+    }
+    walk.record.stamp_seconds = bits;
+    let map = set + 12;
+    if bits > 0 {
+        walk.record.stamp_nanoseconds = order.word(read!(walk, bytes, present, map, 1)[0]);
+    }
+    if bits > 32 {
+        walk.record.fragment_start = order.word(read!(walk, bytes, present, map + 4, 1)[0]);
+    }
+    if bits > 64 {
+        walk.record.fragments = order.word(read!(walk, bytes, present, map + 8, 1)[0]);
+    }
+    if bits > 96 {
+        walk.record.sample_size = order.word(read!(walk, bytes, present, map + 12, 1)[0]);
+    }
+    if bits > 128 {
+        walk.record.status_info = order.word(read!(walk, bytes, present, map + 16, 1)[0]);
+    }
+    if gap && bits > Record::BITMAP_BITS {
+        Step::LongGap
+    } else {
+        Step::Endpoint
+    }
+}
+
+/// What to do with a submessage before the interest map is asked.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[repr(u32)]
+pub enum Fate {
+    /// Of no interest to anybody, ever.
+    Ignore = 0,
+    /// Discovery: the datagram goes to user space whole.
+    Capture = 1,
+    /// As the interest map says for the record's writer; not in it: unknown, capture at first.
+    Writer = 2,
+    /// As the interest map says for the record's reader; not in it: ignore.
+    Reader = 3,
+}
+
+/// The part of the verdict that needs no state. Discovery is SPDP and SEDP and what can be read of
+/// their secure variants; other builtin traffic (liveliness, type lookup, authentication) is not
+/// looked at.
+#[inline(always)]
+#[must_use]
+pub const fn fate(record: &Record) -> Fate {
+    if record.kind == kind::ACKNACK {
+        let [_, _, _, last] = record.reader[3].to_ne_bytes();
+        return if last & 0xc0 == 0 {
+            Fate::Reader
+        } else {
+            Fate::Ignore
+        };
+    }
+    let writer = record.writer[3];
+    let [_, _, _, last] = writer.to_ne_bytes();
+    if last & 0xc0 == 0 {
+        return Fate::Writer;
+    }
+    let is_data = record.kind == kind::DATA || record.kind == kind::DATA_FRAG;
+    if is_data && is_discovery_writer(writer) {
+        Fate::Capture
+    } else {
+        Fate::Ignore
+    }
+}
+
+#[inline(always)]
+const fn is_discovery_writer(entity: u32) -> bool {
+    const SPDP: u32 = word(EntityId::SPDP_WRITER);
+    const PUBLICATIONS: u32 = word(EntityId::SEDP_PUBLICATIONS_WRITER);
+    const SUBSCRIPTIONS: u32 = word(EntityId::SEDP_SUBSCRIPTIONS_WRITER);
+    const SPDP_SECURE: u32 = word(EntityId::SPDP_SECURE_WRITER);
+    const PUBLICATIONS_SECURE: u32 = word(EntityId::SEDP_PUBLICATIONS_SECURE_WRITER);
+    const SUBSCRIPTIONS_SECURE: u32 = word(EntityId::SEDP_SUBSCRIPTIONS_SECURE_WRITER);
+    entity == SPDP
+        || entity == PUBLICATIONS
+        || entity == SUBSCRIPTIONS
+        || entity == SPDP_SECURE
+        || entity == PUBLICATIONS_SECURE
+        || entity == SUBSCRIPTIONS_SECURE
+}
+
+const fn word(entity: EntityId) -> u32 {
+    u32::from_ne_bytes(entity.0)
+}
+
+/// What is known of a datagram besides its bytes.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
+pub struct Envelope {
+    /// Nanoseconds since the Unix epoch, of the frame that completed the datagram.
+    pub time: u64,
+    /// Destination address, IPv4-mapped for IPv4.
+    pub destination: [u8; 16],
+    /// Destination UDP port.
+    pub destination_port: u16,
+    /// Interface index, 0 = unknown.
+    pub interface: u32,
+    /// Sent by this host.
+    pub outgoing: bool,
+    /// Came in several IP fragments.
+    pub fragmented: bool,
+}
+
+impl Envelope {
+    /// The record fields that concern the whole datagram.
+    fn record(&self) -> Record {
+        const IPV4_MAPPED: [u8; 12] = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff];
+        let mut flags = 0;
+        if self.fragmented {
+            flags |= flag::FRAGMENTED;
+        }
+        if self.outgoing {
+            flags |= flag::OUTGOING;
+        }
+        if !self.destination.starts_with(&IPV4_MAPPED) {
+            flags |= flag::IPV6;
+        }
+        Record {
+            time: self.time,
+            destination: zerocopy::transmute!(self.destination),
+            destination_port: self.destination_port,
+            interface: self.interface,
+            flags,
+            ..Record::default()
+        }
+    }
+}
+
+/// One endpoint submessage of a datagram in user space.
+#[derive(Clone, Copy, Debug)]
+pub struct Found<'a> {
+    /// As the kernel filter would report it.
+    pub record: Record,
+    /// The whole submessage behind its header: fixed fields, inline QoS and payload.
+    pub body: &'a [u8],
+    /// Serialized payload of DATA, the fragment bytes of DATA_FRAG; empty for the others.
+    pub payload: &'a [u8],
+}
+
+/// How a walk in user space ended.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Outcome {
+    /// To the datagram's end.
+    Complete,
+    /// No RTPS magic.
+    NotRtps,
+    /// A submessage contradicts the datagram's length; everything before it was reported.
+    Malformed,
+}
+
+/// Walks a whole datagram, any number of submessages, and shows every endpoint submessage to
+/// `show`. With `handover` the walk goes on where the kernel filter left off; bytes before that
+/// offset are not read. A GAP too long for one record is shown as two.
+pub fn datagram<'a>(
+    payload: &'a [u8],
+    envelope: &Envelope,
+    handover: Option<&Handover>,
+    mut show: impl FnMut(Found<'a>),
+) -> Outcome {
+    let Ok(datagram_len) = u16::try_from(payload.len()).map(u32::from) else {
+        return Outcome::Malformed;
+    };
+    let mut walk = Walk {
+        record: envelope.record(),
+        ..Walk::default()
+    };
+    if let Some(handover) = handover {
+        walk.begin(prefix_words(handover.source), datagram_len);
+        walk.destination = prefix_words(handover.destination);
+        walk.offset = handover.offset;
+        walk.timestamp = handover.timestamp;
+    } else {
+        let Some([magic, _version, source @ ..]) = payload.words::<5>(0) else {
+            return Outcome::NotRtps;
+        };
+        if magic != MAGIC {
+            return Outcome::NotRtps;
+        }
+        walk.begin(source, datagram_len);
+    }
+    loop {
+        let start = walk.offset;
+        let step = step(&mut walk, &payload, datagram_len);
+        match step {
+            Step::End | Step::Later => return Outcome::Complete,
+            Step::Split | Step::Malformed => return Outcome::Malformed,
+            Step::Passed => {}
+            Step::Endpoint | Step::LongGap => {
+                let body = slice(payload, start + 4, walk.offset);
+                let is_data = matches!(walk.record.kind, kind::DATA | kind::DATA_FRAG);
+                let payload_len = if is_data { walk.record.payload_len } else { 0 };
+                let data = slice(payload, walk.offset - payload_len, walk.offset);
+                show(Found {
+                    record: walk.record,
+                    body,
+                    payload: data,
+                });
+                if step == Step::LongGap {
+                    let record = long_gap_tail(&walk.record, body);
+                    show(Found {
+                        record,
+                        body,
+                        payload: &[],
+                    });
+                }
+            }
+        }
+    }
+}
+
+/// The second record of a GAP whose set has more than [`Record::BITMAP_BITS`] bits: the same set
+/// from there on, with an empty range before it.
+fn long_gap_tail(record: &Record, body: &[u8]) -> Record {
+    let order = Order::of(record.submessage_flags.into());
+    let base = record
+        .second_sequence_number()
+        .wrapping_add(Record::BITMAP_BITS.into());
+    // reader, writer, gapStart, base, numBits, then five words that the first record holds
+    let map = |index: u32| {
+        body.words::<1>(28 + 20 + 4 * index)
+            .map_or(0, |[word]| order.word(word))
+    };
+    Record {
+        sequence_number: base,
+        payload_len: (base >> 32) as u32,
+        encapsulation: base as u32,
+        stamp_seconds: record.stamp_seconds - Record::BITMAP_BITS,
+        stamp_nanoseconds: map(0),
+        fragment_start: map(1),
+        fragments: map(2),
+        sample_size: 0,
+        status_info: 0,
+        ..*record
+    }
+}
+
+fn slice(bytes: &[u8], start: u32, end: u32) -> &[u8] {
+    bytes.get(start as usize..end as usize).unwrap_or(&[])
+}
+
+fn prefix_words(prefix: crate::guid::GuidPrefix) -> [u32; 3] {
+    zerocopy::transmute!(prefix)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::vec::Vec;
+
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::guid::{Guid, GuidPrefix};
+
+    const SOURCE: [u8; 12] = *b"\x01\x0fsourcepref";
+    const OTHER: [u8; 12] = *b"\x01\x10otherprefi";
+    const READER: [u8; 4] = [0, 0, 0x12, 0x04];
+    const WRITER: [u8; 4] = [0, 0, 0x11, 0x03];
+
+    fn message(submessages: &[Vec<u8>]) -> Vec<u8> {
+        let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
+        bytes.extend_from_slice(&SOURCE);
+        submessages
+            .iter()
+            .for_each(|submessage| bytes.extend_from_slice(submessage));
+        bytes
+    }
+
+    fn submessage(id: u8, flags: u8, body: &[u8]) -> Vec<u8> {
+        let len = u16::try_from(body.len()).unwrap();
+        let len = if flags & 1 == 1 {
+            len.to_le_bytes()
+        } else {
+            len.to_be_bytes()
+        };
+        [&[id, flags][..], &len, body].concat()
+    }
+
+    fn data_body(little: bool, sequence_number: u32, tail: &[u8]) -> Vec<u8> {
+        let number = |n: u32| {
+            if little {
+                n.to_le_bytes()
+            } else {
+                n.to_be_bytes()
+            }
+        };
+        let sixteen = if little { [0, 0, 16, 0] } else { [0, 0, 0, 16] };
+        [
+            &sixteen[..],
+            &READER,
+            &WRITER,
+            &number(0),
+            &number(sequence_number),
+            tail,
+        ]
+        .concat()
+    }
+
+    fn walk_all(bytes: &[u8]) -> (Outcome, Vec<(Record, Vec<u8>)>) {
+        let mut found = Vec::new();
+        let outcome = datagram(bytes, &Envelope::default(), None, |each| {
+            found.push((each.record, each.payload.to_vec()));
+        });
+        (outcome, found)
+    }
+
+    fn guid(prefix: [u8; 12], entity: [u8; 4]) -> Guid {
+        Guid::new(GuidPrefix(prefix), EntityId(entity))
+    }
+
+    #[test]
+    fn data_in_either_byte_order_reads_the_same() {
+        let payload = [0, 1, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 0xaa, 0xbb];
+        for little in [true, false] {
+            let body = data_body(little, 7, &payload);
+            let bytes = message(&[submessage(0x15, 0x04 | u8::from(little), &body)]);
+            let (outcome, found) = walk_all(&bytes);
+            assert_eq!(outcome, Outcome::Complete);
+            let [(record, seen)] = found.as_slice() else {
+                panic!("one DATA")
+            };
+            assert_eq!(record.writer(), guid(SOURCE, WRITER));
+            assert_eq!(record.reader(), guid([0; 12], READER));
+            assert_eq!(record.sequence_number, 7);
+            assert_eq!(record.payload_len, 14);
+            assert_eq!(record.header_stamp(), Some((1, 2)));
+            assert_eq!(seen, &payload);
+        }
+    }
+
+    #[test]
+    fn every_data_of_a_datagram_is_seen_also_the_fortieth() {
+        let submessages: Vec<_> = (1..=40)
+            .map(|sn| submessage(0x15, 5, &data_body(true, sn, &[0, 1, 0, 0])))
+            .collect();
+        let (_, found) = walk_all(&message(&submessages));
+        let numbers: Vec<_> = found
+            .iter()
+            .map(|(record, _)| record.sequence_number)
+            .collect();
+        assert_eq!(numbers, (1..=40).collect::<Vec<u64>>());
+    }
+
+    #[test]
+    fn the_reader_guid_has_the_prefix_of_info_dst_and_info_src_changes_the_writer() {
+        let info_source = [&[0; 4][..], &[2, 1, 1, 0x10], &OTHER].concat();
+        let bytes = message(&[
+            submessage(0x09, 1, &[5, 0, 0, 0, 0, 0, 0, 0x80]),
+            submessage(0x0e, 1, &OTHER),
+            submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0])),
+            submessage(0x0c, 1, &info_source),
+            submessage(0x15, 5, &data_body(true, 2, &[0, 1, 0, 0])),
+        ]);
+        let (_, found) = walk_all(&bytes);
+        assert_eq!(found[0].0.reader(), guid(OTHER, READER));
+        assert_eq!(found[0].0.writer(), guid(SOURCE, WRITER));
+        assert_eq!(found[0].0.source_timestamp, 5 << 32 | 0x8000_0000);
+        assert_eq!(found[1].0.writer(), guid(OTHER, WRITER));
+        assert_eq!(
+            found[1].0.source_timestamp, 0,
+            "INFO_SRC resets the timestamp"
+        );
+    }
+
+    #[test]
+    fn status_info_is_big_endian_and_inline_qos_is_not_payload() {
+        let tail = [
+            0x70, 0, 16, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, // KEY_HASH
+            0x71, 0, 4, 0, 0, 0, 0, 3, // STATUS_INFO
+            1, 0, 0, 0, // SENTINEL
+        ];
+        let bytes = message(&[submessage(0x15, 0x03, &data_body(true, 9, &tail))]);
+        let (outcome, found) = walk_all(&bytes);
+        assert_eq!(outcome, Outcome::Complete);
+        assert_eq!((found[0].0.status_info, found[0].0.payload_len), (3, 0));
+
+        let with_data = [&tail[..], &[0, 1, 0, 0, 9, 9, 9, 9]].concat();
+        let bytes = message(&[submessage(0x15, 0x07, &data_body(true, 9, &with_data))]);
+        assert_eq!(walk_all(&bytes).1[0].0.payload_len, 8);
+    }
+
+    #[test]
+    fn data_frag_gives_fragment_numbers_and_sizes() {
+        let head = [
+            &[0, 0, 28, 0][..],
+            &READER,
+            &WRITER,
+            &[0; 4],
+            &[3, 0, 0, 0],
+            &[11, 0, 0, 0],
+            &[10, 0, 0x40, 5],
+            &[0xa4, 0xd4, 9, 0],
+            &[0xcc; 40],
+        ]
+        .concat();
+        let bytes = message(&[submessage(0x16, 1, &head)]);
+        let (_, found) = walk_all(&bytes);
+        let record = found[0].0;
+        assert_eq!(record.fragment_start, 11);
+        assert_eq!(
+            (record.fragments_in_submessage(), record.fragment_size()),
+            (10, 1344)
+        );
+        assert_eq!(record.sample_size, 644_260);
+        assert_eq!((record.payload_len, record.header_stamp()), (40, None));
+    }
+
+    #[test]
+    fn a_length_of_zero_reaches_the_end_but_not_for_pad_and_info_ts() {
+        let mut last = submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0, 7, 7, 7, 7]));
+        last[2..4].copy_from_slice(&[0, 0]);
+        let bytes = message(&[submessage(0x01, 1, &[]), submessage(0x09, 3, &[]), last]);
+        let (outcome, found) = walk_all(&bytes);
+        assert_eq!((outcome, found[0].0.payload_len), (Outcome::Complete, 8));
+    }
+
+    #[test]
+    fn a_gap_of_256_becomes_two_records() {
+        let body = [
+            &READER[..],
+            &WRITER,
+            &[0; 4],
+            &[10, 0, 0, 0],
+            &[0; 4],
+            &[20, 0, 0, 0],
+            &[0, 1, 0, 0],
+            &[0xff; 32],
+        ]
+        .concat();
+        let (_, found) = walk_all(&message(&[submessage(0x08, 1, &body)]));
+        assert_eq!(found.len(), 2);
+        let irrelevant = |record: &Record| {
+            let base = record.second_sequence_number();
+            (record.sequence_number..base)
+                .chain(record.bitmap().map(|bit| base + u64::from(bit)))
+                .collect::<Vec<_>>()
+        };
+        let all: Vec<_> = found
+            .iter()
+            .flat_map(|(record, _)| irrelevant(record))
+            .collect();
+        assert_eq!(all, (10..20 + 256).collect::<Vec<u64>>());
+    }
+
+    #[test]
+    fn only_discovery_is_captured_without_being_asked_for() {
+        let record = |writer: EntityId, kind| Record {
+            writer: crate::record::guid_words(Guid::new(GuidPrefix(SOURCE), writer)),
+            kind,
+            ..Record::default()
+        };
+        assert_eq!(
+            fate(&record(EntityId::SPDP_WRITER, kind::DATA)),
+            Fate::Capture
+        );
+        assert_eq!(
+            fate(&record(EntityId::SPDP_WRITER, kind::HEARTBEAT)),
+            Fate::Ignore
+        );
+        assert_eq!(
+            fate(&record(EntityId::PARTICIPANT_MESSAGE_WRITER, kind::DATA)),
+            Fate::Ignore
+        );
+        assert_eq!(fate(&record(EntityId(WRITER), kind::GAP)), Fate::Writer);
+    }
+
+    #[test]
+    fn the_first_malformed_submessage_ends_the_walk_but_not_what_came_before() {
+        let mut bytes = message(&[
+            submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0])),
+            submessage(0x15, 5, &data_body(true, 2, &[0, 1, 0, 0])),
+        ]);
+        bytes.truncate(bytes.len() - 1);
+        let (outcome, found) = walk_all(&bytes);
+        assert_eq!((outcome, found.len()), (Outcome::Malformed, 1));
+    }
+
+    /// A valid message with one of everything, to be cut and damaged.
+    fn sampler() -> Vec<u8> {
+        let set = [
+            &READER[..],
+            &WRITER,
+            &[0; 4],
+            &[1, 0, 0, 0],
+            &[40, 0, 0, 0],
+            &[0xff; 8],
+            &[0; 4],
+        ];
+        message(&[
+            submessage(0x09, 1, &[5, 0, 0, 0, 0, 0, 0, 0x80]),
+            submessage(0x0e, 1, &OTHER),
+            submessage(0x06, 1, &set.concat()),
+            submessage(0x07, 1, &[&READER[..], &WRITER, &[0; 20]].concat()),
+            submessage(
+                0x15,
+                7,
+                &data_body(
+                    true,
+                    1,
+                    &[0x71, 0, 4, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0],
+                ),
+            ),
+            submessage(0x80, 1, &[1, 2, 3, 4]),
+        ])
+    }
+
+    #[test]
+    fn every_truncation_and_every_single_byte_corruption_is_survived() {
+        let whole = sampler();
+        assert_eq!(walk_all(&whole).0, Outcome::Complete);
+        for len in 0..whole.len() {
+            walk_all(&whole[..len]);
+        }
+        for at in 0..whole.len() {
+            for value in [0, 1, 0x7f, 0x80, 0xff] {
+                let mut damaged = whole.clone();
+                damaged[at] = value;
+                walk_all(&damaged);
+            }
+        }
+    }
+
+    proptest! {
+        /// The kernel sees a datagram fragment by fragment: stopping anywhere and going on with
+        /// more bytes must find the same as one go, unless the walk says that it is split.
+        #[test]
+        fn pausing_between_fragments_changes_nothing(cuts in proptest::collection::vec(8u32..300, 1..6)) {
+            let bytes = sampler();
+            let whole = walk_all(&bytes).1.len();
+            let mut walk = Walk::default();
+            walk.begin([0; 3], u32::try_from(bytes.len()).unwrap());
+            let mut found = 0;
+            let mut ends: Vec<u32> = cuts.iter().scan(20, |at, cut| { *at += cut; Some(*at) }).collect();
+            ends.push(walk.datagram_len);
+            for present in ends {
+                let present = present.min(walk.datagram_len);
+                loop {
+                    match step(&mut walk, &bytes.as_slice(), present) {
+                        Step::Endpoint => found += 1,
+                        Step::Passed => {}
+                        Step::Later | Step::End | Step::Split => break,
+                        other => panic!("{other:?}"),
+                    }
+                }
+            }
+            prop_assert_eq!(found, whole);
+        }
+
+        #[test]
+        fn arbitrary_bytes_never_panic(tail in proptest::collection::vec(any::<u8>(), 0..600)) {
+            let mut bytes = message(&[]);
+            bytes.extend(tail);
+            walk_all(&bytes);
+        }
+    }
+}
