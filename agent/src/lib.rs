@@ -3,5 +3,6 @@
 //! Three layers, dependencies pointing inwards: `capture` (I/O) and `surface` (metrics, HTTP)
 //! around `model` (discovery and statistics, deterministic).
 
+pub mod capture;
 pub mod config;
 pub mod model;

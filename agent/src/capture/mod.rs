@@ -1,0 +1,3 @@
+//! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
+
+pub mod pcap;

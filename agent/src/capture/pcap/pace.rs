@@ -1,0 +1,109 @@
+//! Replaying at the pace of the capture, a multiple of it, or as fast as it goes.
+//!
+//! Only tells how long to wait; who waits, and what may interrupt it, is the caller's choice.
+
+use std::str::FromStr;
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::Timestamp;
+
+/// How fast to replay.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub enum Speed {
+    /// Without waiting.
+    Max,
+    /// This many times as fast as it was captured.
+    Times(f64),
+}
+
+/// Says how long to wait before each packet.
+#[derive(Clone, Debug)]
+pub struct Pacer {
+    speed: Speed,
+    anchor: Option<(Timestamp, Instant)>,
+}
+
+/// Not a speed.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
+#[error("a speed is a number above zero (1 is the capture's own pace) or \"max\"")]
+pub struct SpeedError;
+
+impl FromStr for Speed {
+    type Err = SpeedError;
+
+    fn from_str(text: &str) -> Result<Self, SpeedError> {
+        if text == "max" {
+            return Ok(Self::Max);
+        }
+        match text.parse::<f64>() {
+            Ok(factor) if factor.is_finite() && factor > 0.0 => Ok(Self::Times(factor)),
+            _ => Err(SpeedError),
+        }
+    }
+}
+
+impl Pacer {
+    /// Nothing replayed yet.
+    #[must_use]
+    pub const fn new(speed: Speed) -> Self {
+        Self {
+            speed,
+            anchor: None,
+        }
+    }
+
+    /// How long from `now` until the packet captured at `time` is due. The first packet is due at
+    /// once and sets the pace; a packet older than the first, or one that is late, is due at once.
+    pub fn delay(&mut self, time: Timestamp, now: Instant) -> Duration {
+        let Speed::Times(factor) = self.speed else {
+            return Duration::ZERO;
+        };
+        let (first, started) = *self.anchor.get_or_insert((time, now));
+        let since_first = Duration::from_nanos(time.0.saturating_sub(first.0));
+        // A capture that spans centuries at a crawl: as good as for ever.
+        let due = Duration::try_from_secs_f64(since_first.as_secs_f64() / factor)
+            .unwrap_or(Duration::MAX);
+        due.saturating_sub(now.saturating_duration_since(started))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn packets_keep_their_distance_divided_by_the_speed() {
+        let start = Instant::now();
+        let mut pacer = Pacer::new("2".parse().unwrap());
+        assert_eq!(pacer.delay(Timestamp(5_000_000_000), start), Duration::ZERO);
+        assert_eq!(
+            pacer.delay(Timestamp(6_000_000_000), start),
+            Duration::from_millis(500)
+        );
+        let later = start + Duration::from_millis(400);
+        assert_eq!(
+            pacer.delay(Timestamp(6_000_000_000), later),
+            Duration::from_millis(100)
+        );
+        let late = start + Duration::from_secs(9);
+        assert_eq!(pacer.delay(Timestamp(6_000_000_000), late), Duration::ZERO);
+        assert_eq!(pacer.delay(Timestamp(1), start), Duration::ZERO);
+    }
+
+    #[test]
+    fn an_absurd_distance_does_not_overflow() {
+        let start = Instant::now();
+        let mut pacer = Pacer::new(Speed::Times(f64::MIN_POSITIVE));
+        pacer.delay(Timestamp(0), start);
+        assert_eq!(pacer.delay(Timestamp(u64::MAX), start), Duration::MAX);
+    }
+
+    #[test]
+    fn a_speed_is_a_positive_number_or_max() {
+        assert_eq!("max".parse(), Ok(Speed::Max));
+        assert_eq!("0.5".parse(), Ok(Speed::Times(0.5)));
+        for wrong in ["0", "-1", "inf", "NaN", "fast", ""] {
+            assert_eq!(wrong.parse::<Speed>(), Err(SpeedError), "{wrong}");
+        }
+    }
+}
