@@ -1,3 +1,242 @@
 //! The configuration: YAML shape first, then meaning; all mistakes reported with their place.
+//!
+//! Nothing is bound, opened or read from the environment here.
 
+mod check;
+mod document;
+mod meaning;
+mod mistake;
+mod shape;
 pub mod watch;
+
+use std::fs::File;
+use std::io::{self, Read as _};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+pub use mistake::{Mistake, Mistakes, Position};
+pub use watch::{Expectations, Watch, Watchlist};
+
+/// A larger file is no configuration.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// Everything the agent is told, checked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Config {
+    /// What to measure, in file order.
+    pub watches: Vec<Watch>,
+    /// Caps of the model's tables.
+    pub limits: Limits,
+    /// Where packets come from.
+    pub capture: CaptureSettings,
+    /// The metrics surface.
+    pub metrics: MetricsSettings,
+    /// How long a topic without endpoints is still reported.
+    pub topic_grace: Duration,
+    /// Least severe level that is logged.
+    pub log: Level,
+}
+
+/// Caps of the model's tables.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// DDS participants.
+    pub participants: usize,
+    /// Writers and readers.
+    pub endpoints: usize,
+    /// Topics that are measured.
+    pub topics: usize,
+    /// Writers that send without a known announcement.
+    pub unknown_writers: usize,
+    /// Bytes held while datagrams are reassembled.
+    pub reassembly_bytes: usize,
+}
+
+/// Where packets come from and the memory used for it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CaptureSettings {
+    /// Interface globs to look at; empty = all.
+    pub include_interfaces: Vec<String>,
+    /// Interface globs never looked at.
+    pub exclude_interfaces: Vec<String>,
+    /// Further network namespaces.
+    pub network_namespaces: Vec<PathBuf>,
+    /// Packet ring of each network namespace.
+    pub ring_bytes: usize,
+    /// Ring for measurement records.
+    pub record_ring_bytes: usize,
+}
+
+/// The metrics surface.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MetricsSettings {
+    /// Where to listen; `None` = nowhere.
+    pub listen: Option<SocketAddr>,
+    /// Histograms of watched topics.
+    pub histograms: bool,
+    /// Series per writer.
+    pub per_writer: bool,
+}
+
+/// How much is logged.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Level {
+    /// Failures.
+    Error,
+    /// And what will hurt soon.
+    Warn,
+    /// And changes of state.
+    #[default]
+    Info,
+    /// And why.
+    Debug,
+    /// And everything else.
+    Trace,
+}
+
+/// Why there is no configuration.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("cannot read the configuration {}", path.display())]
+    Read {
+        /// Which file.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// Nobody writes that much by hand.
+    #[error("the configuration {} is larger than 1 MiB", path.display())]
+    TooLarge {
+        /// Which file.
+        path: PathBuf,
+    },
+    /// It says what it must not; one line for each mistake.
+    #[error("{}", mistakes.report(&path.display().to_string()))]
+    Invalid {
+        /// Which file.
+        path: PathBuf,
+        /// What is wrong.
+        mistakes: Mistakes,
+    },
+}
+
+impl Config {
+    /// Reads and checks a file.
+    ///
+    /// # Errors
+    /// When it cannot be read or has mistakes; then all of them.
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let read = || {
+            let mut bytes = Vec::new();
+            File::open(path)?
+                .take(MAX_BYTES + 1)
+                .read_to_end(&mut bytes)?;
+            Ok(bytes)
+        };
+        let bytes = read().map_err(|source| ConfigError::Read {
+            path: path.into(),
+            source,
+        })?;
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(ConfigError::TooLarge { path: path.into() });
+        }
+        Self::parse(&bytes).map_err(|mistakes| ConfigError::Invalid {
+            path: path.into(),
+            mistakes,
+        })
+    }
+
+    /// Checks the bytes of a file.
+    ///
+    /// # Errors
+    /// All mistakes, in file order.
+    pub fn parse(bytes: &[u8]) -> Result<Self, Mistakes> {
+        meaning::parse(bytes)
+    }
+
+    /// Keys whose change in `new` takes effect only after a restart.
+    #[must_use]
+    pub fn needs_restart(&self, new: &Self) -> Vec<&'static str> {
+        [
+            ("limits", self.limits != new.limits),
+            ("capture", self.capture != new.capture),
+            ("metrics.listen", self.metrics.listen != new.metrics.listen),
+            ("topic_grace_s", self.topic_grace != new.topic_grace),
+        ]
+        .into_iter()
+        .filter_map(|(key, changed)| changed.then_some(key))
+        .collect()
+    }
+
+    /// The JSON schema of the file.
+    #[must_use]
+    pub fn schema() -> serde_json::Value {
+        schemars::schema_for!(shape::ConfigShape).to_value()
+    }
+}
+
+/// What an empty file means.
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            watches: Vec::new(),
+            limits: Limits {
+                participants: defaults::PARTICIPANTS,
+                endpoints: defaults::ENDPOINTS,
+                topics: defaults::TOPICS,
+                unknown_writers: defaults::UNKNOWN_WRITERS,
+                reassembly_bytes: defaults::REASSEMBLY_BYTES,
+            },
+            capture: CaptureSettings {
+                include_interfaces: Vec::new(),
+                exclude_interfaces: Vec::new(),
+                network_namespaces: Vec::new(),
+                ring_bytes: defaults::RING_BYTES,
+                record_ring_bytes: defaults::RECORD_RING_BYTES,
+            },
+            metrics: MetricsSettings {
+                listen: defaults::LISTEN.parse().ok(),
+                histograms: true,
+                per_writer: false,
+            },
+            topic_grace: Duration::from_secs(defaults::topic_grace_s()),
+            log: Level::default(),
+        }
+    }
+}
+
+impl Level {
+    /// As written in the file.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Error => "error",
+            Self::Warn => "warn",
+            Self::Info => "info",
+            Self::Debug => "debug",
+            Self::Trace => "trace",
+        }
+    }
+}
+
+/// What is not written in the file.
+mod defaults {
+    pub(super) const PARTICIPANTS: usize = 1_000;
+    pub(super) const ENDPOINTS: usize = 20_000;
+    pub(super) const TOPICS: usize = 1_000;
+    pub(super) const UNKNOWN_WRITERS: usize = 256;
+    pub(super) const REASSEMBLY_BYTES: usize = 4 << 20;
+    pub(super) const RING_BYTES: usize = 2 << 20;
+    pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
+    pub(super) const LISTEN: &str = "127.0.0.1:17400";
+
+    pub(super) const fn topic_grace_s() -> u64 {
+        600
+    }
+}

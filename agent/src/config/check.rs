@@ -1,0 +1,241 @@
+//! Compares a document with the schema and reports every difference with its place.
+//!
+//! serde stops at its first error; an operator wants all of them. The schema is the generated one
+//! (see `shape`), so names, types and ranges exist once. It knows the few keywords that schemars
+//! writes for our shapes and nothing else of JSON Schema.
+
+use serde_json::Value;
+
+use super::document::{Content, Key, Node, Scalar, item_path, key_path};
+use super::mistake::Mistakes;
+
+/// What people write for keys that are called otherwise: old names first, then likely guesses.
+const RENAMED: &[(&str, &str)] = &[
+    ("watchlist", "watch"),
+    ("watches", "watch"),
+    ("topic_grace", "topic_grace_s"),
+    ("log_level", "log"),
+    ("name", "topic"),
+    ("domain_id", "domain"),
+    ("min_hz", "min_rate_hz"),
+    ("max_hz", "max_rate_hz"),
+    ("max_loss", "max_loss_ratio"),
+    ("max_delay_ms", "max_latency_ms"),
+    ("timeout_s", "max_silence_s"),
+    ("address", "listen"),
+    ("port", "listen"),
+];
+
+/// Adds what `node` at `path` does wrong by `schema`; `root` holds the definitions.
+pub(super) fn check(node: &Node, path: &str, schema: &Value, root: &Value, found: &mut Mistakes) {
+    let schema = resolve(schema, root);
+    if let Some(choices) = any_of(schema) {
+        let fitting = choices.iter().map(|choice| resolve(choice, root));
+        match fitting.clone().find(|choice| allows(choice, node)) {
+            Some(choice) => check(node, path, choice, root, found),
+            None => {
+                let expected: Vec<&str> = fitting.flat_map(expected).collect();
+                wrong_kind(node, path, &expected, found);
+            }
+        }
+        return;
+    }
+    if !allows(schema, node) {
+        wrong_kind(node, path, &expected(schema), found);
+        return;
+    }
+    match &node.content {
+        Content::Scalar { text, .. } => check_scalar(node, text, path, schema, found),
+        Content::List(items) => {
+            if let Some(schema) = schema.get("items") {
+                for (index, item) in items.iter().enumerate() {
+                    check(item, &item_path(path, index), schema, root, found);
+                }
+            }
+        }
+        Content::Map(entries) => check_map(node, entries, path, schema, root, found),
+    }
+}
+
+fn check_map(
+    node: &Node,
+    entries: &[(Key, Node)],
+    path: &str,
+    schema: &Value,
+    root: &Value,
+    found: &mut Mistakes,
+) {
+    let properties = schema.get("properties").and_then(Value::as_object);
+    let known = || {
+        properties
+            .into_iter()
+            .flat_map(|all| all.keys().map(String::as_str))
+    };
+    for (key, value) in entries {
+        let path = key_path(path, &key.name);
+        match properties.and_then(|all| all.get(&key.name)) {
+            Some(schema) => check(value, &path, schema, root, found),
+            None => found.add(key.position, &path, unknown_key(&key.name, known())),
+        }
+    }
+    for required in schema
+        .get("required")
+        .and_then(Value::as_array)
+        .into_iter()
+        .flatten()
+    {
+        let Some(name) = required.as_str() else {
+            continue;
+        };
+        if !entries.iter().any(|(key, _)| key.name == name) {
+            found.add(node.position, path, format!("the key `{name}` is missing"));
+        }
+    }
+}
+
+fn check_scalar(node: &Node, text: &str, path: &str, schema: &Value, found: &mut Mistakes) {
+    let number = match node.scalar() {
+        #[expect(clippy::cast_precision_loss, reason = "ranges are far below 2^53")]
+        Some(Scalar::Integer(value)) => value as f64,
+        Some(Scalar::Number(value)) => value,
+        Some(Scalar::Text) => {
+            let words: Vec<&str> = words(schema).collect();
+            if !words.is_empty() && !words.contains(&text) {
+                let message = format!(
+                    "is {}, must be one of {}",
+                    node.describe(),
+                    words.join(", ")
+                );
+                found.add(node.position, path, message);
+            }
+            return;
+        }
+        _ => return,
+    };
+    let limit = |name| schema.get(name).and_then(Value::as_f64);
+    let (minimum, maximum) = (limit("minimum"), limit("maximum"));
+    let fits = minimum.is_none_or(|low| number >= low) && maximum.is_none_or(|high| number <= high);
+    if !fits || number.is_nan() {
+        let range = match (minimum, maximum) {
+            (Some(low), Some(high)) => format!("between {low} and {high}"),
+            (Some(low), None) => format!("at least {low}"),
+            (None, Some(high)) => format!("at most {high}"),
+            (None, None) => "a finite number".to_owned(),
+        };
+        found.add(node.position, path, format!("is {text}, must be {range}"));
+    }
+}
+
+fn wrong_kind(node: &Node, path: &str, expected: &[&str], found: &mut Mistakes) {
+    let message = format!("is {}, must be {}", node.describe(), expected.join(" or "));
+    found.add(node.position, path, message);
+}
+
+fn unknown_key<'a>(name: &str, known: impl Iterator<Item = &'a str> + Clone) -> String {
+    let has = |key: &&str| known.clone().any(|other| other == *key);
+    let renamed = RENAMED
+        .iter()
+        .filter(|(old, _)| *old == name)
+        .map(|(_, new)| *new)
+        .find(has);
+    if let Some(new) = renamed {
+        return format!("unknown key; it is called `{new}`");
+    }
+    let near = known
+        .clone()
+        .map(|key| (distance(name, key), key))
+        .filter(|(distance, key)| *distance <= 1 + key.len() / 4)
+        .min();
+    match near {
+        Some((_, key)) => format!("unknown key; did you mean `{key}`?"),
+        None => format!(
+            "unknown key; known are {}",
+            known.collect::<Vec<_>>().join(", ")
+        ),
+    }
+}
+
+fn resolve<'a>(schema: &'a Value, root: &'a Value) -> &'a Value {
+    let name = schema
+        .get("$ref")
+        .and_then(Value::as_str)
+        .and_then(|path| path.rsplit('/').next());
+    name.and_then(|name| root.get("$defs")?.get(name))
+        .unwrap_or(schema)
+}
+
+fn any_of(schema: &Value) -> Option<&Vec<Value>> {
+    schema.get("anyOf").and_then(Value::as_array)
+}
+
+/// The JSON type names a schema allows.
+fn kinds(schema: &Value) -> Vec<&str> {
+    match schema.get("type") {
+        Some(Value::String(kind)) => vec![kind.as_str()],
+        Some(Value::Array(kinds)) => kinds.iter().filter_map(Value::as_str).collect(),
+        _ if words(schema).next().is_some() => vec!["string"],
+        _ => Vec::new(),
+    }
+}
+
+fn allows(schema: &Value, node: &Node) -> bool {
+    let kinds = kinds(schema);
+    let any = |names: &[&str]| names.iter().any(|name| kinds.contains(name));
+    match (&node.content, node.scalar()) {
+        (Content::List(_), _) => any(&["array"]),
+        (Content::Map(_), _) => any(&["object"]),
+        (_, Some(Scalar::Null)) => any(&["null"]),
+        (_, Some(Scalar::Boolean)) => any(&["boolean"]),
+        (_, Some(Scalar::Integer(_))) => any(&["integer", "number"]),
+        (_, Some(Scalar::Number(_))) => any(&["number"]),
+        (_, Some(Scalar::Text) | None) => any(&["string"]),
+    }
+}
+
+/// The allowed kinds in words; leaving a section empty goes without saying.
+fn expected(schema: &Value) -> Vec<&'static str> {
+    let words = |kind: &&str| match *kind {
+        "array" => Some("a list"),
+        "object" => Some("a map of keys"),
+        "boolean" => Some("true or false"),
+        "integer" => Some("a whole number"),
+        "number" => Some("a number"),
+        "string" => Some("text"),
+        _ => None,
+    };
+    kinds(schema).iter().filter_map(words).collect()
+}
+
+/// The words of an enumeration.
+fn words(schema: &Value) -> impl Iterator<Item = &str> {
+    let listed = schema
+        .get("enum")
+        .and_then(Value::as_array)
+        .into_iter()
+        .flatten();
+    let described = schema
+        .get("oneOf")
+        .and_then(Value::as_array)
+        .into_iter()
+        .flatten();
+    listed
+        .chain(described.filter_map(|choice| choice.get("const")))
+        .filter_map(Value::as_str)
+}
+
+/// Edits from one word to the other, an exchange of neighbours counting as two.
+fn distance(one: &str, other: &str) -> usize {
+    let other: Vec<char> = other.chars().collect();
+    let mut row: Vec<usize> = (0..=other.len()).collect();
+    for (i, a) in one.chars().take(64).enumerate() {
+        let mut next = vec![i + 1];
+        for (j, b) in other.iter().enumerate() {
+            let at =
+                |row: &[usize], index: usize| row.get(index).copied().unwrap_or(usize::MAX / 2);
+            let change = at(&row, j) + usize::from(a != *b);
+            next.push(change.min(at(&row, j + 1) + 1).min(at(&next, j) + 1));
+        }
+        row = next;
+    }
+    row.last().copied().unwrap_or(usize::MAX)
+}

@@ -1,0 +1,410 @@
+//! From shape to meaning: what the types and ranges of the shape cannot say.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use globset::Glob;
+
+use super::check::check;
+use super::document::Node;
+use super::mistake::{Mistakes, Position};
+use super::shape::{CaptureShape, ConfigShape, MetricsShape, WatchEntryShape, WatchShape};
+use super::watch::{Expectations, Watch, check_pattern};
+use super::{CaptureSettings, Config, Limits, MetricsSettings};
+
+/// A watchlist that long should be globs.
+const MAX_WATCHES: usize = 1_000;
+
+/// The whole way from bytes to a configuration.
+pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
+    let mut mistakes = Mistakes::default();
+    let source = match std::str::from_utf8(bytes) {
+        Ok(source) => source,
+        Err(error) => {
+            let valid = bytes.get(..error.valid_up_to()).unwrap_or_default();
+            let last = valid
+                .rsplit(|byte| *byte == b'\n')
+                .next()
+                .unwrap_or_default();
+            let line = 1 + valid.iter().filter(|byte| **byte == b'\n').count();
+            let column = 1 + String::from_utf8_lossy(last).chars().count();
+            mistakes.add(Position { line, column }, "", "not UTF-8");
+            return mistakes.none_or(Config::default());
+        }
+    };
+    let document = Node::parse(source)?;
+    if document.is_empty() {
+        return Ok(Config::default());
+    }
+    let schema = Config::schema();
+    let places = document.index(&mut mistakes);
+    check(&document, "", &schema, &schema, &mut mistakes);
+    mistakes = match mistakes.none_or(()) {
+        Ok(()) => Mistakes::default(),
+        Err(mistakes) => return Err(mistakes),
+    };
+    let mut reader = Reader { places, mistakes };
+    match serde_yaml::from_str::<ConfigShape>(source) {
+        Ok(shape) => {
+            let config = reader.config(shape);
+            reader.mistakes.none_or(config)
+        }
+        // The two YAML readers disagree: rare, and still said with its place.
+        Err(error) => {
+            let place = error.location().map(|at| Position {
+                line: at.line(),
+                column: at.column(),
+            });
+            reader
+                .mistakes
+                .add(place.unwrap_or_default(), "", error.to_string());
+            reader.mistakes.none_or(Config::default())
+        }
+    }
+}
+
+/// Where values stand, and what was found wrong with them.
+struct Reader {
+    places: BTreeMap<String, Position>,
+    mistakes: Mistakes,
+}
+
+impl Reader {
+    fn wrong(&mut self, key: &str, message: impl Into<String>) {
+        let position = self.places.get(key).copied().unwrap_or_default();
+        self.mistakes.add(position, key, message);
+    }
+
+    fn config(&mut self, shape: ConfigShape) -> Config {
+        let limits = shape.limits.unwrap_or_default();
+        Config {
+            watches: self.watches(shape.watch.unwrap_or_default()),
+            limits: Limits {
+                participants: limits.participants,
+                endpoints: limits.endpoints,
+                topics: limits.topics,
+                unknown_writers: limits.unknown_writers,
+                reassembly_bytes: limits.reassembly_bytes,
+            },
+            capture: self.capture(shape.capture.unwrap_or_default()),
+            metrics: self.metrics(&shape.metrics.unwrap_or_default()),
+            topic_grace: Duration::from_secs(shape.topic_grace_s),
+            log: shape.log,
+        }
+    }
+
+    fn watches(&mut self, shapes: Vec<WatchShape>) -> Vec<Watch> {
+        if shapes.len() > MAX_WATCHES {
+            let message = format!(
+                "has {} entries, at most {MAX_WATCHES} are allowed",
+                shapes.len()
+            );
+            self.wrong("watch", message);
+            return Vec::new();
+        }
+        let mut watches: Vec<Watch> = Vec::with_capacity(shapes.len());
+        for (index, shape) in shapes.into_iter().enumerate() {
+            let key = format!("watch[{index}]");
+            let watch = match shape {
+                WatchShape::Pattern(pattern) => Watch {
+                    pattern,
+                    domain_id: None,
+                    expectations: Expectations::default(),
+                },
+                WatchShape::Entry(entry) => self.entry(&key, *entry),
+            };
+            if let Err(error) = check_pattern(&watch.pattern) {
+                let topic = format!("{key}.topic");
+                let key = if self.places.contains_key(&topic) {
+                    &topic
+                } else {
+                    &key
+                };
+                self.wrong(key, error.to_string());
+            }
+            let twin = |other: &Watch| {
+                other.pattern == watch.pattern && other.domain_id == watch.domain_id
+            };
+            if let Some(first) = watches.iter().position(twin) {
+                self.wrong(&key, format!("repeats watch[{first}]"));
+            }
+            watches.push(watch);
+        }
+        watches
+    }
+
+    fn entry(&mut self, key: &str, entry: WatchEntryShape) -> Watch {
+        if let (Some(low), Some(high)) = (entry.min_rate_hz, entry.max_rate_hz)
+            && low > high
+        {
+            self.wrong(
+                &format!("{key}.max_rate_hz"),
+                format!("is {high}, below min_rate_hz, which is {low}"),
+            );
+        }
+        Watch {
+            pattern: entry.topic,
+            domain_id: entry.domain,
+            expectations: Expectations {
+                min_rate_hz: entry.min_rate_hz,
+                max_rate_hz: entry.max_rate_hz,
+                max_loss_ratio: entry.max_loss_ratio,
+                max_latency_ms: entry.max_latency_ms,
+                max_silence_s: entry.max_silence_s,
+            },
+        }
+    }
+
+    fn capture(&mut self, shape: CaptureShape) -> CaptureSettings {
+        let interfaces = shape.interfaces.unwrap_or_default();
+        let namespaces = shape.network_namespaces.unwrap_or_default();
+        for (index, path) in namespaces.iter().enumerate() {
+            if !path.starts_with('/') {
+                let key = format!("capture.network_namespaces[{index}]");
+                self.wrong(&key, "must be an absolute path, as in `/run/netns/robot`");
+            }
+        }
+        CaptureSettings {
+            include_interfaces: self.interfaces("include", interfaces.include),
+            exclude_interfaces: self.interfaces("exclude", interfaces.exclude),
+            network_namespaces: namespaces.into_iter().map(PathBuf::from).collect(),
+            ring_bytes: shape.ring_bytes,
+            record_ring_bytes: shape.record_ring_bytes,
+        }
+    }
+
+    fn interfaces(&mut self, list: &str, globs: Option<Vec<String>>) -> Vec<String> {
+        let globs = globs.unwrap_or_default();
+        for (index, glob) in globs.iter().enumerate() {
+            let key = format!("capture.interfaces.{list}[{index}]");
+            let strange = |c: char| c.is_whitespace() || c == '/';
+            if glob.is_empty() || glob.contains(strange) {
+                self.wrong(&key, "must be an interface name or glob, as in `eth*`");
+            } else if let Err(error) = Glob::new(glob) {
+                self.wrong(&key, error.kind().to_string());
+            }
+        }
+        globs
+    }
+
+    fn metrics(&mut self, shape: &MetricsShape) -> MetricsSettings {
+        let listen = match shape.listen.as_str() {
+            "off" => None,
+            address => match address.parse::<SocketAddr>() {
+                Ok(address) => Some(address),
+                Err(_) => {
+                    let message = format!(
+                        "is `{address}`, must be an IP address and port, as in \
+                         `127.0.0.1:17400` or `[::1]:17400`, or `off`"
+                    );
+                    self.wrong("metrics.listen", message);
+                    None
+                }
+            },
+        };
+        MetricsSettings {
+            listen,
+            histograms: shape.histograms,
+            per_writer: shape.per_writer,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::Write as _;
+
+    use super::*;
+
+    fn report(source: &str) -> String {
+        parse(source.as_bytes()).map_or_else(|mistakes| mistakes.report("f"), |_| String::new())
+    }
+
+    #[test]
+    fn an_empty_file_means_the_defaults() {
+        for empty in [
+            "",
+            "# nothing\n",
+            "---\n",
+            "watch:\nlimits:\ncapture:\nmetrics:\n",
+            "{}",
+        ] {
+            assert_eq!(parse(empty.as_bytes()), Ok(Config::default()), "{empty:?}");
+        }
+        assert!(Config::default().watches.is_empty());
+        assert_eq!(
+            Config::default().metrics.listen.unwrap().to_string(),
+            "127.0.0.1:17400"
+        );
+    }
+
+    #[test]
+    fn every_mistake_is_reported_with_its_place() {
+        let source = "\
+watch:
+  - /points
+  - topic: /imu
+    min_rate: 5
+    max_loss_ratio: 3
+  - topik: /scan
+metrics:
+  listen: 17400
+  per_writer: maybe
+log: loud
+limtis: {}
+";
+        assert_eq!(
+            report(source),
+            "f:4:5: watch[1].min_rate: unknown key; did you mean `min_rate_hz`?\n\
+             f:5:21: watch[1].max_loss_ratio: is 3, must be between 0 and 1\n\
+             f:6:5: watch[2]: the key `topic` is missing\n\
+             f:6:5: watch[2].topik: unknown key; did you mean `topic`?\n\
+             f:8:11: metrics.listen: is `17400`, must be text\n\
+             f:9:15: metrics.per_writer: is the text `maybe`, must be true or false\n\
+             f:10:6: log: is the text `loud`, must be one of error, warn, info, debug, trace\n\
+             f:11:1: limtis: unknown key; did you mean `limits`?"
+        );
+    }
+
+    #[test]
+    fn what_types_cannot_say_is_checked_too() {
+        let source = "\
+watch:
+  - points
+  - {topic: /a b, min_rate_hz: 5, max_rate_hz: 1}
+  - /x
+  - /x
+capture:
+  interfaces: {include: ['eth[']}
+  network_namespaces: [robot]
+metrics: {listen: localhost}
+";
+        assert_eq!(
+            report(source),
+            "f:2:5: watch[0]: must begin with a slash, as in `/points`\n\
+             f:3:13: watch[1].topic: has the character ` `: ROS names have letters, digits and \
+             `_`, globs also `*`\n\
+             f:3:48: watch[1].max_rate_hz: is 1, below min_rate_hz, which is 5\n\
+             f:5:5: watch[3]: repeats watch[2]\n\
+             f:7:26: capture.interfaces.include[0]: unclosed character class; missing ']'\n\
+             f:8:24: capture.network_namespaces[0]: must be an absolute path, as in \
+             `/run/netns/robot`\n\
+             f:9:19: metrics.listen: is `localhost`, must be an IP address and port, as in \
+             `127.0.0.1:17400` or `[::1]:17400`, or `off`"
+        );
+    }
+
+    #[test]
+    fn a_key_that_is_called_otherwise_is_named() {
+        assert_eq!(
+            report("watchlist: []"),
+            "f:1:1: watchlist: unknown key; it is called `watch`"
+        );
+        let source = "watch: [{topic: /a, max_delay_ms: 3}]";
+        assert!(report(source).ends_with("unknown key; it is called `max_latency_ms`"));
+    }
+
+    #[test]
+    fn a_key_written_twice_is_reported() {
+        assert_eq!(
+            report("log: info\nlog: warn"),
+            "f:2:1: log: written twice, first at 1:6"
+        );
+    }
+
+    #[test]
+    fn broken_yaml_is_reported_with_its_place() {
+        for (source, place) in [
+            ("watch: [", "f:2:1:"),
+            ("watch:\n\t- /a", "f:2:2:"),
+            ("a: 'x", "f:1:"),
+            ("--- 1\n--- 2\n", "f:2:1:"),
+            ("- 1", "f:1:1: is a list, must be a map of keys"),
+            ("? [a]\n: 1", "f:1:3:"),
+        ] {
+            let report = report(source);
+            assert!(report.starts_with(place), "{source:?}: {report}");
+            assert!(!report.contains('\n'), "{source:?}: {report}");
+        }
+        assert!(
+            parse(b"log: \xff")
+                .unwrap_err()
+                .report("f")
+                .starts_with("f:1:6: not UTF-8")
+        );
+    }
+
+    #[test]
+    fn bombs_are_refused_quickly() {
+        let aliases = "a: &a [x,x]\nb: &b [*a,*a]\nc: [*b,*b]\n";
+        assert!(report(aliases).contains("aliases are not supported"));
+        assert!(report(&"[".repeat(200)).contains("nested too deep"));
+        assert!(report(&"[".repeat(100_000)).contains("recursion limit"));
+        let steps: String = (0..1000)
+            .map(|depth| format!("{}a:\n", " ".repeat(depth)))
+            .collect();
+        assert!(report(&steps).contains("nested too deep"));
+        let mut long = "watch:\n".to_owned();
+        (0..100_000)
+            .try_for_each(|i| writeln!(long, "  - /t{i}"))
+            .unwrap();
+        assert!(report(&long).contains("too many values"));
+        let mut many = "watch:\n".to_owned();
+        (0..2_000)
+            .try_for_each(|i| writeln!(many, "  - /t{i}"))
+            .unwrap();
+        assert!(report(&many).contains("f:2:3: watch: has 2000 entries"));
+        let mut wrong = "watch:\n".to_owned();
+        (0..500)
+            .try_for_each(|i| writeln!(wrong, "  - t{i}"))
+            .unwrap();
+        assert!(report(&wrong).ends_with("f: and 450 more"));
+    }
+
+    #[test]
+    fn a_full_file_is_understood() {
+        let source = "\
+watch:
+  - /tf
+  - {topic: /points, domain: 5, min_rate_hz: 18, max_rate_hz: 22.5, max_loss_ratio: 0.01,
+     max_latency_ms: 50, max_silence_s: 1}
+limits: {topics: 5, participants: 6, endpoints: 7, unknown_writers: 8, reassembly_bytes: 65536}
+capture:
+  interfaces: {include: [eth*], exclude: [docker0]}
+  network_namespaces: [/run/netns/a]
+  ring_bytes: 4194304
+  record_ring_bytes: 65536
+metrics: {listen: 'off', histograms: false, per_writer: true}
+topic_grace_s: 60
+log: debug
+";
+        let config = parse(source.as_bytes()).unwrap();
+        let points = config.watches.get(1).unwrap();
+        assert_eq!(
+            (points.pattern.as_str(), points.domain_id),
+            ("/points", Some(5))
+        );
+        assert_eq!(points.expectations.max_rate_hz, Some(22.5));
+        assert_eq!(config.limits.unknown_writers, 8);
+        assert_eq!(config.capture.exclude_interfaces, ["docker0"]);
+        assert_eq!(config.metrics.listen, None);
+        assert_eq!(
+            (config.topic_grace, config.log.label()),
+            (Duration::from_mins(1), "debug")
+        );
+        assert_eq!(
+            Config::default().needs_restart(&config),
+            ["limits", "capture", "metrics.listen", "topic_grace_s"]
+        );
+    }
+
+    #[test]
+    fn no_cut_of_a_good_file_panics() {
+        let source = include_bytes!("../../../config/ros2probe.yaml");
+        for end in 0..source.len() {
+            let _ = parse(source.get(..end).unwrap());
+        }
+    }
+}

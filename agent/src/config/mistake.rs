@@ -1,0 +1,101 @@
+//! What is wrong with a configuration, and exactly where.
+
+use std::fmt;
+
+/// A place in the file, both counted from one.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Position {
+    /// Line.
+    pub line: usize,
+    /// Column, in characters.
+    pub column: usize,
+}
+
+impl fmt::Display for Position {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}:{}", self.line, self.column)
+    }
+}
+
+/// One mistake.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Mistake {
+    /// Where.
+    pub position: Position,
+    /// The key with its parents, `watch[2].min_rate_hz`; empty for the document itself.
+    pub key: String,
+    /// What is wrong and what would be right.
+    pub message: String,
+}
+
+impl fmt::Display for Mistake {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: ", self.position)?;
+        if !self.key.is_empty() {
+            write!(f, "{}: ", self.key)?;
+        }
+        f.write_str(&self.message)
+    }
+}
+
+/// All mistakes of one file, in file order.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Mistakes(Vec<Mistake>);
+
+impl Mistakes {
+    /// More than these do not help anybody.
+    const SHOWN: usize = 50;
+
+    /// Adds one.
+    pub fn add(&mut self, position: Position, key: &str, message: impl Into<String>) {
+        self.0.push(Mistake {
+            position,
+            key: key.to_owned(),
+            message: message.into(),
+        });
+    }
+
+    /// `value` if nothing is wrong, all mistakes in file order otherwise.
+    ///
+    /// # Errors
+    /// When there is at least one mistake.
+    pub fn none_or<T>(mut self, value: T) -> Result<T, Self> {
+        if self.0.is_empty() {
+            return Ok(value);
+        }
+        self.0.sort();
+        self.0.dedup();
+        Err(self)
+    }
+
+    /// Nothing wrong so far.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Each mistake.
+    pub fn iter(&self) -> impl Iterator<Item = &Mistake> {
+        self.0.iter()
+    }
+
+    /// One line each, as compilers write them: `file:line:column: key: message`.
+    #[must_use]
+    pub fn report(&self, file: &str) -> String {
+        let mut lines: Vec<String> = self
+            .0
+            .iter()
+            .take(Self::SHOWN)
+            .map(|mistake| format!("{file}:{mistake}"))
+            .collect();
+        if let Some(more) = self
+            .0
+            .len()
+            .checked_sub(Self::SHOWN)
+            .filter(|more| *more > 0)
+        {
+            lines.push(format!("{file}: and {more} more"));
+        }
+        lines.join("\n")
+    }
+}

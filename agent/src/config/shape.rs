@@ -1,0 +1,165 @@
+//! The shape of the YAML file: what `config/ros2probe.schema.json` is generated from.
+//!
+//! Sections may be left empty (`watch:` with everything below it commented out). Ranges written
+//! here are enforced while reading; what needs more than one value is checked in `meaning`.
+
+use schemars::JsonSchema;
+use serde::Deserialize;
+
+use super::{Level, defaults};
+
+/// Configuration of the ros2probe agent. Every key may be left out.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(title = "ros2probe configuration")]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct ConfigShape {
+    /// Topics to measure: names (`/points`), globs (`/camera/*/image_raw`, `/**`), or maps with
+    /// expectations. Nothing listed: the graph alone is reported. Applied on reload.
+    pub(super) watch: Option<Vec<WatchShape>>,
+    /// Caps of the agent's tables; what exceeds them is counted in `ros2probe_table_evictions_total`.
+    pub(super) limits: Option<LimitsShape>,
+    /// Where packets are taken from and how much memory is used for it.
+    pub(super) capture: Option<CaptureShape>,
+    /// The metrics listener and what it shows.
+    pub(super) metrics: Option<MetricsShape>,
+    /// How long a topic without endpoints is still reported, in seconds.
+    #[schemars(range(min = 0, max = 604_800))]
+    #[serde(default = "defaults::topic_grace_s")]
+    pub(super) topic_grace_s: u64,
+    /// Least severe log level that is written to standard error. Applied on reload.
+    #[serde(default)]
+    pub(super) log: Level,
+}
+
+/// A topic name or glob, or one with a domain and expectations.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub(super) enum WatchShape {
+    /// A topic name or glob.
+    Pattern(String),
+    /// A topic name or glob with what should hold.
+    Entry(Box<WatchEntryShape>),
+}
+
+/// One watched topic or glob and what should hold for each topic it covers.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields)]
+pub(super) struct WatchEntryShape {
+    /// ROS name or glob: `*` stands for any part of one name token, `**` for any tokens.
+    pub(super) topic: String,
+    /// Only in this domain; every domain when left out.
+    #[schemars(range(min = 0, max = 232))]
+    pub(super) domain: Option<u32>,
+    /// At least this many messages a second.
+    #[schemars(range(min = 0.0, max = 1_000_000.0))]
+    pub(super) min_rate_hz: Option<f64>,
+    /// At most this many messages a second.
+    #[schemars(range(min = 0.0, max = 1_000_000.0))]
+    pub(super) max_rate_hz: Option<f64>,
+    /// At most this part of the messages may be lost, 0 to 1.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub(super) max_loss_ratio: Option<f64>,
+    /// Longest time from the writer's timestamp to the wire, in milliseconds.
+    #[schemars(range(min = 0.0, max = 3_600_000.0))]
+    pub(super) max_latency_ms: Option<f64>,
+    /// Longest time without a message, in seconds.
+    #[schemars(range(min = 0.001, max = 604_800.0))]
+    pub(super) max_silence_s: Option<f64>,
+}
+
+/// Caps of the agent's tables.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct LimitsShape {
+    /// DDS participants.
+    #[schemars(range(min = 1, max = 100_000))]
+    pub(super) participants: usize,
+    /// Writers and readers.
+    #[schemars(range(min = 1, max = 1_000_000))]
+    pub(super) endpoints: usize,
+    /// Topics that are measured.
+    #[schemars(range(min = 1, max = 100_000))]
+    pub(super) topics: usize,
+    /// Writers that send without a known announcement.
+    #[schemars(range(min = 1, max = 100_000))]
+    pub(super) unknown_writers: usize,
+    /// Bytes held while fragmented datagrams are put together.
+    #[schemars(range(min = 65_536, max = 1_073_741_824))]
+    pub(super) reassembly_bytes: usize,
+}
+
+/// Where packets are taken from.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct CaptureShape {
+    /// Which interfaces are looked at.
+    pub(super) interfaces: Option<InterfacesShape>,
+    /// Further network namespaces to look into, by path (`/run/netns/robot`). Needs CAP_SYS_ADMIN.
+    pub(super) network_namespaces: Option<Vec<String>>,
+    /// Packet ring of each network namespace, in bytes.
+    #[schemars(range(min = 262_144, max = 1_073_741_824))]
+    pub(super) ring_bytes: usize,
+    /// Ring for measurement records from the kernel filter, in bytes.
+    #[schemars(range(min = 65_536, max = 1_073_741_824))]
+    pub(super) record_ring_bytes: usize,
+}
+
+/// Interface names or globs (`eth*`).
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct InterfacesShape {
+    /// Look at these alone; all when empty.
+    pub(super) include: Option<Vec<String>>,
+    /// Never look at these.
+    pub(super) exclude: Option<Vec<String>>,
+}
+
+/// The metrics listener.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct MetricsShape {
+    /// `address:port` to serve `/metrics`, `/healthz` and `/readyz` on, or `off`.
+    pub(super) listen: String,
+    /// Histograms of inter-arrival time and latency of watched topics. Applied on reload.
+    pub(super) histograms: bool,
+    /// Series per writer of watched topics, besides those per topic. Applied on reload.
+    pub(super) per_writer: bool,
+}
+
+impl Default for LimitsShape {
+    fn default() -> Self {
+        Self {
+            participants: defaults::PARTICIPANTS,
+            endpoints: defaults::ENDPOINTS,
+            topics: defaults::TOPICS,
+            unknown_writers: defaults::UNKNOWN_WRITERS,
+            reassembly_bytes: defaults::REASSEMBLY_BYTES,
+        }
+    }
+}
+
+impl Default for CaptureShape {
+    fn default() -> Self {
+        Self {
+            interfaces: None,
+            network_namespaces: None,
+            ring_bytes: defaults::RING_BYTES,
+            record_ring_bytes: defaults::RECORD_RING_BYTES,
+        }
+    }
+}
+
+impl Default for MetricsShape {
+    fn default() -> Self {
+        Self {
+            listen: defaults::LISTEN.to_owned(),
+            histograms: true,
+            per_writer: false,
+        }
+    }
+}
