@@ -113,6 +113,12 @@ impl<'a> Cursor<'a> {
         self.endianness
     }
 
+    /// The same position, read in another byte order from here on.
+    #[must_use]
+    pub const fn with_endianness(self, endianness: Endianness) -> Self {
+        Self { endianness, ..self }
+    }
+
     /// The error for a field that begins here.
     #[must_use]
     pub const fn error(&self, what: &'static str, reason: Reason) -> WireError {

@@ -14,8 +14,20 @@ extern crate std;
 
 pub mod cursor;
 pub mod frame;
+#[cfg(feature = "alloc")]
+pub mod discovery;
+#[cfg(feature = "alloc")]
+pub mod entities;
 pub mod guid;
+#[cfg(feature = "alloc")]
+pub mod names;
+pub mod parameters;
+#[cfg(feature = "alloc")]
+pub mod qos;
 pub mod record;
+pub mod rtps;
+#[cfg(feature = "alloc")]
+mod text;
 pub mod time;
 pub mod walk;
 

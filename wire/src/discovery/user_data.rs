@@ -1,0 +1,127 @@
+//! What ROS hides in DDS user data: `key=value;` pairs.
+
+use core::fmt;
+
+/// Longest user data looked at.
+const MAX_LEN: usize = 4096;
+
+/// The pairs of one USER_DATA value; borrowed, in any order, NULs and other text tolerated.
+#[derive(Clone, Copy, Debug)]
+pub struct UserData<'a>(&'a str);
+
+impl<'a> UserData<'a> {
+    /// Over the octets of USER_DATA. What is not text has no pairs.
+    #[must_use]
+    pub fn new(octets: &'a [u8]) -> Self {
+        // Fast DDS counts a NUL into the value, Cyclone DDS does not.
+        let octets = octets.get(..MAX_LEN).unwrap_or(octets);
+        let end = octets
+            .iter()
+            .rposition(|byte| *byte != 0)
+            .map_or(0, |last| last + 1);
+        Self(
+            octets
+                .get(..end)
+                .and_then(|octets| str::from_utf8(octets).ok())
+                .unwrap_or(""),
+        )
+    }
+
+    /// Value of the first pair with this key.
+    #[must_use]
+    pub fn find(self, key: &str) -> Option<&'a str> {
+        self.0.split(';').find_map(|pair| {
+            let (name, value) = pair.split_once('=')?;
+            (name.trim_matches(['\0', ' ']) == key).then_some(value)
+        })
+    }
+}
+
+/// A ROS type's hash, version 1 of the scheme (`RIHS01_`), Iron and later.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TypeHash(pub [u8; 32]);
+
+impl TypeHash {
+    /// From `RIHS01_` and 64 hexadecimal digits; other versions are not known here.
+    #[must_use]
+    pub fn parse(text: &str) -> Option<Self> {
+        let digits = text.strip_prefix("RIHS01_")?.as_bytes();
+        let (pairs, []) = digits.as_chunks::<2>() else {
+            return None;
+        };
+        let pairs: &[[u8; 2]; 32] = pairs.try_into().ok()?;
+        let mut hash = [0; 32];
+        for (byte, [high, low]) in hash.iter_mut().zip(pairs) {
+            *byte = hexadecimal(*high)? << 4 | hexadecimal(*low)?;
+        }
+        Some(Self(hash))
+    }
+}
+
+fn hexadecimal(digit: u8) -> Option<u8> {
+    match digit {
+        b'0'..=b'9' => Some(digit - b'0'),
+        b'a'..=b'f' => Some(digit - b'a' + 10),
+        b'A'..=b'F' => Some(digit - b'A' + 10),
+        _ => None,
+    }
+}
+
+impl fmt::Display for TypeHash {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("RIHS01_")?;
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl fmt::Debug for TypeHash {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::string::ToString;
+
+    use super::*;
+
+    const HASH: &str = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e";
+
+    #[test]
+    fn pairs_in_any_order_with_or_without_a_nul() {
+        assert_eq!(UserData::new(b"enclave=/;\0").find("enclave"), Some("/"));
+        assert_eq!(
+            UserData::new(b"enclave=/robot;").find("enclave"),
+            Some("/robot")
+        );
+        assert_eq!(UserData::new(b"enclave=/a").find("enclave"), Some("/a"));
+        let data = UserData::new(b"serviceid= 1.10.b4;typehash=x;");
+        assert_eq!(
+            (data.find("typehash"), data.find("enclave")),
+            (Some("x"), None)
+        );
+        assert_eq!(UserData::new(b"\xff\xfe=1;").find("typehash"), None);
+        assert_eq!(UserData::new(b"").find(""), None);
+    }
+
+    #[test]
+    fn buffer_endpoints_still_have_their_hash() {
+        let text = std::format!("BUFBE:cpu=;typehash={HASH};");
+        assert_eq!(UserData::new(text.as_bytes()).find("typehash"), Some(HASH));
+    }
+
+    #[test]
+    fn a_hash_comes_back_as_it_was_written() {
+        assert_eq!(TypeHash::parse(HASH).unwrap().to_string(), HASH);
+        for bad in [
+            "",
+            "RIHS01_",
+            "RIHS02_00",
+            &HASH[..70],
+            &HASH.replace('9', "g"),
+        ] {
+            assert_eq!(TypeHash::parse(bad), None, "{bad}");
+        }
+    }
+}

@@ -1,0 +1,195 @@
+//! Parameter lists (RTPS 2.5, 9.4.2.11 and 9.6.4): the form of inline QoS and of discovery data.
+//!
+//! An iterator over borrowed bytes. Unknown parameters are handed on with their length; whether
+//! they matter is the reader's business. "Must understand" is shown but never a reason to drop: an
+//! observer would rather see a participant partly than not at all.
+
+use core::fmt;
+
+use crate::cursor::{Cursor, Endianness, Reason, WireError};
+
+/// Identifier of a parameter, flag bits included.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct ParameterId(pub u16);
+
+#[expect(
+    missing_docs,
+    reason = "the names are those of RTPS 2.5, table 9.14, and of the vendors"
+)]
+impl ParameterId {
+    pub const PAD: Self = Self(0x0000);
+    pub const SENTINEL: Self = Self(0x0001);
+    pub const PARTICIPANT_LEASE_DURATION: Self = Self(0x0002);
+    pub const TIME_BASED_FILTER: Self = Self(0x0004);
+    pub const TOPIC_NAME: Self = Self(0x0005);
+    pub const TYPE_NAME: Self = Self(0x0007);
+    pub const DOMAIN_ID: Self = Self(0x000f);
+    pub const DOMAIN_TAG: Self = Self(0x0014);
+    pub const PROTOCOL_VERSION: Self = Self(0x0015);
+    pub const VENDORID: Self = Self(0x0016);
+    pub const RELIABILITY: Self = Self(0x001a);
+    pub const LIVELINESS: Self = Self(0x001b);
+    pub const DURABILITY: Self = Self(0x001d);
+    pub const OWNERSHIP: Self = Self(0x001f);
+    pub const DEADLINE: Self = Self(0x0023);
+    pub const PARTITION: Self = Self(0x0029);
+    pub const LIFESPAN: Self = Self(0x002b);
+    pub const USER_DATA: Self = Self(0x002c);
+    pub const UNICAST_LOCATOR: Self = Self(0x002f);
+    pub const MULTICAST_LOCATOR: Self = Self(0x0030);
+    pub const DEFAULT_UNICAST_LOCATOR: Self = Self(0x0031);
+    pub const METATRAFFIC_UNICAST_LOCATOR: Self = Self(0x0032);
+    pub const METATRAFFIC_MULTICAST_LOCATOR: Self = Self(0x0033);
+    pub const CONTENT_FILTER_PROPERTY: Self = Self(0x0035);
+    pub const HISTORY: Self = Self(0x0040);
+    pub const DEFAULT_MULTICAST_LOCATOR: Self = Self(0x0048);
+    pub const PARTICIPANT_GUID: Self = Self(0x0050);
+    pub const BUILTIN_ENDPOINT_SET: Self = Self(0x0058);
+    pub const PROPERTY_LIST: Self = Self(0x0059);
+    pub const ENDPOINT_GUID: Self = Self(0x005a);
+    pub const ENTITY_NAME: Self = Self(0x0062);
+    pub const KEY_HASH: Self = Self(0x0070);
+    pub const STATUS_INFO: Self = Self(0x0071);
+    pub const DATA_REPRESENTATION: Self = Self(0x0073);
+    pub const RELATED_SAMPLE_IDENTITY: Self = Self(0x0083);
+    pub const IDENTITY_TOKEN: Self = Self(0x1001);
+    pub const PERMISSIONS_TOKEN: Self = Self(0x1002);
+    pub const ENDPOINT_SECURITY_INFO: Self = Self(0x1004);
+    pub const PARTICIPANT_SECURITY_INFO: Self = Self(0x1005);
+
+    /// eProsima's; Cyclone DDS has no parameter of this number, ADLINK's stack had none either.
+    pub const FAST_DATASHARING: Self = Self(0x8006);
+    /// eProsima's; for Cyclone DDS the same number is the subscription keys.
+    pub const FAST_RELATED_SAMPLE_IDENTITY: Self = Self(0x800f);
+}
+
+impl ParameterId {
+    /// Means something only together with the vendor.
+    #[must_use]
+    pub const fn is_vendor_specific(self) -> bool {
+        self.0 & 0x8000 != 0
+    }
+
+    /// Whoever does not know it should not use the list.
+    #[must_use]
+    pub const fn must_understand(self) -> bool {
+        self.0 & 0x4000 != 0
+    }
+
+    /// Without the must-understand bit: the form to compare with the constants.
+    #[must_use]
+    pub const fn known(self) -> Self {
+        Self(self.0 & !0x4000)
+    }
+}
+
+impl fmt::Debug for ParameterId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:#06x}", self.0)
+    }
+}
+
+/// One parameter.
+#[derive(Clone, Copy, Debug)]
+pub struct Parameter<'a> {
+    /// Which one.
+    pub id: ParameterId,
+    /// Its value, exactly as long as the list says.
+    pub value: Cursor<'a>,
+}
+
+/// A list of parameters; iterates over all but PAD and SENTINEL, ends after the first error.
+#[derive(Clone, Copy, Debug)]
+pub struct ParameterList<'a> {
+    rest: Cursor<'a>,
+    needs_sentinel: bool,
+    ended: bool,
+}
+
+impl<'a> ParameterList<'a> {
+    /// Over bytes without encapsulation, as in inline QoS. The sentinel has to be there.
+    #[must_use]
+    pub const fn inline(rest: Cursor<'a>) -> Self {
+        Self {
+            rest,
+            needs_sentinel: true,
+            ended: false,
+        }
+    }
+
+    /// Over a serialized payload: checks its encapsulation (RTPS 2.5, 10.5). A list that ends
+    /// cleanly at the payload's end needs no sentinel.
+    ///
+    /// # Errors
+    /// [`Reason::BadMarker`] when the payload is not a parameter list.
+    pub fn encapsulated(payload: &'a [u8]) -> Result<Self, WireError> {
+        let mut cursor = Cursor::new(payload, Endianness::Big);
+        let error = cursor.error("encapsulation", Reason::BadMarker);
+        let endianness = match cursor.u16("encapsulation")? {
+            // PL_CDR; PL_CDR2 is let through, for builtin topics it names the same form.
+            0x0002 | 0x000a => Endianness::Big,
+            0x0003 | 0x000b => Endianness::Little,
+            _ => return Err(error),
+        };
+        cursor.u16("encapsulation options")?;
+        let rest = cursor.with_endianness(endianness);
+        Ok(Self {
+            rest,
+            needs_sentinel: false,
+            ended: false,
+        })
+    }
+
+    /// The list at the cursor, which moves behind the sentinel: only the sentinel tells where a
+    /// payload begins.
+    pub(crate) fn take(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
+        let list = Self::inline(*cursor);
+        let mut walk = list;
+        while let Some(parameter) = walk.next() {
+            parameter?;
+        }
+        *cursor = walk.rest;
+        Ok(list)
+    }
+
+    /// The first parameter of this identifier; `None` also when the list breaks off before it.
+    #[must_use]
+    pub fn find(self, id: ParameterId) -> Option<Cursor<'a>> {
+        self.map_while(Result::ok)
+            .find(|parameter| parameter.id.known() == id)
+            .map(|parameter| parameter.value)
+    }
+
+    fn parameter(&mut self) -> Result<Option<Parameter<'a>>, WireError> {
+        loop {
+            if self.rest.remaining() < 4 && !self.needs_sentinel {
+                return Ok(None);
+            }
+            let id = ParameterId(self.rest.u16("parameter id")?);
+            let length = usize::from(self.rest.u16("parameter length")?);
+            if id.known() == ParameterId::SENTINEL {
+                return Ok(None);
+            }
+            let value = self.rest.sub("parameter", length)?;
+            // Lengths are multiples of four; whoever writes another one pads.
+            self.rest
+                .take("parameter padding", length.wrapping_neg() & 3)?;
+            if id.known() != ParameterId::PAD {
+                return Ok(Some(Parameter { id, value }));
+            }
+        }
+    }
+}
+
+impl<'a> Iterator for ParameterList<'a> {
+    type Item = Result<Parameter<'a>, WireError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.ended {
+            return None;
+        }
+        let parameter = self.parameter().transpose();
+        self.ended = !matches!(parameter, Some(Ok(_)));
+        parameter
+    }
+}

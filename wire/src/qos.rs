@@ -1,0 +1,264 @@
+//! Quality of service of endpoints, as discovery announces it.
+//!
+//! Absent means a default, and the defaults differ by role (DDS 1.4, 2.2.3): one table for both is
+//! wrong. What an implementation never announces is unknown, not a default.
+
+use alloc::boxed::Box;
+use alloc::vec::Vec;
+use core::fmt;
+
+use crate::cursor::{Cursor, Reason, WireError};
+use crate::parameters::ParameterId;
+use crate::rtps::VendorId;
+use crate::text;
+use crate::time::Duration;
+
+/// Which end an endpoint is.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Role {
+    /// Publishes.
+    Writer,
+    /// Subscribes.
+    Reader,
+}
+
+/// A policy's kind with the words ROS has for its values; an unknown value keeps its number.
+macro_rules! kind {
+    ($(#[$doc:meta])* $name:ident { $($constant:ident = $value:literal),+ $(,)? }) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+        pub struct $name(pub u32);
+
+        #[expect(missing_docs, reason = "the names are those of DDS and of ROS")]
+        impl $name {
+            $(pub const $constant: Self = Self($value);)+
+
+            /// The word ROS has for it; `None` for a value it does not know.
+            #[must_use]
+            pub const fn name(self) -> Option<&'static str> {
+                match self {
+                    $(Self::$constant => Some(stringify!($constant)),)+
+                    _ => None,
+                }
+            }
+        }
+
+        /// `UNKNOWN` for a value ROS has no word for.
+        impl fmt::Display for $name {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.pad(self.name().unwrap_or("UNKNOWN"))
+            }
+        }
+    };
+}
+
+kind!(
+    /// Wire values: alone among the policies this one counts from 1 (RTPS 2.5, 9.4.2.11.2; Fast
+    /// DDS and Cyclone DDS agree).
+    Reliability { BEST_EFFORT = 1, RELIABLE = 2 }
+);
+kind!(
+    /// How long samples live on for late joiners.
+    Durability { VOLATILE = 0, TRANSIENT_LOCAL = 1, TRANSIENT = 2, PERSISTENT = 3 }
+);
+kind!(
+    /// Who says that a writer is alive.
+    Liveliness { AUTOMATIC = 0, MANUAL_BY_PARTICIPANT = 1, MANUAL_BY_TOPIC = 2 }
+);
+kind!(
+    /// Whether several writers may update one instance.
+    Ownership { SHARED = 0, EXCLUSIVE = 1 }
+);
+kind!(
+    /// How many samples are kept.
+    HistoryKind { KEEP_LAST = 0, KEEP_ALL = 1 }
+);
+
+/// History policy.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct History {
+    /// All or the last ones.
+    pub kind: HistoryKind,
+    /// How many, for [`HistoryKind::KEEP_LAST`].
+    pub depth: i32,
+}
+
+/// Most partitions kept of one endpoint; ROS 2 uses none.
+const MAX_PARTITIONS: usize = 16;
+/// Longest partition name kept.
+const MAX_PARTITION_LEN: usize = 256;
+
+/// What an endpoint offers or asks for.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Qos {
+    /// Reliability.
+    pub reliability: Reliability,
+    /// Durability.
+    pub durability: Durability,
+    /// History; `None` where the implementation does not say (Fast DDS before 3.2).
+    pub history: Option<History>,
+    /// Longest time between two samples.
+    pub deadline: Duration,
+    /// Age at which samples become void; writers only.
+    pub lifespan: Duration,
+    /// Liveliness.
+    pub liveliness: Liveliness,
+    /// Time within which liveliness is asserted.
+    pub liveliness_lease: Duration,
+    /// Ownership.
+    pub ownership: Ownership,
+    /// Least time between two samples a reader wants to see.
+    pub minimum_separation: Duration,
+    /// Partitions; empty is the default one.
+    pub partitions: Vec<Box<str>>,
+}
+
+impl Qos {
+    /// What holds for every policy that is not announced.
+    #[must_use]
+    pub const fn defaults(role: Role, vendor: VendorId) -> Self {
+        Self {
+            reliability: match role {
+                Role::Writer => Reliability::RELIABLE,
+                Role::Reader => Reliability::BEST_EFFORT,
+            },
+            durability: Durability::VOLATILE,
+            // Not part of the specification's discovery data. Cyclone DDS announces it when it
+            // differs from KEEP_LAST 1; Fast DDS 2.x never does, 3.2 and later always.
+            history: match vendor {
+                VendorId::CYCLONE => Some(History {
+                    kind: HistoryKind::KEEP_LAST,
+                    depth: 1,
+                }),
+                _ => None,
+            },
+            deadline: Duration::Infinite,
+            lifespan: Duration::Infinite,
+            liveliness: Liveliness::AUTOMATIC,
+            liveliness_lease: Duration::Infinite,
+            ownership: Ownership::SHARED,
+            minimum_separation: Duration::Finite(0),
+            partitions: Vec::new(),
+        }
+    }
+
+    /// Takes one parameter over; `false` when it is not a QoS policy kept here.
+    pub(crate) fn apply(
+        &mut self,
+        id: ParameterId,
+        mut value: Cursor<'_>,
+    ) -> Result<bool, WireError> {
+        match id {
+            ParameterId::RELIABILITY => {
+                // Old texts had 3 for reliable.
+                self.reliability = match value.u32("PID_RELIABILITY")? {
+                    3 => Reliability::RELIABLE,
+                    kind => Reliability(kind),
+                };
+            }
+            ParameterId::DURABILITY => self.durability = Durability(value.u32("PID_DURABILITY")?),
+            ParameterId::HISTORY => {
+                self.history = Some(History {
+                    kind: HistoryKind(value.u32("PID_HISTORY")?),
+                    depth: value.i32("PID_HISTORY")?,
+                });
+            }
+            ParameterId::DEADLINE => self.deadline = duration(&mut value, "PID_DEADLINE")?,
+            ParameterId::LIFESPAN => self.lifespan = duration(&mut value, "PID_LIFESPAN")?,
+            ParameterId::LIVELINESS => {
+                self.liveliness = Liveliness(value.u32("PID_LIVELINESS")?);
+                self.liveliness_lease = duration(&mut value, "PID_LIVELINESS")?;
+            }
+            ParameterId::OWNERSHIP => self.ownership = Ownership(value.u32("PID_OWNERSHIP")?),
+            ParameterId::TIME_BASED_FILTER => {
+                self.minimum_separation = duration(&mut value, "PID_TIME_BASED_FILTER")?;
+            }
+            ParameterId::PARTITION => self.partitions = partitions(&mut value)?,
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+}
+
+/// Seconds and 2^-32 fractions.
+pub(crate) fn duration(value: &mut Cursor<'_>, what: &'static str) -> Result<Duration, WireError> {
+    let seconds = value.i32(what)?;
+    Ok(Duration::from_wire(seconds, value.u32(what)?))
+}
+
+fn partitions(value: &mut Cursor<'_>) -> Result<Vec<Box<str>>, WireError> {
+    let start = *value;
+    let count = value.u32("PID_PARTITION")?;
+    let mut partitions = Vec::new();
+    for _ in 0..count {
+        if partitions.len() == MAX_PARTITIONS {
+            return Err(start.error("PID_PARTITION", Reason::OverLimit));
+        }
+        partitions.push(text::name(value, "PID_PARTITION", MAX_PARTITION_LEN)?.into());
+    }
+    Ok(partitions)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::string::ToString;
+
+    use super::*;
+    use crate::cursor::Endianness;
+
+    fn apply(qos: &mut Qos, id: ParameterId, value: &[u8]) -> Result<bool, WireError> {
+        qos.apply(id, Cursor::new(value, Endianness::Little))
+    }
+
+    #[test]
+    fn defaults_differ_by_role_and_by_vendor() {
+        let writer = Qos::defaults(Role::Writer, VendorId::CYCLONE);
+        let reader = Qos::defaults(Role::Reader, VendorId::CYCLONE);
+        assert_eq!(writer.reliability, Reliability::RELIABLE);
+        assert_eq!(reader.reliability, Reliability::BEST_EFFORT);
+        assert_eq!(writer.history.unwrap().depth, 1);
+        assert_eq!(
+            Qos::defaults(Role::Writer, VendorId::EPROSIMA).history,
+            None
+        );
+    }
+
+    #[test]
+    fn unknown_values_are_kept_and_shown_as_unknown() {
+        let mut qos = Qos::defaults(Role::Reader, VendorId::EPROSIMA);
+        assert_eq!(
+            apply(&mut qos, ParameterId::DURABILITY, &[9, 0, 0, 0]),
+            Ok(true)
+        );
+        assert_eq!(
+            (qos.durability, qos.durability.to_string()),
+            (Durability(9), "UNKNOWN".into())
+        );
+        assert_eq!(Liveliness::MANUAL_BY_TOPIC.to_string(), "MANUAL_BY_TOPIC");
+    }
+
+    #[test]
+    fn liveliness_has_its_lease_behind_the_kind() {
+        let mut qos = Qos::defaults(Role::Reader, VendorId::EPROSIMA);
+        let value = [2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0x80];
+        apply(&mut qos, ParameterId::LIVELINESS, &value).unwrap();
+        assert_eq!(qos.liveliness, Liveliness::MANUAL_BY_TOPIC);
+        assert_eq!(qos.liveliness_lease, Duration::Finite(1_500_000_000));
+    }
+
+    #[test]
+    fn partitions_are_bounded() {
+        let mut qos = Qos::defaults(Role::Reader, VendorId::EPROSIMA);
+        let value = *b"\x02\0\0\0\x02\0\0\0a\0\0\0\x03\0\0\0bc\0\0";
+        apply(&mut qos, ParameterId::PARTITION, &value).unwrap();
+        assert_eq!(qos.partitions, ["a".into(), "bc".into()]);
+        let mut many = [0; 4 + 4 * 40];
+        many[0] = 40;
+        assert_eq!(
+            apply(&mut qos, ParameterId::PARTITION, &many).map_err(|error| error.reason),
+            Err(Reason::OverLimit)
+        );
+        many[..4].copy_from_slice(&[0xff; 4]);
+        assert!(apply(&mut qos, ParameterId::PARTITION, &many[..20]).is_err());
+    }
+}

@@ -1,0 +1,92 @@
+//! What inline QoS says about one change: which instance, whether it is gone, whose answer it is.
+
+use super::{SequenceNumber, VendorId};
+use crate::cursor::{Cursor, WireError};
+use crate::guid::Guid;
+use crate::parameters::{ParameterId, ParameterList};
+
+/// State of the instance (RTPS 2.5, 9.6.4.9).
+#[derive(Clone, Copy, Default, PartialEq, Eq, Hash, Debug)]
+pub struct StatusInfo(pub u32);
+
+impl StatusInfo {
+    /// The instance was deleted.
+    #[must_use]
+    pub const fn is_disposed(self) -> bool {
+        self.0 & 1 != 0
+    }
+
+    /// The writer no longer speaks for the instance.
+    #[must_use]
+    pub const fn is_unregistered(self) -> bool {
+        self.0 & 2 != 0
+    }
+
+    /// The change was filtered out for the reader it is sent to.
+    #[must_use]
+    pub const fn is_filtered(self) -> bool {
+        self.0 & 4 != 0
+    }
+}
+
+/// Which change this one answers (RTPS 2.5 with DDS-RPC 1.0, 7.8.2).
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct SampleIdentity {
+    /// The other change's writer; rmw_fastrtps puts the client's response reader here.
+    pub writer: Guid,
+    /// The other change's number.
+    pub sequence_number: SequenceNumber,
+}
+
+/// The inline QoS parameters an observer needs.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
+pub struct InlineQos {
+    /// The instance's key hash; the GUID itself for discovery data.
+    pub key_hash: Option<[u8; 16]>,
+    /// Zero when not given.
+    pub status_info: StatusInfo,
+    /// Request or reply correlation.
+    pub related_sample_identity: Option<SampleIdentity>,
+}
+
+impl InlineQos {
+    /// From a parameter list; `vendor` decides what the vendor-specific identifiers mean.
+    ///
+    /// # Errors
+    /// The list is malformed or one of these values is too short.
+    pub fn parse(parameters: ParameterList<'_>, vendor: VendorId) -> Result<Self, WireError> {
+        let mut inline_qos = Self::default();
+        for parameter in parameters {
+            let parameter = parameter?;
+            let mut value = parameter.value;
+            match parameter.id.known() {
+                ParameterId::KEY_HASH => inline_qos.key_hash = Some(value.array("PID_KEY_HASH")?),
+                ParameterId::STATUS_INFO => {
+                    // Octets, not a number: big-endian whatever the submessage's E flag says.
+                    let octets = value.array("PID_STATUS_INFO")?;
+                    inline_qos.status_info = StatusInfo(u32::from_be_bytes(octets));
+                }
+                ParameterId::RELATED_SAMPLE_IDENTITY => {
+                    inline_qos.related_sample_identity = Some(sample_identity(&mut value)?);
+                }
+                // The number Fast DDS used before the standard one; RTI reads it too. For Cyclone
+                // DDS the same number means subscription keys.
+                ParameterId::FAST_RELATED_SAMPLE_IDENTITY
+                    if matches!(vendor, VendorId::EPROSIMA | VendorId::RTI_CONNEXT)
+                        && inline_qos.related_sample_identity.is_none() =>
+                {
+                    inline_qos.related_sample_identity = Some(sample_identity(&mut value)?);
+                }
+                _ => {}
+            }
+        }
+        Ok(inline_qos)
+    }
+}
+
+fn sample_identity(value: &mut Cursor<'_>) -> Result<SampleIdentity, WireError> {
+    Ok(SampleIdentity {
+        writer: Guid::from_bytes(value.array("PID_RELATED_SAMPLE_IDENTITY")?),
+        sequence_number: SequenceNumber::read(value, "PID_RELATED_SAMPLE_IDENTITY")?,
+    })
+}

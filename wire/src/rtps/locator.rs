@@ -1,0 +1,121 @@
+//! Locators: where an endpoint can be reached (RTPS 2.5, 9.3.2.3 and 9.4.2.11).
+
+use core::fmt;
+use core::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+
+use crate::cursor::{Cursor, Reason, WireError};
+
+/// Kind of transport; the vendors add their own.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct LocatorKind(pub i32);
+
+impl LocatorKind {
+    /// Not a locator.
+    pub const INVALID: Self = Self(-1);
+    /// UDP over IPv4.
+    pub const UDP_V4: Self = Self(1);
+    /// UDP over IPv6.
+    pub const UDP_V6: Self = Self(2);
+    /// TCP over IPv4.
+    pub const TCP_V4: Self = Self(4);
+    /// TCP over IPv6.
+    pub const TCP_V6: Self = Self(8);
+    /// Shared memory of Fast DDS 2.x and of Cyclone DDS.
+    pub const SHARED_MEMORY: Self = Self(16);
+    /// Shared memory of Fast DDS 3.x.
+    pub const SHARED_MEMORY_FAST_3: Self = Self(19);
+}
+
+/// One address of one transport.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Locator {
+    /// Which transport.
+    pub kind: LocatorKind,
+    /// Its port.
+    pub port: u32,
+    /// Its address; IPv4 stands in the last four bytes.
+    pub address: [u8; 16],
+}
+
+impl Locator {
+    /// Length on the wire.
+    pub const LEN: usize = 24;
+
+    /// # Errors
+    /// [`Reason::Truncated`].
+    pub fn read(cursor: &mut Cursor<'_>) -> Result<Self, WireError> {
+        Ok(Self {
+            kind: LocatorKind(cursor.i32("locator kind")?),
+            port: cursor.u32("locator port")?,
+            address: cursor.array("locator address")?,
+        })
+    }
+
+    /// The UDP address, when it is one.
+    #[must_use]
+    pub fn udp(&self) -> Option<SocketAddr> {
+        let address = match self.kind {
+            LocatorKind::UDP_V4 => {
+                let [.., a, b, c, d] = self.address;
+                IpAddr::V4(Ipv4Addr::new(a, b, c, d))
+            }
+            LocatorKind::UDP_V6 => IpAddr::V6(Ipv6Addr::from(self.address)),
+            _ => return None,
+        };
+        Some(SocketAddr::new(address, u16::try_from(self.port).ok()?))
+    }
+
+    /// Shared memory, whoever's numbering.
+    #[must_use]
+    pub const fn is_shared_memory(&self) -> bool {
+        matches!(
+            self.kind,
+            LocatorKind::SHARED_MEMORY | LocatorKind::SHARED_MEMORY_FAST_3
+        )
+    }
+}
+
+impl fmt::Display for Locator {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(address) = self.udp() {
+            return write!(f, "udp:{address}");
+        }
+        write!(f, "{}:", self.kind.0)?;
+        self.address
+            .iter()
+            .try_for_each(|byte| write!(f, "{byte:02x}"))?;
+        write!(f, ":{}", self.port)
+    }
+}
+
+impl fmt::Debug for Locator {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+/// A counted list of locators, shown to be there but not copied.
+#[derive(Clone, Copy, Debug)]
+pub struct LocatorList<'a> {
+    rest: Cursor<'a>,
+}
+
+impl<'a> LocatorList<'a> {
+    /// `u32` count, then that many locators.
+    pub(crate) fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
+        let error = cursor.error("locator list", Reason::BadLength);
+        let count = usize::try_from(cursor.u32("locator count")?).map_err(|_| error)?;
+        let length = count.checked_mul(Locator::LEN).ok_or(error)?;
+        Ok(Self {
+            rest: cursor.sub("locator list", length)?,
+        })
+    }
+}
+
+impl Iterator for LocatorList<'_> {
+    type Item = Locator;
+
+    fn next(&mut self) -> Option<Locator> {
+        Locator::read(&mut self.rest).ok()
+    }
+}

@@ -1,0 +1,446 @@
+//! The submessages' bodies (RTPS 2.5, 9.4.5), with GUIDs made whole from the receiver state.
+
+use super::{
+    FragmentNumberSet, Locator, LocatorKind, LocatorList, ProtocolVersion, Receiver,
+    SequenceNumber, SequenceNumberSet, SubmessageId, VendorId,
+};
+use crate::cursor::{Cursor, Reason, WireError};
+use crate::guid::{EntityId, Guid, GuidPrefix};
+use crate::parameters::ParameterList;
+use crate::time::RtpsTime;
+
+/// What a submessage holds.
+#[derive(Clone, Copy, Debug)]
+pub enum Body<'a> {
+    /// Filler.
+    Pad,
+    /// ACKNACK.
+    AckNack(AckNack<'a>),
+    /// HEARTBEAT.
+    Heartbeat(Heartbeat),
+    /// HEARTBEAT_FRAG.
+    HeartbeatFrag(HeartbeatFrag),
+    /// GAP.
+    Gap(Gap<'a>),
+    /// NACK_FRAG.
+    NackFrag(NackFrag<'a>),
+    /// INFO_TS; the time is in [`Receiver::timestamp`].
+    InfoTimestamp,
+    /// INFO_SRC; the source is in [`Receiver`].
+    InfoSource,
+    /// INFO_DST; the destination is in [`Receiver`].
+    InfoDestination,
+    /// INFO_REPLY and INFO_REPLY_IP4.
+    InfoReply(InfoReply<'a>),
+    /// DATA.
+    Data(Data<'a>),
+    /// DATA_FRAG.
+    DataFrag(DataFrag<'a>),
+    /// SEC_* and SRTPS_*: a transformation's header, footer or cipher text.
+    Secure(&'a [u8]),
+    /// A kind not known here, stepped over by its length.
+    Unknown(&'a [u8]),
+}
+
+/// Reader to writer: what has arrived and what is missing.
+#[derive(Clone, Copy, Debug)]
+pub struct AckNack<'a> {
+    /// The sender's reader.
+    pub reader: Guid,
+    /// The destination's writer.
+    pub writer: Guid,
+    /// All before the base is acknowledged, members are missing.
+    pub missing: SequenceNumberSet<'a>,
+    /// Grows with every new ACKNACK of this reader.
+    pub count: u32,
+    /// No answer is needed when nothing is missing.
+    pub is_final: bool,
+}
+
+/// Writer to readers: what it has.
+#[derive(Clone, Copy, Debug)]
+pub struct Heartbeat {
+    /// For whom; an unknown entity is every matched reader.
+    pub reader: Guid,
+    /// Whose.
+    pub writer: Guid,
+    /// The oldest change still held; one more than `last` when there is none.
+    pub first: SequenceNumber,
+    /// The newest change.
+    pub last: SequenceNumber,
+    /// Grows with every new HEARTBEAT of this writer.
+    pub count: u32,
+    /// No answer is needed from a reader that has all.
+    pub is_final: bool,
+    /// Asserts the writer's liveliness only.
+    pub is_liveliness: bool,
+}
+
+/// Writer to readers: which fragments of one change it has.
+#[derive(Clone, Copy, Debug)]
+pub struct HeartbeatFrag {
+    /// For whom.
+    pub reader: Guid,
+    /// Whose.
+    pub writer: Guid,
+    /// The change.
+    pub sequence_number: SequenceNumber,
+    /// Fragments 1 to this one are there.
+    pub last_fragment: u32,
+    /// Grows with every new HEARTBEAT_FRAG of this writer.
+    pub count: u32,
+}
+
+/// Writer to readers: changes that will never come.
+#[derive(Clone, Copy, Debug)]
+pub struct Gap<'a> {
+    /// For whom.
+    pub reader: Guid,
+    /// Whose.
+    pub writer: Guid,
+    /// Irrelevant are the changes from here up to before the list's base. The span may be any
+    /// length: whoever walks it has to bound the walk.
+    pub start: SequenceNumber,
+    /// And the members of this list.
+    pub list: SequenceNumberSet<'a>,
+}
+
+/// Reader to writer: fragments that are missing.
+#[derive(Clone, Copy, Debug)]
+pub struct NackFrag<'a> {
+    /// The sender's reader.
+    pub reader: Guid,
+    /// The destination's writer.
+    pub writer: Guid,
+    /// The change.
+    pub sequence_number: SequenceNumber,
+    /// Its missing fragments.
+    pub missing: FragmentNumberSet<'a>,
+    /// Grows with every new NACK_FRAG of this reader.
+    pub count: u32,
+}
+
+/// Where to send answers to the submessages that follow.
+#[derive(Clone, Copy, Debug)]
+pub enum InfoReply<'a> {
+    /// INFO_REPLY: unicast locators, and multicast ones when given.
+    Lists(LocatorList<'a>, Option<LocatorList<'a>>),
+    /// INFO_REPLY_IP4: one UDPv4 locator of each.
+    Ip4(Locator, Option<Locator>),
+}
+
+/// One change of one writer.
+#[derive(Clone, Copy, Debug)]
+pub struct Data<'a> {
+    /// For whom; an unknown entity is every matched reader.
+    pub reader: Guid,
+    /// Whose.
+    pub writer: Guid,
+    /// Its number.
+    pub sequence_number: SequenceNumber,
+    /// Parameters about the change.
+    pub inline_qos: Option<ParameterList<'a>>,
+    /// The change itself.
+    pub payload: Payload<'a>,
+}
+
+/// What a change carries, encapsulation header included; up to three bytes of it may be padding.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Payload<'a> {
+    /// The whole value.
+    Data(&'a [u8]),
+    /// Its key only: the instance is disposed or unregistered.
+    Key(&'a [u8]),
+    /// Nothing; what there is to know stands in the inline QoS.
+    None,
+}
+
+impl<'a> Payload<'a> {
+    /// The bytes, whatever they are; empty for none.
+    #[must_use]
+    pub const fn bytes(self) -> &'a [u8] {
+        match self {
+            Self::Data(bytes) | Self::Key(bytes) => bytes,
+            Self::None => &[],
+        }
+    }
+}
+
+/// Consecutive fragments of one change.
+#[derive(Clone, Copy, Debug)]
+pub struct DataFrag<'a> {
+    /// For whom; an unknown entity is every matched reader.
+    pub reader: Guid,
+    /// Whose.
+    pub writer: Guid,
+    /// The change's number.
+    pub sequence_number: SequenceNumber,
+    /// First fragment in here, counted from 1.
+    pub starting: u32,
+    /// How many are in here, at least 1.
+    pub count: u16,
+    /// Size of every fragment but the last, at least 1.
+    pub fragment_size: u16,
+    /// Size of the whole payload. Claimed, not shown: nothing may be allocated for it.
+    pub sample_size: u32,
+    /// Parameters about the change.
+    pub inline_qos: Option<ParameterList<'a>>,
+    /// The assembled payload is a key only.
+    pub is_key: bool,
+    /// The fragments' bytes without padding, exactly as many as the numbers above say.
+    pub bytes: &'a [u8],
+}
+
+impl<'a> DataFrag<'a> {
+    /// How many fragments the whole change has.
+    #[must_use]
+    pub const fn total(&self) -> u32 {
+        self.sample_size.div_ceil(self.fragment_size as u32)
+    }
+
+    /// Where the first fragment in here begins in the change's payload.
+    #[must_use]
+    pub const fn offset(&self) -> u64 {
+        (self.starting as u64).saturating_sub(1) * self.fragment_size as u64
+    }
+
+    /// The fragments one by one, with their numbers.
+    pub fn fragments(&self) -> impl Iterator<Item = (u32, &'a [u8])> + use<'a> {
+        (self.starting..).zip(self.bytes.chunks(usize::from(self.fragment_size).max(1)))
+    }
+}
+
+/// Flag bits besides E.
+const FINAL: u8 = 0x02;
+const LIVELINESS: u8 = 0x04;
+const INVALIDATE: u8 = 0x02;
+const MULTICAST: u8 = 0x02;
+const INLINE_QOS: u8 = 0x02;
+const DATA: u8 = 0x04;
+const KEY: u8 = 0x08;
+/// In DATA_FRAG the key flag stands where DATA has its data flag (RTPS 2.5, 9.4.5.5).
+const FRAGMENT_KEY: u8 = 0x04;
+
+/// Reads one body and applies it to the receiver state.
+pub(super) fn read<'a>(
+    id: SubmessageId,
+    flags: u8,
+    mut body: Cursor<'a>,
+    receiver: &mut Receiver,
+) -> Result<Body<'a>, WireError> {
+    let has = |flag: u8| flags & flag != 0;
+    Ok(match id {
+        SubmessageId::PAD => Body::Pad,
+        SubmessageId::INFO_TS => {
+            receiver.timestamp = if has(INVALIDATE) {
+                RtpsTime::default()
+            } else {
+                let seconds = body.u32("INFO_TS seconds")?;
+                let fraction = body.u32("INFO_TS fraction")?;
+                RtpsTime(u64::from(seconds) << 32 | u64::from(fraction))
+            };
+            Body::InfoTimestamp
+        }
+        SubmessageId::INFO_SRC => {
+            body.take("INFO_SRC unused", 4)?;
+            let [major, minor] = body.array("INFO_SRC version")?;
+            // RTPS 2.5, 8.3.8.9.4: the time in force ends with the source it came from.
+            *receiver = Receiver {
+                version: ProtocolVersion { major, minor },
+                vendor: VendorId(body.array("INFO_SRC vendor")?),
+                source: GuidPrefix(body.array("INFO_SRC prefix")?),
+                destination: receiver.destination,
+                timestamp: RtpsTime::default(),
+            };
+            Body::InfoSource
+        }
+        SubmessageId::INFO_DST => {
+            receiver.destination = GuidPrefix(body.array("INFO_DST prefix")?);
+            Body::InfoDestination
+        }
+        SubmessageId::INFO_REPLY => {
+            let unicast = LocatorList::read(&mut body)?;
+            let multicast = has(MULTICAST)
+                .then(|| LocatorList::read(&mut body))
+                .transpose()?;
+            Body::InfoReply(InfoReply::Lists(unicast, multicast))
+        }
+        SubmessageId::INFO_REPLY_IP4 => {
+            let unicast = locator_ip4(&mut body)?;
+            let multicast = has(MULTICAST).then(|| locator_ip4(&mut body)).transpose()?;
+            Body::InfoReply(InfoReply::Ip4(unicast, multicast))
+        }
+        SubmessageId::ACKNACK => {
+            let (reader, writer) = from_reader(&mut body, receiver)?;
+            Body::AckNack(AckNack {
+                reader,
+                writer,
+                missing: SequenceNumberSet::read(&mut body)?,
+                count: body.u32("ACKNACK count")?,
+                is_final: has(FINAL),
+            })
+        }
+        SubmessageId::NACK_FRAG => {
+            let (reader, writer) = from_reader(&mut body, receiver)?;
+            Body::NackFrag(NackFrag {
+                reader,
+                writer,
+                sequence_number: SequenceNumber::read_from(&mut body, "NACK_FRAG writerSN", 1)?,
+                missing: FragmentNumberSet::read(&mut body)?,
+                count: body.u32("NACK_FRAG count")?,
+            })
+        }
+        SubmessageId::HEARTBEAT => {
+            let (reader, writer) = from_writer(&mut body, receiver)?;
+            let first = SequenceNumber::read_from(&mut body, "HEARTBEAT firstSN", 1)?;
+            let last = SequenceNumber::read_from(&mut body, "HEARTBEAT lastSN", first.0 - 1)?;
+            Body::Heartbeat(Heartbeat {
+                reader,
+                writer,
+                first,
+                last,
+                count: body.u32("HEARTBEAT count")?,
+                is_final: has(FINAL),
+                is_liveliness: has(LIVELINESS),
+            })
+        }
+        SubmessageId::HEARTBEAT_FRAG => {
+            let (reader, writer) = from_writer(&mut body, receiver)?;
+            Body::HeartbeatFrag(HeartbeatFrag {
+                reader,
+                writer,
+                sequence_number: SequenceNumber::read_from(
+                    &mut body,
+                    "HEARTBEAT_FRAG writerSN",
+                    1,
+                )?,
+                last_fragment: body.u32("HEARTBEAT_FRAG lastFragmentNum")?,
+                count: body.u32("HEARTBEAT_FRAG count")?,
+            })
+        }
+        SubmessageId::GAP => {
+            let (reader, writer) = from_writer(&mut body, receiver)?;
+            Body::Gap(Gap {
+                reader,
+                writer,
+                start: SequenceNumber::read_from(&mut body, "GAP gapStart", 1)?,
+                list: SequenceNumberSet::read(&mut body)?,
+            })
+        }
+        SubmessageId::DATA => Body::Data(data(flags, body, receiver)?),
+        SubmessageId::DATA_FRAG => Body::DataFrag(data_frag(flags, body, receiver)?),
+        SubmessageId::SEC_BODY
+        | SubmessageId::SEC_PREFIX
+        | SubmessageId::SEC_POSTFIX
+        | SubmessageId::SRTPS_PREFIX
+        | SubmessageId::SRTPS_POSTFIX => Body::Secure(body.rest()),
+        _ => Body::Unknown(body.rest()),
+    })
+}
+
+/// `readerId`, `writerId` where the message's source is the writer.
+fn from_writer(body: &mut Cursor<'_>, receiver: &Receiver) -> Result<(Guid, Guid), WireError> {
+    let reader = EntityId(body.array("readerId")?);
+    let writer = EntityId(body.array("writerId")?);
+    Ok((
+        Guid::new(receiver.destination, reader),
+        Guid::new(receiver.source, writer),
+    ))
+}
+
+/// `readerId`, `writerId` where the message's source is the reader.
+fn from_reader(body: &mut Cursor<'_>, receiver: &Receiver) -> Result<(Guid, Guid), WireError> {
+    let reader = EntityId(body.array("readerId")?);
+    let writer = EntityId(body.array("writerId")?);
+    Ok((
+        Guid::new(receiver.source, reader),
+        Guid::new(receiver.destination, writer),
+    ))
+}
+
+fn data<'a>(flags: u8, mut body: Cursor<'a>, receiver: &Receiver) -> Result<Data<'a>, WireError> {
+    let has = |flag: u8| flags & flag != 0;
+    if has(DATA) && has(KEY) {
+        return Err(body.error("DATA flags", Reason::BadValue));
+    }
+    let mut rest = after_octets_to_inline_qos(&mut body)?;
+    let (reader, writer) = from_writer(&mut body, receiver)?;
+    let sequence_number = SequenceNumber::read_from(&mut body, "DATA writerSN", 1)?;
+    let inline_qos = has(INLINE_QOS)
+        .then(|| ParameterList::take(&mut rest))
+        .transpose()?;
+    let payload = match (has(DATA), has(KEY)) {
+        (true, _) => Payload::Data(rest.rest()),
+        (_, true) => Payload::Key(rest.rest()),
+        _ => Payload::None,
+    };
+    Ok(Data {
+        reader,
+        writer,
+        sequence_number,
+        inline_qos,
+        payload,
+    })
+}
+
+fn data_frag<'a>(
+    flags: u8,
+    mut body: Cursor<'a>,
+    receiver: &Receiver,
+) -> Result<DataFrag<'a>, WireError> {
+    let mut rest = after_octets_to_inline_qos(&mut body)?;
+    let (reader, writer) = from_writer(&mut body, receiver)?;
+    let sequence_number = SequenceNumber::read_from(&mut body, "DATA_FRAG writerSN", 1)?;
+    let numbers = body.error("DATA_FRAG fragment numbers", Reason::BadValue);
+    let starting = body.u32("DATA_FRAG fragmentStartingNum")?;
+    let count = body.u16("DATA_FRAG fragmentsInSubmessage")?;
+    let fragment_size = body.u16("DATA_FRAG fragmentSize")?;
+    let sample_size = body.u32("DATA_FRAG sampleSize")?;
+    let inline_qos = (flags & INLINE_QOS != 0)
+        .then(|| ParameterList::take(&mut rest))
+        .transpose()?;
+
+    // The fragments in here span [begin, end) of the payload; the last one may be shorter.
+    let first = u64::from(starting).checked_sub(1).ok_or(numbers)?;
+    let begin = first * u64::from(fragment_size);
+    let end = ((first + u64::from(count)) * u64::from(fragment_size)).min(sample_size.into());
+    let begin_of_last = (first + u64::from(count)).saturating_sub(1) * u64::from(fragment_size);
+    if count == 0 || fragment_size == 0 || begin_of_last >= u64::from(sample_size) {
+        return Err(numbers);
+    }
+    let length = usize::try_from(end - begin).map_err(|_| numbers)?;
+    Ok(DataFrag {
+        reader,
+        writer,
+        sequence_number,
+        starting,
+        count,
+        fragment_size,
+        sample_size,
+        inline_qos,
+        is_key: flags & FRAGMENT_KEY != 0,
+        bytes: rest.take("DATA_FRAG fragments", length)?,
+    })
+}
+
+/// Reads `extraFlags` and `octetsToInlineQos`; returns where the inline QoS (or the payload)
+/// begins. Later versions may put fields between, so the offset is followed, not assumed.
+fn after_octets_to_inline_qos<'a>(body: &mut Cursor<'a>) -> Result<Cursor<'a>, WireError> {
+    body.u16("extraFlags")?;
+    let octets = body.u16("octetsToInlineQos")?;
+    let mut rest = *body;
+    rest.take("octetsToInlineQos", octets.into())?;
+    Ok(rest)
+}
+
+/// `LocatorUDPv4_t` (RTPS 2.5, 9.4.2.10): address and port as numbers.
+fn locator_ip4(body: &mut Cursor<'_>) -> Result<Locator, WireError> {
+    let [a, b, c, d] = body.u32("INFO_REPLY_IP4 address")?.to_be_bytes();
+    let port = body.u32("INFO_REPLY_IP4 port")?;
+    let address = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, a, b, c, d];
+    Ok(Locator {
+        kind: LocatorKind::UDP_V4,
+        port,
+        address,
+    })
+}

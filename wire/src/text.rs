@@ -1,0 +1,111 @@
+//! Text that somebody else wrote: read within a limit, and refused when it could break out of a
+//! log line, a label or a terminal.
+
+use crate::cursor::{Cursor, Reason, WireError};
+
+/// A CDR string: `u32` length including the terminating NUL, the bytes, padding to four. What it
+/// says is not checked; see [`checked`].
+///
+/// More than one NUL at the end is tolerated (Fast DDS counts one into some lengths), a length of
+/// zero is an empty string. The limit is in bytes of text.
+pub(crate) fn string<'a>(
+    cursor: &mut Cursor<'a>,
+    what: &'static str,
+    limit: usize,
+) -> Result<&'a str, WireError> {
+    let start = *cursor;
+    let bytes = octets(cursor, what)?;
+    let text = core::str::from_utf8(bytes).map_err(|_| start.error(what, Reason::BadText))?;
+    if !text.is_empty() && !text.ends_with('\0') {
+        return Err(start.error(what, Reason::BadText));
+    }
+    let text = text.trim_end_matches('\0');
+    if text.len() > limit {
+        return Err(start.error(what, Reason::OverLimit));
+    }
+    Ok(text)
+}
+
+/// A CDR octet sequence: `u32` length, the bytes, padding to four.
+pub(crate) fn octets<'a>(
+    cursor: &mut Cursor<'a>,
+    what: &'static str,
+) -> Result<&'a [u8], WireError> {
+    cursor.align(4);
+    let start = *cursor;
+    let length =
+        usize::try_from(cursor.u32(what)?).map_err(|_| start.error(what, Reason::BadLength))?;
+    let bytes = cursor.take(what, length)?;
+    cursor.align(4);
+    Ok(bytes)
+}
+
+/// Whether a name can stand unquoted on a terminal, in a label and in a log line: no control
+/// characters and none that ends or escapes a quotation. DDS and ROS names never have them
+/// (DDS 1.4, annex B: letters, digits, underscore; slashes in ROS's mapping).
+pub(crate) fn is_plain(text: &str) -> bool {
+    !text.chars().any(|c| {
+        c.is_control()
+            || matches!(c, '"' | '\'' | '`' | '\\')
+            // Line and paragraph separators, and the marks that reorder text on a terminal.
+            || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}' | '\u{feff}')
+    })
+}
+
+/// [`string`] that [`is_plain`].
+pub(crate) fn name<'a>(
+    cursor: &mut Cursor<'a>,
+    what: &'static str,
+    limit: usize,
+) -> Result<&'a str, WireError> {
+    let start = *cursor;
+    let text = string(cursor, what, limit)?;
+    if is_plain(text) {
+        Ok(text)
+    } else {
+        Err(start.error(what, Reason::BadText))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cursor::Endianness;
+
+    fn read(bytes: &[u8]) -> Result<&str, Reason> {
+        name(&mut Cursor::new(bytes, Endianness::Little), "name", 8).map_err(|error| error.reason)
+    }
+
+    #[test]
+    fn a_string_needs_its_terminator() {
+        assert_eq!(read(b"\x03\0\0\0ab\0\0"), Ok("ab"));
+        assert_eq!(read(b"\x02\0\0\0ab\0\0"), Err(Reason::BadText));
+        assert_eq!(read(b"\0\0\0\0"), Ok(""));
+        assert_eq!(read(b"\x01\0\0\0\0"), Ok(""));
+    }
+
+    #[test]
+    fn a_length_beyond_the_bytes_is_truncated() {
+        assert_eq!(read(b"\xff\xff\xff\xffab\0\0"), Err(Reason::Truncated));
+        assert_eq!(read(b"\x05\0\0\0ab\0\0"), Err(Reason::Truncated));
+    }
+
+    #[test]
+    fn hostile_names_are_refused() {
+        assert_eq!(read(b"\x0a\0\0\0abcdefghi\0"), Err(Reason::OverLimit));
+        assert_eq!(read(b"\x03\0\0\0\xff\xfe\0"), Err(Reason::BadText));
+        for bad in [
+            "a\"b",
+            "a\nb",
+            "a\0b",
+            "a\\b",
+            "a'b",
+            "a`b",
+            "\u{1b}[2J",
+            "\u{202e}x",
+        ] {
+            assert!(!is_plain(bad), "{bad:?}");
+        }
+        assert!(is_plain("rt/röbot/scan"));
+    }
+}
