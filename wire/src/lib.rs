@@ -13,11 +13,11 @@ extern crate alloc;
 extern crate std;
 
 pub mod cursor;
-pub mod frame;
 #[cfg(feature = "alloc")]
 pub mod discovery;
 #[cfg(feature = "alloc")]
 pub mod entities;
+pub mod frame;
 pub mod guid;
 #[cfg(feature = "alloc")]
 pub mod names;
