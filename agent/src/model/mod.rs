@@ -1,4 +1,5 @@
 //! The core: a plain state machine. Time and bytes in, facts out; no I/O, no clock, no thread.
 
 pub mod histogram;
+pub mod reassembly;
 pub mod snapshot;

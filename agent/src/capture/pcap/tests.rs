@@ -5,6 +5,7 @@ use flate2::write::GzEncoder;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use super::*;
+use crate::model::reassembly::{self, FlowKey, Limits, Reassembly};
 
 const PACKETS: [(u32, u32, &[u8]); 3] = [
     (1_700_000_000, 123_456, b"first"),
@@ -340,6 +341,37 @@ fn what_is_not_a_capture_says_so() {
         .unwrap()
         .to_string();
     assert_eq!(missing, "cannot open capture /nonexistent/x.pcap");
+}
+
+#[test]
+fn fragments_of_a_real_capture_become_a_datagram() {
+    let (_, datagrams, counters) = datagrams(&data("cyclonedds-qos-mismatch.pcap.gz"));
+    assert_eq!(
+        (datagrams, counters.completed, counters.contradictory),
+        (146, 1, 0)
+    );
+}
+
+/// Frames, datagrams whole or put together, what became of the fragments.
+fn datagrams(path: &Path) -> (u64, u64, reassembly::Counters) {
+    let mut reader = PcapReader::open(path).unwrap();
+    let mut reassembly = Reassembly::new(Limits::default());
+    let mut whole = 0;
+    while let Some(captured) = reader.next_packet().unwrap() {
+        let frame = frame::parse(captured.link, captured.bytes, captured.length).unwrap();
+        let Some(packet) = frame.packet else { continue };
+        match packet.payload {
+            Payload::Datagram(_) => whole += 1,
+            Payload::Fragment(part) => {
+                let outgoing = frame.packet_type == PacketType::OUTGOING;
+                let interface = frame.interface.unwrap_or_default();
+                let key = FlowKey::new(0, interface, outgoing, &packet, &part);
+                whole += u64::from(reassembly.fragment(captured.time, key, &part).is_some());
+            }
+            Payload::Other(_) => {}
+        }
+    }
+    (reader.packets(), whole, reassembly.counters())
 }
 
 /// Frames, whole UDP datagrams, fragments, frames that a cooked header calls outgoing.

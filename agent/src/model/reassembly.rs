@@ -1,0 +1,388 @@
+//! Puts UDP datagrams together again that IP cut into fragments.
+//!
+//! Kept in memory are bytes that came, never bytes that were announced; flows and bytes are capped,
+//! and the oldest flow goes first. A finished datagram is remembered for a while, so that a
+//! repeated fragment does not open it anew. Fragments never wait longer than the receiving kernel
+//! would let them.
+//!
+//! The kernel filter walks fragmented datagrams itself. Where it cannot go on it hands over: it
+//! tells from which submessage on, and captures the remaining fragments only. Such a datagram is
+//! complete when everything from there to its end has come.
+
+mod flow;
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+
+use ros2probe_wire::frame::{Fragment, Packet};
+use ros2probe_wire::record::{Record, flag};
+use ros2probe_wire::{Cursor, Endianness, Timestamp};
+
+use flow::{Flow, Placed};
+
+const UDP_HEADER: u32 = 8;
+
+/// How much may be kept, and for how long.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Limits {
+    /// Bytes of all unfinished datagrams together, bookkeeping included.
+    pub bytes: usize,
+    /// Unfinished datagrams.
+    pub flows: usize,
+    /// Nanoseconds an unfinished datagram is kept. Linux: `ipfrag_time`, 30 s.
+    pub timeout: u64,
+    /// Finished datagrams remembered.
+    pub remembered: usize,
+    /// Nanoseconds a finished datagram is remembered. Repetitions come within milliseconds, while
+    /// a busy sender uses an IPv4 identification again after seconds.
+    pub remember: u64,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            bytes: 4 << 20,
+            flows: 256,
+            timeout: 30_000_000_000,
+            remembered: 1024,
+            remember: 1_000_000_000,
+        }
+    }
+}
+
+/// What the fragments of one datagram have in common. They travel together, so a copy of the
+/// datagram seen on another interface or in the other direction is another flow.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct FlowKey {
+    /// Number of the source (network namespace, capture) that saw them.
+    pub namespace: u32,
+    /// Index of the interface; 0 when unknown.
+    pub interface: u32,
+    /// Sent by this host.
+    pub outgoing: bool,
+    /// Source address, IPv4-mapped for IPv4.
+    pub source: [u8; 16],
+    /// Destination address, IPv4-mapped for IPv4.
+    pub destination: [u8; 16],
+    /// IP identification.
+    pub id: u32,
+}
+
+/// A datagram put together.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Reassembled {
+    /// UDP header and payload; zeros before `start`.
+    transport: Vec<u8>,
+    /// The kernel filter's [`ros2probe_wire::record::kind::HANDOVER`] record when the walk begins
+    /// inside the payload.
+    pub handover: Option<Record>,
+    /// Offset in the payload where to begin: 0 unless handed over. Before it are zeros.
+    pub start: u32,
+    /// True length of the payload; more than [`Self::payload`] holds if the capture was cut short.
+    pub length: u32,
+    /// Capture time of the first fragment.
+    pub first_seen: Timestamp,
+    /// Capture time of the fragment that completed it.
+    pub last_seen: Timestamp,
+    /// Port it was sent from; 0 when handed over.
+    pub source_port: u16,
+    /// Port it was sent to.
+    pub destination_port: u16,
+}
+
+impl Reassembled {
+    /// The payload up to the first byte that the capture did not keep.
+    #[must_use]
+    pub fn payload(&self) -> &[u8] {
+        self.transport
+            .get(UDP_HEADER as usize..)
+            .unwrap_or_default()
+    }
+}
+
+/// What became of fragments that made no datagram.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
+pub struct Counters {
+    /// Datagrams completed.
+    pub completed: u64,
+    /// Unfinished datagrams given up because of the caps.
+    pub evicted: u64,
+    /// Unfinished datagrams given up because of their age.
+    pub timed_out: u64,
+    /// Fragments that brought nothing new.
+    pub duplicate: u64,
+    /// Fragments that contradict what came before: other bytes in the same place, or bytes beyond
+    /// the datagram's end.
+    pub contradictory: u64,
+    /// Datagrams with an impossible UDP header.
+    pub malformed: u64,
+}
+
+/// All unfinished datagrams.
+#[derive(Debug)]
+pub struct Reassembly {
+    limits: Limits,
+    flows: HashMap<FlowKey, Flow>,
+    /// Flows by the order in which they were opened.
+    order: BTreeMap<u64, FlowKey>,
+    opened: u64,
+    bytes: usize,
+    finished: HashMap<FlowKey, Timestamp>,
+    finished_order: VecDeque<FlowKey>,
+    counters: Counters,
+}
+
+impl FlowKey {
+    /// Of a captured fragment.
+    #[must_use]
+    pub const fn new(
+        namespace: u32,
+        interface: u32,
+        outgoing: bool,
+        packet: &Packet<'_>,
+        fragment: &Fragment<'_>,
+    ) -> Self {
+        Self {
+            namespace,
+            interface,
+            outgoing,
+            source: packet.source,
+            destination: packet.destination,
+            id: fragment.id,
+        }
+    }
+
+    /// Of the datagram that a HANDOVER record is about.
+    #[must_use]
+    pub fn of_handover(namespace: u32, record: &Record) -> Self {
+        let handover = record.handover();
+        let mut destination = [0; 16];
+        for (target, word) in destination.chunks_exact_mut(4).zip(record.destination) {
+            target.copy_from_slice(&word.to_ne_bytes());
+        }
+        Self {
+            namespace,
+            interface: record.interface,
+            outgoing: record.flags & flag::OUTGOING != 0,
+            source: handover.source_address,
+            destination,
+            id: handover.identification,
+        }
+    }
+}
+
+impl Reassembly {
+    /// Nothing kept yet.
+    #[must_use]
+    pub fn new(limits: Limits) -> Self {
+        Self {
+            limits,
+            flows: HashMap::new(),
+            order: BTreeMap::new(),
+            opened: 0,
+            bytes: 0,
+            finished: HashMap::new(),
+            finished_order: VecDeque::new(),
+            counters: Counters::default(),
+        }
+    }
+
+    /// Takes a fragment; gives the datagram it completes.
+    pub fn fragment(
+        &mut self,
+        at: Timestamp,
+        key: FlowKey,
+        fragment: &Fragment<'_>,
+    ) -> Option<Reassembled> {
+        self.advance(at);
+        if self.finished.contains_key(&key) {
+            self.counters.duplicate += 1;
+            return None;
+        }
+        let flow = self.open(at, key)?;
+        let before = flow.memory();
+        let placed = flow.place(at, fragment);
+        let after = flow.memory();
+        let handed_over = flow.handover.is_some();
+        self.bytes = (self.bytes + after).saturating_sub(before);
+        match placed {
+            Placed::New => {}
+            Placed::Nothing => self.counters.duplicate += 1,
+            Placed::Contradiction => {
+                self.counters.contradictory += 1;
+                // The identification is in use again, and the rest of the old datagram will not
+                // come. What the kernel filter handed over it has just seen itself: that stays.
+                if !handed_over {
+                    self.close(&key);
+                    let flow = self.open(at, key)?;
+                    let before = flow.memory();
+                    flow.place(at, fragment);
+                    let after = flow.memory();
+                    self.bytes = (self.bytes + after).saturating_sub(before);
+                }
+            }
+        }
+        self.finish(key)
+    }
+
+    /// Takes a HANDOVER record, before or after the fragments it is about; gives the datagram if
+    /// they are all there.
+    pub fn hand_over(
+        &mut self,
+        at: Timestamp,
+        key: FlowKey,
+        record: &Record,
+    ) -> Option<Reassembled> {
+        self.advance(at);
+        if self.finished.contains_key(&key) {
+            self.counters.duplicate += 1;
+            return None;
+        }
+        if record.handover().offset >= u32::from(record.datagram_len) {
+            self.counters.malformed += 1;
+            return None;
+        }
+        self.open(at, key)?.handover.get_or_insert(*record);
+        self.finish(key)
+    }
+
+    /// Gives up what has waited for too long at the time `now`.
+    pub fn advance(&mut self, now: Timestamp) {
+        while let Some(key) = self.oldest() {
+            let fresh = self
+                .flows
+                .get(&key)
+                .is_some_and(|flow| now.0.saturating_sub(flow.first_seen.0) <= self.limits.timeout);
+            if fresh {
+                break;
+            }
+            self.close(&key);
+            self.counters.timed_out += 1;
+        }
+        while let Some(key) = self.finished_order.front() {
+            let fresh = self
+                .finished
+                .get(key)
+                .is_some_and(|at| now.0.saturating_sub(at.0) <= self.limits.remember);
+            if fresh && self.finished_order.len() <= self.limits.remembered {
+                break;
+            }
+            self.finished.remove(key);
+            self.finished_order.pop_front();
+        }
+    }
+
+    /// Counters since the start.
+    #[must_use]
+    pub const fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// Bytes held at the moment.
+    #[must_use]
+    pub const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Unfinished datagrams at the moment.
+    #[must_use]
+    pub fn flows(&self) -> usize {
+        self.flows.len()
+    }
+
+    fn oldest(&self) -> Option<FlowKey> {
+        self.order.first_key_value().map(|(_, key)| *key)
+    }
+
+    /// The flow of this key, made if need be at the oldest one's expense.
+    fn open(&mut self, at: Timestamp, key: FlowKey) -> Option<&mut Flow> {
+        if !self.flows.contains_key(&key) {
+            if self.flows.len() >= self.limits.flows
+                && let Some(oldest) = self.oldest()
+            {
+                self.close(&oldest);
+                self.counters.evicted += 1;
+            }
+            let flow = Flow::new(self.opened, at);
+            self.bytes += flow.memory();
+            self.order.insert(self.opened, key);
+            self.opened += 1;
+            self.flows.insert(key, flow);
+        }
+        self.flows.get_mut(&key)
+    }
+
+    fn close(&mut self, key: &FlowKey) -> Option<Flow> {
+        let flow = self.flows.remove(key)?;
+        self.order.remove(&flow.order);
+        self.bytes = self.bytes.saturating_sub(flow.memory());
+        Some(flow)
+    }
+
+    /// Delivers the flow if it is complete, and otherwise makes room.
+    fn finish(&mut self, key: FlowKey) -> Option<Reassembled> {
+        let complete = self.flows.get(&key)?.complete();
+        if complete.is_none() {
+            while self.bytes > self.limits.bytes
+                && let Some(oldest) = self.oldest()
+            {
+                self.close(&oldest);
+                self.counters.evicted += 1;
+            }
+        }
+        let (from, to) = complete?;
+        let mut flow = self.close(&key)?;
+        self.finished.insert(key, flow.last_seen);
+        self.finished_order.push_back(key);
+        let transport = flow.take(from, to);
+        let reassembled = match flow.handover {
+            Some(record) => Some(handed_over(&flow, transport, &record)),
+            None => whole(&flow, transport, to),
+        };
+        if reassembled.is_some() {
+            self.counters.completed += 1;
+        } else {
+            self.counters.malformed += 1;
+        }
+        reassembled
+    }
+}
+
+fn handed_over(flow: &Flow, transport: Vec<u8>, record: &Record) -> Reassembled {
+    Reassembled {
+        transport,
+        handover: Some(*record),
+        start: record.handover().offset,
+        length: u32::from(record.datagram_len),
+        first_seen: flow.first_seen,
+        last_seen: flow.last_seen,
+        source_port: 0,
+        destination_port: record.destination_port,
+    }
+}
+
+/// `None` when the UDP header cannot be read or claims more than there is: no socket got that.
+fn whole(flow: &Flow, mut transport: Vec<u8>, total: u32) -> Option<Reassembled> {
+    let mut cursor = Cursor::new(&transport, Endianness::Big);
+    let source_port = cursor.u16("UDP source port").ok()?;
+    let destination_port = cursor.u16("UDP destination port").ok()?;
+    let udp_length = u32::from(cursor.u16("UDP length").ok()?);
+    cursor.u16("UDP checksum").ok()?;
+    if udp_length > total {
+        return None;
+    }
+    let length = udp_length.checked_sub(UDP_HEADER)?;
+    transport.truncate(usize::try_from(udp_length).ok()?);
+    Some(Reassembled {
+        transport,
+        handover: None,
+        start: 0,
+        length,
+        first_seen: flow.first_seen,
+        last_seen: flow.last_seen,
+        source_port,
+        destination_port,
+    })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,218 @@
+//! The fragments of one datagram: which byte ranges have come, and their bytes.
+
+use std::mem::size_of;
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::frame::Fragment;
+use ros2probe_wire::record::Record;
+
+use super::{FlowKey, UDP_HEADER};
+
+/// An unfinished datagram.
+#[derive(Debug)]
+pub(super) struct Flow {
+    /// Position among all flows ever opened.
+    pub(super) order: u64,
+    pub(super) first_seen: Timestamp,
+    pub(super) last_seen: Timestamp,
+    pub(super) handover: Option<Record>,
+    /// Sorted, neither overlapping nor touching.
+    pieces: Vec<Piece>,
+    /// Length of the datagram with its UDP header, once the last fragment has come.
+    total: Option<u32>,
+    /// First byte that a capture cut short did not keep.
+    first_unknown: Option<u32>,
+    /// Capacity of all pieces.
+    held: usize,
+}
+
+/// Consecutive bytes. In-order fragments all end up in one.
+#[derive(Debug)]
+struct Piece {
+    start: u32,
+    bytes: Vec<u8>,
+}
+
+/// What a fragment brought.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Placed {
+    /// Bytes that were missing.
+    New,
+    /// Nothing that was not there.
+    Nothing,
+    /// It cannot belong to the same datagram. Nothing has changed.
+    Contradiction,
+}
+
+impl Piece {
+    fn end(&self) -> u32 {
+        self.start
+            .saturating_add(u32::try_from(self.bytes.len()).unwrap_or(u32::MAX))
+    }
+}
+
+impl Flow {
+    pub(super) const fn new(order: u64, at: Timestamp) -> Self {
+        Self {
+            order,
+            first_seen: at,
+            last_seen: at,
+            handover: None,
+            pieces: Vec::new(),
+            total: None,
+            first_unknown: None,
+            held: 0,
+        }
+    }
+
+    /// Bytes this flow costs, bookkeeping included.
+    pub(super) const fn memory(&self) -> usize {
+        const ENTRIES: usize = size_of::<Flow>() + 2 * size_of::<FlowKey>();
+        ENTRIES + self.held + self.pieces.capacity() * size_of::<Piece>()
+    }
+
+    /// Takes a fragment. Of overlapping bytes the first to come are kept.
+    pub(super) fn place(&mut self, at: Timestamp, fragment: &Fragment<'_>) -> Placed {
+        let (start, end) = (fragment.offset, fragment.end());
+        let seen = self.pieces.last().map_or(0, Piece::end);
+        let total = self.total();
+        let too_long = total.is_some_and(|total| end > total);
+        let ends_early = !fragment.more && (seen > end || total.is_some_and(|total| end != total));
+        if too_long || ends_early {
+            return Placed::Contradiction;
+        }
+        let mut position = start;
+        let mut placed = Placed::Nothing;
+        while let Some((index, from, to)) = self.gap(position, end) {
+            self.fill(index, from, to, fragment);
+            position = to;
+            placed = Placed::New;
+        }
+        if placed == Placed::Nothing && self.differs(fragment) {
+            return Placed::Contradiction;
+        }
+        if placed == Placed::New {
+            self.last_seen = self.last_seen.max(at);
+            let kept = start.saturating_add(u32::try_from(fragment.bytes.len()).unwrap_or(end));
+            if kept < end {
+                self.first_unknown = Some(self.first_unknown.map_or(kept, |known| known.min(kept)));
+            }
+        }
+        if !fragment.more {
+            self.total = Some(end);
+        }
+        placed
+    }
+
+    /// The byte range, counted from the UDP header, that has to be delivered, if it is all there.
+    pub(super) fn complete(&self) -> Option<(u32, u32)> {
+        let to = self.total()?;
+        let from = self
+            .handover
+            .map_or(0, |record| record.handover().offset + UDP_HEADER);
+        let piece = self.pieces.get(self.first_ending_after(from))?;
+        (piece.start <= from && to <= piece.end()).then_some((from, to))
+    }
+
+    /// The bytes up to `to`, with zeros before `from`, without those a capture did not keep.
+    pub(super) fn take(&mut self, from: u32, to: u32) -> Vec<u8> {
+        let index = self.first_ending_after(from);
+        let Some(piece) = self.pieces.get_mut(index) else {
+            return Vec::new();
+        };
+        let to = self.first_unknown.map_or(to, |unknown| unknown.min(to));
+        let size = |offset: u32| usize::try_from(offset).unwrap_or(usize::MAX);
+        if piece.start == 0 && from == 0 {
+            let mut bytes = std::mem::take(&mut piece.bytes);
+            bytes.truncate(size(to));
+            return bytes;
+        }
+        let head = from.max(piece.start);
+        let mut bytes = vec![0; size(head.min(to))];
+        let known = size(head - piece.start)..size(to.saturating_sub(piece.start));
+        bytes.extend_from_slice(piece.bytes.get(known).unwrap_or_default());
+        bytes
+    }
+
+    fn total(&self) -> Option<u32> {
+        let handed_over = self
+            .handover
+            .map(|record| u32::from(record.datagram_len) + UDP_HEADER);
+        handed_over.or(self.total)
+    }
+
+    fn first_ending_after(&self, offset: u32) -> usize {
+        self.pieces.partition_point(|piece| piece.end() <= offset)
+    }
+
+    /// The first missing range within `from..to`, and which piece it stands before.
+    fn gap(&self, mut from: u32, to: u32) -> Option<(usize, u32, u32)> {
+        let mut index = self.first_ending_after(from);
+        if let Some(piece) = self.pieces.get(index)
+            && piece.start <= from
+        {
+            from = piece.end();
+            index += 1;
+        }
+        let to = self.pieces.get(index).map_or(to, |next| next.start.min(to));
+        (from < to).then_some((index, from, to))
+    }
+
+    /// Puts the fragment's bytes `from..to` before the piece at `index`, joining what touches.
+    fn fill(&mut self, index: usize, from: u32, to: u32, fragment: &Fragment<'_>) {
+        let size = |offset: u32| usize::try_from(offset).unwrap_or(usize::MAX);
+        let within = |offset: u32| size(offset.saturating_sub(fragment.offset));
+        let kept = fragment.bytes.len();
+        let bytes = fragment
+            .bytes
+            .get(within(from).min(kept)..within(to).min(kept))
+            .unwrap_or_default();
+        let before = index.checked_sub(1).filter(|&before| {
+            self.pieces
+                .get(before)
+                .is_some_and(|piece| piece.end() == from)
+        });
+        let target = before.unwrap_or(index);
+        if before.is_none() {
+            self.pieces.insert(
+                index,
+                Piece {
+                    start: from,
+                    bytes: Vec::new(),
+                },
+            );
+        }
+        let next = target + 1;
+        let touches = self.pieces.get(next).is_some_and(|piece| piece.start == to);
+        let joined = if touches {
+            self.pieces.remove(next).bytes
+        } else {
+            Vec::new()
+        };
+        self.held = self.held.saturating_sub(joined.capacity());
+        let Some(piece) = self.pieces.get_mut(target) else {
+            return;
+        };
+        self.held = self.held.saturating_sub(piece.bytes.capacity());
+        piece.bytes.extend_from_slice(bytes);
+        // What the capture did not keep of the fragment.
+        piece.bytes.resize(size(to.saturating_sub(piece.start)), 0);
+        piece.bytes.extend_from_slice(&joined);
+        self.held += piece.bytes.capacity();
+    }
+
+    /// Whether a fragment that is wholly covered has other bytes than those that cover it.
+    fn differs(&self, fragment: &Fragment<'_>) -> bool {
+        if self.first_unknown.is_some() {
+            return false;
+        }
+        let Some(piece) = self.pieces.get(self.first_ending_after(fragment.offset)) else {
+            return false;
+        };
+        let start = fragment.offset.saturating_sub(piece.start);
+        let held = usize::try_from(start)
+            .ok()
+            .and_then(|start| piece.bytes.get(start..));
+        !held.is_some_and(|held| held.starts_with(fragment.bytes))
+    }
+}
