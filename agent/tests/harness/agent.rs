@@ -1,8 +1,10 @@
 //! The agent under test, and what it exports.
 
+use std::collections::BTreeSet;
 use std::ffi::OsStr;
+use std::fs::File;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail};
@@ -29,12 +31,32 @@ impl<'a> Agent<'a> {
         program: impl AsRef<OsStr>,
         configuration: &Path,
     ) -> Result<Agent<'a>> {
+        Agent::start_with(host, program, configuration, Stdio::inherit())
+    }
+
+    /// As [`Agent::start`], with what the agent logs in a file.
+    pub(crate) fn start_logging(
+        host: &'a Namespace,
+        program: impl AsRef<OsStr>,
+        configuration: &Path,
+        log: &Path,
+    ) -> Result<Agent<'a>> {
+        let file = File::create(log).with_context(|| format!("cannot create {}", log.display()))?;
+        Agent::start_with(host, program, configuration, file.into())
+    }
+
+    fn start_with(
+        host: &'a Namespace,
+        program: impl AsRef<OsStr>,
+        configuration: &Path,
+        errors: Stdio,
+    ) -> Result<Agent<'a>> {
         let arguments = [
             OsStr::new("run"),
             OsStr::new("--config"),
             configuration.as_os_str(),
         ];
-        let process = Process::start(&host.on_network(), program, arguments)?;
+        let process = Process::start_with(&host.on_network(), program, arguments, errors)?;
         let mut agent = Agent { process, host };
         agent.wait_ready(Duration::from_secs(10))?;
         Ok(agent)
@@ -73,6 +95,17 @@ impl Scrape {
     /// The sum over all samples of `name` that have these labels.
     pub(crate) fn sum(&self, name: &str, labels: &[(&str, &str)]) -> f64 {
         self.samples(name, labels).sum()
+    }
+
+    /// The values that a label takes over the samples of `name`.
+    pub(crate) fn labels_of(&self, name: &str, label: &str) -> BTreeSet<String> {
+        let start = format!("{label}=\"");
+        let values = self.0.lines().filter_map(|line| {
+            let labels = line.strip_prefix(name)?.strip_prefix('{')?;
+            let (_, value) = labels.split_once(&start)?;
+            Some(value.split_once('"')?.0.to_owned())
+        });
+        values.collect()
     }
 
     fn samples(&self, name: &str, labels: &[(&str, &str)]) -> impl Iterator<Item = f64> {

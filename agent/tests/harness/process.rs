@@ -23,6 +23,16 @@ impl Process {
         program: impl AsRef<OsStr>,
         arguments: impl IntoIterator<Item = A>,
     ) -> Result<Process> {
+        Process::start_with(host, program, arguments, Stdio::inherit())
+    }
+
+    /// As [`Process::start`], with standard error going elsewhere.
+    pub(crate) fn start_with<A: AsRef<OsStr>>(
+        host: &[String],
+        program: impl AsRef<OsStr>,
+        arguments: impl IntoIterator<Item = A>,
+        errors: Stdio,
+    ) -> Result<Process> {
         let name = program.as_ref().to_string_lossy().into_owned();
         let [enter, words @ ..] = host else {
             bail!("no host to run {name} on");
@@ -34,6 +44,7 @@ impl Process {
             .args(arguments)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
+            .stderr(errors)
             .spawn()
             .with_context(|| format!("cannot start {name}"))?;
         let stdout = child
