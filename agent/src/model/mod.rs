@@ -1,5 +1,8 @@
 //! The core: a plain state machine. Time and bytes in, facts out; no I/O, no clock, no thread.
 
 pub mod histogram;
+pub mod rate;
 pub mod reassembly;
+pub mod samples;
+pub mod sequence;
 pub mod snapshot;
