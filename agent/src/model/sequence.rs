@@ -73,6 +73,17 @@ pub enum Arrival {
     Duplicate,
 }
 
+/// How a sample was delivered, for telling a retransmission.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Delivery {
+    /// The writer never retransmits.
+    BestEffort,
+    /// The writer retransmits what a reader misses.
+    Reliable,
+    /// It does, but the sample came in fragments: that it is late need not mean that it was lost.
+    ReliableFragments,
+}
+
 /// One or several numbers that were decided.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Settled {
@@ -109,23 +120,16 @@ impl Sequence {
         self.started() && (number < self.floor() || number < self.next && self.received.get(number))
     }
 
-    /// Takes in one whole sample. `reliable` says whether the writer retransmits at all.
+    /// Takes in one whole sample, after [`Self::recognise`].
     pub fn receive(
         &mut self,
         number: u64,
-        source: Option<Timestamp>,
+        delivery: Delivery,
         now: Timestamp,
-        reliable: bool,
         settled: &mut impl FnMut(Settled),
     ) -> Arrival {
         if number == 0 || number > u64::MAX >> 1 {
             return Arrival::Duplicate;
-        }
-        if self.is_new_incarnation(number, source) {
-            self.restart(number);
-        }
-        if let Some(source) = source {
-            self.newest_source = self.newest_source.max(source);
         }
         if !self.started() {
             self.restart(number);
@@ -148,10 +152,24 @@ impl Sequence {
             return Arrival::Duplicate;
         }
         self.received.set(number);
-        let recovered = reliable && number >= self.first && self.was_retransmitted(number, now);
+        let recovered = number >= self.first && self.was_retransmitted(number, delivery, now);
         Arrival::New {
             recovered,
             newest: false,
+        }
+    }
+
+    /// Looks at number and source time of a sample before anything else does: a writer that begins
+    /// anew under its old GUID is recognised here, and all numbers count afresh.
+    pub fn recognise(&mut self, number: u64, source: Option<Timestamp>) {
+        if number == 0 || number > u64::MAX >> 1 {
+            return;
+        }
+        if self.is_new_incarnation(number, source) {
+            self.restart(number);
+        }
+        if let Some(source) = source {
+            self.newest_source = self.newest_source.max(source);
         }
     }
 
@@ -162,12 +180,17 @@ impl Sequence {
         }
     }
 
-    /// Begins here without having received anything: what came of this number was not its
-    /// beginning.
-    pub fn begin_after(&mut self, number: u64) {
-        if !self.started() && number < u64::MAX >> 1 {
-            self.restart(number + 1);
+    /// Numbers count from here on; does nothing once begun.
+    pub fn begin(&mut self, number: u64) {
+        if !self.started() && number > 0 && number < u64::MAX >> 1 {
+            self.restart(number);
         }
+    }
+
+    /// Lowest number that counts.
+    #[must_use]
+    pub const fn first(&self) -> u64 {
+        self.first
     }
 
     /// HEARTBEAT: the writer has `first..=last`. What lies before `first` it will never send again;
@@ -240,17 +263,6 @@ impl Sequence {
     pub fn excuse(&mut self, start: u64, end: u64) {
         for number in start.max(self.floor()).max(self.settled)..end.min(self.next) {
             self.excused.set(number);
-        }
-    }
-
-    /// Forgives what is missing between the last sample before and the first one after a moment in
-    /// which samples were sent where they could not be seen.
-    pub fn excuse_gap_before(&mut self, number: u64) {
-        let Some(gap) = self.gaps.back().copied() else {
-            return;
-        };
-        if gap.end == number {
-            self.excuse(gap.start, gap.end);
         }
     }
 
@@ -361,13 +373,19 @@ impl Sequence {
         });
     }
 
-    fn was_retransmitted(&self, number: u64, now: Timestamp) -> bool {
+    fn was_retransmitted(&self, number: u64, delivery: Delivery, now: Timestamp) -> bool {
         let gap = self
             .gaps
             .iter()
             .rev()
             .find(|gap| gap.start <= number && number < gap.end);
-        gap.is_none_or(|gap| gap.requested || now.nanoseconds_since(gap.noticed) >= REORDERING)
+        let late = |gap: &Gap| gap.requested || now.nanoseconds_since(gap.noticed) >= REORDERING;
+        match delivery {
+            Delivery::BestEffort => false,
+            // A gap that was forgotten is an old one.
+            Delivery::Reliable => gap.is_none_or(late),
+            Delivery::ReliableFragments => gap.is_some_and(late),
+        }
     }
 
     fn settle(&mut self, limit: u64, settled: &mut impl FnMut(Settled)) {
@@ -474,11 +492,11 @@ mod tests {
 
         fn receive_at(&mut self, number: u64, source: Option<u64>) {
             let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
+            self.sequence.recognise(number, source.map(Timestamp));
             let arrival = self.sequence.receive(
                 number,
-                source.map(Timestamp),
+                Delivery::Reliable,
                 Timestamp(self.now),
-                true,
                 &mut |settled| note(settled, lost, irrelevant),
             );
             match arrival {
