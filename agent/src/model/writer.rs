@@ -123,7 +123,7 @@ impl Writer {
                 let (first, last) = (record.sequence_number, record.second_sequence_number());
                 let (sequence, mut settling) = self.parts(scene);
                 sequence.heartbeat(first, last, record_time(record), &mut |settled| {
-                    settling.take(settled)
+                    settling.take(settled);
                 });
             }
             kind::GAP => {
@@ -131,7 +131,7 @@ impl Writer {
                 let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
                 let (sequence, mut settling) = self.parts(scene);
                 sequence.gap(start, base, set, record_time(record), &mut |settled| {
-                    settling.take(settled)
+                    settling.take(settled);
                 });
             }
             kind::ACKNACK => {
