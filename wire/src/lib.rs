@@ -17,6 +17,7 @@ pub mod cursor;
 pub mod discovery;
 #[cfg(feature = "alloc")]
 pub mod entities;
+pub mod filter;
 pub mod frame;
 pub mod guid;
 #[cfg(feature = "alloc")]

@@ -1,3 +1,4 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
+pub mod filter;
 pub mod pcap;

@@ -1,0 +1,257 @@
+//! Datagrams in several IP fragments: one walk across frames, reported once all have come.
+//!
+//! Only the first fragment has a UDP header, and submessage headers may lie in any. The walk's state
+//! waits in a table between frames. Where the filter cannot go on alone (discovery behind user data,
+//! a header cut in two, fragments out of order) it hands the rest of the datagram to user space with
+//! the walk's state, so nothing is decided twice and nothing is missed.
+
+use aya_ebpf::bindings::__sk_buff;
+use ros2probe_wire::{
+    filter::Counter,
+    record::{Record, flag, kind},
+};
+
+use crate::{
+    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Scratch, count, scratch},
+    verdict::{self, progress},
+};
+
+/// A datagram whose fragments are further apart than this has been given up, and its identification
+/// may be in use again.
+const FLOW_LIFETIME_NANOSECONDS: u64 = 5_000_000_000;
+
+mod state {
+    /// A new flow's. Trailing fragments that find it came before the first: what the datagram is,
+    /// is not known, and they are captured within the budget of unclassified writers.
+    pub const HEADLESS: u32 = 0;
+    /// RTPS, walked here.
+    pub const WALKING: u32 = 1;
+    /// All fragments go to user space.
+    pub const CAPTURED: u32 = 2;
+    /// Fragments from some point on go to user space.
+    pub const HANDED_OVER: u32 = 3;
+    /// Not RTPS.
+    pub const FOREIGN: u32 = 4;
+    /// Complete; late copies of fragments change nothing.
+    pub const DONE: u32 = 5;
+}
+
+/// One IP fragment; 1 = keep the frame.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn pass(skb: *mut __sk_buff) -> u32 {
+    let Some(scratch) = scratch() else { return 0 };
+    count(Counter::Fragments, 1);
+    let Some(flow) = flow(scratch) else {
+        count(Counter::FlowTableFull, 1);
+        return 0;
+    };
+    let (offset, len, more) = (scratch.packet.offset, scratch.packet.len, scratch.packet.more);
+    if flow.state == state::DONE || flow.state == state::FOREIGN && offset != 0 {
+        return 0;
+    }
+    let (cell, mask) = (offset >> 9 & 127, 1_u64 << (offset >> 9 & 63));
+    let cells = if cell < 64 { &mut flow.cells[0] } else { &mut flow.cells[1] };
+    if *cells & mask != 0 {
+        count(Counter::FragmentsRepeated, 1);
+        return u32::from(flow.state == state::CAPTURED || flow.state == state::HANDED_OVER);
+    }
+    *cells |= mask;
+    flow.seen += len;
+    if more == 0 {
+        flow.expected = offset + len;
+    }
+    let complete = flow.expected != 0 && flow.expected == flow.seen;
+    let keep = if offset == 0 {
+        first(skb, scratch, flow)
+    } else {
+        trailing(skb, scratch, flow)
+    };
+    if complete {
+        finish(scratch, flow);
+    }
+    keep
+}
+
+/// The flow of the fragment at hand, made new when there is none or its identification is reused.
+#[inline(always)]
+fn flow(scratch: &mut Scratch) -> Option<&'static mut Flow> {
+    let packet = &scratch.packet;
+    let key = FlowKey {
+        source: packet.source,
+        destination: packet.destination,
+        identification: packet.identification,
+        interface: packet.interface | packet.outgoing << 31,
+    };
+    if let Some(flow) = FLOWS.get_ptr_mut(key) {
+        // SAFETY: a map value pointer checked against null. An LRU entry may be given to another
+        // key while we hold it; then two flows are miscounted, no memory is.
+        let flow = unsafe { &mut *flow };
+        let reused = flow.state == state::DONE && packet.offset == 0;
+        if !reused && packet.now.wrapping_sub(flow.born) < FLOW_LIFETIME_NANOSECONDS {
+            return Some(flow);
+        }
+    }
+    if packet.offset != 0 {
+        count(Counter::FragmentsWithoutFlow, 1);
+    }
+    // SAFETY: NEW_FLOW is never written, so it stays all zero.
+    let empty = unsafe { &*NEW_FLOW.get_ptr(0)? };
+    FLOWS.insert(key, empty, 0).ok()?;
+    // SAFETY: as above.
+    let flow = unsafe { &mut *FLOWS.get_ptr_mut(key)? };
+    flow.born = packet.now;
+    flow.token = packet.now as u32 | 1;
+    Some(flow)
+}
+
+/// The fragment with the UDP header.
+#[inline(always)]
+fn first(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
+    if verdict::begin(skb, scratch).is_none() {
+        flow.state = state::FOREIGN;
+        return 0;
+    }
+    scratch.walk.record.datagram = flow.token;
+    // Any fragment seen before this one was captured: so is the whole.
+    let alone = flow.seen == scratch.packet.len;
+    let (base, present) = (scratch.packet.body + 8, scratch.packet.len - 8);
+    let result = if alone { verdict::run(skb, base, present) } else { progress::CAPTURE };
+    if result >= progress::CAPTURE {
+        // Also when a header is split: user space gets the datagram from its start.
+        flow.state = state::CAPTURED;
+        verdict::captured(scratch);
+        return 1;
+    }
+    flow.state = state::WALKING;
+    keep_walk(scratch, flow);
+    0
+}
+
+/// A later fragment.
+#[inline(always)]
+fn trailing(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
+    if flow.state == state::HEADLESS {
+        // Nobody may fill the packet ring with fragments of nothing.
+        return u32::from(verdict::charge(scratch.packet.len));
+    }
+    if flow.state != state::WALKING {
+        return 1;
+    }
+    // In the UDP payload, which begins 8 bytes into the IP payload.
+    let start = scratch.packet.offset - 8;
+    let end = start + scratch.packet.len;
+    let next = flow.walk.offset;
+    if next >= end || next + 4 > flow.walk.datagram_len {
+        return 0;
+    }
+    scratch.walk = flow.walk;
+    scratch.count = 0;
+    scratch.unknown = 0;
+    // The walk goes on in a fragment that has not come yet: this one is out of order.
+    let result = if next < start {
+        progress::SPLIT
+    } else {
+        verdict::run(skb, scratch.packet.body.wrapping_sub(start), end)
+    };
+    keep_walk(scratch, flow);
+    if result < progress::CAPTURE {
+        return 0;
+    }
+    hand_over(scratch, flow);
+    verdict::captured(scratch);
+    1
+}
+
+/// Sends ahead what was found, but for the last record, and puts the walk's state away.
+#[inline(always)]
+fn keep_walk(scratch: &mut Scratch, flow: &mut Flow) {
+    let found = scratch.count;
+    flow.walk = scratch.walk;
+    if found == 0 {
+        return;
+    }
+    send_pending(flow, flag::AHEAD);
+    if found > 1 {
+        verdict::flush(found - 1, u32::from(flag::AHEAD));
+        flow.ahead = 1;
+    }
+    if let Some(last) = scratch.records.get(found as usize - 1) {
+        flow.pending = *last;
+        flow.has_pending = 1;
+    }
+}
+
+#[inline(always)]
+fn send_pending(flow: &mut Flow, flags: u16) {
+    if flow.has_pending != 0 {
+        flow.has_pending = 0;
+        flow.pending.flags |= flags;
+        flow.ahead = 1;
+        verdict::write(&flow.pending);
+    }
+}
+
+/// Tells user space how to go on with the datagram.
+#[inline(always)]
+fn hand_over(scratch: &Scratch, flow: &mut Flow) {
+    send_pending(flow, flag::AHEAD);
+    flow.state = state::HANDED_OVER;
+    flow.ahead = 1;
+    let (walk, packet) = (&scratch.walk, &scratch.packet);
+    let record = &mut flow.pending;
+    *record = walk.record;
+    record.time = packet.now;
+    record.kind = kind::HANDOVER;
+    record.submessage_flags = 0;
+    record.flags |= flag::AHEAD;
+    record.writer = [walk.source[0], walk.source[1], walk.source[2], 0];
+    record.reader = [walk.destination[0], walk.destination[1], walk.destination[2], 0];
+    record.sequence_number = 0;
+    record.source_timestamp = u64::from(walk.timestamp[0]) << 32 | u64::from(walk.timestamp[1]);
+    record.payload_len = walk.offset;
+    record.encapsulation = packet.identification;
+    record.stamp_seconds = packet.source[0];
+    record.stamp_nanoseconds = packet.source[1];
+    record.fragment_start = packet.source[2];
+    record.fragments = packet.source[3];
+    record.sample_size = 0;
+    record.status_info = 0;
+    count(Counter::HandedOver, 1);
+    verdict::write(&flow.pending);
+}
+
+/// All fragments have come.
+#[inline(always)]
+fn finish(scratch: &Scratch, flow: &mut Flow) {
+    let (walked, handed_over) =
+        (flow.state == state::WALKING, flow.state == state::HANDED_OVER);
+    flow.state = state::DONE;
+    if !walked && !handed_over {
+        return;
+    }
+    let metered = flow.has_pending != 0 || flow.ahead != 0;
+    if walked {
+        count(if metered { Counter::Metered } else { Counter::Ignored }, 1);
+    }
+    if !metered {
+        return;
+    }
+    count(Counter::FragmentedComplete, 1);
+    if flow.has_pending == 0 {
+        // Everything was sent ahead: say that it counts now.
+        complete(flow);
+    }
+    flow.has_pending = 0;
+    flow.pending.time = scratch.packet.now;
+    verdict::write(&flow.pending);
+}
+
+#[inline(always)]
+fn complete(flow: &mut Flow) {
+    let token = flow.token;
+    let record: &mut Record = &mut flow.pending;
+    record.kind = kind::COMPLETE;
+    record.datagram = token;
+    record.flags &= !flag::AHEAD;
+}

@@ -1,0 +1,82 @@
+//! The kernel filter: reads copies, returns how much of a frame user space gets, changes nothing.
+//!
+//! Thin on purpose. What a submessage is and what becomes of it is decided by
+//! `ros2probe_wire::walk`, the same code that user space runs; here are the socket buffer, the maps
+//! and the fragments. A second hook is another entry point beside [`wire`].
+//!
+//! Stays inside what Linux 5.10 verifies: bounded loops, global functions that are verified once,
+//! reads of fixed size, no spin lock, no atomics that return a value.
+
+#![no_std]
+#![no_main]
+
+mod fragment;
+mod maps;
+mod packet;
+mod verdict;
+
+use aya_ebpf::{bindings::__sk_buff, macros::socket_filter, programs::SkBuffContext};
+use ros2probe_wire::filter::Counter;
+
+use crate::maps::{INTERFACES, count, setting};
+
+/// `skb->pkt_type` of a frame that this host sends.
+const PACKET_OUTGOING: u32 = 4;
+/// The loopback device has this index in every network namespace.
+const LOOPBACK: u32 = 1;
+
+/// For an AF_PACKET SOCK_DGRAM socket: the frame begins at the IP header. Returns the bytes that go
+/// into the socket's packet ring: all of the frame, or none.
+#[socket_filter]
+pub fn wire(context: SkBuffContext) -> i64 {
+    frame(context.skb.skb).unwrap_or(0)
+}
+
+#[inline(always)]
+fn frame(skb: *mut __sk_buff) -> Option<i64> {
+    // SAFETY: the verifier rewrites reads of these fields; `skb` is the program's context.
+    let (pkt_type, interface, segments) =
+        unsafe { ((*skb).pkt_type, (*skb).ifindex, (*skb).gso_segs) };
+    if interface == LOOPBACK && pkt_type == PACKET_OUTGOING {
+        // Loopback frames pass twice; the copy on its way in is the one that counts.
+        count(Counter::LoopbackCopies, 1);
+        return Some(0);
+    }
+    let accepted = match INTERFACES.get_ptr(interface) {
+        // SAFETY: a map value pointer that was checked against null.
+        Some(accepted) => unsafe { *accepted },
+        None => setting!(NEW_INTERFACES),
+    };
+    if accepted == 0 {
+        count(Counter::InterfaceExcluded, 1);
+        return Some(0);
+    }
+    if packet::parse(skb) == 0 {
+        return Some(0);
+    }
+    if segments > 1 {
+        count(Counter::Segmented, 1);
+        return Some(0);
+    }
+    let keep = if packet::is_fragment()? {
+        fragment::pass(skb)
+    } else {
+        verdict::whole(skb)
+    };
+    if keep == 0 {
+        return Some(0);
+    }
+    // SAFETY: as above.
+    let len = unsafe { (*skb).len };
+    count(Counter::CapturedBytes, u64::from(len));
+    Some(i64::from(len))
+}
+
+#[panic_handler]
+fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+    loop {}
+}
+
+#[unsafe(link_section = "license")]
+#[unsafe(no_mangle)]
+static LICENSE: [u8; 4] = *b"GPL\0";

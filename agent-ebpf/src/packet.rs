@@ -1,0 +1,166 @@
+//! From the socket buffer to an IP payload that is UDP.
+
+use aya_ebpf::{
+    bindings::__sk_buff,
+    helpers::{bpf_ktime_get_ns, generated::bpf_skb_load_bytes},
+};
+use core::mem::MaybeUninit;
+use ros2probe_wire::{filter::Counter, walk};
+
+use crate::{
+    PACKET_OUTGOING,
+    maps::{Packet, count, scratch},
+};
+
+const UDP: u32 = 17;
+/// First two words of an IPv4-mapped address as they lie in memory.
+const IPV4_MAPPED: u32 = u32::from_ne_bytes([0, 0, 0xff, 0xff]);
+/// EtherTypes 802.1Q and 802.1ad, as `skb->protocol` holds them.
+const VLAN: u32 = 0x8100_u16.to_be() as u32;
+const SERVICE_VLAN: u32 = 0x88a8_u16.to_be() as u32;
+
+/// The UDP payload as the walk reads it: payload offset 0 is at `base` of the socket buffer
+/// (wrapping: for a trailing IP fragment that lies before the frame).
+pub struct Payload {
+    pub skb: *mut __sk_buff,
+    pub base: u32,
+}
+
+impl walk::Bytes for Payload {
+    #[inline(always)]
+    fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]> {
+        load(self.skb, self.base.wrapping_add(offset))
+    }
+}
+
+/// Copies a plain value out of the socket buffer.
+#[inline(always)]
+pub fn load<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
+    let mut value = MaybeUninit::<T>::uninit();
+    // SAFETY: the destination has the size given; the kernel checks the offset.
+    let result = unsafe {
+        bpf_skb_load_bytes(skb.cast(), offset, value.as_mut_ptr().cast(), size_of::<T>() as u32)
+    };
+    if result != 0 {
+        return None;
+    }
+    // SAFETY: the helper has filled all of it; only integer arrays are loaded.
+    Some(unsafe { value.assume_init() })
+}
+
+/// Whether the packet at hand is an IP fragment.
+#[inline(always)]
+pub fn is_fragment() -> Option<bool> {
+    Some(scratch()?.packet.fragmented != 0)
+}
+
+/// Fills in the scratch packet; 1 when it is (part of) a UDP datagram.
+// Global (not inlined) functions are verified once each, whatever calls them.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn parse(skb: *mut __sk_buff) -> u32 {
+    let Some(scratch) = scratch() else { return 0 };
+    let packet = &mut scratch.packet;
+    // SAFETY: the verifier rewrites reads of these fields.
+    let (pkt_type, protocol, interface) =
+        unsafe { ((*skb).pkt_type, (*skb).protocol, (*skb).ifindex) };
+    packet.outgoing = u32::from(pkt_type == PACKET_OUTGOING);
+    packet.interface = interface;
+    // SAFETY: no preconditions.
+    packet.now = unsafe { bpf_ktime_get_ns() };
+    // The kernel strips the outer VLAN tag on the way in; a second one is still there.
+    let start = if pkt_type != PACKET_OUTGOING && (protocol == VLAN || protocol == SERVICE_VLAN) {
+        4
+    } else {
+        0
+    };
+    let Some([first]) = load::<[u8; 1]>(skb, start) else { return 0 };
+    let is_udp = match first >> 4 {
+        4 => ipv4(skb, start, packet),
+        6 => ipv6(skb, start, packet),
+        _ => None,
+    };
+    if is_udp.is_none() {
+        return 0;
+    }
+    count(Counter::Frames, 1);
+    1
+}
+
+/// RFC 791.
+#[inline(always)]
+fn ipv4(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
+    let [first, second, third, source, destination]: [u32; 5] = load(skb, start)?;
+    let (first, second, third) =
+        (u32::from_be(first), u32::from_be(second), u32::from_be(third));
+    if third >> 16 & 0xff != UDP {
+        return None;
+    }
+    let header = (first >> 24 & 0xf) * 4;
+    let total = first & 0xffff;
+    if header < 20 || total < header {
+        return None;
+    }
+    packet.body = start + header;
+    packet.len = total - header;
+    packet.offset = (second & 0x1fff) * 8;
+    packet.more = second >> 13 & 1;
+    packet.identification = second >> 16;
+    packet.fragmented = u32::from(second & 0x3fff != 0);
+    packet.ipv6 = 0;
+    packet.source = [0, 0, IPV4_MAPPED, source];
+    packet.destination = [0, 0, IPV4_MAPPED, destination];
+    Some(())
+}
+
+/// RFC 8200, with up to eight extension headers.
+#[inline(always)]
+fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
+    let header: [u32; 10] = load(skb, start)?;
+    let lengths = u32::from_be(header[1]);
+    packet.source = [header[2], header[3], header[4], header[5]];
+    packet.destination = [header[6], header[7], header[8], header[9]];
+    packet.ipv6 = 1;
+    packet.offset = 0;
+    packet.more = 0;
+    packet.identification = 0;
+    packet.fragmented = 0;
+    let end = start + 40 + (lengths >> 16);
+    let mut next = lengths >> 8 & 0xff;
+    let mut at = start + 40;
+    let mut extensions = 0;
+    while extensions < 8 {
+        if next == UDP {
+            if at > end {
+                return None;
+            }
+            packet.body = at;
+            packet.len = end - at;
+            return Some(());
+        }
+        if packet.offset != 0 {
+            // Behind a fragment header that is not the first, no header follows.
+            return None;
+        }
+        let [word, second]: [u32; 2] = load(skb, at)?;
+        let word = u32::from_be(word);
+        match next {
+            // Hop-by-hop, routing, destination options: length in 8 bytes beyond the first 8.
+            0 | 43 | 60 => at += ((word >> 16 & 0xff) + 1) * 8,
+            44 => {
+                packet.fragmented = u32::from(word & 0xfff9 != 0);
+                // The offset field counts 8 bytes and stands three bits up: its value is bytes.
+                packet.offset = word & 0xfff8;
+                packet.more = word & 1;
+                packet.identification = u32::from_be(second);
+                at += 8;
+            }
+            // Authentication header: length in 4 bytes beyond the first 8.
+            51 => at += ((word >> 16 & 0xff) + 2) * 4,
+            _ => return None,
+        }
+        next = word >> 24;
+        extensions += 1;
+    }
+    None
+}

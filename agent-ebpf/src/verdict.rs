@@ -1,0 +1,261 @@
+//! The three verdicts on a datagram: ignore, meter, capture.
+
+use aya_ebpf::bindings::__sk_buff;
+use ros2probe_wire::{
+    filter::{Budget, Counter, UNKNOWN_CAPTURE_BYTES},
+    record::{Record, Verdict, flag},
+    walk::{self, Fate, MAGIC, Step},
+};
+
+use crate::{
+    maps::{
+        BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, UNKNOWN, count,
+        scratch, setting,
+    },
+    packet::{Payload, load},
+};
+
+/// Submessages that one run of the program follows; a datagram with more is captured.
+const SUBMESSAGES: u32 = 64;
+/// `BPF_RB_NO_WAKEUP`, `BPF_RB_FORCE_WAKEUP`, `BPF_RB_AVAIL_DATA`.
+const NO_WAKEUP: u64 = 1;
+const FORCE_WAKEUP: u64 = 2;
+const AVAILABLE_DATA: u64 = 0;
+
+/// What [`advance`] says; values cross a function boundary as `u32`.
+pub mod progress {
+    /// There may be more submessages here.
+    pub const ON: u32 = 0;
+    /// Nothing more in this frame.
+    pub const STOP: u32 = 1;
+    /// User space has to see the datagram.
+    pub const CAPTURE: u32 = 2;
+    /// The submessage goes on in a later fragment: user space has to read it.
+    pub const SPLIT: u32 = 3;
+}
+
+/// A datagram in one frame; 1 = keep the frame.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn whole(skb: *mut __sk_buff) -> u32 {
+    let Some(scratch) = scratch() else { return 0 };
+    if begin(skb, scratch).is_none() {
+        return 0;
+    }
+    if scratch.walk.datagram_len + 8 > scratch.packet.len {
+        count(Counter::Malformed, 1);
+        return 0;
+    }
+    let (base, present) = (scratch.packet.body + 8, scratch.walk.datagram_len);
+    if run(skb, base, present) >= progress::CAPTURE {
+        captured(scratch);
+        return 1;
+    }
+    let records = scratch.count;
+    count(if records == 0 { Counter::Ignored } else { Counter::Metered }, 1);
+    flush(records, 0);
+    0
+}
+
+/// Reads the UDP and RTPS headers of the packet at hand and starts the walk; `None` when it is not
+/// RTPS.
+#[inline(always)]
+pub fn begin(skb: *mut __sk_buff, scratch: &mut Scratch) -> Option<()> {
+    let packet = &scratch.packet;
+    if packet.len < 8 + walk::HEADER_LEN {
+        return None;
+    }
+    let [ports, lengths, magic, _version, source @ ..]: [u32; 7] = load(skb, packet.body)?;
+    if magic != MAGIC {
+        return None;
+    }
+    count(Counter::Messages, 1);
+    let udp_len = u32::from_be(lengths) >> 16;
+    if udp_len < 8 + walk::HEADER_LEN {
+        count(Counter::Malformed, 1);
+        return None;
+    }
+    let (now, destination, interface) = (packet.now, packet.destination, packet.interface);
+    let flags = (if packet.fragmented != 0 { flag::FRAGMENTED } else { 0 })
+        | (if packet.outgoing != 0 { flag::OUTGOING } else { 0 })
+        | (if packet.ipv6 != 0 { flag::IPV6 } else { 0 });
+    scratch.count = 0;
+    scratch.unknown = 0;
+    let record = &mut scratch.walk.record;
+    record.time = now;
+    record.destination = destination;
+    record.destination_port = (u32::from_be(ports) & 0xffff) as u16;
+    record.interface = interface;
+    record.datagram = 0;
+    record.flags = flags;
+    scratch.walk.begin(source, udp_len - 8);
+    if let Some(last) = PARTICIPANTS.get_ptr_mut(source) {
+        // SAFETY: a map value pointer checked against null; racing writers store the same moment.
+        unsafe { *last = now }
+    }
+    Some(())
+}
+
+/// Walks the submessages that begin before `present`; the strongest [`progress`] met.
+#[inline(always)]
+pub fn run(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
+    let mut submessages = 0;
+    while submessages < SUBMESSAGES {
+        let result = advance(skb, base, present);
+        if result != progress::ON {
+            return result;
+        }
+        submessages += 1;
+    }
+    progress::CAPTURE
+}
+
+/// One submessage.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
+    let Some(scratch) = scratch() else { return progress::STOP };
+    let before = scratch.walk.offset;
+    let result = match walk::step(&mut scratch.walk, &Payload { skb, base }, present) {
+        Step::End | Step::Later => progress::STOP,
+        Step::Passed => progress::ON,
+        Step::Split => progress::SPLIT,
+        Step::Malformed => {
+            count(Counter::Malformed, 1);
+            progress::STOP
+        }
+        Step::Endpoint => endpoint(scratch, false),
+        Step::LongGap => endpoint(scratch, true),
+    };
+    if result == progress::CAPTURE {
+        // Whoever takes over reads this submessage again.
+        scratch.walk.offset = before;
+    }
+    result
+}
+
+/// Asks the interest map about the submessage at hand.
+#[inline(always)]
+fn endpoint(scratch: &mut Scratch, long_gap: bool) -> u32 {
+    let record = &scratch.walk.record;
+    let (key, unknown_counts) = match walk::fate(record) {
+        Fate::Ignore => return progress::ON,
+        Fate::Capture => return progress::CAPTURE,
+        Fate::Writer => (record.writer, true),
+        Fate::Reader => (record.reader, false),
+    };
+    let meter = match INTEREST.get_ptr(key) {
+        // SAFETY: a map value pointer checked against null.
+        Some(verdict) => match unsafe { *verdict } {
+            verdict if verdict == Verdict::Capture as u32 => return progress::CAPTURE,
+            verdict => verdict == Verdict::Meter as u32,
+        },
+        None if unknown_counts => match unknown(scratch, key) {
+            progress::CAPTURE => return progress::CAPTURE,
+            admitted => admitted == progress::STOP,
+        },
+        None => false,
+    };
+    if !meter {
+        return progress::ON;
+    }
+    let index = scratch.count;
+    if long_gap || index >= RECORDS_PER_DATAGRAM {
+        return progress::CAPTURE;
+    }
+    let record = scratch.walk.record;
+    if let Some(slot) = scratch.records.get_mut(index as usize) {
+        *slot = record;
+    }
+    scratch.count = index + 1;
+    progress::ON
+}
+
+/// A writer that user space has not classified: `CAPTURE` within its budget, then `STOP` for one
+/// record, then `ON` for nothing.
+#[inline(always)]
+fn unknown(scratch: &mut Scratch, key: [u32; 4]) -> u32 {
+    let len = scratch.walk.datagram_len;
+    let used = match UNKNOWN.get_ptr_mut(key) {
+        Some(used) => used,
+        None => {
+            let _ = UNKNOWN.insert(key, 0, 0);
+            match UNKNOWN.get_ptr_mut(key) {
+                Some(used) => used,
+                None => return progress::ON,
+            }
+        }
+    };
+    // SAFETY: a map value pointer checked against null.
+    let used = unsafe { &mut *used };
+    if *used < UNKNOWN_CAPTURE_BYTES && charge(len) {
+        *used += len;
+        scratch.unknown = 1;
+        return progress::CAPTURE;
+    }
+    if spend(Budget::Records, 1) {
+        count(Counter::MeteredUnknown, 1);
+        return progress::STOP;
+    }
+    count(Counter::UnknownOverBudget, 1);
+    progress::ON
+}
+
+/// Takes the bytes of something unclassified out of the capture budget.
+#[inline(always)]
+pub fn charge(len: u32) -> bool {
+    spend(Budget::CaptureBytes, len)
+}
+
+#[inline(always)]
+fn spend(budget: Budget, amount: u32) -> bool {
+    let Some(left) = BUDGET.get_ptr_mut(budget as u32) else { return false };
+    // SAFETY: a map value pointer checked against null. It is a budget, not an account: CPUs that
+    // race may overdraw it by a datagram.
+    let left = unsafe { &mut *left };
+    let granted = *left > 0;
+    if granted {
+        *left -= i64::from(amount);
+    }
+    granted
+}
+
+/// Counts a datagram that goes to user space.
+#[inline(always)]
+pub fn captured(scratch: &Scratch) {
+    count(Counter::Captured, 1);
+    if scratch.unknown != 0 {
+        count(Counter::CapturedUnknown, 1);
+    }
+}
+
+/// Writes the first `records` scratch records, each with `flags` added.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn flush(records: u32, flags: u32) -> u32 {
+    let Some(scratch) = scratch() else { return 0 };
+    let mut index = 0;
+    while index < RECORDS_PER_DATAGRAM {
+        if index >= records {
+            break;
+        }
+        if let Some(record) = scratch.records.get_mut(index as usize) {
+            record.flags |= flags as u16;
+            write(record);
+        }
+        index += 1;
+    }
+    0
+}
+
+/// Writes one record; user space is woken only when the ring runs full.
+#[inline(always)]
+pub fn write(record: &Record) {
+    let wake = if RECORDS.query(AVAILABLE_DATA) > setting!(WAKE_BYTES) {
+        FORCE_WAKEUP
+    } else {
+        NO_WAKEUP
+    };
+    let written = RECORDS.output::<Record>(record, wake).is_ok();
+    count(if written { Counter::Records } else { Counter::RecordsLost }, 1);
+}

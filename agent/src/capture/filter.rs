@@ -1,0 +1,296 @@
+//! The kernel filter from user space: load it, tell it what is of interest, read what it found.
+//!
+//! The object is committed beside its source (`agent-ebpf/`), so no BPF toolchain is needed here.
+//! Needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8).
+
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
+
+use aya::maps::{Array, HashMap, Map, MapData, MapError, PerCpuArray, RingBuf};
+use aya::programs::{ProgramError, ProgramFd, SocketFilter};
+use aya::{Ebpf, EbpfError, EbpfLoader};
+use ros2probe_wire::filter::{Budget, Counter};
+use ros2probe_wire::record::{Verdict, guid_words};
+use ros2probe_wire::{Guid, GuidPrefix, Record};
+use zerocopy::FromBytes;
+
+/// The object `agent-ebpf/build.sh` made. Aligned, because ELF is read in place.
+static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
+
+#[repr(align(8))]
+struct Aligned<T: ?Sized>(T);
+
+/// Why the filter is not running.
+#[derive(Debug, thiserror::Error)]
+pub enum FilterError {
+    /// The kernel refuses BPF to this process.
+    #[error("loading the kernel filter is not permitted")]
+    NotPermitted(#[source] io::Error),
+    /// The object does not load.
+    #[error("the kernel filter does not load")]
+    Load(#[source] EbpfError),
+    /// The verifier refuses the program.
+    #[error("the kernel refuses the filter program")]
+    Program(#[source] ProgramError),
+    /// The object lacks a part that this binary needs.
+    #[error("the kernel filter object has no {0}")]
+    Missing(&'static str),
+    /// A map operation failed.
+    #[error("the kernel filter's {map} map: {action}")]
+    Map {
+        /// Which map.
+        map: &'static str,
+        /// What was being done.
+        action: &'static str,
+        /// Why it failed.
+        #[source]
+        source: MapError,
+    },
+}
+
+/// Sizes and defaults of one loaded filter.
+#[derive(Clone, Copy, Debug)]
+pub struct FilterSettings {
+    /// Bytes of the record ring; rounded up to a power of two of at least a page.
+    pub record_ring_bytes: u32,
+    /// Whether to look at interfaces that [`Filter::accept_interface`] has not been told about.
+    pub accept_new_interfaces: bool,
+}
+
+impl Default for FilterSettings {
+    fn default() -> Self {
+        Self {
+            record_ring_bytes: 512 * 1024,
+            accept_new_interfaces: true,
+        }
+    }
+}
+
+/// One loaded filter with its maps.
+
+pub struct Filter {
+    program: ProgramFd,
+    interest: HashMap<MapData, [u32; 4], u32>,
+    participants: HashMap<MapData, [u32; 3], u64>,
+    interfaces: HashMap<MapData, u32, u32>,
+    budget: Array<MapData, i64>,
+    counters: PerCpuArray<MapData, u64>,
+    records: RingBuf<MapData>,
+}
+
+impl Filter {
+    /// Loads the program and its maps; attaches it to nothing.
+    ///
+    /// # Errors
+    /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
+    pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
+        let ring = settings
+            .record_ring_bytes
+            .next_power_of_two()
+            .max(page_size());
+        let accept = u32::from(settings.accept_new_interfaces);
+        let wake = u64::from(ring / 2);
+        let mut ebpf = EbpfLoader::new()
+            .override_global("NEW_INTERFACES", &accept, true)
+            .override_global("WAKE_BYTES", &wake, true)
+            .map_max_entries("RECORDS", ring)
+            .load(&OBJECT.0)
+            .map_err(FilterError::load)?;
+        let program: &mut SocketFilter = ebpf
+            .program_mut("wire")
+            .ok_or(FilterError::Missing("program wire"))?
+            .try_into()
+            .map_err(FilterError::Program)?;
+        program.load().map_err(FilterError::program)?;
+        let program = program
+            .fd()
+            .map_err(FilterError::Program)?
+            .try_clone()
+            .map_err(|error| FilterError::Program(ProgramError::IOError(error)))?;
+        let mut budget: Array<_, i64> = take(&mut ebpf, "BUDGET")?;
+        for index in [Budget::CaptureBytes, Budget::Records] {
+            budget
+                .set(index as u32, 0, 0)
+                .map_err(failed("BUDGET", "clear"))?;
+        }
+        Ok(Self {
+            program,
+            interest: take(&mut ebpf, "INTEREST")?,
+            participants: take(&mut ebpf, "PARTICIPANTS")?,
+            interfaces: take(&mut ebpf, "INTERFACES")?,
+            budget,
+            counters: take(&mut ebpf, "COUNTERS")?,
+            records: take(&mut ebpf, "RECORDS")?,
+        })
+    }
+
+    /// The loaded program, for attaching it to a socket.
+    #[must_use]
+    pub fn program(&self) -> BorrowedFd<'_> {
+        self.program.as_fd()
+    }
+
+    /// Readable when the record ring is half full.
+    #[must_use]
+    pub fn record_ring(&self) -> BorrowedFd<'_> {
+        self.records.as_fd()
+    }
+
+    /// Sets or removes a writer's or reader's verdict.
+    ///
+    /// # Errors
+    /// When the map is full or the kernel refuses.
+    pub fn set_interest(
+        &mut self,
+        endpoint: Guid,
+        verdict: Option<Verdict>,
+    ) -> Result<(), FilterError> {
+        let key = guid_words(endpoint);
+        match verdict {
+            Some(verdict) => self.interest.insert(key, verdict as u32, 0),
+            None => absent_is_fine(self.interest.remove(&key)),
+        }
+        .map_err(failed("INTEREST", "update"))
+    }
+
+    /// Starts or stops noting when a participant last sent anything.
+    ///
+    /// # Errors
+    /// When the map is full or the kernel refuses.
+    pub fn follow_participant(
+        &mut self,
+        participant: GuidPrefix,
+        follow: bool,
+    ) -> Result<(), FilterError> {
+        let key = zerocopy::transmute!(participant);
+        if follow {
+            self.participants.insert(key, 0, 0)
+        } else {
+            absent_is_fine(self.participants.remove(&key))
+        }
+        .map_err(failed("PARTICIPANTS", "update"))
+    }
+
+    /// Followed participants and the CLOCK_MONOTONIC nanoseconds of their last message; those that
+    /// have sent nothing since they are followed are left out.
+    pub fn participants(&self) -> impl Iterator<Item = (GuidPrefix, u64)> + '_ {
+        self.participants.iter().filter_map(|entry| {
+            let (key, last): ([u32; 3], u64) = entry.ok()?;
+            (last != 0).then(|| (zerocopy::transmute!(key), last))
+        })
+    }
+
+    /// Looks at an interface's frames, or leaves them out.
+    ///
+    /// # Errors
+    /// When the map is full or the kernel refuses.
+    pub fn accept_interface(&mut self, index: u32, accept: bool) -> Result<(), FilterError> {
+        self.interfaces
+            .insert(index, u32::from(accept), 0)
+            .map_err(failed("INTERFACES", "update"))
+    }
+
+    /// Sets what unclassified writers may cost from now on, in bytes captured and records.
+    ///
+    /// # Errors
+    /// When the kernel refuses.
+    pub fn set_unknown_budget(&mut self, bytes: u32, records: u32) -> Result<(), FilterError> {
+        let entries = [(Budget::CaptureBytes, bytes), (Budget::Records, records)];
+        for (index, value) in entries {
+            self.budget
+                .set(index as u32, i64::from(value), 0)
+                .map_err(failed("BUDGET", "refill"))?;
+        }
+        Ok(())
+    }
+
+    /// All counters, summed over CPUs.
+    ///
+    /// # Errors
+    /// When the kernel refuses.
+    pub fn counters(&self) -> Result<Vec<(Counter, u64)>, FilterError> {
+        Counter::ALL
+            .into_iter()
+            .map(|counter| {
+                let values = self
+                    .counters
+                    .get(&(counter as u32), 0)
+                    .map_err(failed("COUNTERS", "read"))?;
+                Ok((counter, values.iter().sum()))
+            })
+            .collect()
+    }
+
+    /// The oldest record not read yet.
+    pub fn next_record(&mut self) -> Option<Record> {
+        let item = self.records.next()?;
+        Record::read_from_bytes(&item).ok()
+    }
+}
+
+impl FilterError {
+    /// Tells the operator's problem (no privilege) from ours.
+    fn load(error: EbpfError) -> Self {
+        match not_permitted(&error) {
+            Some(error) => Self::NotPermitted(error),
+            None => Self::Load(error),
+        }
+    }
+
+    fn program(error: ProgramError) -> Self {
+        match not_permitted(&error) {
+            Some(error) => Self::NotPermitted(error),
+            None => Self::Program(error),
+        }
+    }
+}
+
+/// The permission error at the end of an error's chain of causes.
+fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error> {
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        if let Some(io) = error.downcast_ref::<io::Error>()
+            && io.kind() == io::ErrorKind::PermissionDenied
+        {
+            return Some(io.raw_os_error().map_or_else(
+                || io::ErrorKind::PermissionDenied.into(),
+                io::Error::from_raw_os_error,
+            ));
+        }
+        cause = error.source();
+    }
+    None
+}
+
+fn take<T>(ebpf: &mut Ebpf, name: &'static str) -> Result<T, FilterError>
+where
+    T: TryFrom<Map, Error = MapError>,
+{
+    let map = ebpf.take_map(name).ok_or(FilterError::Missing(name))?;
+    T::try_from(map).map_err(failed(name, "open"))
+}
+
+fn failed(map: &'static str, action: &'static str) -> impl Fn(MapError) -> FilterError {
+    move |source| FilterError::Map {
+        map,
+        action,
+        source,
+    }
+}
+
+/// Removing what is not there has already succeeded.
+fn absent_is_fine(result: Result<(), MapError>) -> Result<(), MapError> {
+    match result {
+        Err(MapError::KeyNotFound) => Ok(()),
+        Err(MapError::SyscallError(error)) if error.io_error.kind() == io::ErrorKind::NotFound => {
+            Ok(())
+        }
+        other => other,
+    }
+}
+
+fn page_size() -> u32 {
+    // SAFETY: sysconf has no preconditions.
+    let size = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
+    u32::try_from(size).unwrap_or(65_536)
+}

@@ -1,0 +1,208 @@
+//! Holds what the kernel filter reports of a fragmented datagram before all of it has come.
+//!
+//! A datagram with a missing IP fragment was never delivered, so nothing in it may count. The filter
+//! cannot go back to earlier fragments; it sends their records ahead, marked, and says later that
+//! the datagram is complete. Until then they wait here, bounded in number and time.
+
+use std::collections::{HashMap, VecDeque};
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::record::{Record, flag, kind};
+
+use super::reassembly::Reassembled;
+
+/// Datagrams waited for; more push out the oldest.
+const DATAGRAMS: usize = 1024;
+/// Records held of one datagram. A UDP payload has room for at most 2,047 empty submessages.
+const RECORDS_PER_DATAGRAM: usize = 2048;
+/// Linux gives up a fragmented datagram after 30 seconds (`ipfrag_time`).
+const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
+
+/// What may be taken in now.
+#[derive(Debug)]
+pub enum Ready {
+    /// A record of a complete datagram.
+    Record(Record),
+    /// The rest of a complete datagram that the kernel filter handed over.
+    Rest(Reassembled),
+}
+
+/// Datagrams that are not complete yet.
+#[derive(Debug, Default)]
+pub struct Ahead {
+    waiting: HashMap<Token, Waiting>,
+    oldest: VecDeque<(Timestamp, Token)>,
+    given_up: u64,
+}
+
+/// One datagram of one source.
+type Token = (u32, u32);
+
+#[derive(Debug, Default)]
+struct Waiting {
+    records: Vec<Record>,
+    handed_over: bool,
+    rest: Option<Reassembled>,
+    /// Time of the frame that completed it.
+    complete: Option<u64>,
+}
+
+impl Ahead {
+    /// Takes in a record of source `namespace`. Handovers are the caller's to pass on to the
+    /// reassembly; here they only say that a rest will come.
+    pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(Ready)) {
+        let mut ready = ready;
+        if record.datagram == 0 {
+            return ready(Ready::Record(record));
+        }
+        let token = (namespace, record.datagram);
+        if record.flags & flag::AHEAD == 0 && !self.waiting.contains_key(&token) {
+            // The usual case: one record, written when the datagram was complete.
+            if record.kind != kind::COMPLETE {
+                ready(Ready::Record(record));
+            }
+            return;
+        }
+        let waiting = self.entry(token, Timestamp(record.time));
+        match record.kind {
+            kind::HANDOVER => waiting.handed_over = true,
+            kind::COMPLETE => {}
+            _ if waiting.records.len() < RECORDS_PER_DATAGRAM => waiting.records.push(record),
+            _ => {}
+        }
+        if record.flags & flag::AHEAD == 0 {
+            waiting.complete = Some(record.time);
+        }
+        self.settle(token, ready);
+    }
+
+    /// Takes in the rest of a handed-over datagram.
+    pub fn rest(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(Ready)) {
+        let Some(handover) = rest.handover else {
+            return;
+        };
+        let token = (namespace, handover.datagram);
+        let waiting = self.entry(token, rest.last_seen);
+        waiting.handed_over = true;
+        waiting.rest = Some(rest);
+        self.settle(token, ready);
+    }
+
+    /// Gives up what can no longer become complete.
+    pub fn advance(&mut self, now: Timestamp) {
+        while let Some((born, token)) = self.oldest.front().copied()
+            && now.nanoseconds_since(born) > LIFETIME_NANOSECONDS
+        {
+            self.oldest.pop_front();
+            self.given_up += u64::from(self.waiting.remove(&token).is_some());
+        }
+    }
+
+    /// Datagrams that were begun and never became complete, or had no room.
+    #[must_use]
+    pub const fn given_up(&self) -> u64 {
+        self.given_up
+    }
+
+    fn entry(&mut self, token: Token, at: Timestamp) -> &mut Waiting {
+        if !self.waiting.contains_key(&token) {
+            if self.oldest.len() >= DATAGRAMS
+                && let Some((_, oldest)) = self.oldest.pop_front()
+            {
+                self.given_up += u64::from(self.waiting.remove(&oldest).is_some());
+            }
+            self.oldest.push_back((at, token));
+        }
+        self.waiting.entry(token).or_default()
+    }
+
+    fn settle(&mut self, token: Token, mut ready: impl FnMut(Ready)) {
+        let Some(waiting) = self.waiting.get(&token) else {
+            return;
+        };
+        let Some(time) = waiting.complete else { return };
+        if waiting.handed_over && waiting.rest.is_none() {
+            return;
+        }
+        let Some(waiting) = self.waiting.remove(&token) else {
+            return;
+        };
+        for record in waiting.records {
+            ready(Ready::Record(Record {
+                time,
+                flags: record.flags & !flag::AHEAD,
+                ..record
+            }));
+        }
+        if let Some(rest) = waiting.rest {
+            ready(Ready::Rest(rest));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn record(datagram: u32, kind: u8, flags: u16, time: u64) -> Record {
+        Record {
+            datagram,
+            kind,
+            flags,
+            time,
+            ..Record::default()
+        }
+    }
+
+    fn taken(ahead: &mut Ahead, record: Record) -> Vec<Record> {
+        let mut all = Vec::new();
+        ahead.record(0, record, |ready| match ready {
+            Ready::Record(record) => all.push(record),
+            Ready::Rest(_) => unreachable!("nothing was handed over"),
+        });
+        all
+    }
+
+    #[test]
+    fn an_incomplete_datagram_never_counts() {
+        let mut ahead = Ahead::default();
+        assert!(taken(&mut ahead, record(9, kind::DATA, flag::AHEAD, 1)).is_empty());
+        ahead.advance(Timestamp(31_000_000_000));
+        assert_eq!(ahead.given_up(), 1);
+        assert!(taken(&mut ahead, record(9, kind::COMPLETE, 0, 2)).is_empty());
+    }
+
+    #[test]
+    fn records_sent_ahead_count_once_the_last_one_came_and_bear_its_time() {
+        let mut ahead = Ahead::default();
+        taken(
+            &mut ahead,
+            record(9, kind::DATA, flag::AHEAD | flag::FRAGMENTED, 1),
+        );
+        let all = taken(&mut ahead, record(9, kind::HEARTBEAT, flag::FRAGMENTED, 5));
+        let kinds: Vec<_> = all
+            .iter()
+            .map(|record| (record.kind, record.time))
+            .collect();
+        assert_eq!(kinds, [(kind::DATA, 5), (kind::HEARTBEAT, 5)]);
+        assert!(all.iter().all(|record| record.flags == flag::FRAGMENTED));
+    }
+
+    #[test]
+    fn a_datagram_of_another_namespace_is_another_datagram() {
+        let mut ahead = Ahead::default();
+        taken(&mut ahead, record(9, kind::DATA, flag::AHEAD, 1));
+        let mut seen = 0;
+        ahead.record(1, record(9, kind::DATA, 0, 2), |_| seen += 1);
+        assert_eq!(seen, 1);
+    }
+
+    #[test]
+    fn a_storm_of_datagrams_that_never_end_stays_bounded() {
+        let mut ahead = Ahead::default();
+        for token in 1..10_000 {
+            taken(&mut ahead, record(token, kind::DATA, flag::AHEAD, 1));
+        }
+        assert!(ahead.waiting.len() <= DATAGRAMS && ahead.oldest.len() <= DATAGRAMS);
+    }
+}

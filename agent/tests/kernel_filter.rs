@@ -1,0 +1,428 @@
+//! The kernel program against the user-space walk: the same records, to the byte.
+//!
+//! Every frame of every capture goes through the loaded program (BPF_PROG_TEST_RUN: no interface,
+//! no socket) and through the reassembly and walk of user space. Needs root.
+
+mod program_run;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use program_run::{Kernel, Seen};
+use ros2probe::capture::pcap::PcapReader;
+use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_wire::frame::{self, Link, PacketType, Payload};
+use ros2probe_wire::record::{Record, Verdict, flag, guid_words};
+use ros2probe_wire::walk::{self, Envelope, Fate};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+/// One IP packet of a capture.
+struct IpPacket {
+    bytes: Vec<u8>,
+    time: u64,
+}
+
+fn captures() -> Vec<PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let mut found = Vec::new();
+    for folder in ["wire/tests/data", "agent/tests/data", "../shared/fixtures"] {
+        collect(&root.join(folder), &mut found);
+    }
+    assert!(
+        found.len() >= 3,
+        "the captures of the project itself are missing: {found:?}"
+    );
+    // Captures with a shortened frame length cannot be given to the kernel as frames.
+    found.retain(|path| !path.to_string_lossy().contains("snap256"));
+    found.sort();
+    found
+}
+
+fn collect(folder: &Path, found: &mut Vec<PathBuf>) {
+    let Ok(entries) = std::fs::read_dir(folder) else {
+        return;
+    };
+    for path in entries.map(|entry| entry.unwrap().path()) {
+        if path.is_dir() {
+            collect(&path, found);
+        } else if path.to_string_lossy().ends_with(".pcap.gz") {
+            found.push(path);
+        }
+    }
+}
+
+fn ip_packets(path: &Path) -> Vec<IpPacket> {
+    let mut reader = PcapReader::open(path).unwrap();
+    let mut packets = Vec::new();
+    while let Some(captured) = reader.next_packet().unwrap() {
+        let header = match captured.link {
+            Link::ETHERNET => 14,
+            Link::LINUX_SLL => 16,
+            Link::LINUX_SLL2 => 20,
+            other => panic!("{}: link type {other:?}", path.display()),
+        };
+        let parsed = frame::parse(captured.link, captured.bytes, captured.length).unwrap();
+        let Some(packet) = parsed.packet else {
+            continue;
+        };
+        let bytes = &captured.bytes[header..];
+        let pieces = match packet.payload {
+            // A program run takes a page at most: show it as a link with a smaller MTU would.
+            Payload::Datagram(udp) if bytes.len() > 3000 => {
+                let id = u32::try_from(packets.len()).unwrap() % 60_000;
+                program_run::fragments(udp.payload, 2960, false, id)
+            }
+            _ => vec![bytes.to_vec()],
+        };
+        let time = captured.time.0;
+        packets.extend(pieces.into_iter().map(|bytes| IpPacket { bytes, time }));
+    }
+    packets
+}
+
+/// What user space makes of a packet: every datagram it completes, in whole.
+struct UserSpace {
+    reassembly: Reassembly,
+}
+
+impl UserSpace {
+    fn packet(&mut self, packet: &IpPacket, mut datagram: impl FnMut(&[u8], &Envelope)) {
+        let protocol = if packet.bytes[0] >> 4 == 4 {
+            0x0800
+        } else {
+            0x86dd
+        };
+        let len = u32::try_from(packet.bytes.len()).unwrap();
+        let parsed = frame::parse_cooked(protocol, PacketType::HOST, &packet.bytes, len);
+        let parsed = parsed.unwrap().unwrap();
+        let mut envelope = Envelope {
+            destination: parsed.destination,
+            interface: program_run::INTERFACE,
+            ..Envelope::default()
+        };
+        match parsed.payload {
+            Payload::Datagram(udp) => {
+                envelope.destination_port = udp.destination_port;
+                datagram(udp.payload, &envelope);
+            }
+            Payload::Fragment(fragment) => {
+                let at = ros2probe_wire::Timestamp(packet.time);
+                let key = FlowKey::new(0, program_run::INTERFACE, false, &parsed, &fragment);
+                if let Some(whole) = self.reassembly.fragment(at, key, &fragment) {
+                    envelope.destination_port = whole.destination_port;
+                    envelope.fragmented = true;
+                    datagram(whole.payload(), &envelope);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+fn user_space() -> UserSpace {
+    UserSpace {
+        reassembly: Reassembly::new(Limits {
+            bytes: 64 << 20,
+            ..Limits::default()
+        }),
+    }
+}
+
+/// The filter's verdict on a whole datagram, stated once more and plainly.
+fn expected(
+    payload: &[u8],
+    envelope: &Envelope,
+    interest: &BTreeMap<Guid, Verdict>,
+) -> (bool, Vec<Record>) {
+    let (mut capture, mut records) = (false, Vec::new());
+    walk::datagram(payload, envelope, None, |found| {
+        let record = found.record;
+        let endpoint = match walk::fate(&record) {
+            Fate::Ignore => return,
+            Fate::Capture => return capture = true,
+            Fate::Writer => record.writer(),
+            Fate::Reader => record.reader(),
+        };
+        match interest.get(&endpoint) {
+            Some(Verdict::Meter) => records.push(record),
+            Some(Verdict::Capture) => capture = true,
+            Some(Verdict::Ignore) | None => {}
+        }
+    });
+    (capture, if capture { Vec::new() } else { records })
+}
+
+/// All user endpoints that a capture mentions as sender.
+fn endpoints(packets: &[IpPacket]) -> BTreeSet<Guid> {
+    let mut found = BTreeSet::new();
+    let mut user = user_space();
+    for packet in packets {
+        user.packet(packet, |payload, envelope| {
+            walk::datagram(payload, envelope, None, |each| {
+                match walk::fate(&each.record) {
+                    Fate::Writer => drop(found.insert(each.record.writer())),
+                    Fate::Reader => drop(found.insert(each.record.reader())),
+                    _ => {}
+                }
+            });
+        });
+    }
+    found
+}
+
+fn comparable(record: Record) -> Record {
+    Record {
+        time: 0,
+        datagram: 0,
+        flags: record.flags & !flag::AHEAD,
+        ..record
+    }
+}
+
+fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
+    let packets = ip_packets(path);
+    let mut kernel = Kernel::load();
+    kernel.set_interest(interest);
+    let (mut user, mut records, mut captures) = (user_space(), 0, 0);
+    for (number, packet) in packets.iter().enumerate() {
+        let Seen {
+            kept,
+            records: found,
+        } = kernel.frame(&packet.bytes);
+        let mut wanted = Vec::new();
+        let mut captured = false;
+        let mut finished = false;
+        user.packet(packet, |payload, envelope| {
+            let (capture, records) = expected(payload, envelope, interest);
+            captured = capture;
+            wanted.extend(records);
+            finished = true;
+        });
+        if finished {
+            assert_eq!(kept, captured, "{} packet {number}: kept", path.display());
+            captures += usize::from(kept);
+        }
+        let found: Vec<_> = found.into_iter().map(comparable).collect();
+        let wanted: Vec<_> = wanted.into_iter().map(comparable).collect();
+        assert_eq!(found, wanted, "{} packet {number}: records", path.display());
+        records += found.len();
+    }
+    (records, captures)
+}
+
+#[test]
+fn the_kernel_and_user_space_make_the_same_records_of_every_capture() {
+    for path in captures() {
+        let all = endpoints(&ip_packets(&path));
+        let meter_all = all.iter().map(|guid| (*guid, Verdict::Meter)).collect();
+        let (records, captured) = compare(&path, &meter_all);
+        assert!(captured > 0, "{}: no discovery seen", path.display());
+        println!("{}: {records} records, {captured} captured", path.display());
+
+        let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
+        let mixed = all
+            .iter()
+            .copied()
+            .zip(verdicts.into_iter().cycle())
+            .collect();
+        compare(&path, &mixed);
+    }
+}
+
+#[test]
+fn an_unknown_writer_is_captured_until_its_budget_ends_then_metered_then_only_counted() {
+    let mut kernel = Kernel::load();
+    let writer = Guid::new(GuidPrefix(*b"\x01\x0fsomebodyxx"), EntityId([0, 0, 1, 3]));
+    let frame = |sn| program_run::data(writer, sn, 1000);
+
+    assert!(!kernel.frame(&frame(1)).kept, "no budget at first");
+    kernel.set_unknown_budget(2500, 2);
+    let seen: Vec<_> = (2..8).map(|sn| kernel.frame(&frame(sn))).collect();
+    let kept: Vec<_> = seen.iter().map(|seen| seen.kept).collect();
+    assert_eq!(kept, [true, true, true, false, false, false]);
+    let records: Vec<_> = seen.iter().map(|seen| seen.records.len()).collect();
+    assert_eq!(records, [0, 0, 0, 1, 1, 0]);
+
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    assert_eq!(kernel.frame(&frame(9)).records.len(), 1);
+}
+
+#[test]
+fn thirty_two_samples_in_one_datagram_become_records_and_more_make_it_captured() {
+    let writer = Guid::new(GuidPrefix(*b"\x01\x10packspacks"), EntityId([0, 0, 1, 3]));
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    let seen = kernel.frame(&program_run::datagram(&program_run::message(
+        writer,
+        1..=32,
+        20,
+    )));
+    let numbers: Vec<_> = seen
+        .records
+        .iter()
+        .map(|record| record.sequence_number)
+        .collect();
+    assert_eq!(
+        (seen.kept, numbers),
+        (false, (1..=32).collect::<Vec<u64>>())
+    );
+    let seen = kernel.frame(&program_run::datagram(&program_run::message(
+        writer,
+        1..=33,
+        20,
+    )));
+    assert_eq!((seen.kept, seen.records.len()), (true, 0));
+}
+
+/// Cuts a message into fragments, shows them to the kernel in `order`, and gives all records found
+/// and the fragments kept.
+fn fragmented(
+    kernel: &mut Kernel,
+    payload: &[u8],
+    ipv6: bool,
+    order: &[usize],
+) -> (Vec<Record>, Vec<usize>) {
+    let fragments = program_run::fragments(payload, 1480, ipv6, kernel.next_identification());
+    let (mut records, mut kept) = (Vec::new(), Vec::new());
+    for index in order {
+        let seen = kernel.frame(&fragments[*index]);
+        records.extend(seen.records);
+        if seen.kept {
+            kept.push(*index);
+        }
+    }
+    (records, kept)
+}
+
+#[test]
+fn samples_in_later_fragments_are_found_and_count_only_when_all_fragments_came() {
+    let writer = Guid::new(GuidPrefix(*b"\x01\x10fragmented"), EntityId([0, 0, 1, 3]));
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    // Submessages of 496 bytes from offset 20 on: none begins or ends its header across a cut.
+    let payload = program_run::message(writer, 1..=9, 472);
+    for ipv6 in [false, true] {
+        let (records, kept) = fragmented(&mut kernel, &payload, ipv6, &[0, 1, 2, 3]);
+        let numbers: BTreeSet<_> = records
+            .iter()
+            .map(|record| record.sequence_number)
+            .collect();
+        assert_eq!(numbers, (1..=9).collect(), "IPv6 {ipv6}: {kept:?} kept");
+
+        let (records, _) = fragmented(&mut kernel, &payload, ipv6, &[0, 1, 3]);
+        assert!(
+            records.is_empty(),
+            "a fragment is missing: nothing was delivered"
+        );
+
+        let (records, _) = fragmented(&mut kernel, &payload, ipv6, &[0, 1, 1, 2, 3, 3]);
+        assert_eq!(records.len(), 9, "a repeated fragment changes nothing");
+    }
+}
+
+#[test]
+fn a_header_cut_in_two_and_fragments_out_of_order_are_handed_over() {
+    let writer = Guid::new(GuidPrefix(*b"\x01\x10cutheaders"), EntityId([0, 0, 1, 3]));
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    for size in [20, 100, 244, 472, 700] {
+        let payload = program_run::message(writer, 1..=30, size);
+        kernel.set_unknown_budget(1 << 20, 0);
+        let count = program_run::fragments(&payload, 1480, false, 1).len();
+        let mut orders = vec![(0..count).collect::<Vec<_>>(), (0..count).rev().collect()];
+        let mut swapped: Vec<_> = (0..count).collect();
+        let middle = count / 2;
+        swapped.swap(middle, middle.saturating_sub(1).max(1).min(count - 1));
+        orders.push(swapped);
+        for order in orders {
+            let (mut records, kept) = fragmented(&mut kernel, &payload, false, &order);
+            if kept.len() == count {
+                continue; // user space has all of it
+            }
+            // What was handed over is read by user space from the kept fragments.
+            records.extend(kernel.take_rest());
+            let numbers: BTreeSet<_> = records
+                .iter()
+                .map(|record| record.sequence_number)
+                .collect();
+            assert_eq!(numbers, (1..=30).collect(), "size {size}, order {order:?}");
+            assert_eq!(
+                records.len(),
+                30,
+                "size {size}, order {order:?}: none twice"
+            );
+        }
+    }
+}
+
+#[test]
+fn discovery_behind_user_data_in_a_later_fragment_is_captured() {
+    let prefix = GuidPrefix(*b"\x01\x10behindbehi");
+    let writer = Guid::new(prefix, EntityId([0, 0, 1, 3]));
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    let mut payload = program_run::message(writer, 1..=3, 1200);
+    let announcement = Guid::new(prefix, EntityId::SEDP_PUBLICATIONS_WRITER);
+    payload.extend(&program_run::message(announcement, 1..=1, 300)[20..]);
+    let (records, kept) = fragmented(&mut kernel, &payload, false, &[0, 1, 2]);
+    assert_eq!(
+        kept,
+        [2],
+        "the fragment with the announcement, and no other"
+    );
+    assert!(records.is_empty(), "they wait for the rest");
+    let rest = kernel.take_rest();
+    let seen: BTreeSet<_> = rest
+        .iter()
+        .map(|record| (record.writer, record.sequence_number))
+        .collect();
+    assert_eq!(seen.len(), 4);
+    assert!(seen.contains(&(guid_words(announcement), 1)));
+}
+
+#[test]
+fn an_acknack_is_metered_by_its_reader() {
+    let reader = Guid::new(GuidPrefix(*b"\x01\x0freaderread"), EntityId([0, 0, 7, 4]));
+    let mut payload = b"RTPS\x02\x03\x01\x0f".to_vec();
+    payload.extend_from_slice(&reader.prefix.0);
+    payload.extend_from_slice(&[0x06, 1, 24, 0]);
+    payload.extend_from_slice(&[reader.entity.0, [0, 0, 1, 3]].concat());
+    payload.extend_from_slice(&[0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0]);
+    let mut kernel = Kernel::load();
+    kernel.set_unknown_budget(10_000, 10);
+    assert!(
+        kernel
+            .frame(&program_run::datagram(&payload))
+            .records
+            .is_empty()
+    );
+    kernel.set_interest(&BTreeMap::from([(reader, Verdict::Meter)]));
+    let seen = kernel.frame(&program_run::datagram(&payload));
+    assert_eq!(seen.records.len(), 1);
+    assert_eq!(
+        (seen.records[0].reader(), seen.records[0].sequence_number),
+        (reader, 5)
+    );
+}
+
+#[test]
+fn foreign_and_damaged_frames_are_never_kept() {
+    let mut kernel = Kernel::load();
+    kernel.set_unknown_budget(1 << 20, 100);
+    let writer = Guid::new(GuidPrefix(*b"\x01\x0fdamageddam"), EntityId([0, 0, 1, 3]));
+    let whole = program_run::data(writer, 1, 100);
+    assert!(kernel.frame(&whole).kept);
+    for len in 20..whole.len() {
+        kernel.frame(&whole[..len]);
+    }
+    for at in 0..whole.len() {
+        let mut damaged = whole.clone();
+        damaged[at] ^= 0xff;
+        kernel.frame(&damaged);
+    }
+    assert!(
+        !kernel
+            .frame(&program_run::datagram(b"not RTPS at all, but long enough"))
+            .kept
+    );
+}

@@ -1,0 +1,262 @@
+//! Runs the kernel filter on frames of the test's own making.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::ops::RangeInclusive;
+use std::os::fd::AsRawFd as _;
+
+use ros2probe::capture::filter::{Filter, FilterSettings};
+use ros2probe::model::ahead::{Ahead, Ready};
+use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_wire::frame::{self, PacketType, Payload};
+use ros2probe_wire::record::{Record, Verdict, kind};
+use ros2probe_wire::walk::{self, Envelope};
+use ros2probe_wire::{Guid, Timestamp};
+
+/// Interface index that frames seem to come from.
+pub const INTERFACE: u32 = 1;
+
+/// What became of one frame.
+pub struct Seen {
+    /// User space gets it.
+    pub kept: bool,
+    /// Records that may count now.
+    pub records: Vec<Record>,
+}
+
+/// A loaded filter, and the user-space side of fragments.
+pub struct Kernel {
+    filter: Filter,
+    ahead: Ahead,
+    reassembly: Reassembly,
+    rest: Vec<Record>,
+    identification: u32,
+    now: u64,
+}
+
+impl Kernel {
+    pub fn load() -> Self {
+        let settings = FilterSettings {
+            record_ring_bytes: 1 << 20,
+            ..FilterSettings::default()
+        };
+        let filter = Filter::load(&settings)
+            .expect("loading the kernel filter needs root: run the tests with sudo");
+        Self {
+            filter,
+            ahead: Ahead::default(),
+            reassembly: Reassembly::new(Limits::default()),
+            rest: Vec::new(),
+            identification: 0,
+            now: 1,
+        }
+    }
+
+    pub fn set_interest(&mut self, interest: &BTreeMap<Guid, Verdict>) {
+        for (guid, verdict) in interest {
+            self.filter.set_interest(*guid, Some(*verdict)).unwrap();
+        }
+    }
+
+    pub fn set_unknown_budget(&mut self, bytes: u32, records: u32) {
+        self.filter.set_unknown_budget(bytes, records).unwrap();
+    }
+
+    pub fn next_identification(&mut self) -> u32 {
+        self.identification += 1;
+        self.identification
+    }
+
+    /// Records that user space read from what the filter handed over since the last call.
+    pub fn take_rest(&mut self) -> Vec<Record> {
+        std::mem::take(&mut self.rest)
+    }
+
+    /// One IP packet.
+    pub fn frame(&mut self, packet: &[u8]) -> Seen {
+        let kept = self.run(packet) != 0;
+        self.now += 1;
+        let mut ready = Vec::new();
+        if kept {
+            self.keep(packet, &mut ready);
+        }
+        while let Some(record) = self.filter.next_record() {
+            if record.kind == kind::HANDOVER {
+                let key = FlowKey::of_handover(0, &record);
+                if let Some(rest) = self.reassembly.hand_over(Timestamp(self.now), key, &record) {
+                    self.ahead.rest(0, rest, |each| ready.push(each));
+                }
+            }
+            self.ahead.record(0, record, |each| ready.push(each));
+        }
+        let mut records = Vec::new();
+        let rest_came = ready.iter().any(|each| matches!(each, Ready::Rest(_)));
+        for each in ready {
+            match each {
+                Ready::Record(record) if rest_came => self.rest.push(record),
+                Ready::Record(record) => records.push(record),
+                Ready::Rest(rest) => {
+                    let handover = rest.handover.map(|record| record.handover());
+                    let envelope = Envelope::default();
+                    walk::datagram(rest.payload(), &envelope, handover.as_ref(), |found| {
+                        self.rest.push(found.record);
+                    });
+                }
+            }
+        }
+        Seen { kept, records }
+    }
+
+    fn keep(&mut self, packet: &[u8], ready: &mut Vec<Ready>) {
+        let protocol = if packet[0] >> 4 == 4 { 0x0800 } else { 0x86dd };
+        let len = u32::try_from(packet.len()).unwrap();
+        let Ok(Some(parsed)) = frame::parse_cooked(protocol, PacketType::HOST, packet, len) else {
+            return;
+        };
+        if let Payload::Fragment(fragment) = &parsed.payload {
+            let key = FlowKey::new(0, INTERFACE, false, &parsed, fragment);
+            let whole = self.reassembly.fragment(Timestamp(self.now), key, fragment);
+            if let Some(rest) = whole.filter(|whole| whole.handover.is_some()) {
+                self.ahead.rest(0, rest, |each| ready.push(each));
+            }
+        }
+    }
+
+    /// BPF_PROG_TEST_RUN; the program's return value.
+    fn run(&self, packet: &[u8]) -> u32 {
+        /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
+        #[repr(C)]
+        #[derive(Default)]
+        struct TestRun {
+            prog_fd: u32,
+            retval: u32,
+            data_size_in: u32,
+            data_size_out: u32,
+            data_in: u64,
+            data_out: u64,
+            repeat: u32,
+            duration: u32,
+            ctx_size_in: u32,
+            ctx_size_out: u32,
+            ctx_in: u64,
+            ctx_out: u64,
+        }
+        const BPF_PROG_TEST_RUN: libc::c_int = 10;
+        let ether_type = if packet[0] >> 4 == 4 {
+            [0x08, 0x00]
+        } else {
+            [0x86, 0xdd]
+        };
+        let frame = [
+            &[2, 0, 0, 0, 0, 1, 2, 0, 0, 0, 0, 2][..],
+            &ether_type,
+            packet,
+        ]
+        .concat();
+        let mut attributes = TestRun {
+            prog_fd: self.filter.program().as_raw_fd().cast_unsigned(),
+            data_size_in: u32::try_from(frame.len()).unwrap(),
+            data_in: frame.as_ptr() as u64,
+            repeat: 1,
+            ..TestRun::default()
+        };
+        // SAFETY: the attribute's size is given, and `frame` outlives the call.
+        let result = unsafe {
+            libc::syscall(
+                libc::SYS_bpf,
+                BPF_PROG_TEST_RUN,
+                &raw mut attributes,
+                size_of::<TestRun>(),
+            )
+        };
+        assert!(
+            result >= 0,
+            "BPF_PROG_TEST_RUN: {}",
+            io::Error::last_os_error()
+        );
+        attributes.retval
+    }
+}
+
+/// An RTPS message of one DATA per sequence number, each with `size` bytes of payload.
+pub fn message(writer: Guid, numbers: RangeInclusive<u32>, size: usize) -> Vec<u8> {
+    let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
+    bytes.extend_from_slice(&writer.prefix.0);
+    for number in numbers {
+        let body = [&[0, 0, 16, 0, 0, 0, 0, 0][..], &writer.entity.0, &[0; 4]].concat();
+        bytes.extend_from_slice(&[0x15, 5]);
+        bytes.extend_from_slice(&u16::try_from(20 + size).unwrap().to_le_bytes());
+        bytes.extend_from_slice(&body);
+        bytes.extend_from_slice(&number.to_le_bytes());
+        bytes.extend_from_slice(&[0, 1, 0, 0]);
+        bytes.extend(std::iter::repeat_n(0x33, size - 4));
+    }
+    bytes
+}
+
+/// One DATA as an IPv4 packet.
+pub fn data(writer: Guid, number: u32, size: usize) -> Vec<u8> {
+    datagram(&message(writer, number..=number, size))
+}
+
+/// A UDP payload as an IPv4 packet.
+pub fn datagram(payload: &[u8]) -> Vec<u8> {
+    fragments(payload, 65_000, false, 0).remove(0)
+}
+
+/// A UDP payload as IP packets that carry at most `size` bytes of IP payload.
+pub fn fragments(payload: &[u8], size: usize, ipv6: bool, identification: u32) -> Vec<Vec<u8>> {
+    let udp_len = u16::try_from(payload.len() + 8).unwrap();
+    let udp = [
+        &7411_u16.to_be_bytes()[..],
+        &7411_u16.to_be_bytes(),
+        &udp_len.to_be_bytes(),
+        &[0; 2],
+        payload,
+    ];
+    let udp = udp.concat();
+    let pieces = udp.chunks(size / 8 * 8);
+    let last = pieces.len() - 1;
+    let single = last == 0;
+    pieces
+        .enumerate()
+        .map(|(index, piece)| {
+            let offset = u16::try_from(index * (size / 8 * 8)).unwrap();
+            let more = index != last;
+            if ipv6 {
+                v6(piece, offset, more, identification)
+            } else {
+                v4(piece, offset, more, identification, single)
+            }
+        })
+        .collect()
+}
+
+fn v4(piece: &[u8], offset: u16, more: bool, identification: u32, single: bool) -> Vec<u8> {
+    let total = u16::try_from(piece.len() + 20).unwrap().to_be_bytes();
+    let id = u16::try_from(identification).unwrap().to_be_bytes();
+    let flags = if single {
+        0x4000
+    } else {
+        u16::from(more) << 13 | offset / 8
+    }
+    .to_be_bytes();
+    let header = [
+        0x45, 0, total[0], total[1], id[0], id[1], flags[0], flags[1], 64, 17, 0, 0,
+    ];
+    [&header[..], &[10, 99, 0, 1], &[10, 99, 0, 2], piece].concat()
+}
+
+fn v6(piece: &[u8], offset: u16, more: bool, identification: u32) -> Vec<u8> {
+    let len = u16::try_from(piece.len() + 8).unwrap().to_be_bytes();
+    let mut address = [0xfd, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1];
+    let mut bytes = vec![0x60, 0, 0, 0, len[0], len[1], 44, 64];
+    bytes.extend_from_slice(&address);
+    address[15] = 2;
+    bytes.extend_from_slice(&address);
+    bytes.extend_from_slice(&[17, 0]);
+    bytes.extend_from_slice(&(offset | u16::from(more)).to_be_bytes());
+    bytes.extend_from_slice(&identification.to_be_bytes());
+    bytes.extend_from_slice(piece);
+    bytes
+}

@@ -1,0 +1,140 @@
+//! Names and limits that the kernel filter and its loader agree on.
+
+/// What the filter counts, per CPU; the value is the index in its counter array.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[repr(u32)]
+pub enum Counter {
+    /// UDP frames looked at.
+    Frames = 0,
+    /// RTPS messages begun (first or only IP fragment).
+    Messages,
+    /// Datagrams of no interest.
+    Ignored,
+    /// Datagrams that became records only.
+    Metered,
+    /// Datagrams handed to user space whole.
+    Captured,
+    /// Of those: because a writer was not classified yet.
+    CapturedUnknown,
+    /// Frame bytes handed to user space.
+    CapturedBytes,
+    /// Submessages of unclassified writers beyond their capture budget that became records.
+    MeteredUnknown,
+    /// Submessages of unclassified writers beyond all budgets.
+    UnknownOverBudget,
+    /// Records written to the ring.
+    Records,
+    /// Records lost because the ring was full.
+    RecordsLost,
+    /// IP fragments looked at.
+    Fragments,
+    /// IP fragments seen again.
+    FragmentsRepeated,
+    /// IP fragments whose first fragment is unknown: reordered, or the flow was evicted.
+    FragmentsWithoutFlow,
+    /// Fragmented datagrams of interest that became complete.
+    FragmentedComplete,
+    /// Fragmented datagrams whose walk user space had to continue.
+    HandedOver,
+    /// Fragmented datagrams that the flow table had no room for.
+    FlowTableFull,
+    /// Submessages or headers that contradict their datagram's length.
+    Malformed,
+    /// Second copies of loopback frames.
+    LoopbackCopies,
+    /// Frames of interfaces that the configuration leaves out.
+    InterfaceExcluded,
+    /// Frames that hold several datagrams (UDP segmentation offload); not taken apart.
+    Segmented,
+}
+
+impl Counter {
+    /// All of them, in index order.
+    pub const ALL: [Self; 21] = [
+        Self::Frames,
+        Self::Messages,
+        Self::Ignored,
+        Self::Metered,
+        Self::Captured,
+        Self::CapturedUnknown,
+        Self::CapturedBytes,
+        Self::MeteredUnknown,
+        Self::UnknownOverBudget,
+        Self::Records,
+        Self::RecordsLost,
+        Self::Fragments,
+        Self::FragmentsRepeated,
+        Self::FragmentsWithoutFlow,
+        Self::FragmentedComplete,
+        Self::HandedOver,
+        Self::FlowTableFull,
+        Self::Malformed,
+        Self::LoopbackCopies,
+        Self::InterfaceExcluded,
+        Self::Segmented,
+    ];
+
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Frames => "frames",
+            Self::Messages => "messages",
+            Self::Ignored => "ignored",
+            Self::Metered => "metered",
+            Self::Captured => "captured",
+            Self::CapturedUnknown => "captured_unknown",
+            Self::CapturedBytes => "captured_bytes",
+            Self::MeteredUnknown => "metered_unknown",
+            Self::UnknownOverBudget => "unknown_over_budget",
+            Self::Records => "records",
+            Self::RecordsLost => "records_lost",
+            Self::Fragments => "fragments",
+            Self::FragmentsRepeated => "fragments_repeated",
+            Self::FragmentsWithoutFlow => "fragments_without_flow",
+            Self::FragmentedComplete => "fragmented_complete",
+            Self::HandedOver => "handed_over",
+            Self::FlowTableFull => "flow_table_full",
+            Self::Malformed => "malformed",
+            Self::LoopbackCopies => "loopback_copies",
+            Self::InterfaceExcluded => "interface_excluded",
+            Self::Segmented => "segmented",
+        }
+    }
+}
+
+/// Entries of the budget array, refilled by user space.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[repr(u32)]
+pub enum Budget {
+    /// Bytes of datagrams of unclassified writers that may still be captured.
+    CaptureBytes = 0,
+    /// Records of unclassified writers that may still be written.
+    Records = 1,
+}
+
+/// Writers and readers that the interest map holds.
+pub const INTEREST_CAPACITY: u32 = 16_384;
+/// Participants whose last message the filter notes.
+pub const PARTICIPANT_CAPACITY: u32 = 4_096;
+/// Unclassified writers that the filter remembers.
+pub const UNKNOWN_CAPACITY: u32 = 1_024;
+/// Fragmented datagrams in flight.
+pub const FLOW_CAPACITY: u32 = 2_048;
+/// Interfaces of one network namespace.
+pub const INTERFACE_CAPACITY: u32 = 1_024;
+/// Bytes captured of one unclassified writer before it is only metered: enough for the whole
+/// `ros_discovery_info` burst of a node that starts, a few datagrams of a point cloud.
+pub const UNKNOWN_CAPTURE_BYTES: u32 = 256 * 1024;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counters_are_listed_in_index_order() {
+        for (index, counter) in Counter::ALL.into_iter().enumerate() {
+            assert_eq!(counter as usize, index, "{}", counter.label());
+        }
+    }
+}
