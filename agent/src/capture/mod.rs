@@ -1,4 +1,6 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
 pub mod filter;
+pub mod netns;
 pub mod pcap;
+pub mod ring;

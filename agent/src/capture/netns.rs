@@ -1,0 +1,165 @@
+//! Opening things in another network namespace: that of a container, or a named one.
+//!
+//! A thread of its own enters the namespace and ends, so no other thread's namespace changes. A
+//! socket stays in the namespace it was made in, whoever uses it later.
+
+use std::fs::File;
+use std::io;
+use std::os::fd::AsRawFd;
+use std::path::{Path, PathBuf};
+use std::thread;
+
+/// Why nothing could be done in a network namespace.
+#[derive(Debug, thiserror::Error)]
+pub enum NetnsError {
+    /// There is no such file, or it may not be read.
+    #[error("cannot open network namespace {}", path.display())]
+    Open {
+        /// Path of the namespace.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The process lacks a capability.
+    #[error("not permitted to enter network namespace {}: CAP_SYS_ADMIN is missing", path.display())]
+    NotPermitted {
+        /// Path of the namespace.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// It cannot be entered, for instance because the file is not a network namespace.
+    #[error("cannot enter network namespace {}", path.display())]
+    Enter {
+        /// Path of the namespace.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The thread that entered it could not be started or did not come back.
+    #[error("the thread for network namespace {} failed", path.display())]
+    Thread {
+        /// Path of the namespace.
+        path: PathBuf,
+    },
+}
+
+/// Runs `work` in the network namespace at `path` (`/run/netns/robot`, `/proc/1234/ns/net`).
+///
+/// # Errors
+/// The namespace cannot be opened or entered.
+pub fn within<T: Send>(path: &Path, work: impl FnOnce() -> T + Send) -> Result<T, NetnsError> {
+    let failed = || NetnsError::Thread {
+        path: path.to_path_buf(),
+    };
+    thread::scope(|scope| {
+        thread::Builder::new()
+            .name("netns".to_owned())
+            .spawn_scoped(scope, || enter(path).map(|()| work()))
+            .map_err(|_| failed())?
+            .join()
+            .map_err(|_| failed())?
+    })
+}
+
+/// Moves the calling thread, for good.
+fn enter(path: &Path) -> Result<(), NetnsError> {
+    let open = |source| NetnsError::Open {
+        path: path.to_path_buf(),
+        source,
+    };
+    let namespace = File::open(path).map_err(open)?;
+    // SAFETY: takes no pointers; the descriptor is open. Only this thread is moved.
+    if unsafe { libc::setns(namespace.as_raw_fd(), libc::CLONE_NEWNET) } == 0 {
+        return Ok(());
+    }
+    let source = io::Error::last_os_error();
+    let path = path.to_path_buf();
+    Err(if source.kind() == io::ErrorKind::PermissionDenied {
+        NetnsError::NotPermitted { path, source }
+    } else {
+        NetnsError::Enter { path, source }
+    })
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    /// Runs a test in a network namespace of its own, with `lo` up. Says so and does nothing where
+    /// that is not permitted.
+    pub(crate) fn in_new_namespace(test: impl FnOnce() + Send) {
+        thread::scope(|scope| {
+            let thread = scope.spawn(|| {
+                // SAFETY: takes no pointers; only this thread is moved.
+                if unsafe { libc::unshare(libc::CLONE_NEWNET) } != 0 {
+                    eprintln!(
+                        "skipped, needs CAP_SYS_ADMIN: {}",
+                        io::Error::last_os_error()
+                    );
+                    return;
+                }
+                ip("link set lo up");
+                test();
+            });
+            if let Err(panic) = thread.join() {
+                std::panic::resume_unwind(panic);
+            }
+        });
+    }
+
+    /// Runs iproute2's `ip` in the calling thread's namespace.
+    pub(crate) fn ip(arguments: &str) {
+        let output = Command::new("ip")
+            .args(arguments.split(' '))
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "ip {arguments}: {output:?}");
+    }
+
+    /// Path of the calling thread's namespace.
+    fn current() -> PathBuf {
+        // SAFETY: takes no pointers.
+        let thread = unsafe { libc::gettid() };
+        PathBuf::from(format!("/proc/{}/task/{thread}/ns/net", std::process::id()))
+    }
+
+    fn name(path: &Path) -> PathBuf {
+        std::fs::read_link(path).unwrap()
+    }
+
+    #[test]
+    fn work_is_done_there_and_the_caller_stays_here() {
+        let outside = current();
+        let (before, outside_name) = (name(&outside), name(&outside));
+        in_new_namespace(|| {
+            let inside = name(&current());
+            assert_ne!(inside, outside_name);
+            assert_eq!(within(&outside, || name(&current())).unwrap(), outside_name);
+            assert_eq!(name(&current()), inside);
+        });
+        assert_eq!(name(&current()), before);
+    }
+
+    #[test]
+    fn mistakes_name_the_path() {
+        let missing = within(Path::new("/run/netns/no-such-robot"), || ()).unwrap_err();
+        assert_eq!(
+            missing.to_string(),
+            "cannot open network namespace /run/netns/no-such-robot"
+        );
+        let wrong = within(Path::new("/proc/self/ns/uts"), || ()).unwrap_err();
+        assert!(wrong.to_string().contains("/proc/self/ns/uts"), "{wrong}");
+    }
+
+    #[test]
+    fn a_panic_there_is_an_error_here() {
+        let result = within(&current(), || panic!("on purpose"));
+        assert!(matches!(
+            result,
+            Err(NetnsError::Thread { .. } | NetnsError::NotPermitted { .. })
+        ));
+    }
+}

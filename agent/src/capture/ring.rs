@@ -1,0 +1,450 @@
+//! Frames of every interface of a network namespace, through a ring shared with the kernel:
+//! `AF_PACKET` with TPACKET_V3.
+//!
+//! The socket is created without a protocol, so that nothing arrives before the filter is attached;
+//! it is bound to no interface, so that interfaces which appear later are seen as well. It never
+//! sends. Which frames are kept, and how much of each, is the filter's verdict and not decided here.
+//!
+//! Kernel memory is touched in this module only: a [`Block`] is lent to its reader and goes back to
+//! the kernel when it is dropped. What is in a block is read by [`block`] as plain bytes.
+
+pub mod block;
+
+use std::ffi::c_void;
+use std::io;
+use std::mem::{size_of, size_of_val};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
+use std::ptr::NonNull;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Duration;
+
+use libc::{c_int, socklen_t};
+
+pub use block::{Frames, RingFrame};
+
+/// The kernel wants a frame size in TPACKET_V3 too, but packs frames as tightly as they fit.
+const NOMINAL_FRAME: usize = 2048;
+/// Between two looks at a socket that reports an error again and again.
+const ERROR_PAUSE: Duration = Duration::from_millis(10);
+
+/// Size and pace of a ring.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Settings {
+    /// Bytes of a block; rounded up to whole pages.
+    pub block_size: usize,
+    /// Blocks. One is being filled, the others wait for the reader.
+    pub blocks: usize,
+    /// How long a frame may wait in a block that does not fill up.
+    pub retire: Duration,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            block_size: 256 << 10,
+            blocks: 8,
+            retire: Duration::from_millis(60),
+        }
+    }
+}
+
+/// What the kernel counted for this socket.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
+pub struct Statistics {
+    /// Frames that passed the filter, also those dropped for lack of room.
+    pub packets: u64,
+    /// Frames dropped because every block was waiting for the reader.
+    pub drops: u64,
+    /// How often that began.
+    pub freezes: u64,
+    /// Errors the socket reported, such as a link going down. Capturing goes on.
+    pub socket_errors: u64,
+}
+
+/// Why there is no ring, or no more.
+#[derive(Debug, thiserror::Error)]
+pub enum RingError {
+    /// The process lacks a capability.
+    #[error("not permitted to capture ({call}): CAP_NET_RAW is missing")]
+    NotPermitted {
+        /// The system call.
+        call: &'static str,
+        /// Its error.
+        source: io::Error,
+    },
+    /// A system call failed.
+    #[error("{call} failed")]
+    System {
+        /// The system call.
+        call: &'static str,
+        /// Its error.
+        source: io::Error,
+    },
+    /// The ring cannot have this size.
+    #[error("a ring of {blocks} blocks of {block_size} bytes is empty or too large")]
+    Size {
+        /// Blocks asked for.
+        blocks: usize,
+        /// Bytes of a block asked for.
+        block_size: usize,
+    },
+}
+
+/// A packet socket and its ring.
+#[derive(Debug)]
+pub struct Ring {
+    // Fields are dropped in this order: the memory is given back before the socket is closed.
+    memory: Mapping,
+    socket: OwnedFd,
+    block_size: usize,
+    blocks: usize,
+    /// Block that the kernel will hand over next.
+    next: usize,
+    statistics: Statistics,
+}
+
+/// A block of frames on loan from the kernel. Frames are dropped while the reader keeps all blocks,
+/// so it should not be kept for long.
+#[derive(Debug)]
+pub struct Block<'a> {
+    ring: &'a mut Ring,
+}
+
+impl Ring {
+    /// Captures in the calling thread's network namespace, on all its interfaces. `filter` is a
+    /// loaded BPF program of type socket filter; without one every frame is kept.
+    ///
+    /// # Errors
+    /// A capability is missing, or the kernel refuses the filter or the ring's size.
+    pub fn open(settings: Settings, filter: Option<BorrowedFd<'_>>) -> Result<Self, RingError> {
+        Self::open_on(settings, filter, 0)
+    }
+
+    fn open_on(
+        settings: Settings,
+        filter: Option<BorrowedFd<'_>>,
+        interface: i32,
+    ) -> Result<Self, RingError> {
+        let wrong = RingError::Size {
+            blocks: settings.blocks,
+            block_size: settings.block_size,
+        };
+        let Some((request, block_size)) = request(settings) else {
+            return Err(wrong);
+        };
+        let socket = create()?;
+        let version = libc::tpacket_versions::TPACKET_V3 as c_int;
+        set(
+            &socket,
+            libc::SOL_PACKET,
+            libc::PACKET_VERSION,
+            &version,
+            "PACKET_VERSION",
+        )?;
+        if let Some(filter) = filter {
+            let program = filter.as_raw_fd();
+            set(
+                &socket,
+                libc::SOL_SOCKET,
+                libc::SO_ATTACH_BPF,
+                &program,
+                "SO_ATTACH_BPF",
+            )?;
+        }
+        set(
+            &socket,
+            libc::SOL_PACKET,
+            libc::PACKET_RX_RING,
+            &request,
+            "PACKET_RX_RING",
+        )?;
+        let memory = Mapping::new(&socket, block_size * settings.blocks)?;
+        let ring = Self {
+            memory,
+            socket,
+            block_size,
+            blocks: settings.blocks,
+            next: 0,
+            statistics: Statistics::default(),
+        };
+        bind(&ring.socket, interface)?;
+        Ok(ring)
+    }
+
+    /// The next block if the kernel is done with it.
+    pub fn block(&mut self) -> Option<Block<'_>> {
+        // Acquire: pairs with the write barrier between the kernel's last write to the block and
+        // its status (net/packet/af_packet.c, prb_flush_block).
+        let status = self.status().load(Ordering::Acquire);
+        if status & libc::TP_STATUS_USER == 0 {
+            return None;
+        }
+        Some(Block { ring: self })
+    }
+
+    /// Waits until a block is ready; `false` when the time is over or a signal came.
+    ///
+    /// An error that the socket reports is cleared, counted and survived. A link that goes down
+    /// reports one to each socket bound to it.
+    ///
+    /// # Errors
+    /// `poll` itself fails.
+    pub fn wait(&mut self, timeout: Duration) -> Result<bool, RingError> {
+        let mut poll = libc::pollfd {
+            fd: self.socket.as_raw_fd(),
+            events: libc::POLLIN,
+            revents: 0,
+        };
+        let milliseconds = c_int::try_from(timeout.as_millis()).unwrap_or(c_int::MAX);
+        // SAFETY: `poll` is one pollfd, it is ours, and the count says one.
+        let count = unsafe { libc::poll(&raw mut poll, 1, milliseconds) };
+        if count < 0 {
+            let source = io::Error::last_os_error();
+            if source.kind() == io::ErrorKind::Interrupted {
+                return Ok(false);
+            }
+            return Err(RingError::System {
+                call: "poll",
+                source,
+            });
+        }
+        if poll.revents & !libc::POLLIN != 0 {
+            self.statistics.socket_errors += 1;
+            let mut pending: c_int = 0;
+            // Reading the error clears it; without that, poll would return at once for ever.
+            get(
+                &self.socket,
+                libc::SOL_SOCKET,
+                libc::SO_ERROR,
+                &mut pending,
+                "SO_ERROR",
+            )?;
+            if poll.revents & libc::POLLIN == 0 {
+                std::thread::sleep(ERROR_PAUSE.min(timeout));
+            }
+        }
+        Ok(poll.revents & libc::POLLIN != 0)
+    }
+
+    /// Counts since the ring was opened.
+    ///
+    /// # Errors
+    /// The kernel does not tell.
+    pub fn statistics(&mut self) -> Result<Statistics, RingError> {
+        let mut fresh = libc::tpacket_stats_v3 {
+            tp_packets: 0,
+            tp_drops: 0,
+            tp_freeze_q_cnt: 0,
+        };
+        // The kernel starts over with each reading.
+        get(
+            &self.socket,
+            libc::SOL_PACKET,
+            libc::PACKET_STATISTICS,
+            &mut fresh,
+            "PACKET_STATISTICS",
+        )?;
+        self.statistics.packets += u64::from(fresh.tp_packets);
+        self.statistics.drops += u64::from(fresh.tp_drops);
+        self.statistics.freezes += u64::from(fresh.tp_freeze_q_cnt);
+        Ok(self.statistics)
+    }
+
+    /// The word by which the next block changes hands.
+    fn status(&self) -> &AtomicU32 {
+        let offset = self.next * self.block_size + block::STATUS;
+        // SAFETY: `next < blocks`, so the word lies within the mapping, which is `blocks` times
+        // `block_size` long and page-aligned (and STATUS a multiple of 4).
+        let word = unsafe { self.memory.start.byte_add(offset) };
+        // SAFETY: aligned and mapped as above, for as long as `self` lives. Kernel and user space
+        // both access it as one 32-bit word; the kernel does not write it while we own the block.
+        unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) }
+    }
+}
+
+impl AsFd for Ring {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+impl Block<'_> {
+    /// The frames in it.
+    #[must_use]
+    pub fn frames(&self) -> Frames<'_> {
+        Frames::new(self.bytes())
+    }
+
+    fn bytes(&self) -> &[u8] {
+        let offset = self.ring.next * self.ring.block_size;
+        // SAFETY: `next < blocks`, so the block lies within the mapping.
+        let start = unsafe { self.ring.memory.start.byte_add(offset) };
+        // SAFETY: the block is mapped for as long as the ring lives, which this borrows. It belongs
+        // to user space since `Ring::block` saw TP_STATUS_USER, and until our Drop the kernel
+        // writes nothing into it; nor do we. Any bytes are valid `u8`.
+        unsafe { std::slice::from_raw_parts(start.cast().as_ptr(), self.ring.block_size) }
+    }
+}
+
+impl Drop for Block<'_> {
+    fn drop(&mut self) {
+        // Release: our reads of the block come before the kernel's writes. Pairs with the read
+        // barrier after the status in net/packet/af_packet.c, prb_dispatch_next_block.
+        self.ring
+            .status()
+            .store(libc::TP_STATUS_KERNEL, Ordering::Release);
+        self.ring.next = (self.ring.next + 1) % self.ring.blocks;
+    }
+}
+
+/// Memory shared with the kernel.
+#[derive(Debug)]
+struct Mapping {
+    start: NonNull<c_void>,
+    length: usize,
+}
+
+// SAFETY: the mapping is owned, and reached through the ring that owns it only; no thread has a
+// claim to it.
+unsafe impl Send for Mapping {}
+
+impl Mapping {
+    fn new(socket: &OwnedFd, length: usize) -> Result<Self, RingError> {
+        // SAFETY: a new mapping at an address of the kernel's choice touches no memory in use.
+        let start = unsafe {
+            libc::mmap(
+                std::ptr::null_mut(),
+                length,
+                libc::PROT_READ | libc::PROT_WRITE,
+                libc::MAP_SHARED,
+                socket.as_raw_fd(),
+                0,
+            )
+        };
+        if start == libc::MAP_FAILED {
+            return Err(last("mmap"));
+        }
+        NonNull::new(start)
+            .map(|start| Self { start, length })
+            .ok_or(last("mmap"))
+    }
+}
+
+impl Drop for Mapping {
+    fn drop(&mut self) {
+        // SAFETY: mapped by `new` with this length, and nothing borrows it any more.
+        unsafe { libc::munmap(self.start.as_ptr(), self.length) };
+    }
+}
+
+/// The ring as the kernel wants to be asked for it, and the size of its blocks. `None` when the
+/// numbers do not fit.
+fn request(settings: Settings) -> Option<(libc::tpacket_req3, usize)> {
+    // SAFETY: sysconf reads nothing of ours.
+    let page = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).ok()?;
+    let block_size = settings.block_size.max(1).checked_next_multiple_of(page)?;
+    let length = block_size.checked_mul(settings.blocks)?;
+    if length == 0 || length > 1 << 30 {
+        return None;
+    }
+    let frames = (block_size / NOMINAL_FRAME).checked_mul(settings.blocks)?;
+    let request = libc::tpacket_req3 {
+        tp_block_size: u32::try_from(block_size).ok()?,
+        tp_block_nr: u32::try_from(settings.blocks).ok()?,
+        tp_frame_size: u32::try_from(NOMINAL_FRAME).ok()?,
+        tp_frame_nr: u32::try_from(frames).ok()?,
+        // 0 would mean a default computed from the link's speed.
+        tp_retire_blk_tov: u32::try_from(settings.retire.as_millis().max(1)).ok()?,
+        tp_sizeof_priv: 0,
+        tp_feature_req_word: 0,
+    };
+    Some((request, block_size))
+}
+
+/// Protocol 0: receives nothing until it is bound.
+fn create() -> Result<OwnedFd, RingError> {
+    let kind = libc::SOCK_DGRAM | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
+    // SAFETY: takes no pointers.
+    let fd = unsafe { libc::socket(libc::AF_PACKET, kind, 0) };
+    if fd < 0 {
+        return Err(last("socket(AF_PACKET)"));
+    }
+    // SAFETY: a descriptor just made, which nobody else owns.
+    Ok(unsafe { OwnedFd::from_raw_fd(fd) })
+}
+
+fn bind(socket: &OwnedFd, interface: i32) -> Result<(), RingError> {
+    let address = libc::sockaddr_ll {
+        sll_family: libc::AF_PACKET as u16,
+        sll_protocol: (libc::ETH_P_ALL as u16).to_be(),
+        sll_ifindex: interface,
+        sll_hatype: 0,
+        sll_pkttype: 0,
+        sll_halen: 0,
+        sll_addr: [0; 8],
+    };
+    let length = size_of_val(&address) as socklen_t;
+    // SAFETY: `address` is a whole sockaddr_ll and `length` its size.
+    let result = unsafe { libc::bind(socket.as_raw_fd(), (&raw const address).cast(), length) };
+    if result < 0 {
+        Err(last("bind(ETH_P_ALL)"))
+    } else {
+        Ok(())
+    }
+}
+
+fn set<T>(
+    socket: &OwnedFd,
+    level: c_int,
+    option: c_int,
+    value: &T,
+    name: &'static str,
+) -> Result<(), RingError> {
+    let length = size_of::<T>() as socklen_t;
+    // SAFETY: `value` is a live `T`, and the kernel reads `length` bytes of it.
+    let result = unsafe {
+        libc::setsockopt(
+            socket.as_raw_fd(),
+            level,
+            option,
+            (&raw const *value).cast(),
+            length,
+        )
+    };
+    if result < 0 { Err(last(name)) } else { Ok(()) }
+}
+
+/// `T` must be a plain integer or a `repr(C)` struct of such.
+fn get<T: Copy>(
+    socket: &OwnedFd,
+    level: c_int,
+    option: c_int,
+    value: &mut T,
+    name: &'static str,
+) -> Result<(), RingError> {
+    let mut length = size_of::<T>() as socklen_t;
+    // SAFETY: `value` is a live `T` of integers, the kernel writes at most `length` bytes into it,
+    // and whatever it writes is a valid `T`.
+    let result = unsafe {
+        libc::getsockopt(
+            socket.as_raw_fd(),
+            level,
+            option,
+            (&raw mut *value).cast(),
+            &raw mut length,
+        )
+    };
+    if result < 0 { Err(last(name)) } else { Ok(()) }
+}
+
+fn last(call: &'static str) -> RingError {
+    let source = io::Error::last_os_error();
+    if source.kind() == io::ErrorKind::PermissionDenied {
+        RingError::NotPermitted { call, source }
+    } else {
+        RingError::System { call, source }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,293 @@
+//! Live, in network namespaces of their own; where that is not permitted they say so and pass.
+
+use std::net::UdpSocket;
+use std::time::Instant;
+
+use ros2probe_wire::frame::{self, PacketType, Payload};
+
+use super::*;
+use crate::capture::netns::tests::{in_new_namespace, ip};
+
+const SMALL: Settings = Settings {
+    block_size: 16 << 10,
+    blocks: 4,
+    retire: Duration::from_millis(10),
+};
+
+/// UDP payloads seen, of frames that this host sends.
+fn sent(ring: &mut Ring, patience: Duration) -> Vec<(u32, Vec<u8>)> {
+    let mut payloads = Vec::new();
+    let start = Instant::now();
+    while start.elapsed() < patience {
+        ring.wait(Duration::from_millis(20)).unwrap();
+        while let Some(block) = ring.block() {
+            let mut frames = block.frames();
+            for frame in frames.by_ref() {
+                let packet = frame::parse_cooked(
+                    frame.protocol,
+                    frame.packet_type,
+                    frame.bytes,
+                    frame.length,
+                );
+                if let Ok(Some(packet)) = packet
+                    && frame.packet_type == PacketType::OUTGOING
+                    && let Payload::Datagram(datagram) = packet.payload
+                {
+                    payloads.push((frame.interface, datagram.payload.to_vec()));
+                }
+            }
+            assert!(!frames.damaged());
+        }
+    }
+    payloads
+}
+
+/// Loads a socket filter that returns `keep`.
+fn filter(keep: i32) -> OwnedFd {
+    #[repr(C)]
+    #[derive(Default)]
+    struct Load {
+        kind: u32,
+        count: u32,
+        instructions: u64,
+        license: u64,
+        rest: [u64; 13],
+    }
+    let constant = u64::from(keep.cast_unsigned()) << 32 | 0xb7;
+    let program = [constant, 0x95];
+    let load = Load {
+        kind: 1,
+        count: 2,
+        instructions: program.as_ptr() as u64,
+        license: c"GPL".as_ptr() as u64,
+        ..Load::default()
+    };
+    // SAFETY: BPF_PROG_LOAD with a zero-padded attribute whose pointers outlive the call.
+    let fd = unsafe { libc::syscall(libc::SYS_bpf, 5, &raw const load, size_of::<Load>()) };
+    assert!(fd >= 0, "{}", io::Error::last_os_error());
+    // SAFETY: just made.
+    unsafe { OwnedFd::from_raw_fd(i32::try_from(fd).unwrap()) }
+}
+
+#[test]
+fn frames_on_loopback_arrive_with_kernel_time_and_direction() {
+    in_new_namespace(|| {
+        let mut ring = Ring::open(SMALL, None).unwrap();
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let now = || std::time::UNIX_EPOCH.elapsed().unwrap().as_nanos();
+        let before = now();
+        socket.send_to(b"RTPS", "127.0.0.1:7400").unwrap();
+        let after = now();
+        assert!(ring.wait(Duration::from_secs(1)).unwrap());
+        let block = ring.block().unwrap();
+        let frames: Vec<_> = block
+            .frames()
+            .filter(|frame| frame.bytes.get(9) == Some(&17))
+            .collect();
+        // Loopback shows each frame twice: sent, then received.
+        assert_eq!(frames.len(), 2);
+        assert_eq!(
+            [frames[0].packet_type, frames[1].packet_type],
+            [PacketType::OUTGOING, PacketType::HOST]
+        );
+        for frame in &frames {
+            let expected = (0x0800, 32, 1, None);
+            assert_eq!(
+                (frame.protocol, frame.length, frame.interface, frame.vlan),
+                expected
+            );
+            assert!(frame.bytes.ends_with(b"RTPS"));
+            let time = u128::from(frame.time.0);
+            assert!(
+                time >= before && time <= after + 50_000_000,
+                "{before} {time} {after}"
+            );
+        }
+    });
+}
+
+#[test]
+fn the_ring_goes_round_many_times_without_losing_a_frame() {
+    in_new_namespace(|| {
+        let mut ring = Ring::open(SMALL, None).unwrap();
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let mut numbers = Vec::new();
+        // 4 blocks hold about 60 of these; 3000 times two copies are 100 rounds.
+        for batch in 0..150_u32 {
+            for number in batch * 20..batch * 20 + 20 {
+                let mut payload = [0; 800];
+                payload[..4].copy_from_slice(&number.to_be_bytes());
+                socket.send_to(&payload, "127.0.0.1:7400").unwrap();
+            }
+            let mut patience = 100;
+            while numbers.len() < (batch as usize + 1) * 20 && patience > 0 {
+                patience -= 1;
+                for (_, payload) in sent(&mut ring, Duration::from_millis(1)) {
+                    numbers.push(u32::from_be_bytes(*payload.first_chunk().unwrap()));
+                }
+            }
+        }
+        // Not `assert_eq`: nobody reads two lists of 3000 numbers.
+        assert!(
+            numbers.iter().copied().eq(0..3000),
+            "{:?}",
+            &numbers[..200.min(numbers.len())]
+        );
+        let statistics = ring.statistics().unwrap();
+        assert_eq!(statistics.drops, 0);
+        assert!(statistics.packets >= 6000);
+    });
+}
+
+#[test]
+fn asking_for_a_block_that_is_not_ready_changes_nothing() {
+    in_new_namespace(|| {
+        let mut ring = Ring::open(SMALL, None).unwrap();
+        for _ in 0..7 {
+            assert!(ring.block().is_none());
+        }
+        assert_eq!(ring.next, 0);
+        assert!(!ring.wait(Duration::from_millis(1)).unwrap());
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.send_to(b"RTPS", "127.0.0.1:7400").unwrap();
+        assert_eq!(
+            sent(&mut ring, Duration::from_millis(50)),
+            [(1, b"RTPS".to_vec())]
+        );
+        assert_eq!(ring.next, 1);
+    });
+}
+
+#[test]
+fn what_a_slow_reader_misses_is_counted_once() {
+    in_new_namespace(|| {
+        let mut ring = Ring::open(SMALL, None).unwrap();
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        for _ in 0..500 {
+            socket.send_to(&[7; 1000], "127.0.0.1:7400").unwrap();
+        }
+        let first = ring.statistics().unwrap();
+        assert!(first.drops > 800 && first.freezes >= 1, "{first:?}");
+        // The kernel forgets with each reading, we do not.
+        assert_eq!(ring.statistics().unwrap(), first);
+        let kept = sent(&mut ring, Duration::from_millis(100)).len();
+        assert!(kept > 10, "{kept}");
+        // Blocks went back to the kernel: there is room again.
+        socket.send_to(b"again", "127.0.0.1:7400").unwrap();
+        let seen = sent(&mut ring, Duration::from_millis(200));
+        assert_eq!(seen.last().unwrap().1, b"again");
+        assert_eq!(ring.statistics().unwrap().drops, first.drops);
+    });
+}
+
+#[test]
+fn the_filter_cuts_frames_and_keeps_their_length() {
+    in_new_namespace(|| {
+        let program = filter(28);
+        let mut ring = Ring::open(SMALL, Some(program.as_fd())).unwrap();
+        let nothing = filter(0);
+        let mut silent = Ring::open(SMALL, Some(nothing.as_fd())).unwrap();
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.send_to(&[1; 5000], "127.0.0.1:7400").unwrap();
+        assert!(ring.wait(Duration::from_secs(1)).unwrap());
+        let block = ring.block().unwrap();
+        let frame = block.frames().next().unwrap();
+        assert_eq!((frame.bytes.len(), frame.length), (28, 5028));
+        assert_eq!(silent.statistics().unwrap().packets, 0);
+    });
+}
+
+#[test]
+fn an_interface_that_appears_later_is_seen() {
+    in_new_namespace(|| {
+        let mut ring = Ring::open(SMALL, None).unwrap();
+        ip("link add later type veth peer name far");
+        ip("address add 10.99.0.1/24 dev later");
+        ip("link set later up");
+        ip("link set far up");
+        let socket = UdpSocket::bind("10.99.0.1:0").unwrap();
+        ip("neighbour add 10.99.0.2 lladdr 02:00:00:00:00:02 dev later");
+        // A link takes a moment to come up.
+        let hello = (0..40).find_map(|_| {
+            socket.send_to(b"hello", "10.99.0.2:7400").unwrap();
+            let seen = sent(&mut ring, Duration::from_millis(50));
+            seen.into_iter().find(|(_, payload)| payload == b"hello")
+        });
+        assert_ne!(hello.unwrap().0, 1);
+    });
+}
+
+#[test]
+fn a_link_that_goes_down_does_not_make_the_reader_spin() {
+    in_new_namespace(|| {
+        ip("link add gone type veth peer name far");
+        ip("link set gone up");
+        ip("link set far up");
+        // SAFETY: a terminated string.
+        let index = unsafe { libc::if_nametoindex(c"gone".as_ptr()) };
+        let index = i32::try_from(index).unwrap();
+        // Only a socket bound to the interface is told; ours are not, and still must not spin.
+        let mut bound = Ring::open_on(SMALL, None, index).unwrap();
+        let mut unbound = Ring::open(SMALL, None).unwrap();
+        sent(&mut bound, Duration::from_millis(50));
+        sent(&mut unbound, Duration::from_millis(50));
+        ip("link set gone down");
+        ip("link delete gone");
+        for (ring, errors) in [(&mut bound, 1..=2), (&mut unbound, 0..=0)] {
+            let start = Instant::now();
+            let mut rounds = 0;
+            while start.elapsed() < Duration::from_millis(300) {
+                ring.wait(Duration::from_millis(50)).unwrap();
+                while let Some(block) = ring.block() {
+                    drop(block);
+                }
+                rounds += 1;
+            }
+            assert!(rounds < 40, "{rounds} rounds in 300 ms");
+            let statistics = ring.statistics().unwrap();
+            assert!(errors.contains(&statistics.socket_errors), "{statistics:?}");
+        }
+    });
+}
+
+#[test]
+fn impossible_sizes_are_refused() {
+    for (block_size, blocks) in [
+        (4096, 0),
+        (usize::MAX, 2),
+        (1 << 20, usize::MAX),
+        (1 << 29, 3),
+    ] {
+        let settings = Settings {
+            block_size,
+            blocks,
+            ..SMALL
+        };
+        assert!(matches!(
+            Ring::open(settings, None),
+            Err(RingError::Size { .. })
+        ));
+    }
+    // One byte becomes a page, whatever a page is.
+    let (request, block_size) = request(Settings {
+        block_size: 1,
+        ..SMALL
+    })
+    .unwrap();
+    assert_eq!(request.tp_block_size as usize, block_size);
+    assert!(block_size >= 4096 && block_size.is_power_of_two());
+}
+
+#[test]
+fn without_the_capability_the_error_names_it() {
+    let thread = std::thread::spawn(|| {
+        if caps::clear(None, caps::CapSet::Effective).is_err() {
+            return None;
+        }
+        Some(Ring::open(SMALL, None).unwrap_err())
+    });
+    if let Some(error) = thread.join().unwrap() {
+        assert!(matches!(error, RingError::NotPermitted { .. }), "{error:?}");
+        assert!(error.to_string().contains("CAP_NET_RAW"), "{error}");
+    }
+}
