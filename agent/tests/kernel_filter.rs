@@ -3,6 +3,14 @@
 //! Every frame of every capture goes through the loaded program (BPF_PROG_TEST_RUN: no interface,
 //! no socket) and through the reassembly and walk of user space. Needs root.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "test code says what must hold by failing"
+)]
+
 mod program_run;
 
 use std::collections::{BTreeMap, BTreeSet};

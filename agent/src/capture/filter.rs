@@ -67,7 +67,6 @@ impl Default for FilterSettings {
 }
 
 /// One loaded filter with its maps.
-
 pub struct Filter {
     program: ProgramFd,
     interest: HashMap<MapData, [u32; 4], u32>,

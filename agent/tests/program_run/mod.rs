@@ -238,7 +238,7 @@ fn v4(piece: &[u8], offset: u16, more: bool, identification: u32, single: bool) 
     let flags = if single {
         0x4000
     } else {
-        u16::from(more) << 13 | offset / 8
+        (u16::from(more) << 13) | (offset / 8)
     }
     .to_be_bytes();
     let header = [
