@@ -12,7 +12,7 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Scratch, count, scratch},
+    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Scratch, copy, count, scratch},
     verdict::{self, progress},
 };
 
@@ -46,12 +46,20 @@ pub extern "C" fn pass(skb: *mut __sk_buff) -> u32 {
         count(Counter::FlowTableFull, 1);
         return 0;
     };
-    let (offset, len, more) = (scratch.packet.offset, scratch.packet.len, scratch.packet.more);
+    let (offset, len, more) = (
+        scratch.packet.offset,
+        scratch.packet.len,
+        scratch.packet.more,
+    );
     if flow.state == state::DONE || flow.state == state::FOREIGN && offset != 0 {
         return 0;
     }
     let (cell, mask) = (offset >> 9 & 127, 1_u64 << (offset >> 9 & 63));
-    let cells = if cell < 64 { &mut flow.cells[0] } else { &mut flow.cells[1] };
+    let cells = if cell < 64 {
+        &mut flow.cells[0]
+    } else {
+        &mut flow.cells[1]
+    };
     if *cells & mask != 0 {
         count(Counter::FragmentsRepeated, 1);
         return u32::from(flow.state == state::CAPTURED || flow.state == state::HANDED_OVER);
@@ -116,7 +124,11 @@ fn first(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
     // Any fragment seen before this one was captured: so is the whole.
     let alone = flow.seen == scratch.packet.len;
     let (base, present) = (scratch.packet.body + 8, scratch.packet.len - 8);
-    let result = if alone { verdict::run(skb, base, present) } else { progress::CAPTURE };
+    let result = if alone {
+        verdict::run(skb, base, present)
+    } else {
+        progress::CAPTURE
+    };
     if result >= progress::CAPTURE {
         // Also when a header is split: user space gets the datagram from its start.
         flow.state = state::CAPTURED;
@@ -145,7 +157,7 @@ fn trailing(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 
     if next >= end || next + 4 > flow.walk.datagram_len {
         return 0;
     }
-    scratch.walk = flow.walk;
+    copy(&flow.walk, &mut scratch.walk);
     scratch.count = 0;
     scratch.unknown = 0;
     // The walk goes on in a fragment that has not come yet: this one is out of order.
@@ -167,7 +179,7 @@ fn trailing(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 
 #[inline(always)]
 fn keep_walk(scratch: &mut Scratch, flow: &mut Flow) {
     let found = scratch.count;
-    flow.walk = scratch.walk;
+    copy(&scratch.walk, &mut flow.walk);
     if found == 0 {
         return;
     }
@@ -177,7 +189,7 @@ fn keep_walk(scratch: &mut Scratch, flow: &mut Flow) {
         flow.ahead = 1;
     }
     if let Some(last) = scratch.records.get(found as usize - 1) {
-        flow.pending = *last;
+        copy(last, &mut flow.pending);
         flow.has_pending = 1;
     }
 }
@@ -200,13 +212,18 @@ fn hand_over(scratch: &Scratch, flow: &mut Flow) {
     flow.ahead = 1;
     let (walk, packet) = (&scratch.walk, &scratch.packet);
     let record = &mut flow.pending;
-    *record = walk.record;
+    copy(&walk.record, record);
     record.time = packet.now;
     record.kind = kind::HANDOVER;
     record.submessage_flags = 0;
     record.flags |= flag::AHEAD;
     record.writer = [walk.source[0], walk.source[1], walk.source[2], 0];
-    record.reader = [walk.destination[0], walk.destination[1], walk.destination[2], 0];
+    record.reader = [
+        walk.destination[0],
+        walk.destination[1],
+        walk.destination[2],
+        0,
+    ];
     record.sequence_number = 0;
     record.source_timestamp = u64::from(walk.timestamp[0]) << 32 | u64::from(walk.timestamp[1]);
     record.payload_len = walk.offset;
@@ -224,15 +241,24 @@ fn hand_over(scratch: &Scratch, flow: &mut Flow) {
 /// All fragments have come.
 #[inline(always)]
 fn finish(scratch: &Scratch, flow: &mut Flow) {
-    let (walked, handed_over) =
-        (flow.state == state::WALKING, flow.state == state::HANDED_OVER);
+    let (walked, handed_over) = (
+        flow.state == state::WALKING,
+        flow.state == state::HANDED_OVER,
+    );
     flow.state = state::DONE;
     if !walked && !handed_over {
         return;
     }
     let metered = flow.has_pending != 0 || flow.ahead != 0;
     if walked {
-        count(if metered { Counter::Metered } else { Counter::Ignored }, 1);
+        count(
+            if metered {
+                Counter::Metered
+            } else {
+                Counter::Ignored
+            },
+            1,
+        );
     }
     if !metered {
         return;

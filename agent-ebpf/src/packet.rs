@@ -39,7 +39,12 @@ pub fn load<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     let mut value = MaybeUninit::<T>::uninit();
     // SAFETY: the destination has the size given; the kernel checks the offset.
     let result = unsafe {
-        bpf_skb_load_bytes(skb.cast(), offset, value.as_mut_ptr().cast(), size_of::<T>() as u32)
+        bpf_skb_load_bytes(
+            skb.cast(),
+            offset,
+            value.as_mut_ptr().cast(),
+            size_of::<T>() as u32,
+        )
     };
     if result != 0 {
         return None;
@@ -74,7 +79,9 @@ pub extern "C" fn parse(skb: *mut __sk_buff) -> u32 {
     } else {
         0
     };
-    let Some([first]) = load::<[u8; 1]>(skb, start) else { return 0 };
+    let Some([first]) = load::<[u8; 1]>(skb, start) else {
+        return 0;
+    };
     let is_udp = match first >> 4 {
         4 => ipv4(skb, start, packet),
         6 => ipv6(skb, start, packet),
@@ -91,8 +98,11 @@ pub extern "C" fn parse(skb: *mut __sk_buff) -> u32 {
 #[inline(always)]
 fn ipv4(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
     let [first, second, third, source, destination]: [u32; 5] = load(skb, start)?;
-    let (first, second, third) =
-        (u32::from_be(first), u32::from_be(second), u32::from_be(third));
+    let (first, second, third) = (
+        u32::from_be(first),
+        u32::from_be(second),
+        u32::from_be(third),
+    );
     if third >> 16 & 0xff != UDP {
         return None;
     }
@@ -121,10 +131,12 @@ fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
     packet.source = [header[2], header[3], header[4], header[5]];
     packet.destination = [header[6], header[7], header[8], header[9]];
     packet.ipv6 = 1;
-    packet.offset = 0;
-    packet.more = 0;
-    packet.identification = 0;
-    packet.fragmented = 0;
+    // Opaque, or four zeros in a row become a call of `memset`.
+    let zero = core::hint::black_box(0);
+    packet.offset = zero;
+    packet.more = zero;
+    packet.identification = zero;
+    packet.fragmented = zero;
     let end = start + 40 + (lengths >> 16);
     let mut next = lengths >> 8 & 0xff;
     let mut at = start + 40;

@@ -9,8 +9,8 @@ use ros2probe_wire::{
 
 use crate::{
     maps::{
-        BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, UNKNOWN, count,
-        scratch, setting,
+        BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, UNKNOWN, copy,
+        count, scratch, setting,
     },
     packet::{Payload, load},
 };
@@ -52,7 +52,14 @@ pub extern "C" fn whole(skb: *mut __sk_buff) -> u32 {
         return 1;
     }
     let records = scratch.count;
-    count(if records == 0 { Counter::Ignored } else { Counter::Metered }, 1);
+    count(
+        if records == 0 {
+            Counter::Ignored
+        } else {
+            Counter::Metered
+        },
+        1,
+    );
     flush(records, 0);
     0
 }
@@ -76,9 +83,15 @@ pub fn begin(skb: *mut __sk_buff, scratch: &mut Scratch) -> Option<()> {
         return None;
     }
     let (now, destination, interface) = (packet.now, packet.destination, packet.interface);
-    let flags = (if packet.fragmented != 0 { flag::FRAGMENTED } else { 0 })
-        | (if packet.outgoing != 0 { flag::OUTGOING } else { 0 })
-        | (if packet.ipv6 != 0 { flag::IPV6 } else { 0 });
+    let flags = (if packet.fragmented != 0 {
+        flag::FRAGMENTED
+    } else {
+        0
+    }) | (if packet.outgoing != 0 {
+        flag::OUTGOING
+    } else {
+        0
+    }) | (if packet.ipv6 != 0 { flag::IPV6 } else { 0 });
     scratch.count = 0;
     scratch.unknown = 0;
     let record = &mut scratch.walk.record;
@@ -114,7 +127,9 @@ pub fn run(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
-    let Some(scratch) = scratch() else { return progress::STOP };
+    let Some(scratch) = scratch() else {
+        return progress::STOP;
+    };
     let before = scratch.walk.offset;
     let result = match walk::step(&mut scratch.walk, &Payload { skb, base }, present) {
         Step::End | Step::Later => progress::STOP,
@@ -163,9 +178,8 @@ fn endpoint(scratch: &mut Scratch, long_gap: bool) -> u32 {
     if long_gap || index >= RECORDS_PER_DATAGRAM {
         return progress::CAPTURE;
     }
-    let record = scratch.walk.record;
     if let Some(slot) = scratch.records.get_mut(index as usize) {
-        *slot = record;
+        copy(&scratch.walk.record, slot);
     }
     scratch.count = index + 1;
     progress::ON
@@ -209,7 +223,9 @@ pub fn charge(len: u32) -> bool {
 
 #[inline(always)]
 fn spend(budget: Budget, amount: u32) -> bool {
-    let Some(left) = BUDGET.get_ptr_mut(budget as u32) else { return false };
+    let Some(left) = BUDGET.get_ptr_mut(budget as u32) else {
+        return false;
+    };
     // SAFETY: a map value pointer checked against null. It is a budget, not an account: CPUs that
     // race may overdraw it by a datagram.
     let left = unsafe { &mut *left };
@@ -257,5 +273,12 @@ pub fn write(record: &Record) {
         NO_WAKEUP
     };
     let written = RECORDS.output::<Record>(record, wake).is_ok();
-    count(if written { Counter::Records } else { Counter::RecordsLost }, 1);
+    count(
+        if written {
+            Counter::Records
+        } else {
+            Counter::RecordsLost
+        },
+        1,
+    );
 }

@@ -125,11 +125,12 @@ impl Walk {
     /// checked the magic.
     #[inline(always)]
     pub fn begin(&mut self, source: [u32; 3], datagram_len: u32) {
+        let zero = zero();
         self.source = source;
-        self.destination = [0; 3];
+        self.destination = [zero; 3];
         self.offset = HEADER_LEN;
         self.datagram_len = datagram_len;
-        self.timestamp = [0; 2];
+        self.timestamp = [zero; 2];
         self.record.datagram_len = datagram_len as u16;
     }
 
@@ -235,7 +236,7 @@ fn receiver_state<B: Bytes>(
 ) -> Step {
     if id == INFO_TS {
         if flags & 0x02 != 0 {
-            walk.timestamp = [0; 2];
+            walk.timestamp = [zero(); 2];
             return Step::Passed;
         }
         if body + 8 > end {
@@ -254,7 +255,7 @@ fn receiver_state<B: Bytes>(
             return Step::Malformed;
         }
         walk.source = read!(walk, bytes, present, body + 8, 3);
-        walk.timestamp = [0; 2];
+        walk.timestamp = [zero(); 2];
     }
     Step::Passed
 }
@@ -269,15 +270,23 @@ fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
     record.kind = id as u8;
     record.submessage_flags = flags as u8;
     record.flags &= flag::FRAGMENTED | flag::OUTGOING | flag::IPV6;
-    record.source_timestamp = 0;
-    record.payload_len = 0;
-    record.encapsulation = 0;
-    record.stamp_seconds = 0;
-    record.stamp_nanoseconds = 0;
-    record.fragment_start = 0;
-    record.fragments = 0;
-    record.sample_size = 0;
-    record.status_info = 0;
+    let zero = zero();
+    record.source_timestamp = u64::from(zero);
+    record.payload_len = zero;
+    record.encapsulation = zero;
+    record.stamp_seconds = zero;
+    record.stamp_nanoseconds = zero;
+    record.fragment_start = zero;
+    record.fragments = zero;
+    record.sample_size = zero;
+    record.status_info = zero;
+}
+
+/// A zero that the compiler does not know to be one: rows of plain zeros would become a call of
+/// `memset`, which for the BPF target is a loop over bytes.
+#[inline(always)]
+fn zero() -> u32 {
+    core::hint::black_box(0)
 }
 
 /// DATA and DATA_FRAG (RTPS 2.5, 9.4.5.3 and 9.4.5.4).
