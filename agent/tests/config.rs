@@ -1,4 +1,5 @@
 //! The shipped configuration and its schema agree with the code.
+#![expect(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::path::Path;
 

@@ -1,0 +1,136 @@
+//! The agent's part of the page: what it drops, cannot read or cannot hold (`ros2probe_*`), and its
+//! own process (`process_*`).
+
+use std::fmt;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::board::{Reload, State};
+use super::catalogue as metric;
+use super::page::{Label, Page};
+use super::process::Process;
+use super::robot::Rows;
+
+/// What runs, where its packets come from, and whether it sees.
+pub(super) fn identity(page: &mut Page<'_>, state: &State, now: Instant) -> fmt::Result {
+    page.family(&metric::BUILD_INFO, |family| {
+        let version = Label::Text(env!("CARGO_PKG_VERSION"));
+        family.info(&[version, Label::Text(std::env::consts::ARCH)])
+    })?;
+    page.family(&metric::SOURCE_INFO, |family| {
+        family.info(&[Label::Text(state.agent.source.label())])
+    })?;
+    page.single(&metric::READY, state.ready(now).is_ok())
+}
+
+/// The capture and the kernel filter.
+pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
+    let agent = &state.agent;
+    page.family(&metric::CAPTURE_PACKETS, |family| {
+        agent.interfaces.iter().try_for_each(|interface| {
+            family.sample(&[Label::Text(&interface.name)], interface.packets)
+        })
+    })?;
+    page.family(&metric::CAPTURE_DROPPED, |family| {
+        agent.interfaces.iter().try_for_each(|interface| {
+            family.sample(&[Label::Text(&interface.name)], interface.dropped)
+        })
+    })?;
+    page.single(&metric::CAPTURE_COPIED, agent.copied_bytes)?;
+    page.family(&metric::FILTER_VERDICTS, |family| {
+        agent
+            .verdicts
+            .iter()
+            .try_for_each(|(verdict, count)| family.sample(&[Label::Text(verdict)], *count))
+    })?;
+    page.single(&metric::RECORDS_DROPPED, agent.records_dropped)?;
+    page.single(&metric::FLOWS_EVICTED, agent.flows_evicted)
+}
+
+/// The model's tables and what it could not read.
+pub(super) fn model(page: &mut Page<'_>, state: &State, rows: &Rows<'_>) -> fmt::Result {
+    let snapshot = state.snapshot.as_ref();
+    let tables = || snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
+    page.single(
+        &metric::DATAGRAMS,
+        snapshot.map_or(0, |snapshot| snapshot.datagrams),
+    )?;
+    page.single(
+        &metric::RECORDS,
+        snapshot.map_or(0, |snapshot| snapshot.records),
+    )?;
+    page.family(&metric::DECODE_ERRORS, |family| {
+        let mut errors = snapshot
+            .into_iter()
+            .flat_map(|snapshot| &snapshot.decode_errors);
+        errors.try_for_each(|error| {
+            family.sample(
+                &[Label::Text(error.stage), Label::Text(error.reason)],
+                error.count,
+            )
+        })
+    })?;
+    page.family(&metric::TABLE_ENTRIES, |family| {
+        tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.size))
+    })?;
+    page.family(&metric::TABLE_LIMIT, |family| {
+        tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.limit))
+    })?;
+    page.family(&metric::TABLE_EVICTIONS, |family| {
+        tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.evictions))
+    })?;
+    let tracked = rows
+        .shown
+        .iter()
+        .filter(|row| row.measurement().is_some())
+        .count();
+    page.single(&metric::TRACKED_TOPICS, tracked)?;
+    page.single(
+        &metric::TOPICS_REJECTED,
+        snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
+    )?;
+    page.single(&metric::TOPICS_HIDDEN, rows.hidden)
+}
+
+/// The surface itself.
+pub(super) fn surface(
+    page: &mut Page<'_>,
+    state: &State,
+    reload: Reload,
+    last_scrape: Duration,
+    now: Instant,
+) -> fmt::Result {
+    let age = now.saturating_duration_since(state.agent.at);
+    page.single(&metric::SNAPSHOT_AGE, age.as_secs_f64())?;
+    page.single(&metric::SCRAPE_DURATION, last_scrape.as_secs_f64())?;
+    page.single(&metric::RELOAD_SUCCESSFUL, reload.successful)?;
+    let since_epoch = reload.last_success.duration_since(SystemTime::UNIX_EPOCH);
+    page.single(
+        &metric::RELOAD_TIMESTAMP,
+        since_epoch.unwrap_or_default().as_secs_f64(),
+    )
+}
+
+/// The process; what cannot be read is left out.
+pub(super) fn process(page: &mut Page<'_>) -> fmt::Result {
+    let Process {
+        cpu_seconds,
+        resident_bytes,
+        virtual_bytes,
+        open_fds,
+        max_fds,
+        start_time,
+    } = Process::read();
+    for (metric, value) in [
+        (&metric::PROCESS_CPU, cpu_seconds),
+        (&metric::PROCESS_RESIDENT, resident_bytes),
+        (&metric::PROCESS_VIRTUAL, virtual_bytes),
+        (&metric::PROCESS_OPEN_FDS, open_fds),
+        (&metric::PROCESS_MAX_FDS, max_fds),
+        (&metric::PROCESS_START_TIME, start_time),
+    ] {
+        if let Some(value) = value {
+            page.single(metric, value)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,227 @@
+//! The board on which the capture thread pins what it knows and from which surfaces read.
+//!
+//! Nobody waits here: a reader takes the latest state, the writer replaces it.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use arc_swap::ArcSwap;
+
+use super::agent_facts::{AgentFacts, SourceKind};
+use crate::config::{Config, Watch};
+use crate::model::snapshot::Snapshot;
+
+/// Older than this, the state no longer describes the robot.
+const FRESH: Duration = Duration::from_secs(5);
+
+/// Everything surfaces read, replaced piece by piece.
+#[derive(Debug)]
+pub struct Board {
+    state: ArcSwap<State>,
+    settings: ArcSwap<Settings>,
+    reload: ArcSwap<Reload>,
+}
+
+/// What the capture thread found out.
+#[derive(Clone, Debug)]
+pub struct State {
+    /// The robot; `None` until the first snapshot.
+    pub snapshot: Option<Snapshot>,
+    /// The agent.
+    pub agent: AgentFacts,
+}
+
+/// The part of the configuration that decides what is shown.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Settings {
+    /// Expectations are shown as configured.
+    pub watches: Vec<Watch>,
+    /// Histograms of watched topics.
+    pub histograms: bool,
+    /// Series per writer.
+    pub per_writer: bool,
+    /// Topics shown at most.
+    pub max_topics: usize,
+}
+
+/// How the last reload of the configuration went.
+#[derive(Clone, Copy, Debug)]
+pub struct Reload {
+    /// It was taken over.
+    pub successful: bool,
+    /// When one was last taken over.
+    pub last_success: SystemTime,
+}
+
+impl Settings {
+    /// What `config` wants to be shown, with the watches that are in force.
+    #[must_use]
+    pub fn new(config: &Config) -> Self {
+        Self {
+            watches: config.watches.clone(),
+            histograms: config.metrics.histograms,
+            per_writer: config.metrics.per_writer,
+            max_topics: config.limits.topics,
+        }
+    }
+}
+
+impl Board {
+    /// An empty board of an agent that was configured just now.
+    #[must_use]
+    pub fn new(source: SourceKind, settings: Settings) -> Self {
+        let agent = AgentFacts::new(source, Instant::now());
+        let reload = Reload {
+            successful: true,
+            last_success: SystemTime::now(),
+        };
+        Self {
+            state: ArcSwap::from_pointee(State {
+                snapshot: None,
+                agent,
+            }),
+            settings: ArcSwap::from_pointee(settings),
+            reload: ArcSwap::from_pointee(reload),
+        }
+    }
+
+    /// Pins a new state.
+    pub fn publish(&self, snapshot: Snapshot, agent: AgentFacts) {
+        self.state.store(Arc::new(State {
+            snapshot: Some(snapshot),
+            agent,
+        }));
+    }
+
+    /// Pins new settings after a reload that worked.
+    pub fn reloaded(&self, settings: Settings) {
+        self.settings.store(Arc::new(settings));
+        let reload = Reload {
+            successful: true,
+            last_success: SystemTime::now(),
+        };
+        self.reload.store(Arc::new(reload));
+    }
+
+    /// Notes that a reload was refused.
+    pub fn reload_failed(&self) {
+        let last_success = self.reload.load().last_success;
+        self.reload.store(Arc::new(Reload {
+            successful: false,
+            last_success,
+        }));
+    }
+
+    /// The latest state.
+    #[must_use]
+    pub fn state(&self) -> Arc<State> {
+        self.state.load_full()
+    }
+
+    /// The settings in force.
+    #[must_use]
+    pub fn settings(&self) -> Arc<Settings> {
+        self.settings.load_full()
+    }
+
+    /// How the last reload went.
+    #[must_use]
+    pub fn reload(&self) -> Reload {
+        **self.reload.load()
+    }
+}
+
+impl State {
+    /// Whether what is shown describes the robot at `now`.
+    ///
+    /// # Errors
+    /// The reason why it does not.
+    pub fn ready(&self, now: Instant) -> Result<(), String> {
+        if self.snapshot.is_none() {
+            return Err("starting: nothing was captured yet".to_owned());
+        }
+        if self.agent.finished {
+            return Ok(());
+        }
+        let stuck = now.saturating_duration_since(self.agent.capture_progress);
+        if stuck > FRESH {
+            return Err(format!(
+                "the capture has made no progress for {} s",
+                stuck.as_secs()
+            ));
+        }
+        let age = now.saturating_duration_since(self.agent.at);
+        if age > FRESH {
+            return Err(format!("the last snapshot is {} s old", age.as_secs()));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_agent_is_ready_only_while_it_sees() {
+        let board = Board::new(SourceKind::Live, Settings::default());
+        let start = Instant::now();
+        assert!(
+            board
+                .state()
+                .ready(start)
+                .unwrap_err()
+                .starts_with("starting")
+        );
+
+        board.publish(
+            Snapshot::default(),
+            AgentFacts::new(SourceKind::Live, start),
+        );
+        assert_eq!(board.state().ready(start + Duration::from_secs(4)), Ok(()));
+        let reason = board
+            .state()
+            .ready(start + Duration::from_secs(7))
+            .unwrap_err();
+        assert_eq!(reason, "the capture has made no progress for 7 s");
+
+        let later = start + Duration::from_secs(60);
+        let agent = AgentFacts {
+            capture_progress: later,
+            ..AgentFacts::new(SourceKind::Live, start)
+        };
+        board.publish(Snapshot::default(), agent);
+        assert_eq!(
+            board.state().ready(later).unwrap_err(),
+            "the last snapshot is 60 s old"
+        );
+    }
+
+    #[test]
+    fn a_finished_replay_stays_ready() {
+        let start = Instant::now();
+        let agent = AgentFacts {
+            finished: true,
+            ..AgentFacts::new(SourceKind::Replay, start)
+        };
+        let state = State {
+            snapshot: Some(Snapshot::default()),
+            agent,
+        };
+        assert_eq!(state.ready(start + Duration::from_hours(1)), Ok(()));
+    }
+
+    #[test]
+    fn a_refused_reload_keeps_the_settings() {
+        let settings = Settings {
+            per_writer: true,
+            ..Settings::default()
+        };
+        let board = Board::new(SourceKind::Live, settings.clone());
+        let first = board.reload().last_success;
+        board.reload_failed();
+        assert_eq!(*board.settings(), settings);
+        assert!(!board.reload().successful);
+        assert_eq!(board.reload().last_success, first);
+    }
+}

@@ -1,0 +1,568 @@
+//! Every metric the agent exports, once: name, type, unit, labels, help, stability. The renderer, the README's table
+//! and the tests work from it; nothing else spells a metric name.
+//!
+//! Names follow the Prometheus naming practices; labels of topic series are `domain_id` and `topic`
+//! alone, details are in one info series.
+
+/// One metric family.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Metric {
+    /// As it is queried, with `_total` or `_info`; histograms without `_bucket`.
+    pub name: &'static str,
+    /// Type.
+    pub kind: Kind,
+    /// Base unit, which the name contains.
+    pub unit: Option<&'static str>,
+    /// Label names, in order.
+    pub labels: &'static [&'static str],
+    /// One sentence.
+    pub help: &'static str,
+    /// Whether name and meaning may still change.
+    pub stability: Stability,
+}
+
+/// Metric types.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Only grows while its series exists.
+    Counter,
+    /// Goes up and down.
+    Gauge,
+    /// Buckets, sum and count.
+    Histogram,
+    /// Always 1; its labels are the message.
+    Info,
+}
+
+/// Promise to users.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stability {
+    /// Changes only with a major version.
+    Stable,
+    /// May change with a minor version; noted in the change log.
+    Experimental,
+}
+
+impl Metric {
+    const fn counter(
+        name: &'static str,
+        labels: &'static [&'static str],
+        help: &'static str,
+    ) -> Self {
+        let (kind, stability) = (Kind::Counter, Stability::Stable);
+        Self {
+            name,
+            kind,
+            unit: None,
+            labels,
+            help,
+            stability,
+        }
+    }
+
+    const fn gauge(
+        name: &'static str,
+        labels: &'static [&'static str],
+        help: &'static str,
+    ) -> Self {
+        Self {
+            kind: Kind::Gauge,
+            ..Self::counter(name, labels, help)
+        }
+    }
+
+    const fn info(name: &'static str, labels: &'static [&'static str], help: &'static str) -> Self {
+        Self {
+            kind: Kind::Info,
+            ..Self::counter(name, labels, help)
+        }
+    }
+
+    const fn histogram(
+        name: &'static str,
+        labels: &'static [&'static str],
+        help: &'static str,
+    ) -> Self {
+        Self {
+            kind: Kind::Histogram,
+            ..Self::counter(name, labels, help)
+        }
+    }
+
+    const fn unit(self, unit: &'static str) -> Self {
+        Self {
+            unit: Some(unit),
+            ..self
+        }
+    }
+
+    const fn experimental(self) -> Self {
+        Self {
+            stability: Stability::Experimental,
+            ..self
+        }
+    }
+
+    /// The name without what the exposition format appends: type suffix and unit.
+    #[must_use]
+    pub fn stem(&self) -> &'static str {
+        let name = match self.kind {
+            Kind::Counter => self.name.strip_suffix("_total"),
+            Kind::Info => self.name.strip_suffix("_info"),
+            Kind::Gauge | Kind::Histogram => None,
+        }
+        .unwrap_or(self.name);
+        let without_unit = |unit| name.strip_suffix(unit)?.strip_suffix('_');
+        self.unit.and_then(without_unit).unwrap_or(name)
+    }
+}
+
+impl Kind {
+    /// In words.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Counter => "counter",
+            Self::Gauge => "gauge",
+            Self::Histogram => "histogram",
+            Self::Info => "info",
+        }
+    }
+}
+
+const DOMAIN: &[&str] = &["domain_id"];
+const TOPIC: &[&str] = &["domain_id", "topic"];
+const WRITER: &[&str] = &["domain_id", "topic", "writer", "ros_node"];
+const UNKNOWN: &[&str] = &["writer", "vendor"];
+
+// The graph.
+pub(super) const PARTICIPANTS: Metric = Metric::gauge(
+    "ros2_participants",
+    DOMAIN,
+    "DDS participants that are alive.",
+);
+pub(super) const SECURED_PARTICIPANTS: Metric = Metric::gauge(
+    "ros2_secured_participants",
+    DOMAIN,
+    "Participants with DDS security: their messages may be encrypted and invisible.",
+);
+pub(super) const NODES: Metric = Metric::gauge("ros2_nodes", DOMAIN, "ROS nodes that are alive.");
+pub(super) const NODE_INFO: Metric = Metric::info(
+    "ros2_node_info",
+    &["domain_id", "ros_node", "participant", "vendor", "host"],
+    "ROS nodes and where they run.",
+);
+pub(super) const TOPICS: Metric = Metric::gauge(
+    "ros2_topics",
+    &["domain_id", "kind"],
+    "DDS topics with at least one endpoint, by what ROS uses them for.",
+);
+pub(super) const DISCOVERY_EVENTS: Metric = Metric::counter(
+    "ros2_discovery_events_total",
+    &["domain_id", "entity", "event"],
+    "Participants, writers, readers and nodes that appeared, changed or went, and how.",
+);
+pub(super) const UNKNOWN_WRITERS: Metric = Metric::gauge(
+    "ros2_unknown_writers",
+    &[],
+    "Writers that send although their announcement was not seen.",
+);
+pub(super) const UNKNOWN_WRITER_MESSAGES: Metric = Metric::counter(
+    "ros2_unknown_writer_messages_total",
+    UNKNOWN,
+    "Messages of unknown writers, for the first 32 of them.",
+)
+.experimental();
+
+// Topics.
+pub(super) const TOPIC_INFO: Metric = Metric::info(
+    "ros2_topic_info",
+    &[
+        "domain_id",
+        "topic",
+        "kind",
+        "message_type",
+        "reliability",
+        "durability",
+    ],
+    "Type and quality of service as its publishers announce them; several values are joined by commas.",
+);
+pub(super) const TOPIC_PUBLISHERS: Metric = Metric::gauge(
+    "ros2_topic_publishers",
+    TOPIC,
+    "Writers of the topic; 0 once it has vanished.",
+);
+pub(super) const TOPIC_SUBSCRIPTIONS: Metric =
+    Metric::gauge("ros2_topic_subscriptions", TOPIC, "Readers of the topic.");
+pub(super) const TOPIC_MESSAGES: Metric = Metric::counter(
+    "ros2_topic_messages_total",
+    TOPIC,
+    "Messages seen whole on the wire, each counted once.",
+);
+pub(super) const TOPIC_BYTES: Metric = Metric::counter(
+    "ros2_topic_bytes_total",
+    TOPIC,
+    "Payload bytes of those messages, encapsulation included, as `ros2 topic bw` counts.",
+)
+.unit("bytes");
+pub(super) const TOPIC_LOST: Metric = Metric::counter(
+    "ros2_topic_lost_messages_total",
+    TOPIC,
+    "Messages that were sent but never seen whole: sequence gaps that nothing excused or filled.",
+);
+pub(super) const TOPIC_RECOVERED: Metric = Metric::counter(
+    "ros2_topic_recovered_messages_total",
+    TOPIC,
+    "Messages that filled a sequence gap later, by retransmission or reordering.",
+);
+pub(super) const TOPIC_DUPLICATES: Metric = Metric::counter(
+    "ros2_topic_duplicate_messages_total",
+    TOPIC,
+    "Messages and fragments seen again, counted nowhere else.",
+);
+pub(super) const TOPIC_INCOMPLETE: Metric = Metric::counter(
+    "ros2_topic_incomplete_messages_total",
+    TOPIC,
+    "Fragmented messages of which a part never came; they are lost messages too.",
+);
+pub(super) const TOPIC_LAST_MESSAGE: Metric = Metric::gauge(
+    "ros2_topic_last_message_timestamp_seconds",
+    TOPIC,
+    "Unix time of the last message.",
+)
+.unit("seconds");
+pub(super) const TOPIC_RATE: Metric = Metric::gauge(
+    "ros2_topic_rate_hertz",
+    TOPIC,
+    "Messages a second over the agent's last window, for people; rules use rate() of the counter.",
+)
+.unit("hertz");
+pub(super) const TOPIC_BANDWIDTH: Metric = Metric::gauge(
+    "ros2_topic_bandwidth_bytes_per_second",
+    TOPIC,
+    "Payload bytes a second over the same window, for people.",
+);
+pub(super) const TOPIC_INTERARRIVAL: Metric = Metric::histogram(
+    "ros2_topic_interarrival_seconds",
+    TOPIC,
+    "Time between consecutive messages of one writer, at capture.",
+)
+.unit("seconds");
+pub(super) const TOPIC_LATENCY: Metric = Metric::histogram(
+    "ros2_topic_latency_seconds",
+    TOPIC,
+    "From the writer's timestamp to the capture; across hosts it needs synchronised clocks.",
+)
+.unit("seconds");
+pub(super) const TOPIC_HEADER_LATENCY: Metric = Metric::histogram(
+    "ros2_topic_header_latency_seconds",
+    TOPIC,
+    "From the message's Header.stamp to the capture; across hosts it needs synchronised clocks.",
+)
+.unit("seconds");
+pub(super) const TOPIC_NEGATIVE_LATENCY: Metric = Metric::counter(
+    "ros2_topic_negative_latency_messages_total",
+    TOPIC,
+    "Messages stamped after their capture: clocks are apart. They are in no latency histogram.",
+);
+
+// Writers, on request.
+pub(super) const WRITER_MESSAGES: Metric = Metric::counter(
+    "ros2_writer_messages_total",
+    WRITER,
+    "As for the topic, of one writer.",
+)
+.experimental();
+pub(super) const WRITER_BYTES: Metric = Metric::counter(
+    "ros2_writer_bytes_total",
+    WRITER,
+    "As for the topic, of one writer.",
+)
+.unit("bytes")
+.experimental();
+pub(super) const WRITER_LOST: Metric = Metric::counter(
+    "ros2_writer_lost_messages_total",
+    WRITER,
+    "As for the topic, of one writer.",
+)
+.experimental();
+
+// The watchlist.
+pub(super) const WATCH_STATE: Metric = Metric::gauge(
+    "ros2_watch_state",
+    &["domain_id", "topic", "watch", "state"],
+    "1 for the state a watched topic is in: ok, violated, silent, not_published or no_subscriber.",
+);
+pub(super) const WATCH_VIOLATED: Metric = Metric::gauge(
+    "ros2_watch_expectation_violated",
+    &["domain_id", "topic", "watch", "expectation"],
+    "1 while a configured expectation is broken, after hysteresis.",
+);
+
+// The agent.
+pub(super) const BUILD_INFO: Metric = Metric::info(
+    "ros2probe_build_info",
+    &["version", "arch"],
+    "What is running.",
+);
+pub(super) const SOURCE_INFO: Metric = Metric::info(
+    "ros2probe_source_info",
+    &["source"],
+    "Where packets come from: live or replay.",
+);
+pub(super) const READY: Metric = Metric::gauge(
+    "ros2probe_ready",
+    &[],
+    "1 while packets are captured and the model is fresh, as /readyz answers.",
+);
+pub(super) const CAPTURE_PACKETS: Metric = Metric::counter(
+    "ros2probe_capture_packets_total",
+    &["interface"],
+    "Packets that the filter let through to user space.",
+);
+pub(super) const CAPTURE_DROPPED: Metric = Metric::counter(
+    "ros2probe_capture_dropped_packets_total",
+    &["interface"],
+    "Packets lost because the ring was full: above 0, everything else is a lower bound.",
+);
+pub(super) const CAPTURE_COPIED: Metric = Metric::counter(
+    "ros2probe_capture_copied_bytes_total",
+    &[],
+    "Bytes copied to user space, packets and records.",
+)
+.unit("bytes");
+pub(super) const FILTER_VERDICTS: Metric = Metric::counter(
+    "ros2probe_filter_verdicts_total",
+    &["verdict"],
+    "What the kernel filter decided.",
+)
+.experimental();
+pub(super) const RECORDS_DROPPED: Metric = Metric::counter(
+    "ros2probe_records_dropped_total",
+    &[],
+    "Measurement records lost because their ring was full: above 0, counts are lower bounds.",
+);
+pub(super) const FLOWS_EVICTED: Metric = Metric::counter(
+    "ros2probe_filter_flows_evicted_total",
+    &[],
+    "Fragmented datagrams that the kernel filter gave up for newer ones.",
+);
+pub(super) const DATAGRAMS: Metric = Metric::counter(
+    "ros2probe_datagrams_total",
+    &[],
+    "Datagrams looked at in user space.",
+);
+pub(super) const RECORDS: Metric = Metric::counter(
+    "ros2probe_records_total",
+    &[],
+    "Measurement records taken in.",
+);
+pub(super) const DECODE_ERRORS: Metric = Metric::counter(
+    "ros2probe_decode_errors_total",
+    &["stage", "reason"],
+    "Packets and submessages that could not be read, by what was being read and why.",
+);
+pub(super) const TABLE_ENTRIES: Metric = Metric::gauge(
+    "ros2probe_table_entries",
+    &["table"],
+    "Entries of a bounded table; bytes for reassembly.",
+);
+pub(super) const TABLE_LIMIT: Metric =
+    Metric::gauge("ros2probe_table_limit", &["table"], "Its cap.");
+pub(super) const TABLE_EVICTIONS: Metric = Metric::counter(
+    "ros2probe_table_evictions_total",
+    &["table"],
+    "Entries given up because of the cap.",
+);
+pub(super) const TRACKED_TOPICS: Metric = Metric::gauge(
+    "ros2probe_tracked_topics",
+    &[],
+    "Topics that are or were measured and shown.",
+);
+pub(super) const TOPICS_REJECTED: Metric = Metric::counter(
+    "ros2probe_topics_rejected_total",
+    &[],
+    "Topics that the watchlist matched but the cap kept from being measured.",
+);
+pub(super) const TOPICS_HIDDEN: Metric = Metric::gauge(
+    "ros2probe_topics_not_shown",
+    &[],
+    "Topics without series of their own because of the cap or an ambiguous name.",
+);
+pub(super) const SNAPSHOT_AGE: Metric = Metric::gauge(
+    "ros2probe_snapshot_age_seconds",
+    &[],
+    "How old the state shown here is.",
+)
+.unit("seconds");
+pub(super) const SCRAPE_DURATION: Metric = Metric::gauge(
+    "ros2probe_scrape_duration_seconds",
+    &[],
+    "How long writing the previous scrape took.",
+)
+.unit("seconds");
+pub(super) const RELOAD_SUCCESSFUL: Metric = Metric::gauge(
+    "ros2probe_config_last_reload_successful",
+    &[],
+    "1 unless the last reload of the configuration was refused.",
+);
+pub(super) const RELOAD_TIMESTAMP: Metric = Metric::gauge(
+    "ros2probe_config_last_reload_success_timestamp_seconds",
+    &[],
+    "Unix time when a configuration was last taken over.",
+)
+.unit("seconds");
+
+// The process, under the names every exporter uses.
+pub(super) const PROCESS_CPU: Metric = Metric::counter(
+    "process_cpu_seconds_total",
+    &[],
+    "User and system CPU time.",
+)
+.unit("seconds");
+pub(super) const PROCESS_RESIDENT: Metric =
+    Metric::gauge("process_resident_memory_bytes", &[], "Resident memory.").unit("bytes");
+pub(super) const PROCESS_VIRTUAL: Metric =
+    Metric::gauge("process_virtual_memory_bytes", &[], "Virtual memory.").unit("bytes");
+pub(super) const PROCESS_OPEN_FDS: Metric =
+    Metric::gauge("process_open_fds", &[], "Open file descriptors.");
+pub(super) const PROCESS_MAX_FDS: Metric =
+    Metric::gauge("process_max_fds", &[], "File descriptors that may be open.");
+pub(super) const PROCESS_START_TIME: Metric = Metric::gauge(
+    "process_start_time_seconds",
+    &[],
+    "Unix time when the process started.",
+)
+.unit("seconds");
+
+/// All of them, in the order of the page.
+pub const CATALOGUE: &[Metric] = &[
+    PARTICIPANTS,
+    SECURED_PARTICIPANTS,
+    NODES,
+    NODE_INFO,
+    TOPICS,
+    DISCOVERY_EVENTS,
+    UNKNOWN_WRITERS,
+    UNKNOWN_WRITER_MESSAGES,
+    TOPIC_INFO,
+    TOPIC_PUBLISHERS,
+    TOPIC_SUBSCRIPTIONS,
+    TOPIC_MESSAGES,
+    TOPIC_BYTES,
+    TOPIC_LOST,
+    TOPIC_RECOVERED,
+    TOPIC_DUPLICATES,
+    TOPIC_INCOMPLETE,
+    TOPIC_LAST_MESSAGE,
+    TOPIC_RATE,
+    TOPIC_BANDWIDTH,
+    TOPIC_NEGATIVE_LATENCY,
+    TOPIC_INTERARRIVAL,
+    TOPIC_LATENCY,
+    TOPIC_HEADER_LATENCY,
+    WRITER_MESSAGES,
+    WRITER_BYTES,
+    WRITER_LOST,
+    WATCH_STATE,
+    WATCH_VIOLATED,
+    BUILD_INFO,
+    SOURCE_INFO,
+    READY,
+    CAPTURE_PACKETS,
+    CAPTURE_DROPPED,
+    CAPTURE_COPIED,
+    FILTER_VERDICTS,
+    RECORDS_DROPPED,
+    FLOWS_EVICTED,
+    DATAGRAMS,
+    RECORDS,
+    DECODE_ERRORS,
+    TABLE_ENTRIES,
+    TABLE_LIMIT,
+    TABLE_EVICTIONS,
+    TRACKED_TOPICS,
+    TOPICS_REJECTED,
+    TOPICS_HIDDEN,
+    SNAPSHOT_AGE,
+    SCRAPE_DURATION,
+    RELOAD_SUCCESSFUL,
+    RELOAD_TIMESTAMP,
+    PROCESS_CPU,
+    PROCESS_RESIDENT,
+    PROCESS_VIRTUAL,
+    PROCESS_OPEN_FDS,
+    PROCESS_MAX_FDS,
+    PROCESS_START_TIME,
+];
+
+/// The catalogue as a Markdown table, for the README.
+#[must_use]
+pub fn markdown() -> String {
+    let mut table = "| metric | type | labels | meaning |\n| --- | --- | --- | --- |\n".to_owned();
+    for Metric {
+        name,
+        kind,
+        labels,
+        help,
+        stability,
+        ..
+    } in CATALOGUE
+    {
+        let labels: Vec<String> = labels.iter().map(|label| format!("`{label}`")).collect();
+        let kind = kind.label();
+        let mark = match stability {
+            Stability::Stable => "",
+            Stability::Experimental => " (experimental)",
+        };
+        let labels = labels.join(", ");
+        table.push_str(&format!(
+            "| `{name}`{mark} | {kind} | {labels} | {help} |\n"
+        ));
+    }
+    table
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_unique_and_carry_type_and_unit() {
+        let mut names: Vec<&str> = CATALOGUE.iter().map(|metric| metric.name).collect();
+        names.sort_unstable();
+        names.dedup();
+        assert_eq!(names.len(), CATALOGUE.len());
+        for metric in CATALOGUE {
+            let Metric {
+                name,
+                kind,
+                unit,
+                labels,
+                help,
+                ..
+            } = metric;
+            assert_eq!(name.ends_with("_total"), *kind == Kind::Counter, "{name}");
+            assert_eq!(name.ends_with("_info"), *kind == Kind::Info, "{name}");
+            assert!(
+                unit.is_none_or(|unit| name.contains(&format!("_{unit}"))),
+                "{name}"
+            );
+            assert!(
+                help.ends_with('.') && !help.contains(['\n', '\\', '|']),
+                "{name}"
+            );
+            for taken in ["type", "service", "env", "instance", "job", "node", "le"] {
+                assert!(!labels.contains(&taken), "{name} has the label {taken}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_stem_and_its_suffixes_make_the_name() {
+        assert_eq!(TOPIC_BYTES.stem(), "ros2_topic");
+        assert_eq!(TOPIC_MESSAGES.stem(), "ros2_topic_messages");
+        assert_eq!(TOPIC_INTERARRIVAL.stem(), "ros2_topic_interarrival");
+        assert_eq!(NODE_INFO.stem(), "ros2_node");
+    }
+}

@@ -1,0 +1,207 @@
+//! One scrape as text: OpenMetrics 1.0 when the client asks for it, classic Prometheus text
+//! otherwise. Both come from the same writer, so they cannot disagree.
+
+use std::fmt::{self, Write};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, text};
+use prometheus_client::registry::Registry;
+
+use super::agent;
+use super::board::Board;
+use super::page::Page;
+use super::robot::{self, Rows};
+use crate::model::snapshot::Snapshot;
+
+/// The two text formats.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// `application/openmetrics-text; version=1.0.0`.
+    OpenMetrics,
+    /// `text/plain; version=0.0.4`.
+    Classic,
+}
+
+/// Writes scrapes of a board.
+#[derive(Debug)]
+pub struct Exposition {
+    registry: Registry,
+    last_scrape_nanoseconds: Arc<AtomicU64>,
+}
+
+impl Format {
+    /// The best of what an `Accept` header allows; classic text when it says nothing.
+    #[must_use]
+    pub fn negotiate(accept: &str) -> Self {
+        let quality = |wanted: fn(&str) -> bool| {
+            let offers = accept.split(',').filter_map(|offer| {
+                let mut parameters = offer.split(';').map(str::trim);
+                let media = parameters.next().unwrap_or_default();
+                let mut weight = 1.0;
+                for parameter in parameters {
+                    match parameter.split_once('=') {
+                        Some(("q", value)) => weight = value.parse().unwrap_or(0.0),
+                        Some(("version", version))
+                            if media == OPENMETRICS && !["1.0.0", "0.0.1"].contains(&version) =>
+                        {
+                            return None;
+                        }
+                        _ => {}
+                    }
+                }
+                wanted(media).then_some(weight)
+            });
+            offers.fold(0.0_f32, f32::max)
+        };
+        let openmetrics = quality(|media| media == OPENMETRICS);
+        let classic = quality(|media| media == "text/plain");
+        if openmetrics > 0.0 && openmetrics >= classic {
+            Self::OpenMetrics
+        } else {
+            Self::Classic
+        }
+    }
+
+    /// The answer's `Content-Type`.
+    #[must_use]
+    pub const fn content_type(self) -> &'static str {
+        match self {
+            Self::OpenMetrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
+            Self::Classic => "text/plain; version=0.0.4; charset=utf-8",
+        }
+    }
+}
+
+const OPENMETRICS: &str = "application/openmetrics-text";
+
+impl Exposition {
+    /// Of what is pinned to `board`.
+    #[must_use]
+    pub fn new(board: Arc<Board>) -> Self {
+        let last_scrape_nanoseconds = Arc::new(AtomicU64::new(0));
+        let mut registry = Registry::default();
+        let last_scrape = Arc::clone(&last_scrape_nanoseconds);
+        registry.register_collector(Box::new(Scrape { board, last_scrape }));
+        Self {
+            registry,
+            last_scrape_nanoseconds,
+        }
+    }
+
+    /// The whole page.
+    ///
+    /// # Errors
+    /// Never while writing to memory; the formatting machinery wants to be asked.
+    pub fn render(&self, format: Format) -> Result<String, fmt::Error> {
+        let start = Instant::now();
+        let mut page = String::new();
+        match format {
+            Format::OpenMetrics => text::encode(&mut page, &self.registry)?,
+            Format::Classic => text::encode(&mut Classic::new(&mut page), &self.registry)?,
+        }
+        let took = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
+        self.last_scrape_nanoseconds.store(took, Ordering::Relaxed);
+        Ok(page)
+    }
+}
+
+/// Called by the registry on each scrape.
+#[derive(Debug)]
+struct Scrape {
+    board: Arc<Board>,
+    last_scrape: Arc<AtomicU64>,
+}
+
+impl Collector for Scrape {
+    fn encode(&self, encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let (state, settings) = (self.board.state(), self.board.settings());
+        let nothing = Snapshot::default();
+        let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+        let rows = Rows::new(snapshot, settings.max_topics);
+        let now = Instant::now();
+        let last_scrape = Duration::from_nanos(self.last_scrape.load(Ordering::Relaxed));
+
+        let mut page = Page::new(encoder);
+        robot::graph(&mut page, snapshot)?;
+        robot::topics(&mut page, &rows.shown, &settings)?;
+        robot::watches(&mut page, snapshot, &settings.watches)?;
+        agent::identity(&mut page, &state, now)?;
+        agent::capture(&mut page, &state)?;
+        agent::model(&mut page, &state, &rows)?;
+        agent::surface(&mut page, &state, self.board.reload(), last_scrape, now)?;
+        agent::process(&mut page)
+    }
+}
+
+/// Turns OpenMetrics into text format 0.0.4 line by line: families carry their full names, an info
+/// is a gauge, and there are no units and no end mark. Samples are the same in both.
+struct Classic<'a> {
+    out: &'a mut String,
+    line: String,
+    help: String,
+}
+
+impl<'a> Classic<'a> {
+    fn new(out: &'a mut String) -> Self {
+        Self {
+            out,
+            line: String::new(),
+            help: String::new(),
+        }
+    }
+
+    fn end_line(&mut self) {
+        let line = std::mem::take(&mut self.line);
+        if let Some(help) = line.strip_prefix("# HELP ") {
+            self.help = help.split_once(' ').map_or("", |(_, text)| text).to_owned();
+        } else if let Some((name, kind)) = line
+            .strip_prefix("# TYPE ")
+            .and_then(|rest| rest.split_once(' '))
+        {
+            let (suffix, kind) = match kind {
+                "counter" => ("_total", kind),
+                "info" => ("_info", "gauge"),
+                _ => ("", kind),
+            };
+            let help = std::mem::take(&mut self.help);
+            for piece in [
+                "# HELP ",
+                name,
+                suffix,
+                " ",
+                &help,
+                "\n# TYPE ",
+                name,
+                suffix,
+                " ",
+                kind,
+                "\n",
+            ] {
+                self.out.push_str(piece);
+            }
+        } else if !line.starts_with("# ") {
+            self.out.push_str(&line);
+            self.out.push('\n');
+        }
+        // Keeps its memory for the next line.
+        self.line = line;
+        self.line.clear();
+    }
+}
+
+impl Write for Classic<'_> {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        let mut pieces = text.split('\n');
+        if let Some(first) = pieces.next() {
+            self.line.push_str(first);
+        }
+        for piece in pieces {
+            self.end_line();
+            self.line.push_str(piece);
+        }
+        Ok(())
+    }
+}

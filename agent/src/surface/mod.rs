@@ -1,0 +1,16 @@
+//! What people and machines read: metrics and health over HTTP, from immutable snapshots. Nothing
+//! here ever makes the capture wait.
+
+mod agent;
+pub mod agent_facts;
+pub mod board;
+pub mod catalogue;
+pub mod exposition;
+pub mod http;
+mod page;
+mod process;
+mod robot;
+
+pub use agent_facts::{AgentFacts, InterfaceFacts, SourceKind};
+pub use board::{Board, Settings, State};
+pub use exposition::{Exposition, Format};

@@ -1,0 +1,233 @@
+//! Writing families and samples through prometheus-client, straight from facts, in the
+//! catalogue's order. No registry types are kept: what is gone from the facts is gone from the page.
+
+use std::collections::hash_map::DefaultHasher;
+use std::fmt::{self, Write as _};
+use std::hash::{Hash as _, Hasher as _};
+
+use prometheus_client::encoding::{
+    CounterValueEncoder, DescriptorEncoder, EncodeCounterValue, EncodeGaugeValue, EncodeLabelSet,
+    GaugeValueEncoder, LabelEncoder, LabelSetEncoder, MetricEncoder, NoLabelSet,
+};
+use prometheus_client::metrics::MetricType;
+use prometheus_client::registry::Unit;
+use ros2probe_wire::Guid;
+
+use super::catalogue::{Kind, Metric};
+use crate::model::histogram::Histogram;
+
+/// Longer label values are cut. ROS allows 255 characters; what is longer is hostile.
+const MAX_LABEL_BYTES: usize = 256;
+
+/// A label value.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Label<'a> {
+    Text(&'a str),
+    Number(u32),
+    Guid(Guid),
+}
+
+/// A sample value.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Number {
+    Count(u64),
+    Real(f64),
+}
+
+/// One scrape being written.
+pub(super) struct Page<'a>(DescriptorEncoder<'a>);
+
+/// One family being written; its samples follow one another.
+pub(super) struct Family<'a> {
+    metric: &'static Metric,
+    encoder: MetricEncoder<'a>,
+}
+
+impl<'a> Page<'a> {
+    pub(super) fn new(encoder: DescriptorEncoder<'a>) -> Self {
+        Self(encoder)
+    }
+
+    /// Begins a family; `samples` writes what it holds.
+    pub(super) fn family(
+        &mut self,
+        metric: &'static Metric,
+        samples: impl FnOnce(&mut Family<'_>) -> fmt::Result,
+    ) -> fmt::Result {
+        let kind = match metric.kind {
+            Kind::Counter => MetricType::Counter,
+            Kind::Gauge => MetricType::Gauge,
+            Kind::Histogram => MetricType::Histogram,
+            Kind::Info => MetricType::Info,
+        };
+        // prometheus-client appends the unit only where it ends the name.
+        let stem = metric.stem();
+        let unit = metric.unit.map(|unit| Unit::Other(unit.to_owned()));
+        let encoder = self
+            .0
+            .encode_descriptor(stem, metric.help, unit.as_ref(), kind)?;
+        samples(&mut Family { metric, encoder })
+    }
+
+    /// A family with one sample and no labels.
+    pub(super) fn single(
+        &mut self,
+        metric: &'static Metric,
+        value: impl Into<Number>,
+    ) -> fmt::Result {
+        self.family(metric, |family| family.sample(&[], value))
+    }
+}
+
+impl Family<'_> {
+    /// One counter, gauge or info sample; an info's value is ignored.
+    pub(super) fn sample(&mut self, labels: &[Label<'_>], value: impl Into<Number>) -> fmt::Result {
+        let value = value.into();
+        let labels = self.labels(labels);
+        let kind = self.metric.kind;
+        if kind == Kind::Info {
+            return self.encoder.encode_info(&labels);
+        }
+        let write = |encoder: &mut MetricEncoder<'_>| match kind {
+            Kind::Counter => encoder.encode_counter::<NoLabelSet, _, f64>(&value, None),
+            _ => encoder.encode_gauge(&value),
+        };
+        if labels.names.is_empty() {
+            return write(&mut self.encoder);
+        }
+        write(&mut self.encoder.encode_family(&labels)?)
+    }
+
+    /// One info sample.
+    pub(super) fn info(&mut self, labels: &[Label<'_>]) -> fmt::Result {
+        self.sample(labels, 1_u64)
+    }
+
+    /// One histogram.
+    pub(super) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
+        let buckets: Vec<(f64, u64)> = values.buckets().collect();
+        let labels = self.labels(labels);
+        let mut encoder = self.encoder.encode_family(&labels)?;
+        encoder.encode_histogram::<NoLabelSet>(values.sum(), values.count(), &buckets, None)
+    }
+
+    fn labels<'l>(&self, values: &'l [Label<'l>]) -> Labels<'l> {
+        debug_assert_eq!(
+            self.metric.labels.len(),
+            values.len(),
+            "{}",
+            self.metric.name
+        );
+        Labels {
+            names: self.metric.labels,
+            values,
+        }
+    }
+}
+
+/// The catalogue's label names with one sample's values.
+#[derive(Debug)]
+struct Labels<'a> {
+    names: &'static [&'static str],
+    values: &'a [Label<'a>],
+}
+
+impl EncodeLabelSet for Labels<'_> {
+    fn encode(&self, encoder: &mut LabelSetEncoder<'_>) -> fmt::Result {
+        for (name, value) in self.names.iter().zip(self.values) {
+            value.encode(name, encoder.encode_label())?;
+        }
+        Ok(())
+    }
+}
+
+impl Label<'_> {
+    fn encode(self, name: &str, mut encoder: LabelEncoder<'_>) -> fmt::Result {
+        let mut key = encoder.encode_label_key()?;
+        key.write_str(name)?;
+        let mut value = key.encode_label_value()?;
+        match self {
+            Self::Text(text) => write_capped(&mut value, text)?,
+            Self::Number(number) => write!(value, "{number}")?,
+            Self::Guid(guid) => write!(value, "{guid}")?,
+        }
+        value.finish()
+    }
+}
+
+/// Text up to the cap. What is longer keeps its beginning and a hash of the whole, so that two long
+/// names do not become one series.
+fn write_capped(out: &mut impl fmt::Write, text: &str) -> fmt::Result {
+    if text.len() <= MAX_LABEL_BYTES {
+        return out.write_str(text);
+    }
+    let mut hasher = DefaultHasher::new();
+    text.hash(&mut hasher);
+    let end = text.floor_char_boundary(MAX_LABEL_BYTES - 20);
+    write!(
+        out,
+        "{}...{:016x}",
+        text.get(..end).unwrap_or_default(),
+        hasher.finish()
+    )
+}
+
+impl From<u64> for Number {
+    fn from(count: u64) -> Self {
+        Self::Count(count)
+    }
+}
+
+impl From<usize> for Number {
+    fn from(count: usize) -> Self {
+        Self::Count(count as u64)
+    }
+}
+
+impl From<bool> for Number {
+    fn from(holds: bool) -> Self {
+        Self::Count(u64::from(holds))
+    }
+}
+
+impl From<f64> for Number {
+    fn from(value: f64) -> Self {
+        Self::Real(value)
+    }
+}
+
+impl EncodeCounterValue for Number {
+    fn encode(&self, encoder: &mut CounterValueEncoder<'_>) -> fmt::Result {
+        match self {
+            Self::Count(count) => EncodeCounterValue::encode(count, encoder),
+            Self::Real(value) => EncodeCounterValue::encode(value, encoder),
+        }
+    }
+}
+
+impl EncodeGaugeValue for Number {
+    fn encode(&self, encoder: &mut GaugeValueEncoder<'_>) -> fmt::Result {
+        match self {
+            Self::Count(count) => EncodeGaugeValue::encode(count, encoder),
+            Self::Real(value) => EncodeGaugeValue::encode(value, encoder),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_values_are_cut_but_stay_apart() {
+        let capped = |text: &str| {
+            let mut out = String::new();
+            write_capped(&mut out, text).unwrap();
+            out
+        };
+        let (one, two) = ("ü".repeat(5_000), "ü".repeat(5_001));
+        assert!(capped(&one).len() <= MAX_LABEL_BYTES);
+        assert_ne!(capped(&one), capped(&two));
+        assert_eq!(capped("/points"), "/points");
+    }
+}

@@ -1,0 +1,102 @@
+//! What the kernel says about this process, from `/proc`. A value that cannot be read is absent:
+//! hardened services may not see all of it.
+
+use std::fs;
+
+/// One reading.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Process {
+    pub(super) cpu_seconds: Option<f64>,
+    pub(super) resident_bytes: Option<f64>,
+    pub(super) virtual_bytes: Option<f64>,
+    pub(super) open_fds: Option<f64>,
+    pub(super) max_fds: Option<f64>,
+    pub(super) start_time: Option<f64>,
+}
+
+impl Process {
+    pub(super) fn read() -> Self {
+        let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
+        // The command name may hold spaces and brackets; fields count from behind its last one.
+        let fields: Vec<&str> = match stat.rsplit_once(") ") {
+            Some((_, rest)) => rest.split(' ').collect(),
+            None => Vec::new(),
+        };
+        // proc(5) counts fields from 1 and the state is the third.
+        let field = |number: usize| fields.get(number - 3)?.trim().parse::<f64>().ok();
+        let ticks = ticks_per_second();
+        Self {
+            cpu_seconds: field(14)
+                .zip(field(15))
+                .map(|(user, system)| (user + system) / ticks),
+            resident_bytes: field(24).map(|pages| pages * page_bytes()),
+            virtual_bytes: field(23),
+            #[expect(clippy::cast_precision_loss, reason = "far below 2^53")]
+            open_fds: fs::read_dir("/proc/self/fd")
+                .ok()
+                .map(|fds| fds.count() as f64),
+            max_fds: max_fds(),
+            start_time: field(22)
+                .zip(boot_time())
+                .map(|(start, boot)| boot + start / ticks),
+        }
+    }
+}
+
+fn boot_time() -> Option<f64> {
+    let stat = fs::read_to_string("/proc/stat").ok()?;
+    stat.lines()
+        .find_map(|line| line.strip_prefix("btime "))?
+        .trim()
+        .parse()
+        .ok()
+}
+
+fn max_fds() -> Option<f64> {
+    let limits = fs::read_to_string("/proc/self/limits").ok()?;
+    let line = limits
+        .lines()
+        .find_map(|line| line.strip_prefix("Max open files"))?;
+    line.split_whitespace().next()?.parse().ok()
+}
+
+fn ticks_per_second() -> f64 {
+    // USER_HZ is 100 on every architecture the agent supports, whatever the kernel's own HZ.
+    100.0
+}
+
+/// From the auxiliary vector: 16 KiB on a Raspberry Pi 5.
+fn page_bytes() -> f64 {
+    const AT_PAGESZ: usize = 6;
+    let vector = fs::read("/proc/self/auxv").unwrap_or_default();
+    let (entries, _) = vector.as_chunks::<{ size_of::<usize>() }>();
+    let (pairs, _) = entries.as_chunks::<2>();
+    let page = pairs
+        .iter()
+        .find(|[key, _]| usize::from_ne_bytes(*key) == AT_PAGESZ);
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "page sizes are small powers of two"
+    )]
+    page.map_or(4096.0, |[_, value]| usize::from_ne_bytes(*value) as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_process_can_read_about_itself() {
+        let process = Process::read();
+        assert!(process.resident_bytes.unwrap() > 100_000.0);
+        assert!(process.virtual_bytes >= process.resident_bytes);
+        assert!(process.open_fds.unwrap() >= 3.0 && process.open_fds <= process.max_fds);
+        let now = std::time::SystemTime::UNIX_EPOCH
+            .elapsed()
+            .unwrap()
+            .as_secs_f64();
+        let age = now - process.start_time.unwrap();
+        assert!((-2.0..600.0).contains(&age), "{age}");
+        assert!((4096.0..=65536.0).contains(&page_bytes()));
+    }
+}

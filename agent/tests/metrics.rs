@@ -1,0 +1,351 @@
+//! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
+#![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+mod sample_robot;
+
+use std::collections::BTreeSet;
+use std::io::Write as _;
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+
+use ros2probe::config::{Expectations, Watch};
+use ros2probe::model::snapshot::{Snapshot, WatchFacts, WatchState, WatchedTopicFacts};
+use ros2probe::surface::catalogue::{CATALOGUE, Kind};
+use ros2probe::surface::{Board, Exposition, Format, Settings, SourceKind};
+
+fn settings() -> Settings {
+    let expectations = Expectations {
+        min_rate_hz: Some(10.0),
+        ..Expectations::default()
+    };
+    Settings {
+        watches: vec![Watch {
+            expectations,
+            ..Watch::named("/**").unwrap()
+        }],
+        histograms: true,
+        per_writer: true,
+        max_topics: 1_000,
+    }
+}
+
+fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
+    let board = Arc::new(Board::new(SourceKind::Live, settings));
+    board.publish(snapshot, sample_robot::agent());
+    Exposition::new(board).render(format).unwrap()
+}
+
+/// Everything promtool has to say about a page in classic format.
+fn promtool(page: &str) -> String {
+    let mut promtool = Command::new("promtool")
+        .args(["check", "metrics"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap_or_else(|error| panic!("promtool: {error}; `apt-get install prometheus`"));
+    promtool
+        .stdin
+        .take()
+        .unwrap()
+        .write_all(page.as_bytes())
+        .unwrap();
+    let output = promtool.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    format!(
+        "{}{}",
+        said,
+        if output.status.success() {
+            ""
+        } else {
+            "(failed)"
+        }
+    )
+}
+
+fn sample<'a>(page: &'a str, series: &str) -> Option<&'a str> {
+    page.lines()
+        .find_map(|line| line.strip_prefix(series)?.strip_prefix(' '))
+}
+
+#[test]
+fn the_page_shows_the_whole_catalogue_and_nothing_else() {
+    let page = page(
+        sample_robot::snapshot(["/points"]),
+        settings(),
+        Format::Classic,
+    );
+    let kind = |kind: Kind| {
+        if kind == Kind::Info {
+            "gauge"
+        } else {
+            kind.label()
+        }
+    };
+    let wanted: Vec<String> = CATALOGUE
+        .iter()
+        .map(|metric| format!("# TYPE {} {}", metric.name, kind(metric.kind)))
+        .collect();
+    let shown: Vec<&str> = page
+        .lines()
+        .filter(|line| line.starts_with("# TYPE"))
+        .collect();
+    assert_eq!(shown, wanted);
+    for metric in CATALOGUE {
+        let bucket = |line: &&str| line.starts_with(metric.name) && !line.starts_with('#');
+        assert!(
+            page.lines().any(|line| bucket(&line)),
+            "{} has no sample",
+            metric.name
+        );
+        assert!(page.contains(&format!("# HELP {} {}\n", metric.name, metric.help)));
+    }
+}
+
+#[test]
+fn values_are_what_the_snapshot_says() {
+    let page = page(
+        sample_robot::snapshot(["/points"]),
+        settings(),
+        Format::Classic,
+    );
+    let topic = "{domain_id=\"0\",topic=\"/points\"}";
+    for (series, value) in [
+        ("ros2_topic_messages_total", "123456"),
+        ("ros2_topic_bytes_total", "79504384000"),
+        ("ros2_topic_lost_messages_total", "12"),
+        ("ros2_topic_publishers", "1"),
+        ("ros2_topic_rate_hertz", "19.98"),
+        (
+            "ros2_topic_last_message_timestamp_seconds",
+            "1700000000.1234568",
+        ),
+        ("ros2_topic_interarrival_seconds_count", "1000"),
+    ] {
+        assert_eq!(
+            sample(&page, &format!("{series}{topic}")),
+            Some(value),
+            "{series}\n{page}"
+        );
+    }
+    let bucket = |le: &str| {
+        let labels = format!("{{le=\"{le}\",domain_id=\"0\",topic=\"/points\"}}");
+        sample(
+            &page,
+            &format!("ros2_topic_interarrival_seconds_bucket{labels}"),
+        )
+    };
+    assert_eq!(
+        (bucket("0.02"), bucket("+Inf")),
+        (Some("540"), Some("1000"))
+    );
+    let watch = "domain_id=\"0\",topic=\"/points\",watch=\"/**\"";
+    for (series, value) in [
+        (
+            format!("ros2_watch_state{{{watch},state=\"violated\"}}"),
+            "1",
+        ),
+        (format!("ros2_watch_state{{{watch},state=\"ok\"}}"), "0"),
+        (
+            format!("ros2_watch_expectation_violated{{{watch},expectation=\"min_rate_hz\"}}"),
+            "1",
+        ),
+    ] {
+        assert_eq!(sample(&page, &series), Some(value), "{series}");
+    }
+}
+
+#[test]
+fn promtool_finds_nothing_to_say() {
+    let board = Arc::new(Board::new(SourceKind::Live, settings()));
+    let starting = Exposition::new(board).render(Format::Classic).unwrap();
+    assert_eq!(promtool(&starting), "");
+    let page = page(
+        sample_robot::snapshot(["/points", "/imu"]),
+        settings(),
+        Format::Classic,
+    );
+    assert_eq!(promtool(&page), "");
+}
+
+#[test]
+fn hostile_names_stay_inside_their_label() {
+    let long = format!("/{}", "\u{e9}".repeat(10_000));
+    let longer = format!("{long}x");
+    let names = [
+        "/a\"} 1\nros2_topic_messages_total{topic=\"forged",
+        "/back\\slash",
+        "/tab\tand\rreturn",
+        "/\u{1F916}",
+        "",
+        &long,
+        &longer,
+    ];
+    let page = page(sample_robot::snapshot(names), settings(), Format::Classic);
+    assert_eq!(promtool(&page), "");
+    assert!(page.lines().all(|line| line.len() < 1_000));
+    let messages = |line: &&str| line.starts_with("ros2_topic_messages_total{");
+    let series: Vec<&str> = page.lines().filter(messages).collect();
+    assert_eq!(series.len(), names.len());
+    assert_eq!(series.iter().collect::<BTreeSet<_>>().len(), names.len());
+}
+
+#[test]
+fn no_series_appears_twice() {
+    let mut snapshot = sample_robot::snapshot(["/points", "/points"]);
+    let mut dds = sample_robot::topic("/points");
+    (dds.kind, dds.dds_name) = ("dds", "/points".to_owned());
+    snapshot.topics.push(dds);
+    let mut request = sample_robot::topic("/points");
+    (request.kind, request.dds_name) = ("service_request", "rq/pointsRequest".to_owned());
+    snapshot.topics.push(request);
+    let nodes = snapshot.nodes.clone();
+    snapshot.nodes.extend(nodes);
+    snapshot.watches.clear();
+    let page = page(snapshot, settings(), Format::Classic);
+    let series: Vec<&str> = page
+        .lines()
+        .filter(|line| !line.starts_with('#'))
+        .map(|line| line.rsplit_once(' ').unwrap().0)
+        .collect();
+    assert_eq!(series.iter().collect::<BTreeSet<_>>().len(), series.len());
+    assert_eq!(sample(&page, "ros2probe_topics_not_shown"), Some("1"));
+    for name in ["/points", "dds:/points", "rq/pointsRequest"] {
+        let series = format!("ros2_topic_publishers{{domain_id=\"0\",topic=\"{name}\"}}");
+        assert_eq!(sample(&page, &series), Some("1"), "{name}");
+    }
+}
+
+#[test]
+fn a_watched_topic_that_nobody_announced_begins_with_zero() {
+    let missing = WatchedTopicFacts {
+        domain_id: 0,
+        topic: "/cmd_vel".to_owned(),
+        state: WatchState::NotPublished,
+        violations: Vec::new(),
+    };
+    let watch = WatchFacts {
+        pattern: "/cmd_vel".to_owned(),
+        domain_id: Some(0),
+        topics: vec![missing],
+    };
+    let snapshot = Snapshot {
+        watches: vec![watch],
+        ..Snapshot::default()
+    };
+    let page = page(snapshot, settings(), Format::Classic);
+    for name in [
+        "publishers",
+        "messages_total",
+        "bytes_total",
+        "lost_messages_total",
+    ] {
+        let series = format!("ros2_topic_{name}{{domain_id=\"0\",topic=\"/cmd_vel\"}}");
+        assert_eq!(sample(&page, &series), Some("0"), "{name}");
+    }
+    let labels = "domain_id=\"0\",topic=\"/cmd_vel\",watch=\"/cmd_vel@0\",state=\"not_published\"";
+    assert_eq!(
+        sample(&page, &format!("ros2_watch_state{{{labels}}}")),
+        Some("1")
+    );
+}
+
+#[test]
+fn measured_topics_come_first_when_the_cap_is_reached() {
+    let mut snapshot = sample_robot::snapshot(["/z_measured"]);
+    snapshot.watches.clear();
+    for index in 0..2_000 {
+        let mut topic = sample_robot::topic(&format!("/forged{index:04}"));
+        topic.measurement = None;
+        snapshot.topics.push(topic);
+    }
+    let page = page(snapshot, settings(), Format::Classic);
+    let series = |line: &&str| line.starts_with("ros2_topic_publishers{");
+    assert_eq!(page.lines().filter(series).count(), 1_000);
+    assert!(page.contains("topic=\"/z_measured\""));
+    assert_eq!(sample(&page, "ros2probe_topics_not_shown"), Some("1001"));
+    assert_eq!(sample(&page, "ros2probe_tracked_topics"), Some("1"));
+}
+
+#[test]
+fn both_formats_hold_the_same_samples() {
+    let board = Arc::new(Board::new(SourceKind::Live, settings()));
+    board.publish(
+        sample_robot::snapshot(["/points", "/imu"]),
+        sample_robot::agent(),
+    );
+    let exposition = Exposition::new(board);
+    let (open, classic) = (
+        exposition.render(Format::OpenMetrics).unwrap(),
+        exposition.render(Format::Classic).unwrap(),
+    );
+    assert!(open.ends_with("# EOF\n"));
+    assert!(open.contains("# TYPE ros2_topic_messages counter\n"));
+    assert!(open.contains("# TYPE ros2_topic info\n"));
+    assert!(open.contains("# UNIT ros2_topic_interarrival_seconds seconds\n"));
+    // What changes from scrape to scrape is left out.
+    let samples = |page: &str| -> Vec<String> {
+        let steady = |line: &&str| {
+            ![
+                "#",
+                "process_",
+                "ros2probe_scrape",
+                "ros2probe_snapshot_age",
+            ]
+            .iter()
+            .any(|prefix| line.starts_with(prefix))
+        };
+        page.lines().filter(steady).map(str::to_owned).collect()
+    };
+    assert_eq!(samples(&open), samples(&classic));
+}
+
+#[test]
+fn the_format_follows_the_accept_header() {
+    for (accept, format) in [
+        ("", Format::Classic),
+        ("*/*", Format::Classic),
+        ("text/html,application/xhtml+xml,*/*;q=0.8", Format::Classic),
+        ("application/openmetrics-text", Format::OpenMetrics),
+        (
+            "application/openmetrics-text;version=1.0.0,application/openmetrics-text;\
+             version=0.0.1;q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1",
+            Format::OpenMetrics,
+        ),
+        (
+            "application/openmetrics-text; version=1.0.0; q=0.2, text/plain; q=0.9",
+            Format::Classic,
+        ),
+        (
+            "application/openmetrics-text;version=2.0.0",
+            Format::Classic,
+        ),
+        ("application/openmetrics-text;q=0", Format::Classic),
+    ] {
+        assert_eq!(Format::negotiate(accept), format, "{accept}");
+    }
+}
+
+#[test]
+fn a_page_of_a_thousand_measured_topics_stays_below_8_kb_a_topic() {
+    let names: Vec<String> = (0..1_000)
+        .map(|index| format!("/robot/sensor_{index:04}"))
+        .collect();
+    let snapshot = sample_robot::snapshot(names.iter().map(String::as_str));
+    let settings = Settings {
+        per_writer: false,
+        ..settings()
+    };
+    let all = page(snapshot.clone(), settings.clone(), Format::Classic).len();
+    assert!(all < 8_000_000, "{all} bytes");
+    let lean = page(
+        snapshot,
+        Settings {
+            histograms: false,
+            ..settings
+        },
+        Format::Classic,
+    )
+    .len();
+    assert!(lean < 2_500_000, "{lean} bytes");
+}

@@ -1,0 +1,149 @@
+//! A robot of any size as the model would describe it, with every fact filled in.
+
+use std::time::{Duration, Instant};
+
+use ros2probe::model::histogram::Histogram;
+use ros2probe::model::snapshot::{
+    ChurnCount, DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts,
+    Snapshot, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
+    WatchedTopicFacts,
+};
+use ros2probe::surface::{AgentFacts, InterfaceFacts, SourceKind};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+/// Everything an agent knows of a robot with topics of these names, all watched by `/**`.
+pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
+    let guid = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 0xc1]));
+    let topics: Vec<TopicFacts> = names.into_iter().map(topic).collect();
+    let watched = |topic: &TopicFacts| WatchedTopicFacts {
+        domain_id: topic.domain_id,
+        topic: topic.name.clone(),
+        state: WatchState::Violated,
+        violations: vec!["min_rate_hz"],
+    };
+    Snapshot {
+        at: Timestamp(1_700_000_000_000_000_000),
+        participants: vec![ParticipantFacts {
+            guid,
+            domain_id: 0,
+            vendor: "eProsima Fast DDS".to_owned(),
+            enclave: Some("/".to_owned()),
+            host: Some("robot".to_owned()),
+            process_id: Some(42),
+            process_name: None,
+            first_seen: Timestamp(1),
+            last_seen: Timestamp(2),
+            lease_nanoseconds: Some(20_000_000_000),
+            secured: false,
+        }],
+        nodes: vec![NodeFacts {
+            domain_id: 0,
+            name: "/lidar".to_owned(),
+            participant: guid,
+            writers: Vec::new(),
+            readers: Vec::new(),
+        }],
+        watches: vec![WatchFacts {
+            pattern: "/**".to_owned(),
+            domain_id: None,
+            topics: topics.iter().map(watched).collect(),
+        }],
+        topics,
+        unknown_writers: vec![UnknownWriterFacts {
+            guid,
+            vendor: None,
+            first_seen: Timestamp(3),
+            measurement: measurement(),
+        }],
+        churn: vec![ChurnCount {
+            domain_id: 0,
+            entity: "writer",
+            event: "appeared",
+            count: 12,
+        }],
+        decode_errors: vec![DecodeErrorCount {
+            stage: "rtps",
+            reason: "truncated",
+            count: 1,
+        }],
+        tables: vec![TableFacts {
+            table: "topics",
+            size: 3,
+            limit: 1_000,
+            evictions: 0,
+        }],
+        datagrams: 100,
+        records: 1_000,
+        topics_rejected: 0,
+    }
+}
+
+/// An agent in the midst of it.
+pub fn agent() -> AgentFacts {
+    AgentFacts {
+        interfaces: vec![InterfaceFacts {
+            name: "eth0".to_owned(),
+            packets: 5,
+            dropped: 0,
+        }],
+        verdicts: vec![("ignore", 7), ("meter", 8), ("capture", 9)],
+        copied_bytes: 12_345,
+        ..AgentFacts::new(SourceKind::Live, Instant::now())
+    }
+}
+
+/// A measured topic with one publisher and one subscription.
+pub fn topic(name: &str) -> TopicFacts {
+    let guid = |entity: u8| Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, entity, 3]));
+    let endpoint = |guid: Guid| EndpointFacts {
+        guid,
+        node: Some("/lidar".to_owned()),
+        reliability: "RELIABLE".to_owned(),
+        durability: "VOLATILE".to_owned(),
+        history: "KEEP_LAST (10)".to_owned(),
+        deadline_nanoseconds: None,
+        lifespan_nanoseconds: None,
+        liveliness: "AUTOMATIC".to_owned(),
+        liveliness_lease_nanoseconds: None,
+        message_type: "sensor_msgs/msg/PointCloud2".to_owned(),
+        type_hash: None,
+        first_seen: Timestamp(4),
+        measurement: Some(measurement()),
+    };
+    TopicFacts {
+        domain_id: 0,
+        name: name.to_owned(),
+        dds_name: format!("rt{name}"),
+        kind: "topic",
+        hidden: false,
+        message_types: vec!["sensor_msgs/msg/PointCloud2".to_owned()],
+        type_hashes: Vec::new(),
+        publishers: vec![endpoint(guid(1))],
+        subscriptions: vec![endpoint(guid(2))],
+        measurement: Some(measurement()),
+        vanished: false,
+    }
+}
+
+fn measurement() -> Measurement {
+    let mut histogram = Histogram::default();
+    for step in 1..=1_000 {
+        histogram.observe(Duration::from_micros(step * 37).as_secs_f64());
+    }
+    Measurement {
+        messages: 123_456,
+        bytes: 79_504_384_000,
+        lost: 12,
+        recovered: 3,
+        duplicates: 4,
+        incomplete: 1,
+        irrelevant: 0,
+        last_message: Some(Timestamp(1_700_000_000_123_456_789)),
+        rate_hz: 19.98,
+        bandwidth: 12_867_120.5,
+        interarrival: histogram,
+        source_latency: histogram,
+        header_latency: histogram,
+        negative_latency: 0,
+    }
+}
