@@ -1,8 +1,4 @@
 //! How long a scrape of a large robot takes: the capture thread never waits for it, but a core does.
-#![expect(
-    missing_docs,
-    reason = "criterion_group generates an undocumented function"
-)]
 
 #[path = "../tests/sample_robot/mod.rs"]
 mod sample_robot;

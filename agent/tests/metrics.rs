@@ -1,5 +1,5 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod sample_robot;
 

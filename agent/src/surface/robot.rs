@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 
 use super::board::Settings;
-use super::catalogue as metric;
+use super::catalogue::{self as metric, Metric};
 use super::page::{Family, Label, Number, Page};
 use crate::config::Watch;
 use crate::model::histogram::Histogram;
@@ -17,6 +17,11 @@ use crate::model::snapshot::{
 const MAX_UNKNOWN_WRITERS: usize = 32;
 /// Different types or policies named in one label.
 const MAX_JOINED: usize = 4;
+
+/// How a counter is read.
+type Count = fn(&Measurement) -> u64;
+/// How a histogram is read.
+type Values = fn(&Measurement) -> &Histogram;
 
 /// A topic with series of its own.
 pub(super) struct Row<'a> {
@@ -221,7 +226,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
             )
         })
     })?;
-    let counters: [(&metric::Metric, fn(&Measurement) -> u64); 6] = [
+    let counters: [(&Metric, Count); 6] = [
         (&metric::TOPIC_MESSAGES, |measured| measured.messages),
         (&metric::TOPIC_BYTES, |measured| measured.bytes),
         (&metric::TOPIC_LOST, |measured| measured.lost),
@@ -251,7 +256,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
     page.family(&metric::TOPIC_NEGATIVE_LATENCY, |family| {
         measured(family, rows, |facts| Some(facts.negative_latency.into()))
     })?;
-    let histograms: [(&metric::Metric, fn(&Measurement) -> &Histogram); 3] = [
+    let histograms: [(&Metric, Values); 3] = [
         (&metric::TOPIC_INTERARRIVAL, |measured| {
             &measured.interarrival
         }),
@@ -274,7 +279,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
             Ok(())
         })?;
     }
-    let per_writer: [(&metric::Metric, fn(&Measurement) -> u64); 3] = [
+    let per_writer: [(&Metric, Count); 3] = [
         (&metric::WRITER_MESSAGES, |measured| measured.messages),
         (&metric::WRITER_BYTES, |measured| measured.bytes),
         (&metric::WRITER_LOST, |measured| measured.lost),
@@ -348,7 +353,7 @@ fn joined<'a>(values: impl Iterator<Item = &'a String>) -> String {
     text
 }
 
-fn writers(family: &mut Family<'_>, row: &Row<'_>, value: fn(&Measurement) -> u64) -> fmt::Result {
+fn writers(family: &mut Family<'_>, row: &Row<'_>, value: Count) -> fmt::Result {
     let mut seen = BTreeSet::new();
     for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
         let Some(measured) = &writer.measurement else {
