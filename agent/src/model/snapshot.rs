@@ -171,6 +171,26 @@ pub struct Measurement {
     pub negative_latency: u64,
 }
 
+impl Measurement {
+    /// Adds all of `other`, as a topic adds up its writers.
+    pub fn add(&mut self, other: &Self) {
+        self.messages += other.messages;
+        self.bytes += other.bytes;
+        self.lost += other.lost;
+        self.recovered += other.recovered;
+        self.duplicates += other.duplicates;
+        self.incomplete += other.incomplete;
+        self.irrelevant += other.irrelevant;
+        self.last_message = self.last_message.max(other.last_message);
+        self.rate_hz += other.rate_hz;
+        self.bandwidth += other.bandwidth;
+        self.interarrival.merge(&other.interarrival);
+        self.source_latency.merge(&other.source_latency);
+        self.header_latency.merge(&other.header_latency);
+        self.negative_latency += other.negative_latency;
+    }
+}
+
 /// A writer that sends without a known announcement.
 #[derive(Clone, Debug)]
 pub struct UnknownWriterFacts {

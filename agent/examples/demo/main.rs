@@ -1,0 +1,147 @@
+//! `make demo`: a robot and an operator's host in network namespaces of their own, the agent beside
+//! the robot, and a live summary of what it exports. Nothing of it touches the machine's network;
+//! the metrics are relayed to a port of this machine so that `curl` and a browser reach them.
+//!
+//! It only reads what anybody can read from `/metrics`.
+
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail};
+use clap::Parser;
+
+use crate::harness::agent::Agent;
+use crate::harness::network::{Link, Namespace};
+use crate::harness::peer;
+use crate::harness::process::Process;
+use crate::relay::Relay;
+use crate::summary::Summary;
+
+#[path = "../../tests/harness/mod.rs"]
+mod harness;
+mod relay;
+mod summary;
+
+const REFRESH: Duration = Duration::from_secs(2);
+/// The agent's own metrics port, used here too when it is free.
+const PORT: u16 = 17400;
+
+#[derive(Parser)]
+#[command(about = "Shows the agent watching a small robot; needs root for network namespaces")]
+struct Options {
+    /// The agent; `rp` of the same build when left out
+    #[arg(long)]
+    agent: Option<PathBuf>,
+    #[arg(long, default_value = "config/ros2probe.yaml")]
+    config: PathBuf,
+    /// End by itself after so many seconds
+    #[arg(long)]
+    seconds: Option<f64>,
+    #[arg(long, hide = true)]
+    relay: Option<PathBuf>,
+}
+
+/// One thread: the processes started below live as long as it does.
+#[tokio::main(flavor = "current_thread")]
+async fn main() -> Result<()> {
+    let options = Options::parse();
+    if let Some(socket) = &options.relay {
+        return relay::serve(socket, PORT);
+    }
+    let agent = options.agent.clone().map_or_else(beside_this_program, Ok)?;
+    for needed in [&agent, &options.config] {
+        if !needed.exists() {
+            bail!(
+                "{} is missing: run `make demo`, which builds it",
+                needed.display()
+            );
+        }
+    }
+    let mut end = std::pin::pin!(ended(options.seconds));
+
+    let link = Link::new()?;
+    println!(
+        "two hosts, {} and {}, on one cable",
+        link.robot.name(),
+        link.monitor.name()
+    );
+    let directory = tempfile::tempdir().context("cannot create a directory")?;
+    let log = directory.path().join("agent.log");
+    let agent = Agent::start_logging(&link.robot, agent, &options.config, &log)
+        .with_context(|| format!("the agent said:\n{}", read_lossy(&log)))?;
+    let relay = Relay::start(&link.robot, directory.path(), PORT)?;
+    let robots = [
+        robot(&link.robot, "lidar")?,
+        robot(&link.robot, "base")?,
+        robot(&link.monitor, "monitor")?,
+    ];
+
+    let mut summary = Summary::new(std::io::stdout().is_terminal());
+    let mut failure = None;
+    loop {
+        tokio::select! {
+            interrupted = &mut end => {
+                interrupted?;
+                break;
+            }
+            () = tokio::time::sleep(REFRESH) => {}
+        }
+        match agent.scrape() {
+            Ok(scrape) => summary.show(&scrape, Instant::now(), &relay, &link),
+            Err(error) => {
+                failure = Some(error.context(format!("the agent said:\n{}", read_lossy(&log))));
+                break;
+            }
+        }
+    }
+    println!("\nstopping the robot and the agent");
+    drop(relay);
+    for mut robot in robots {
+        robot.terminate()?;
+    }
+    let mut agent = agent;
+    let status = agent.process.terminate()?;
+    match failure {
+        Some(error) => Err(error),
+        None if !status.success() => bail!("the agent ended with {status}"),
+        None => Ok(()),
+    }
+}
+
+fn beside_this_program() -> Result<PathBuf> {
+    let program = std::env::current_exe().context("cannot tell where this program is")?;
+    let directory = program
+        .ancestors()
+        .nth(2)
+        .context("this program is in no directory")?;
+    Ok(directory.join("rp"))
+}
+
+fn robot(host: &Namespace, role: &str) -> Result<Process> {
+    let mut robot = Process::start(&host.inside(), peer::robot()?, ["--role", role])?;
+    robot.wait_for("ready", Duration::from_secs(20))?;
+    Ok(robot)
+}
+
+async fn ended(after: Option<f64>) -> Result<()> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut terminate = signal(SignalKind::terminate())?;
+    let limit = async {
+        match after {
+            Some(seconds) => tokio::time::sleep(Duration::from_secs_f64(seconds.max(0.0))).await,
+            None => std::future::pending().await,
+        }
+    };
+    tokio::select! {
+        interrupted = tokio::signal::ctrl_c() => interrupted?,
+        _ = terminate.recv() => {}
+        () = limit => {}
+    }
+    Ok(())
+}
+
+fn read_lossy(path: &Path) -> String {
+    let bytes = std::fs::read(path).unwrap_or_default();
+    String::from_utf8_lossy(&bytes).into_owned()
+}

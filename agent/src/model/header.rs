@@ -1,0 +1,113 @@
+//! Which ROS types begin with a `std_msgs/Header`, and whether a stamp can be one.
+//!
+//! The agent has no message definitions on the metering path, so this is a list: the types of the
+//! common interface packages whose first field is a header. A type that is not on it has no header
+//! latency; a stamp that is implausible (simulated time, an unset header) is left out.
+
+use ros2probe_wire::Timestamp;
+
+/// Stamps further than this from the capture time are not the same clock.
+const PLAUSIBLE: u64 = 3_600_000_000_000;
+
+/// Types outside `sensor_msgs` and `geometry_msgs`.
+const OTHERS: [&str; 33] = [
+    "ackermann_msgs/msg/AckermannDriveStamped",
+    "actionlib_msgs/msg/GoalStatusArray",
+    "can_msgs/msg/Frame",
+    "control_msgs/msg/DynamicJointState",
+    "control_msgs/msg/InterfaceValue",
+    "control_msgs/msg/JointControllerState",
+    "control_msgs/msg/JointJog",
+    "control_msgs/msg/JointTrajectoryControllerState",
+    "control_msgs/msg/PidState",
+    "control_msgs/msg/SteeringControllerStatus",
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "geographic_msgs/msg/GeoPointStamped",
+    "geographic_msgs/msg/GeoPoseStamped",
+    "map_msgs/msg/OccupancyGridUpdate",
+    "mavros_msgs/msg/State",
+    "nav2_msgs/msg/Costmap",
+    "nav2_msgs/msg/ParticleCloud",
+    "nav_msgs/msg/GridCells",
+    "nav_msgs/msg/OccupancyGrid",
+    "nav_msgs/msg/Odometry",
+    "nav_msgs/msg/Path",
+    "nmea_msgs/msg/Sentence",
+    "radar_msgs/msg/RadarScan",
+    "radar_msgs/msg/RadarTracks",
+    "stereo_msgs/msg/DisparityImage",
+    "trajectory_msgs/msg/JointTrajectory",
+    "trajectory_msgs/msg/MultiDOFJointTrajectory",
+    "vision_msgs/msg/Detection2DArray",
+    "vision_msgs/msg/Detection3DArray",
+    "visualization_msgs/msg/ImageMarker",
+    "visualization_msgs/msg/InteractiveMarker",
+    "visualization_msgs/msg/InteractiveMarkerFeedback",
+    "visualization_msgs/msg/Marker",
+];
+
+/// The messages of `sensor_msgs` that are parts of others and have no header.
+const SENSOR_PARTS: [&str; 7] = [
+    "ChannelFloat32",
+    "JoyFeedback",
+    "JoyFeedbackArray",
+    "LaserEcho",
+    "NavSatStatus",
+    "PointField",
+    "RegionOfInterest",
+];
+
+/// Whether messages of this ROS type begin with a header.
+#[must_use]
+pub fn begins_with_header(message_type: &str) -> bool {
+    if let Some(name) = message_type.strip_prefix("sensor_msgs/msg/") {
+        return !SENSOR_PARTS.contains(&name);
+    }
+    if let Some(name) = message_type.strip_prefix("geometry_msgs/msg/") {
+        return name.ends_with("Stamped") || name == "PoseArray";
+    }
+    OTHERS.binary_search(&message_type).is_ok()
+}
+
+/// The stamp as a time, if it can be of the clock that `now` is of.
+#[must_use]
+pub fn stamp_time((seconds, nanoseconds): (i32, u32), now: Timestamp) -> Option<Timestamp> {
+    let seconds = u64::try_from(seconds).ok()?;
+    let stamp = seconds * 1_000_000_000 + u64::from(nanoseconds);
+    (stamp.abs_diff(now.0) <= PLAUSIBLE).then_some(Timestamp(stamp))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_list_can_be_searched() {
+        assert!(OTHERS.is_sorted());
+        for name in [
+            "sensor_msgs/msg/Imu",
+            "nav_msgs/msg/Odometry",
+            "geometry_msgs/msg/PoseArray",
+        ] {
+            assert!(begins_with_header(name), "{name}");
+        }
+        for name in [
+            "sensor_msgs/msg/PointField",
+            "geometry_msgs/msg/Twist",
+            "std_msgs/msg/String",
+            "",
+        ] {
+            assert!(!begins_with_header(name), "{name}");
+        }
+    }
+
+    #[test]
+    fn simulated_time_is_no_latency() {
+        let now = Timestamp(1_795_143_000_000_000_000);
+        assert_eq!(stamp_time((12, 0), now), None);
+        assert_eq!(stamp_time((-1, 0), now), None);
+        assert_eq!(stamp_time((0, 0), now), None);
+        let stamp = Timestamp(1_795_142_999_500_000_000);
+        assert_eq!(stamp_time((1_795_142_999, 500_000_000), now), Some(stamp));
+    }
+}

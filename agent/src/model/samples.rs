@@ -1,0 +1,367 @@
+//! Samples that come in DATA_FRAGs: complete when every fragment number was seen.
+//!
+//! Writers repeat fragments, so bytes prove nothing; a bitmap per sample does. It holds no payload,
+//! and it believes no size: the bitmap grows with the fragments that came, within a budget shared
+//! by all writers. Whether a finished sample's number was seen before is the business of
+//! [`super::sequence`]; the caller asks there first.
+
+use ros2probe_wire::{Record, RtpsTime, Timestamp};
+
+/// Most fragments of one sample: 88 MB of Cyclone DDS fragments, 4 GB of Fast DDS ones.
+pub const MAX_FRAGMENTS: u32 = 65_536;
+/// Samples of one writer under way at once.
+const MAX_PER_WRITER: usize = 16;
+
+/// What all writers' bitmaps may take together, and what was given up for it.
+#[derive(Clone, Copy, Debug)]
+pub struct Budget {
+    /// Bytes in use.
+    pub bytes: usize,
+    /// Samples under way.
+    pub samples: usize,
+    /// Cap on the bytes.
+    pub limit: usize,
+    /// Samples given up.
+    pub evictions: u64,
+    /// Fragments whose numbers contradict themselves, or of samples with too many.
+    pub rejected: u64,
+}
+
+impl Budget {
+    /// Empty.
+    #[must_use]
+    pub const fn new(limit: usize) -> Self {
+        Self {
+            bytes: 0,
+            samples: 0,
+            limit,
+            evictions: 0,
+            rejected: 0,
+        }
+    }
+}
+
+/// The unfinished samples of one writer.
+#[derive(Debug, Default)]
+pub struct Samples {
+    partial: Vec<Partial>,
+}
+
+/// One unfinished sample.
+#[derive(Debug)]
+struct Partial {
+    number: u64,
+    size: u32,
+    fragment_size: u32,
+    seen: u32,
+    bitmap: Vec<u64>,
+    /// When the last fragment number was first seen.
+    tail: Option<Timestamp>,
+    latest: Timestamp,
+    facts: Facts,
+}
+
+/// What the fragments told of their sample.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Facts {
+    /// INFO_TS; Cyclone DDS sends it with the first fragment only.
+    pub source: RtpsTime,
+    /// Stamp in the payload of the first fragment.
+    pub stamp: Option<(i32, u32)>,
+    /// Size in bytes.
+    pub size: u32,
+    /// Its last missing fragment came this long after its last fragment number, nanoseconds.
+    pub repaired_after: i64,
+}
+
+/// What a fragment did.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Progress {
+    /// New, but some are still missing.
+    Partial,
+    /// That was the last missing one.
+    Complete(Facts),
+    /// All of it was seen before.
+    Duplicate,
+    /// Impossible numbers, or more of them than are kept.
+    Rejected,
+}
+
+impl Samples {
+    /// Takes in one DATA_FRAG.
+    pub fn fragment(&mut self, record: &Record, now: Timestamp, budget: &mut Budget) -> Progress {
+        let (start, count) = (record.fragment_start, record.fragments_in_submessage());
+        let (size, fragment_size) = (record.sample_size, record.fragment_size());
+        let total = if fragment_size == 0 {
+            0
+        } else {
+            size.div_ceil(fragment_size)
+        };
+        let end = start.saturating_add(count);
+        if total == 0 || total > MAX_FRAGMENTS || start == 0 || count == 0 || end - 1 > total {
+            budget.rejected += 1;
+            return Progress::Rejected;
+        }
+        let index = match self.place(record.sequence_number) {
+            Some(index) => index,
+            None => self.open(record, now, budget),
+        };
+        let Some(partial) = self.partial.get_mut(index) else {
+            return Progress::Rejected;
+        };
+        if partial.size != size || partial.fragment_size != fragment_size {
+            budget.rejected += 1;
+            return Progress::Rejected;
+        }
+        let before = partial.bitmap.len();
+        let new = partial.mark(start - 1, end - 1);
+        budget.bytes += (partial.bitmap.len() - before) * 8;
+        if new == 0 {
+            return Progress::Duplicate;
+        }
+        partial.seen += new;
+        partial.latest = now;
+        if end - 1 == total && partial.tail.is_none() {
+            partial.tail = Some(now);
+        }
+        if partial.facts.source == RtpsTime(0) {
+            partial.facts.source = record.source_timestamp();
+        }
+        if start == 1 {
+            partial.facts.stamp = record.header_stamp();
+        }
+        if partial.seen == total {
+            let mut facts = partial.facts;
+            facts.repaired_after = partial.tail.map_or(0, |tail| now.nanoseconds_since(tail));
+            self.close(index, budget);
+            return Progress::Complete(facts);
+        }
+        if budget.bytes > budget.limit {
+            self.evict(record.sequence_number, budget);
+        }
+        Progress::Partial
+    }
+
+    /// Whether fragments of this sample came and others are missing.
+    #[must_use]
+    pub fn is_partial(&self, number: u64) -> bool {
+        self.place(number).is_some()
+    }
+
+    /// The oldest sample that still gets fragments: it and what follows is not decided yet.
+    #[must_use]
+    pub fn growing(&self, now: Timestamp, window: u64) -> Option<u64> {
+        let growing = self
+            .partial
+            .iter()
+            .filter(|each| each.latest.0.saturating_add(window) > now.0);
+        growing.map(|each| each.number).min()
+    }
+
+    /// Forgets this one; true if it was under way.
+    pub fn forget(&mut self, number: u64, budget: &mut Budget) -> bool {
+        let index = self.place(number);
+        if let Some(index) = index {
+            self.close(index, budget);
+        }
+        index.is_some()
+    }
+
+    /// Forgets what got no fragment for `window` nanoseconds; how many that were.
+    pub fn expire(&mut self, now: Timestamp, window: u64, budget: &mut Budget) -> u64 {
+        let mut expired = 0;
+        while let Some(index) = self
+            .partial
+            .iter()
+            .position(|each| each.latest.0.saturating_add(window) <= now.0)
+        {
+            self.close(index, budget);
+            expired += 1;
+        }
+        expired
+    }
+
+    /// Forgets all, returning their share to the budget.
+    pub fn clear(&mut self, budget: &mut Budget) {
+        while !self.partial.is_empty() {
+            self.close(0, budget);
+        }
+    }
+
+    fn place(&self, number: u64) -> Option<usize> {
+        self.partial.iter().position(|each| each.number == number)
+    }
+
+    fn open(&mut self, record: &Record, now: Timestamp, budget: &mut Budget) -> usize {
+        if self.partial.len() >= MAX_PER_WRITER {
+            self.evict(record.sequence_number, budget);
+        }
+        budget.samples += 1;
+        self.partial.push(Partial {
+            number: record.sequence_number,
+            size: record.sample_size,
+            fragment_size: record.fragment_size(),
+            seen: 0,
+            bitmap: Vec::new(),
+            tail: None,
+            latest: now,
+            facts: Facts {
+                size: record.sample_size,
+                ..Facts::default()
+            },
+        });
+        self.partial.len() - 1
+    }
+
+    /// Gives up the one that has waited longest, the newcomer only when it is alone.
+    fn evict(&mut self, newcomer: u64, budget: &mut Budget) {
+        let candidates = self.partial.iter().enumerate();
+        let oldest = candidates.min_by_key(|(_, each)| (each.number == newcomer, each.latest));
+        if let Some(index) = oldest.map(|(index, _)| index) {
+            self.close(index, budget);
+            budget.evictions += 1;
+        }
+    }
+
+    fn close(&mut self, index: usize, budget: &mut Budget) {
+        let partial = self.partial.swap_remove(index);
+        budget.bytes = budget.bytes.saturating_sub(partial.bitmap.len() * 8);
+        budget.samples = budget.samples.saturating_sub(1);
+    }
+}
+
+impl Partial {
+    /// Sets the bits `start..end`; how many of them were new.
+    fn mark(&mut self, start: u32, end: u32) -> u32 {
+        let words = end.div_ceil(64) as usize;
+        if self.bitmap.len() < words {
+            self.bitmap.resize(words, 0);
+        }
+        let mut new = 0;
+        for bit in start..end {
+            if let Some(word) = self.bitmap.get_mut(bit as usize / 64) {
+                let mask = 1 << (bit % 64);
+                new += u32::from(*word & mask == 0);
+                *word |= mask;
+            }
+        }
+        new
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
+        Record {
+            sequence_number: number,
+            fragment_start: start,
+            fragments: count << 16 | 1344,
+            sample_size: size,
+            ..Record::default()
+        }
+    }
+
+    fn budget() -> Budget {
+        Budget::new(64 * 1024)
+    }
+
+    #[test]
+    fn repeated_fragments_do_not_complete_a_sample() {
+        let (mut samples, mut budget) = (Samples::default(), budget());
+        let mut put = |start, count| {
+            samples.fragment(
+                &fragment(1, start, count, 13_440),
+                Timestamp(1),
+                &mut budget,
+            )
+        };
+        assert_eq!(put(1, 5), Progress::Partial);
+        assert_eq!(put(1, 5), Progress::Duplicate);
+        assert_eq!(put(2, 5), Progress::Partial);
+        assert_eq!(put(8, 3), Progress::Partial);
+        assert!(matches!(
+            put(7, 1),
+            Progress::Complete(Facts { size: 13_440, .. })
+        ));
+        assert_eq!((budget.bytes, budget.samples), (0, 0));
+    }
+
+    #[test]
+    fn a_claimed_size_allocates_nothing() {
+        let (mut samples, mut budget) = (Samples::default(), budget());
+        let hostile = Record {
+            fragments: 1 << 16 | 0xffff,
+            ..fragment(1, 1, 1, u32::MAX)
+        };
+        assert_eq!(
+            samples.fragment(&hostile, Timestamp(1), &mut budget),
+            Progress::Rejected
+        );
+        let large = fragment(1, 1, 1, 88_000_000);
+        assert_eq!(
+            samples.fragment(&large, Timestamp(1), &mut budget),
+            Progress::Partial
+        );
+        assert_eq!(budget.bytes, 8);
+    }
+
+    #[test]
+    fn impossible_fragment_numbers_are_rejected() {
+        let (mut samples, mut budget) = (Samples::default(), budget());
+        for (start, count, size) in [
+            (0, 1, 9000),
+            (1, 0, 9000),
+            (7, 2, 9000),
+            (1, 1, 0),
+            (u32::MAX, 65_535, 9000),
+        ] {
+            let record = fragment(1, start, count, size);
+            assert_eq!(
+                samples.fragment(&record, Timestamp(1), &mut budget),
+                Progress::Rejected
+            );
+        }
+        samples.fragment(&fragment(1, 1, 1, 9000), Timestamp(1), &mut budget);
+        let other_size = fragment(1, 2, 1, 9001);
+        assert_eq!(
+            samples.fragment(&other_size, Timestamp(1), &mut budget),
+            Progress::Rejected
+        );
+        assert_eq!(budget.rejected, 6);
+    }
+
+    #[test]
+    fn a_storm_of_unfinished_samples_stays_in_the_budget() {
+        let (mut samples, mut budget) = (Samples::default(), budget());
+        for number in 0..10_000 {
+            let last = fragment(number, 65_000, 1, 65_000 * 1344);
+            samples.fragment(&last, Timestamp(number), &mut budget);
+        }
+        assert!(budget.bytes <= budget.limit && samples.partial.len() <= MAX_PER_WRITER);
+        assert!(budget.evictions > 9000);
+    }
+
+    #[test]
+    fn info_ts_of_the_first_fragment_is_kept() {
+        let (mut samples, mut budget) = (Samples::default(), budget());
+        let first = Record {
+            source_timestamp: 77 << 32,
+            ..fragment(1, 1, 1, 2000)
+        };
+        samples.fragment(&first, Timestamp(1), &mut budget);
+        let done = samples.fragment(&fragment(1, 2, 1, 2000), Timestamp(9), &mut budget);
+        assert!(matches!(done, Progress::Complete(facts) if facts.source == RtpsTime(77 << 32)));
+    }
+
+    #[test]
+    fn stalled_samples_expire() {
+        let (mut samples, mut budget) = (Samples::default(), budget());
+        samples.fragment(&fragment(4, 1, 1, 9000), Timestamp(100), &mut budget);
+        assert_eq!(samples.growing(Timestamp(150), 100), Some(4));
+        assert_eq!(samples.growing(Timestamp(250), 100), None);
+        assert_eq!(samples.expire(Timestamp(250), 100, &mut budget), 1);
+        assert_eq!(budget.bytes, 0);
+    }
+}

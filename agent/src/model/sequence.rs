@@ -1,0 +1,705 @@
+//! Which sequence numbers of one writer came, and which never will.
+//!
+//! A gap is not a loss yet: it stays open for the settle window, so that reordering and
+//! retransmission can fill it. What GAP, HEARTBEAT's firstSN or the moment of first sight excuse is
+//! never a loss. Memory is two bitmaps that grow with the number of undecided sequence numbers, up
+//! to [`MAX_WINDOW`]. It knows no payloads and no time but the one it is given.
+
+use std::collections::VecDeque;
+
+use ros2probe_wire::Timestamp;
+
+/// Undecided and recently decided sequence numbers remembered at the start.
+const MIN_WINDOW: u64 = 512;
+/// And at most: 8 KiB of bitmaps; about 3000 messages a second over the reliable settle window.
+pub const MAX_WINDOW: u64 = 32_768;
+/// A jump beyond this is a new incarnation or a forgery, not a million losses.
+const MAX_JUMP: u64 = 1 << 20;
+/// HEARTBEAT and GAP may run ahead of the data by at most this.
+const MAX_AHEAD: u64 = 4096;
+/// A gap that fills this soon, unasked, was reordering. Retransmissions that no ACKNACK was seen
+/// for take longer: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before they answer a
+/// HEARTBEAT.
+const REORDERING: i64 = 5_000_000;
+/// Gaps remembered for telling reordering from retransmission.
+const GAPS: usize = 32;
+/// A lower sequence number with a source time newer by this is a new incarnation of the writer.
+const INCARNATION: u64 = 100_000_000;
+/// So many consecutive samples below the window are one too, whatever their source time says.
+const STALE: u32 = 1024;
+/// Settling advances in this many steps per window.
+const STEPS: u64 = 16;
+
+/// State of one writer's sequence numbers.
+#[derive(Debug, Default)]
+pub struct Sequence {
+    /// The first one seen; what lies before does not count. 0 = none seen yet.
+    first: u64,
+    /// All below are decided.
+    settled: u64,
+    /// All that are known to exist are below this.
+    next: u64,
+    received: Bitmap,
+    excused: Bitmap,
+    /// `next` at some moments, oldest first.
+    checkpoints: VecDeque<(Timestamp, u64)>,
+    gaps: VecDeque<Gap>,
+    newest_source: Timestamp,
+    stale: u32,
+    /// When the last one that moved `next` came.
+    last_advance: Timestamp,
+}
+
+/// One run of missing numbers, for telling reordering from retransmission.
+#[derive(Clone, Copy, Debug)]
+struct Gap {
+    start: u64,
+    end: u64,
+    noticed: Timestamp,
+    requested: bool,
+}
+
+/// How a sample's number relates to those before.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Arrival {
+    /// Not seen before.
+    New {
+        /// It filled a gap by retransmission.
+        recovered: bool,
+        /// It is the newest so far, so its delay is a delivery delay and not a repetition's.
+        newest: bool,
+    },
+    /// Seen before, or too old to tell.
+    Duplicate,
+}
+
+/// How a sample was delivered, for telling a retransmission.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Delivery {
+    /// The writer never retransmits.
+    BestEffort,
+    /// The writer retransmits what a reader misses.
+    Reliable,
+    /// It does, but the sample came in fragments: that it is late need not mean that it was lost.
+    ReliableFragments,
+}
+
+/// One or several numbers that were decided.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Settled {
+    /// Never came.
+    Lost(u64),
+    /// Excused by the writer.
+    Irrelevant(u64),
+    /// So many in one go, beyond what the window holds.
+    LostRun(u64, u64),
+}
+
+impl Sequence {
+    /// Whether any sample was seen.
+    #[must_use]
+    pub const fn started(&self) -> bool {
+        self.first != 0
+    }
+
+    /// One past the highest number known to exist.
+    #[must_use]
+    pub const fn next(&self) -> u64 {
+        self.next
+    }
+
+    /// When the highest number last rose.
+    #[must_use]
+    pub const fn last_advance(&self) -> Timestamp {
+        self.last_advance
+    }
+
+    /// Whether this sample was received whole before.
+    #[must_use]
+    pub fn has(&self, number: u64) -> bool {
+        self.started() && (number < self.floor() || number < self.next && self.received.get(number))
+    }
+
+    /// Takes in one whole sample, after [`Self::recognise`].
+    pub fn receive(
+        &mut self,
+        number: u64,
+        delivery: Delivery,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) -> Arrival {
+        if number == 0 || number > u64::MAX >> 1 {
+            return Arrival::Duplicate;
+        }
+        if !self.started() {
+            self.restart(number);
+        }
+        if number >= self.next {
+            self.stale = 0;
+            self.extend(number, number + 1, now, settled);
+            self.received.set(number);
+            return Arrival::New {
+                recovered: false,
+                newest: true,
+            };
+        }
+        if number < self.floor() {
+            self.stale += 1;
+            return Arrival::Duplicate;
+        }
+        self.stale = 0;
+        if self.received.get(number) {
+            return Arrival::Duplicate;
+        }
+        self.received.set(number);
+        let recovered = number >= self.first && self.was_retransmitted(number, delivery, now);
+        Arrival::New {
+            recovered,
+            newest: false,
+        }
+    }
+
+    /// Looks at number and source time of a sample before anything else does: a writer that begins
+    /// anew under its old GUID is recognised here, and all numbers count afresh.
+    pub fn recognise(&mut self, number: u64, source: Option<Timestamp>) {
+        if number == 0 || number > u64::MAX >> 1 {
+            return;
+        }
+        if self.is_new_incarnation(number, source) {
+            self.restart(number);
+        }
+        if let Some(source) = source {
+            self.newest_source = self.newest_source.max(source);
+        }
+    }
+
+    /// A sample of this number exists, for some of its fragments came.
+    pub fn exists(&mut self, number: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+        if self.started() && number >= self.next {
+            self.extend(number, number + 1, now, settled);
+        }
+    }
+
+    /// Numbers count from here on; does nothing once begun.
+    pub fn begin(&mut self, number: u64) {
+        if !self.started() && number > 0 && number < u64::MAX >> 1 {
+            self.restart(number);
+        }
+    }
+
+    /// Lowest number that counts.
+    #[must_use]
+    pub const fn first(&self) -> u64 {
+        self.first
+    }
+
+    /// HEARTBEAT: the writer has `first..=last`. What lies before `first` it will never send again;
+    /// what lies up to `last` exists.
+    pub fn heartbeat(
+        &mut self,
+        first: u64,
+        last: u64,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() || first == 0 || first > last.saturating_add(1) {
+            return;
+        }
+        self.excuse(self.settled, first.min(self.next));
+        let next = last.saturating_add(1);
+        if next > self.next && next - self.next <= MAX_AHEAD {
+            let start = self.next.max(first);
+            if start > self.next {
+                self.extend(start - 1, start, now, settled);
+                self.excuse(self.settled, start);
+            }
+            self.note_gap(start, next, now);
+            self.extend(next - 1, next, now, settled);
+        }
+    }
+
+    /// GAP: `start..base` and some numbers from there on will never come.
+    pub fn gap(
+        &mut self,
+        start: u64,
+        base: u64,
+        set: impl Iterator<Item = u64>,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() || start == 0 || base < start {
+            return;
+        }
+        let mut one = |sequence: &mut Self, start: u64, end: u64| {
+            if end > sequence.next {
+                if end - sequence.next > MAX_AHEAD {
+                    return;
+                }
+                sequence.extend(end - 1, end, now, settled);
+            }
+            sequence.excuse(start.max(sequence.settled), end);
+        };
+        one(self, start, base);
+        for number in set {
+            one(self, number, number.saturating_add(1));
+        }
+    }
+
+    /// ACKNACK: a reader asks for these again.
+    pub fn requested(&mut self, mut set: impl Iterator<Item = u64>) {
+        if self.gaps.is_empty() {
+            return;
+        }
+        let (Some(low), high) = (set.next(), set.last()) else {
+            return;
+        };
+        let high = high.unwrap_or(low);
+        for gap in &mut self.gaps {
+            gap.requested |= gap.start <= high && low < gap.end;
+        }
+    }
+
+    /// Nothing in `start..end` is a loss.
+    pub fn excuse(&mut self, start: u64, end: u64) {
+        for number in start.max(self.floor()).max(self.settled)..end.min(self.next) {
+            self.excused.set(number);
+        }
+    }
+
+    /// Decides what has been open for `window`, but nothing from `hold` on.
+    pub fn advance(
+        &mut self,
+        now: Timestamp,
+        window: u64,
+        hold: Option<u64>,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() {
+            return;
+        }
+        let mut limit = None;
+        while let Some((at, next)) = self.checkpoints.front().copied()
+            && at.0.saturating_add(window) <= now.0
+        {
+            limit = Some(next);
+            if hold.is_some_and(|hold| hold < next) {
+                break;
+            }
+            self.checkpoints.pop_front();
+        }
+        if let Some(limit) = limit {
+            self.settle(hold.map_or(limit, |hold| hold.min(limit)), settled);
+        }
+        let due = self.checkpoints.back().is_none_or(|(at, next)| {
+            *next < self.next && at.0.saturating_add(window / STEPS) <= now.0
+        });
+        if due && self.settled < self.next {
+            self.checkpoints.push_back((now, self.next));
+        }
+    }
+
+    /// Decides everything that is open.
+    pub fn settle_all(&mut self, settled: &mut impl FnMut(Settled)) {
+        self.settle(self.next, settled);
+        self.checkpoints.clear();
+    }
+
+    /// Numbers below this are not remembered.
+    fn floor(&self) -> u64 {
+        self.next.saturating_sub(self.received.len())
+    }
+
+    fn restart(&mut self, number: u64) {
+        *self = Self {
+            first: number,
+            settled: number,
+            next: number,
+            newest_source: self.newest_source,
+            last_advance: self.last_advance,
+            received: Bitmap::with_len(MIN_WINDOW),
+            excused: Bitmap::with_len(MIN_WINDOW),
+            ..Self::default()
+        };
+    }
+
+    fn is_new_incarnation(&self, number: u64, source: Option<Timestamp>) -> bool {
+        if !self.started() {
+            return false;
+        }
+        if number >= self.next {
+            return number - self.next > MAX_JUMP;
+        }
+        let newer = source.is_some_and(|source| {
+            self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
+        });
+        newer && self.has(number) || self.stale >= STALE && number < self.floor()
+    }
+
+    /// Raises `next` to `end`; `start..end` came, what lies before it is a gap.
+    fn extend(&mut self, start: u64, end: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+        if start > self.next {
+            self.note_gap(self.next, start, now);
+        }
+        let undecided = end - self.settled;
+        if undecided > self.received.len() && self.received.len() < MAX_WINDOW {
+            let len = undecided.next_power_of_two().min(MAX_WINDOW);
+            self.received.grow(len, self.floor(), self.next);
+            self.excused.grow(len, self.floor(), self.next);
+        }
+        let keep = end.saturating_sub(self.received.len());
+        if keep > self.settled {
+            // Too many to keep open: decided now.
+            self.settle(keep.min(self.next), settled);
+            if keep > self.settled {
+                settled(Settled::LostRun(self.settled, keep));
+                self.settled = keep;
+            }
+        }
+        self.received.clear(self.next, end);
+        self.excused.clear(self.next, end);
+        self.next = end;
+        self.last_advance = now;
+    }
+
+    fn note_gap(&mut self, start: u64, end: u64, now: Timestamp) {
+        if self.gaps.len() >= GAPS {
+            self.gaps.pop_front();
+        }
+        self.gaps.push_back(Gap {
+            start,
+            end,
+            noticed: now,
+            requested: false,
+        });
+    }
+
+    fn was_retransmitted(&self, number: u64, delivery: Delivery, now: Timestamp) -> bool {
+        let gap = self
+            .gaps
+            .iter()
+            .rev()
+            .find(|gap| gap.start <= number && number < gap.end);
+        let late = |gap: &Gap| gap.requested || now.nanoseconds_since(gap.noticed) >= REORDERING;
+        match delivery {
+            Delivery::BestEffort => false,
+            // A gap that was forgotten is an old one.
+            Delivery::Reliable => gap.is_none_or(late),
+            Delivery::ReliableFragments => gap.is_some_and(late),
+        }
+    }
+
+    fn settle(&mut self, limit: u64, settled: &mut impl FnMut(Settled)) {
+        for number in self.settled..limit.min(self.next) {
+            if !self.received.get(number) {
+                let excused = self.excused.get(number);
+                settled(if excused {
+                    Settled::Irrelevant(number)
+                } else {
+                    Settled::Lost(number)
+                });
+            }
+        }
+        self.settled = self.settled.max(limit.min(self.next));
+    }
+}
+
+/// A ring of bits, a power of two of them, addressed by sequence number.
+#[derive(Debug, Default)]
+struct Bitmap {
+    words: Vec<u64>,
+}
+
+impl Bitmap {
+    fn with_len(bits: u64) -> Self {
+        Self {
+            words: vec![0; usize::try_from(bits / 64).unwrap_or(0)],
+        }
+    }
+
+    fn len(&self) -> u64 {
+        self.words.len() as u64 * 64
+    }
+
+    fn place(&self, number: u64) -> (usize, u64) {
+        let bit = number & self.len().wrapping_sub(1);
+        (
+            usize::try_from(bit / 64).unwrap_or(usize::MAX),
+            1 << (bit % 64),
+        )
+    }
+
+    fn get(&self, number: u64) -> bool {
+        let (word, mask) = self.place(number);
+        self.words.get(word).is_some_and(|word| word & mask != 0)
+    }
+
+    fn set(&mut self, number: u64) {
+        let (word, mask) = self.place(number);
+        if let Some(word) = self.words.get_mut(word) {
+            *word |= mask;
+        }
+    }
+
+    fn clear(&mut self, start: u64, end: u64) {
+        if end.saturating_sub(start) >= self.len() {
+            self.words.fill(0);
+            return;
+        }
+        for number in start..end {
+            let (word, mask) = self.place(number);
+            if let Some(word) = self.words.get_mut(word) {
+                *word &= !mask;
+            }
+        }
+    }
+
+    fn grow(&mut self, bits: u64, start: u64, end: u64) {
+        let mut wider = Self::with_len(bits);
+        for number in start..end {
+            if self.get(number) {
+                wider.set(number);
+            }
+        }
+        *self = wider;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: u64 = 1_000_000_000;
+
+    /// A sequence with virtual time and the verdicts in lists.
+    #[derive(Default)]
+    struct Bench {
+        sequence: Sequence,
+        now: u64,
+        recovered: Vec<u64>,
+        duplicates: Vec<u64>,
+        lost: Vec<u64>,
+        irrelevant: Vec<u64>,
+    }
+
+    impl Bench {
+        fn receive(&mut self, numbers: impl IntoIterator<Item = u64>) -> &mut Self {
+            for number in numbers {
+                self.now += SECOND / 1000;
+                self.receive_at(number, None);
+            }
+            self
+        }
+
+        fn receive_at(&mut self, number: u64, source: Option<u64>) {
+            let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
+            self.sequence.recognise(number, source.map(Timestamp));
+            let arrival = self.sequence.receive(
+                number,
+                Delivery::Reliable,
+                Timestamp(self.now),
+                &mut |settled| note(settled, lost, irrelevant),
+            );
+            match arrival {
+                Arrival::New {
+                    recovered: true, ..
+                } => self.recovered.push(number),
+                Arrival::New { .. } => {}
+                Arrival::Duplicate => self.duplicates.push(number),
+            }
+        }
+
+        fn wait(&mut self, seconds: u64) -> &mut Self {
+            let end = self.now + seconds * SECOND;
+            while self.now < end {
+                self.now += SECOND / 10;
+                let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
+                self.sequence
+                    .advance(Timestamp(self.now), SECOND, None, &mut |settled| {
+                        note(settled, lost, irrelevant);
+                    });
+            }
+            self
+        }
+    }
+
+    fn note(settled: Settled, lost: &mut Vec<u64>, irrelevant: &mut Vec<u64>) {
+        match settled {
+            Settled::Lost(number) => lost.push(number),
+            Settled::LostRun(start, end) => lost.extend(start..end),
+            Settled::Irrelevant(number) => irrelevant.push(number),
+        }
+    }
+
+    #[test]
+    fn order_1_2_4_3_5_is_no_loss_and_no_recovery() {
+        let mut bench = Bench::default();
+        bench.receive([1, 2, 4, 3, 5]).wait(5);
+        assert_eq!(
+            (
+                bench.lost.len(),
+                bench.recovered.len(),
+                bench.duplicates.len()
+            ),
+            (0, 0, 0)
+        );
+    }
+
+    #[test]
+    fn a_gap_is_lost_once_after_the_window() {
+        let mut bench = Bench::default();
+        bench.receive([1, 2, 5]);
+        assert!(bench.lost.is_empty());
+        bench.wait(3);
+        assert_eq!(bench.lost, [3, 4]);
+        bench.wait(5);
+        assert_eq!(bench.lost, [3, 4]);
+    }
+
+    #[test]
+    fn a_retransmission_recovers() {
+        let mut bench = Bench::default();
+        bench.receive([1, 2, 4]);
+        bench.now += SECOND / 5;
+        bench.receive([3]).wait(5);
+        assert_eq!(
+            (bench.lost.as_slice(), bench.recovered.as_slice()),
+            (&[][..], &[3][..])
+        );
+    }
+
+    #[test]
+    fn a_fast_retransmission_that_was_asked_for_is_no_reordering() {
+        let mut bench = Bench::default();
+        bench.receive([1, 2, 4]);
+        bench.sequence.requested([3].into_iter());
+        bench.receive([3]);
+        assert_eq!(bench.recovered, [3]);
+    }
+
+    #[test]
+    fn nothing_before_the_first_sight_is_lost() {
+        let mut bench = Bench::default();
+        bench.receive([385, 386]).wait(5);
+        assert!(bench.lost.is_empty());
+    }
+
+    #[test]
+    fn gap_and_heartbeat_excuse() {
+        let mut bench = Bench::default();
+        bench.receive([1, 4, 7, 9]);
+        bench
+            .sequence
+            .gap(2, 4, [].into_iter(), Timestamp(bench.now), &mut |_| {});
+        bench
+            .sequence
+            .heartbeat(7, 9, Timestamp(bench.now), &mut |_| {});
+        bench.wait(3);
+        assert_eq!(
+            (bench.irrelevant.as_slice(), bench.lost.as_slice()),
+            (&[2, 3, 5, 6][..], &[8][..])
+        );
+    }
+
+    #[test]
+    fn a_gap_ahead_of_the_data_does_not_hide_data() {
+        let mut bench = Bench::default();
+        bench.receive([1]);
+        bench
+            .sequence
+            .gap(2, 4, [4].into_iter(), Timestamp(bench.now), &mut |_| {});
+        bench.receive([3, 5]).wait(3);
+        assert_eq!(
+            (bench.irrelevant.as_slice(), bench.lost.len()),
+            (&[2, 4][..], 0)
+        );
+        assert!(bench.duplicates.is_empty());
+    }
+
+    #[test]
+    fn the_last_sample_of_a_burst_is_missed_by_its_heartbeat() {
+        let mut bench = Bench::default();
+        bench.receive([1, 2]);
+        bench
+            .sequence
+            .heartbeat(1, 3, Timestamp(bench.now), &mut |_| {});
+        bench.wait(3);
+        assert_eq!(bench.lost, [3]);
+    }
+
+    #[test]
+    fn forged_heartbeats_and_gaps_make_no_losses() {
+        let mut bench = Bench::default();
+        bench.receive([1, 2]);
+        let now = Timestamp(bench.now);
+        for (first, last) in [(1, u64::MAX), (0, 5), (9, 3), (u64::MAX, u64::MAX)] {
+            bench.sequence.heartbeat(first, last, now, &mut |_| {});
+        }
+        bench
+            .sequence
+            .gap(1, u64::MAX, [u64::MAX].into_iter(), now, &mut |_| {});
+        bench.sequence.gap(0, 0, [].into_iter(), now, &mut |_| {});
+        bench.receive([3, 4]).wait(3);
+        assert!(bench.lost.is_empty());
+    }
+
+    #[test]
+    fn a_restart_under_the_same_guid_begins_anew() {
+        let mut bench = Bench::default();
+        for number in 1..=100 {
+            bench.now += SECOND / 100;
+            bench.receive_at(number, Some(bench.now));
+        }
+        bench.wait(3);
+        for number in 1..=50 {
+            bench.now += SECOND / 100;
+            bench.receive_at(number, Some(bench.now));
+        }
+        bench.wait(3);
+        assert!(bench.duplicates.is_empty() && bench.lost.is_empty());
+    }
+
+    #[test]
+    fn history_for_a_late_joiner_is_duplicate() {
+        let mut bench = Bench::default();
+        for number in 1..=100 {
+            bench.now += SECOND / 100;
+            bench.receive_at(number, Some(number * SECOND / 100));
+        }
+        for number in 60..=100 {
+            bench.receive_at(number, Some(number * SECOND / 100));
+        }
+        assert_eq!(bench.duplicates.len(), 41);
+    }
+
+    #[test]
+    fn a_forged_jump_is_not_a_million_losses() {
+        let mut bench = Bench::default();
+        bench.receive([1, 2, u64::MAX >> 1, 1 << 40]).wait(3);
+        assert!(bench.lost.is_empty());
+        let mut numbers = 3..;
+        bench.receive(numbers.by_ref().take(2000)).wait(3);
+        assert!(bench.lost.is_empty());
+        assert!(bench.duplicates.len() <= 1100, "{}", bench.duplicates.len());
+    }
+
+    #[test]
+    fn more_undecided_than_the_window_holds_is_decided_at_once() {
+        let mut bench = Bench::default();
+        bench.receive([1, 200_000]);
+        bench.wait(3);
+        assert_eq!(bench.lost.len(), 199_998);
+        assert!(bench.sequence.received.len() <= MAX_WINDOW);
+    }
+
+    #[test]
+    fn a_late_sample_after_settling_still_counts_once() {
+        let mut bench = Bench::default();
+        bench.receive([1, 3]).wait(3);
+        bench.receive([2, 2]);
+        assert_eq!(
+            (bench.lost.as_slice(), bench.recovered.as_slice()),
+            (&[2][..], &[2][..])
+        );
+        assert_eq!(bench.duplicates, [2]);
+    }
+}

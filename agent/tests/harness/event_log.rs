@@ -1,0 +1,52 @@
+//! What a peer says it really sent or received: one JSON object per line.
+
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+use serde::Deserialize;
+
+/// One line. Which fields are there depends on `ev`.
+#[derive(Clone, Debug, Deserialize)]
+pub(crate) struct Event {
+    /// `start`, `endpoint`, `pub`, `pub_failed`, `sub`, `error`, `stop` or `exit`.
+    pub(crate) ev: String,
+    /// Unix time in nanoseconds.
+    pub(crate) t: u64,
+    /// The application's sequence number from 0; the DDS writer counts from 1.
+    pub(crate) seq: Option<u64>,
+    /// Serialized size with the encapsulation header.
+    pub(crate) len: Option<u64>,
+    pub(crate) stamp_ns: Option<u64>,
+    pub(crate) kind: Option<String>,
+    /// Prefix and entity id, 32 hexadecimal digits.
+    pub(crate) guid: Option<String>,
+    pub(crate) topic: Option<String>,
+    pub(crate) node: Option<String>,
+}
+
+pub(crate) struct EventLog(pub(crate) Vec<Event>);
+
+impl EventLog {
+    pub(crate) fn read(path: &Path) -> Result<EventLog> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        let whole_lines = text.rfind('\n').map_or("", |end| &text[..end]);
+        let events = whole_lines.lines().map(|line| {
+            serde_json::from_str(line).with_context(|| format!("not an event: {line}"))
+        });
+        Ok(EventLog(events.collect::<Result<_>>()?))
+    }
+
+    /// The application's sequence numbers of the events of one kind, in the order they happened.
+    pub(crate) fn sequences(&self, ev: &str) -> Vec<u64> {
+        self.0
+            .iter()
+            .filter(|event| event.ev == ev)
+            .filter_map(|event| event.seq)
+            .collect()
+    }
+
+    pub(crate) fn endpoints(&self) -> impl Iterator<Item = &Event> {
+        self.0.iter().filter(|event| event.ev == "endpoint")
+    }
+}

@@ -1,0 +1,62 @@
+//! What the live tests and the demo stand on: hosts made of network namespaces, DDS peers and the
+//! agent started inside them, packet loss, and the logs and metrics they leave behind.
+//!
+//! Everything is named after the process and a counter, so tests run side by side, and everything
+//! goes when its value is dropped, also when a test panics. Where something is missing the harness
+//! fails and says what to install; it never skips.
+
+#![allow(dead_code, reason = "each test file uses its own part of the harness")]
+
+pub(crate) mod agent;
+pub(crate) mod event_log;
+pub(crate) mod loss;
+pub(crate) mod network;
+pub(crate) mod peer;
+pub(crate) mod process;
+
+use std::process::Command;
+
+use anyhow::{Context as _, Result, bail};
+
+/// Tools the harness runs, with the Debian or Ubuntu package that has each.
+const TOOLS: [(&str, &str); 6] = [
+    ("ip", "iproute2"),
+    ("nft", "nftables"),
+    ("ethtool", "ethtool"),
+    ("nsenter", "util-linux"),
+    ("setpriv", "util-linux"),
+    ("curl", "curl"),
+];
+
+/// Fails unless this process is root and every tool is there.
+pub(crate) fn require() -> Result<()> {
+    let status = std::fs::read_to_string("/proc/self/status").context("cannot read /proc")?;
+    let effective = status.lines().find_map(|line| line.strip_prefix("Uid:"));
+    if effective.and_then(|ids| ids.split_whitespace().nth(1)) != Some("0") {
+        bail!("network namespaces need root: run `sudo -E make test`");
+    }
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    for (tool, package) in TOOLS {
+        if !std::env::split_paths(&path).any(|directory| directory.join(tool).exists()) {
+            bail!("`{tool}` is missing: run `apt-get install {package}` or `make prerequisites`");
+        }
+    }
+    Ok(())
+}
+
+/// Runs a command line made of words without spaces, and fails with what it said.
+fn run(line: &str) -> Result<String> {
+    let mut words = line.split_whitespace();
+    let program = words.next().context("an empty command")?;
+    let output = Command::new(program)
+        .args(words)
+        .output()
+        .with_context(|| format!("cannot run `{line}`"))?;
+    if !output.status.success() {
+        bail!(
+            "`{line}` failed: {}",
+            String::from_utf8_lossy(&output.stderr).trim()
+        );
+    }
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}

@@ -1,0 +1,142 @@
+//! Hosts: network namespaces joined by a veth pair of MTU 1500 with real checksums.
+
+use std::fs;
+use std::net::Ipv4Addr;
+use std::path::Path;
+use std::sync::Once;
+use std::sync::atomic::{AtomicU16, Ordering};
+
+use anyhow::Result;
+
+use super::{require, run};
+
+/// The interface of every host.
+pub(crate) const INTERFACE: &str = "eth0";
+const PREFIX: &str = "r2p";
+
+static NEXT: AtomicU16 = AtomicU16::new(0);
+
+/// One host.
+pub(crate) struct Namespace {
+    name: String,
+    address: Ipv4Addr,
+}
+
+/// Two hosts on one cable.
+pub(crate) struct Link {
+    pub(crate) robot: Namespace,
+    pub(crate) monitor: Namespace,
+}
+
+impl Link {
+    pub(crate) fn new() -> Result<Link> {
+        let subnet = next_subnet();
+        let robot = Namespace::create("robot", subnet, 1)?;
+        let monitor = Namespace::create("monitor", subnet, 2)?;
+        run(&format!(
+            "ip link add {INTERFACE} netns {} mtu 1500 type veth peer name {INTERFACE} mtu 1500 netns {}",
+            robot.name, monitor.name
+        ))?;
+        robot.configure(INTERFACE)?;
+        monitor.configure(INTERFACE)?;
+        Ok(Link { robot, monitor })
+    }
+}
+
+impl Namespace {
+    /// A host whose cable ends nowhere: its nodes talk over loopback only.
+    pub(crate) fn alone() -> Result<Namespace> {
+        let host = Namespace::create("robot", next_subnet(), 1)?;
+        run(&format!(
+            "ip -n {0} link add {INTERFACE} type veth peer name unplugged",
+            host.name
+        ))?;
+        run(&format!("ip -n {0} link set unplugged up", host.name))?;
+        host.configure(INTERFACE)?;
+        Ok(host)
+    }
+
+    pub(crate) fn name(&self) -> &str {
+        &self.name
+    }
+
+    pub(crate) fn address(&self) -> Ipv4Addr {
+        self.address
+    }
+
+    /// The words that run a command in this host with the host's own `/sys`.
+    pub(crate) fn inside(&self) -> Vec<String> {
+        ["ip", "netns", "exec", &self.name]
+            .map(str::to_owned)
+            .to_vec()
+    }
+
+    /// The words that run a command on this host's network only: `/sys/fs/cgroup` and the rest of
+    /// the file system stay as they are, as for a system service.
+    pub(crate) fn on_network(&self) -> Vec<String> {
+        vec![
+            "nsenter".to_owned(),
+            format!("--net=/run/netns/{}", self.name),
+        ]
+    }
+
+    fn create(role: &str, subnet: u16, host: u8) -> Result<Namespace> {
+        require()?;
+        static SWEPT: Once = Once::new();
+        SWEPT.call_once(remove_leftovers);
+        let name = format!("{PREFIX}-{}-{subnet}-{role}", std::process::id());
+        let [_, third] = subnet.to_be_bytes();
+        run(&format!("ip netns add {name}"))?;
+        Ok(Namespace {
+            name,
+            address: Ipv4Addr::new(10, 99, third, host),
+        })
+    }
+
+    fn configure(&self, interface: &str) -> Result<()> {
+        let Namespace { name, address } = self;
+        run(&format!("ip -n {name} link set lo multicast on up"))?;
+        run(&format!(
+            "ip -n {name} addr add {address}/24 dev {interface}"
+        ))?;
+        run(&format!("ip -n {name} link set {interface} up"))?;
+        run(&format!(
+            "ip -n {name} route add 239.0.0.0/8 dev {interface}"
+        ))?;
+        // veth carries unfinished checksums otherwise, which no cable does.
+        run(&format!(
+            "ip netns exec {name} ethtool -K {interface} tx off"
+        ))?;
+        Ok(())
+    }
+}
+
+impl Drop for Namespace {
+    fn drop(&mut self) {
+        if let Err(error) = run(&format!("ip netns delete {}", self.name)) {
+            eprintln!("{error:#}");
+        }
+    }
+}
+
+fn next_subnet() -> u16 {
+    NEXT.fetch_add(1, Ordering::Relaxed)
+}
+
+/// Removes the hosts of processes that were killed before they could.
+fn remove_leftovers() {
+    let Ok(entries) = fs::read_dir("/run/netns") else {
+        return;
+    };
+    for entry in entries.flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let mut parts = name.split('-');
+        let (prefix, owner) = (parts.next(), parts.next());
+        let Some(owner) = owner.filter(|_| prefix == Some(PREFIX)) else {
+            continue;
+        };
+        if !Path::new("/proc").join(owner).exists() {
+            let _ = run(&format!("ip netns delete {name}"));
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! Real DDS participants: one command line for three stacks (see `agent/tests/peers/peer.hpp`).
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, bail};
+use tempfile::TempDir;
+
+use super::event_log::EventLog;
+use super::network::Namespace;
+use super::process::Process;
+
+/// How long discovery may take on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Stack {
+    Fast,
+    Cyclone,
+    Rust,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Role {
+    Publisher,
+    Subscriber,
+}
+
+/// What the publisher sends or the subscriber expects.
+#[derive(Clone, Debug)]
+pub(crate) struct Stream {
+    pub(crate) topic: &'static str,
+    pub(crate) size: usize,
+    pub(crate) rate: f64,
+    pub(crate) count: u64,
+    pub(crate) reliable: bool,
+    pub(crate) transient_local: bool,
+    pub(crate) depth: usize,
+    pub(crate) domain: u16,
+}
+
+pub(crate) struct Peer {
+    pub(crate) process: Process,
+    directory: TempDir,
+}
+
+impl Stack {
+    pub(crate) const ALL: [Stack; 3] = [Stack::Fast, Stack::Cyclone, Stack::Rust];
+
+    fn program(self) -> Result<PathBuf> {
+        let target = target_directory()?;
+        let (program, remedy) = match self {
+            Stack::Fast => (target.join("peers/fastdds"), "make peers"),
+            Stack::Cyclone => (target.join("peers/cyclonedds"), "make peers"),
+            Stack::Rust => (robot()?, "cargo build --example robot"),
+        };
+        if !program.exists() {
+            bail!("{} is missing: run `{remedy}`", program.display());
+        }
+        Ok(program)
+    }
+}
+
+impl Stream {
+    /// Small samples as from an IMU: 320 B at 200 Hz, best effort.
+    pub(crate) fn small(count: u64) -> Stream {
+        Stream {
+            topic: "/imu",
+            size: 320,
+            rate: 200.0,
+            count,
+            reliable: false,
+            transient_local: false,
+            depth: 100,
+            domain: 0,
+        }
+    }
+
+    /// A point cloud of `size` bytes at 20 Hz, best effort.
+    pub(crate) fn point_cloud(size: usize, count: u64) -> Stream {
+        Stream {
+            topic: "/points",
+            size,
+            rate: 20.0,
+            depth: 5,
+            ..Stream::small(count)
+        }
+    }
+}
+
+impl Peer {
+    /// Starts a peer and waits until its endpoint exists. A publisher holds its samples until
+    /// [`Peer::go`].
+    pub(crate) fn start(
+        host: &Namespace,
+        stack: Stack,
+        role: Role,
+        stream: &Stream,
+        nodes: &[&str],
+    ) -> Result<Peer> {
+        let directory = tempfile::tempdir().context("cannot create a directory for the log")?;
+        let role_name = match role {
+            Role::Publisher => "pub",
+            Role::Subscriber => "sub",
+        };
+        let mut words: Vec<String> = ["--role", role_name, "--topic", stream.topic, "--hold"]
+            .into_iter()
+            .filter(|word| *word != "--hold" || role == Role::Publisher)
+            .map(str::to_owned)
+            .collect();
+        let mut option = |name: &str, value: String| words.extend([name.to_owned(), value]);
+        option("--size", stream.size.to_string());
+        option("--rate", stream.rate.to_string());
+        option("--depth", stream.depth.to_string());
+        option("--domain", stream.domain.to_string());
+        option("--log", directory.path().join("log").display().to_string());
+        if role == Role::Publisher {
+            option("--count", stream.count.to_string());
+        }
+        for node in nodes {
+            option("--node", (*node).to_owned());
+        }
+        words.push(
+            if stream.reliable {
+                "--reliable"
+            } else {
+                "--best-effort"
+            }
+            .to_owned(),
+        );
+        if stream.transient_local {
+            words.push("--transient-local".to_owned());
+        }
+        let mut process = Process::start(&host.inside(), stack.program()?, words)?;
+        process
+            .wait_for("ready", PATIENCE)
+            .with_context(|| format!("{stack:?} {role:?}"))?;
+        Ok(Peer { process, directory })
+    }
+
+    /// Waits until a peer of the other role is known.
+    pub(crate) fn wait_matched(&mut self) -> Result<()> {
+        self.process.wait_for("matched", PATIENCE)
+    }
+
+    /// Lets a publisher send.
+    pub(crate) fn go(&mut self) -> Result<()> {
+        self.process.say("go")
+    }
+
+    /// Waits until a publisher has sent everything.
+    pub(crate) fn wait_sent(&mut self, limit: Duration) -> Result<()> {
+        self.process.wait_for("done", limit)
+    }
+
+    pub(crate) fn log_path(&self) -> PathBuf {
+        self.directory.path().join("log")
+    }
+
+    pub(crate) fn log(&self) -> Result<EventLog> {
+        EventLog::read(&self.log_path())
+    }
+}
+
+/// The demo robot, built by cargo as an example beside the tests.
+pub(crate) fn robot() -> Result<PathBuf> {
+    Ok(profile_directory()?.join("examples/robot"))
+}
+
+/// `target/debug` or the like: tests run from its `deps`, examples from its `examples`.
+fn profile_directory() -> Result<PathBuf> {
+    let program = std::env::current_exe().context("cannot tell where this program is")?;
+    let directory = program
+        .ancestors()
+        .nth(2)
+        .context("this program is not in a target directory")?;
+    Ok(directory.to_owned())
+}
+
+fn target_directory() -> Result<PathBuf> {
+    let profile = profile_directory()?;
+    let target = profile
+        .ancestors()
+        .find(|directory| directory.join("CACHEDIR.TAG").exists());
+    Ok(target
+        .or_else(|| profile.parent())
+        .unwrap_or(Path::new("target"))
+        .to_owned())
+}

@@ -1,0 +1,135 @@
+//! A program running on a host, ended with its value. It also dies with the thread that started it,
+//! so a killed test leaves nothing behind: start it from the thread that keeps it.
+
+use std::ffi::OsStr;
+use std::io::{BufRead, BufReader, Write};
+use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail};
+
+pub(crate) struct Process {
+    name: String,
+    child: Child,
+    input: Option<ChildStdin>,
+    output: Receiver<String>,
+}
+
+impl Process {
+    /// Runs `program` behind the words of `host` (`Namespace::inside` or `on_network`).
+    pub(crate) fn start<A: AsRef<OsStr>>(
+        host: &[String],
+        program: impl AsRef<OsStr>,
+        arguments: impl IntoIterator<Item = A>,
+    ) -> Result<Process> {
+        Process::start_with(host, program, arguments, Stdio::inherit())
+    }
+
+    /// As [`Process::start`], with standard error going elsewhere.
+    pub(crate) fn start_with<A: AsRef<OsStr>>(
+        host: &[String],
+        program: impl AsRef<OsStr>,
+        arguments: impl IntoIterator<Item = A>,
+        errors: Stdio,
+    ) -> Result<Process> {
+        let name = program.as_ref().to_string_lossy().into_owned();
+        let [enter, words @ ..] = host else {
+            bail!("no host to run {name} on");
+        };
+        let mut child = Command::new(enter)
+            .args(words)
+            .args(["setpriv", "--pdeathsig", "KILL"])
+            .arg(program)
+            .args(arguments)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(errors)
+            .spawn()
+            .with_context(|| format!("cannot start {name}"))?;
+        let stdout = child
+            .stdout
+            .take()
+            .with_context(|| format!("{name} has no output"))?;
+        let (lines, output) = channel();
+        std::thread::spawn(move || {
+            for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+                if lines.send(line).is_err() {
+                    return;
+                }
+            }
+        });
+        let input = child.stdin.take();
+        Ok(Process {
+            name,
+            child,
+            input,
+            output,
+        })
+    }
+
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Waits until the program prints this line.
+    pub(crate) fn wait_for(&mut self, line: &str, limit: Duration) -> Result<()> {
+        let deadline = Instant::now() + limit;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            match self.output.recv_timeout(left) {
+                Ok(printed) if printed == line => return Ok(()),
+                Ok(_) => {}
+                Err(RecvTimeoutError::Timeout) => {
+                    bail!("{} did not print `{line}` within {limit:?}", self.name)
+                }
+                Err(RecvTimeoutError::Disconnected) => {
+                    bail!("{} ended before it printed `{line}`", self.name)
+                }
+            }
+        }
+    }
+
+    pub(crate) fn say(&mut self, line: &str) -> Result<()> {
+        let input = self
+            .input
+            .as_mut()
+            .with_context(|| format!("{} has no input", self.name))?;
+        writeln!(input, "{line}").with_context(|| format!("cannot write to {}", self.name))
+    }
+
+    /// Sends a signal by its name (`TERM`, `INT`, `HUP`, `STOP`, `KILL`).
+    pub(crate) fn signal(&self, name: &str) -> Result<()> {
+        super::run(&format!("kill -{name} {}", self.pid()))?;
+        Ok(())
+    }
+
+    pub(crate) fn wait(&mut self, limit: Duration) -> Result<ExitStatus> {
+        let deadline = Instant::now() + limit;
+        loop {
+            if let Some(status) = self.child.try_wait()? {
+                return Ok(status);
+            }
+            if Instant::now() > deadline {
+                bail!("{} still runs after {limit:?}", self.name);
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Asks the program to end in order, and fails if it does not within five seconds.
+    pub(crate) fn terminate(&mut self) -> Result<ExitStatus> {
+        if let Some(status) = self.child.try_wait()? {
+            return Ok(status);
+        }
+        self.signal("TERM")?;
+        self.wait(Duration::from_secs(5))
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

@@ -1,0 +1,329 @@
+// A ROS 2 publisher or subscriber on Fast DDS, announced as rmw_fastrtps does: UDPv4 only (no
+// shared memory), the enclave in the participant's user data, ros_discovery_info republished whole
+// whenever an entity comes or goes. Command line and log: ../peer.hpp.
+#include <fastdds/dds/domain/DomainParticipant.hpp>
+#include <fastdds/dds/domain/DomainParticipantFactory.hpp>
+#include <fastdds/dds/publisher/DataWriter.hpp>
+#include <fastdds/dds/publisher/Publisher.hpp>
+#include <fastdds/dds/publisher/qos/DataWriterQos.hpp>
+#include <fastdds/dds/subscriber/DataReader.hpp>
+#include <fastdds/dds/subscriber/DataReaderListener.hpp>
+#include <fastdds/dds/subscriber/SampleInfo.hpp>
+#include <fastdds/dds/subscriber/Subscriber.hpp>
+#include <fastdds/dds/subscriber/qos/DataReaderQos.hpp>
+#include <fastdds/dds/topic/TopicDataType.hpp>
+#include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
+
+#include <atomic>
+#include <memory>
+
+#include "../peer.hpp"
+
+using namespace eprosima::fastdds::dds;
+using eprosima::fastdds::rtps::UDPv4TransportDescriptor;
+using eprosima::fastrtps::rtps::GUID_t;
+using eprosima::fastrtps::rtps::SerializedPayload_t;
+
+namespace {
+
+using Payload = std::vector<uint8_t>;  // serialized, encapsulation included
+
+// A type whose samples are already serialized.
+class SerializedType : public TopicDataType {
+ public:
+  SerializedType(const char* name, size_t size) {
+    setName(name);
+    m_typeSize = static_cast<uint32_t>(size);
+    m_isGetKeyDefined = false;
+  }
+
+  bool serialize(void* sample, SerializedPayload_t* out) override {
+    const Payload& bytes = *static_cast<Payload*>(sample);
+    if (bytes.size() > out->max_size) return false;
+    memcpy(out->data, bytes.data(), bytes.size());
+    out->length = static_cast<uint32_t>(bytes.size());
+    out->encapsulation = CDR_LE;
+    return true;
+  }
+
+  bool deserialize(SerializedPayload_t* in, void* sample) override {
+    static_cast<Payload*>(sample)->assign(in->data, in->data + in->length);
+    return true;
+  }
+
+  std::function<uint32_t()> getSerializedSizeProvider(void* sample) override {
+    return [sample] { return static_cast<uint32_t>(static_cast<Payload*>(sample)->size()); };
+  }
+
+  void* createData() override { return new Payload; }
+  void deleteData(void* sample) override { delete static_cast<Payload*>(sample); }
+  bool getKey(void*, eprosima::fastrtps::rtps::InstanceHandle_t*, bool) override { return false; }
+};
+
+// Writes CDR little-endian with alignment relative to the end of the encapsulation header.
+class Cdr {
+ public:
+  Cdr() : bytes{0, 1, 0, 0} {}
+
+  void u32(uint32_t value) {
+    while (bytes.size() % 4 != 0) bytes.push_back(0);
+    for (int shift = 0; shift < 32; shift += 8) bytes.push_back(static_cast<uint8_t>(value >> shift));
+  }
+
+  void string(const std::string& text) {
+    u32(static_cast<uint32_t>(text.size() + 1));
+    bytes.insert(bytes.end(), text.begin(), text.end());
+    bytes.push_back(0);
+  }
+
+  void gid(const peer::Guid& guid, size_t size) {
+    bytes.insert(bytes.end(), guid.begin(), guid.end());
+    bytes.insert(bytes.end(), size - guid.size(), 0);
+  }
+
+  Payload bytes;
+};
+
+Payload point_cloud(size_t data_size) {
+  Cdr cdr;
+  cdr.u32(0);
+  cdr.u32(0);
+  cdr.string("lidar");
+  cdr.u32(1);
+  cdr.u32(static_cast<uint32_t>(data_size));
+  cdr.u32(0);
+  cdr.bytes.push_back(0);
+  cdr.u32(1);
+  cdr.u32(static_cast<uint32_t>(data_size));
+  cdr.u32(static_cast<uint32_t>(data_size));
+  cdr.bytes.insert(cdr.bytes.end(), data_size, 0x5a);
+  cdr.bytes.push_back(1);
+  return cdr.bytes;
+}
+
+constexpr size_t kStampOffset = 4;
+constexpr size_t kDataOffset = 4 + 48;
+
+peer::Guid guid_of(const GUID_t& guid) {
+  peer::Guid bytes;
+  memcpy(bytes.data(), guid.guidPrefix.value, 12);
+  memcpy(bytes.data() + 12, guid.entityId.value, 4);
+  return bytes;
+}
+
+class Receiver : public DataReaderListener {
+ public:
+  Receiver(const peer::Options& options, peer::Log& log) : options_(options), log_(log) {}
+
+  void on_data_available(DataReader* reader) override {
+    SampleInfo info;
+    while (reader->take_next_sample(&sample_, &info) == ReturnCode_t::RETCODE_OK) {
+      if (!info.valid_data || sample_.size() < kDataOffset + 8) continue;
+      uint32_t stamp[2];
+      uint64_t seq;
+      memcpy(stamp, &sample_[kStampOffset], sizeof stamp);
+      memcpy(&seq, &sample_[kDataOffset], sizeof seq);
+      log_.received(seq, sample_.size(), stamp[0] * 1000000000LL + stamp[1]);
+      if (++received_ == options_.count) peer::stopped = 1;
+    }
+  }
+
+ private:
+  const peer::Options& options_;
+  peer::Log& log_;
+  Payload sample_;
+  uint64_t received_ = 0;
+};
+
+// One participant with its nodes, keeping ros_discovery_info in step.
+class Context {
+ public:
+  Context(const peer::Options& options) : options_(options) {
+    auto factory = DomainParticipantFactory::get_instance();
+    DomainParticipantQos qos = PARTICIPANT_QOS_DEFAULT;
+    qos.name("/");
+    const char enclave[] = "enclave=/;";
+    qos.user_data().setValue(std::vector<uint8_t>(enclave, enclave + sizeof enclave));
+    auto udp = std::make_shared<UDPv4TransportDescriptor>();
+    udp->receiveBufferSize = 4 << 20;
+    qos.transport().use_builtin_transports = false;
+    qos.transport().user_transports.push_back(udp);
+    participant_ = factory->create_participant(options.domain, qos);
+    if (!participant_) peer::fail("cannot create a participant");
+    publisher_ = participant_->create_publisher(PUBLISHER_QOS_DEFAULT);
+    subscriber_ = participant_->create_subscriber(SUBSCRIBER_QOS_DEFAULT);
+    cloud_type_ = TypeSupport(new SerializedType(peer::kPointCloudType, options.size));
+    cloud_type_.register_type(participant_);
+
+    TypeSupport info_type(new SerializedType(peer::kDiscoveryType, 4096));
+    info_type.register_type(participant_);
+    Topic* topic = create_topic(peer::kDiscoveryTopic, info_type);
+    DataWriterQos writer_qos = DATAWRITER_QOS_DEFAULT;
+    writer_qos.durability().kind = TRANSIENT_LOCAL_DURABILITY_QOS;
+    writer_qos.history().depth = 1;
+    common(writer_qos);
+    DataReaderQos reader_qos = DATAREADER_QOS_DEFAULT;
+    reader_qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
+    reader_qos.durability().kind = TRANSIENT_LOCAL_DURABILITY_QOS;
+    reader_qos.history().kind = KEEP_ALL_HISTORY_QOS;
+    common(reader_qos);
+    info_writer_ = publisher_->create_datawriter(topic, writer_qos);
+    info_reader_ = subscriber_->create_datareader(topic, reader_qos, &info_drain_);
+    if (!info_writer_ || !info_reader_) peer::fail("cannot create ros_discovery_info");
+  }
+
+  size_t add_node(const std::string& full_name) {
+    nodes_.push_back(peer::Node::of(full_name));
+    announce();
+    return nodes_.size() - 1;
+  }
+
+  DataWriter* add_writer(size_t node, const std::string& ros_topic) {
+    DataWriterQos qos = DATAWRITER_QOS_DEFAULT;
+    qos.reliability().kind =
+        options_.best_effort ? BEST_EFFORT_RELIABILITY_QOS : RELIABLE_RELIABILITY_QOS;
+    qos.durability().kind = durability();
+    qos.history().depth = options_.depth;
+    common(qos);
+    DataWriter* writer =
+        publisher_->create_datawriter(create_topic(peer::dds_topic(ros_topic), cloud_type_), qos);
+    if (!writer) peer::fail("cannot create a writer");
+    nodes_[node].writers.push_back(guid_of(writer->guid()));
+    announce();
+    return writer;
+  }
+
+  DataReader* add_reader(size_t node, const std::string& ros_topic, DataReaderListener* listener) {
+    DataReaderQos qos = DATAREADER_QOS_DEFAULT;
+    qos.reliability().kind =
+        options_.best_effort ? BEST_EFFORT_RELIABILITY_QOS : RELIABLE_RELIABILITY_QOS;
+    qos.durability().kind = durability();
+    qos.history().depth = options_.depth;
+    common(qos);
+    DataReader* reader = subscriber_->create_datareader(
+        create_topic(peer::dds_topic(ros_topic), cloud_type_), qos, listener);
+    if (!reader) peer::fail("cannot create a reader");
+    nodes_[node].readers.push_back(guid_of(reader->guid()));
+    announce();
+    return reader;
+  }
+
+  void leave() {
+    nodes_.clear();
+    announce();
+    participant_->delete_contained_entities();
+    DomainParticipantFactory::get_instance()->delete_participant(participant_);
+  }
+
+ private:
+  struct Drain : DataReaderListener {
+    void on_data_available(DataReader* reader) override {
+      Payload sample;
+      SampleInfo info;
+      while (reader->take_next_sample(&sample, &info) == ReturnCode_t::RETCODE_OK) {
+      }
+    }
+  };
+
+  template <typename Qos>
+  static void common(Qos& qos) {
+    qos.data_sharing().off();
+    qos.endpoint().history_memory_policy =
+        eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
+  }
+
+  DurabilityQosPolicyKind durability() const {
+    return options_.transient_local ? TRANSIENT_LOCAL_DURABILITY_QOS : VOLATILE_DURABILITY_QOS;
+  }
+
+  Topic* create_topic(const std::string& name, const TypeSupport& type) {
+    Topic* topic = participant_->create_topic(name, type->getName(), TOPIC_QOS_DEFAULT);
+    if (!topic) peer::fail("cannot create a topic");
+    return topic;
+  }
+
+  void announce() {
+    Cdr cdr;
+    cdr.gid(guid_of(participant_->guid()), options_.gid_size);
+    cdr.u32(static_cast<uint32_t>(nodes_.size()));
+    for (const auto& node : nodes_) {
+      cdr.string(node.namespace_);
+      cdr.string(node.name);
+      for (const auto* gids : {&node.readers, &node.writers}) {
+        cdr.u32(static_cast<uint32_t>(gids->size()));
+        for (const auto& gid : *gids) cdr.gid(gid, options_.gid_size);
+      }
+    }
+    info_writer_->write(&cdr.bytes);
+  }
+
+  const peer::Options& options_;
+  Drain info_drain_;
+  DomainParticipant* participant_;
+  Publisher* publisher_;
+  Subscriber* subscriber_;
+  TypeSupport cloud_type_;
+  DataWriter* info_writer_;
+  DataReader* info_reader_;
+  std::vector<peer::Node> nodes_;
+};
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  const peer::Options options = peer::Options::parse(argc, argv);
+  peer::stop_on_signals();
+  peer::Log log(options, "fastdds");
+  Receiver receiver(options, log);
+  Context context(options);
+
+  DataWriter* writer = nullptr;
+  DataReader* reader = nullptr;
+  for (size_t i = 0; i < options.nodes.size(); i++) {
+    size_t node = context.add_node(options.nodes[i]);
+    const std::string topic = options.topic_of(i);
+    if (options.publishes) {
+      DataWriter* added = context.add_writer(node, topic);
+      log.endpoint("pub", guid_of(added->guid()), topic, options.nodes[i]);
+      if (i == 0) writer = added;
+    } else {
+      DataReader* added = context.add_reader(node, topic, i == 0 ? &receiver : nullptr);
+      log.endpoint("sub", guid_of(added->guid()), topic, options.nodes[i]);
+      if (i == 0) reader = added;
+    }
+  }
+  peer::say("ready");
+
+  if (options.publishes) {
+    peer::wait_for_start(options, [&] {
+      PublicationMatchedStatus status;
+      writer->get_publication_matched_status(status);
+      return status.current_count;
+    });
+    Payload cloud = point_cloud(options.data_size());
+    peer::send_all(options, log, [&](uint64_t seq, int64_t now) {
+      const uint32_t stamp[2] = {static_cast<uint32_t>(now / 1000000000),
+                                 static_cast<uint32_t>(now % 1000000000)};
+      memcpy(&cloud[kStampOffset], stamp, sizeof stamp);
+      memcpy(&cloud[kDataOffset], &seq, sizeof seq);
+      return writer->write(&cloud);
+    });
+  } else {
+    bool matched = false;
+    while (!peer::stopped) {
+      SubscriptionMatchedStatus status;
+      reader->get_subscription_matched_status(status);
+      if (!matched && status.current_count >= options.peers) {
+        matched = true;
+        peer::say("matched");
+      }
+      usleep(20000);
+    }
+    reader->set_listener(nullptr);
+    log.event("stop");
+    peer::say("done");
+  }
+  context.leave();
+  log.event("exit");
+  return 0;
+}
