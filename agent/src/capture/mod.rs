@@ -1,6 +1,7 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
 pub mod filter;
+pub mod interfaces;
 pub mod netns;
 pub mod pcap;
 pub mod ring;

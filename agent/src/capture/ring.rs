@@ -24,6 +24,8 @@ pub use block::{Frames, RingFrame};
 
 /// The kernel wants a frame size in TPACKET_V3 too, but packs frames as tightly as they fit.
 const NOMINAL_FRAME: usize = 2048;
+/// Room for a frame of 64 KiB, its header and the block's.
+const SMALLEST_BLOCK: usize = 128 << 10;
 /// Between two looks at a socket that reports an error again and again.
 const ERROR_PAUSE: Duration = Duration::from_millis(10);
 
@@ -44,6 +46,21 @@ impl Default for Settings {
             block_size: 256 << 10,
             blocks: 8,
             retire: Duration::from_millis(60),
+        }
+    }
+}
+
+impl Settings {
+    /// A ring of about this much memory, in blocks that hold the largest frame (64 KiB on `lo`).
+    #[must_use]
+    pub fn with_memory(bytes: usize) -> Self {
+        let settings = Self::default();
+        let blocks = (bytes / settings.block_size).max(2);
+        let block_size = (bytes / blocks).clamp(SMALLEST_BLOCK, settings.block_size);
+        Self {
+            block_size,
+            blocks,
+            ..settings
         }
     }
 }

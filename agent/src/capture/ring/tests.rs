@@ -279,6 +279,28 @@ fn impossible_sizes_are_refused() {
 }
 
 #[test]
+fn any_amount_of_memory_makes_a_ring_for_the_largest_frames() {
+    assert_eq!(Settings::with_memory(2 << 20), Settings::default());
+    for (memory, block_size, blocks) in [
+        (0, 128 << 10, 2),
+        (300_000, 150_000, 2),
+        (1 << 20, 256 << 10, 4),
+        (16 << 20, 256 << 10, 64),
+    ] {
+        let settings = Settings::with_memory(memory);
+        assert_eq!((settings.block_size, settings.blocks), (block_size, blocks));
+        assert!(request(settings).is_some());
+    }
+    in_new_namespace(|| {
+        let mut ring = Ring::open(Settings::with_memory(0), None).unwrap();
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.send_to(&[5; 65_507], "127.0.0.1:7400").unwrap();
+        let seen = sent(&mut ring, Duration::from_millis(200));
+        assert_eq!(seen, [(1, vec![5; 65_507])]);
+    });
+}
+
+#[test]
 fn without_the_capability_the_error_names_it() {
     let thread = std::thread::spawn(|| {
         if caps::clear(None, caps::CapSet::Effective).is_err() {

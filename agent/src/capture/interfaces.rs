@@ -1,0 +1,552 @@
+//! The interfaces of a network namespace: which there are, which come and go, and which of them
+//! the configuration wants to be looked at.
+//!
+//! Learnt from the kernel through rtnetlink (`man 7 rtnetlink`). Nothing is ever changed there and
+//! nothing is sent to the network.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::mem::size_of_val;
+use std::os::fd::{AsFd, BorrowedFd, FromRawFd, OwnedFd};
+
+use globset::{Glob, GlobSet, GlobSetBuilder};
+use ros2probe_wire::{Cursor, Endianness, WireError};
+
+/// The kernel makes no longer messages for one interface.
+const BUFFER: usize = 64 << 10;
+const IFLA_IFNAME: u16 = 3;
+/// How often a list is asked for that changed while it was being written.
+const MOST_ATTEMPTS: u32 = 5;
+
+/// One interface.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Interface {
+    /// Its index, unique in its namespace.
+    pub index: u32,
+    /// Its name.
+    pub name: String,
+    /// Its `ARPHRD_` number: 1 Ethernet, 772 loopback, 65534 none (tun).
+    pub hardware: u16,
+    /// Whether it is administratively up.
+    pub up: bool,
+}
+
+/// What happened to an interface.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Change {
+    /// It appeared, was renamed, went up or down.
+    Present(Interface),
+    /// It was deleted or moved to another namespace.
+    Gone(Interface),
+}
+
+/// Why the interfaces are not known.
+#[derive(Debug, thiserror::Error)]
+pub enum InterfacesError {
+    /// A system call failed.
+    #[error("cannot learn the network interfaces: {call} failed")]
+    System {
+        /// The system call.
+        call: &'static str,
+        /// Its error.
+        source: io::Error,
+    },
+    /// The kernel's answer could not be read.
+    #[error("cannot learn the network interfaces: unreadable answer")]
+    Unreadable(#[from] WireError),
+    /// The list never held still.
+    #[error("cannot learn the network interfaces: they change faster than the kernel lists them")]
+    Restless,
+}
+
+/// The interfaces of the namespace in which it was opened.
+#[derive(Debug)]
+pub struct Interfaces {
+    socket: File,
+    known: BTreeMap<u32, Interface>,
+    sequence: u32,
+    buffer: Vec<u8>,
+}
+
+/// Which interfaces to look at.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    include: GlobSet,
+    exclude: GlobSet,
+}
+
+impl Interfaces {
+    /// Lists the interfaces of the calling thread's namespace, and keeps listening.
+    ///
+    /// # Errors
+    /// The kernel refuses.
+    pub fn open() -> Result<Self, InterfacesError> {
+        let socket = File::from(listen()?);
+        let mut interfaces = Self {
+            socket,
+            known: BTreeMap::new(),
+            sequence: 0,
+            buffer: vec![0; BUFFER],
+        };
+        interfaces.list()?;
+        Ok(interfaces)
+    }
+
+    /// All interfaces, by index.
+    pub fn iter(&self) -> impl Iterator<Item = &Interface> {
+        self.known.values()
+    }
+
+    /// The interface with this index.
+    #[must_use]
+    pub fn by_index(&self, index: u32) -> Option<&Interface> {
+        self.known.get(&index)
+    }
+
+    /// What has changed since the last call. Does not wait.
+    ///
+    /// # Errors
+    /// The kernel fails; what is known stays known.
+    pub fn changes(&mut self) -> Result<Vec<Change>, InterfacesError> {
+        let mut changes = Vec::new();
+        if self.drain(&mut changes)? {
+            // Messages were lost: only a new list tells what we missed.
+            changes.extend(self.list()?);
+        }
+        Ok(changes)
+    }
+
+    /// Takes what is waiting; `true` when the kernel had to leave something out.
+    fn drain(&mut self, changes: &mut Vec<Change>) -> Result<bool, InterfacesError> {
+        let mut lost = false;
+        loop {
+            match self.socket.read(&mut self.buffer) {
+                Ok(count) => {
+                    let known = &mut self.known;
+                    let bytes = self.buffer.get(..count).unwrap_or_default();
+                    read(bytes, |message| changes.extend(apply(known, message)))?;
+                }
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(lost),
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) if error.raw_os_error() == Some(libc::ENOBUFS) => lost = true,
+                Err(source) => {
+                    return Err(InterfacesError::System {
+                        call: "read",
+                        source,
+                    });
+                }
+            }
+        }
+    }
+
+    /// Asks for all interfaces and compares them with those known.
+    fn list(&mut self) -> Result<Vec<Change>, InterfacesError> {
+        let mut changes = Vec::new();
+        'attempt: for _ in 0..MOST_ATTEMPTS {
+            // What still waits is older than the list, and its sequel may be lost.
+            self.drain(&mut changes)?;
+            self.ask()?;
+            let mut listed = BTreeSet::new();
+            let mut interrupted = false;
+            loop {
+                let count = match self.socket.read(&mut self.buffer) {
+                    Ok(count) => count,
+                    Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                    Err(error) if error.raw_os_error() == Some(libc::ENOBUFS) => continue 'attempt,
+                    Err(source) => {
+                        return Err(InterfacesError::System {
+                            call: "read",
+                            source,
+                        });
+                    }
+                };
+                let (known, sequence) = (&mut self.known, self.sequence);
+                let mut done = None;
+                read(self.buffer.get(..count).unwrap_or_default(), |message| {
+                    let answer = message.sequence == sequence;
+                    interrupted |= answer && message.flags & libc::NLM_F_DUMP_INTR != 0;
+                    match &message.body {
+                        Body::Present(interface) => {
+                            listed.insert(interface.index);
+                        }
+                        Body::Gone(index) => {
+                            listed.remove(index);
+                        }
+                        Body::End(error) if answer => done = Some(*error),
+                        Body::End(_) | Body::Other => {}
+                    }
+                    changes.extend(apply(known, message));
+                })?;
+                match done {
+                    None => {}
+                    Some(0) if interrupted => continue 'attempt,
+                    Some(0) => {
+                        let gone = self
+                            .known
+                            .extract_if(.., |index, _| !listed.contains(index));
+                        changes.extend(gone.map(|(_, interface)| Change::Gone(interface)));
+                        return Ok(changes);
+                    }
+                    Some(error) => {
+                        let source = io::Error::from_raw_os_error(error.saturating_neg());
+                        return Err(InterfacesError::System {
+                            call: "RTM_GETLINK",
+                            source,
+                        });
+                    }
+                }
+            }
+        }
+        Err(InterfacesError::Restless)
+    }
+
+    fn ask(&mut self) -> Result<(), InterfacesError> {
+        self.sequence = self.sequence.wrapping_add(1);
+        let mut request = Vec::with_capacity(32);
+        request.extend_from_slice(&32_u32.to_ne_bytes());
+        request.extend_from_slice(&libc::RTM_GETLINK.to_ne_bytes());
+        request.extend_from_slice(&(NLM_F_REQUEST | NLM_F_DUMP).to_ne_bytes());
+        request.extend_from_slice(&self.sequence.to_ne_bytes());
+        // Our port, given by the kernel; then an ifinfomsg that asks for every interface.
+        request.extend_from_slice(&[0; 4 + 16]);
+        self.socket
+            .write_all(&request)
+            .map_err(|source| InterfacesError::System {
+                call: "write",
+                source,
+            })
+    }
+}
+
+impl AsFd for Interfaces {
+    /// Readable when there are changes.
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+impl Selection {
+    /// From globs such as `eth*`. Without any `include`, everything is included.
+    ///
+    /// # Errors
+    /// A glob that cannot be read.
+    pub fn new(include: &[String], exclude: &[String]) -> Result<Self, globset::Error> {
+        let set = |globs: &[String]| {
+            let mut builder = GlobSetBuilder::new();
+            for glob in globs {
+                builder.add(Glob::new(glob)?);
+            }
+            builder.build()
+        };
+        Ok(Self {
+            include: set(include)?,
+            exclude: set(exclude)?,
+        })
+    }
+
+    /// Whether to look at an interface of this name.
+    #[must_use]
+    pub fn accepts(&self, name: &str) -> bool {
+        (self.include.is_empty() || self.include.is_match(name)) && !self.exclude.is_match(name)
+    }
+
+    /// Whether to look at an interface whose name is not known yet. Those that nobody asked for
+    /// must not be looked at even for a moment, nor those that somebody excluded.
+    #[must_use]
+    pub fn accepts_unknown(&self) -> bool {
+        self.include.is_empty() && self.exclude.is_empty()
+    }
+}
+
+/// One netlink message, as far as it matters here.
+struct Message {
+    flags: i32,
+    sequence: u32,
+    body: Body,
+}
+
+enum Body {
+    Present(Interface),
+    Gone(u32),
+    /// End of a list, or an error in its place: 0 or a negative error number.
+    End(i32),
+    Other,
+}
+
+const NLM_F_REQUEST: u16 = 1;
+const NLM_F_DUMP: u16 = 0x300;
+const _: () = assert!(libc::NLM_F_REQUEST == 1 && libc::NLM_F_DUMP == 0x300);
+
+fn apply(known: &mut BTreeMap<u32, Interface>, message: Message) -> Option<Change> {
+    match message.body {
+        Body::Present(interface) => {
+            let before = known.insert(interface.index, interface.clone());
+            (before.as_ref() != Some(&interface)).then_some(Change::Present(interface))
+        }
+        Body::Gone(index) => known.remove(&index).map(Change::Gone),
+        Body::End(_) | Body::Other => None,
+    }
+}
+
+/// Reads the messages of one datagram.
+fn read(bytes: &[u8], mut sink: impl FnMut(Message)) -> Result<(), WireError> {
+    const NATIVE: Endianness = if cfg!(target_endian = "big") {
+        Endianness::Big
+    } else {
+        Endianness::Little
+    };
+    let mut cursor = Cursor::new(bytes, NATIVE);
+    while cursor.remaining() > 0 {
+        let length = cursor.u32("netlink length")?;
+        let body = usize::try_from(length)
+            .unwrap_or(usize::MAX)
+            .saturating_sub(4);
+        let mut message = cursor.sub("netlink message", body)?;
+        cursor.align(4);
+        let kind = message.u16("netlink type")?;
+        let flags = i32::from(message.u16("netlink flags")?);
+        let sequence = message.u32("netlink sequence")?;
+        message.u32("netlink port")?;
+        let body = match kind {
+            libc::RTM_NEWLINK | libc::RTM_DELLINK => link(kind, message)?,
+            // NLMSG_ERROR and NLMSG_DONE both begin with the error number.
+            2 | 3 => Body::End(message.i32("netlink error")?),
+            _ => Body::Other,
+        };
+        sink(Message {
+            flags,
+            sequence,
+            body,
+        });
+    }
+    Ok(())
+}
+
+fn link(kind: u16, mut cursor: Cursor<'_>) -> Result<Body, WireError> {
+    let family = cursor.u8("link family")?;
+    cursor.u8("link padding")?;
+    let hardware = cursor.u16("link type")?;
+    let index = cursor.u32("link index")?;
+    let flags = cursor.u32("link flags")?;
+    cursor.u32("link change")?;
+    // A bridge tells of its ports in the same words: one that leaves the bridge is not deleted.
+    if i32::from(family) != libc::AF_UNSPEC {
+        return Ok(Body::Other);
+    }
+    if kind == libc::RTM_DELLINK {
+        return Ok(Body::Gone(index));
+    }
+    let up = flags & 1 != 0;
+    while cursor.remaining() >= 4 {
+        let length = usize::from(cursor.u16("attribute length")?);
+        let code = cursor.u16("attribute type")?;
+        let mut value = cursor.sub("attribute", length.saturating_sub(4))?;
+        cursor.align(4);
+        if code & 0x3fff == IFLA_IFNAME {
+            let name = value.take("interface name", value.remaining())?;
+            let name = name.split(|byte| *byte == 0).next().unwrap_or_default();
+            let name = String::from_utf8_lossy(name).into_owned();
+            return Ok(Body::Present(Interface {
+                index,
+                name,
+                hardware,
+                up,
+            }));
+        }
+    }
+    Ok(Body::Other)
+}
+
+fn listen() -> Result<OwnedFd, InterfacesError> {
+    let failed = |call| InterfacesError::System {
+        call,
+        source: io::Error::last_os_error(),
+    };
+    let kind = libc::SOCK_RAW | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
+    // SAFETY: takes no pointers.
+    let fd = unsafe { libc::socket(libc::AF_NETLINK, kind, libc::NETLINK_ROUTE) };
+    if fd < 0 {
+        return Err(failed("socket(NETLINK_ROUTE)"));
+    }
+    // SAFETY: a descriptor just made, which nobody else owns.
+    let socket = unsafe { OwnedFd::from_raw_fd(fd) };
+    // SAFETY: a struct of integers, for which zeros are a value.
+    let mut address: libc::sockaddr_nl = unsafe { std::mem::zeroed() };
+    address.nl_family = libc::AF_NETLINK as libc::sa_family_t;
+    address.nl_groups = libc::RTMGRP_LINK as u32;
+    let length = size_of_val(&address) as libc::socklen_t;
+    // SAFETY: `address` is a whole sockaddr_nl and `length` its size.
+    if unsafe { libc::bind(fd, (&raw const address).cast(), length) } < 0 {
+        return Err(failed("bind(NETLINK_ROUTE)"));
+    }
+    Ok(socket)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::netns::tests::{in_new_namespace, ip};
+
+    fn globs(list: &[&str]) -> Vec<String> {
+        list.iter().map(|glob| (*glob).to_owned()).collect()
+    }
+
+    fn change(changes: &[Change], name: &str) -> Option<Change> {
+        let named = |change: &&Change| match change {
+            Change::Present(interface) | Change::Gone(interface) => interface.name == name,
+        };
+        changes.iter().rfind(named).cloned()
+    }
+
+    #[test]
+    fn exclusion_wins_over_inclusion() {
+        let all = Selection::new(&[], &[]).unwrap();
+        assert!(all.accepts("eth0") && all.accepts_unknown());
+        let some = Selection::new(&globs(&["eth*", "lo"]), &globs(&["eth1"])).unwrap();
+        let accepted = ["eth0", "eth1", "lo", "wlan0"].map(|name| some.accepts(name));
+        assert_eq!(accepted, [true, false, true, false]);
+        assert!(!some.accepts_unknown());
+        let most = Selection::new(&[], &globs(&["docker*"])).unwrap();
+        assert!(most.accepts("eth0") && !most.accepts("docker0") && !most.accepts_unknown());
+        assert!(Selection::new(&globs(&["eth["]), &[]).is_err());
+    }
+
+    #[test]
+    fn interfaces_are_listed_and_followed() {
+        in_new_namespace(|| {
+            let mut interfaces = Interfaces::open().unwrap();
+            let lo = interfaces.by_index(1).unwrap().clone();
+            assert_eq!((lo.name.as_str(), lo.hardware, lo.up), ("lo", 772, true));
+            interfaces.changes().unwrap();
+
+            ip("link add one type veth peer name two");
+            let Some(Change::Present(one)) = change(&interfaces.changes().unwrap(), "one") else {
+                panic!("a new interface is not seen");
+            };
+            assert_eq!((one.hardware, one.up), (1, false));
+            ip("link set one up");
+            let up = Interface {
+                up: true,
+                ..one.clone()
+            };
+            assert_eq!(
+                change(&interfaces.changes().unwrap(), "one"),
+                Some(Change::Present(up))
+            );
+            ip("link set one down");
+            ip("link set one name renamed");
+            let renamed = Interface {
+                name: "renamed".to_owned(),
+                ..one
+            };
+            assert_eq!(
+                change(&interfaces.changes().unwrap(), "renamed"),
+                Some(Change::Present(renamed.clone()))
+            );
+            assert_eq!(interfaces.by_index(renamed.index), Some(&renamed));
+            ip("link delete renamed");
+            assert_eq!(
+                change(&interfaces.changes().unwrap(), "renamed"),
+                Some(Change::Gone(renamed.clone()))
+            );
+            assert_eq!(interfaces.by_index(renamed.index), None);
+            assert_eq!(interfaces.changes().unwrap(), []);
+        });
+    }
+
+    #[test]
+    fn a_bridge_port_that_leaves_its_bridge_is_still_there() {
+        in_new_namespace(|| {
+            let mut interfaces = Interfaces::open().unwrap();
+            ip("link add port type veth peer name far");
+            if !std::process::Command::new("ip")
+                .args(["link", "add", "bridge", "type", "bridge"])
+                .status()
+                .unwrap()
+                .success()
+            {
+                eprintln!("skipped: this kernel has no bridges");
+                return;
+            }
+            ip("link set port master bridge");
+            interfaces.changes().unwrap();
+            ip("link set port nomaster");
+            let changes = interfaces.changes().unwrap();
+            assert!(
+                !matches!(change(&changes, "port"), Some(Change::Gone(_))),
+                "{changes:?}"
+            );
+            assert!(interfaces.iter().any(|interface| interface.name == "port"));
+        });
+    }
+
+    #[test]
+    fn a_flood_of_changes_ends_in_the_right_list() {
+        in_new_namespace(|| {
+            let mut interfaces = Interfaces::open().unwrap();
+            // Far more than the socket's buffer holds, while nobody reads.
+            let commands: String = (0..400)
+                .flat_map(|number| {
+                    [
+                        "address 02:00:00:00:00:01",
+                        "mtu 1400",
+                        "address 02:00:00:00:00:02",
+                    ]
+                    .map(|what| {
+                        format!(
+                            "link set flood mtu {}\nlink set flood {what}\n",
+                            1300 + number
+                        )
+                    })
+                })
+                .collect();
+            ip("link add flood type veth peer name far");
+            let file = tempfile::NamedTempFile::new().unwrap();
+            std::fs::write(file.path(), commands).unwrap();
+            ip(&format!("-batch {}", file.path().display()));
+            ip("link delete flood");
+            interfaces.changes().unwrap();
+            let names: Vec<_> = interfaces
+                .iter()
+                .map(|interface| interface.name.as_str())
+                .collect();
+            assert_eq!(names, ["lo"]);
+        });
+    }
+
+    #[test]
+    fn a_damaged_answer_is_an_error_at_worst() {
+        let mut bytes = Vec::new();
+        for (kind, attribute) in [
+            (libc::RTM_NEWLINK, &b"\x09\0\x03\0lo\0\0\0\0\0\0"[..]),
+            (3, &[0; 4]),
+        ] {
+            let body = if kind == 3 {
+                vec![]
+            } else {
+                vec![0, 0, 4, 3, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0]
+            };
+            let length = 16 + body.len() + attribute.len();
+            bytes.extend_from_slice(&u32::try_from(length).unwrap().to_ne_bytes());
+            bytes.extend_from_slice(&kind.to_ne_bytes());
+            bytes.extend_from_slice(&[0; 10]);
+            bytes.extend_from_slice(&body);
+            bytes.extend_from_slice(attribute);
+        }
+        let mut seen = Vec::new();
+        read(&bytes, |message| seen.push(message)).unwrap();
+        assert!(matches!(&seen[..], [
+            Message { body: Body::Present(lo), .. },
+            Message { body: Body::End(0), .. },
+        ] if lo.name == "lo" && lo.up));
+        for end in 0..bytes.len() {
+            let _ = read(&bytes[..end], |_| ());
+            for value in [0, 1, 3, 15, 17, 255] {
+                let mut bytes = bytes.clone();
+                bytes[end] = value;
+                let _ = read(&bytes, |_| ());
+            }
+        }
+    }
+}
