@@ -132,3 +132,221 @@ fn gid(cursor: &mut Cursor<'_>, gid_len: usize) -> Result<Guid, WireError> {
         Ok(guid)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::string::ToString;
+
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::guid::GuidPrefix;
+    use crate::testing::{self, Encoder, hurt};
+
+    fn captured(datagram: &[u8]) -> ParticipantEntities {
+        ParticipantEntities::parse(testing::data(datagram)[0].2.payload.bytes()).unwrap()
+    }
+
+    fn encoded(entities: &ParticipantEntities, gid_len: usize, endianness: Endianness) -> Vec<u8> {
+        let gid = |encoder: &mut Encoder, guid: Guid| {
+            encoder.raw(&guid.to_bytes()).raw(&[0; 8][..gid_len - 16]);
+        };
+        let mut encoder = Encoder::new(endianness);
+        encoder.raw(&[0, u8::from(endianness == Endianness::Little), 0, 0]);
+        gid(&mut encoder, entities.participant);
+        encoder.u32(u32::try_from(entities.nodes.len()).unwrap());
+        for node in &entities.nodes {
+            encoder.string(&node.namespace).string(&node.name);
+            for guids in [&node.readers, &node.writers] {
+                encoder.u32(u32::try_from(guids.len()).unwrap());
+                guids.iter().for_each(|guid| gid(&mut encoder, *guid));
+            }
+        }
+        encoder.bytes
+    }
+
+    #[test]
+    fn nodes_with_humbles_long_gids() {
+        let entities = captured(testing::FAST_ENTITIES);
+        assert_eq!(
+            entities.participant.to_string(),
+            "010f2b7d6a474f3300000000.000001c1"
+        );
+        let [node] = &entities.nodes[..] else {
+            panic!("{entities:?}")
+        };
+        assert_eq!(node.fully_qualified_name(), "/robot2/listener_node");
+        assert!(node.readers.is_empty());
+        let [writer] = &node.writers[..] else {
+            panic!("{node:?}")
+        };
+        assert_eq!(writer.entity, EntityId([0, 0, 3, 3]));
+        let node = &captured(testing::CYCLONE_ENTITIES).nodes[0];
+        assert_eq!((node.readers.len(), node.writers.len()), (7, 8));
+    }
+
+    #[test]
+    fn nodes_with_jazzys_short_gids() {
+        let entities = captured(testing::JAZZY_ENTITIES);
+        assert_eq!(
+            entities.participant.to_string(),
+            "0110e8d0b98da210b7994456.000001c1"
+        );
+        let [node] = &entities.nodes[..] else {
+            panic!("{entities:?}")
+        };
+        assert_eq!(
+            (node.namespace.as_str(), node.name.as_str()),
+            ("/robot2", "listener_node")
+        );
+        assert_eq!(node.writers[0].entity, EntityId([0, 0, 6, 3]));
+    }
+
+    #[test]
+    fn a_participant_without_nodes_reads_in_both_layouts() {
+        let participant = Guid::new(GuidPrefix([1; 12]), EntityId::PARTICIPANT);
+        let entities = ParticipantEntities {
+            participant,
+            nodes: Vec::new(),
+        };
+        for gid_len in [16, 24] {
+            let payload = encoded(&entities, gid_len, Endianness::Little);
+            assert_eq!(ParticipantEntities::parse(&payload), Ok(entities.clone()));
+        }
+    }
+
+    #[test]
+    fn the_root_namespace_needs_no_second_slash() {
+        let node = |namespace: &str| NodeEntities {
+            namespace: namespace.into(),
+            name: "talker".into(),
+            readers: Vec::new(),
+            writers: Vec::new(),
+        };
+        assert_eq!(node("/").fully_qualified_name(), "/talker");
+        assert_eq!(node("/a/b").fully_qualified_name(), "/a/b/talker");
+        assert_eq!(node("").fully_qualified_name(), "/talker");
+    }
+
+    #[test]
+    fn counts_are_not_believed() {
+        let payload = testing::data(testing::JAZZY_ENTITIES)[0].2.payload.bytes();
+        // The number of nodes, of readers, of writers.
+        for offset in [20, 56, 60] {
+            let mut hostile = payload.to_vec();
+            hostile[offset..offset + 4].copy_from_slice(&[0xff; 4]);
+            let error = ParticipantEntities::parse(&hostile).unwrap_err();
+            assert!(
+                matches!(error.reason, Reason::Truncated | Reason::BadLength),
+                "{error}"
+            );
+        }
+        let participant = Guid::new(GuidPrefix([1; 12]), EntityId::PARTICIPANT);
+        let node = NodeEntities {
+            namespace: "/".into(),
+            name: "n".into(),
+            readers: Vec::new(),
+            writers: Vec::new(),
+        };
+        let many = ParticipantEntities {
+            participant,
+            nodes: std::vec![node; MAX_NODES + 1],
+        };
+        let payload = encoded(&many, 16, Endianness::Little);
+        assert_eq!(
+            ParticipantEntities::parse(&payload).unwrap_err().reason,
+            Reason::OverLimit
+        );
+    }
+
+    #[test]
+    fn hostile_node_names_are_refused() {
+        let participant = Guid::new(GuidPrefix([1; 12]), EntityId::PARTICIPANT);
+        let reason = |namespace: &str, name: &str| {
+            let (namespace, name) = (namespace.into(), name.into());
+            let node = NodeEntities {
+                namespace,
+                name,
+                readers: Vec::new(),
+                writers: Vec::new(),
+            };
+            let entities = ParticipantEntities {
+                participant,
+                nodes: [node].into(),
+            };
+            let payload = encoded(&entities, 24, Endianness::Little);
+            ParticipantEntities::parse(&payload).unwrap_err().reason
+        };
+        assert_eq!(reason("/", "a\"b"), Reason::BadText);
+        assert_eq!(reason("/\n", "a"), Reason::BadText);
+        assert_eq!(reason("/", &"a".repeat(10_000)), Reason::OverLimit);
+    }
+
+    #[test]
+    fn other_encapsulations_and_other_writers_are_refused() {
+        let mut payload = testing::data(testing::JAZZY_ENTITIES)[0]
+            .2
+            .payload
+            .bytes()
+            .to_vec();
+        payload[1] = 3;
+        assert_eq!(
+            ParticipantEntities::parse(&payload).unwrap_err().reason,
+            Reason::BadMarker
+        );
+        payload[1] = 1;
+        payload[19] = 3;
+        assert_eq!(
+            ParticipantEntities::parse(&payload).unwrap_err().reason,
+            Reason::BadValue
+        );
+    }
+
+    #[test]
+    fn hurt_payloads_never_panic() {
+        for datagram in [
+            testing::FAST_ENTITIES,
+            testing::JAZZY_ENTITIES,
+            testing::CYCLONE_ENTITIES,
+        ] {
+            hurt(testing::data(datagram)[0].2.payload.bytes(), |bytes| {
+                let _ = ParticipantEntities::parse(bytes);
+            });
+        }
+    }
+
+    fn guids() -> impl Strategy<Value = Vec<Guid>> {
+        // Entity ids of the first endpoints are small numbers and look like counts.
+        let guid = (any::<[u8; 12]>(), 0..40_u8).prop_map(|(prefix, entity)| {
+            Guid::new(GuidPrefix(prefix), EntityId([0, 0, entity, 3]))
+        });
+        prop::collection::vec(guid, 0..5)
+    }
+
+    fn node() -> impl Strategy<Value = NodeEntities> {
+        ("/[a-z/]{0,12}", "[a-z_]{1,12}", guids(), guids()).prop_map(
+            |(namespace, name, readers, writers)| NodeEntities {
+                namespace,
+                name,
+                readers,
+                writers,
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn both_layouts_come_back_and_are_told_apart(
+            prefix in any::<[u8; 12]>(),
+            nodes in prop::collection::vec(node(), 0..5),
+            long in any::<bool>(),
+            little in any::<bool>(),
+        ) {
+            let participant = Guid::new(GuidPrefix(prefix), EntityId::PARTICIPANT);
+            let entities = ParticipantEntities { participant, nodes };
+            let endianness = if little { Endianness::Little } else { Endianness::Big };
+            let payload = encoded(&entities, if long { 24 } else { 16 }, endianness);
+            prop_assert_eq!(ParticipantEntities::parse(&payload), Ok(entities));
+        }
+    }
+}

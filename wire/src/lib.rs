@@ -27,6 +27,8 @@ pub mod parameters;
 pub mod qos;
 pub mod record;
 pub mod rtps;
+#[cfg(test)]
+mod testing;
 #[cfg(feature = "alloc")]
 mod text;
 pub mod time;

@@ -145,7 +145,7 @@ impl<'a> ParameterList<'a> {
     pub(crate) fn take(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
         let list = Self::inline(*cursor);
         let mut walk = list;
-        while let Some(parameter) = walk.next() {
+        for parameter in walk.by_ref() {
             parameter?;
         }
         *cursor = walk.rest;
@@ -167,7 +167,7 @@ impl<'a> ParameterList<'a> {
             }
             let id = ParameterId(self.rest.u16("parameter id")?);
             let length = usize::from(self.rest.u16("parameter length")?);
-            if id.known() == ParameterId::SENTINEL {
+            if id == ParameterId::SENTINEL {
                 return Ok(None);
             }
             let value = self.rest.sub("parameter", length)?;
@@ -191,5 +191,83 @@ impl<'a> Iterator for ParameterList<'a> {
         let parameter = self.parameter().transpose();
         self.ended = !matches!(parameter, Some(Ok(_)));
         parameter
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::vec::Vec;
+
+    use super::*;
+
+    fn ids(list: ParameterList<'_>) -> Result<Vec<(u16, usize)>, WireError> {
+        list.map(|parameter| parameter.map(|p| (p.id.0, p.value.remaining())))
+            .collect()
+    }
+
+    fn inline(bytes: &[u8]) -> Result<Vec<(u16, usize)>, Reason> {
+        let list = ParameterList::inline(Cursor::new(bytes, Endianness::Little));
+        ids(list).map_err(|error| error.reason)
+    }
+
+    const TWO: [u8; 20] = [
+        0x05, 0, 4, 0, 1, 2, 3, 4, 0x00, 0, 0, 0, 0x0f, 0x80, 0, 0, 0x01, 0, 0xff, 0xff,
+    ];
+
+    #[test]
+    fn pads_are_passed_and_the_sentinels_length_is_ignored() {
+        assert_eq!(inline(&TWO), Ok([(0x0005, 4), (0x800f, 0)].into()));
+    }
+
+    #[test]
+    fn inline_qos_needs_its_sentinel_and_a_payload_does_not() {
+        for length in 0..TWO.len() {
+            assert_eq!(inline(&TWO[..length]), Err(Reason::Truncated), "{length}");
+        }
+        let payload = [&[0, 3, 0, 0], &TWO[..16]].concat();
+        assert_eq!(
+            ids(ParameterList::encapsulated(&payload).unwrap())
+                .unwrap()
+                .len(),
+            2
+        );
+        let cut = ids(ParameterList::encapsulated(&payload[..10]).unwrap());
+        assert_eq!(cut.map_err(|error| error.offset), Err(8));
+    }
+
+    #[test]
+    fn a_length_that_is_not_padded_does_not_shift_what_follows() {
+        let bytes = [0x62, 0, 2, 0, b'a', 0, 0, 0, 0x05, 0, 0, 0, 1, 0, 0, 0];
+        assert_eq!(inline(&bytes), Ok([(0x0062, 2), (0x0005, 0)].into()));
+    }
+
+    #[test]
+    fn an_ended_list_stays_ended() {
+        let mut list = ParameterList::inline(Cursor::new(&TWO, Endianness::Little));
+        assert_eq!(list.by_ref().count(), 2);
+        assert!(list.next().is_none());
+        let mut list = ParameterList::inline(Cursor::new(&TWO[..6], Endianness::Little));
+        assert!(list.next().is_some_and(|parameter| parameter.is_err()));
+        assert!(list.next().is_none());
+    }
+
+    #[test]
+    fn only_parameter_lists_are_taken_for_ones() {
+        assert!(ParameterList::encapsulated(&[0, 2, 0, 0]).is_ok());
+        for kind in [0x00, 0x01, 0x06, 0x07, 0xff] {
+            let error = ParameterList::encapsulated(&[0, kind, 0, 0])
+                .map(|_| ())
+                .unwrap_err();
+            assert_eq!(error.reason, Reason::BadMarker);
+        }
+        assert!(ParameterList::encapsulated(&[0, 3, 0]).is_err());
+    }
+
+    #[test]
+    fn must_understand_is_not_part_of_the_number() {
+        let tag = ParameterId(0x4014);
+        assert!(tag.must_understand() && !tag.is_vendor_specific());
+        assert_eq!(tag.known(), ParameterId::DOMAIN_TAG);
+        assert!(ParameterId(0x8006).is_vendor_specific());
     }
 }

@@ -145,3 +145,6 @@ fn push_locator(
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

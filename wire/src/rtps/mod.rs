@@ -352,7 +352,8 @@ impl<'a> Iterator for Message<'a> {
     type Item = Result<Submessage<'a>, WireError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        if self.rest.remaining() == 0 {
+        // A tail shorter than a submessage header is padding.
+        if self.rest.remaining() < 4 {
             return None;
         }
         let result = self.submessage();
@@ -363,3 +364,6 @@ impl<'a> Iterator for Message<'a> {
         Some(result)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -363,7 +363,7 @@ fn data<'a>(flags: u8, mut body: Cursor<'a>, receiver: &Receiver) -> Result<Data
     if has(DATA) && has(KEY) {
         return Err(body.error("DATA flags", Reason::BadValue));
     }
-    let mut rest = after_octets_to_inline_qos(&mut body)?;
+    let mut rest = after_octets_to_inline_qos(&mut body, 16)?;
     let (reader, writer) = from_writer(&mut body, receiver)?;
     let sequence_number = SequenceNumber::read_from(&mut body, "DATA writerSN", 1)?;
     let inline_qos = has(INLINE_QOS)
@@ -388,7 +388,7 @@ fn data_frag<'a>(
     mut body: Cursor<'a>,
     receiver: &Receiver,
 ) -> Result<DataFrag<'a>, WireError> {
-    let mut rest = after_octets_to_inline_qos(&mut body)?;
+    let mut rest = after_octets_to_inline_qos(&mut body, 28)?;
     let (reader, writer) = from_writer(&mut body, receiver)?;
     let sequence_number = SequenceNumber::read_from(&mut body, "DATA_FRAG writerSN", 1)?;
     let numbers = body.error("DATA_FRAG fragment numbers", Reason::BadValue);
@@ -424,10 +424,18 @@ fn data_frag<'a>(
 }
 
 /// Reads `extraFlags` and `octetsToInlineQos`; returns where the inline QoS (or the payload)
-/// begins. Later versions may put fields between, so the offset is followed, not assumed.
-fn after_octets_to_inline_qos<'a>(body: &mut Cursor<'a>) -> Result<Cursor<'a>, WireError> {
+/// begins. Later versions may put fields behind the `least` octets of this one, so the offset is
+/// followed, not assumed.
+fn after_octets_to_inline_qos<'a>(
+    body: &mut Cursor<'a>,
+    least: u16,
+) -> Result<Cursor<'a>, WireError> {
     body.u16("extraFlags")?;
+    let error = body.error("octetsToInlineQos", Reason::BadValue);
     let octets = body.u16("octetsToInlineQos")?;
+    if octets < least {
+        return Err(error);
+    }
     let mut rest = *body;
     rest.take("octetsToInlineQos", octets.into())?;
     Ok(rest)
