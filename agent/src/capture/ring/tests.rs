@@ -7,6 +7,7 @@ use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use super::*;
 use crate::capture::netns::tests::{in_new_namespace, ip};
+use crate::model::reassembly::{FlowKey, Limits, Reassembly};
 
 const SMALL: Settings = Settings {
     block_size: 16 << 10,
@@ -297,6 +298,57 @@ fn any_amount_of_memory_makes_a_ring_for_the_largest_frames() {
         socket.send_to(&[5; 65_507], "127.0.0.1:7400").unwrap();
         let seen = sent(&mut ring, Duration::from_millis(200));
         assert_eq!(seen, [(1, vec![5; 65_507])]);
+    });
+}
+
+#[test]
+fn fragments_from_the_ring_become_datagrams_in_both_ip_versions() {
+    in_new_namespace(|| {
+        ip("link set lo mtu 1500");
+        let mut ring = Ring::open(Settings::default(), None).unwrap();
+        let mut reassembly = Reassembly::new(Limits::default());
+        let payload: Vec<u8> = (0..60_000_u32)
+            .map(|at| at.to_le_bytes()[(at % 3) as usize])
+            .collect();
+        for (from, to) in [("127.0.0.1:0", "127.0.0.1:7400"), ("[::1]:0", "[::1]:7400")] {
+            let socket = UdpSocket::bind(from).unwrap();
+            socket.send_to(&payload, to).unwrap();
+        }
+        let mut seen = Vec::new();
+        while ring.wait(Duration::from_millis(200)).unwrap() {
+            while let Some(block) = ring.block() {
+                for frame in block.frames() {
+                    let outgoing = frame.packet_type == PacketType::OUTGOING;
+                    let packet = frame::parse_cooked(
+                        frame.protocol,
+                        frame.packet_type,
+                        frame.bytes,
+                        frame.length,
+                    );
+                    let Some(packet) = packet.unwrap() else {
+                        continue;
+                    };
+                    let Payload::Fragment(part) = packet.payload else {
+                        continue;
+                    };
+                    let key = FlowKey::new(0, frame.interface, outgoing, &packet, &part);
+                    if let Some(done) = reassembly.fragment(frame.time, key, &part) {
+                        assert_eq!(done.payload(), payload);
+                        assert_eq!(done.destination_port, 7400);
+                        seen.push((packet.source.starts_with(&[0; 15]), outgoing));
+                    }
+                }
+            }
+        }
+        seen.sort_unstable();
+        assert_eq!(
+            seen,
+            [(false, false), (false, true), (true, false), (true, true)]
+        );
+        assert_eq!(
+            (reassembly.flows(), reassembly.counters().completed),
+            (0, 4)
+        );
     });
 }
 
