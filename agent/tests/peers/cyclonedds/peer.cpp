@@ -2,6 +2,7 @@
 // the participant's user data, no type information in discovery, ros_discovery_info republished
 // whole whenever an entity comes or goes. Command line and log: ../peer.hpp.
 #include <dds/dds.h>
+#include <dds/version.h>
 
 #include "../peer.hpp"
 #include "types.h"
@@ -184,16 +185,23 @@ void on_cloud(dds_entity_t reader, void* argument) {
   }
 }
 
+// Lets the socket buffer hold a burst of point cloud fragments, as far as net.core.rmem_max goes.
+// Cyclone DDS 0.8 cannot be told so.
+void make_room_for_bursts() {
+#if DDS_VERSION_MAJOR > 0 || DDS_VERSION_MINOR >= 10
+  setenv("CYCLONEDDS_URI",
+         "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max=\"4MB\"/></Internal></Domain>"
+         "</CycloneDDS>",
+         0);
+#endif
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
   const peer::Options options = peer::Options::parse(argc, argv);
   peer::stop_on_signals();
-  // Room for a burst of point cloud fragments, as far as net.core.rmem_max lets it grow.
-  setenv("CYCLONEDDS_URI",
-         "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max=\"4MB\"/></Internal></Domain>"
-         "</CycloneDDS>",
-         0);
+  make_room_for_bursts();
   peer::Log log(options, "cyclonedds");
   Receiver receiver{options, log};
   Context context(options);
