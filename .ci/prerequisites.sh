@@ -1,0 +1,161 @@
+#!/usr/bin/env bash
+# Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
+#
+#   prerequisites.sh demo|test|ebpf|fuzz...   install what those targets need
+#   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
+#
+# Made for Debian 12 and Ubuntu 22.04 or newer. It starts no service, adds no package source and
+# changes no system setting; what cannot be had ends it with a line that says how to get it.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+tools=$PWD/target/tools
+# The newest nightly whose LLVM is the 22 that bpf-linker is built with.
+pinned_nightly=nightly-2026-05-20
+
+say() { printf '%s\n' "$*" >&2; }
+die() {
+    say "$@"
+    exit 1
+}
+
+as_root() {
+    if [ "$(id -u)" = 0 ]; then
+        "$@"
+    else
+        command -v sudo >/dev/null || die "root is needed for: $*"
+        sudo "$@"
+    fi
+}
+
+installed() { dpkg-query -W -f='${db:Status-Status}\n' "$1" 2>/dev/null | grep -qx installed; }
+available() { [ -n "$(apt-cache show --no-all-versions "$1" 2>/dev/null)" ]; }
+
+refreshed=
+refresh() {
+    [ -n "$refreshed" ] && return
+    as_root apt-get update -qq
+    refreshed=yes
+}
+
+packages() {
+    local missing=() package
+    for package; do installed "$package" || missing+=("$package"); done
+    [ ${#missing[@]} -eq 0 ] && return
+    command -v apt-get >/dev/null ||
+        die "no apt-get here: install what stands for these Debian packages: ${missing[*]}"
+    refresh
+    for package in "${missing[@]}"; do
+        available "$package" ||
+            die "package $package is in none of this system's sources (on Ubuntu: sudo add-apt-repository universe)"
+    done
+    say "installing Debian packages: ${missing[*]}"
+    as_root env DEBIAN_FRONTEND=noninteractive \
+        apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
+}
+
+# The package would start a server on port 9090 and enable it at boot: take the programs only.
+prometheus() {
+    command -v prometheus >/dev/null && command -v promtool >/dev/null && return
+    [ -x "$tools/usr/bin/promtool" ] && return
+    refresh
+    say "unpacking prometheus and promtool into target/tools (nothing is installed or started)"
+    mkdir -p "$tools"
+    (cd "$tools" && apt-get download -qq prometheus && dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb)
+}
+
+rust() {
+    if ! command -v cargo >/dev/null; then
+        packages curl ca-certificates
+        say "installing Rust with rustup into ${CARGO_HOME:-$HOME/.cargo}"
+        curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs |
+            sh -s -- -y -q --profile minimal --component clippy --component rustfmt
+    fi
+    local version
+    version=$(rustc --version | sed -E 's/rustc 1\.([0-9]+).*/\1/')
+    [ "$version" -ge 95 ] || die "rustc 1.95 or newer is needed, here is $(rustc --version): rustup update stable"
+    cargo clippy --version >/dev/null 2>&1 || component clippy
+    cargo fmt --version >/dev/null 2>&1 || component rustfmt
+}
+
+component() {
+    say "adding the Rust component $1"
+    rustup component add "$1"
+}
+
+nightly() {
+    if rustc +nightly -vV 2>/dev/null | grep -q '^LLVM version: 22'; then
+        echo nightly
+    else
+        echo "$pinned_nightly"
+    fi
+}
+
+nightly_toolchain() {
+    local toolchain
+    toolchain=$(nightly)
+    command -v rustup >/dev/null || die "rustup is needed for $toolchain: see https://rustup.rs"
+    if ! rustc "+$toolchain" --version >/dev/null 2>&1; then
+        say "installing the Rust toolchain $toolchain"
+        rustup toolchain install "$toolchain" --profile minimal
+    fi
+    if [ ! -d "$(rustc "+$toolchain" --print sysroot)/lib/rustlib/src/rust/library" ]; then
+        say "adding rust-src to the Rust toolchain $toolchain"
+        rustup component add rust-src --toolchain "$toolchain"
+    fi
+}
+
+ebpf() {
+    nightly_toolchain
+    if bpf-linker --version >/dev/null 2>&1; then
+        [ -x /usr/lib/llvm-22/bin/llvm-strip ] || command -v llvm-strip >/dev/null || packages llvm
+        return
+    fi
+    command -v apt-get >/dev/null && refresh
+    if installed llvm-22-dev || available llvm-22-dev; then
+        packages llvm-22-dev g++
+        say "installing bpf-linker 0.13.0 with LLVM 22"
+        LLVM_PREFIX=/usr/lib/llvm-22 cargo install bpf-linker --version 0.13.0 --locked \
+            --no-default-features --features llvm-22
+    elif [ "$(uname -m)" = x86_64 ]; then
+        # rustup ships LLVM as a shared library for this architecture only; 0.10.2 can use it.
+        packages llvm g++
+        say "installing bpf-linker 0.10.2 with the LLVM of $(nightly)"
+        cargo "+$(nightly)" install bpf-linker --version 0.10.2 --locked
+    else
+        die "bpf-linker needs llvm-22-dev, which this system does not have: see https://apt.llvm.org"
+    fi
+}
+
+network_tools=(iproute2 nftables ethtool util-linux curl ca-certificates)
+
+for need; do
+    case $need in
+    --nightly) nightly ;;
+    demo)
+        packages "${network_tools[@]}" gcc libc6-dev
+        rust
+        ;;
+    test)
+        packages "${network_tools[@]}" gcc g++ make tcpdump tshark strace jq \
+            libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
+        prometheus
+        rust
+        ebpf
+        ;;
+    ebpf)
+        rust
+        ebpf
+        ;;
+    fuzz)
+        packages g++
+        rust
+        nightly_toolchain
+        command -v cargo-fuzz >/dev/null || {
+            say "installing cargo-fuzz"
+            cargo install cargo-fuzz --locked
+        }
+        ;;
+    *) die "prerequisites.sh: $need is none of demo, test, ebpf, fuzz" ;;
+    esac
+done

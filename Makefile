@@ -1,0 +1,60 @@
+# Each target first names and installs what it needs and this machine lacks (.ci/prerequisites.sh).
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+TARGET := $(abspath $(or $(CARGO_TARGET_DIR),target))
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo -E)
+HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_')
+NEXTEST := $(shell cargo nextest --version >/dev/null 2>&1 && echo yes)
+
+export PATH := $(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
+export LLVM_PREFIX ?= $(if $(wildcard /usr/lib/llvm-22/bin/llvm-strip),/usr/lib/llvm-22,/usr)
+# The tests make network namespaces: build as the user, run the tests as root.
+ifneq ($(SUDO),)
+export CARGO_TARGET_$(HOST)_RUNNER := $(SUDO) env PATH=$(PATH)
+endif
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
+
+demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it by itself (needs root)
+	@.ci/prerequisites.sh demo
+	cargo build --package ros2probe --bin rp --example robot --example demo
+	@$(SUDO) $(TARGET)/debug/examples/demo $(if $(DEMO_SECONDS),--seconds $(DEMO_SECONDS))
+
+test: ## format, lints, kernel object, and all tests with real DDS participants (needs root)
+	@.ci/prerequisites.sh test
+	cargo fmt --all --check
+	cargo clippy --workspace --all-targets -- -D warnings
+	NIGHTLY=$$(.ci/prerequisites.sh --nightly) agent-ebpf/build.sh --check
+	@$(MAKE) --no-print-directory peers
+	cargo build --workspace --bins --examples
+	cargo test --workspace --doc --quiet
+	$(if $(NEXTEST),cargo nextest run --workspace,cargo test --workspace --lib --bins --tests)
+
+ebpf: ## rebuild the kernel filter's committed object
+	@.ci/prerequisites.sh ebpf
+	NIGHTLY=$$(.ci/prerequisites.sh --nightly) agent-ebpf/build.sh
+
+run: ## run the agent on this machine with the default configuration (needs root)
+	cargo build --release --package ros2probe --bin rp
+	$(SUDO) $(TARGET)/release/rp run --config config/ros2probe.yaml
+
+peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
+	@$(MAKE) --no-print-directory -C agent/tests/peers OUT=$(TARGET)/peers
+
+bench: ## benchmarks
+	@.ci/prerequisites.sh test
+	cargo bench --workspace
+
+fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
+	@.ci/prerequisites.sh fuzz
+	cd wire && for target in $$(cargo fuzz list); do \
+	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run "$$target" -- \
+	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
+	done
+
+prerequisites: ## install what demo, test, ebpf and fuzz need
+	@.ci/prerequisites.sh demo test ebpf fuzz
+
+.PHONY: help demo test ebpf run peers bench fuzz prerequisites
