@@ -5,9 +5,12 @@
 #   build.sh --check   fail when the committed object is not what the sources give
 #   build.sh --stale   fail when the sources have changed since the object was built (no toolchain)
 #
-# Needs nightly with rust-src, and bpf-linker: `make prerequisites` installs both.
+# Needs nightly (or what NIGHTLY names) with rust-src, and bpf-linker: `make prerequisites` installs
+# them. LLVM_PREFIX says where LLVM's tools are.
 set -euo pipefail
 cd "$(dirname "$0")"
+
+nightly=${NIGHTLY:-nightly}
 
 sources() {
     cat Cargo.toml Cargo.lock build.sh src/*.rs ../wire/Cargo.toml \
@@ -15,7 +18,7 @@ sources() {
 }
 hash_sources() { sources | sha256sum | cut -d' ' -f1; }
 # Another compiler may order instructions differently without anything being wrong.
-toolchain() { echo "$(rustc +nightly --version), $(bpf-linker --version)"; }
+toolchain() { echo "$(rustc "+$nightly" --version), $(bpf-linker --version)"; }
 
 if [ "${1:-}" = --stale ]; then
     [ "$(hash_sources)" = "$(head -n 1 filter.bpf.sha256)" ] && exit 0
@@ -27,8 +30,8 @@ separator=$'\x1f'
 flags="--cfg=bpf_target_arch=\"x86_64\"${separator}-Cdebuginfo=2${separator}-Clink-arg=--btf"
 flags+="${separator}--remap-path-prefix=$(cd .. && pwd)=/ros2probe"
 flags+="${separator}--remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=/cargo"
-flags+="${separator}--remap-path-prefix=$(rustc +nightly --print sysroot)=/rust"
-CARGO_ENCODED_RUSTFLAGS="$flags" cargo +nightly build --quiet --release --locked \
+flags+="${separator}--remap-path-prefix=$(rustc "+$nightly" --print sysroot)=/rust"
+CARGO_ENCODED_RUSTFLAGS="$flags" cargo "+$nightly" build --quiet --release --locked \
     --target bpfel-unknown-none -Z build-std=core
 built=target/bpfel-unknown-none/release/filter
 # The linker needs the debug information to write BTF; nobody needs it afterwards.
