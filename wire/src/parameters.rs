@@ -152,12 +152,18 @@ impl<'a> ParameterList<'a> {
         Ok(list)
     }
 
-    /// The first parameter of this identifier; `None` also when the list breaks off before it.
-    #[must_use]
-    pub fn find(self, id: ParameterId) -> Option<Cursor<'a>> {
-        self.map_while(Result::ok)
-            .find(|parameter| parameter.id.known() == id)
-            .map(|parameter| parameter.value)
+    /// Value of the first parameter of this identifier.
+    ///
+    /// # Errors
+    /// The list breaks off before it.
+    pub fn find(self, id: ParameterId) -> Result<Option<Cursor<'a>>, WireError> {
+        for parameter in self {
+            let parameter = parameter?;
+            if parameter.id.known() == id {
+                return Ok(Some(parameter.value));
+            }
+        }
+        Ok(None)
     }
 
     fn parameter(&mut self) -> Result<Option<Parameter<'a>>, WireError> {

@@ -58,7 +58,7 @@ impl EndpointAnnouncement {
             offset: 4,
             reason: Reason::BadValue,
         };
-        let missing = |id, what| parameters.find(id).ok_or(bad(what));
+        let required = |id, what| parameters.find(id)?.ok_or(bad(what));
 
         let guid = guid(parameters, ParameterId::ENDPOINT_GUID)?.ok_or(bad("PID_ENDPOINT_GUID"))?;
         let fits = match role {
@@ -70,7 +70,7 @@ impl EndpointAnnouncement {
         }
         // Cyclone DDS leaves it out. One that differs would put the endpoint under somebody else.
         let participant = Guid::new(guid.prefix, EntityId::PARTICIPANT);
-        if let Some(mut value) = parameters.find(ParameterId::PARTICIPANT_GUID)
+        if let Some(mut value) = parameters.find(ParameterId::PARTICIPANT_GUID)?
             && Guid::from_bytes(value.array("PID_PARTICIPANT_GUID")?) != participant
         {
             return Err(bad("PID_PARTICIPANT_GUID"));
@@ -81,8 +81,8 @@ impl EndpointAnnouncement {
             participant,
             role,
             vendor,
-            topic: DdsTopic::read(&mut missing(ParameterId::TOPIC_NAME, "PID_TOPIC_NAME")?)?,
-            type_name: DdsType::read(&mut missing(ParameterId::TYPE_NAME, "PID_TYPE_NAME")?)?,
+            topic: DdsTopic::read(&mut required(ParameterId::TOPIC_NAME, "PID_TOPIC_NAME")?)?,
+            type_name: DdsType::read(&mut required(ParameterId::TYPE_NAME, "PID_TYPE_NAME")?)?,
             qos: Qos::defaults(role, vendor),
             type_hash: None,
             service_type_hash: None,

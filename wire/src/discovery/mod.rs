@@ -111,17 +111,17 @@ fn gone(
 
 /// The instance's GUID, from its own parameter or from the key hash beside it.
 fn guid(parameters: ParameterList<'_>, key: ParameterId) -> Result<Option<Guid>, WireError> {
-    let value = parameters
-        .find(key)
-        .or_else(|| parameters.find(ParameterId::KEY_HASH));
-    value
-        .map(|mut value| Ok(Guid::from_bytes(value.array("GUID")?)))
-        .transpose()
+    for id in [key, ParameterId::KEY_HASH] {
+        if let Some(mut value) = parameters.find(id)? {
+            return Ok(Some(Guid::from_bytes(value.array("GUID")?)));
+        }
+    }
+    Ok(None)
 }
 
 /// Whose vendor-specific parameters these are.
 fn vendor(parameters: ParameterList<'_>, sender: VendorId) -> Result<VendorId, WireError> {
-    match parameters.find(ParameterId::VENDORID) {
+    match parameters.find(ParameterId::VENDORID)? {
         Some(mut value) => Ok(VendorId(value.array("PID_VENDORID")?)),
         None => Ok(sender),
     }

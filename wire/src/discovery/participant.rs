@@ -49,7 +49,7 @@ pub struct ParticipantAnnouncement {
     pub domain_id: Option<u32>,
     /// Its domain's tag; empty is the default.
     pub domain_tag: String,
-    /// Its entity name; Fast DDS puts the enclave here.
+    /// Its entity name, where it is plain text; Fast DDS puts the enclave here.
     pub entity_name: String,
     /// The ROS enclave; only ROS participants have one.
     pub enclave: Option<String>,
@@ -126,7 +126,11 @@ impl ParticipantAnnouncement {
                 self.domain_tag = text::name(&mut value, "PID_DOMAIN_TAG", MAX_NAME_LEN)?.into();
             }
             ParameterId::ENTITY_NAME => {
-                self.entity_name = text::name(&mut value, "PID_ENTITY_NAME", MAX_NAME_LEN)?.into();
+                // Not an identity, and free text where ROS did not set it.
+                match text::name(&mut value, "PID_ENTITY_NAME", MAX_NAME_LEN) {
+                    Ok(name) => self.entity_name = name.into(),
+                    Err(_) => *truncated = true,
+                }
             }
             ParameterId::USER_DATA => {
                 let user_data = UserData::new(text::octets(&mut value, "PID_USER_DATA")?);

@@ -447,6 +447,24 @@ fn an_unreadable_property_costs_only_itself() {
 }
 
 #[test]
+fn a_strange_entity_name_does_not_hide_the_participant() {
+    let mut payload = participant_list();
+    payload.parameter(0x0062, b"\x05\0\0\0it's\0\0\0\0");
+    let participant = announced(&payload.bytes).unwrap();
+    assert_eq!(
+        (participant.entity_name.as_str(), participant.is_truncated),
+        ("", true)
+    );
+}
+
+#[test]
+fn a_list_that_breaks_off_is_truncated_and_not_incomplete() {
+    let payload = endpoint_list("rt/a", "A").bytes;
+    let error = writer(&payload[..payload.len() - 10], VendorId::EPROSIMA).unwrap_err();
+    assert_eq!(error.reason, Reason::Truncated);
+}
+
+#[test]
 fn hurt_announcements_never_panic() {
     for datagram in testing::CAPTURED {
         for (vendor, inline_qos, data) in testing::data(datagram) {

@@ -1,0 +1,231 @@
+//! What the fuzz targets do with their bytes: plain functions, so that the tests run them too, over
+//! the committed seeds and all their truncations (`wire/tests/fuzz_seeds.rs`). In this directory:
+//! `cargo +nightly fuzz run datagram corpus/datagram ../tests/data/datagrams`, and `discovery` and
+//! `entities` with their directories under `seeds`.
+//!
+//! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic, no
+//! list beyond its bound, nothing kept that was not shown to exist, and the kernel filter's walk
+//! agreeing with the full parser.
+
+use ros2probe_wire::discovery::{self, Discovery, Role};
+use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::names::{MAX_LEN, TopicKind};
+use ros2probe_wire::record::{Record, kind};
+use ros2probe_wire::rtps::{Body, InlineQos, Message, Payload, StatusInfo, Submessage, VendorId};
+use ros2probe_wire::walk::{self, Step, Walk};
+use ros2probe_wire::{EntityId, Guid};
+
+/// A UDP payload, through everything that looks into it.
+pub fn datagram(bytes: &[u8]) {
+    let Ok(message) = Message::parse(bytes) else {
+        return;
+    };
+    let records = walk(bytes, message.header().prefix.0);
+    for submessage in message.map_while(Result::ok) {
+        let record = records
+            .iter()
+            .find(|(offset, _)| *offset == submessage.offset);
+        agrees(&submessage, record.map(|(_, record)| record));
+        match submessage.body {
+            Body::Data(data) => {
+                let vendor = submessage.receiver.vendor;
+                let inline_qos = data
+                    .inline_qos
+                    .and_then(|list| InlineQos::parse(list, vendor).ok())
+                    .unwrap_or_default();
+                match data.writer.entity {
+                    EntityId::SPDP_WRITER => participant(vendor, data.payload, &inline_qos),
+                    EntityId::SEDP_PUBLICATIONS_WRITER => {
+                        endpoint(Role::Writer, vendor, data.payload, &inline_qos);
+                    }
+                    EntityId::SEDP_SUBSCRIPTIONS_WRITER => {
+                        endpoint(Role::Reader, vendor, data.payload, &inline_qos);
+                    }
+                    _ => entities(data.payload.bytes()),
+                }
+            }
+            Body::DataFrag(fragments) => {
+                assert!(fragments.bytes.len() <= bytes.len());
+                assert_eq!(fragments.fragments().count(), usize::from(fragments.count));
+                assert!(fragments.starting <= fragments.total());
+            }
+            Body::AckNack(acknack) => assert!(acknack.missing.iter().count() <= 256),
+            Body::Gap(gap) => assert!(gap.list.iter().all(|number| number >= gap.list.base)),
+            Body::NackFrag(nack_frag) => assert!(nack_frag.missing.iter().count() <= 256),
+            Body::InfoReply(_)
+            | Body::Pad
+            | Body::Heartbeat(_)
+            | Body::HeartbeatFrag(_)
+            | Body::InfoTimestamp
+            | Body::InfoSource
+            | Body::InfoDestination
+            | Body::Secure(_)
+            | Body::Unknown(_) => {}
+        }
+    }
+}
+
+/// A discovery sample: the first byte chooses what it is taken for, the rest is its payload.
+pub fn discovery(bytes: &[u8]) {
+    let Some((choice, bytes)) = bytes.split_first() else {
+        return;
+    };
+    let vendor = if choice & 1 == 0 {
+        VendorId::EPROSIMA
+    } else {
+        VendorId::CYCLONE
+    };
+    let payload = if choice & 2 == 0 {
+        Payload::Data(bytes)
+    } else {
+        Payload::Key(bytes)
+    };
+    let status_info = StatusInfo(u32::from(choice >> 2 & 3));
+    let inline_qos = InlineQos {
+        status_info,
+        ..InlineQos::default()
+    };
+    match choice >> 4 & 3 {
+        0 => participant(vendor, payload, &inline_qos),
+        1 => endpoint(Role::Writer, vendor, payload, &inline_qos),
+        _ => endpoint(Role::Reader, vendor, payload, &inline_qos),
+    }
+}
+
+/// The payload of a `ros_discovery_info` sample.
+pub fn entities(bytes: &[u8]) {
+    let Ok(entities) = ParticipantEntities::parse(bytes) else {
+        return;
+    };
+    assert_eq!(entities.participant.entity, EntityId::PARTICIPANT);
+    let guids: usize = entities
+        .nodes
+        .iter()
+        .map(|node| node.readers.len() + node.writers.len())
+        .sum();
+    assert!(16 * (guids + entities.nodes.len()) <= bytes.len());
+    for node in &entities.nodes {
+        assert!(
+            node.fully_qualified_name()
+                .chars()
+                .all(|c| !c.is_control() && c != '"')
+        );
+    }
+}
+
+fn participant(vendor: VendorId, payload: Payload<'_>, inline_qos: &InlineQos) {
+    let Ok(Discovery::Alive(participant)) = discovery::participant(vendor, payload, inline_qos)
+    else {
+        return;
+    };
+    assert_eq!(participant.guid.entity, EntityId::PARTICIPANT);
+    assert!(participant.properties.len() <= 32);
+    for locators in [
+        &participant.default_unicast,
+        &participant.default_multicast,
+        &participant.metatraffic_unicast,
+        &participant.metatraffic_multicast,
+    ] {
+        assert!(locators.len() <= 64);
+    }
+    let text = [&participant.entity_name, &participant.domain_tag];
+    assert!(
+        text.into_iter()
+            .chain(&participant.enclave)
+            .all(|text| text.len() <= 256)
+    );
+}
+
+fn endpoint(role: Role, vendor: VendorId, payload: Payload<'_>, inline_qos: &InlineQos) {
+    let Ok(Discovery::Alive(endpoint)) = discovery::endpoint(role, vendor, payload, inline_qos)
+    else {
+        return;
+    };
+    assert_eq!(
+        endpoint.participant,
+        Guid::new(endpoint.guid.prefix, EntityId::PARTICIPANT)
+    );
+    assert!(endpoint.unicast.len() <= 64 && endpoint.multicast.len() <= 64);
+    assert!(endpoint.qos.partitions.len() <= 16);
+    let topic = endpoint.topic.as_str();
+    assert!(topic.len() <= MAX_LEN && topic.chars().all(|c| !c.is_control() && c != '"'));
+    match endpoint.topic.kind() {
+        TopicKind::Topic(name) => assert_eq!(topic, format!("rt{name}")),
+        TopicKind::ServiceRequest(name) => assert_eq!(topic, format!("rq{name}Request")),
+        TopicKind::ServiceReply(name) => assert_eq!(topic, format!("rr{name}Reply")),
+        _ => {}
+    }
+    assert!(endpoint.type_name.service().as_str().len() <= endpoint.type_name.as_str().len());
+}
+
+/// Every record of the kernel filter's walk with the offset of its submessage.
+fn walk(bytes: &[u8], prefix: [u8; 12]) -> Vec<(usize, Record)> {
+    let Ok(length) = u32::try_from(bytes.len()) else {
+        return Vec::new();
+    };
+    let [a, b, c] = [0, 4, 8].map(|at| {
+        let mut word = [0; 4];
+        word.copy_from_slice(&prefix[at..at + 4]);
+        u32::from_ne_bytes(word)
+    });
+    let mut walk = Walk::default();
+    walk.begin([a, b, c], length);
+    let mut records = Vec::new();
+    loop {
+        let offset = walk.offset as usize;
+        match walk::step(&mut walk, &bytes, length) {
+            Step::Endpoint | Step::LongGap => records.push((offset, walk.record)),
+            Step::Passed => {}
+            _ => return records,
+        }
+    }
+}
+
+/// Whether the walk saw what the full parser saw. The other direction need not hold: the walk lets
+/// numbers pass that the parser refuses.
+fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
+    let (kind, writer, reader, number) = match submessage.body {
+        Body::Data(data) => (kind::DATA, data.writer, data.reader, data.sequence_number),
+        Body::DataFrag(data) => (
+            kind::DATA_FRAG,
+            data.writer,
+            data.reader,
+            data.sequence_number,
+        ),
+        Body::Heartbeat(heartbeat) => (
+            kind::HEARTBEAT,
+            heartbeat.writer,
+            heartbeat.reader,
+            heartbeat.first,
+        ),
+        Body::Gap(gap) => (kind::GAP, gap.writer, gap.reader, gap.start),
+        Body::AckNack(acknack) => (
+            kind::ACKNACK,
+            acknack.writer,
+            acknack.reader,
+            acknack.missing.base,
+        ),
+        _ => return,
+    };
+    assert!(record.is_some(), "the walk missed {submessage:?}");
+    let Some(record) = record else { return };
+    assert_eq!(record.kind, kind, "{submessage:?}");
+    assert_eq!(record.submessage_flags, submessage.flags);
+    assert_eq!(record.sequence_number, number.0.cast_unsigned());
+    if kind == kind::DATA || kind == kind::DATA_FRAG {
+        assert_eq!(record.source_timestamp, submessage.receiver.timestamp.0);
+    }
+    assert_eq!(
+        (guid(record.writer), guid(record.reader)),
+        (writer, reader),
+        "{submessage:?}"
+    );
+}
+
+fn guid(words: [u32; 4]) -> Guid {
+    let mut bytes = [0; 16];
+    for (chunk, word) in bytes.chunks_exact_mut(4).zip(words) {
+        chunk.copy_from_slice(&word.to_ne_bytes());
+    }
+    Guid::from_bytes(bytes)
+}
