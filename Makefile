@@ -43,9 +43,12 @@ run: ## run the agent on this machine with the default configuration (needs root
 peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
 	@$(MAKE) --no-print-directory -C agent/tests/peers OUT=$(TARGET)/peers
 
-bench: ## benchmarks
+bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 	@.ci/prerequisites.sh test
 	cargo bench --workspace
+	@$(MAKE) --no-print-directory peers
+	cargo build --release --package ros2probe --bin rp --example workloads
+	@$(SUDO) $(TARGET)/release/examples/workloads
 
 fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	@.ci/prerequisites.sh fuzz

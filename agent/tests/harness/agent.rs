@@ -80,6 +80,12 @@ impl<'a> Agent<'a> {
         Ok(Scrape(self.request("/metrics")?))
     }
 
+    /// A scrape after the agent has had time to take over what the kernel still held.
+    pub(crate) fn settled_scrape(&self) -> Result<Scrape> {
+        std::thread::sleep(Duration::from_millis(1500));
+        self.scrape()
+    }
+
     /// GETs a path from inside the host; anything but success is an error.
     pub(crate) fn request(&self, path: &str) -> Result<String> {
         get(self.host, &format!("{METRICS}{path}"))

@@ -13,6 +13,7 @@ pub(crate) mod loss;
 pub(crate) mod network;
 pub(crate) mod peer;
 pub(crate) mod process;
+pub(crate) mod usage;
 
 use std::process::Command;
 

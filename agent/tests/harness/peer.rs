@@ -37,6 +37,8 @@ pub(crate) struct Stream {
     pub(crate) transient_local: bool,
     pub(crate) depth: usize,
     pub(crate) domain: u16,
+    /// Whether the peers log every sample.
+    pub(crate) logged: bool,
 }
 
 pub(crate) struct Peer {
@@ -73,6 +75,7 @@ impl Stream {
             transient_local: false,
             depth: 100,
             domain: 0,
+            logged: true,
         }
     }
 
@@ -113,7 +116,9 @@ impl Peer {
         option("--rate", stream.rate.to_string());
         option("--depth", stream.depth.to_string());
         option("--domain", stream.domain.to_string());
-        option("--log", directory.path().join("log").display().to_string());
+        if stream.logged {
+            option("--log", directory.path().join("log").display().to_string());
+        }
         if role == Role::Publisher {
             option("--count", stream.count.to_string());
         }
