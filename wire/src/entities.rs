@@ -200,6 +200,9 @@ mod tests {
             ("/robot2", "listener_node")
         );
         assert_eq!(node.writers[0].entity, EntityId([0, 0, 6, 3]));
+        let node = &captured(testing::RUSTDDS_ENTITIES).nodes[0];
+        assert_eq!(node.fully_qualified_name(), "/ns/pubber");
+        assert_eq!(node.writers.len(), 2);
     }
 
     #[test]

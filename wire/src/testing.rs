@@ -31,6 +31,11 @@ captured! {
     FAST_ENTITIES = "fast-entities";
     FAST_GAP = "fast-gap";
     FAST_NACK_FRAG = "fast-nack-frag";
+    RUSTDDS_SPDP = "rustdds-spdp";
+    RUSTDDS_SPDP_DISPOSE = "rustdds-spdp-dispose";
+    RUSTDDS_SEDP = "rustdds-sedp";
+    RUSTDDS_SEDP_DISPOSE = "rustdds-sedp-dispose";
+    RUSTDDS_ENTITIES = "rustdds-entities";
     JAZZY_SPDP = "jazzy-spdp";
     JAZZY_ACKNACK = "jazzy-acknack";
     JAZZY_SEDP = "jazzy-sedp";

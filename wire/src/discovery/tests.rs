@@ -206,6 +206,43 @@ fn endpoints_as_cyclone_dds_announces_them() {
 }
 
 #[test]
+fn what_rustdds_announces() {
+    let participant = alive(captured_participant(testing::RUSTDDS_SPDP));
+    assert_eq!(
+        participant.guid.to_string(),
+        "0112fa8840171addfe777b8f.000001c1"
+    );
+    assert_eq!(participant.vendor, VendorId::RUSTDDS);
+    assert_eq!(participant.lease, Duration::Finite(50_000_000_000));
+    // A ROS participant that says neither its enclave nor its domain.
+    assert!(!participant.is_ros() && participant.domain_id.is_none());
+    let [writer, events, _] = captured_endpoints(testing::RUSTDDS_SEDP)
+        .into_iter()
+        .map(alive)
+        .collect::<Vec<_>>()
+        .try_into()
+        .unwrap();
+    // The vendor is the sender's, the history is not said, and the entity key 0 is in use.
+    assert_eq!(
+        (writer.vendor, writer.qos.history),
+        (VendorId::RUSTDDS, None)
+    );
+    assert_eq!(writer.guid.entity, EntityId([0, 0, 0, 3]));
+    assert_eq!(events.topic.as_str(), "rt/parameter_events");
+    // It disposes of its builtin readers too.
+    let gone = captured_endpoints(testing::RUSTDDS_SEDP_DISPOSE);
+    let builtin = gone.iter().filter(|discovery| match discovery {
+        Discovery::Gone { guid, .. } => guid.entity.is_builtin(),
+        Discovery::Alive(alive) => panic!("{alive:?}"),
+    });
+    assert_eq!((builtin.count(), gone.len()), (5, 8));
+    assert!(matches!(
+        captured_participant(testing::RUSTDDS_SPDP_DISPOSE),
+        Discovery::Gone { guid, .. } if guid == participant.guid
+    ));
+}
+
+#[test]
 fn iron_and_later_say_the_type_hash() {
     let [first, ..] = &captured_endpoints(testing::JAZZY_SEDP)[..] else {
         panic!()

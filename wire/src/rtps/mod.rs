@@ -35,6 +35,8 @@ impl VendorId {
     pub const EPROSIMA: Self = Self([0x01, 0x0f]);
     /// Eclipse Cyclone DDS.
     pub const CYCLONE: Self = Self([0x01, 0x10]);
+    /// Atostek RustDDS.
+    pub const RUSTDDS: Self = Self([0x01, 0x12]);
 
     /// Name of the product, for people and for labels; `None` when the number is not known here.
     #[must_use]
@@ -49,6 +51,8 @@ impl VendorId {
             [0x01, 0x0a] => "RTI Connext Micro",
             [0x01, 0x0f] => "eProsima Fast DDS",
             [0x01, 0x10] => "Eclipse Cyclone DDS",
+            [0x01, 0x11] => "GurumDDS",
+            [0x01, 0x12] => "Atostek RustDDS",
             [0x01, 0x15] => "SafeDDS",
             [0x01, 0x20] => "ADLINK Cloud",
             _ => return None,
