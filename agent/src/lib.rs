@@ -6,4 +6,6 @@
 pub mod capture;
 pub mod config;
 pub mod model;
+pub mod privilege;
+pub mod run;
 pub mod surface;

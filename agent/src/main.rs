@@ -1,1 +1,150 @@
-fn main() {}
+//! `rp`: the agent and its tools.
+
+mod cli;
+mod logging;
+mod supervise;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::mpsc::sync_channel;
+
+use anyhow::{Context as _, Result};
+use clap::Parser as _;
+use ros2probe::capture::pcap::Speed;
+use ros2probe::config::{Config, ConfigError, Watchlist};
+use ros2probe::privilege::{self, Missing};
+use ros2probe::run::replay::Replay;
+use ros2probe::run::{Run, Source};
+use ros2probe::surface::http::Server;
+use ros2probe::surface::{Board, Exposition, Format, Settings};
+use tokio_util::sync::CancellationToken;
+
+use cli::{Arguments, Command, DEFAULT_CONFIG};
+use logging::Log;
+use supervise::{Supervisor, add_watches};
+
+/// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
+const NO_PERMISSION: u8 = 77;
+const BAD_CONFIG: u8 = 78;
+
+fn main() -> ExitCode {
+    let done = match Arguments::parse().command {
+        Command::Run(options) => run(options),
+        Command::CheckConfig { file } => check_config(&file),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{}", message(&error));
+            exit_code(&error)
+        }
+    }
+}
+
+/// The agent's life, in order.
+fn run(options: cli::Run) -> Result<()> {
+    let (mut config, file) = configuration(options.config.as_deref())?;
+    add_watches(&mut config, &options.watch);
+    if let Some(listen) = options.metrics {
+        config.metrics.listen = listen.0;
+    } else if options.report {
+        config.metrics.listen = None;
+    }
+    let log = Log::start(config.log);
+    let source = open(&options, &config)?;
+    let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
+    let watchlist = Watchlist::new(config.watches.clone()).context("the watchlist is unusable")?;
+    let server = config
+        .metrics
+        .listen
+        .map(|address| Server::bind(address, Arc::clone(&board)));
+    let server = server.transpose()?;
+    privilege::give_up()?;
+    if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {
+        tracing::info!(%address, watches = config.watches.len(), "serving metrics");
+    }
+
+    let stop = CancellationToken::new();
+    let (orders, inbox) = sync_channel(4);
+    let run = Run::new(source, watchlist, Arc::clone(&board), inbox, stop.clone());
+    if options.report && server.is_none() {
+        let ended = run.run();
+        print!("{}", Exposition::new(board).render(Format::Classic)?);
+        return Ok(ended?);
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = runtime.context("cannot start the runtime of the metrics listener")?;
+    let extra = options.watch;
+    let supervisor = Supervisor {
+        board: Arc::clone(&board),
+        config,
+        file,
+        extra,
+        orders,
+        stop,
+        log,
+    };
+    runtime.block_on(supervisor.run(run, server, options.report))?;
+    if options.report {
+        print!("{}", Exposition::new(board).render(Format::Classic)?);
+    }
+    Ok(())
+}
+
+/// The configuration and the file it came from. Without `--config` a missing file is no mistake.
+fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>)> {
+    let default = Path::new(DEFAULT_CONFIG);
+    match file {
+        None if !default.exists() => Ok((Config::default(), None)),
+        file => {
+            let file = file.unwrap_or(default);
+            Ok((Config::load(file)?, Some(file.to_path_buf())))
+        }
+    }
+}
+
+fn open(options: &cli::Run, config: &Config) -> Result<Source> {
+    let Some(file) = &options.replay else {
+        privilege::check(&config.capture)?;
+        anyhow::bail!("live capture is not part of this build");
+    };
+    let pace = if options.report {
+        Speed::Max
+    } else {
+        Speed::Times(1.0)
+    };
+    let replay = Replay::open(file, options.speed.unwrap_or(pace))
+        .with_context(|| format!("cannot replay {}", file.display()))?;
+    Ok(Source::Replay(Box::new(replay)))
+}
+
+fn check_config(file: &Path) -> Result<()> {
+    let config = Config::load(file)?;
+    println!(
+        "{} is good: {} watched",
+        file.display(),
+        config.watches.len()
+    );
+    Ok(())
+}
+
+/// The error with its causes, once. Mistakes of a configuration are one line each, as they are.
+fn message(error: &anyhow::Error) -> String {
+    match error.downcast_ref::<ConfigError>() {
+        Some(mistakes @ ConfigError::Invalid { .. }) => mistakes.to_string(),
+        _ => format!("rp: {error:#}"),
+    }
+}
+
+fn exit_code(error: &anyhow::Error) -> ExitCode {
+    if error.is::<Missing>() {
+        ExitCode::from(NO_PERMISSION)
+    } else if error.is::<ConfigError>() {
+        ExitCode::from(BAD_CONFIG)
+    } else {
+        ExitCode::FAILURE
+    }
+}

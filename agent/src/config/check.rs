@@ -7,6 +7,7 @@
 use serde_json::Value;
 
 use super::document::{Content, Key, Node, Scalar, item_path, key_path};
+use super::meaning::check_text;
 use super::mistake::Mistakes;
 
 /// What people write for keys that are called otherwise: old names first, then likely guesses.
@@ -106,6 +107,8 @@ fn check_scalar(node: &Node, text: &str, path: &str, schema: &Value, found: &mut
                     node.describe(),
                     words.join(", ")
                 );
+                found.add(node.position, path, message);
+            } else if let Err(message) = check_text(path, text) {
                 found.add(node.position, path, message);
             }
             return;
@@ -223,8 +226,11 @@ fn words(schema: &Value) -> impl Iterator<Item = &str> {
         .filter_map(Value::as_str)
 }
 
-/// Edits from one word to the other, an exchange of neighbours counting as two.
+/// Edits from one word to the other; the same letters in another order are one.
 fn distance(one: &str, other: &str) -> usize {
+    if one != other && sorted(one) == sorted(other) {
+        return 1;
+    }
     let other: Vec<char> = other.chars().collect();
     let mut row: Vec<usize> = (0..=other.len()).collect();
     for (i, a) in one.chars().take(64).enumerate() {
@@ -238,4 +244,10 @@ fn distance(one: &str, other: &str) -> usize {
         row = next;
     }
     row.last().copied().unwrap_or(usize::MAX)
+}
+
+fn sorted(word: &str) -> Vec<char> {
+    let mut letters: Vec<char> = word.chars().collect();
+    letters.sort_unstable();
+    letters
 }

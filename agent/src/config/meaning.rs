@@ -88,8 +88,8 @@ impl Reader {
                 unknown_writers: limits.unknown_writers,
                 reassembly_bytes: limits.reassembly_bytes,
             },
-            capture: self.capture(shape.capture.unwrap_or_default()),
-            metrics: self.metrics(&shape.metrics.unwrap_or_default()),
+            capture: capture(shape.capture.unwrap_or_default()),
+            metrics: metrics(&shape.metrics.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             log: shape.log,
         }
@@ -115,15 +115,6 @@ impl Reader {
                 },
                 WatchShape::Entry(entry) => self.entry(&key, *entry),
             };
-            if let Err(error) = check_pattern(&watch.pattern) {
-                let topic = format!("{key}.topic");
-                let key = if self.places.contains_key(&topic) {
-                    &topic
-                } else {
-                    &key
-                };
-                self.wrong(key, error.to_string());
-            }
             let twin = |other: &Watch| {
                 other.pattern == watch.pattern && other.domain_id == watch.domain_id
             };
@@ -156,59 +147,60 @@ impl Reader {
             },
         }
     }
+}
 
-    fn capture(&mut self, shape: CaptureShape) -> CaptureSettings {
-        let interfaces = shape.interfaces.unwrap_or_default();
-        let namespaces = shape.network_namespaces.unwrap_or_default();
-        for (index, path) in namespaces.iter().enumerate() {
-            if !path.starts_with('/') {
-                let key = format!("capture.network_namespaces[{index}]");
-                self.wrong(&key, "must be an absolute path, as in `/run/netns/robot`");
+/// What text at this key must be, where any text will not do.
+pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
+    match without_indices(key).as_str() {
+        "watch[]" | "watch[].topic" => check_pattern(text).map_err(|error| error.to_string()),
+        "capture.interfaces.include[]" | "capture.interfaces.exclude[]" => {
+            if text.is_empty() || text.contains(|c: char| c.is_whitespace() || c == '/') {
+                return Err("must be an interface name or glob, as in `eth*`".to_owned());
             }
+            Glob::new(text)
+                .map(|_| ())
+                .map_err(|error| error.kind().to_string())
         }
-        CaptureSettings {
-            include_interfaces: self.interfaces("include", interfaces.include),
-            exclude_interfaces: self.interfaces("exclude", interfaces.exclude),
-            network_namespaces: namespaces.into_iter().map(PathBuf::from).collect(),
-            ring_bytes: shape.ring_bytes,
-            record_ring_bytes: shape.record_ring_bytes,
+        "capture.network_namespaces[]" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/run/netns/robot`".to_owned())
         }
+        "metrics.listen" if text != "off" && text.parse::<SocketAddr>().is_err() => Err(format!(
+            "is `{text}`, must be an IP address and port, as in `127.0.0.1:17400` or \
+             `[::1]:17400`, or `off`"
+        )),
+        _ => Ok(()),
     }
+}
 
-    fn interfaces(&mut self, list: &str, globs: Option<Vec<String>>) -> Vec<String> {
-        let globs = globs.unwrap_or_default();
-        for (index, glob) in globs.iter().enumerate() {
-            let key = format!("capture.interfaces.{list}[{index}]");
-            let strange = |c: char| c.is_whitespace() || c == '/';
-            if glob.is_empty() || glob.contains(strange) {
-                self.wrong(&key, "must be an interface name or glob, as in `eth*`");
-            } else if let Err(error) = Glob::new(glob) {
-                self.wrong(&key, error.kind().to_string());
-            }
-        }
-        globs
+/// `watch[2].topic` as `watch[].topic`.
+fn without_indices(key: &str) -> String {
+    let mut inside = false;
+    let mut shown = |c: char| {
+        let shown = !inside || c == ']';
+        inside = c == '[' || (inside && c != ']');
+        shown
+    };
+    key.chars().filter(|c| shown(*c)).collect()
+}
+
+fn capture(shape: CaptureShape) -> CaptureSettings {
+    let interfaces = shape.interfaces.unwrap_or_default();
+    let namespaces = shape.network_namespaces.unwrap_or_default();
+    CaptureSettings {
+        include_interfaces: interfaces.include.unwrap_or_default(),
+        exclude_interfaces: interfaces.exclude.unwrap_or_default(),
+        network_namespaces: namespaces.into_iter().map(PathBuf::from).collect(),
+        ring_bytes: shape.ring_bytes,
+        record_ring_bytes: shape.record_ring_bytes,
     }
+}
 
-    fn metrics(&mut self, shape: &MetricsShape) -> MetricsSettings {
-        let listen = match shape.listen.as_str() {
-            "off" => None,
-            address => match address.parse::<SocketAddr>() {
-                Ok(address) => Some(address),
-                Err(_) => {
-                    let message = format!(
-                        "is `{address}`, must be an IP address and port, as in \
-                         `127.0.0.1:17400` or `[::1]:17400`, or `off`"
-                    );
-                    self.wrong("metrics.listen", message);
-                    None
-                }
-            },
-        };
-        MetricsSettings {
-            listen,
-            histograms: shape.histograms,
-            per_writer: shape.per_writer,
-        }
+fn metrics(shape: &MetricsShape) -> MetricsSettings {
+    MetricsSettings {
+        // Text that is no address is `off`: everything else was refused before.
+        listen: shape.listen.parse().ok(),
+        histograms: shape.histograms,
+        per_writer: shape.per_writer,
     }
 }
 
@@ -249,11 +241,13 @@ watch:
     min_rate: 5
     max_loss_ratio: 3
   - topik: /scan
+  - scan
 metrics:
   listen: 17400
   per_writer: maybe
 log: loud
 limtis: {}
+lgo: 1
 ";
         assert_eq!(
             report(source),
@@ -261,10 +255,12 @@ limtis: {}
              f:5:21: watch[1].max_loss_ratio: is 3, must be between 0 and 1\n\
              f:6:5: watch[2]: the key `topic` is missing\n\
              f:6:5: watch[2].topik: unknown key; did you mean `topic`?\n\
-             f:8:11: metrics.listen: is `17400`, must be text\n\
-             f:9:15: metrics.per_writer: is the text `maybe`, must be true or false\n\
-             f:10:6: log: is the text `loud`, must be one of error, warn, info, debug, trace\n\
-             f:11:1: limtis: unknown key; did you mean `limits`?"
+             f:7:5: watch[3]: must begin with a slash, as in `/points`\n\
+             f:9:11: metrics.listen: is `17400`, must be text\n\
+             f:10:15: metrics.per_writer: is the text `maybe`, must be true or false\n\
+             f:11:6: log: is the text `loud`, must be one of error, warn, info, debug, trace\n\
+             f:12:1: limtis: unknown key; did you mean `limits`?\n\
+             f:13:1: lgo: unknown key; did you mean `log`?"
         );
     }
 
@@ -273,9 +269,7 @@ limtis: {}
         let source = "\
 watch:
   - points
-  - {topic: /a b, min_rate_hz: 5, max_rate_hz: 1}
-  - /x
-  - /x
+  - {topic: /a b}
 capture:
   interfaces: {include: ['eth[']}
   network_namespaces: [robot]
@@ -286,13 +280,27 @@ metrics: {listen: localhost}
             "f:2:5: watch[0]: must begin with a slash, as in `/points`\n\
              f:3:13: watch[1].topic: has the character ` `: ROS names have letters, digits and \
              `_`, globs also `*`\n\
-             f:3:48: watch[1].max_rate_hz: is 1, below min_rate_hz, which is 5\n\
-             f:5:5: watch[3]: repeats watch[2]\n\
-             f:7:26: capture.interfaces.include[0]: unclosed character class; missing ']'\n\
-             f:8:24: capture.network_namespaces[0]: must be an absolute path, as in \
+             f:5:26: capture.interfaces.include[0]: unclosed character class; missing ']'\n\
+             f:6:24: capture.network_namespaces[0]: must be an absolute path, as in \
              `/run/netns/robot`\n\
-             f:9:19: metrics.listen: is `localhost`, must be an IP address and port, as in \
+             f:7:19: metrics.listen: is `localhost`, must be an IP address and port, as in \
              `127.0.0.1:17400` or `[::1]:17400`, or `off`"
+        );
+    }
+
+    #[test]
+    fn values_are_compared_with_each_other() {
+        let source = "\
+watch:
+  - {topic: /a, min_rate_hz: 5, max_rate_hz: 1}
+  - /x
+  - {topic: /x, domain: 3}
+  - /x
+";
+        assert_eq!(
+            report(source),
+            "f:2:46: watch[0].max_rate_hz: is 1, below min_rate_hz, which is 5\n\
+             f:5:5: watch[3]: repeats watch[1]"
         );
     }
 

@@ -1,0 +1,62 @@
+//! The log: events to standard error, in a form the journal keeps well.
+
+use std::io;
+
+use ros2probe::config::Level;
+use tracing_subscriber::filter::{EnvFilter, LevelFilter};
+use tracing_subscriber::layer::SubscriberExt as _;
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{Layer as _, Registry, fmt, reload};
+
+/// Changes the level of the running agent.
+#[derive(Debug)]
+pub(crate) struct Log {
+    level: reload::Handle<EnvFilter, Registry>,
+    /// `RUST_LOG` was given: it stays in force.
+    fixed: bool,
+}
+
+impl Log {
+    /// Begins logging at `level`, or as `RUST_LOG` says.
+    pub(crate) fn start(level: Level) -> Self {
+        let fixed = EnvFilter::try_from_default_env().ok();
+        let (filter, handle) = reload::Layer::new(fixed.clone().unwrap_or_else(|| filter(level)));
+        // The journal stamps each line itself.
+        let journal = std::env::var_os("JOURNAL_STREAM").is_some();
+        let lines = fmt::layer().with_writer(io::stderr).with_target(false);
+        let lines = if journal {
+            lines.without_time().boxed()
+        } else {
+            lines.boxed()
+        };
+        // Fails when a log has begun already, which only a test could do.
+        let _ = tracing_subscriber::registry()
+            .with(filter)
+            .with(lines)
+            .try_init();
+        Self {
+            level: handle,
+            fixed: fixed.is_some(),
+        }
+    }
+
+    /// Changes the level.
+    pub(crate) fn set(&self, level: Level) {
+        if !self.fixed
+            && let Err(error) = self.level.reload(filter(level))
+        {
+            tracing::warn!(%error, "the log level was not changed");
+        }
+    }
+}
+
+fn filter(level: Level) -> EnvFilter {
+    let level = match level {
+        Level::Error => LevelFilter::ERROR,
+        Level::Warn => LevelFilter::WARN,
+        Level::Info => LevelFilter::INFO,
+        Level::Debug => LevelFilter::DEBUG,
+        Level::Trace => LevelFilter::TRACE,
+    };
+    EnvFilter::default().add_directive(level.into())
+}

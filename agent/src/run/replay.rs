@@ -1,0 +1,193 @@
+//! A capture as a source: its packets at the pace asked for, in slices short enough that the agent
+//! stays responsive.
+
+use std::io::IsTerminal as _;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::frame::Link;
+
+use crate::capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed};
+
+/// How often a terminal is told how far it is.
+const PROGRESS: Duration = Duration::from_secs(1);
+
+/// A capture being replayed.
+pub struct Replay {
+    reader: PcapReader,
+    pacer: Pacer,
+    speed: Speed,
+    /// Read but not due yet.
+    waiting: Option<Waiting>,
+    clock: Timestamp,
+    packets: u64,
+    bytes: u64,
+    began: Option<Timestamp>,
+    progress: Option<Instant>,
+    finished: bool,
+}
+
+/// A packet's facts; its bytes are in `bytes`.
+struct Waiting {
+    time: Timestamp,
+    link: Link,
+    interface: u32,
+    bytes: Vec<u8>,
+    length: u32,
+}
+
+impl Replay {
+    /// Opens a capture.
+    ///
+    /// # Errors
+    /// When it cannot be read or is none.
+    pub fn open(path: &Path, speed: Speed) -> Result<Self, PcapError> {
+        Ok(Self {
+            reader: PcapReader::open(path)?,
+            pacer: Pacer::new(speed),
+            speed,
+            waiting: None,
+            clock: Timestamp::default(),
+            packets: 0,
+            bytes: 0,
+            began: None,
+            progress: std::io::stderr().is_terminal().then(Instant::now),
+            finished: false,
+        })
+    }
+
+    /// Delivers what is due within `timeout`, then returns: at the latest after it, earlier at the
+    /// end of the capture.
+    ///
+    /// # Errors
+    /// When the rest of the capture cannot be read; what came before has been delivered.
+    pub fn poll(
+        &mut self,
+        timeout: Duration,
+        mut deliver: impl FnMut(Captured<'_>),
+    ) -> Result<(), PcapError> {
+        let end = Instant::now() + timeout;
+        while !self.finished {
+            let now = Instant::now();
+            if now >= end {
+                break;
+            }
+            if let Some(waiting) = &self.waiting {
+                let delay = self.pacer.delay(waiting.time, now);
+                let slice = delay.min(end.saturating_duration_since(now));
+                if !slice.is_zero() {
+                    std::thread::sleep(slice);
+                }
+                if slice < delay {
+                    self.clock = before(waiting.time, delay - slice, self.speed).max(self.clock);
+                    break;
+                }
+                let Waiting {
+                    time,
+                    link,
+                    interface,
+                    length,
+                    ..
+                } = *waiting;
+                let bytes = &waiting.bytes;
+                self.clock = self.clock.max(time);
+                deliver(Captured {
+                    time,
+                    link,
+                    interface,
+                    bytes,
+                    length,
+                });
+            }
+            self.next()?;
+        }
+        self.show_progress();
+        Ok(())
+    }
+
+    /// Reads one packet ahead, into the memory of the one before.
+    fn next(&mut self) -> Result<(), PcapError> {
+        let memory = self.waiting.take().map(|waiting| waiting.bytes);
+        match self.reader.next_packet() {
+            Ok(Some(Captured {
+                time,
+                link,
+                interface,
+                bytes,
+                length,
+            })) => {
+                let mut memory = memory.unwrap_or_default();
+                memory.clear();
+                memory.extend_from_slice(bytes);
+                self.packets += 1;
+                self.bytes += bytes.len() as u64;
+                if self.began.is_none() {
+                    (self.began, self.clock) = (Some(time), time);
+                }
+                self.waiting = Some(Waiting {
+                    time,
+                    link,
+                    interface,
+                    bytes: memory,
+                    length,
+                });
+                Ok(())
+            }
+            Ok(None) => {
+                self.finished = true;
+                Ok(())
+            }
+            Err(error) => {
+                self.finished = true;
+                Err(error)
+            }
+        }
+    }
+
+    /// The capture's clock: the time of its last packet, running on while the next one is waited
+    /// for.
+    #[must_use]
+    pub const fn clock(&self) -> Timestamp {
+        self.clock
+    }
+
+    /// All packets were delivered.
+    #[must_use]
+    pub const fn is_finished(&self) -> bool {
+        self.finished
+    }
+
+    /// Packets and their bytes so far.
+    #[must_use]
+    pub const fn progress(&self) -> (u64, u64) {
+        (self.packets, self.bytes)
+    }
+
+    fn show_progress(&mut self) {
+        let Some(last) = self.progress else { return };
+        if self.finished {
+            eprint!("\r\x1b[K");
+            self.progress = None;
+        } else if last.elapsed() >= PROGRESS {
+            self.progress = Some(Instant::now());
+            let seconds =
+                self.clock.nanoseconds_since(self.began.unwrap_or_default()) / 1_000_000_000;
+            eprint!(
+                "\rreplayed {} packets, {seconds} s of the capture\x1b[K",
+                self.packets
+            );
+        }
+    }
+}
+
+/// The capture's time when a packet is `delay` away.
+fn before(time: Timestamp, delay: Duration, speed: Speed) -> Timestamp {
+    let Speed::Times(factor) = speed else {
+        return time;
+    };
+    let distance =
+        Duration::try_from_secs_f64(delay.as_secs_f64() * factor).unwrap_or(Duration::MAX);
+    let nanoseconds = u64::try_from(distance.as_nanos()).unwrap_or(u64::MAX);
+    Timestamp(time.0.saturating_sub(nanoseconds))
+}

@@ -1,0 +1,235 @@
+//! What goes on around the working thread: signals, reloads, the metrics listener, the service
+//! manager and its watchdog, and an orderly end.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::mpsc::SyncSender;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, anyhow};
+use ros2probe::config::{Config, Watch, Watchlist};
+use ros2probe::run::{Order, Run, RunError};
+use ros2probe::surface::http::Server;
+use ros2probe::surface::{Board, Settings};
+use sd_notify::NotifyState;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::oneshot;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio_util::sync::CancellationToken;
+
+use crate::logging::Log;
+
+/// How often readiness and the watchdog are looked at.
+const TICK: Duration = Duration::from_millis(500);
+/// For answers that have begun and the working thread's last round.
+const DRAIN: Duration = Duration::from_secs(3);
+
+/// The agent around its working thread.
+pub(crate) struct Supervisor {
+    pub(crate) board: Arc<Board>,
+    pub(crate) config: Config,
+    /// Where the configuration came from; read again on SIGHUP.
+    pub(crate) file: Option<PathBuf>,
+    /// From the command line: they stay through reloads.
+    pub(crate) extra: Vec<Watch>,
+    pub(crate) orders: SyncSender<Order>,
+    pub(crate) stop: CancellationToken,
+    pub(crate) log: Log,
+}
+
+/// Signals that are listened to from before the working thread starts.
+struct Signals {
+    terminate: Signal,
+    interrupt: Signal,
+    hangup: Signal,
+}
+
+/// The working thread and the news of its end.
+struct Worker {
+    thread: JoinHandle<()>,
+    ended: oneshot::Receiver<Result<(), RunError>>,
+}
+
+impl Supervisor {
+    /// Runs everything until a signal or a failure, or with `once` until the capture ends, and says
+    /// in the log how it ended.
+    pub(crate) async fn run(mut self, run: Run, server: Option<Server>, once: bool) -> Result<()> {
+        let mut signals = Signals::listen().context("cannot listen to signals")?;
+        let mut worker = Worker::start(run).context("cannot start the working thread")?;
+        let serving = server.map(|server| tokio::spawn(server.serve(self.stop.clone())));
+        let mut watchdog = Watchdog::new();
+        let mut tick = interval(TICK);
+        tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut working = true;
+
+        let outcome = loop {
+            tokio::select! {
+                _ = signals.terminate.recv() => break Ok("SIGTERM"),
+                _ = signals.interrupt.recv() => break Ok("SIGINT"),
+                _ = signals.hangup.recv() => self.reload(),
+                ended = &mut worker.ended, if working => {
+                    working = false;
+                    match ended {
+                        Ok(Ok(())) if once => break Ok("end of capture"),
+                        Ok(Ok(())) => {
+                            tracing::info!("the capture has ended, its final state stays");
+                        }
+                        Ok(Err(error)) => break Err(error.into()),
+                        // Its sender went without a word: the panic is in the log.
+                        Err(_) => break Err(anyhow!("the working thread died")),
+                    }
+                }
+                _ = tick.tick() => watchdog.look(&self.board),
+            }
+        };
+
+        let _ = sd_notify::notify(&[NotifyState::Stopping]);
+        self.stop.cancel();
+        let drained = timeout(DRAIN, async {
+            if working {
+                let _ = (&mut worker.ended).await;
+            }
+            if let Some(serving) = serving {
+                let _ = serving.await;
+            }
+        });
+        let drained = drained.await.is_ok();
+        if drained && worker.thread.join().is_err() {
+            tracing::error!("the working thread died while ending");
+        }
+        match outcome {
+            Ok(reason) => {
+                tracing::info!(reason, drained, "ended");
+                Ok(())
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Reads the configuration again; a mistake changes nothing.
+    fn reload(&mut self) {
+        let Some(file) = &self.file else {
+            tracing::warn!("nothing to reload: the agent was started without a configuration file");
+            return;
+        };
+        if let Ok(now) = NotifyState::monotonic_usec_now() {
+            let _ = sd_notify::notify(&[NotifyState::Reloading, now]);
+        }
+        match Config::load(file) {
+            Ok(config) => self.take_over(config),
+            Err(error) => {
+                self.board.reload_failed();
+                let error = format!("{:#}", anyhow!(error));
+                for line in error.lines() {
+                    tracing::error!(error = line, "the configuration was not reloaded");
+                }
+            }
+        }
+        let _ = sd_notify::notify(&[NotifyState::Ready]);
+    }
+
+    fn take_over(&mut self, mut config: Config) {
+        for key in self.config.needs_restart(&config) {
+            tracing::warn!(key, "the change takes effect after a restart");
+        }
+        add_watches(&mut config, &self.extra);
+        let watchlist = match Watchlist::new(config.watches.clone()) {
+            Ok(watchlist) => watchlist,
+            Err(error) => {
+                self.board.reload_failed();
+                tracing::error!(%error, "the configuration was not reloaded");
+                return;
+            }
+        };
+        // Full or gone: the thread is stuck or has ended, and /readyz says so.
+        if self.orders.try_send(Order::Watch(watchlist)).is_err() {
+            tracing::warn!("the watchlist was not handed over: nothing is captured any more");
+        }
+        self.log.set(config.log);
+        let settings = Settings::new(&config);
+        // The cap of the tables is the one the agent was started with.
+        let max_topics = self.config.limits.topics;
+        self.board.reloaded(Settings {
+            max_topics,
+            ..settings
+        });
+        tracing::info!(
+            watches = config.watches.len(),
+            "the configuration was reloaded"
+        );
+    }
+}
+
+/// Adds the command line's watches to the configured ones.
+pub(crate) fn add_watches(config: &mut Config, extra: &[Watch]) {
+    for watch in extra {
+        let same =
+            |other: &Watch| other.pattern == watch.pattern && other.domain_id == watch.domain_id;
+        if !config.watches.iter().any(same) {
+            config.watches.push(watch.clone());
+        }
+    }
+}
+
+impl Signals {
+    fn listen() -> std::io::Result<Self> {
+        Ok(Self {
+            terminate: signal(SignalKind::terminate())?,
+            interrupt: signal(SignalKind::interrupt())?,
+            hangup: signal(SignalKind::hangup())?,
+        })
+    }
+}
+
+impl Worker {
+    fn start(run: Run) -> std::io::Result<Self> {
+        let (tell, ended) = oneshot::channel();
+        let thread = std::thread::Builder::new()
+            .name("capture".to_owned())
+            .spawn(move || {
+                let _ = tell.send(run.run());
+            })?;
+        Ok(Self { thread, ended })
+    }
+}
+
+/// Tells the service manager that the agent sees, as long as it does.
+struct Watchdog {
+    period: Option<Duration>,
+    fed: Option<Instant>,
+    ready: bool,
+}
+
+impl Watchdog {
+    fn new() -> Self {
+        // A third of what is allowed: one late round does not kill.
+        let period = sd_notify::watchdog_enabled().map(|allowed| allowed / 3);
+        Self {
+            period,
+            fed: None,
+            ready: false,
+        }
+    }
+
+    /// Not a timer: what feeds the watchdog is the capture's progress.
+    fn look(&mut self, board: &Board) {
+        let now = Instant::now();
+        if board.state().ready(now).is_err() {
+            return;
+        }
+        if !self.ready {
+            self.ready = true;
+            tracing::info!("ready");
+            let _ = sd_notify::notify(&[NotifyState::Ready]);
+        }
+        let Some(period) = self.period else { return };
+        if self
+            .fed
+            .is_none_or(|fed| now.saturating_duration_since(fed) >= period)
+        {
+            self.fed = Some(now);
+            let _ = sd_notify::notify(&[NotifyState::Watchdog]);
+        }
+    }
+}
