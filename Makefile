@@ -52,10 +52,12 @@ bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 
 fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	@.ci/prerequisites.sh fuzz
-	cd wire && for target in $$(cargo fuzz list); do \
-	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run "$$target" -- \
+	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list); do \
+	    mkdir -p "fuzz/corpus/$$target"; \
+	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run "$$target" "fuzz/corpus/$$target" \
+	        $$(ls -d "fuzz/seeds/$$target" "tests/data/$${target}s" 2>/dev/null) -- \
 	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
-	done
+	done) || exit 1; done
 
 prerequisites: ## install what demo, test, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test ebpf fuzz

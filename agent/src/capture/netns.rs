@@ -88,19 +88,18 @@ pub(crate) mod tests {
 
     use super::*;
 
-    /// Runs a test in a network namespace of its own, with `lo` up. Says so and does nothing where
-    /// that is not permitted.
+    /// Runs a test in a network namespace of its own, with `lo` up.
     pub(crate) fn in_new_namespace(test: impl FnOnce() + Send) {
         thread::scope(|scope| {
             let thread = scope.spawn(|| {
                 // SAFETY: takes no pointers; only this thread is moved.
-                if unsafe { libc::unshare(libc::CLONE_NEWNET) } != 0 {
-                    eprintln!(
-                        "skipped, needs CAP_SYS_ADMIN: {}",
-                        io::Error::last_os_error()
-                    );
-                    return;
-                }
+                let result = unsafe { libc::unshare(libc::CLONE_NEWNET) };
+                assert_eq!(
+                    result,
+                    0,
+                    "network namespaces need root: run `sudo -E make test` ({})",
+                    io::Error::last_os_error()
+                );
                 ip("link set lo up");
                 test();
             });

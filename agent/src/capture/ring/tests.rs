@@ -1,4 +1,4 @@
-//! Live, in network namespaces of their own; where that is not permitted they say so and pass.
+//! Live, in network namespaces of their own, which takes root.
 
 use std::net::UdpSocket;
 use std::time::Instant;

@@ -1,0 +1,111 @@
+//! What the fuzz targets do with their bytes: plain functions, so that the tests run them too, over
+//! the committed seeds and all their truncations (`agent/tests/fuzz_seeds.rs`).
+//!
+//! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic,
+//! nothing delivered that was not there, an end, and an end that stays.
+
+use std::io::Cursor;
+
+use ros2probe::capture::pcap::PcapReader;
+use ros2probe::capture::ring::block::Frames;
+use ros2probe::config::Config;
+use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::frame::{self, Packet, Payload};
+use ros2probe_wire::walk::{self, Envelope};
+
+/// The block's header, and a frame's with its address.
+const BLOCK_HEADER: usize = 48;
+const FRAME_HEADER: usize = 48;
+/// A compressed capture may be as long as it likes; the fuzzer looks at its beginning.
+const PACKETS: u64 = 10_000;
+
+/// A capture file, through reassembly and walk.
+pub fn capture(bytes: &[u8]) {
+    let Ok(mut reader) = PcapReader::new(Cursor::new(bytes.to_vec())) else {
+        return;
+    };
+    let mut inside = Inside::default();
+    while let Ok(Some(packet)) = reader.next_packet() {
+        assert!(packet.bytes.len() <= 262_144);
+        if let Ok(frame) = frame::parse(packet.link, packet.bytes, packet.length)
+            && let Some(found) = &frame.packet
+        {
+            inside.packet(packet.time, packet.interface, found);
+        }
+        if reader.packets() == PACKETS {
+            return;
+        }
+    }
+    assert!(matches!(reader.next_packet(), Ok(None)));
+}
+
+/// A block of the packet ring, through reassembly and walk.
+pub fn ring_block(bytes: &[u8]) {
+    let mut frames = Frames::new(bytes);
+    let mut inside = Inside::default();
+    let mut count = 0;
+    for captured in frames.by_ref() {
+        count += 1;
+        assert!(count * FRAME_HEADER + BLOCK_HEADER <= bytes.len() + FRAME_HEADER);
+        let range = captured.bytes.as_ptr_range();
+        assert!(bytes.as_ptr_range().start <= range.start && range.end <= bytes.as_ptr_range().end);
+        let packet = frame::parse_cooked(
+            captured.protocol,
+            captured.packet_type,
+            captured.bytes,
+            captured.length,
+        );
+        if let Ok(Some(packet)) = packet {
+            inside.packet(captured.time, captured.interface, &packet);
+        }
+    }
+    assert_eq!(frames.next(), None);
+    assert!(frames.damaged() || bytes.len() >= BLOCK_HEADER);
+}
+
+/// A configuration file.
+pub fn configuration(bytes: &[u8]) {
+    match Config::parse(bytes) {
+        Ok(config) => assert_eq!(config.needs_restart(&config), [""; 0]),
+        Err(mistakes) => {
+            assert!(!mistakes.is_empty());
+            let lines = bytes.split(|byte| *byte == b'\n').count();
+            for mistake in mistakes.iter() {
+                assert!(mistake.position.line <= lines + 1, "{mistake} of {lines}");
+            }
+            assert!(mistakes.report("file").lines().count() >= 1);
+        }
+    }
+}
+
+/// What comes out of frames.
+struct Inside(Reassembly);
+
+impl Default for Inside {
+    fn default() -> Self {
+        Self(Reassembly::new(Limits::default()))
+    }
+}
+
+impl Inside {
+    fn packet(&mut self, time: Timestamp, interface: u32, packet: &Packet<'_>) {
+        match &packet.payload {
+            Payload::Datagram(datagram) => read(datagram.payload),
+            Payload::Fragment(fragment) => {
+                let key = FlowKey::new(0, interface, false, packet, fragment);
+                if let Some(whole) = self.0.fragment(time, key, fragment) {
+                    read(whole.payload());
+                }
+                assert!(self.0.bytes() <= Limits::default().bytes);
+            }
+            Payload::Other(_) => {}
+        }
+    }
+}
+
+fn read(datagram: &[u8]) {
+    walk::datagram(datagram, &Envelope::default(), None, |found| {
+        assert!(found.payload.len() <= datagram.len());
+    });
+}

@@ -1,0 +1,56 @@
+//! The fuzz targets' entry functions over their seeds and all truncations of them, so that what
+//! fuzzing checks is also checked where there is no fuzzer.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    reason = "a failed expectation may panic"
+)]
+
+#[path = "../fuzz/src/lib.rs"]
+mod entry;
+
+use std::fs;
+use std::path::Path;
+
+/// Seeds longer than this are cut and changed only up to here.
+const LENGTH: usize = 2_000;
+
+/// Every seed in a directory, every truncation of it, and every byte of it changed.
+fn run(directory: &str, entry: fn(&[u8])) {
+    let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join(directory);
+    let mut count = 0;
+    for seed in fs::read_dir(directory).unwrap() {
+        let mut bytes = fs::read(seed.unwrap().path()).unwrap();
+        count += 1;
+        entry(&bytes);
+        bytes.truncate(LENGTH);
+        for length in 0..bytes.len() {
+            entry(&bytes[..length]);
+        }
+        for position in 0..bytes.len() {
+            let byte = bytes[position];
+            for changed in [0x00, 0xff, byte ^ 0x01, byte ^ 0x80] {
+                bytes[position] = changed;
+                entry(&bytes);
+            }
+            bytes[position] = byte;
+        }
+    }
+    assert!(count > 0);
+}
+
+#[test]
+fn captures_survive() {
+    run("fuzz/seeds/capture", entry::capture);
+}
+
+#[test]
+fn ring_blocks_survive() {
+    run("fuzz/seeds/ring_block", entry::ring_block);
+}
+
+#[test]
+fn configurations_survive() {
+    run("fuzz/seeds/configuration", entry::configuration);
+}
