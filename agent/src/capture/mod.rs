@@ -4,4 +4,5 @@ pub mod filter;
 pub mod interfaces;
 pub mod netns;
 pub mod pcap;
+pub mod replay;
 pub mod ring;

@@ -181,6 +181,15 @@ impl Samples {
         expired
     }
 
+    /// Moves what the unfinished samples take from one budget to another.
+    pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
+        let bytes: usize = self.partial.iter().map(|each| each.bitmap.len() * 8).sum();
+        from.bytes = from.bytes.saturating_sub(bytes);
+        from.samples = from.samples.saturating_sub(self.partial.len());
+        to.bytes += bytes;
+        to.samples += self.partial.len();
+    }
+
     /// Forgets all, returning their share to the budget.
     pub fn clear(&mut self, budget: &mut Budget) {
         while !self.partial.is_empty() {

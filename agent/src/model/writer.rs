@@ -99,6 +99,11 @@ impl Writer {
         self.traits = traits;
     }
 
+    /// Moves what its unfinished samples take from one budget to another.
+    pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
+        self.samples.transfer(from, to);
+    }
+
     /// Messages counted.
     #[must_use]
     pub const fn messages(&self) -> u64 {
@@ -163,13 +168,6 @@ impl Writer {
         let (sequence, mut settling) = self.parts(scene);
         sequence.settle_all(&mut |settled| settling.take(settled));
         self.samples.clear(scene.budget);
-    }
-
-    /// Nobody looks for a while: what is counted stays, sequence numbers begin anew afterwards.
-    pub fn pause(&mut self, scene: &mut Scene<'_>) {
-        self.settle(scene);
-        self.sequence = Sequence::default();
-        self.last_message = None;
     }
 
     /// Everything counted so far.
@@ -685,21 +683,6 @@ mod tests {
         bench.data(500).data(501).wait(5000);
         let facts = bench.facts();
         assert_eq!((facts.messages, facts.lost, facts.irrelevant), (4, 0, 497));
-    }
-
-    #[test]
-    fn a_pause_is_no_loss() {
-        let mut bench = Bench::new(Traits::default());
-        bench.data(1).data(2);
-        let now = Timestamp(bench.now);
-        let (budget, journal) = (&mut bench.budget, &mut bench.journal);
-        bench.writer.pause(&mut Scene {
-            now,
-            budget,
-            journal,
-        });
-        bench.data(900).wait(5000);
-        assert_eq!((bench.facts().messages, bench.facts().lost), (3, 0));
     }
 
     #[test]

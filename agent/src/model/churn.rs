@@ -1,0 +1,97 @@
+//! How often participants, endpoints and nodes came and went: the counters behind an alert on a
+//! flapping robot. Bounded: few kinds, and no more domains than ports allow.
+
+use std::collections::BTreeMap;
+
+use ros2probe_wire::discovery::Role;
+
+use super::snapshot::ChurnCount;
+
+/// Who.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Entity {
+    /// A participant.
+    Participant,
+    /// A writer.
+    Writer,
+    /// A reader.
+    Reader,
+    /// A node.
+    Node,
+}
+
+/// What happened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Event {
+    /// Announced for the first time, or again after it was gone.
+    Appeared,
+    /// Announced with other properties.
+    Changed,
+    /// It said goodbye.
+    Disposed,
+    /// Its lease ran out.
+    Expired,
+    /// It went with its participant.
+    Cascaded,
+}
+
+impl Entity {
+    /// Of an endpoint.
+    #[must_use]
+    pub const fn of(role: Role) -> Self {
+        match role {
+            Role::Writer => Self::Writer,
+            Role::Reader => Self::Reader,
+        }
+    }
+
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Participant => "participant",
+            Self::Writer => "writer",
+            Self::Reader => "reader",
+            Self::Node => "node",
+        }
+    }
+}
+
+impl Event {
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Appeared => "appeared",
+            Self::Changed => "changed",
+            Self::Disposed => "disposed",
+            Self::Expired => "expired",
+            Self::Cascaded => "cascaded",
+        }
+    }
+}
+
+/// The counters.
+#[derive(Debug, Default)]
+pub struct Churn {
+    counts: BTreeMap<(u32, Entity, Event), u64>,
+}
+
+impl Churn {
+    /// Counts one.
+    pub fn count(&mut self, domain_id: u32, entity: Entity, event: Event) {
+        *self.counts.entry((domain_id, entity, event)).or_default() += 1;
+    }
+
+    /// All counters that are not zero, sorted.
+    #[must_use]
+    pub fn facts(&self) -> Vec<ChurnCount> {
+        let fact = |((domain_id, entity, event), count): (&(u32, Entity, Event), &u64)| ChurnCount {
+            domain_id: *domain_id,
+            entity: entity.label(),
+            event: event.label(),
+            count: *count,
+        };
+        self.counts.iter().map(fact).collect()
+    }
+}

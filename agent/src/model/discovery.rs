@@ -1,0 +1,682 @@
+//! Who is there: participants, their endpoints and nodes, as discovery told.
+//!
+//! Identity comes from payloads. A participant lives until it is disposed or its lease ends; with
+//! it go its endpoints and nodes. An endpoint's life is its own: that its participant is announced
+//! again says nothing about it. Every table is capped: what was there before a flood of forgeries
+//! stays, newcomers are refused until there is room.
+
+use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::sync::Arc;
+
+use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, Role, TypeHash};
+use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
+use ros2probe_wire::qos::Qos;
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
+
+use super::churn::{Churn, Entity, Event};
+use super::journal::{DiscoveryEvent, Journal};
+
+const SECOND: u64 = 1_000_000_000;
+/// A participant that was seen over this span is no forgery of the moment.
+const ESTABLISHED: u64 = 2 * SECOND;
+/// One that is not established makes room after this long without a word.
+const DOUBTFUL: u64 = 5 * SECOND;
+/// How often a full table is searched for room.
+const SEARCH: u64 = SECOND / 10;
+/// Announcements older than a disposal are stale, for this long after it.
+const BURIED: u64 = SECOND / 2;
+const BURIALS: usize = 256;
+/// Endpoints and nodes whose participant is not known yet: how many and how long.
+const PENDING: usize = 1024;
+const PENDING_FOR: u64 = 60 * SECOND;
+/// Most endpoints of one participant.
+const PER_PARTICIPANT: usize = 4096;
+/// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
+const MAX_DOMAIN: u32 = 232;
+
+/// Caps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Caps {
+    /// Participants.
+    pub participants: usize,
+    /// Endpoints.
+    pub endpoints: usize,
+    /// Nodes.
+    pub nodes: usize,
+}
+
+/// How sure a participant's domain is, least first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum DomainSource {
+    /// Nothing told.
+    Assumed,
+    /// A unicast port that has the form of a discovery port.
+    UnicastPort,
+    /// The multicast port it announces itself on.
+    MulticastPort,
+    /// It said so.
+    Announced,
+}
+
+/// Where an announcement came from.
+#[derive(Clone, Copy, Debug)]
+pub struct Origin {
+    /// When.
+    pub at: Timestamp,
+    /// Who sent it, perhaps on somebody else's behalf.
+    pub sender: GuidPrefix,
+    /// Its number among those of its writer.
+    pub sequence_number: u64,
+    /// Destination address, IPv4-mapped for IPv4.
+    pub destination: [u8; 16],
+    /// Destination port.
+    pub port: u16,
+}
+
+/// What a participant says about itself, as far as it is shown.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Portrait {
+    /// Implementation.
+    pub vendor: VendorId,
+    /// ROS enclave.
+    pub enclave: Option<Box<str>>,
+    /// Host name.
+    pub host: Option<Box<str>>,
+    /// Process name.
+    pub process_name: Option<Box<str>>,
+    /// Process id, or its low 16 bits.
+    pub process_id: Option<u32>,
+    /// Lease.
+    pub lease: Duration,
+    /// Announces security.
+    pub secured: bool,
+}
+
+/// One participant.
+#[derive(Debug)]
+pub struct Participant {
+    /// What it says.
+    pub portrait: Portrait,
+    /// Its domain.
+    pub domain_id: u32,
+    /// First announcement.
+    pub first_seen: Timestamp,
+    /// Last sign of life.
+    pub last_seen: Timestamp,
+    /// Its endpoints.
+    pub endpoints: BTreeSet<Guid>,
+    /// Its nodes.
+    pub nodes: Vec<Node>,
+    domain_source: DomainSource,
+    /// The `ros_discovery_info` sample that told the nodes.
+    nodes_from: Option<(Guid, u64)>,
+}
+
+/// One node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Node {
+    /// Fully qualified name.
+    pub name: Arc<str>,
+    /// Its writers.
+    pub writers: Vec<Guid>,
+    /// Its readers.
+    pub readers: Vec<Guid>,
+}
+
+/// One writer or reader.
+#[derive(Clone, Debug)]
+pub struct Endpoint {
+    /// Writer or reader.
+    pub role: Role,
+    /// Domain of its participant.
+    pub domain_id: u32,
+    /// DDS topic.
+    pub topic: Arc<str>,
+    /// ROS type.
+    pub message_type: Arc<str>,
+    /// RIHS01 hash.
+    pub type_hash: Option<TypeHash>,
+    /// Quality of service.
+    pub qos: Qos,
+    /// First announcement.
+    pub first_seen: Timestamp,
+}
+
+/// What the rest of the model has to follow up.
+#[derive(Debug)]
+pub enum Change {
+    /// An endpoint is there.
+    Appeared(Guid),
+    /// Its type or QoS is another.
+    Changed(Guid),
+    /// It is no more.
+    Gone(Guid, Box<Endpoint>),
+}
+
+/// Samples of `ros_discovery_info` that came before their participant.
+#[derive(Debug)]
+struct PendingNodes {
+    at: Timestamp,
+    writer: Guid,
+    sequence_number: u64,
+    nodes: Vec<Node>,
+}
+
+/// All participants, endpoints and nodes.
+#[derive(Debug)]
+pub struct Discovery {
+    caps: Caps,
+    participants: HashMap<GuidPrefix, Participant>,
+    endpoints: HashMap<Guid, Endpoint>,
+    pending_endpoints: VecDeque<(Timestamp, Box<EndpointAnnouncement>)>,
+    pending_nodes: HashMap<GuidPrefix, PendingNodes>,
+    /// What was disposed of last: when, by which sender's which sample.
+    buried: VecDeque<(Guid, Timestamp, GuidPrefix, u64)>,
+    node_count: usize,
+    changes: Vec<Change>,
+    /// Counters of events.
+    pub churn: Churn,
+    evictions: Evictions,
+    search_after: Timestamp,
+}
+
+/// Entries refused or given up because of a cap.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Evictions {
+    /// Participants.
+    pub participants: u64,
+    /// Endpoints, pending ones included.
+    pub endpoints: u64,
+    /// Nodes.
+    pub nodes: u64,
+}
+
+impl Discovery {
+    /// Nobody there.
+    #[must_use]
+    pub fn new(caps: Caps) -> Self {
+        Self {
+            caps,
+            participants: HashMap::new(),
+            endpoints: HashMap::new(),
+            pending_endpoints: VecDeque::new(),
+            pending_nodes: HashMap::new(),
+            buried: VecDeque::new(),
+            node_count: 0,
+            changes: Vec::new(),
+            churn: Churn::default(),
+            evictions: Evictions::default(),
+            search_after: Timestamp(0),
+        }
+    }
+
+    /// Everybody.
+    #[must_use]
+    pub const fn participants(&self) -> &HashMap<GuidPrefix, Participant> {
+        &self.participants
+    }
+
+    /// All endpoints of known participants.
+    #[must_use]
+    pub const fn endpoints(&self) -> &HashMap<Guid, Endpoint> {
+        &self.endpoints
+    }
+
+    /// Nodes of all participants.
+    #[must_use]
+    pub const fn node_count(&self) -> usize {
+        self.node_count
+    }
+
+    /// What the caps cost.
+    #[must_use]
+    pub const fn evictions(&self) -> Evictions {
+        self.evictions
+    }
+
+    /// Whether this endpoint was disposed of a moment ago: what it sent may still be on its way.
+    #[must_use]
+    pub fn was_buried(&self, guid: Guid, now: Timestamp) -> bool {
+        self.buried
+            .iter()
+            .any(|(buried, at, ..)| *buried == guid && at.0 + 4 * BURIED > now.0)
+    }
+
+    /// What happened to endpoints since the last call.
+    pub fn changes(&mut self) -> Vec<Change> {
+        std::mem::take(&mut self.changes)
+    }
+
+    /// Something of this participant was seen: its lease begins anew.
+    pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp) {
+        if let Some(participant) = self.participants.get_mut(&prefix) {
+            participant.last_seen = participant.last_seen.max(at);
+        }
+    }
+
+    /// SPDP: it is there.
+    pub fn participant(
+        &mut self,
+        announcement: &ParticipantAnnouncement,
+        origin: &Origin,
+        journal: &mut Journal,
+    ) {
+        let guid = announcement.guid;
+        if self.is_stale(guid, origin) {
+            return;
+        }
+        let (domain_id, source) = domain(announcement.domain_id, origin);
+        let portrait = Portrait::of(announcement);
+        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
+            participant.last_seen = participant.last_seen.max(origin.at);
+            if participant.portrait != portrait {
+                participant.portrait = portrait;
+                let domain_id = participant.domain_id;
+                self.note(domain_id, Entity::Participant, Event::Changed, guid, "", origin.at, journal);
+            }
+            self.move_to(guid.prefix, domain_id, source);
+            return;
+        }
+        if self.participants.len() >= self.caps.participants && !self.make_room(origin.at) {
+            self.evictions.participants += 1;
+            return;
+        }
+        self.participants.insert(
+            guid.prefix,
+            Participant {
+                portrait,
+                domain_id,
+                first_seen: origin.at,
+                last_seen: origin.at,
+                endpoints: BTreeSet::new(),
+                nodes: Vec::new(),
+                domain_source: source,
+                nodes_from: None,
+            },
+        );
+        self.note(domain_id, Entity::Participant, Event::Appeared, guid, "", origin.at, journal);
+        self.adopt_pending(guid.prefix, origin.at, journal);
+    }
+
+    /// SPDP: it says goodbye.
+    pub fn participant_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
+        if guid.entity != EntityId::PARTICIPANT {
+            return;
+        }
+        self.bury(guid, origin);
+        self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
+    }
+
+    /// SEDP: an endpoint is there.
+    pub fn endpoint(
+        &mut self,
+        announcement: EndpointAnnouncement,
+        origin: &Origin,
+        journal: &mut Journal,
+    ) {
+        if self.is_stale(announcement.guid, origin) {
+            return;
+        }
+        if self.participants.contains_key(&announcement.guid.prefix) {
+            self.admit(announcement, origin.at, journal);
+            return;
+        }
+        let guid = announcement.guid;
+        self.pending_endpoints.retain(|(_, pending)| pending.guid != guid);
+        if self.pending_endpoints.len() >= PENDING {
+            self.pending_endpoints.pop_front();
+            self.evictions.endpoints += 1;
+        }
+        self.pending_endpoints.push_back((origin.at, Box::new(announcement)));
+    }
+
+    /// SEDP: an endpoint says goodbye.
+    pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
+        self.bury(guid, origin);
+        self.pending_endpoints.retain(|(_, pending)| pending.guid != guid);
+        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
+            participant.endpoints.remove(&guid);
+        }
+        self.drop_endpoint(guid, Some(Event::Disposed), origin.at, journal);
+    }
+
+    /// `ros_discovery_info`: these are the participant's nodes now.
+    pub fn entities(
+        &mut self,
+        entities: &ParticipantEntities,
+        writer: Guid,
+        origin: &Origin,
+        journal: &mut Journal,
+    ) {
+        // A participant tells of its own nodes only.
+        let prefix = entities.participant.prefix;
+        if prefix != writer.prefix {
+            return;
+        }
+        let room = self.caps.nodes.saturating_sub(self.node_count);
+        let known = self.participants.get(&prefix).map_or(0, |known| known.nodes.len());
+        let nodes: Vec<Node> =
+            entities.nodes.iter().take(room + known).map(Node::of).collect();
+        self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
+        if self.participants.contains_key(&prefix) {
+            self.set_nodes(prefix, writer, origin.sequence_number, nodes, origin.at, journal);
+            return;
+        }
+        let older = |pending: &PendingNodes| {
+            pending.writer == writer && pending.sequence_number >= origin.sequence_number
+        };
+        if self.pending_nodes.get(&prefix).is_some_and(older) {
+            return;
+        }
+        if self.pending_nodes.len() >= PENDING / 8 && !self.pending_nodes.contains_key(&prefix) {
+            let oldest = self.pending_nodes.iter().min_by_key(|(_, pending)| pending.at);
+            if let Some(oldest) = oldest.map(|(prefix, _)| *prefix) {
+                self.pending_nodes.remove(&oldest);
+                self.evictions.nodes += 1;
+            }
+        }
+        let sequence_number = origin.sequence_number;
+        let pending = PendingNodes { at: origin.at, writer, sequence_number, nodes };
+        self.pending_nodes.insert(prefix, pending);
+    }
+
+    /// Ends leases that have run out at `now`.
+    pub fn advance(&mut self, now: Timestamp, journal: &mut Journal) {
+        let mut expired: Vec<_> = self
+            .participants
+            .iter()
+            .filter_map(|(prefix, participant)| {
+                let Duration::Finite(lease) = participant.portrait.lease else { return None };
+                let end = participant.last_seen.0.saturating_add(lease);
+                (end <= now.0).then_some((end, *prefix))
+            })
+            .collect();
+        expired.sort_unstable();
+        for (end, prefix) in expired {
+            self.remove(prefix, Timestamp(end), Some(Event::Expired), journal);
+        }
+        let fresh = |at: Timestamp| at.0.saturating_add(PENDING_FOR) > now.0;
+        while self.pending_endpoints.front().is_some_and(|(at, _)| !fresh(*at)) {
+            self.pending_endpoints.pop_front();
+        }
+        self.pending_nodes.retain(|_, pending| fresh(pending.at));
+    }
+
+    /// Puts an announced endpoint into its known participant.
+    fn admit(&mut self, announcement: EndpointAnnouncement, at: Timestamp, journal: &mut Journal) {
+        let guid = announcement.guid;
+        let Some(participant) = self.participants.get(&guid.prefix) else { return };
+        let domain_id = participant.domain_id;
+        let entity = Entity::of(announcement.role);
+        if let Some(known) = self.endpoints.get_mut(&guid) {
+            if *known.topic == *announcement.topic.as_str() {
+                let before = (known.type_hash, known.qos.clone(), Arc::clone(&known.message_type));
+                known.qos = announcement.qos;
+                known.type_hash = announcement.type_hash;
+                known.message_type = announcement.type_name.message().as_str().into();
+                let unchanged = before.0 == known.type_hash
+                    && before.1 == known.qos
+                    && before.2 == known.message_type;
+                if !unchanged {
+                    let topic = Arc::clone(&known.topic);
+                    self.changes.push(Change::Changed(guid));
+                    self.note(domain_id, entity, Event::Changed, guid, &topic, at, journal);
+                }
+                return;
+            }
+            // The same GUID on another topic: its dispose was missed.
+            self.drop_endpoint(guid, Some(Event::Disposed), at, journal);
+        }
+        let own = self.participants.get(&guid.prefix).map_or(0, |known| known.endpoints.len());
+        let full = self.endpoints.len() >= self.caps.endpoints && !self.make_room(at);
+        if full || own >= PER_PARTICIPANT {
+            self.evictions.endpoints += 1;
+            return;
+        }
+        let endpoint = Endpoint {
+            role: announcement.role,
+            domain_id,
+            topic: announcement.topic.as_str().into(),
+            message_type: announcement.type_name.message().as_str().into(),
+            type_hash: announcement.type_hash,
+            qos: announcement.qos,
+            first_seen: at,
+        };
+        let topic = Arc::clone(&endpoint.topic);
+        self.endpoints.insert(guid, endpoint);
+        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
+            participant.endpoints.insert(guid);
+        }
+        self.changes.push(Change::Appeared(guid));
+        self.note(domain_id, entity, Event::Appeared, guid, &topic, at, journal);
+    }
+
+    /// What waited for this participant.
+    fn adopt_pending(&mut self, prefix: GuidPrefix, at: Timestamp, journal: &mut Journal) {
+        let (adopted, waiting) = std::mem::take(&mut self.pending_endpoints)
+            .into_iter()
+            .partition(|(_, pending)| pending.guid.prefix == prefix);
+        self.pending_endpoints = waiting;
+        let adopted: VecDeque<(Timestamp, Box<EndpointAnnouncement>)> = adopted;
+        for (_, announcement) in adopted {
+            self.admit(*announcement, at, journal);
+        }
+        if let Some(pending) = self.pending_nodes.remove(&prefix) {
+            let PendingNodes { writer, sequence_number, nodes, .. } = pending;
+            self.set_nodes(prefix, writer, sequence_number, nodes, at, journal);
+        }
+    }
+
+    fn set_nodes(
+        &mut self,
+        prefix: GuidPrefix,
+        writer: Guid,
+        sequence_number: u64,
+        nodes: Vec<Node>,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) {
+        let Some(participant) = self.participants.get_mut(&prefix) else { return };
+        let older = |(from, number): (Guid, u64)| from == writer && number >= sequence_number;
+        if participant.nodes_from.is_some_and(older) {
+            return;
+        }
+        participant.nodes_from = Some((writer, sequence_number));
+        let domain_id = participant.domain_id;
+        let before = std::mem::replace(&mut participant.nodes, nodes);
+        let after: Vec<_> = participant.nodes.iter().map(|node| Arc::clone(&node.name)).collect();
+        self.node_count = self.node_count + after.len() - before.len().min(self.node_count);
+        let before: Vec<_> = before.into_iter().map(|node| node.name).collect();
+        let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+        for name in difference(&before, &after) {
+            self.note(domain_id, Entity::Node, Event::Disposed, guid, &name, at, journal);
+        }
+        for name in difference(&after, &before) {
+            self.note(domain_id, Entity::Node, Event::Appeared, guid, &name, at, journal);
+        }
+    }
+
+    /// Takes a participant out with all it has; `event` is `None` for a silent eviction.
+    fn remove(
+        &mut self,
+        prefix: GuidPrefix,
+        at: Timestamp,
+        event: Option<Event>,
+        journal: &mut Journal,
+    ) {
+        self.pending_nodes.remove(&prefix);
+        self.pending_endpoints.retain(|(_, pending)| pending.guid.prefix != prefix);
+        let Some(participant) = self.participants.remove(&prefix) else { return };
+        let domain_id = participant.domain_id;
+        let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+        if let Some(event) = event {
+            self.note(domain_id, Entity::Participant, event, guid, "", at, journal);
+        }
+        let cascade = event.map(|_| Event::Cascaded);
+        for endpoint in participant.endpoints {
+            self.drop_endpoint(endpoint, cascade, at, journal);
+        }
+        self.node_count = self.node_count.saturating_sub(participant.nodes.len());
+        if let Some(event) = cascade {
+            for node in participant.nodes {
+                self.note(domain_id, Entity::Node, event, guid, &node.name, at, journal);
+            }
+        }
+    }
+
+    fn drop_endpoint(
+        &mut self,
+        guid: Guid,
+        event: Option<Event>,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) {
+        let Some(endpoint) = self.endpoints.remove(&guid) else { return };
+        if let Some(event) = event {
+            let entity = Entity::of(endpoint.role);
+            self.note(endpoint.domain_id, entity, event, guid, &endpoint.topic, at, journal);
+        }
+        self.changes.push(Change::Gone(guid, Box::new(endpoint)));
+    }
+
+    /// A participant's domain is told better than before: all it has moves along.
+    fn move_to(&mut self, prefix: GuidPrefix, domain_id: u32, source: DomainSource) {
+        let Some(participant) = self.participants.get_mut(&prefix) else { return };
+        if source <= participant.domain_source {
+            return;
+        }
+        participant.domain_source = source;
+        if participant.domain_id == domain_id {
+            return;
+        }
+        participant.domain_id = domain_id;
+        for guid in &participant.endpoints {
+            if let Some(endpoint) = self.endpoints.get_mut(guid) {
+                self.changes.push(Change::Gone(*guid, Box::new(endpoint.clone())));
+                endpoint.domain_id = domain_id;
+                self.changes.push(Change::Appeared(*guid));
+            }
+        }
+    }
+
+    /// Gives up a participant that said something once and nothing since.
+    fn make_room(&mut self, now: Timestamp) -> bool {
+        if now < self.search_after {
+            return false;
+        }
+        let doubtful = self.participants.iter().filter(|(_, participant)| {
+            let span = participant.last_seen.0.saturating_sub(participant.first_seen.0);
+            span < ESTABLISHED && participant.last_seen.0.saturating_add(DOUBTFUL) <= now.0
+        });
+        let oldest = doubtful.min_by_key(|(prefix, participant)| (participant.last_seen, **prefix));
+        let Some(prefix) = oldest.map(|(prefix, _)| *prefix) else {
+            self.search_after = Timestamp(now.0.saturating_add(SEARCH));
+            return false;
+        };
+        self.evictions.participants += 1;
+        self.remove(prefix, now, None, &mut Journal::default());
+        self.participants.len() < self.caps.participants
+            && self.endpoints.len() < self.caps.endpoints
+    }
+
+    fn bury(&mut self, guid: Guid, origin: &Origin) {
+        if self.buried.len() >= BURIALS {
+            self.buried.pop_front();
+        }
+        self.buried.push_back((guid, origin.at, origin.sender, origin.sequence_number));
+    }
+
+    /// A copy of an announcement that overtook or was overtaken by its own disposal.
+    fn is_stale(&self, guid: Guid, origin: &Origin) -> bool {
+        self.buried.iter().rev().any(|(buried, at, sender, number)| {
+            *buried == guid
+                && *sender == origin.sender
+                && *number > origin.sequence_number
+                && at.0.saturating_add(BURIED) > origin.at.0
+        })
+    }
+
+    #[expect(clippy::too_many_arguments, reason = "an event has that many sides")]
+    fn note(
+        &mut self,
+        domain_id: u32,
+        entity: Entity,
+        event: Event,
+        guid: Guid,
+        name: &str,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) {
+        self.churn.count(domain_id, entity, event);
+        journal.note(DiscoveryEvent {
+            at,
+            domain_id,
+            entity: entity.label(),
+            event: event.label(),
+            guid,
+            name: name.into(),
+        });
+    }
+}
+
+impl Portrait {
+    fn of(announcement: &ParticipantAnnouncement) -> Self {
+        let low_bits = || announcement.process_id_low_bits().map(u32::from);
+        Self {
+            vendor: announcement.vendor,
+            enclave: announcement.enclave.as_deref().map(Into::into),
+            host: announcement.host_name().map(Into::into),
+            process_name: announcement.process_name().map(Into::into),
+            process_id: announcement.process_id().or_else(low_bits),
+            lease: announcement.lease,
+            secured: announcement.is_secured,
+        }
+    }
+}
+
+impl Node {
+    fn of(node: &NodeEntities) -> Self {
+        Self {
+            name: node.fully_qualified_name().into(),
+            writers: node.writers.clone(),
+            readers: node.readers.clone(),
+        }
+    }
+}
+
+/// Names of `one` that are not in `other`, each as often as it is missing there.
+fn difference(one: &[Arc<str>], other: &[Arc<str>]) -> Vec<Arc<str>> {
+    let mut rest: Vec<_> = other.to_vec();
+    let mut missing = Vec::new();
+    for name in one {
+        match rest.iter().position(|each| each == name) {
+            Some(index) => drop(rest.swap_remove(index)),
+            None => missing.push(Arc::clone(name)),
+        }
+    }
+    missing
+}
+
+/// The participant's domain: as announced, else by the port its announcement went to (RTPS 2.5,
+/// 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p), else 0. Ports from 32768 on are
+/// mostly ephemeral ones and tell nothing.
+fn domain(announced: Option<u32>, origin: &Origin) -> (u32, DomainSource) {
+    const EPHEMERAL: u16 = 32_768;
+    if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= MAX_DOMAIN) {
+        return (domain_id, DomainSource::Announced);
+    }
+    let Some(offset) = origin.port.checked_sub(7400) else {
+        return (0, DomainSource::Assumed);
+    };
+    let (domain_id, rest) = (u32::from(offset / 250), offset % 250);
+    let [first, .., a, _, _, _] = origin.destination;
+    let is_multicast = first == 0xff || first == 0 && a & 0xf0 == 0xe0;
+    if is_multicast && rest == 0 && domain_id <= MAX_DOMAIN {
+        return (domain_id, DomainSource::MulticastPort);
+    }
+    if rest >= 10 && rest % 2 == 0 && origin.port < EPHEMERAL {
+        return (domain_id, DomainSource::UnicastPort);
+    }
+    (0, DomainSource::Assumed)
+}

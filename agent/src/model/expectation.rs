@@ -1,0 +1,268 @@
+//! Whether a watched topic does what its watchlist entry expects.
+//!
+//! Judged once a second of the source's clock. One bad second is no violation and one good second
+//! no recovery: it takes [`BAD`] and [`GOOD`] in a row. Rates are judged over a window that holds
+//! at least three expected messages (1 to 10 s), one message of tolerance at its edges, so that a
+//! healthy periodic topic never wavers. Silence has its own time and needs no further patience.
+
+use ros2probe_wire::Timestamp;
+
+use super::rate::{SECONDS, Slot};
+use super::snapshot::WatchState;
+use crate::config::Expectations;
+
+/// Consecutive bad judgements until a topic is violated.
+const BAD: u8 = 2;
+/// Consecutive good ones until it is not any more.
+const GOOD: u8 = 3;
+const NAMES: [&str; 5] =
+    ["min_rate_hz", "max_rate_hz", "max_loss_ratio", "max_latency_ms", "max_silence_s"];
+const MIN_RATE: u8 = 1 << 0;
+const MAX_RATE: u8 = 1 << 1;
+const MAX_LOSS: u8 = 1 << 2;
+const MAX_LATENCY: u8 = 1 << 3;
+const MAX_SILENCE: u8 = 1 << 4;
+
+/// What a topic is judged by.
+pub struct Evidence<'a> {
+    /// When.
+    pub now: Timestamp,
+    /// Live writers.
+    pub publishers: usize,
+    /// Live readers.
+    pub subscriptions: usize,
+    /// Last message of any writer.
+    pub last_message: Option<Timestamp>,
+    /// Since when it has had a writer and been watched.
+    pub since: Timestamp,
+    /// Counts of the last whole seconds and how many those are.
+    pub recent: &'a dyn Fn(u64) -> (Slot, u64),
+}
+
+/// How one topic stands with one entry.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Judgement {
+    state: WatchState,
+    violated: bool,
+    broken: u8,
+    bad: u8,
+    good: u8,
+}
+
+impl Default for Judgement {
+    fn default() -> Self {
+        Self { state: WatchState::Ok, violated: false, broken: 0, bad: 0, good: 0 }
+    }
+}
+
+impl Judgement {
+    /// The state.
+    #[must_use]
+    pub const fn state(&self) -> WatchState {
+        self.state
+    }
+
+    /// Which expectations are broken.
+    #[must_use]
+    pub fn violations(&self) -> Vec<&'static str> {
+        let broken = |bit: &usize| self.broken & 1 << bit != 0;
+        (0..NAMES.len()).filter(broken).filter_map(|bit| NAMES.get(bit).copied()).collect()
+    }
+
+    /// Judges once more.
+    pub fn judge(&mut self, expectations: &Expectations, evidence: &Evidence<'_>) {
+        let broken = broken(expectations, evidence);
+        let silent = broken & MAX_SILENCE != 0;
+        if broken & !MAX_SILENCE == 0 {
+            (self.bad, self.good) = (0, self.good.saturating_add(1));
+        } else {
+            (self.bad, self.good) = (self.bad.saturating_add(1), 0);
+        }
+        if self.bad >= BAD {
+            self.violated = true;
+        } else if self.good >= GOOD {
+            self.violated = false;
+        }
+        let quiet = silent || evidence.last_message.is_none();
+        self.state = if evidence.publishers == 0 {
+            WatchState::NotPublished
+        } else if evidence.subscriptions == 0 && quiet {
+            WatchState::NoSubscriber
+        } else if silent {
+            WatchState::Silent
+        } else if self.violated {
+            WatchState::Violated
+        } else {
+            WatchState::Ok
+        };
+        match self.state {
+            WatchState::Silent => self.broken = broken,
+            // While it holds on without a broken expectation, the last ones stand.
+            WatchState::Violated if broken != 0 => self.broken = broken,
+            WatchState::Violated => {}
+            _ => self.broken = 0,
+        }
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts of ten seconds are far below 2^52")]
+fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
+    let mut broken = 0;
+    if let Some(minimum) = expectations.min_rate_hz {
+        let (slot, seconds) = (evidence.recent)(window(minimum));
+        if seconds > 0 && (slot.messages + 1) as f64 <= minimum * seconds as f64 {
+            broken |= MIN_RATE;
+        }
+    }
+    if let Some(maximum) = expectations.max_rate_hz {
+        let (slot, seconds) = (evidence.recent)(window(maximum));
+        if seconds > 0 && slot.messages as f64 >= maximum * seconds as f64 + 1.0 {
+            broken |= MAX_RATE;
+        }
+    }
+    if let Some(maximum) = expectations.max_loss_ratio {
+        let (slot, _) = (evidence.recent)(SECONDS);
+        let sent = slot.messages + slot.lost;
+        if sent > 0 && slot.lost as f64 > maximum * sent as f64 {
+            broken |= MAX_LOSS;
+        }
+    }
+    if let Some(maximum) = expectations.max_latency_ms {
+        let (slot, _) = (evidence.recent)(1);
+        if slot.delayed > 0 && slot.delay * 1000.0 > maximum * slot.delayed as f64 {
+            broken |= MAX_LATENCY;
+        }
+    }
+    if let Some(maximum) = expectations.max_silence_s {
+        let last = evidence.last_message.map_or(evidence.since, |last| last.max(evidence.since));
+        if evidence.now.nanoseconds_since(last) as f64 / 1e9 > maximum {
+            broken |= MAX_SILENCE;
+        }
+    }
+    broken
+}
+
+/// Whole seconds in which three messages of this rate are due.
+fn window(rate: f64) -> u64 {
+    let seconds = (3.0 / rate.max(0.01)).ceil();
+    (1..SECONDS).find(|window| seconds <= f64::from(u32::try_from(*window).unwrap_or(1))).unwrap_or(SECONDS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: u64 = 1_000_000_000;
+
+    struct Bench {
+        judgement: Judgement,
+        expectations: Expectations,
+        now: u64,
+        last_message: Option<Timestamp>,
+        subscriptions: usize,
+        publishers: usize,
+    }
+
+    impl Bench {
+        fn new(expectations: Expectations) -> Self {
+            Self {
+                judgement: Judgement::default(),
+                expectations,
+                now: 1000 * SECOND,
+                last_message: None,
+                subscriptions: 1,
+                publishers: 1,
+            }
+        }
+
+        /// One second with these counts.
+        fn second(&mut self, slot: Slot) -> WatchState {
+            self.now += SECOND;
+            if slot.messages > 0 {
+                self.last_message = Some(Timestamp(self.now));
+            }
+            let recent = |seconds: u64| {
+                let mut sum = Slot::default();
+                (0..seconds).for_each(|_| sum.add(&slot));
+                (sum, seconds)
+            };
+            self.judgement.judge(
+                &self.expectations,
+                &Evidence {
+                    now: Timestamp(self.now),
+                    publishers: self.publishers,
+                    subscriptions: self.subscriptions,
+                    last_message: self.last_message,
+                    since: Timestamp(1000 * SECOND),
+                    recent: &recent,
+                },
+            );
+            self.judgement.state()
+        }
+    }
+
+    fn rate(messages: u64) -> Slot {
+        Slot { messages, ..Slot::default() }
+    }
+
+    #[test]
+    fn one_bad_second_is_no_violation_and_one_good_one_no_recovery() {
+        let mut bench =
+            Bench::new(Expectations { min_rate_hz: Some(10.0), ..Expectations::default() });
+        let states: Vec<_> =
+            [10, 4, 10, 4, 4, 10, 10, 10].map(|messages| bench.second(rate(messages))).into();
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [ok, ok, ok, ok, bad, bad, bad, ok]);
+    }
+
+    #[test]
+    fn a_periodic_topic_at_its_limit_does_not_waver() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(20.0),
+            max_rate_hz: Some(20.0),
+            ..Expectations::default()
+        });
+        for messages in [20, 19, 21, 20, 20, 19] {
+            // 19 and 21 are what jitter makes of 20 at the window's edges.
+            let state = bench.second(rate(messages));
+            assert!(matches!(state, WatchState::Ok | WatchState::Violated));
+        }
+        assert_eq!(window(0.5), 6);
+        assert_eq!((window(200.0), window(0.01)), (1, 10));
+    }
+
+    #[test]
+    fn violations_are_named() {
+        let mut bench = Bench::new(Expectations {
+            max_rate_hz: Some(5.0),
+            max_loss_ratio: Some(0.01),
+            max_latency_ms: Some(50.0),
+            ..Expectations::default()
+        });
+        let slot = Slot { messages: 10, lost: 1, delayed: 10, delay: 1.0, bytes: 0 };
+        bench.second(slot);
+        assert_eq!(bench.second(slot), WatchState::Violated);
+        let violations = bench.judgement.violations();
+        assert_eq!(violations, ["max_rate_hz", "max_loss_ratio", "max_latency_ms"]);
+    }
+
+    #[test]
+    fn silence_counts_from_the_first_publisher() {
+        let mut bench =
+            Bench::new(Expectations { max_silence_s: Some(2.0), ..Expectations::default() });
+        let states: Vec<_> = [0, 0, 0, 5].map(|messages| bench.second(rate(messages))).into();
+        let (ok, silent) = (WatchState::Ok, WatchState::Silent);
+        assert_eq!(states, [ok, ok, silent, ok]);
+    }
+
+    #[test]
+    fn without_subscriber_or_publisher_nothing_is_expected() {
+        let mut bench =
+            Bench::new(Expectations { max_silence_s: Some(1.0), ..Expectations::default() });
+        bench.subscriptions = 0;
+        assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
+        bench.publishers = 0;
+        assert_eq!(bench.second(rate(0)), WatchState::NotPublished);
+        assert!(bench.judgement.violations().is_empty());
+    }
+}

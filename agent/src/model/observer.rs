@@ -1,0 +1,566 @@
+//! The core's entry: datagrams and records in, interest and snapshots out.
+//!
+//! Everything happens in the source's time, which the caller passes in: the same input gives the
+//! same facts, live or replayed at any speed. It reads no clock, sends nothing and keeps no packet.
+
+use std::collections::BTreeMap;
+
+use ros2probe_wire::discovery::{self, Role};
+use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::names::DdsTopic;
+use ros2probe_wire::parameters::ParameterList;
+use ros2probe_wire::qos::{Durability, Reliability};
+use ros2probe_wire::record::{Handover, Verdict, kind};
+use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
+use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
+use ros2probe_wire::{
+    Cursor, Endianness, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError,
+};
+
+use super::discovery::{Caps, Change, Discovery, Endpoint, Origin};
+use super::expectation::Evidence;
+use super::header::begins_with_header;
+use super::interest::Interest;
+use super::journal::Journal;
+use super::pieces::Pieces;
+use super::profiler::Profiler;
+use super::rate::Slot;
+use super::snapshot::Snapshot;
+use super::topic::{Naming, TopicId, Topics, Watched};
+use super::writer::Traits;
+use crate::config::{Limits, Watchlist};
+
+const SECOND: u64 = 1_000_000_000;
+/// How often leases, windows and gaps are looked at.
+const TICK: u64 = SECOND / 10;
+/// A clock that jumps further than this is set, not followed tick by tick.
+const JUMP: u64 = 3600 * SECOND;
+
+/// Caps and times.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Settings {
+    /// Participants.
+    pub participants: usize,
+    /// Endpoints.
+    pub endpoints: usize,
+    /// Nodes.
+    pub nodes: usize,
+    /// Topics that are measured.
+    pub topics: usize,
+    /// Writers that send without a known announcement.
+    pub unknown_writers: usize,
+    /// Entries of the kernel's interest map.
+    pub interest: usize,
+    /// Bytes for the bitmaps of fragmented samples.
+    pub sample_bytes: usize,
+    /// Nanoseconds for which a topic without endpoints is still reported.
+    pub topic_grace: u64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            participants: 1024,
+            endpoints: 16_384,
+            nodes: 4096,
+            topics: 1000,
+            unknown_writers: 256,
+            interest: 16_384,
+            sample_bytes: 1 << 20,
+            topic_grace: 600 * SECOND,
+        }
+    }
+}
+
+impl Settings {
+    /// With the caps of the configuration.
+    #[must_use]
+    pub fn with_limits(self, limits: &Limits) -> Self {
+        Self {
+            participants: limits.participants,
+            endpoints: limits.endpoints,
+            topics: limits.topics,
+            unknown_writers: limits.unknown_writers,
+            ..self
+        }
+    }
+}
+
+/// The core.
+#[derive(Debug)]
+pub struct Observer {
+    pub(super) settings: Settings,
+    pub(super) watchlist: Watchlist,
+    pub(super) discovery: Discovery,
+    pub(super) topics: Topics,
+    pub(super) interest: Interest,
+    pub(super) profiler: Profiler,
+    pub(super) pieces: Pieces,
+    pub(super) decode_errors: BTreeMap<(&'static str, &'static str), u64>,
+    pub(super) datagrams: u64,
+    pub(super) records: u64,
+    journal: Journal,
+    /// Time up to which everything is settled.
+    clock: Timestamp,
+}
+
+impl Observer {
+    /// Nothing seen, nothing watched.
+    #[must_use]
+    pub fn new(settings: Settings) -> Self {
+        let caps = Caps {
+            participants: settings.participants,
+            endpoints: settings.endpoints,
+            nodes: settings.nodes,
+        };
+        Self {
+            settings,
+            watchlist: Watchlist::default(),
+            discovery: Discovery::new(caps),
+            topics: Topics::default(),
+            interest: Interest::new(settings.interest),
+            profiler: Profiler::new(settings.unknown_writers, settings.sample_bytes),
+            pieces: Pieces::default(),
+            decode_errors: BTreeMap::new(),
+            datagrams: 0,
+            records: 0,
+            journal: Journal::default(),
+            clock: Timestamp(0),
+        }
+    }
+
+    /// Watches these from now on. What was counted of a topic that is no more watched stays.
+    pub fn set_watchlist(&mut self, watchlist: Watchlist) {
+        self.watchlist = watchlist;
+        // First give places back, then hand them out.
+        for pass in [Watched::Yes, Watched::No] {
+            for id in self.topics.ids() {
+                let watched = self.topics.get(id).map(|topic| topic.watched);
+                if (watched == Some(Watched::Yes)) == (pass == Watched::Yes) {
+                    self.consult(id);
+                }
+            }
+        }
+    }
+
+    /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`
+    /// the kernel filter has reported what lies before its offset.
+    pub fn datagram(&mut self, envelope: &Envelope, payload: &[u8], handover: Option<&Handover>) {
+        self.datagrams += 1;
+        let vendor = payload.get(6..8).and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
+        let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
+        let outcome =
+            walk::datagram(payload, envelope, handover, |found| self.found(&found, vendor, envelope));
+        if outcome == Outcome::Malformed {
+            self.decode_error("rtps", Reason::BadLength);
+        }
+    }
+
+    /// Takes in a datagram of which a capture kept only the beginning: what it says about its
+    /// submessages counts, its payloads are not read.
+    pub fn cut_datagram(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
+        self.datagrams += 1;
+        self.decode_error("frame", Reason::Truncated);
+        let length = length.min(u16::MAX.into()).try_into().unwrap_or(0);
+        let mut padded = payload.to_vec();
+        padded.resize(payload.len().max(length), 0);
+        walk::datagram(&padded, envelope, None, |found| self.count(&found.record));
+    }
+
+    /// Takes in one record of a complete datagram, its time in nanoseconds since the Unix epoch.
+    pub fn record(&mut self, record: &Record) {
+        self.count(record);
+    }
+
+    /// These participants were last seen then, as the kernel filter knows without a record.
+    pub fn participants_alive(&mut self, alive: impl IntoIterator<Item = (GuidPrefix, Timestamp)>) {
+        for (prefix, at) in alive {
+            self.discovery.seen(prefix, at);
+        }
+    }
+
+    /// Says what time it is: ends leases, settles gaps, judges expectations.
+    pub fn advance(&mut self, now: Timestamp) {
+        if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
+            self.clock = Timestamp(now.0 - now.0 % TICK);
+            self.tick(self.clock);
+        }
+        while self.clock.0 + TICK <= now.0 {
+            self.clock = Timestamp(self.clock.0 + TICK);
+            self.tick(self.clock);
+        }
+    }
+
+    /// Nothing more will come: decides what is still open, without letting time pass.
+    pub fn settle(&mut self) {
+        self.profiler.settle(self.clock, &mut self.journal);
+    }
+
+    /// What the kernel filter has to be told since the last call; `None` = remove the entry.
+    pub fn interest_changes(&mut self) -> Vec<(Guid, Option<Verdict>)> {
+        self.interest.changes()
+    }
+
+    /// The latest discovery events and losses.
+    #[must_use]
+    pub const fn journal(&self) -> &Journal {
+        &self.journal
+    }
+
+    /// All facts at this moment.
+    #[must_use]
+    pub fn snapshot(&self, now: Timestamp) -> Snapshot {
+        super::report::snapshot(self, now)
+    }
+
+    /// Counts a parse failure, also of those outside who parse for the core.
+    pub fn decode_error(&mut self, stage: &'static str, reason: Reason) {
+        *self.decode_errors.entry((stage, reason.label())).or_default() += 1;
+    }
+
+    fn count(&mut self, record: &Record) {
+        self.records += 1;
+        let (writer, at) = (record.writer(), Timestamp(record.time));
+        if record.kind == kind::ACKNACK {
+            self.discovery.seen(record.reader().prefix, at);
+        } else {
+            self.discovery.seen(writer.prefix, at);
+        }
+        if writer.entity.is_builtin() || record.kind == kind::HANDOVER {
+            return;
+        }
+        if self.profiler.record(writer, record, &mut self.journal) {
+            return;
+        }
+        let is_strange = writer.entity.is_writer()
+            && !self.discovery.endpoints().contains_key(&writer)
+            && !self.discovery.was_buried(writer, at);
+        if is_strange {
+            self.profiler.stranger(writer, record, &mut self.journal);
+        }
+    }
+
+    fn found(&mut self, found: &Found<'_>, vendor: Option<VendorId>, envelope: &Envelope) {
+        let record = &found.record;
+        if matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
+            let prefix = record.writer().prefix;
+            let [first, second, ..] = prefix.0;
+            let vendor = vendor.unwrap_or(VendorId([first, second]));
+            let origin = Origin {
+                at: Timestamp(envelope.time),
+                sender: prefix,
+                sequence_number: record.sequence_number,
+                destination: envelope.destination,
+                port: envelope.destination_port,
+            };
+            self.read(found, vendor, &origin);
+            self.follow_up(origin.at);
+        }
+        self.count(record);
+    }
+
+    /// Reads what is of use to discovery.
+    fn read(&mut self, found: &Found<'_>, vendor: VendorId, origin: &Origin) {
+        let record = &found.record;
+        let writer = record.writer();
+        let stage = match writer.entity {
+            EntityId::SPDP_WRITER | EntityId::SPDP_SECURE_WRITER => "spdp",
+            EntityId::SEDP_PUBLICATIONS_WRITER
+            | EntityId::SEDP_SUBSCRIPTIONS_WRITER
+            | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER
+            | EntityId::SEDP_SUBSCRIPTIONS_SECURE_WRITER => "sedp",
+            entity if !entity.is_builtin() && self.may_tell_entities(found) => "entities",
+            _ => return,
+        };
+        let whole;
+        let (payload, inline_qos) = if record.kind == kind::DATA_FRAG {
+            let Some(bytes) = self.pieces.put(record, found.payload) else { return };
+            whole = bytes;
+            let status_info = StatusInfo(record.status_info);
+            (Payload::Data(&whole), Ok(InlineQos { status_info, ..InlineQos::default() }))
+        } else {
+            (data_payload(found), inline_qos(found, vendor))
+        };
+        let told = inline_qos.and_then(|inline_qos| match stage {
+            "spdp" => self.participant(vendor, payload, &inline_qos, origin),
+            "sedp" => self.endpoint(writer.entity, vendor, payload, &inline_qos, origin),
+            _ => self.entities(writer, payload, origin),
+        });
+        if let Err(error) = told {
+            self.decode_error(stage, error.reason);
+        }
+    }
+
+    /// Announced on `ros_discovery_info`, or not announced yet and of its form: the sample is sent
+    /// once, perhaps before the announcement is understood.
+    fn may_tell_entities(&self, found: &Found<'_>) -> bool {
+        let record = &found.record;
+        let writer = record.writer();
+        if record.status_info != 0 {
+            return false;
+        }
+        if let Some(endpoint) = self.discovery.endpoints().get(&writer) {
+            return &*endpoint.topic == "ros_discovery_info";
+        }
+        let own = Guid::new(writer.prefix, EntityId::PARTICIPANT).to_bytes();
+        let begins = found.payload.get(4..20).is_some_and(|gid| *gid == own);
+        match record.kind {
+            kind::DATA => begins,
+            _ => record.fragment_start == 1 && begins || self.pieces.holds(record),
+        }
+    }
+
+    fn participant(
+        &mut self,
+        vendor: VendorId,
+        payload: Payload<'_>,
+        inline_qos: &InlineQos,
+        origin: &Origin,
+    ) -> Result<(), WireError> {
+        match discovery::participant(vendor, payload, inline_qos)? {
+            discovery::Discovery::Alive(announcement) => {
+                self.discovery.participant(&announcement, origin, &mut self.journal);
+            }
+            discovery::Discovery::Gone { guid, .. } => {
+                self.discovery.participant_gone(guid, origin, &mut self.journal);
+            }
+        }
+        Ok(())
+    }
+
+    fn endpoint(
+        &mut self,
+        entity: EntityId,
+        vendor: VendorId,
+        payload: Payload<'_>,
+        inline_qos: &InlineQos,
+        origin: &Origin,
+    ) -> Result<(), WireError> {
+        let role = match entity {
+            EntityId::SEDP_PUBLICATIONS_WRITER | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER => {
+                Role::Writer
+            }
+            _ => Role::Reader,
+        };
+        match discovery::endpoint(role, vendor, payload, inline_qos)? {
+            discovery::Discovery::Alive(announcement) => {
+                self.discovery.endpoint(announcement, origin, &mut self.journal);
+            }
+            discovery::Discovery::Gone { guid, .. } => {
+                self.discovery.endpoint_gone(guid, origin, &mut self.journal);
+            }
+        }
+        Ok(())
+    }
+
+    fn entities(
+        &mut self,
+        writer: Guid,
+        payload: Payload<'_>,
+        origin: &Origin,
+    ) -> Result<(), WireError> {
+        let entities = ParticipantEntities::parse(payload.bytes())?;
+        self.discovery.entities(&entities, writer, origin, &mut self.journal);
+        Ok(())
+    }
+
+    /// Lets topics, interest and measurement follow discovery.
+    fn follow_up(&mut self, now: Timestamp) {
+        for change in self.discovery.changes() {
+            match change {
+                Change::Appeared(guid) => self.appeared(guid, now),
+                Change::Changed(guid) => {
+                    let Some(endpoint) = self.discovery.endpoints().get(&guid) else { continue };
+                    self.profiler.learn(guid, traits(endpoint));
+                }
+                Change::Gone(guid, endpoint) => self.gone(guid, &endpoint, now),
+            }
+        }
+    }
+
+    fn appeared(&mut self, guid: Guid, now: Timestamp) {
+        let Some(endpoint) = self.discovery.endpoints().get(&guid) else { return };
+        let Some(naming) = naming(endpoint) else { return };
+        let role = endpoint.role;
+        let (id, is_new) = self.topics.join(endpoint.domain_id, &naming, guid, role, now);
+        if is_new {
+            self.topics.shrink(self.settings.endpoints);
+            self.consult(id);
+        }
+        self.apply(id, guid, now);
+        let opened = self.topics.get(id).filter(|topic| topic.watched == Watched::Yes);
+        if let Some(topic) = opened.filter(|_| role == Role::Reader) {
+            for writer in topic.writers.iter().chain(&topic.beside) {
+                self.profiler.open(*writer, now);
+            }
+        }
+    }
+
+    fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: Timestamp) {
+        self.interest.remove(guid);
+        self.retire(guid, now);
+        let id = naming(endpoint).and_then(|naming| self.topics.find(endpoint.domain_id, &naming));
+        if let Some(id) = id {
+            self.topics.leave(id, guid, now);
+        }
+    }
+
+    /// Asks the watchlist about a topic and lets its endpoints follow.
+    fn consult(&mut self, id: TopicId) {
+        let now = self.clock;
+        self.topics.consult(id, &self.watchlist, self.settings.topics, now);
+        let Some(topic) = self.topics.get(id) else { return };
+        let lists = [&topic.writers, &topic.readers, &topic.beside];
+        let guids: Vec<_> = lists.into_iter().flatten().copied().collect();
+        for guid in guids {
+            self.apply(id, guid, now);
+        }
+    }
+
+    /// Decides about one endpoint of a topic.
+    fn apply(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
+        let Some(topic) = self.topics.get(id) else { return };
+        let Some(endpoint) = self.discovery.endpoints().get(&guid) else { return };
+        let is_watched = topic.watched == Watched::Yes;
+        match endpoint.role {
+            Role::Reader if is_watched => self.interest.set(guid, Verdict::Meter),
+            Role::Reader => self.interest.remove(guid),
+            Role::Writer => {
+                let counts = naming(endpoint).is_some_and(|naming| naming.counts);
+                let measured = is_watched && counts;
+                let verdict = match topic.naming.kind {
+                    "discovery" => Verdict::Capture,
+                    _ if measured => Verdict::Meter,
+                    _ => Verdict::Ignore,
+                };
+                self.interest.set(guid, verdict);
+                if measured {
+                    let (traits, opened) = (traits(endpoint), topic.reader_appeared);
+                    self.profiler.measure(guid, id, traits, opened, now);
+                } else {
+                    self.retire(guid, now);
+                }
+            }
+        }
+    }
+
+    /// Measures this writer no more; its topic keeps what it had counted.
+    fn retire(&mut self, guid: Guid, now: Timestamp) {
+        let Some((id, measurement)) = self.profiler.stop(guid, now, &mut self.journal) else {
+            return;
+        };
+        if let Some(topic) = self.topics.get_mut(id) {
+            topic.retire(&measurement);
+        }
+    }
+
+    fn tick(&mut self, now: Timestamp) {
+        self.discovery.advance(now, &mut self.journal);
+        self.follow_up(now);
+        let strangers = self.profiler.advance(now, &mut self.journal);
+        for guid in strangers.metered {
+            self.interest.set(guid, Verdict::Meter);
+        }
+        for guid in strangers.forgotten {
+            self.interest.remove(guid);
+        }
+        if now.0 % SECOND == 0 {
+            self.topics.expire(now, self.settings.topic_grace);
+            self.promote();
+            self.judge(now);
+        }
+    }
+
+    /// Gives free measuring places to topics that were kept out.
+    fn promote(&mut self) {
+        if self.topics.watched() >= self.settings.topics {
+            return;
+        }
+        let rejected = self.topics.iter().filter(|(_, topic)| topic.watched == Watched::Rejected);
+        let rejected: Vec<_> = rejected.map(|(id, _)| id).collect();
+        for id in rejected {
+            self.consult(id);
+        }
+    }
+
+    /// Judges every watched topic under every entry that covers it.
+    fn judge(&mut self, now: Timestamp) {
+        for id in self.topics.ids() {
+            let Some(topic) = self.topics.get(id) else { continue };
+            if topic.judgements.is_empty() {
+                continue;
+            }
+            let writers: Vec<_> = topic
+                .writers
+                .iter()
+                .chain(&topic.beside)
+                .filter_map(|guid| self.profiler.get(*guid))
+                .collect();
+            let last_message = writers.iter().filter_map(|each| each.writer.last_message()).max();
+            let retired = topic.retired.as_ref().and_then(|retired| retired.last_message);
+            let recent = |seconds: u64| {
+                writers.iter().fold((Slot::default(), 0), |(mut sum, longest), each| {
+                    let (slot, seconds) = each.writer.recent(now, seconds);
+                    sum.add(&slot);
+                    (sum, seconds.max(longest))
+                })
+            };
+            let evidence = Evidence {
+                now,
+                publishers: topic.writers.len(),
+                subscriptions: topic.readers.len(),
+                last_message: last_message.max(retired),
+                since: topic.published,
+                recent: &recent,
+            };
+            let mut judgements = topic.judgements.clone();
+            for (index, judgement) in &mut judgements {
+                if let Some(watch) = self.watchlist.watches().get(*index) {
+                    judgement.judge(&watch.expectations, &evidence);
+                }
+            }
+            if let Some(topic) = self.topics.get_mut(id) {
+                topic.judgements = judgements;
+            }
+        }
+    }
+}
+
+pub(super) fn naming(endpoint: &Endpoint) -> Option<Naming> {
+    DdsTopic::parse(&endpoint.topic).ok().map(|topic| Naming::of(&topic))
+}
+
+fn traits(endpoint: &Endpoint) -> Traits {
+    Traits {
+        reliable: endpoint.qos.reliability == Reliability::RELIABLE,
+        keeps_history: endpoint.qos.durability != Durability::VOLATILE,
+        has_header: begins_with_header(&endpoint.message_type),
+    }
+}
+
+/// Flags of DATA besides E (RTPS 2.5, 9.4.5.4).
+const INLINE_QOS_FLAG: u8 = 0x02;
+const DATA_FLAG: u8 = 0x04;
+const KEY_FLAG: u8 = 0x08;
+
+fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
+    match found.record.submessage_flags & (DATA_FLAG | KEY_FLAG) {
+        0 => Payload::None,
+        KEY_FLAG => Payload::Key(found.payload),
+        _ => Payload::Data(found.payload),
+    }
+}
+
+/// Inline QoS of a DATA submessage: behind `octetsToInlineQos`, which counts from its own end.
+fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireError> {
+    let flags = found.record.submessage_flags;
+    if flags & INLINE_QOS_FLAG == 0 {
+        return Ok(InlineQos::default());
+    }
+    let endianness = if flags & 1 == 1 { Endianness::Little } else { Endianness::Big };
+    let mut cursor = Cursor::new(found.body, endianness);
+    cursor.u16("extraFlags")?;
+    let octets = cursor.u16("octetsToInlineQos")?;
+    cursor.take("octetsToInlineQos", octets.into())?;
+    InlineQos::parse(ParameterList::inline(cursor), vendor)
+}

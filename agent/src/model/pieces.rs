@@ -1,0 +1,138 @@
+//! Payloads of discovery samples that come in DATA_FRAGs: Cyclone DDS cuts from 1344 bytes on, and
+//! a participant with a few nodes says more than that in `ros_discovery_info`.
+//!
+//! Only for samples the model reads; measured ones never come here. Keeps bytes that came, within
+//! a budget, and forgets the oldest sample first.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use ros2probe_wire::{Guid, Record};
+
+/// Largest sample kept; far more than any discovery data.
+const MAX_SAMPLE: u32 = 256 * 1024;
+/// All samples together.
+const BUDGET: usize = 1 << 20;
+/// Samples under way at once; real participants have one each, for a moment.
+const SAMPLES: usize = 64;
+/// What keeping one fragment costs besides its bytes.
+const OVERHEAD: usize = 64;
+
+/// The unfinished samples, oldest first.
+#[derive(Debug, Default)]
+pub struct Pieces {
+    samples: VecDeque<Sample>,
+    bytes: usize,
+    evictions: u64,
+}
+
+#[derive(Debug)]
+struct Sample {
+    writer: Guid,
+    number: u64,
+    size: u32,
+    fragment_size: u32,
+    fragments: BTreeMap<u32, Box<[u8]>>,
+    bytes: usize,
+}
+
+impl Pieces {
+    /// Whether fragments of this sample were kept.
+    #[must_use]
+    pub fn holds(&self, record: &Record) -> bool {
+        self.place(record).is_some()
+    }
+
+    /// Samples given up.
+    #[must_use]
+    pub const fn evictions(&self) -> u64 {
+        self.evictions
+    }
+
+    /// Keeps the fragments of one DATA_FRAG; gives the payload when all have come.
+    pub fn put(&mut self, record: &Record, bytes: &[u8]) -> Option<Vec<u8>> {
+        let (size, fragment_size) = (record.sample_size, record.fragment_size());
+        if size > MAX_SAMPLE || size == 0 || fragment_size == 0 || record.fragment_start == 0 {
+            return None;
+        }
+        let index = self.place(record).unwrap_or_else(|| {
+            self.samples.push_back(Sample {
+                writer: record.writer(),
+                number: record.sequence_number,
+                size,
+                fragment_size,
+                fragments: BTreeMap::new(),
+                bytes: OVERHEAD,
+            });
+            self.bytes += OVERHEAD;
+            self.samples.len() - 1
+        });
+        let sample = self.samples.get_mut(index)?;
+        let total = size.div_ceil(fragment_size);
+        if sample.size == size && sample.fragment_size == fragment_size {
+            let chunks = bytes.chunks(usize::try_from(fragment_size).ok()?);
+            for (number, chunk) in (record.fragment_start..=total).zip(chunks) {
+                let last = if number == total { size - (total - 1) * fragment_size } else { fragment_size };
+                // The last one may have padding behind it.
+                let Some(chunk) = chunk.get(..usize::try_from(last).ok()?) else { break };
+                if sample.fragments.insert(number, chunk.into()).is_none() {
+                    sample.bytes += chunk.len() + OVERHEAD;
+                    self.bytes += chunk.len() + OVERHEAD;
+                }
+            }
+        }
+        if sample.fragments.len() == usize::try_from(total).ok()? {
+            let sample = self.samples.remove(index)?;
+            self.bytes = self.bytes.saturating_sub(sample.bytes);
+            let parts: Vec<_> = sample.fragments.into_values().collect();
+            return Some(parts.concat());
+        }
+        while self.bytes > BUDGET || self.samples.len() > SAMPLES {
+            let oldest = self.samples.pop_front()?;
+            self.bytes = self.bytes.saturating_sub(oldest.bytes);
+            self.evictions += 1;
+        }
+        None
+    }
+
+    fn place(&self, record: &Record) -> Option<usize> {
+        let writer = record.writer();
+        self.samples
+            .iter()
+            .position(|each| each.writer == writer && each.number == record.sequence_number)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
+        Record {
+            sequence_number: number,
+            fragment_start: start,
+            fragments: count << 16 | 100,
+            sample_size: size,
+            ..Record::default()
+        }
+    }
+
+    #[test]
+    fn fragments_in_any_order_and_several_at_once_make_the_payload() {
+        let payload: Vec<u8> = (0..=249).collect();
+        let mut pieces = Pieces::default();
+        assert_eq!(pieces.put(&fragment(1, 3, 1, 250), &payload[200..]), None);
+        assert!(pieces.holds(&fragment(1, 1, 1, 250)));
+        assert_eq!(pieces.put(&fragment(1, 1, 2, 250), &payload[..200]), Some(payload));
+        assert_eq!((pieces.bytes, pieces.samples.len()), (0, 0));
+    }
+
+    #[test]
+    fn a_claimed_size_allocates_nothing_and_a_storm_stays_in_the_budget() {
+        let mut pieces = Pieces::default();
+        assert_eq!(pieces.put(&fragment(1, 1, 1, u32::MAX), &[0; 100]), None);
+        for number in 0..100_000 {
+            pieces.put(&fragment(number, 1, 1, 200_000), &[0; 100]);
+        }
+        assert!(pieces.bytes <= BUDGET && pieces.evictions > 0);
+    }
+}

@@ -1,0 +1,262 @@
+//! The writers that are measured: those of watched topics, and strangers that send without a known
+//! announcement.
+//!
+//! Strangers are few: beyond the cap a new one is refused until one has been silent for a while.
+//! What was there before a flood of invented GUIDs keeps its place.
+
+use std::collections::HashMap;
+
+use ros2probe_wire::record::kind;
+use ros2probe_wire::{Guid, Record, Timestamp};
+
+use super::journal::Journal;
+use super::samples::Budget;
+use super::snapshot::Measurement;
+use super::topic::TopicId;
+use super::writer::{Scene, Traits, Writer};
+
+const SECOND: u64 = 1_000_000_000;
+/// A stranger is shown and metered after this long: announcements come within a second or so.
+const STRANGE: u64 = 3 * SECOND;
+/// A stranger that is silent this long is forgotten; one that sent little makes room sooner.
+const FORGET: u64 = 30 * SECOND;
+const DOUBTFUL: u64 = 3 * SECOND;
+/// Messages after which a stranger is somebody.
+const SOMEBODY: u64 = 10;
+/// Strangers may use this part of the memory for fragmented samples.
+const STRANGERS_SHARE: usize = 4;
+
+/// One measured writer.
+#[derive(Debug)]
+pub struct Measured {
+    /// What is measured.
+    pub writer: Box<Writer>,
+    /// Its topic; `None` for a stranger.
+    pub topic: Option<TopicId>,
+    /// First record or announcement.
+    pub first_seen: Timestamp,
+    /// Last record.
+    pub last_seen: Timestamp,
+    /// A stranger that has been one for long enough.
+    pub metered: bool,
+    opened: Timestamp,
+}
+
+/// All measured writers.
+#[derive(Debug)]
+pub struct Profiler {
+    writers: HashMap<Guid, Measured>,
+    strangers: usize,
+    stranger_limit: usize,
+    stranger_evictions: u64,
+    budget: Budget,
+    strangers_budget: Budget,
+    search_after: Timestamp,
+}
+
+/// What became of the strangers.
+#[derive(Debug, Default)]
+pub struct Strangers {
+    /// To be metered from now on.
+    pub metered: Vec<Guid>,
+    /// Forgotten.
+    pub forgotten: Vec<Guid>,
+}
+
+impl Profiler {
+    /// Nobody measured.
+    #[must_use]
+    pub fn new(stranger_limit: usize, sample_bytes: usize) -> Self {
+        Self {
+            writers: HashMap::new(),
+            strangers: 0,
+            stranger_limit,
+            stranger_evictions: 0,
+            budget: Budget::new(sample_bytes),
+            strangers_budget: Budget::new(sample_bytes / STRANGERS_SHARE),
+            search_after: Timestamp(0),
+        }
+    }
+
+    /// One of them.
+    #[must_use]
+    pub fn get(&self, guid: Guid) -> Option<&Measured> {
+        self.writers.get(&guid)
+    }
+
+    /// All of them.
+    pub fn iter(&self) -> impl Iterator<Item = (&Guid, &Measured)> {
+        self.writers.iter()
+    }
+
+    /// Writers of topics, strangers, the strangers' cap, and strangers refused or forgotten for it.
+    #[must_use]
+    pub fn size(&self) -> (usize, usize, usize, u64) {
+        let known = self.writers.len() - self.strangers;
+        (known, self.strangers, self.stranger_limit, self.stranger_evictions)
+    }
+
+    /// Memory for fragmented samples, of writers of topics and of strangers.
+    #[must_use]
+    pub const fn budgets(&self) -> [&Budget; 2] {
+        [&self.budget, &self.strangers_budget]
+    }
+
+    /// Takes in a record of a measured writer; `false` if it is of another.
+    pub fn record(&mut self, guid: Guid, record: &Record, journal: &mut Journal) -> bool {
+        let Some(measured) = self.writers.get_mut(&guid) else { return false };
+        let now = Timestamp(record.time);
+        measured.last_seen = measured.last_seen.max(now);
+        let budget = match measured.topic {
+            Some(_) => &mut self.budget,
+            None => &mut self.strangers_budget,
+        };
+        measured.writer.record(record, measured.opened, &mut Scene { now, budget, journal });
+        true
+    }
+
+    /// Takes in a record of a writer nobody announced.
+    pub fn stranger(&mut self, guid: Guid, record: &Record, journal: &mut Journal) {
+        if !matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
+            return;
+        }
+        let now = Timestamp(record.time);
+        if self.strangers >= self.stranger_limit && !self.make_room(now) {
+            self.stranger_evictions += 1;
+            return;
+        }
+        self.strangers += 1;
+        self.writers.insert(guid, Measured::new(Writer::new(guid, Traits::default()), None, now));
+        self.record(guid, record, journal);
+    }
+
+    /// Measures this writer of a topic from now on; what it was measured as a stranger comes along.
+    pub fn measure(
+        &mut self,
+        guid: Guid,
+        topic: TopicId,
+        traits: Traits,
+        opened: Timestamp,
+        now: Timestamp,
+    ) {
+        if let Some(known) = self.writers.get_mut(&guid) {
+            known.writer.learn(traits);
+            known.opened = opened;
+            if known.topic.is_none() {
+                // Its unfinished samples are paid for by the other budget from now on.
+                known.writer.transfer(&mut self.strangers_budget, &mut self.budget);
+                self.strangers -= 1;
+            }
+            known.topic = Some(topic);
+            return;
+        }
+        let mut measured = Measured::new(Writer::new(guid, traits), Some(topic), now);
+        measured.opened = opened;
+        self.writers.insert(guid, measured);
+    }
+
+    /// Discovery says more of this writer.
+    pub fn learn(&mut self, guid: Guid, traits: Traits) {
+        if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.writer.learn(traits);
+        }
+    }
+
+    /// A new reader makes the samples of this writer come where they can be seen.
+    pub fn open(&mut self, guid: Guid, at: Timestamp) {
+        if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.opened = at;
+        }
+    }
+
+    /// Measures this writer no more; what it had counted, if it belonged to a topic.
+    pub fn stop(
+        &mut self,
+        guid: Guid,
+        now: Timestamp,
+        journal: &mut Journal,
+    ) -> Option<(TopicId, Measurement)> {
+        let mut measured = self.writers.remove(&guid)?;
+        let budget = match measured.topic {
+            Some(_) => &mut self.budget,
+            None => &mut self.strangers_budget,
+        };
+        measured.writer.settle(&mut Scene { now, budget, journal });
+        self.strangers -= usize::from(measured.topic.is_none());
+        Some((measured.topic?, measured.writer.measurement(now)))
+    }
+
+    /// Settles what has waited long enough.
+    pub fn advance(&mut self, now: Timestamp, journal: &mut Journal) -> Strangers {
+        let mut strangers = Strangers::default();
+        for (guid, measured) in &mut self.writers {
+            let budget = match measured.topic {
+                Some(_) => &mut self.budget,
+                None => &mut self.strangers_budget,
+            };
+            measured.writer.advance(&mut Scene { now, budget, journal });
+            if measured.topic.is_some() {
+                continue;
+            }
+            if measured.last_seen.0.saturating_add(FORGET) <= now.0 {
+                strangers.forgotten.push(*guid);
+            } else if !measured.metered && measured.first_seen.0.saturating_add(STRANGE) <= now.0 {
+                measured.metered = true;
+                strangers.metered.push(*guid);
+            }
+        }
+        strangers.metered.sort_unstable();
+        strangers.forgotten.sort_unstable();
+        for guid in &strangers.forgotten {
+            self.stop(*guid, now, journal);
+        }
+        strangers
+    }
+
+    /// Settles everything: nothing more will come.
+    pub fn settle(&mut self, now: Timestamp, journal: &mut Journal) {
+        let mut guids: Vec<_> = self.writers.keys().copied().collect();
+        guids.sort_unstable();
+        for guid in guids {
+            let Some(measured) = self.writers.get_mut(&guid) else { continue };
+            let budget = match measured.topic {
+                Some(_) => &mut self.budget,
+                None => &mut self.strangers_budget,
+            };
+            measured.writer.settle(&mut Scene { now, budget, journal });
+        }
+    }
+
+    /// Forgets the stranger that has been silent longest, if it never was anybody.
+    fn make_room(&mut self, now: Timestamp) -> bool {
+        if now < self.search_after {
+            return false;
+        }
+        let doubtful = self.writers.iter().filter(|(_, measured)| {
+            measured.topic.is_none()
+                && measured.writer.messages() < SOMEBODY
+                && measured.last_seen.0.saturating_add(DOUBTFUL) <= now.0
+        });
+        let oldest = doubtful.min_by_key(|(guid, measured)| (measured.last_seen, **guid));
+        let Some(guid) = oldest.map(|(guid, _)| *guid) else {
+            self.search_after = Timestamp(now.0.saturating_add(SECOND / 10));
+            return false;
+        };
+        self.stranger_evictions += 1;
+        self.stop(guid, now, &mut Journal::default());
+        true
+    }
+}
+
+impl Measured {
+    fn new(writer: Writer, topic: Option<TopicId>, now: Timestamp) -> Self {
+        Self {
+            writer: Box::new(writer),
+            topic,
+            first_seen: now,
+            last_seen: now,
+            metered: false,
+            opened: Timestamp(0),
+        }
+    }
+}

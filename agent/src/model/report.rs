@@ -1,0 +1,260 @@
+//! Turns the core's state into a [`Snapshot`]: sorted copies, nothing computed that was not
+//! settled before.
+
+use std::collections::{BTreeSet, HashMap};
+
+use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::qos::HistoryKind;
+use ros2probe_wire::{Duration, EntityId, Guid, Timestamp};
+
+use super::discovery::{Discovery, Endpoint};
+use super::observer::Observer;
+use super::snapshot::{
+    DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Snapshot,
+    TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+};
+use super::topic::Topic;
+
+pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
+    let nodes = nodes_of_endpoints(&observer.discovery);
+    Snapshot {
+        at: now,
+        participants: participants(&observer.discovery),
+        nodes: node_facts(&observer.discovery),
+        topics: observer.topics.iter().map(|(_, topic)| self::topic(observer, topic, &nodes, now)).collect(),
+        unknown_writers: unknown_writers(observer, now),
+        watches: watches(observer),
+        churn: observer.discovery.churn.facts(),
+        decode_errors: decode_errors(observer),
+        tables: tables(observer),
+        datagrams: observer.datagrams,
+        records: observer.records,
+        topics_rejected: observer.topics.rejected,
+    }
+}
+
+fn participants(discovery: &Discovery) -> Vec<ParticipantFacts> {
+    let mut facts: Vec<_> = discovery
+        .participants()
+        .iter()
+        .map(|(prefix, participant)| {
+            let portrait = &participant.portrait;
+            ParticipantFacts {
+                guid: Guid::new(*prefix, EntityId::PARTICIPANT),
+                domain_id: participant.domain_id,
+                vendor: portrait.vendor.to_string(),
+                enclave: portrait.enclave.as_deref().map(Into::into),
+                host: portrait.host.as_deref().map(Into::into),
+                process_id: portrait.process_id,
+                process_name: portrait.process_name.as_deref().map(Into::into),
+                first_seen: participant.first_seen,
+                last_seen: participant.last_seen,
+                lease_nanoseconds: nanoseconds(portrait.lease),
+                secured: portrait.secured,
+            }
+        })
+        .collect();
+    facts.sort_unstable_by_key(|fact| (fact.domain_id, fact.guid));
+    facts
+}
+
+fn node_facts(discovery: &Discovery) -> Vec<NodeFacts> {
+    let mut facts = Vec::with_capacity(discovery.node_count());
+    for (prefix, participant) in discovery.participants() {
+        for node in &participant.nodes {
+            facts.push(NodeFacts {
+                domain_id: participant.domain_id,
+                name: node.name.as_ref().to_owned(),
+                participant: Guid::new(*prefix, EntityId::PARTICIPANT),
+                writers: node.writers.clone(),
+                readers: node.readers.clone(),
+            });
+        }
+    }
+    facts.sort_by(|one, other| {
+        (one.domain_id, &one.name, one.participant).cmp(&(
+            other.domain_id,
+            &other.name,
+            other.participant,
+        ))
+    });
+    facts
+}
+
+/// Which node an endpoint belongs to.
+fn nodes_of_endpoints(discovery: &Discovery) -> HashMap<Guid, &str> {
+    let mut nodes = HashMap::with_capacity(discovery.endpoints().len());
+    for participant in discovery.participants().values() {
+        for node in &participant.nodes {
+            for guid in node.writers.iter().chain(&node.readers) {
+                nodes.insert(*guid, &*node.name);
+            }
+        }
+    }
+    nodes
+}
+
+fn topic(
+    observer: &Observer,
+    topic: &Topic,
+    nodes: &HashMap<Guid, &str>,
+    now: Timestamp,
+) -> TopicFacts {
+    let endpoint = |guid: &Guid| {
+        let endpoint = observer.discovery.endpoints().get(guid)?;
+        let measured = observer.profiler.get(*guid).filter(|measured| measured.topic.is_some());
+        let measurement = measured.map(|measured| measured.writer.measurement(now));
+        Some(endpoint_facts(*guid, endpoint, nodes.get(guid).copied(), measurement))
+    };
+    let publishers: Vec<_> = topic.writers.iter().filter_map(endpoint).collect();
+    let subscriptions: Vec<_> = topic.readers.iter().filter_map(endpoint).collect();
+    let all = || publishers.iter().chain(&subscriptions);
+    let message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
+    let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash.clone()).collect();
+    let mut measurement = topic.retired.as_deref().cloned();
+    if let Some(sum) = &mut measurement {
+        let beside = topic.beside.iter().filter_map(|guid| {
+            Some(observer.profiler.get(*guid)?.writer.measurement(now))
+        });
+        beside.for_each(|beside| sum.add(&beside));
+        let own = publishers.iter().filter_map(|each| each.measurement.as_ref());
+        own.for_each(|own| sum.add(own));
+    }
+    TopicFacts {
+        domain_id: topic.domain_id,
+        name: topic.naming.name.as_ref().to_owned(),
+        dds_name: topic.naming.dds_name.as_ref().to_owned(),
+        kind: topic.naming.kind,
+        hidden: topic.naming.hidden,
+        message_types: message_types.into_iter().collect(),
+        type_hashes: type_hashes.into_iter().collect(),
+        publishers,
+        subscriptions,
+        measurement,
+        vanished: topic.is_vanished(),
+    }
+}
+
+fn endpoint_facts(
+    guid: Guid,
+    endpoint: &Endpoint,
+    node: Option<&str>,
+    measurement: Option<Measurement>,
+) -> EndpointFacts {
+    let qos = &endpoint.qos;
+    let history = match qos.history {
+        None => "UNKNOWN".to_owned(),
+        Some(history) if history.kind == HistoryKind::KEEP_LAST => {
+            format!("{} ({})", history.kind, history.depth)
+        }
+        Some(history) => history.kind.to_string(),
+    };
+    EndpointFacts {
+        guid,
+        node: node.map(ToOwned::to_owned),
+        reliability: qos.reliability.to_string(),
+        durability: qos.durability.to_string(),
+        history,
+        deadline_nanoseconds: nanoseconds(qos.deadline),
+        lifespan_nanoseconds: nanoseconds(qos.lifespan),
+        liveliness: qos.liveliness.to_string(),
+        liveliness_lease_nanoseconds: nanoseconds(qos.liveliness_lease),
+        message_type: endpoint.message_type.as_ref().to_owned(),
+        type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
+        first_seen: endpoint.first_seen,
+        measurement,
+    }
+}
+
+fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFacts> {
+    let strangers = observer.profiler.iter().filter(|(_, measured)| measured.metered && measured.topic.is_none());
+    let mut facts: Vec<_> = strangers
+        .map(|(guid, measured)| {
+            let participant = observer.discovery.participants().get(&guid.prefix);
+            UnknownWriterFacts {
+                guid: *guid,
+                vendor: participant.map(|known| known.portrait.vendor.to_string()),
+                first_seen: measured.first_seen,
+                measurement: measured.writer.measurement(now),
+            }
+        })
+        .collect();
+    facts.sort_unstable_by_key(|fact| fact.guid);
+    facts
+}
+
+fn watches(observer: &Observer) -> Vec<WatchFacts> {
+    let mut facts: Vec<_> = observer
+        .watchlist
+        .watches()
+        .iter()
+        .map(|watch| WatchFacts {
+            pattern: watch.pattern.clone(),
+            domain_id: watch.domain_id,
+            topics: Vec::new(),
+        })
+        .collect();
+    for (_, topic) in observer.topics.iter() {
+        for (index, judgement) in &topic.judgements {
+            let Some(fact) = facts.get_mut(*index) else { continue };
+            fact.topics.push(WatchedTopicFacts {
+                domain_id: topic.domain_id,
+                topic: topic.naming.name.as_ref().to_owned(),
+                state: judgement.state(),
+                violations: judgement.violations(),
+            });
+        }
+    }
+    for (watch, fact) in observer.watchlist.watches().iter().zip(&mut facts) {
+        if watch.is_literal() && fact.topics.is_empty() {
+            fact.topics.push(WatchedTopicFacts {
+                domain_id: watch.domain_id.unwrap_or(0),
+                topic: watch.pattern.clone(),
+                state: WatchState::NotPublished,
+                violations: Vec::new(),
+            });
+        }
+    }
+    facts
+}
+
+fn decode_errors(observer: &Observer) -> Vec<DecodeErrorCount> {
+    let fact = |((stage, reason), count): (&(&'static str, &'static str), &u64)| {
+        DecodeErrorCount { stage, reason, count: *count }
+    };
+    observer.decode_errors.iter().map(fact).collect()
+}
+
+fn tables(observer: &Observer) -> Vec<TableFacts> {
+    let Observer { settings, discovery, topics, profiler, .. } = observer;
+    let evictions = discovery.evictions();
+    let table = |table, size: usize, limit: usize, evictions| TableFacts {
+        table,
+        size: size as u64,
+        limit: limit as u64,
+        evictions,
+    };
+    let (writers, unknown, unknown_limit, unknown_evictions) = profiler.size();
+    let (interest, interest_limit, interest_evictions) = observer.interest.size();
+    let budgets = profiler.budgets();
+    let samples: usize = budgets.iter().map(|budget| budget.bytes).sum();
+    let samples_limit: usize = budgets.iter().map(|budget| budget.limit).sum();
+    let samples_evictions: u64 = budgets.iter().map(|budget| budget.evictions + budget.rejected).sum();
+    vec![
+        table("participants", discovery.participants().len(), settings.participants, evictions.participants),
+        table("endpoints", discovery.endpoints().len(), settings.endpoints, evictions.endpoints),
+        table("nodes", discovery.node_count(), settings.nodes, evictions.nodes),
+        table("topics", topics.len(), settings.endpoints, topics.evictions),
+        table("writers", writers, settings.endpoints, 0),
+        table("unknown_writers", unknown, unknown_limit, unknown_evictions),
+        table("samples", samples, samples_limit, samples_evictions + observer.pieces.evictions()),
+        table("interest", interest, interest_limit, interest_evictions),
+    ]
+}
+
+const fn nanoseconds(duration: Duration) -> Option<u64> {
+    match duration {
+        Duration::Finite(nanoseconds) => Some(nanoseconds),
+        Duration::Infinite => None,
+    }
+}

@@ -1,0 +1,424 @@
+//! Topics: what endpoints meet on, who watches, and what its writers that have gone had counted.
+//!
+//! A topic is a DDS name in one domain; the CPU buffer topics of `rmw_fastrtps` belong to the ROS
+//! topic they stand beside. A topic whose last endpoint has gone is kept for a grace period with
+//! its counters, so that its silence is seen rather than its series missed.
+
+use std::collections::{BTreeMap, HashMap};
+
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::names::{ActionPart, DdsTopic, RosName, TopicKind};
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::expectation::Judgement;
+use super::snapshot::Measurement;
+use crate::config::Watchlist;
+
+/// Handle of a topic.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TopicId(u64);
+
+/// What a topic is called and what it is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Naming {
+    /// DDS name; of a CPU buffer topic that of the topic beside it.
+    pub dds_name: Box<str>,
+    /// ROS name, or the DDS name.
+    pub name: Box<str>,
+    /// Label of what it is.
+    pub kind: &'static str,
+    /// Hidden by ROS convention.
+    pub hidden: bool,
+    /// The endpoint serves the topic from beside it, and is not one of its publishers.
+    pub beside: bool,
+    /// Its samples are messages.
+    pub counts: bool,
+}
+
+/// Whether a topic is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Watched {
+    /// Nobody asked.
+    No,
+    /// Measured.
+    Yes,
+    /// Asked for, but the cap is reached.
+    Rejected,
+}
+
+/// One topic.
+#[derive(Debug)]
+pub struct Topic {
+    /// Domain.
+    pub domain_id: u32,
+    /// Names.
+    pub naming: Naming,
+    /// Live writers.
+    pub writers: Vec<Guid>,
+    /// Live readers.
+    pub readers: Vec<Guid>,
+    /// Writers and readers beside it.
+    pub beside: Vec<Guid>,
+    /// Whether it is measured.
+    pub watched: Watched,
+    /// Watchlist entries that cover it, and how it stands with them.
+    pub judgements: Vec<(usize, Judgement)>,
+    /// What writers had counted that are measured no more.
+    pub retired: Option<Box<Measurement>>,
+    /// When a reader appeared last.
+    pub reader_appeared: Timestamp,
+    /// Since when it has been both published and watched.
+    pub published: Timestamp,
+    /// When its last endpoint went.
+    pub vanished: Option<Timestamp>,
+}
+
+/// All topics of all domains.
+#[derive(Debug, Default)]
+pub struct Topics {
+    topics: HashMap<TopicId, Topic>,
+    index: BTreeMap<(u32, Box<str>), TopicId>,
+    created: u64,
+    watched: usize,
+    /// How often the cap kept out a topic that somebody wanted.
+    pub rejected: u64,
+    /// Vanished topics given up before their grace period ended.
+    pub evictions: u64,
+}
+
+impl Naming {
+    /// Of a DDS topic.
+    #[must_use]
+    pub fn of(topic: &DdsTopic) -> Self {
+        let kind = topic.kind();
+        let (beside, counts) = match kind {
+            TopicKind::CpuBuffer(_) => (true, true),
+            TopicKind::Buffer(_) => (true, false),
+            _ => (false, true),
+        };
+        let named = |name: &RosName, kind: &'static str, dds_name: &DdsTopic| Self {
+            dds_name: dds_name.as_str().into(),
+            name: name.as_str().into(),
+            kind,
+            hidden: name.is_hidden(),
+            beside,
+            counts,
+        };
+        match &kind {
+            TopicKind::Topic(name) => named(name, topic_label(name), topic),
+            TopicKind::CpuBuffer(name) | TopicKind::Buffer(name) => {
+                named(name, topic_label(name), &DdsTopic::of_topic(name))
+            }
+            TopicKind::ServiceRequest(name) => named(name, "service_request", topic),
+            TopicKind::ServiceReply(name) => named(name, "service_reply", topic),
+            TopicKind::RosDiscovery => Self::verbatim(topic, "discovery"),
+            TopicKind::NotRos => Self::verbatim(topic, "dds"),
+        }
+    }
+
+    fn verbatim(topic: &DdsTopic, kind: &'static str) -> Self {
+        let name: Box<str> = topic.as_str().into();
+        Self { dds_name: name.clone(), name, kind, hidden: false, beside: false, counts: true }
+    }
+
+    /// Watchlist entries that cover it. Entries are about topics: services are covered only by
+    /// their DDS names. A hidden topic is covered when an entry names a hidden token itself, so
+    /// `/**` is every topic that `ros2 topic list` shows.
+    fn covered_by(&self, domain_id: u32, watchlist: &Watchlist) -> Vec<usize> {
+        let is_service = matches!(self.kind, "service_request" | "service_reply");
+        let name = if is_service { &self.dds_name } else { &self.name };
+        let mut covering = watchlist.matching(domain_id, name);
+        if self.hidden && !is_service {
+            let names_hidden = |index: &usize| {
+                watchlist.watches().get(*index).is_some_and(|watch| watch.pattern.contains("/_"))
+            };
+            covering.retain(names_hidden);
+        }
+        covering
+    }
+}
+
+fn topic_label(name: &RosName) -> &'static str {
+    match name.action() {
+        Some((_, ActionPart::Feedback)) => "action_feedback",
+        Some((_, ActionPart::Status)) => "action_status",
+        _ if name.service_of_events().is_some() => "service_event",
+        _ => "topic",
+    }
+}
+
+impl Topic {
+    /// Whether any endpoint is left.
+    #[must_use]
+    pub const fn is_vanished(&self) -> bool {
+        self.vanished.is_some()
+    }
+
+    /// Takes over what a writer had counted.
+    pub fn retire(&mut self, measurement: &Measurement) {
+        let retired = self.retired.get_or_insert_default();
+        retired.add(measurement);
+        // What is gone sends no more.
+        (retired.rate_hz, retired.bandwidth) = (0.0, 0.0);
+    }
+}
+
+impl Topics {
+    /// One topic.
+    #[must_use]
+    pub fn get(&self, id: TopicId) -> Option<&Topic> {
+        self.topics.get(&id)
+    }
+
+    /// One topic.
+    pub fn get_mut(&mut self, id: TopicId) -> Option<&mut Topic> {
+        self.topics.get_mut(&id)
+    }
+
+    /// The topic of this DDS name, or of the topic it stands beside.
+    #[must_use]
+    pub fn find(&self, domain_id: u32, naming: &Naming) -> Option<TopicId> {
+        self.index.get(&(domain_id, naming.dds_name.clone())).copied()
+    }
+
+    /// All, by domain and DDS name.
+    pub fn iter(&self) -> impl Iterator<Item = (TopicId, &Topic)> {
+        self.index.values().filter_map(|id| Some((*id, self.topics.get(id)?)))
+    }
+
+    /// All handles, by domain and DDS name.
+    #[must_use]
+    pub fn ids(&self) -> Vec<TopicId> {
+        self.index.values().copied().collect()
+    }
+
+    /// How many.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.topics.len()
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.topics.is_empty()
+    }
+
+    /// How many are measured.
+    #[must_use]
+    pub const fn watched(&self) -> usize {
+        self.watched
+    }
+
+    /// Adds an endpoint; gives its topic and whether the topic is new.
+    pub fn join(
+        &mut self,
+        domain_id: u32,
+        naming: &Naming,
+        guid: Guid,
+        role: Role,
+        now: Timestamp,
+    ) -> (TopicId, bool) {
+        let (id, is_new) = match self.find(domain_id, naming) {
+            Some(id) => (id, false),
+            None => (self.create(domain_id, naming), true),
+        };
+        if let Some(topic) = self.topics.get_mut(&id) {
+            topic.vanished = None;
+            let list = match role {
+                _ if naming.beside => &mut topic.beside,
+                Role::Writer => &mut topic.writers,
+                Role::Reader => &mut topic.readers,
+            };
+            if let Err(place) = list.binary_search(&guid) {
+                list.insert(place, guid);
+            }
+            match role {
+                Role::Writer if topic.writers.len() == 1 => topic.published = now,
+                Role::Writer => {}
+                Role::Reader => topic.reader_appeared = now,
+            }
+        }
+        (id, is_new)
+    }
+
+    /// Takes an endpoint away.
+    pub fn leave(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
+        let Some(topic) = self.topics.get_mut(&id) else { return };
+        for list in [&mut topic.writers, &mut topic.readers, &mut topic.beside] {
+            list.retain(|each| *each != guid);
+        }
+        if topic.writers.is_empty() && topic.readers.is_empty() && topic.beside.is_empty() {
+            topic.vanished = Some(now);
+        }
+    }
+
+    /// Asks the watchlist about one topic, within the cap.
+    pub fn consult(&mut self, id: TopicId, watchlist: &Watchlist, cap: usize, now: Timestamp) {
+        let Some(topic) = self.topics.get(&id) else { return };
+        let covering = topic.naming.covered_by(topic.domain_id, watchlist);
+        let before = topic.watched;
+        let after = if covering.is_empty() {
+            Watched::No
+        } else if before == Watched::Yes || self.watched < cap || self.give_up_vanished(id) {
+            Watched::Yes
+        } else {
+            Watched::Rejected
+        };
+        self.watched += usize::from(after == Watched::Yes);
+        self.watched -= usize::from(before == Watched::Yes);
+        self.rejected += u64::from(after == Watched::Rejected && before != Watched::Rejected);
+        let Some(topic) = self.topics.get_mut(&id) else { return };
+        if after == Watched::Yes && before != Watched::Yes {
+            topic.published = now;
+            topic.retired.get_or_insert_default();
+        }
+        topic.watched = after;
+        topic.judgements = match after {
+            Watched::Yes => covering.into_iter().map(|watch| (watch, Judgement::default())).collect(),
+            _ => Vec::new(),
+        };
+    }
+
+    /// Forgets topics that vanished longer than `grace` ago.
+    pub fn expire(&mut self, now: Timestamp, grace: u64) {
+        let over = |at: Timestamp| at.0.saturating_add(grace) <= now.0;
+        let expired = self.topics.iter().filter(|(_, topic)| topic.vanished.is_some_and(over));
+        let expired: Vec<_> = expired.map(|(id, _)| *id).collect();
+        expired.into_iter().for_each(|id| self.forget(id));
+    }
+
+    /// Forgets the topics that vanished first until at most `cap` are left, as far as that goes.
+    pub fn shrink(&mut self, cap: usize) {
+        while self.topics.len() > cap {
+            let vanished = self.topics.iter().filter_map(|(id, topic)| Some((topic.vanished?, *id)));
+            let Some((_, id)) = vanished.min() else { return };
+            self.forget(id);
+            self.evictions += 1;
+        }
+    }
+
+    fn create(&mut self, domain_id: u32, naming: &Naming) -> TopicId {
+        self.created += 1;
+        let id = TopicId(self.created);
+        self.index.insert((domain_id, naming.dds_name.clone()), id);
+        self.topics.insert(
+            id,
+            Topic {
+                domain_id,
+                naming: Naming { beside: false, counts: true, ..naming.clone() },
+                writers: Vec::new(),
+                readers: Vec::new(),
+                beside: Vec::new(),
+                watched: Watched::No,
+                judgements: Vec::new(),
+                retired: None,
+                reader_appeared: Timestamp(0),
+                published: Timestamp(0),
+                vanished: None,
+            },
+        );
+        id
+    }
+
+    /// Frees the measuring place of the topic that vanished first.
+    fn give_up_vanished(&mut self, keep: TopicId) -> bool {
+        let places = self.topics.iter().filter(|(id, topic)| {
+            **id != keep && topic.watched == Watched::Yes && topic.is_vanished()
+        });
+        let Some((_, id)) = places.filter_map(|(id, topic)| Some((topic.vanished?, *id))).min()
+        else {
+            return false;
+        };
+        self.forget(id);
+        self.evictions += 1;
+        true
+    }
+
+    fn forget(&mut self, id: TopicId) {
+        if let Some(topic) = self.topics.remove(&id) {
+            self.watched -= usize::from(topic.watched == Watched::Yes);
+            self.index.remove(&(topic.domain_id, topic.naming.dds_name));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::{EntityId, GuidPrefix};
+
+    use super::*;
+    use crate::config::Watch;
+
+    fn naming(name: &str) -> Naming {
+        Naming::of(&DdsTopic::parse(name).unwrap())
+    }
+
+    fn guid(number: u8) -> Guid {
+        Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, number, 3]))
+    }
+
+    fn watchlist(patterns: &[&str]) -> Watchlist {
+        Watchlist::new(patterns.iter().map(|name| Watch::named(name).unwrap()).collect()).unwrap()
+    }
+
+    #[test]
+    fn the_same_name_in_two_domains_is_two_topics() {
+        let mut topics = Topics::default();
+        let naming = naming("rt/chatter");
+        let (one, _) = topics.join(0, &naming, guid(1), Role::Writer, Timestamp(1));
+        let (two, _) = topics.join(5, &naming, guid(2), Role::Writer, Timestamp(1));
+        assert_ne!(one, two);
+    }
+
+    #[test]
+    fn everything_means_what_topic_list_shows() {
+        let all = watchlist(&["/**"]);
+        assert_eq!(naming("rt/points").covered_by(0, &all), [0]);
+        assert!(naming("rt/fib/_action/feedback").covered_by(0, &all).is_empty());
+        assert!(naming("rq/addRequest").covered_by(0, &all).is_empty());
+        assert!(naming("ros_discovery_info").covered_by(0, &all).is_empty());
+        let hidden = watchlist(&["/**/_action/feedback", "/fib/_action/status"]);
+        assert_eq!(naming("rt/fib/_action/feedback").covered_by(0, &hidden), [0]);
+        assert_eq!(naming("rt/fib/_action/status").covered_by(0, &hidden), [1]);
+    }
+
+    #[test]
+    fn cpu_buffers_belong_to_the_topic_beside_them() {
+        let mut topics = Topics::default();
+        let (main, _) = topics.join(0, &naming("rt/image"), guid(1), Role::Writer, Timestamp(1));
+        let beside = naming("rt/image/_buf_cpu");
+        let (same, _) = topics.join(0, &beside, guid(2), Role::Writer, Timestamp(1));
+        assert_eq!(main, same);
+        assert_eq!(topics.get(main).unwrap().writers, [guid(1)]);
+    }
+
+    #[test]
+    fn the_cap_rejects_and_counts_until_a_place_is_free() {
+        let mut topics = Topics::default();
+        let all = watchlist(&["/**"]);
+        let mut ids = Vec::new();
+        for name in ["rt/a", "rt/b", "rt/c"] {
+            let (id, _) = topics.join(0, &naming(name), guid(1), Role::Writer, Timestamp(1));
+            topics.consult(id, &all, 2, Timestamp(1));
+            ids.push(id);
+        }
+        let state = |topics: &Topics, index: usize| topics.get(ids[index]).unwrap().watched;
+        assert_eq!((state(&topics, 2), topics.rejected), (Watched::Rejected, 1));
+        topics.leave(ids[0], guid(1), Timestamp(2));
+        topics.consult(ids[2], &all, 2, Timestamp(3));
+        assert_eq!((state(&topics, 2), topics.watched()), (Watched::Yes, 2));
+        assert!(topics.get(ids[0]).is_none());
+    }
+
+    #[test]
+    fn a_vanished_topic_stays_for_its_grace_period() {
+        let mut topics = Topics::default();
+        let (id, _) = topics.join(0, &naming("rt/a"), guid(1), Role::Writer, Timestamp(1));
+        topics.leave(id, guid(1), Timestamp(100));
+        topics.expire(Timestamp(599), 500);
+        assert!(topics.get(id).unwrap().is_vanished());
+        topics.expire(Timestamp(600), 500);
+        assert!(topics.is_empty());
+    }
+}
