@@ -1,8 +1,8 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
+pub mod feed;
 pub mod filter;
 pub mod interfaces;
 pub mod netns;
 pub mod pcap;
-pub mod replay;
 pub mod ring;

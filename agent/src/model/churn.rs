@@ -86,12 +86,13 @@ impl Churn {
     /// All counters that are not zero, sorted.
     #[must_use]
     pub fn facts(&self) -> Vec<ChurnCount> {
-        let fact = |((domain_id, entity, event), count): (&(u32, Entity, Event), &u64)| ChurnCount {
-            domain_id: *domain_id,
-            entity: entity.label(),
-            event: event.label(),
-            count: *count,
-        };
+        let fact =
+            |((domain_id, entity, event), count): (&(u32, Entity, Event), &u64)| ChurnCount {
+                domain_id: *domain_id,
+                entity: entity.label(),
+                event: event.label(),
+                count: *count,
+            };
         self.counts.iter().map(fact).collect()
     }
 }

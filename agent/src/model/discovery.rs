@@ -273,7 +273,15 @@ impl Discovery {
             if participant.portrait != portrait {
                 participant.portrait = portrait;
                 let domain_id = participant.domain_id;
-                self.note(domain_id, Entity::Participant, Event::Changed, guid, "", origin.at, journal);
+                self.note(
+                    domain_id,
+                    Entity::Participant,
+                    Event::Changed,
+                    guid,
+                    "",
+                    origin.at,
+                    journal,
+                );
             }
             self.move_to(guid.prefix, domain_id, source);
             return;
@@ -295,7 +303,15 @@ impl Discovery {
                 nodes_from: None,
             },
         );
-        self.note(domain_id, Entity::Participant, Event::Appeared, guid, "", origin.at, journal);
+        self.note(
+            domain_id,
+            Entity::Participant,
+            Event::Appeared,
+            guid,
+            "",
+            origin.at,
+            journal,
+        );
         self.adopt_pending(guid.prefix, origin.at, journal);
     }
 
@@ -323,18 +339,21 @@ impl Discovery {
             return;
         }
         let guid = announcement.guid;
-        self.pending_endpoints.retain(|(_, pending)| pending.guid != guid);
+        self.pending_endpoints
+            .retain(|(_, pending)| pending.guid != guid);
         if self.pending_endpoints.len() >= PENDING {
             self.pending_endpoints.pop_front();
             self.evictions.endpoints += 1;
         }
-        self.pending_endpoints.push_back((origin.at, Box::new(announcement)));
+        self.pending_endpoints
+            .push_back((origin.at, Box::new(announcement)));
     }
 
     /// SEDP: an endpoint says goodbye.
     pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
         self.bury(guid, origin);
-        self.pending_endpoints.retain(|(_, pending)| pending.guid != guid);
+        self.pending_endpoints
+            .retain(|(_, pending)| pending.guid != guid);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.remove(&guid);
         }
@@ -355,12 +374,26 @@ impl Discovery {
             return;
         }
         let room = self.caps.nodes.saturating_sub(self.node_count);
-        let known = self.participants.get(&prefix).map_or(0, |known| known.nodes.len());
-        let nodes: Vec<Node> =
-            entities.nodes.iter().take(room + known).map(Node::of).collect();
+        let known = self
+            .participants
+            .get(&prefix)
+            .map_or(0, |known| known.nodes.len());
+        let nodes: Vec<Node> = entities
+            .nodes
+            .iter()
+            .take(room + known)
+            .map(Node::of)
+            .collect();
         self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
         if self.participants.contains_key(&prefix) {
-            self.set_nodes(prefix, writer, origin.sequence_number, nodes, origin.at, journal);
+            self.set_nodes(
+                prefix,
+                writer,
+                origin.sequence_number,
+                nodes,
+                origin.at,
+                journal,
+            );
             return;
         }
         let older = |pending: &PendingNodes| {
@@ -370,14 +403,22 @@ impl Discovery {
             return;
         }
         if self.pending_nodes.len() >= PENDING / 8 && !self.pending_nodes.contains_key(&prefix) {
-            let oldest = self.pending_nodes.iter().min_by_key(|(_, pending)| pending.at);
+            let oldest = self
+                .pending_nodes
+                .iter()
+                .min_by_key(|(_, pending)| pending.at);
             if let Some(oldest) = oldest.map(|(prefix, _)| *prefix) {
                 self.pending_nodes.remove(&oldest);
                 self.evictions.nodes += 1;
             }
         }
         let sequence_number = origin.sequence_number;
-        let pending = PendingNodes { at: origin.at, writer, sequence_number, nodes };
+        let pending = PendingNodes {
+            at: origin.at,
+            writer,
+            sequence_number,
+            nodes,
+        };
         self.pending_nodes.insert(prefix, pending);
     }
 
@@ -387,7 +428,9 @@ impl Discovery {
             .participants
             .iter()
             .filter_map(|(prefix, participant)| {
-                let Duration::Finite(lease) = participant.portrait.lease else { return None };
+                let Duration::Finite(lease) = participant.portrait.lease else {
+                    return None;
+                };
                 let end = participant.last_seen.0.saturating_add(lease);
                 (end <= now.0).then_some((end, *prefix))
             })
@@ -397,7 +440,11 @@ impl Discovery {
             self.remove(prefix, Timestamp(end), Some(Event::Expired), journal);
         }
         let fresh = |at: Timestamp| at.0.saturating_add(PENDING_FOR) > now.0;
-        while self.pending_endpoints.front().is_some_and(|(at, _)| !fresh(*at)) {
+        while self
+            .pending_endpoints
+            .front()
+            .is_some_and(|(at, _)| !fresh(*at))
+        {
             self.pending_endpoints.pop_front();
         }
         self.pending_nodes.retain(|_, pending| fresh(pending.at));
@@ -406,12 +453,18 @@ impl Discovery {
     /// Puts an announced endpoint into its known participant.
     fn admit(&mut self, announcement: EndpointAnnouncement, at: Timestamp, journal: &mut Journal) {
         let guid = announcement.guid;
-        let Some(participant) = self.participants.get(&guid.prefix) else { return };
+        let Some(participant) = self.participants.get(&guid.prefix) else {
+            return;
+        };
         let domain_id = participant.domain_id;
         let entity = Entity::of(announcement.role);
         if let Some(known) = self.endpoints.get_mut(&guid) {
             if *known.topic == *announcement.topic.as_str() {
-                let before = (known.type_hash, known.qos.clone(), Arc::clone(&known.message_type));
+                let before = (
+                    known.type_hash,
+                    known.qos.clone(),
+                    Arc::clone(&known.message_type),
+                );
                 known.qos = announcement.qos;
                 known.type_hash = announcement.type_hash;
                 known.message_type = announcement.type_name.message().as_str().into();
@@ -428,7 +481,10 @@ impl Discovery {
             // The same GUID on another topic: its dispose was missed.
             self.drop_endpoint(guid, Some(Event::Disposed), at, journal);
         }
-        let own = self.participants.get(&guid.prefix).map_or(0, |known| known.endpoints.len());
+        let own = self
+            .participants
+            .get(&guid.prefix)
+            .map_or(0, |known| known.endpoints.len());
         let full = self.endpoints.len() >= self.caps.endpoints && !self.make_room(at);
         if full || own >= PER_PARTICIPANT {
             self.evictions.endpoints += 1;
@@ -449,7 +505,15 @@ impl Discovery {
             participant.endpoints.insert(guid);
         }
         self.changes.push(Change::Appeared(guid));
-        self.note(domain_id, entity, Event::Appeared, guid, &topic, at, journal);
+        self.note(
+            domain_id,
+            entity,
+            Event::Appeared,
+            guid,
+            &topic,
+            at,
+            journal,
+        );
     }
 
     /// What waited for this participant.
@@ -463,7 +527,12 @@ impl Discovery {
             self.admit(*announcement, at, journal);
         }
         if let Some(pending) = self.pending_nodes.remove(&prefix) {
-            let PendingNodes { writer, sequence_number, nodes, .. } = pending;
+            let PendingNodes {
+                writer,
+                sequence_number,
+                nodes,
+                ..
+            } = pending;
             self.set_nodes(prefix, writer, sequence_number, nodes, at, journal);
         }
     }
@@ -477,7 +546,9 @@ impl Discovery {
         at: Timestamp,
         journal: &mut Journal,
     ) {
-        let Some(participant) = self.participants.get_mut(&prefix) else { return };
+        let Some(participant) = self.participants.get_mut(&prefix) else {
+            return;
+        };
         let older = |(from, number): (Guid, u64)| from == writer && number >= sequence_number;
         if participant.nodes_from.is_some_and(older) {
             return;
@@ -485,15 +556,35 @@ impl Discovery {
         participant.nodes_from = Some((writer, sequence_number));
         let domain_id = participant.domain_id;
         let before = std::mem::replace(&mut participant.nodes, nodes);
-        let after: Vec<_> = participant.nodes.iter().map(|node| Arc::clone(&node.name)).collect();
+        let after: Vec<_> = participant
+            .nodes
+            .iter()
+            .map(|node| Arc::clone(&node.name))
+            .collect();
         self.node_count = self.node_count + after.len() - before.len().min(self.node_count);
         let before: Vec<_> = before.into_iter().map(|node| node.name).collect();
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         for name in difference(&before, &after) {
-            self.note(domain_id, Entity::Node, Event::Disposed, guid, &name, at, journal);
+            self.note(
+                domain_id,
+                Entity::Node,
+                Event::Disposed,
+                guid,
+                &name,
+                at,
+                journal,
+            );
         }
         for name in difference(&after, &before) {
-            self.note(domain_id, Entity::Node, Event::Appeared, guid, &name, at, journal);
+            self.note(
+                domain_id,
+                Entity::Node,
+                Event::Appeared,
+                guid,
+                &name,
+                at,
+                journal,
+            );
         }
     }
 
@@ -506,8 +597,11 @@ impl Discovery {
         journal: &mut Journal,
     ) {
         self.pending_nodes.remove(&prefix);
-        self.pending_endpoints.retain(|(_, pending)| pending.guid.prefix != prefix);
-        let Some(participant) = self.participants.remove(&prefix) else { return };
+        self.pending_endpoints
+            .retain(|(_, pending)| pending.guid.prefix != prefix);
+        let Some(participant) = self.participants.remove(&prefix) else {
+            return;
+        };
         let domain_id = participant.domain_id;
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         if let Some(event) = event {
@@ -520,7 +614,15 @@ impl Discovery {
         self.node_count = self.node_count.saturating_sub(participant.nodes.len());
         if let Some(event) = cascade {
             for node in participant.nodes {
-                self.note(domain_id, Entity::Node, event, guid, &node.name, at, journal);
+                self.note(
+                    domain_id,
+                    Entity::Node,
+                    event,
+                    guid,
+                    &node.name,
+                    at,
+                    journal,
+                );
             }
         }
     }
@@ -532,17 +634,29 @@ impl Discovery {
         at: Timestamp,
         journal: &mut Journal,
     ) {
-        let Some(endpoint) = self.endpoints.remove(&guid) else { return };
+        let Some(endpoint) = self.endpoints.remove(&guid) else {
+            return;
+        };
         if let Some(event) = event {
             let entity = Entity::of(endpoint.role);
-            self.note(endpoint.domain_id, entity, event, guid, &endpoint.topic, at, journal);
+            self.note(
+                endpoint.domain_id,
+                entity,
+                event,
+                guid,
+                &endpoint.topic,
+                at,
+                journal,
+            );
         }
         self.changes.push(Change::Gone(guid, Box::new(endpoint)));
     }
 
     /// A participant's domain is told better than before: all it has moves along.
     fn move_to(&mut self, prefix: GuidPrefix, domain_id: u32, source: DomainSource) {
-        let Some(participant) = self.participants.get_mut(&prefix) else { return };
+        let Some(participant) = self.participants.get_mut(&prefix) else {
+            return;
+        };
         if source <= participant.domain_source {
             return;
         }
@@ -553,7 +667,8 @@ impl Discovery {
         participant.domain_id = domain_id;
         for guid in &participant.endpoints {
             if let Some(endpoint) = self.endpoints.get_mut(guid) {
-                self.changes.push(Change::Gone(*guid, Box::new(endpoint.clone())));
+                self.changes
+                    .push(Change::Gone(*guid, Box::new(endpoint.clone())));
                 endpoint.domain_id = domain_id;
                 self.changes.push(Change::Appeared(*guid));
             }
@@ -566,7 +681,10 @@ impl Discovery {
             return false;
         }
         let doubtful = self.participants.iter().filter(|(_, participant)| {
-            let span = participant.last_seen.0.saturating_sub(participant.first_seen.0);
+            let span = participant
+                .last_seen
+                .0
+                .saturating_sub(participant.first_seen.0);
             span < ESTABLISHED && participant.last_seen.0.saturating_add(DOUBTFUL) <= now.0
         });
         let oldest = doubtful.min_by_key(|(prefix, participant)| (participant.last_seen, **prefix));
@@ -584,17 +702,21 @@ impl Discovery {
         if self.buried.len() >= BURIALS {
             self.buried.pop_front();
         }
-        self.buried.push_back((guid, origin.at, origin.sender, origin.sequence_number));
+        self.buried
+            .push_back((guid, origin.at, origin.sender, origin.sequence_number));
     }
 
     /// A copy of an announcement that overtook or was overtaken by its own disposal.
     fn is_stale(&self, guid: Guid, origin: &Origin) -> bool {
-        self.buried.iter().rev().any(|(buried, at, sender, number)| {
-            *buried == guid
-                && *sender == origin.sender
-                && *number > origin.sequence_number
-                && at.0.saturating_add(BURIED) > origin.at.0
-        })
+        self.buried
+            .iter()
+            .rev()
+            .any(|(buried, at, sender, number)| {
+                *buried == guid
+                    && *sender == origin.sender
+                    && *number > origin.sequence_number
+                    && at.0.saturating_add(BURIED) > origin.at.0
+            })
     }
 
     #[expect(clippy::too_many_arguments, reason = "an event has that many sides")]

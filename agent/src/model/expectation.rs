@@ -15,8 +15,13 @@ use crate::config::Expectations;
 const BAD: u8 = 2;
 /// Consecutive good ones until it is not any more.
 const GOOD: u8 = 3;
-const NAMES: [&str; 5] =
-    ["min_rate_hz", "max_rate_hz", "max_loss_ratio", "max_latency_ms", "max_silence_s"];
+const NAMES: [&str; 5] = [
+    "min_rate_hz",
+    "max_rate_hz",
+    "max_loss_ratio",
+    "max_latency_ms",
+    "max_silence_s",
+];
 const MIN_RATE: u8 = 1 << 0;
 const MAX_RATE: u8 = 1 << 1;
 const MAX_LOSS: u8 = 1 << 2;
@@ -51,7 +56,13 @@ pub struct Judgement {
 
 impl Default for Judgement {
     fn default() -> Self {
-        Self { state: WatchState::Ok, violated: false, broken: 0, bad: 0, good: 0 }
+        Self {
+            state: WatchState::Ok,
+            violated: false,
+            broken: 0,
+            bad: 0,
+            good: 0,
+        }
     }
 }
 
@@ -66,7 +77,10 @@ impl Judgement {
     #[must_use]
     pub fn violations(&self) -> Vec<&'static str> {
         let broken = |bit: &usize| self.broken & 1 << bit != 0;
-        (0..NAMES.len()).filter(broken).filter_map(|bit| NAMES.get(bit).copied()).collect()
+        (0..NAMES.len())
+            .filter(broken)
+            .filter_map(|bit| NAMES.get(bit).copied())
+            .collect()
     }
 
     /// Judges once more.
@@ -105,7 +119,10 @@ impl Judgement {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "counts of ten seconds are far below 2^52")]
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "counts of ten seconds are far below 2^52"
+)]
 fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
     let mut broken = 0;
     if let Some(minimum) = expectations.min_rate_hz {
@@ -134,7 +151,9 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
         }
     }
     if let Some(maximum) = expectations.max_silence_s {
-        let last = evidence.last_message.map_or(evidence.since, |last| last.max(evidence.since));
+        let last = evidence
+            .last_message
+            .map_or(evidence.since, |last| last.max(evidence.since));
         if evidence.now.nanoseconds_since(last) as f64 / 1e9 > maximum {
             broken |= MAX_SILENCE;
         }
@@ -145,7 +164,9 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
 /// Whole seconds in which three messages of this rate are due.
 fn window(rate: f64) -> u64 {
     let seconds = (3.0 / rate.max(0.01)).ceil();
-    (1..SECONDS).find(|window| seconds <= f64::from(u32::try_from(*window).unwrap_or(1))).unwrap_or(SECONDS)
+    (1..SECONDS)
+        .find(|window| seconds <= f64::from(u32::try_from(*window).unwrap_or(1)))
+        .unwrap_or(SECONDS)
 }
 
 #[cfg(test)]
@@ -202,15 +223,21 @@ mod tests {
     }
 
     fn rate(messages: u64) -> Slot {
-        Slot { messages, ..Slot::default() }
+        Slot {
+            messages,
+            ..Slot::default()
+        }
     }
 
     #[test]
     fn one_bad_second_is_no_violation_and_one_good_one_no_recovery() {
-        let mut bench =
-            Bench::new(Expectations { min_rate_hz: Some(10.0), ..Expectations::default() });
-        let states: Vec<_> =
-            [10, 4, 10, 4, 4, 10, 10, 10].map(|messages| bench.second(rate(messages))).into();
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(10.0),
+            ..Expectations::default()
+        });
+        let states: Vec<_> = [10, 4, 10, 4, 4, 10, 10, 10]
+            .map(|messages| bench.second(rate(messages)))
+            .into();
         let (ok, bad) = (WatchState::Ok, WatchState::Violated);
         assert_eq!(states, [ok, ok, ok, ok, bad, bad, bad, ok]);
     }
@@ -239,26 +266,41 @@ mod tests {
             max_latency_ms: Some(50.0),
             ..Expectations::default()
         });
-        let slot = Slot { messages: 10, lost: 1, delayed: 10, delay: 1.0, bytes: 0 };
+        let slot = Slot {
+            messages: 10,
+            lost: 1,
+            delayed: 10,
+            delay: 1.0,
+            bytes: 0,
+        };
         bench.second(slot);
         assert_eq!(bench.second(slot), WatchState::Violated);
         let violations = bench.judgement.violations();
-        assert_eq!(violations, ["max_rate_hz", "max_loss_ratio", "max_latency_ms"]);
+        assert_eq!(
+            violations,
+            ["max_rate_hz", "max_loss_ratio", "max_latency_ms"]
+        );
     }
 
     #[test]
     fn silence_counts_from_the_first_publisher() {
-        let mut bench =
-            Bench::new(Expectations { max_silence_s: Some(2.0), ..Expectations::default() });
-        let states: Vec<_> = [0, 0, 0, 5].map(|messages| bench.second(rate(messages))).into();
+        let mut bench = Bench::new(Expectations {
+            max_silence_s: Some(2.0),
+            ..Expectations::default()
+        });
+        let states: Vec<_> = [0, 0, 0, 5]
+            .map(|messages| bench.second(rate(messages)))
+            .into();
         let (ok, silent) = (WatchState::Ok, WatchState::Silent);
         assert_eq!(states, [ok, ok, silent, ok]);
     }
 
     #[test]
     fn without_subscriber_or_publisher_nothing_is_expected() {
-        let mut bench =
-            Bench::new(Expectations { max_silence_s: Some(1.0), ..Expectations::default() });
+        let mut bench = Bench::new(Expectations {
+            max_silence_s: Some(1.0),
+            ..Expectations::default()
+        });
         bench.subscriptions = 0;
         assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
         bench.publishers = 0;

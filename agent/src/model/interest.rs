@@ -28,7 +28,12 @@ impl Interest {
     /// Empty, for at most `limit` entries.
     #[must_use]
     pub fn new(limit: usize) -> Self {
-        Self { entries: HashMap::new(), changed: BTreeSet::new(), limit, evictions: 0 }
+        Self {
+            entries: HashMap::new(),
+            changed: BTreeSet::new(),
+            limit,
+            evictions: 0,
+        }
     }
 
     /// Wants this verdict from now on.
@@ -50,7 +55,9 @@ impl Interest {
 
     /// Wants no entry any more.
     pub fn remove(&mut self, guid: Guid) {
-        let Some(entry) = self.entries.get_mut(&guid) else { return };
+        let Some(entry) = self.entries.get_mut(&guid) else {
+            return;
+        };
         entry.wanted = None;
         if entry.told.is_none() {
             self.entries.remove(&guid);
@@ -70,7 +77,9 @@ impl Interest {
     pub fn changes(&mut self) -> Vec<(Guid, Option<Verdict>)> {
         let mut changes = Vec::with_capacity(self.changed.len());
         for guid in std::mem::take(&mut self.changed) {
-            let Some(entry) = self.entries.get_mut(&guid) else { continue };
+            let Some(entry) = self.entries.get_mut(&guid) else {
+                continue;
+            };
             entry.told = entry.wanted;
             changes.push((guid, entry.wanted));
             if entry.wanted.is_none() {
@@ -89,15 +98,21 @@ impl Interest {
     /// Makes room by forgetting one uninteresting entry. Its removal may be told late: the kernel's
     /// map has room for twice the changes.
     fn give_up_one(&mut self) -> bool {
-        let mut ignored = self.entries.iter().filter(|(_, entry)| {
-            entry.wanted == Some(Verdict::Ignore) && entry.told.is_none()
-        });
+        let mut ignored = self
+            .entries
+            .iter()
+            .filter(|(_, entry)| entry.wanted == Some(Verdict::Ignore) && entry.told.is_none());
         let found = ignored.next().map(|(guid, _)| *guid);
         let told = || {
             let ignored = |entry: &Entry| entry.wanted == Some(Verdict::Ignore);
-            self.entries.iter().find(|(_, entry)| ignored(entry)).map(|(guid, _)| *guid)
+            self.entries
+                .iter()
+                .find(|(_, entry)| ignored(entry))
+                .map(|(guid, _)| *guid)
         };
-        let Some(guid) = found.or_else(told) else { return false };
+        let Some(guid) = found.or_else(told) else {
+            return false;
+        };
         self.remove(guid);
         true
     }
@@ -124,7 +139,10 @@ mod tests {
         interest.remove(guid(3));
         assert_eq!(
             interest.changes(),
-            [(guid(1), Some(Verdict::Meter)), (guid(2), Some(Verdict::Capture))]
+            [
+                (guid(1), Some(Verdict::Meter)),
+                (guid(2), Some(Verdict::Capture))
+            ]
         );
         interest.set(guid(1), Verdict::Meter);
         interest.set(guid(2), Verdict::Ignore);

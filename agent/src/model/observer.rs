@@ -4,6 +4,7 @@
 //! same facts, live or replayed at any speed. It reads no clock, sends nothing and keeps no packet.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use ros2probe_wire::discovery::{self, Role};
 use ros2probe_wire::entities::ParticipantEntities;
@@ -147,10 +148,13 @@ impl Observer {
     /// the kernel filter has reported what lies before its offset.
     pub fn datagram(&mut self, envelope: &Envelope, payload: &[u8], handover: Option<&Handover>) {
         self.datagrams += 1;
-        let vendor = payload.get(6..8).and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
+        let vendor = payload
+            .get(6..8)
+            .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
         let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
-        let outcome =
-            walk::datagram(payload, envelope, handover, |found| self.found(&found, vendor, envelope));
+        let outcome = walk::datagram(payload, envelope, handover, |found| {
+            self.found(&found, vendor, envelope);
+        });
         if outcome == Outcome::Malformed {
             self.decode_error("rtps", Reason::BadLength);
         }
@@ -215,7 +219,10 @@ impl Observer {
 
     /// Counts a parse failure, also of those outside who parse for the core.
     pub fn decode_error(&mut self, stage: &'static str, reason: Reason) {
-        *self.decode_errors.entry((stage, reason.label())).or_default() += 1;
+        *self
+            .decode_errors
+            .entry((stage, reason.label()))
+            .or_default() += 1;
     }
 
     fn count(&mut self, record: &Record) {
@@ -274,10 +281,18 @@ impl Observer {
         };
         let whole;
         let (payload, inline_qos) = if record.kind == kind::DATA_FRAG {
-            let Some(bytes) = self.pieces.put(record, found.payload) else { return };
+            let Some(bytes) = self.pieces.put(record, found.payload) else {
+                return;
+            };
             whole = bytes;
             let status_info = StatusInfo(record.status_info);
-            (Payload::Data(&whole), Ok(InlineQos { status_info, ..InlineQos::default() }))
+            (
+                Payload::Data(&whole),
+                Ok(InlineQos {
+                    status_info,
+                    ..InlineQos::default()
+                }),
+            )
         } else {
             (data_payload(found), inline_qos(found, vendor))
         };
@@ -319,10 +334,12 @@ impl Observer {
     ) -> Result<(), WireError> {
         match discovery::participant(vendor, payload, inline_qos)? {
             discovery::Discovery::Alive(announcement) => {
-                self.discovery.participant(&announcement, origin, &mut self.journal);
+                self.discovery
+                    .participant(&announcement, origin, &mut self.journal);
             }
             discovery::Discovery::Gone { guid, .. } => {
-                self.discovery.participant_gone(guid, origin, &mut self.journal);
+                self.discovery
+                    .participant_gone(guid, origin, &mut self.journal);
             }
         }
         Ok(())
@@ -344,10 +361,12 @@ impl Observer {
         };
         match discovery::endpoint(role, vendor, payload, inline_qos)? {
             discovery::Discovery::Alive(announcement) => {
-                self.discovery.endpoint(announcement, origin, &mut self.journal);
+                self.discovery
+                    .endpoint(announcement, origin, &mut self.journal);
             }
             discovery::Discovery::Gone { guid, .. } => {
-                self.discovery.endpoint_gone(guid, origin, &mut self.journal);
+                self.discovery
+                    .endpoint_gone(guid, origin, &mut self.journal);
             }
         }
         Ok(())
@@ -360,7 +379,8 @@ impl Observer {
         origin: &Origin,
     ) -> Result<(), WireError> {
         let entities = ParticipantEntities::parse(payload.bytes())?;
-        self.discovery.entities(&entities, writer, origin, &mut self.journal);
+        self.discovery
+            .entities(&entities, writer, origin, &mut self.journal);
         Ok(())
     }
 
@@ -370,7 +390,9 @@ impl Observer {
             match change {
                 Change::Appeared(guid) => self.appeared(guid, now),
                 Change::Changed(guid) => {
-                    let Some(endpoint) = self.discovery.endpoints().get(&guid) else { continue };
+                    let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
+                        continue;
+                    };
                     self.profiler.learn(guid, traits(endpoint));
                 }
                 Change::Gone(guid, endpoint) => self.gone(guid, &endpoint, now),
@@ -379,16 +401,28 @@ impl Observer {
     }
 
     fn appeared(&mut self, guid: Guid, now: Timestamp) {
-        let Some(endpoint) = self.discovery.endpoints().get(&guid) else { return };
-        let Some(naming) = naming(endpoint) else { return };
-        let role = endpoint.role;
-        let (id, is_new) = self.topics.join(endpoint.domain_id, &naming, guid, role, now);
+        let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
+            return;
+        };
+        let Some(naming) = naming(endpoint) else {
+            return;
+        };
+        let (role, message_type) = (endpoint.role, Arc::clone(&endpoint.message_type));
+        let (id, is_new) = self
+            .topics
+            .join(endpoint.domain_id, &naming, guid, role, now);
+        if let Some(topic) = self.topics.get_mut(id) {
+            topic.last_type = Some(message_type);
+        }
         if is_new {
             self.topics.shrink(self.settings.endpoints);
             self.consult(id);
         }
         self.apply(id, guid, now);
-        let opened = self.topics.get(id).filter(|topic| topic.watched == Watched::Yes);
+        let opened = self
+            .topics
+            .get(id)
+            .filter(|topic| topic.watched == Watched::Yes);
         if let Some(topic) = opened.filter(|_| role == Role::Reader) {
             for writer in topic.writers.iter().chain(&topic.beside) {
                 self.profiler.open(*writer, now);
@@ -408,8 +442,11 @@ impl Observer {
     /// Asks the watchlist about a topic and lets its endpoints follow.
     fn consult(&mut self, id: TopicId) {
         let now = self.clock;
-        self.topics.consult(id, &self.watchlist, self.settings.topics, now);
-        let Some(topic) = self.topics.get(id) else { return };
+        self.topics
+            .consult(id, &self.watchlist, self.settings.topics, now);
+        let Some(topic) = self.topics.get(id) else {
+            return;
+        };
         let lists = [&topic.writers, &topic.readers, &topic.beside];
         let guids: Vec<_> = lists.into_iter().flatten().copied().collect();
         for guid in guids {
@@ -419,8 +456,12 @@ impl Observer {
 
     /// Decides about one endpoint of a topic.
     fn apply(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
-        let Some(topic) = self.topics.get(id) else { return };
-        let Some(endpoint) = self.discovery.endpoints().get(&guid) else { return };
+        let Some(topic) = self.topics.get(id) else {
+            return;
+        };
+        let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
+            return;
+        };
         let is_watched = topic.watched == Watched::Yes;
         match endpoint.role {
             Role::Reader if is_watched => self.interest.set(guid, Verdict::Meter),
@@ -464,7 +505,7 @@ impl Observer {
         for guid in strangers.forgotten {
             self.interest.remove(guid);
         }
-        if now.0 % SECOND == 0 {
+        if now.0.is_multiple_of(SECOND) {
             self.topics.expire(now, self.settings.topic_grace);
             self.promote();
             self.judge(now);
@@ -476,7 +517,10 @@ impl Observer {
         if self.topics.watched() >= self.settings.topics {
             return;
         }
-        let rejected = self.topics.iter().filter(|(_, topic)| topic.watched == Watched::Rejected);
+        let rejected = self
+            .topics
+            .iter()
+            .filter(|(_, topic)| topic.watched == Watched::Rejected);
         let rejected: Vec<_> = rejected.map(|(id, _)| id).collect();
         for id in rejected {
             self.consult(id);
@@ -486,7 +530,9 @@ impl Observer {
     /// Judges every watched topic under every entry that covers it.
     fn judge(&mut self, now: Timestamp) {
         for id in self.topics.ids() {
-            let Some(topic) = self.topics.get(id) else { continue };
+            let Some(topic) = self.topics.get(id) else {
+                continue;
+            };
             if topic.judgements.is_empty() {
                 continue;
             }
@@ -496,14 +542,22 @@ impl Observer {
                 .chain(&topic.beside)
                 .filter_map(|guid| self.profiler.get(*guid))
                 .collect();
-            let last_message = writers.iter().filter_map(|each| each.writer.last_message()).max();
-            let retired = topic.retired.as_ref().and_then(|retired| retired.last_message);
+            let last_message = writers
+                .iter()
+                .filter_map(|each| each.writer.last_message())
+                .max();
+            let retired = topic
+                .retired
+                .as_ref()
+                .and_then(|retired| retired.last_message);
             let recent = |seconds: u64| {
-                writers.iter().fold((Slot::default(), 0), |(mut sum, longest), each| {
-                    let (slot, seconds) = each.writer.recent(now, seconds);
-                    sum.add(&slot);
-                    (sum, seconds.max(longest))
-                })
+                writers
+                    .iter()
+                    .fold((Slot::default(), 0), |(mut sum, longest), each| {
+                        let (slot, seconds) = each.writer.recent(now, seconds);
+                        sum.add(&slot);
+                        (sum, seconds.max(longest))
+                    })
             };
             let evidence = Evidence {
                 now,
@@ -527,7 +581,9 @@ impl Observer {
 }
 
 pub(super) fn naming(endpoint: &Endpoint) -> Option<Naming> {
-    DdsTopic::parse(&endpoint.topic).ok().map(|topic| Naming::of(&topic))
+    DdsTopic::parse(&endpoint.topic)
+        .ok()
+        .map(|topic| Naming::of(&topic))
 }
 
 fn traits(endpoint: &Endpoint) -> Traits {
@@ -557,7 +613,11 @@ fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireErro
     if flags & INLINE_QOS_FLAG == 0 {
         return Ok(InlineQos::default());
     }
-    let endianness = if flags & 1 == 1 { Endianness::Little } else { Endianness::Big };
+    let endianness = if flags & 1 == 1 {
+        Endianness::Little
+    } else {
+        Endianness::Big
+    };
     let mut cursor = Cursor::new(found.body, endianness);
     cursor.u16("extraFlags")?;
     let octets = cursor.u16("octetsToInlineQos")?;

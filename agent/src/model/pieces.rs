@@ -71,9 +71,15 @@ impl Pieces {
         if sample.size == size && sample.fragment_size == fragment_size {
             let chunks = bytes.chunks(usize::try_from(fragment_size).ok()?);
             for (number, chunk) in (record.fragment_start..=total).zip(chunks) {
-                let last = if number == total { size - (total - 1) * fragment_size } else { fragment_size };
+                let last = if number == total {
+                    size - (total - 1) * fragment_size
+                } else {
+                    fragment_size
+                };
                 // The last one may have padding behind it.
-                let Some(chunk) = chunk.get(..usize::try_from(last).ok()?) else { break };
+                let Some(chunk) = chunk.get(..usize::try_from(last).ok()?) else {
+                    break;
+                };
                 if sample.fragments.insert(number, chunk.into()).is_none() {
                     sample.bytes += chunk.len() + OVERHEAD;
                     self.bytes += chunk.len() + OVERHEAD;
@@ -122,7 +128,10 @@ mod tests {
         let mut pieces = Pieces::default();
         assert_eq!(pieces.put(&fragment(1, 3, 1, 250), &payload[200..]), None);
         assert!(pieces.holds(&fragment(1, 1, 1, 250)));
-        assert_eq!(pieces.put(&fragment(1, 1, 2, 250), &payload[..200]), Some(payload));
+        assert_eq!(
+            pieces.put(&fragment(1, 1, 2, 250), &payload[..200]),
+            Some(payload)
+        );
         assert_eq!((pieces.bytes, pieces.samples.len()), (0, 0));
     }
 

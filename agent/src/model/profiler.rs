@@ -93,7 +93,12 @@ impl Profiler {
     #[must_use]
     pub fn size(&self) -> (usize, usize, usize, u64) {
         let known = self.writers.len() - self.strangers;
-        (known, self.strangers, self.stranger_limit, self.stranger_evictions)
+        (
+            known,
+            self.strangers,
+            self.stranger_limit,
+            self.stranger_evictions,
+        )
     }
 
     /// Memory for fragmented samples, of writers of topics and of strangers.
@@ -104,14 +109,24 @@ impl Profiler {
 
     /// Takes in a record of a measured writer; `false` if it is of another.
     pub fn record(&mut self, guid: Guid, record: &Record, journal: &mut Journal) -> bool {
-        let Some(measured) = self.writers.get_mut(&guid) else { return false };
+        let Some(measured) = self.writers.get_mut(&guid) else {
+            return false;
+        };
         let now = Timestamp(record.time);
         measured.last_seen = measured.last_seen.max(now);
         let budget = match measured.topic {
             Some(_) => &mut self.budget,
             None => &mut self.strangers_budget,
         };
-        measured.writer.record(record, measured.opened, &mut Scene { now, budget, journal });
+        measured.writer.record(
+            record,
+            measured.opened,
+            &mut Scene {
+                now,
+                budget,
+                journal,
+            },
+        );
         true
     }
 
@@ -126,7 +141,10 @@ impl Profiler {
             return;
         }
         self.strangers += 1;
-        self.writers.insert(guid, Measured::new(Writer::new(guid, Traits::default()), None, now));
+        self.writers.insert(
+            guid,
+            Measured::new(Writer::new(guid, Traits::default()), None, now),
+        );
         self.record(guid, record, journal);
     }
 
@@ -144,7 +162,9 @@ impl Profiler {
             known.opened = opened;
             if known.topic.is_none() {
                 // Its unfinished samples are paid for by the other budget from now on.
-                known.writer.transfer(&mut self.strangers_budget, &mut self.budget);
+                known
+                    .writer
+                    .transfer(&mut self.strangers_budget, &mut self.budget);
                 self.strangers -= 1;
             }
             known.topic = Some(topic);
@@ -181,7 +201,11 @@ impl Profiler {
             Some(_) => &mut self.budget,
             None => &mut self.strangers_budget,
         };
-        measured.writer.settle(&mut Scene { now, budget, journal });
+        measured.writer.settle(&mut Scene {
+            now,
+            budget,
+            journal,
+        });
         self.strangers -= usize::from(measured.topic.is_none());
         Some((measured.topic?, measured.writer.measurement(now)))
     }
@@ -194,7 +218,11 @@ impl Profiler {
                 Some(_) => &mut self.budget,
                 None => &mut self.strangers_budget,
             };
-            measured.writer.advance(&mut Scene { now, budget, journal });
+            measured.writer.advance(&mut Scene {
+                now,
+                budget,
+                journal,
+            });
             if measured.topic.is_some() {
                 continue;
             }
@@ -218,12 +246,18 @@ impl Profiler {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();
         guids.sort_unstable();
         for guid in guids {
-            let Some(measured) = self.writers.get_mut(&guid) else { continue };
+            let Some(measured) = self.writers.get_mut(&guid) else {
+                continue;
+            };
             let budget = match measured.topic {
                 Some(_) => &mut self.budget,
                 None => &mut self.strangers_budget,
             };
-            measured.writer.settle(&mut Scene { now, budget, journal });
+            measured.writer.settle(&mut Scene {
+                now,
+                budget,
+                journal,
+            });
         }
     }
 

@@ -21,7 +21,11 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
         at: now,
         participants: participants(&observer.discovery),
         nodes: node_facts(&observer.discovery),
-        topics: observer.topics.iter().map(|(_, topic)| self::topic(observer, topic, &nodes, now)).collect(),
+        topics: observer
+            .topics
+            .iter()
+            .map(|(_, topic)| self::topic(observer, topic, &nodes, now))
+            .collect(),
         unknown_writers: unknown_writers(observer, now),
         watches: watches(observer),
         churn: observer.discovery.churn.facts(),
@@ -102,22 +106,36 @@ fn topic(
 ) -> TopicFacts {
     let endpoint = |guid: &Guid| {
         let endpoint = observer.discovery.endpoints().get(guid)?;
-        let measured = observer.profiler.get(*guid).filter(|measured| measured.topic.is_some());
+        let measured = observer
+            .profiler
+            .get(*guid)
+            .filter(|measured| measured.topic.is_some());
         let measurement = measured.map(|measured| measured.writer.measurement(now));
-        Some(endpoint_facts(*guid, endpoint, nodes.get(guid).copied(), measurement))
+        Some(endpoint_facts(
+            *guid,
+            endpoint,
+            nodes.get(guid).copied(),
+            measurement,
+        ))
     };
     let publishers: Vec<_> = topic.writers.iter().filter_map(endpoint).collect();
     let subscriptions: Vec<_> = topic.readers.iter().filter_map(endpoint).collect();
     let all = || publishers.iter().chain(&subscriptions);
-    let message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
+    let mut message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
+    if topic.is_vanished() {
+        message_types.extend(topic.last_type.as_deref().map(ToOwned::to_owned));
+    }
     let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash.clone()).collect();
     let mut measurement = topic.retired.as_deref().cloned();
     if let Some(sum) = &mut measurement {
-        let beside = topic.beside.iter().filter_map(|guid| {
-            Some(observer.profiler.get(*guid)?.writer.measurement(now))
-        });
+        let beside = topic
+            .beside
+            .iter()
+            .filter_map(|guid| Some(observer.profiler.get(*guid)?.writer.measurement(now)));
         beside.for_each(|beside| sum.add(&beside));
-        let own = publishers.iter().filter_map(|each| each.measurement.as_ref());
+        let own = publishers
+            .iter()
+            .filter_map(|each| each.measurement.as_ref());
         own.for_each(|own| sum.add(own));
     }
     TopicFacts {
@@ -167,7 +185,10 @@ fn endpoint_facts(
 }
 
 fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFacts> {
-    let strangers = observer.profiler.iter().filter(|(_, measured)| measured.metered && measured.topic.is_none());
+    let strangers = observer
+        .profiler
+        .iter()
+        .filter(|(_, measured)| measured.metered && measured.topic.is_none());
     let mut facts: Vec<_> = strangers
         .map(|(guid, measured)| {
             let participant = observer.discovery.participants().get(&guid.prefix);
@@ -196,7 +217,9 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
         .collect();
     for (_, topic) in observer.topics.iter() {
         for (index, judgement) in &topic.judgements {
-            let Some(fact) = facts.get_mut(*index) else { continue };
+            let Some(fact) = facts.get_mut(*index) else {
+                continue;
+            };
             fact.topics.push(WatchedTopicFacts {
                 domain_id: topic.domain_id,
                 topic: topic.naming.name.as_ref().to_owned(),
@@ -219,14 +242,22 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
 }
 
 fn decode_errors(observer: &Observer) -> Vec<DecodeErrorCount> {
-    let fact = |((stage, reason), count): (&(&'static str, &'static str), &u64)| {
-        DecodeErrorCount { stage, reason, count: *count }
+    let fact = |((stage, reason), count): (&(&'static str, &'static str), &u64)| DecodeErrorCount {
+        stage,
+        reason,
+        count: *count,
     };
     observer.decode_errors.iter().map(fact).collect()
 }
 
 fn tables(observer: &Observer) -> Vec<TableFacts> {
-    let Observer { settings, discovery, topics, profiler, .. } = observer;
+    let Observer {
+        settings,
+        discovery,
+        topics,
+        profiler,
+        ..
+    } = observer;
     let evictions = discovery.evictions();
     let table = |table, size: usize, limit: usize, evictions| TableFacts {
         table,
@@ -239,15 +270,38 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     let budgets = profiler.budgets();
     let samples: usize = budgets.iter().map(|budget| budget.bytes).sum();
     let samples_limit: usize = budgets.iter().map(|budget| budget.limit).sum();
-    let samples_evictions: u64 = budgets.iter().map(|budget| budget.evictions + budget.rejected).sum();
+    let samples_evictions: u64 = budgets
+        .iter()
+        .map(|budget| budget.evictions + budget.rejected)
+        .sum();
     vec![
-        table("participants", discovery.participants().len(), settings.participants, evictions.participants),
-        table("endpoints", discovery.endpoints().len(), settings.endpoints, evictions.endpoints),
-        table("nodes", discovery.node_count(), settings.nodes, evictions.nodes),
+        table(
+            "participants",
+            discovery.participants().len(),
+            settings.participants,
+            evictions.participants,
+        ),
+        table(
+            "endpoints",
+            discovery.endpoints().len(),
+            settings.endpoints,
+            evictions.endpoints,
+        ),
+        table(
+            "nodes",
+            discovery.node_count(),
+            settings.nodes,
+            evictions.nodes,
+        ),
         table("topics", topics.len(), settings.endpoints, topics.evictions),
         table("writers", writers, settings.endpoints, 0),
         table("unknown_writers", unknown, unknown_limit, unknown_evictions),
-        table("samples", samples, samples_limit, samples_evictions + observer.pieces.evictions()),
+        table(
+            "samples",
+            samples,
+            samples_limit,
+            samples_evictions + observer.pieces.evictions(),
+        ),
         table("interest", interest, interest_limit, interest_evictions),
     ]
 }

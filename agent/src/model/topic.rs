@@ -5,6 +5,7 @@
 //! its counters, so that its silence is seen rather than its series missed.
 
 use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::{ActionPart, DdsTopic, RosName, TopicKind};
@@ -59,6 +60,8 @@ pub struct Topic {
     pub readers: Vec<Guid>,
     /// Writers and readers beside it.
     pub beside: Vec<Guid>,
+    /// Type of the endpoint that came last, for when none is left.
+    pub last_type: Option<Arc<str>>,
     /// Whether it is measured.
     pub watched: Watched,
     /// Watchlist entries that cover it, and how it stands with them.
@@ -118,7 +121,14 @@ impl Naming {
 
     fn verbatim(topic: &DdsTopic, kind: &'static str) -> Self {
         let name: Box<str> = topic.as_str().into();
-        Self { dds_name: name.clone(), name, kind, hidden: false, beside: false, counts: true }
+        Self {
+            dds_name: name.clone(),
+            name,
+            kind,
+            hidden: false,
+            beside: false,
+            counts: true,
+        }
     }
 
     /// Watchlist entries that cover it. Entries are about topics: services are covered only by
@@ -126,11 +136,18 @@ impl Naming {
     /// `/**` is every topic that `ros2 topic list` shows.
     fn covered_by(&self, domain_id: u32, watchlist: &Watchlist) -> Vec<usize> {
         let is_service = matches!(self.kind, "service_request" | "service_reply");
-        let name = if is_service { &self.dds_name } else { &self.name };
+        let name = if is_service {
+            &self.dds_name
+        } else {
+            &self.name
+        };
         let mut covering = watchlist.matching(domain_id, name);
         if self.hidden && !is_service {
             let names_hidden = |index: &usize| {
-                watchlist.watches().get(*index).is_some_and(|watch| watch.pattern.contains("/_"))
+                watchlist
+                    .watches()
+                    .get(*index)
+                    .is_some_and(|watch| watch.pattern.contains("/_"))
             };
             covering.retain(names_hidden);
         }
@@ -178,12 +195,16 @@ impl Topics {
     /// The topic of this DDS name, or of the topic it stands beside.
     #[must_use]
     pub fn find(&self, domain_id: u32, naming: &Naming) -> Option<TopicId> {
-        self.index.get(&(domain_id, naming.dds_name.clone())).copied()
+        self.index
+            .get(&(domain_id, naming.dds_name.clone()))
+            .copied()
     }
 
     /// All, by domain and DDS name.
     pub fn iter(&self) -> impl Iterator<Item = (TopicId, &Topic)> {
-        self.index.values().filter_map(|id| Some((*id, self.topics.get(id)?)))
+        self.index
+            .values()
+            .filter_map(|id| Some((*id, self.topics.get(id)?)))
     }
 
     /// All handles, by domain and DDS name.
@@ -244,7 +265,9 @@ impl Topics {
 
     /// Takes an endpoint away.
     pub fn leave(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
-        let Some(topic) = self.topics.get_mut(&id) else { return };
+        let Some(topic) = self.topics.get_mut(&id) else {
+            return;
+        };
         for list in [&mut topic.writers, &mut topic.readers, &mut topic.beside] {
             list.retain(|each| *each != guid);
         }
@@ -255,7 +278,9 @@ impl Topics {
 
     /// Asks the watchlist about one topic, within the cap.
     pub fn consult(&mut self, id: TopicId, watchlist: &Watchlist, cap: usize, now: Timestamp) {
-        let Some(topic) = self.topics.get(&id) else { return };
+        let Some(topic) = self.topics.get(&id) else {
+            return;
+        };
         let covering = topic.naming.covered_by(topic.domain_id, watchlist);
         let before = topic.watched;
         let after = if covering.is_empty() {
@@ -268,14 +293,19 @@ impl Topics {
         self.watched += usize::from(after == Watched::Yes);
         self.watched -= usize::from(before == Watched::Yes);
         self.rejected += u64::from(after == Watched::Rejected && before != Watched::Rejected);
-        let Some(topic) = self.topics.get_mut(&id) else { return };
+        let Some(topic) = self.topics.get_mut(&id) else {
+            return;
+        };
         if after == Watched::Yes && before != Watched::Yes {
             topic.published = now;
             topic.retired.get_or_insert_default();
         }
         topic.watched = after;
         topic.judgements = match after {
-            Watched::Yes => covering.into_iter().map(|watch| (watch, Judgement::default())).collect(),
+            Watched::Yes => covering
+                .into_iter()
+                .map(|watch| (watch, Judgement::default()))
+                .collect(),
             _ => Vec::new(),
         };
     }
@@ -283,7 +313,10 @@ impl Topics {
     /// Forgets topics that vanished longer than `grace` ago.
     pub fn expire(&mut self, now: Timestamp, grace: u64) {
         let over = |at: Timestamp| at.0.saturating_add(grace) <= now.0;
-        let expired = self.topics.iter().filter(|(_, topic)| topic.vanished.is_some_and(over));
+        let expired = self
+            .topics
+            .iter()
+            .filter(|(_, topic)| topic.vanished.is_some_and(over));
         let expired: Vec<_> = expired.map(|(id, _)| *id).collect();
         expired.into_iter().for_each(|id| self.forget(id));
     }
@@ -291,8 +324,13 @@ impl Topics {
     /// Forgets the topics that vanished first until at most `cap` are left, as far as that goes.
     pub fn shrink(&mut self, cap: usize) {
         while self.topics.len() > cap {
-            let vanished = self.topics.iter().filter_map(|(id, topic)| Some((topic.vanished?, *id)));
-            let Some((_, id)) = vanished.min() else { return };
+            let vanished = self
+                .topics
+                .iter()
+                .filter_map(|(id, topic)| Some((topic.vanished?, *id)));
+            let Some((_, id)) = vanished.min() else {
+                return;
+            };
             self.forget(id);
             self.evictions += 1;
         }
@@ -306,10 +344,15 @@ impl Topics {
             id,
             Topic {
                 domain_id,
-                naming: Naming { beside: false, counts: true, ..naming.clone() },
+                naming: Naming {
+                    beside: false,
+                    counts: true,
+                    ..naming.clone()
+                },
                 writers: Vec::new(),
                 readers: Vec::new(),
                 beside: Vec::new(),
+                last_type: None,
                 watched: Watched::No,
                 judgements: Vec::new(),
                 retired: None,
@@ -326,7 +369,9 @@ impl Topics {
         let places = self.topics.iter().filter(|(id, topic)| {
             **id != keep && topic.watched == Watched::Yes && topic.is_vanished()
         });
-        let Some((_, id)) = places.filter_map(|(id, topic)| Some((topic.vanished?, *id))).min()
+        let Some((_, id)) = places
+            .filter_map(|(id, topic)| Some((topic.vanished?, *id)))
+            .min()
         else {
             return false;
         };
@@ -359,7 +404,13 @@ mod tests {
     }
 
     fn watchlist(patterns: &[&str]) -> Watchlist {
-        Watchlist::new(patterns.iter().map(|name| Watch::named(name).unwrap()).collect()).unwrap()
+        Watchlist::new(
+            patterns
+                .iter()
+                .map(|name| Watch::named(name).unwrap())
+                .collect(),
+        )
+        .unwrap()
     }
 
     #[test]
@@ -375,11 +426,18 @@ mod tests {
     fn everything_means_what_topic_list_shows() {
         let all = watchlist(&["/**"]);
         assert_eq!(naming("rt/points").covered_by(0, &all), [0]);
-        assert!(naming("rt/fib/_action/feedback").covered_by(0, &all).is_empty());
+        assert!(
+            naming("rt/fib/_action/feedback")
+                .covered_by(0, &all)
+                .is_empty()
+        );
         assert!(naming("rq/addRequest").covered_by(0, &all).is_empty());
         assert!(naming("ros_discovery_info").covered_by(0, &all).is_empty());
         let hidden = watchlist(&["/**/_action/feedback", "/fib/_action/status"]);
-        assert_eq!(naming("rt/fib/_action/feedback").covered_by(0, &hidden), [0]);
+        assert_eq!(
+            naming("rt/fib/_action/feedback").covered_by(0, &hidden),
+            [0]
+        );
         assert_eq!(naming("rt/fib/_action/status").covered_by(0, &hidden), [1]);
     }
 

@@ -1,6 +1,6 @@
-//! Feeds the core from a capture: frames to datagrams to the observer, in the capture's own time.
+//! Feeds the core with captured frames: frames to datagrams to the observer, in the frames' own time.
 //!
-//! The live source does the same with frames from the ring. Nothing here waits; whoever replays at
+//! The live source takes its frames from the ring itself. Nothing here waits; whoever replays at
 //! a certain speed does so between packets.
 
 use ros2probe_wire::Timestamp;
@@ -13,23 +13,30 @@ use crate::model::reassembly::{FlowKey, Limits, Reassembly};
 
 /// One capture on its way into the core.
 #[derive(Debug)]
-pub struct Replay {
+pub struct Feed {
     reassembly: Reassembly,
     last: Timestamp,
 }
 
-impl Replay {
+impl Feed {
     /// At the beginning.
     #[must_use]
     pub fn new(limits: Limits) -> Self {
-        Self { reassembly: Reassembly::new(limits), last: Timestamp(0) }
+        Self {
+            reassembly: Reassembly::new(limits),
+            last: Timestamp(0),
+        }
     }
 
     /// Replays the rest of a capture as fast as it goes, and settles.
     ///
     /// # Errors
     /// When the capture cannot be read on; what came before it counts.
-    pub fn run(&mut self, reader: &mut PcapReader, observer: &mut Observer) -> Result<(), PcapError> {
+    pub fn run(
+        &mut self,
+        reader: &mut PcapReader,
+        observer: &mut Observer,
+    ) -> Result<(), PcapError> {
         while let Some(captured) = reader.next_packet()? {
             self.packet(&captured, observer);
         }
@@ -62,7 +69,10 @@ impl Replay {
         match packet.payload {
             Payload::Datagram(datagram) => {
                 let destination_port = datagram.destination_port;
-                let envelope = Envelope { destination_port, ..envelope };
+                let envelope = Envelope {
+                    destination_port,
+                    ..envelope
+                };
                 give(observer, &envelope, datagram.payload, datagram.length);
             }
             Payload::Fragment(fragment) => {
@@ -70,7 +80,11 @@ impl Replay {
                 let whole = self.reassembly.fragment(captured.time, key, &fragment);
                 if let Some(whole) = whole {
                     let destination_port = whole.destination_port;
-                    let envelope = Envelope { destination_port, fragmented: true, ..envelope };
+                    let envelope = Envelope {
+                        destination_port,
+                        fragmented: true,
+                        ..envelope
+                    };
                     give(observer, &envelope, whole.payload(), whole.length);
                 }
             }
