@@ -1,0 +1,240 @@
+//! The command line: what it answers, how it fails, how it ends.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test may panic"
+)]
+
+mod local_agent;
+
+use std::fs::Permissions;
+use std::net::TcpListener;
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
+use std::os::unix::net::UnixDatagram;
+use std::path::PathBuf;
+use std::process::{Command, Output};
+
+use local_agent::{LocalAgent, PATIENCE, capture, metric, promtool, rp};
+
+fn run(arguments: &[&str]) -> Output {
+    rp().args(arguments).output().unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+fn file(directory: &tempfile::TempDir, name: &str, text: &str) -> PathBuf {
+    let path = directory.path().join(name);
+    std::fs::write(&path, text).unwrap();
+    path
+}
+
+/// One line, no backtrace, and this exit code.
+fn fails_with(output: &Output, code: i32, parts: &[&str]) {
+    let said = stderr(output);
+    assert_eq!(output.status.code(), Some(code), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+    for part in parts {
+        assert!(said.contains(part), "`{part}` is not in {said}");
+    }
+}
+
+#[test]
+fn a_good_configuration_is_called_good() {
+    let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../config/ros2probe.yaml");
+    let output = run(&["check-config", shipped]);
+    assert!(output.status.success());
+    assert!(
+        String::from_utf8(output.stdout)
+            .unwrap()
+            .contains("is good")
+    );
+}
+
+#[test]
+fn a_broken_configuration_is_reported_line_by_line_and_nothing_starts() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = file(&directory, "bad.yaml", "watch:\n  - points\nlgo: info\n");
+    let path = path.to_str().unwrap();
+    for arguments in [&["check-config", path][..], &["run", "--config", path]] {
+        let output = run(arguments);
+        assert_eq!(output.status.code(), Some(78));
+        assert_eq!(
+            stderr(&output),
+            format!(
+                "{path}:2:5: watch[0]: must begin with a slash, as in `/points`\n\
+                 {path}:3:1: lgo: unknown key; did you mean `log`?\n"
+            )
+        );
+    }
+}
+
+#[test]
+fn missing_files_are_named() {
+    fails_with(
+        &run(&["check-config", "/nowhere.yaml"]),
+        78,
+        &["/nowhere.yaml", "No such file"],
+    );
+    fails_with(
+        &run(&["run", "--config", "/nowhere.yaml"]),
+        78,
+        &["/nowhere.yaml"],
+    );
+    fails_with(
+        &run(&["run", "--replay", "/nowhere.pcap"]),
+        1,
+        &["/nowhere.pcap", "No such file"],
+    );
+    let text = concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml");
+    fails_with(&run(&["run", "--replay", text]), 1, &["not a capture"]);
+}
+
+#[test]
+fn a_busy_port_is_named_with_the_key_that_moves_it() {
+    let busy = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = busy.local_addr().unwrap().to_string();
+    let capture = capture();
+    let output = run(&[
+        "run",
+        "--replay",
+        capture.to_str().unwrap(),
+        "--metrics",
+        &address,
+    ]);
+    fails_with(
+        &output,
+        1,
+        &[&address, "metrics.listen", "--metrics", "in use"],
+    );
+}
+
+#[test]
+fn without_privilege_the_missing_capabilities_and_the_command_are_named() {
+    // The build directory may be closed to others.
+    let directory = tempfile::tempdir().unwrap();
+    let program = directory.path().join("rp");
+    std::fs::copy(env!("CARGO_BIN_EXE_rp"), &program).unwrap();
+    for path in [directory.path(), &program] {
+        std::fs::set_permissions(path, Permissions::from_mode(0o755)).unwrap();
+    }
+    let mut command = Command::new("setpriv");
+    if std::fs::metadata("/proc/self").unwrap().uid() == 0 {
+        command.args(["--reuid=65534", "--regid=65534", "--clear-groups"]);
+    }
+    let output = command
+        .args(["--inh-caps=-all"])
+        .arg(&program)
+        .arg("run")
+        .output()
+        .unwrap();
+    let program = program.to_str().unwrap();
+    let grant = format!("sudo setcap cap_net_raw,cap_bpf,cap_perfmon+ep {program}");
+    fails_with(&output, 77, &["CAP_NET_RAW, CAP_BPF, CAP_PERFMON", &grant]);
+}
+
+#[test]
+fn a_report_is_the_metrics_page_and_nothing_else() {
+    let capture = capture();
+    let output = run(&["run", "--replay", capture.to_str().unwrap(), "--report"]);
+    assert!(output.status.success(), "{}", stderr(&output));
+    let page = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(promtool(&page), "");
+    assert_eq!(
+        metric(&page, "ros2probe_source_info{source=\"replay\"}"),
+        Some(1.0)
+    );
+    let packets = metric(
+        &page,
+        "ros2probe_capture_packets_total{interface=\"replay\"}",
+    );
+    assert!(packets > Some(100.0), "{page}");
+}
+
+#[test]
+fn a_cut_capture_is_reported_up_to_the_cut_and_fails() {
+    let directory = tempfile::tempdir().unwrap();
+    let whole = std::fs::read(capture()).unwrap();
+    let path = directory.path().join("cut.pcap.gz");
+    std::fs::write(&path, &whole[..whole.len() / 2]).unwrap();
+    let output = run(&["run", "--replay", path.to_str().unwrap(), "--report"]);
+    fails_with(&output, 1, &["the capture was replayed up to a fault"]);
+    let page = String::from_utf8(output.stdout).unwrap();
+    let packets = metric(
+        &page,
+        "ros2probe_capture_packets_total{interface=\"replay\"}",
+    );
+    assert!(packets > Some(10.0), "{page}");
+}
+
+#[test]
+fn options_that_make_no_sense_are_refused() {
+    for (arguments, message) in [
+        (&["run", "--report"][..], "--replay"),
+        (&["run", "--watch", "points"], "must begin with a slash"),
+        (
+            &["run", "--metrics", "17400"],
+            "must be an IP address and port",
+        ),
+        (
+            &["run", "--replay", "x", "--speed", "fast"],
+            "a speed is a number",
+        ),
+    ] {
+        let output = run(arguments);
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}");
+        assert!(stderr(&output).contains(message), "{}", stderr(&output));
+    }
+}
+
+#[test]
+fn the_version_is_the_package_s() {
+    let output = run(&["--version"]);
+    let version = concat!("rp ", env!("CARGO_PKG_VERSION"), "\n");
+    assert_eq!(String::from_utf8(output.stdout).unwrap(), version);
+}
+
+#[test]
+fn a_signal_ends_the_agent_in_order_and_the_log_says_so() {
+    for signal in ["-TERM", "-INT"] {
+        let mut agent = LocalAgent::start(&[]);
+        agent.wait_for_log("ready");
+        agent.signal(signal);
+        assert!(agent.wait().success());
+        let line = agent.wait_for_log("ended");
+        assert!(line.contains(&format!("SIG{}", &signal[1..])), "{line}");
+        assert!(line.contains("drained=true"), "{line}");
+    }
+}
+
+#[test]
+fn the_service_manager_hears_of_start_progress_reload_and_stop() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("notify");
+    let socket = UnixDatagram::bind(&path).unwrap();
+    socket.set_read_timeout(Some(PATIENCE)).unwrap();
+    let hear = || {
+        let mut buffer = [0; 512];
+        let length = socket.recv(&mut buffer).unwrap();
+        String::from_utf8_lossy(&buffer[..length]).into_owned()
+    };
+    let wait_for = |wanted: &str| while !hear().contains(wanted) {};
+
+    let config = file(&directory, "c.yaml", "watch: [/a]\n");
+    let mut command = rp();
+    command
+        .env("NOTIFY_SOCKET", &path)
+        .env("WATCHDOG_USEC", "1500000");
+    let mut agent = LocalAgent::start_as(&mut command, &["--config", config.to_str().unwrap()]);
+    wait_for("READY=1");
+    wait_for("WATCHDOG=1");
+    wait_for("WATCHDOG=1");
+    agent.signal("-HUP");
+    wait_for("RELOADING=1");
+    wait_for("READY=1");
+    agent.signal("-TERM");
+    wait_for("STOPPING=1");
+    assert!(agent.wait().success());
+}

@@ -1,0 +1,206 @@
+//! The real binary on a free port of this host, replaying a capture: no privilege, no namespaces.
+#![allow(dead_code, reason = "each test file uses its own part")]
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::{Duration, Instant};
+
+/// Longest wait for anything.
+pub const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A small capture of the repository.
+pub fn capture() -> PathBuf {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../wire/tests/data");
+    data.join("cyclonedds-samehost-any.pcap.gz")
+}
+
+/// `rp`, with an environment that does not leak into it.
+pub fn rp() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rp"));
+    command
+        .env_remove("RUST_LOG")
+        .env_remove("NOTIFY_SOCKET")
+        .env("RUST_BACKTRACE", "1");
+    command
+}
+
+/// A running agent; killed with its value.
+pub struct LocalAgent {
+    child: Child,
+    log: Receiver<String>,
+    seen: Vec<String>,
+    pub address: SocketAddr,
+}
+
+/// An HTTP answer.
+pub struct Answer {
+    pub status: u16,
+    pub headers: String,
+    pub body: String,
+}
+
+impl LocalAgent {
+    /// Starts `rp run` on the capture, with further arguments, and waits for its listener.
+    pub fn start(arguments: &[&str]) -> Self {
+        Self::start_as(&mut rp(), arguments)
+    }
+
+    /// As [`Self::start`], with an environment of its own.
+    pub fn start_as(command: &mut Command, arguments: &[&str]) -> Self {
+        let mut child = command
+            .args(["run", "--metrics", "127.0.0.1:0", "--replay"])
+            .arg(capture())
+            .args(arguments)
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let stderr = BufReader::new(child.stderr.take().unwrap());
+        let (lines, log) = channel();
+        std::thread::spawn(move || {
+            stderr
+                .lines()
+                .map_while(Result::ok)
+                .all(|line| lines.send(line).is_ok())
+        });
+        let address = SocketAddr::from(([127, 0, 0, 1], 0));
+        let mut agent = Self {
+            child,
+            log,
+            seen: Vec::new(),
+            address,
+        };
+        let line = agent.wait_for_log("serving metrics");
+        let address = line
+            .split("address=")
+            .nth(1)
+            .and_then(|rest| rest.split(' ').next());
+        agent.address = address.unwrap().parse().unwrap();
+        agent
+    }
+
+    /// The next line of the log that contains `text`.
+    pub fn wait_for_log(&mut self, text: &str) -> String {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let line = self.log.recv_timeout(left).unwrap_or_else(|error| {
+                panic!(
+                    "no `{text}` in the log ({error}):\n{}",
+                    self.seen.join("\n")
+                )
+            });
+            self.seen.push(line.clone());
+            if line.contains(text) {
+                return line;
+            }
+        }
+    }
+
+    /// All of the log so far.
+    pub fn log(&mut self) -> String {
+        self.seen.extend(self.log.try_iter());
+        self.seen.join("\n")
+    }
+
+    pub fn signal(&self, name: &str) {
+        let status = Command::new("kill")
+            .args([name, &self.child.id().to_string()])
+            .status()
+            .unwrap();
+        assert!(status.success());
+    }
+
+    pub fn get(&self, path: &str) -> Answer {
+        self.request("GET", path, "")
+    }
+
+    pub fn request(&self, method: &str, path: &str, headers: &str) -> Answer {
+        request(self.address, method, path, headers)
+    }
+
+    /// Scrapes until a series has a value that is wanted; panics with the last page otherwise.
+    pub fn wait_for_metric(&self, series: &str, wanted: impl Fn(f64) -> bool) -> f64 {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let page = self.get("/metrics").body;
+            match metric(&page, series) {
+                Some(value) if wanted(value) => return value,
+                _ if Instant::now() > deadline => panic!("no such {series} in\n{page}"),
+                _ => std::thread::sleep(Duration::from_millis(50)),
+            }
+        }
+    }
+
+    /// Waits for the end.
+    pub fn wait(&mut self) -> ExitStatus {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status;
+            }
+            assert!(Instant::now() < deadline, "still running:\n{}", self.log());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
+impl Drop for LocalAgent {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// One request on its own connection.
+pub fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> Answer {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let request = format!(
+        "{method} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n{headers}\r\n"
+    );
+    stream.write_all(request.as_bytes()).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    let (headers, body) = answer.split_once("\r\n\r\n").unwrap();
+    let status = headers.split(' ').nth(1).unwrap().parse().unwrap();
+    Answer {
+        status,
+        headers: headers.to_lowercase(),
+        body: body.to_owned(),
+    }
+}
+
+/// The value of a series, written as on the page.
+pub fn metric(page: &str, series: &str) -> Option<f64> {
+    page.lines()
+        .find_map(|line| line.strip_prefix(series)?.strip_prefix(' ')?.parse().ok())
+}
+
+/// What promtool finds wrong with a page in classic format.
+pub fn promtool(page: &str) -> String {
+    let mut promtool = Command::new("promtool")
+        .args(["check", "metrics"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap_or_else(|error| panic!("promtool: {error}; `apt-get install prometheus`"));
+    promtool
+        .stdin
+        .take()
+        .unwrap()
+        .write_all(page.as_bytes())
+        .unwrap();
+    let output = promtool.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    let end = if output.status.success() {
+        ""
+    } else {
+        "(failed)"
+    };
+    format!("{said}{end}")
+}

@@ -1,0 +1,64 @@
+//! The shipped unit: hardened, and free of what systemd would complain about.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn unit() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../systemd/ros2probe.service")
+}
+
+fn systemd_analyze(arguments: &[&str], unit: &Path) -> Output {
+    Command::new("systemd-analyze")
+        .args(arguments)
+        .arg(unit)
+        .output()
+        .unwrap_or_else(|error| panic!("systemd-analyze: {error}; `apt-get install systemd`"))
+}
+
+#[test]
+fn the_exposure_level_is_at_most_2_5() {
+    let output = systemd_analyze(&["security", "--offline=true", "--no-pager"], &unit());
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    let level = said.lines().find_map(|line| {
+        let (_, level) = line.split_once("Overall exposure level for ros2probe.service: ")?;
+        level.split_whitespace().next()?.parse::<f64>().ok()
+    });
+    assert!(
+        level.unwrap_or_else(|| panic!("no level in\n{said}")) <= 2.5,
+        "{said}"
+    );
+}
+
+#[test]
+fn systemd_understands_every_line() {
+    let directory = tempfile::tempdir().unwrap();
+    let copy = directory.path().join("ros2probe.service");
+    let text = std::fs::read_to_string(unit()).unwrap();
+    std::fs::write(&copy, text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"))).unwrap();
+    let output = systemd_analyze(&["verify", "--man=no"], &copy);
+    let said = String::from_utf8_lossy(&output.stderr);
+    // What systemd says of other units on the machine is not ours.
+    let ours: Vec<&str> = said
+        .lines()
+        .filter(|line| line.contains("ros2probe"))
+        .collect();
+    assert!(ours.is_empty(), "{said}");
+}
+
+#[test]
+fn the_agent_may_do_what_it_needs_and_nothing_else() {
+    let text = std::fs::read_to_string(unit()).unwrap();
+    for set in ["CapabilityBoundingSet", "AmbientCapabilities"] {
+        let line = format!("\n{set}=CAP_NET_RAW CAP_BPF CAP_PERFMON\n");
+        assert!(text.contains(&line), "{set}");
+    }
+    for line in [
+        "Type=notify",
+        "LimitMEMLOCK=infinity",
+        "Before=network.target",
+        "Restart=always",
+    ] {
+        assert!(text.lines().any(|other| other == line), "{line}");
+    }
+}
