@@ -176,6 +176,8 @@ impl Header {
 pub struct SubmessageId(pub u8);
 
 impl SubmessageId {
+    /// Header extension of RTPS 2.5; nobody is known to send it.
+    pub const HEADER_EXTENSION: Self = Self(0x00);
     /// Filler.
     pub const PAD: Self = Self(0x01);
     /// Reader acknowledges and asks again.
@@ -217,6 +219,7 @@ impl SubmessageId {
     #[must_use]
     pub const fn name(self) -> Option<&'static str> {
         Some(match self {
+            Self::HEADER_EXTENSION => "RTPS_HE",
             Self::PAD => "PAD",
             Self::ACKNACK => "ACKNACK",
             Self::HEARTBEAT => "HEARTBEAT",
