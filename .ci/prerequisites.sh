@@ -61,7 +61,8 @@ prometheus() {
     refresh
     say "unpacking prometheus and promtool into target/tools (nothing is installed or started)"
     mkdir -p "$tools"
-    (cd "$tools" && apt-get download -qq prometheus && dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb)
+    (cd "$tools" && apt-get -o APT::Sandbox::User=root download -qq prometheus &&
+        dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb)
 }
 
 rust() {
