@@ -11,8 +11,11 @@ use std::sync::mpsc::sync_channel;
 
 use anyhow::{Context as _, Result};
 use clap::Parser as _;
+use ros2probe::capture::live::LiveSource;
 use ros2probe::capture::pcap::Speed;
 use ros2probe::config::{Config, ConfigError, Watchlist};
+use ros2probe::model::observer::{self, Observer};
+use ros2probe::model::reassembly::Limits;
 use ros2probe::privilege::{self, Missing};
 use ros2probe::run::replay::Replay;
 use ros2probe::run::{Run, Source};
@@ -67,7 +70,14 @@ fn run(options: cli::Run) -> Result<()> {
 
     let stop = CancellationToken::new();
     let (orders, inbox) = sync_channel(4);
-    let run = Run::new(source, watchlist, Arc::clone(&board), inbox, stop.clone());
+    let grace = u64::try_from(config.topic_grace.as_nanos()).unwrap_or(u64::MAX);
+    let settings = observer::Settings {
+        topic_grace: grace,
+        ..observer::Settings::default().with_limits(&config.limits)
+    };
+    let mut observer = Observer::new(settings);
+    observer.set_watchlist(watchlist);
+    let run = Run::new(source, observer, Arc::clone(&board), inbox, stop.clone());
     if options.report && server.is_none() {
         let ended = run.run();
         print!("{}", Exposition::new(board).render(Format::Classic)?);
@@ -107,16 +117,21 @@ fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>)> {
 }
 
 fn open(options: &cli::Run, config: &Config) -> Result<Source> {
+    let limits = Limits {
+        bytes: config.limits.reassembly_bytes,
+        ..Limits::default()
+    };
     let Some(file) = &options.replay else {
         privilege::check(&config.capture)?;
-        anyhow::bail!("live capture is not part of this build");
+        let live = LiveSource::open(&config.capture, limits)?;
+        return Ok(Source::Live(Box::new(live)));
     };
     let pace = if options.report {
         Speed::Max
     } else {
         Speed::Times(1.0)
     };
-    let replay = Replay::open(file, options.speed.unwrap_or(pace))
+    let replay = Replay::open(file, options.speed.unwrap_or(pace), limits)
         .with_context(|| format!("cannot replay {}", file.display()))?;
     Ok(Source::Replay(Box::new(replay)))
 }

@@ -12,6 +12,7 @@ use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 use crate::guid::EntityId;
 use crate::record::{Handover, Record, flag, kind};
+use crate::time::Timestamp;
 
 /// Where a walk reads from: a slice, or a socket buffer in the kernel.
 pub trait Bytes {
@@ -557,6 +558,19 @@ pub struct Envelope {
 }
 
 impl Envelope {
+    /// Of a datagram that the kernel filter handed over with `record`, complete at `time`.
+    #[must_use]
+    pub fn of_handover(record: &Record, time: Timestamp) -> Self {
+        Self {
+            time: time.0,
+            destination: zerocopy::transmute!(record.destination),
+            destination_port: record.destination_port,
+            interface: record.interface,
+            outgoing: record.flags & flag::OUTGOING != 0,
+            fragmented: true,
+        }
+    }
+
     /// The record fields that concern the whole datagram.
     fn record(&self) -> Record {
         const IPV4_MAPPED: [u8; 12] = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff];

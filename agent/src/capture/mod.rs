@@ -3,6 +3,8 @@
 pub mod feed;
 pub mod filter;
 pub mod interfaces;
+pub mod live;
 pub mod netns;
 pub mod pcap;
 pub mod ring;
+pub mod system;

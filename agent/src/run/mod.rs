@@ -3,14 +3,19 @@
 
 pub mod replay;
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
+use ros2probe_wire::filter::Counter;
+use ros2probe_wire::{GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
+use crate::capture::live::{CaptureError, LiveSource};
 use crate::capture::pcap::PcapError;
 use crate::config::Watchlist;
+use crate::model::observer::Observer;
 use crate::model::snapshot::Snapshot;
 use crate::surface::{AgentFacts, Board, InterfaceFacts, SourceKind};
 use replay::Replay;
@@ -22,6 +27,8 @@ const PUBLISH: Duration = Duration::from_secs(1);
 
 /// Where packets come from.
 pub enum Source {
+    /// This host's interfaces.
+    Live(Box<LiveSource>),
     /// A capture.
     Replay(Box<Replay>),
 }
@@ -36,6 +43,9 @@ pub enum Order {
 /// Why the working thread ended although nobody asked it to.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
+    /// The host's interfaces can no longer be captured.
+    #[error("capturing ended")]
+    Capture(#[from] CaptureError),
     /// The rest of a capture cannot be read; what came before it is on the board.
     #[error("the capture was replayed up to a fault")]
     Replay(#[source] PcapError),
@@ -44,7 +54,9 @@ pub enum RunError {
 /// Source, model and board, for one thread.
 pub struct Run {
     source: Source,
-    watchlist: Watchlist,
+    observer: Observer,
+    /// Participants whose last message the kernel filter notes.
+    followed: BTreeSet<GuidPrefix>,
     board: Arc<Board>,
     orders: Receiver<Order>,
     stop: CancellationToken,
@@ -53,16 +65,17 @@ pub struct Run {
 impl Run {
     /// Ready to run.
     #[must_use]
-    pub fn new(
+    pub const fn new(
         source: Source,
-        watchlist: Watchlist,
+        observer: Observer,
         board: Arc<Board>,
         orders: Receiver<Order>,
         stop: CancellationToken,
     ) -> Self {
         Self {
             source,
-            watchlist,
+            observer,
+            followed: BTreeSet::new(),
             board,
             orders,
             stop,
@@ -78,24 +91,36 @@ impl Run {
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
             self.take_orders();
-            let polled = self.source.poll(SLICE);
+            let polled = self.source.poll(SLICE, &mut self.observer);
             let finished = self.source.is_finished();
+            if finished {
+                self.observer.settle();
+            } else {
+                self.observer.advance(self.source.clock());
+            }
+            if let Source::Live(live) = &mut self.source {
+                live.apply(&self.observer.interest_changes());
+            }
             if finished || polled.is_err() || published.elapsed() >= PUBLISH {
                 self.publish();
                 published = Instant::now();
             }
             polled?;
             if finished {
-                break;
+                return Ok(());
             }
         }
+        if let Source::Live(live) = &mut self.source {
+            live.drain(&mut self.observer);
+        }
+        self.publish();
         Ok(())
     }
 
     fn take_orders(&mut self) {
         loop {
             match self.orders.try_recv() {
-                Ok(Order::Watch(watchlist)) => self.watchlist = watchlist,
+                Ok(Order::Watch(watchlist)) => self.observer.set_watchlist(watchlist),
                 // Without a supervisor there are no more orders; its token says when to stop.
                 Err(TryRecvError::Empty | TryRecvError::Disconnected) => return,
             }
@@ -103,12 +128,32 @@ impl Run {
     }
 
     fn publish(&mut self) {
-        let snapshot = Snapshot {
-            at: self.source.clock(),
-            ..Snapshot::default()
-        };
-        self.board.publish(snapshot, self.source.facts());
+        if let Source::Live(live) = &mut self.source {
+            self.observer.participants_alive(live.last_seen());
+        }
+        let snapshot = self.observer.snapshot(self.source.clock());
+        if let Source::Live(live) = &mut self.source {
+            follow(live, &mut self.followed, &snapshot);
+        }
+        let facts = self.source.facts();
+        self.board.publish(snapshot, facts);
     }
+}
+
+/// Keeps the kernel filter's list of participants the model's.
+fn follow(live: &mut LiveSource, followed: &mut BTreeSet<GuidPrefix>, snapshot: &Snapshot) {
+    let present: BTreeSet<_> = snapshot
+        .participants
+        .iter()
+        .map(|participant| participant.guid.prefix)
+        .collect();
+    for gone in followed.difference(&present) {
+        live.follow(*gone, false);
+    }
+    for new in present.difference(followed) {
+        live.follow(*new, true);
+    }
+    *followed = present;
 }
 
 impl Source {
@@ -116,31 +161,36 @@ impl Source {
     #[must_use]
     pub const fn kind(&self) -> SourceKind {
         match self {
+            Self::Live(_) => SourceKind::Live,
             Self::Replay(_) => SourceKind::Replay,
         }
     }
 
-    fn poll(&mut self, timeout: Duration) -> Result<(), RunError> {
+    fn poll(&mut self, timeout: Duration, observer: &mut Observer) -> Result<(), RunError> {
         match self {
-            Self::Replay(replay) => replay.poll(timeout, |_| {}).map_err(RunError::Replay),
+            Self::Live(live) => Ok(live.poll(timeout, observer)?),
+            Self::Replay(replay) => replay.poll(timeout, observer).map_err(RunError::Replay),
         }
     }
 
-    fn clock(&self) -> ros2probe_wire::Timestamp {
+    fn clock(&self) -> Timestamp {
         match self {
+            Self::Live(live) => live.clock(),
             Self::Replay(replay) => replay.clock(),
         }
     }
 
     fn is_finished(&self) -> bool {
         match self {
+            Self::Live(_) => false,
             Self::Replay(replay) => replay.is_finished(),
         }
     }
 
-    fn facts(&self) -> AgentFacts {
+    fn facts(&mut self) -> AgentFacts {
         let now = Instant::now();
         match self {
+            Self::Live(live) => live_facts(live, now),
             Self::Replay(replay) => {
                 let (packets, bytes) = replay.progress();
                 AgentFacts {
@@ -155,5 +205,45 @@ impl Source {
                 }
             }
         }
+    }
+}
+
+fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
+    let named = |namespace: Option<std::path::PathBuf>, name: &str| match namespace {
+        Some(path) => format!("{}:{name}", path.display()),
+        None => name.to_owned(),
+    };
+    // A socket for all interfaces of a namespace has one drop counter.
+    let drops = live.drops().unwrap_or_default();
+    let mut interfaces: Vec<_> = drops
+        .into_iter()
+        .map(|count| InterfaceFacts {
+            name: named(count.namespace, "any"),
+            packets: 0,
+            dropped: count.dropped,
+        })
+        .collect();
+    interfaces.extend(live.packets().map(|count| InterfaceFacts {
+        name: named(count.namespace, &count.name),
+        packets: count.packets,
+        dropped: 0,
+    }));
+    let counters = live.counters().unwrap_or_default();
+    let value = |wanted: Counter| {
+        counters
+            .iter()
+            .find(|(counter, _)| *counter == wanted)
+            .map_or(0, |(_, value)| *value)
+    };
+    AgentFacts {
+        interfaces,
+        verdicts: counters
+            .iter()
+            .map(|(counter, value)| (counter.label(), *value))
+            .collect(),
+        copied_bytes: live.copied_bytes(),
+        records_dropped: value(Counter::RecordsLost),
+        flows_evicted: live.incomplete_datagrams(),
+        ..AgentFacts::new(SourceKind::Live, now)
     }
 }

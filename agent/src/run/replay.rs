@@ -8,7 +8,10 @@ use std::time::{Duration, Instant};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::Link;
 
+use crate::capture::feed::Feed;
 use crate::capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed};
+use crate::model::observer::Observer;
+use crate::model::reassembly::Limits;
 
 /// How often a terminal is told how far it is.
 const PROGRESS: Duration = Duration::from_secs(1);
@@ -16,6 +19,7 @@ const PROGRESS: Duration = Duration::from_secs(1);
 /// A capture being replayed.
 pub struct Replay {
     reader: PcapReader,
+    feed: Feed,
     pacer: Pacer,
     speed: Speed,
     /// Read but not due yet.
@@ -42,9 +46,10 @@ impl Replay {
     ///
     /// # Errors
     /// When it cannot be read or is none.
-    pub fn open(path: &Path, speed: Speed) -> Result<Self, PcapError> {
+    pub fn open(path: &Path, speed: Speed, limits: Limits) -> Result<Self, PcapError> {
         Ok(Self {
             reader: PcapReader::open(path)?,
+            feed: Feed::new(limits),
             pacer: Pacer::new(speed),
             speed,
             waiting: None,
@@ -62,11 +67,7 @@ impl Replay {
     ///
     /// # Errors
     /// When the rest of the capture cannot be read; what came before has been delivered.
-    pub fn poll(
-        &mut self,
-        timeout: Duration,
-        mut deliver: impl FnMut(Captured<'_>),
-    ) -> Result<(), PcapError> {
+    pub fn poll(&mut self, timeout: Duration, observer: &mut Observer) -> Result<(), PcapError> {
         let end = Instant::now() + timeout;
         while !self.finished {
             let now = Instant::now();
@@ -92,13 +93,14 @@ impl Replay {
                 } = *waiting;
                 let bytes = &waiting.bytes;
                 self.clock = self.clock.max(time);
-                deliver(Captured {
+                let captured = Captured {
                     time,
                     link,
                     interface,
                     bytes,
                     length,
-                });
+                };
+                self.feed.packet(&captured, observer);
             }
             self.next()?;
         }

@@ -1,0 +1,463 @@
+//! This host's interfaces: packets and records of every configured network namespace, given to the
+//! model in the order in which they were captured.
+//!
+//! Each namespace has a tap of its own: packet socket, ring, kernel filter. Nothing is ever sent.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::os::fd::{AsFd as _, BorrowedFd};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use ros2probe_wire::filter::Counter;
+use ros2probe_wire::frame::{self, PacketType, Payload};
+use ros2probe_wire::record::{Verdict, kind};
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp, WireError};
+
+use super::filter::{Filter, FilterError, FilterSettings};
+use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
+use super::netns::{self, NetnsError};
+use super::ring::{self, Ring, RingError, RingFrame};
+use super::system::{Clocks, wait};
+use crate::config::CaptureSettings;
+use crate::model::ahead::{Ahead, Ready};
+use crate::model::observer::Observer;
+use crate::model::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
+
+/// A frame waits this long for its block to fill.
+const RETIRE: Duration = Duration::from_millis(60);
+/// Records younger than this wait, so that frames captured before them are taken in first.
+const SETTLE_NANOSECONDS: u64 = 80_000_000;
+/// What unclassified writers may cost each second, all together: a dozen nodes that start at once
+/// stay far below, a storm of forged ones stays bounded.
+const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
+const UNKNOWN_RECORDS_PER_SECOND: u32 = 4096;
+const SECOND: u64 = 1_000_000_000;
+/// Blocks of a packet ring: enough for one to fill while others wait for us.
+const BLOCKS: usize = 8;
+
+/// Why capturing could not begin or go on.
+#[derive(Debug, thiserror::Error)]
+pub enum CaptureError {
+    /// The kernel filter.
+    #[error(transparent)]
+    Filter(#[from] FilterError),
+    /// The packet socket or its ring.
+    #[error(transparent)]
+    Ring(#[from] RingError),
+    /// The list of interfaces.
+    #[error(transparent)]
+    Interfaces(#[from] InterfacesError),
+    /// Another network namespace.
+    #[error(transparent)]
+    Namespace(#[from] NetnsError),
+    /// An interface glob.
+    #[error("capture.interfaces")]
+    Selection(#[from] globset::Error),
+    /// Waiting for packets.
+    #[error("waiting for packets")]
+    Wait(#[source] std::io::Error),
+}
+
+/// All taps.
+pub struct LiveSource {
+    taps: Vec<Tap>,
+    refilled: u64,
+    refused_updates: u64,
+    clock: Timestamp,
+}
+
+/// What one interface delivered.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct InterfaceCount {
+    /// Network namespace as configured; `None` = the agent's own.
+    pub namespace: Option<PathBuf>,
+    /// Interface name, or its index if it went away before it was known.
+    pub name: String,
+    /// Frames that the filter let through.
+    pub packets: u64,
+}
+
+/// What the kernel dropped for one namespace.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DropCount {
+    /// Network namespace as configured; `None` = the agent's own.
+    pub namespace: Option<PathBuf>,
+    /// Frames lost because the packet ring was full.
+    pub dropped: u64,
+}
+
+impl LiveSource {
+    /// Opens a tap in this network namespace and in each configured one. When this returns, every
+    /// tap is capturing.
+    ///
+    /// # Errors
+    /// A capability is missing, a namespace does not exist, the kernel refuses.
+    pub fn open(settings: &CaptureSettings, limits: Limits) -> Result<Self, CaptureError> {
+        let mut taps = vec![Tap::open(settings, limits, 0, None)?];
+        for (number, path) in (1..).zip(&settings.network_namespaces) {
+            let tap = netns::within(path, || {
+                Tap::open(settings, limits, number, Some(path.clone()))
+            })??;
+            taps.push(tap);
+        }
+        let clocks = Clocks::read();
+        let mut source = Self {
+            taps,
+            refilled: 0,
+            refused_updates: 0,
+            clock: clocks.now,
+        };
+        source.refill(clocks.monotonic);
+        Ok(source)
+    }
+
+    /// Waits for packets, up to `timeout`, and gives the model all there is.
+    ///
+    /// # Errors
+    /// The kernel refuses to go on.
+    pub fn poll(&mut self, timeout: Duration, observer: &mut Observer) -> Result<(), CaptureError> {
+        let descriptors: Vec<_> = self.taps.iter().flat_map(Tap::descriptors).collect();
+        wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
+        let clocks = Clocks::read();
+        if clocks.monotonic.wrapping_sub(self.refilled) >= SECOND {
+            self.refill(clocks.monotonic);
+        }
+        for tap in &mut self.taps {
+            tap.follow_interfaces();
+            tap.take_records();
+            tap.take_frames(observer)?;
+            tap.deliver(&clocks, SETTLE_NANOSECONDS, observer);
+        }
+        self.clock = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
+        Ok(())
+    }
+
+    /// Gives the model what still waits, at the end.
+    pub fn drain(&mut self, observer: &mut Observer) {
+        let clocks = Clocks::read();
+        for tap in &mut self.taps {
+            tap.take_records();
+            tap.deliver(&clocks, 0, observer);
+        }
+    }
+
+    /// Tells the kernel filters what has become of interest. What they have no room for stays
+    /// unknown to them, and is counted.
+    pub fn apply(&mut self, changes: &[(Guid, Option<Verdict>)]) {
+        for tap in &mut self.taps {
+            for (endpoint, verdict) in changes {
+                let told = tap.filter.set_interest(*endpoint, *verdict);
+                self.refused_updates += u64::from(told.is_err());
+            }
+        }
+    }
+
+    /// Notes from now on, or no longer, when a participant last sent anything.
+    pub fn follow(&mut self, participant: GuidPrefix, follow: bool) {
+        for tap in &mut self.taps {
+            let told = tap.filter.follow_participant(participant, follow);
+            self.refused_updates += u64::from(told.is_err());
+        }
+    }
+
+    /// Updates that a kernel map had no room for, or that the kernel refused.
+    #[must_use]
+    pub fn refused_updates(&self) -> u64 {
+        let interfaces: u64 = self.taps.iter().map(|tap| tap.refused_interfaces).sum();
+        self.refused_updates + interfaces
+    }
+
+    /// Time up to which everything captured has been given to the model.
+    #[must_use]
+    pub const fn clock(&self) -> Timestamp {
+        self.clock
+    }
+
+    /// When each followed participant last sent anything.
+    #[must_use]
+    pub fn last_seen(&self) -> BTreeMap<GuidPrefix, Timestamp> {
+        let clocks = Clocks::read();
+        let mut seen = BTreeMap::new();
+        for (participant, at) in self.taps.iter().flat_map(|tap| tap.filter.participants()) {
+            let at = clocks.calendar(at);
+            let latest = seen.entry(participant).or_insert(at);
+            *latest = at.max(*latest);
+        }
+        seen
+    }
+
+    /// Captured frames by interface.
+    pub fn packets(&self) -> impl Iterator<Item = InterfaceCount> + '_ {
+        self.taps.iter().flat_map(|tap| {
+            tap.packets.iter().map(|(index, packets)| InterfaceCount {
+                namespace: tap.path.clone(),
+                name: tap
+                    .interfaces
+                    .by_index(*index)
+                    .map_or_else(|| index.to_string(), |interface| interface.name.clone()),
+                packets: *packets,
+            })
+        })
+    }
+
+    /// Frames that the kernel dropped, by namespace.
+    ///
+    /// # Errors
+    /// The kernel does not tell.
+    pub fn drops(&mut self) -> Result<Vec<DropCount>, CaptureError> {
+        self.taps
+            .iter_mut()
+            .map(|tap| {
+                Ok(DropCount {
+                    namespace: tap.path.clone(),
+                    dropped: tap.ring.statistics()?.drops,
+                })
+            })
+            .collect()
+    }
+
+    /// The kernel filters' counters, summed.
+    ///
+    /// # Errors
+    /// The kernel does not tell.
+    pub fn counters(&self) -> Result<Vec<(Counter, u64)>, CaptureError> {
+        let mut sums: Vec<_> = Counter::ALL.map(|counter| (counter, 0)).into();
+        for tap in &self.taps {
+            for ((_, sum), (_, value)) in sums.iter_mut().zip(tap.filter.counters()?) {
+                *sum += value;
+            }
+        }
+        Ok(sums)
+    }
+
+    /// Bytes that came from the kernel: frames and records.
+    #[must_use]
+    pub fn copied_bytes(&self) -> u64 {
+        self.taps.iter().map(|tap| tap.copied_bytes).sum()
+    }
+
+    /// Fragmented datagrams that were begun and never became complete: the kernel filter's and
+    /// those reassembled here.
+    #[must_use]
+    pub fn incomplete_datagrams(&self) -> u64 {
+        self.taps
+            .iter()
+            .map(|tap| {
+                let reassembly = tap.reassembly.counters();
+                tap.ahead.given_up() + reassembly.evicted + reassembly.timed_out
+            })
+            .sum()
+    }
+
+    /// Bytes held for reassembly.
+    #[must_use]
+    pub fn reassembly_bytes(&self) -> usize {
+        self.taps.iter().map(|tap| tap.reassembly.bytes()).sum()
+    }
+
+    fn refill(&mut self, monotonic: u64) {
+        self.refilled = monotonic;
+        for tap in &mut self.taps {
+            let (bytes, records) = (UNKNOWN_BYTES_PER_SECOND, UNKNOWN_RECORDS_PER_SECOND);
+            let refilled = tap.filter.set_unknown_budget(bytes, records);
+            self.refused_updates += u64::from(refilled.is_err());
+        }
+    }
+}
+
+/// One network namespace.
+struct Tap {
+    number: u32,
+    path: Option<PathBuf>,
+    ring: Ring,
+    filter: Filter,
+    interfaces: Interfaces,
+    selection: Selection,
+    /// Frames captured by interface index.
+    packets: BTreeMap<u32, u64>,
+    reassembly: Reassembly,
+    ahead: Ahead,
+    /// Records that wait for older frames.
+    records: VecDeque<Record>,
+    copied_bytes: u64,
+    refused_interfaces: u64,
+}
+
+impl Tap {
+    /// In the calling thread's namespace. The filter knows the interfaces before the socket sees
+    /// the first frame.
+    fn open(
+        settings: &CaptureSettings,
+        limits: Limits,
+        number: u32,
+        path: Option<PathBuf>,
+    ) -> Result<Self, CaptureError> {
+        let selection = Selection::new(&settings.include_interfaces, &settings.exclude_interfaces)?;
+        let mut filter = Filter::load(&FilterSettings {
+            record_ring_bytes: u32::try_from(settings.record_ring_bytes).unwrap_or(u32::MAX >> 1),
+            accept_new_interfaces: selection.accepts_unknown(),
+        })?;
+        let interfaces = Interfaces::open()?;
+        for interface in interfaces.iter() {
+            filter.accept_interface(interface.index, selection.accepts(&interface.name))?;
+        }
+        let ring = Ring::open(
+            ring::Settings {
+                block_size: settings.ring_bytes / BLOCKS,
+                blocks: BLOCKS,
+                retire: RETIRE,
+            },
+            Some(filter.program()),
+        )?;
+        Ok(Self {
+            number,
+            path,
+            ring,
+            filter,
+            interfaces,
+            selection,
+            packets: BTreeMap::new(),
+            reassembly: Reassembly::new(limits),
+            ahead: Ahead::default(),
+            records: VecDeque::new(),
+            copied_bytes: 0,
+            refused_interfaces: 0,
+        })
+    }
+
+    fn descriptors(&self) -> [BorrowedFd<'_>; 3] {
+        [
+            self.ring.as_fd(),
+            self.filter.record_ring(),
+            self.interfaces.as_fd(),
+        ]
+    }
+
+    /// A list that cannot be read now is read the next time.
+    fn follow_interfaces(&mut self) {
+        for change in self.interfaces.changes().unwrap_or_default() {
+            if let Change::Present(Interface { index, name, .. }) = change {
+                let accept = self.selection.accepts(&name);
+                let told = self.filter.accept_interface(index, accept);
+                self.refused_interfaces += u64::from(told.is_err());
+            }
+        }
+    }
+
+    /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
+    fn take_records(&mut self) {
+        while let Some(record) = self.filter.next_record() {
+            self.copied_bytes += size_of::<Record>() as u64;
+            self.records.push_back(record);
+        }
+    }
+
+    fn take_frames(&mut self, observer: &mut Observer) -> Result<(), CaptureError> {
+        // Clears what the socket reports when a link goes down; without, waiting would never wait.
+        self.ring.wait(Duration::ZERO)?;
+        let (number, reassembly, ahead) = (self.number, &mut self.reassembly, &mut self.ahead);
+        while let Some(block) = self.ring.block() {
+            for captured in block.frames() {
+                self.copied_bytes += captured.bytes.len() as u64;
+                *self.packets.entry(captured.interface).or_default() += 1;
+                let datagram = Assembly {
+                    number,
+                    reassembly: &mut *reassembly,
+                    ahead: &mut *ahead,
+                };
+                if let Err(error) = datagram.frame(&captured, observer) {
+                    observer.decode_error("frame", error.reason);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Gives the model the records that are older than `settle` nanoseconds.
+    fn deliver(&mut self, clocks: &Clocks, settle: u64, observer: &mut Observer) {
+        let horizon = clocks.monotonic.saturating_sub(settle);
+        while let Some(record) = self.records.front()
+            && record.time <= horizon
+            && let Some(mut record) = self.records.pop_front()
+        {
+            let at = clocks.calendar(record.time);
+            record.time = at.0;
+            if record.kind == kind::HANDOVER {
+                let key = FlowKey::of_handover(self.number, &record);
+                if let Some(rest) = self.reassembly.hand_over(at, key, &record) {
+                    let ready = |each| take_in(each, observer);
+                    self.ahead.rest(self.number, rest, ready);
+                }
+            }
+            let ready = |each| take_in(each, observer);
+            self.ahead.record(self.number, record, ready);
+        }
+        self.ahead.advance(clocks.now);
+        self.reassembly.advance(clocks.now);
+    }
+}
+
+/// What turns one tap's frames into datagrams.
+struct Assembly<'a> {
+    number: u32,
+    reassembly: &'a mut Reassembly,
+    ahead: &'a mut Ahead,
+}
+
+impl Assembly<'_> {
+    fn frame(self, captured: &RingFrame<'_>, observer: &mut Observer) -> Result<(), WireError> {
+        let packet = frame::parse_cooked(
+            captured.protocol,
+            captured.packet_type,
+            captured.bytes,
+            captured.length,
+        )?;
+        let Some(packet) = packet else { return Ok(()) };
+        let outgoing = captured.packet_type == PacketType::OUTGOING;
+        let mut envelope = Envelope {
+            time: captured.time.0,
+            destination: packet.destination,
+            interface: captured.interface,
+            outgoing,
+            ..Envelope::default()
+        };
+        match &packet.payload {
+            Payload::Datagram(udp) => {
+                envelope.destination_port = udp.destination_port;
+                observer.datagram(&envelope, udp.payload, None);
+            }
+            Payload::Fragment(fragment) => {
+                let key =
+                    FlowKey::new(self.number, captured.interface, outgoing, &packet, fragment);
+                let Some(whole) = self.reassembly.fragment(captured.time, key, fragment) else {
+                    return Ok(());
+                };
+                if whole.handover.is_some() {
+                    let ready = |each| take_in(each, observer);
+                    self.ahead.rest(self.number, whole, ready);
+                } else {
+                    envelope.destination_port = whole.destination_port;
+                    envelope.fragmented = true;
+                    observer.datagram(&envelope, whole.payload(), None);
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+/// What has become complete.
+fn take_in(ready: Ready, observer: &mut Observer) {
+    match ready {
+        Ready::Record(record) => observer.record(&record),
+        Ready::Rest(rest) => take_in_rest(&rest, observer),
+    }
+}
+
+fn take_in_rest(rest: &Reassembled, observer: &mut Observer) {
+    let Some(record) = rest.handover else { return };
+    let envelope = Envelope::of_handover(&record, rest.last_seen);
+    observer.datagram(&envelope, rest.payload(), Some(&record.handover()));
+}

@@ -1,0 +1,99 @@
+//! The two system calls that live capture needs beside its sockets: waiting and the clocks.
+
+use std::io;
+use std::os::fd::{AsRawFd as _, BorrowedFd};
+use std::time::Duration;
+
+use libc::c_int;
+use ros2probe_wire::Timestamp;
+
+/// Waits until one of `descriptors` is readable or in error, a signal comes, or the time is over.
+///
+/// # Errors
+/// `poll` itself fails.
+pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<()> {
+    let mut poll: Vec<_> = descriptors
+        .iter()
+        .map(|descriptor| libc::pollfd {
+            fd: descriptor.as_raw_fd(),
+            events: libc::POLLIN,
+            revents: 0,
+        })
+        .collect();
+    let milliseconds = c_int::try_from(timeout.as_millis()).unwrap_or(c_int::MAX);
+    let count = libc::nfds_t::try_from(poll.len()).unwrap_or(0);
+    // SAFETY: `poll` holds `count` entries and outlives the call.
+    let ready = unsafe { libc::poll(poll.as_mut_ptr(), count, milliseconds) };
+    if ready < 0 {
+        let error = io::Error::last_os_error();
+        if error.kind() != io::ErrorKind::Interrupted {
+            return Err(error);
+        }
+    }
+    Ok(())
+}
+
+/// The kernel filter's clock beside the calendar's, read at one moment.
+#[derive(Clone, Copy, Debug)]
+pub struct Clocks {
+    /// CLOCK_REALTIME.
+    pub now: Timestamp,
+    /// CLOCK_MONOTONIC in nanoseconds.
+    pub monotonic: u64,
+}
+
+impl Clocks {
+    /// Both clocks now.
+    #[must_use]
+    pub fn read() -> Self {
+        Self {
+            now: Timestamp(nanoseconds(libc::CLOCK_REALTIME)),
+            monotonic: nanoseconds(libc::CLOCK_MONOTONIC),
+        }
+    }
+
+    /// A monotonic time as a calendar time. Wrong by the step if the calendar clock was set between.
+    #[must_use]
+    pub const fn calendar(&self, monotonic: u64) -> Timestamp {
+        let ago = self.monotonic.wrapping_sub(monotonic);
+        Timestamp(self.now.0.wrapping_sub(ago))
+    }
+}
+
+fn nanoseconds(clock: libc::clockid_t) -> u64 {
+    let mut time = libc::timespec {
+        tv_sec: 0,
+        tv_nsec: 0,
+    };
+    // SAFETY: `time` is ours; both clocks always exist.
+    unsafe { libc::clock_gettime(clock, &raw mut time) };
+    let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
+    let nanoseconds = u64::try_from(time.tv_nsec).unwrap_or(0);
+    seconds * 1_000_000_000 + nanoseconds
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::fd::AsFd as _;
+    use std::os::unix::net::UnixStream;
+    use std::time::Instant;
+
+    use super::*;
+
+    #[test]
+    fn waiting_ends_with_the_time_and_with_data() {
+        let (mut one, two) = UnixStream::pair().unwrap();
+        wait(&[two.as_fd()], Duration::from_millis(1)).unwrap();
+        io::Write::write_all(&mut one, b"x").unwrap();
+        let start = Instant::now();
+        wait(&[two.as_fd()], Duration::from_secs(60)).unwrap();
+        assert!(start.elapsed() < Duration::from_secs(30));
+    }
+
+    #[test]
+    fn a_monotonic_time_a_second_ago_is_a_calendar_time_a_second_ago() {
+        let clocks = Clocks::read();
+        let then = clocks.calendar(clocks.monotonic - 1_000_000_000);
+        assert_eq!(clocks.now.nanoseconds_since(then), 1_000_000_000);
+    }
+}
