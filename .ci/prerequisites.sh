@@ -128,7 +128,7 @@ ebpf() {
     fi
 }
 
-network_tools=(iproute2 nftables ethtool util-linux curl ca-certificates)
+network_tools=(iproute2 nftables ethtool util-linux curl ca-certificates tcpdump)
 
 for need; do
     case $need in
@@ -138,7 +138,7 @@ for need; do
         rust
         ;;
     test)
-        packages "${network_tools[@]}" gcc g++ make tcpdump tshark strace jq \
+        packages "${network_tools[@]}" gcc g++ make tshark strace jq \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
         prometheus
         rust

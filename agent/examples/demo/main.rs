@@ -6,6 +6,7 @@
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail};
@@ -42,10 +43,19 @@ struct Options {
     relay: Option<PathBuf>,
 }
 
+fn main() -> ExitCode {
+    match demo(&Options::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("demo: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
 /// One thread: the processes started below live as long as it does.
 #[tokio::main(flavor = "current_thread")]
-async fn main() -> Result<()> {
-    let options = Options::parse();
+async fn demo(options: &Options) -> Result<()> {
     if let Some(socket) = &options.relay {
         return relay::serve(socket, PORT);
     }
@@ -69,7 +79,7 @@ async fn main() -> Result<()> {
     let directory = tempfile::tempdir().context("cannot create a directory")?;
     let log = directory.path().join("agent.log");
     let agent = Agent::start_logging(&link.robot, agent, &options.config, &log)
-        .with_context(|| format!("the agent said:\n{}", read_lossy(&log)))?;
+        .with_context(|| format!("the agent said: {}", read_lossy(&log).trim()))?;
     let relay = Relay::start(&link.robot, directory.path(), PORT)?;
     let robots = [
         robot(&link.robot, "lidar")?,
@@ -90,7 +100,8 @@ async fn main() -> Result<()> {
         match agent.scrape() {
             Ok(scrape) => summary.show(&scrape, Instant::now(), &relay, &link),
             Err(error) => {
-                failure = Some(error.context(format!("the agent said:\n{}", read_lossy(&log))));
+                failure =
+                    Some(error.context(format!("the agent said: {}", read_lossy(&log).trim())));
                 break;
             }
         }

@@ -1,5 +1,6 @@
 //! What a peer says it really sent or received: one JSON object per line.
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
@@ -44,6 +45,16 @@ impl EventLog {
             .filter(|event| event.ev == ev)
             .filter_map(|event| event.seq)
             .collect()
+    }
+
+    /// How many samples are missing between the first and the last that this subscriber was given:
+    /// what an observer of the same link can know to be lost.
+    pub(crate) fn missing(&self) -> u64 {
+        let received: BTreeSet<u64> = self.sequences("sub").into_iter().collect();
+        match (received.first(), received.last()) {
+            (Some(first), Some(last)) => last - first + 1 - received.len() as u64,
+            _ => 0,
+        }
     }
 
     pub(crate) fn endpoints(&self) -> impl Iterator<Item = &Event> {

@@ -8,6 +8,7 @@
 #![allow(dead_code, reason = "each test file uses its own part of the harness")]
 
 pub(crate) mod agent;
+pub(crate) mod capture;
 pub(crate) mod event_log;
 pub(crate) mod loss;
 pub(crate) mod network;
@@ -20,13 +21,14 @@ use std::process::Command;
 use anyhow::{Context as _, Result, bail};
 
 /// Tools the harness runs, with the Debian or Ubuntu package that has each.
-const TOOLS: [(&str, &str); 6] = [
+const TOOLS: [(&str, &str); 7] = [
     ("ip", "iproute2"),
     ("nft", "nftables"),
     ("ethtool", "ethtool"),
     ("nsenter", "util-linux"),
     ("setpriv", "util-linux"),
     ("curl", "curl"),
+    ("tcpdump", "tcpdump"),
 ];
 
 /// Fails unless this process is root and every tool is there.

@@ -92,9 +92,23 @@ impl Stream {
 }
 
 impl Peer {
-    /// Starts a peer and waits until its endpoint exists. A publisher holds its samples until
+    /// Starts a peer and waits until its endpoints exist. A publisher holds its samples until
     /// [`Peer::go`].
     pub(crate) fn start(
+        host: &Namespace,
+        stack: Stack,
+        role: Role,
+        stream: &Stream,
+        nodes: &[&str],
+    ) -> Result<Peer> {
+        let mut peer = Peer::launch(host, stack, role, stream, nodes)?;
+        peer.wait_ready()
+            .with_context(|| format!("{stack:?} {role:?}"))?;
+        Ok(peer)
+    }
+
+    /// As [`Peer::start`] without waiting, for peers that begin at the same time.
+    pub(crate) fn launch(
         host: &Namespace,
         stack: Stack,
         role: Role,
@@ -136,11 +150,12 @@ impl Peer {
         if stream.transient_local {
             words.push("--transient-local".to_owned());
         }
-        let mut process = Process::start(&host.inside(), stack.program()?, words)?;
-        process
-            .wait_for("ready", PATIENCE)
-            .with_context(|| format!("{stack:?} {role:?}"))?;
+        let process = Process::start(&host.inside(), stack.program()?, words)?;
         Ok(Peer { process, directory })
+    }
+
+    pub(crate) fn wait_ready(&mut self) -> Result<()> {
+        self.process.wait_for("ready", PATIENCE)
     }
 
     /// Waits until a peer of the other role is known.
