@@ -138,7 +138,14 @@ fn without_privilege_the_missing_capabilities_and_the_command_are_named() {
 #[test]
 fn a_report_is_the_metrics_page_and_nothing_else() {
     let capture = capture();
-    let output = run(&["run", "--replay", capture.to_str().unwrap(), "--report"]);
+    let output = run(&[
+        "run",
+        "--replay",
+        capture.to_str().unwrap(),
+        "--report",
+        "--watch",
+        "/**",
+    ]);
     assert!(output.status.success(), "{}", stderr(&output));
     let page = String::from_utf8(output.stdout).unwrap();
     assert_eq!(promtool(&page), "");
@@ -150,7 +157,21 @@ fn a_report_is_the_metrics_page_and_nothing_else() {
         &page,
         "ros2probe_capture_packets_total{interface=\"replay\"}",
     );
-    assert!(packets > Some(100.0), "{page}");
+    assert_eq!(packets, Some(620.0));
+    for (topic, messages, bytes) in [
+        ("/chatter", 30.0, None),
+        ("/robot1/points", 4.0, Some(2_576_592.0)),
+    ] {
+        let labels = format!("{{domain_id=\"0\",topic=\"{topic}\"}}");
+        let counter = |name: &str| metric(&page, &format!("ros2_topic_{name}_total{labels}"));
+        assert_eq!(counter("messages"), Some(messages), "{topic}\n{page}");
+        assert_eq!(counter("lost_messages"), Some(0.0), "{topic}\n{page}");
+        assert!(
+            bytes.is_none() || counter("bytes") == bytes,
+            "{topic}\n{page}"
+        );
+    }
+    assert!(page.contains("ros2_node_info{domain_id=\"0\",ros_node=\"/robot2/cloud_sink\""));
 }
 
 #[test]
