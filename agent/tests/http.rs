@@ -183,15 +183,15 @@ impl Drop for Prometheus {
 
 #[test]
 fn a_real_prometheus_sees_the_rate_at_which_a_replayed_publisher_sent() {
-    // 10 Hz for 3 s, at a fifth of the pace.
-    let mut agent = LocalAgent::start(&["--watch", "/chatter", "--speed", "0.2"]);
+    // 10 Hz for 3 s, at a third of the pace.
+    let mut agent = LocalAgent::start(&["--watch", "/chatter", "--speed", "0.3"]);
     agent.wait_for_log("ready");
     let directory = tempfile::tempdir().unwrap();
     let prometheus = Prometheus::start(directory.path(), agent.address);
     prometheus.wait_for("up{job=\"robot\"}", |up| up > 0.5);
     prometheus.wait_for("ros2probe_build_info", |value| value > 0.5);
     let rate = "rate(ros2_topic_messages_total{domain_id=\"0\",topic=\"/chatter\"}[4s])";
-    prometheus.wait_for(rate, |rate| (1.8..=2.2).contains(&rate));
+    prometheus.wait_for(rate, |rate| (2.7..=3.3).contains(&rate));
     prometheus.wait_for("count(count by (__name__) ({job=\"robot\"}))", |names| {
         names > 20.0
     });
