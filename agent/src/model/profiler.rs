@@ -258,6 +258,8 @@ impl Profiler {
                 budget,
                 journal,
             });
+            // Who sent twice and was not announced until the end is a stranger.
+            measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
         }
     }
 
