@@ -47,8 +47,8 @@ bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 	@.ci/prerequisites.sh test
 	cargo bench --workspace
 	@$(MAKE) --no-print-directory peers
-	cargo build --release --package ros2probe --bin rp --example workloads
-	@$(SUDO) $(TARGET)/release/examples/workloads
+	cargo build --release --package ros2probe --bin rp --example robot --example workloads
+	@$(SUDO) $(TARGET)/release/examples/workloads $(BENCH_OPTIONS)
 
 fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	@.ci/prerequisites.sh fuzz

@@ -48,7 +48,7 @@ pub(crate) fn require() -> Result<()> {
 }
 
 /// Runs a command line made of words without spaces, and fails with what it said.
-fn run(line: &str) -> Result<String> {
+pub(crate) fn run(line: &str) -> Result<String> {
     let mut words = line.split_whitespace();
     let program = words.next().context("an empty command")?;
     let output = Command::new(program)

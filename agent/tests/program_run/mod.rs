@@ -1,9 +1,12 @@
 //! Runs the kernel filter on frames of the test's own making.
 
+#![allow(dead_code, reason = "each test and benchmark uses its own part")]
+
 use std::collections::BTreeMap;
 use std::io;
 use std::ops::RangeInclusive;
 use std::os::fd::AsRawFd as _;
+use std::time::Duration;
 
 use ros2probe::capture::filter::{Filter, FilterSettings};
 use ros2probe::model::ahead::{Ahead, Ready};
@@ -74,7 +77,7 @@ impl Kernel {
 
     /// One IP packet.
     pub fn frame(&mut self, packet: &[u8]) -> Seen {
-        let kept = self.run(packet) != 0;
+        let (kept, _) = self.run(packet, 1);
         self.now += 1;
         let mut ready = Vec::new();
         if kept {
@@ -122,8 +125,19 @@ impl Kernel {
         }
     }
 
-    /// BPF_PROG_TEST_RUN; the program's return value.
-    fn run(&self, packet: &[u8]) -> u32 {
+    /// How long the program takes over one IP packet, `repeat` times in a row.
+    pub fn time(&self, packet: &[u8], repeat: u32) -> Duration {
+        let (_, mean) = self.run(packet, repeat);
+        mean * repeat
+    }
+
+    /// Forgets the records that nobody has read.
+    pub fn drain(&mut self) {
+        while self.filter.next_record().is_some() {}
+    }
+
+    /// BPF_PROG_TEST_RUN: whether the program keeps the packet, and the mean time it takes.
+    fn run(&self, packet: &[u8], repeat: u32) -> (bool, Duration) {
         /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
         #[repr(C)]
         #[derive(Default)]
@@ -157,7 +171,7 @@ impl Kernel {
             prog_fd: self.filter.program().as_raw_fd().cast_unsigned(),
             data_size_in: u32::try_from(frame.len()).unwrap(),
             data_in: frame.as_ptr() as u64,
-            repeat: 1,
+            repeat,
             ..TestRun::default()
         };
         // SAFETY: the attribute's size is given, and `frame` outlives the call.
@@ -174,7 +188,10 @@ impl Kernel {
             "BPF_PROG_TEST_RUN: {}",
             io::Error::last_os_error()
         );
-        attributes.retval
+        (
+            attributes.retval != 0,
+            Duration::from_nanos(attributes.duration.into()),
+        )
     }
 }
 

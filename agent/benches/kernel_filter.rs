@@ -1,0 +1,141 @@
+//! What the kernel filter takes of a host's time for one datagram, by verdict, and the same walk in
+//! user space. The kernel itself measures (BPF_PROG_TEST_RUN); a datagram of many IP fragments runs
+//! the program once for each, as on a link of MTU 1500, and every run counts about 25 ns too many.
+//! Needs root.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "a benchmark may panic on its own input"
+)]
+
+#[path = "../tests/program_run/mod.rs"]
+mod program_run;
+
+use std::collections::BTreeMap;
+use std::hint::black_box;
+use std::time::Duration;
+
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use program_run::Kernel;
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::walk::{self, Envelope};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+/// IP payload of a frame at MTU 1500.
+const FRAME: usize = 1480;
+/// Runs of the program between two emptyings of the record ring, which must not run full.
+const BATCH: u32 = 1000;
+const WRITER: Guid = Guid::new(
+    GuidPrefix(*b"\x01\x0fbenchbench"),
+    EntityId([0, 0, 0x11, 3]),
+);
+
+/// As the stacks send them.
+fn datagrams() -> [(&'static str, Vec<u8>); 3] {
+    let cyclone = include_bytes!("../../wire/tests/data/datagrams/cyclone-data-frag.bin");
+    [
+        ("320 B DATA", program_run::message(WRITER, 1..=1, 320)),
+        ("14.7 KB of 10 DATA_FRAG, Cyclone DDS", cyclone.to_vec()),
+        ("65 KB DATA_FRAG, Fast DDS", fragment(65_000)),
+    ]
+}
+
+/// An RTPS message of INFO_TS and the first fragment, of `size` bytes, of a sample of 2.72 MB.
+fn fragment(size: u16) -> Vec<u8> {
+    let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
+    bytes.extend_from_slice(&WRITER.prefix.0);
+    bytes.extend_from_slice(&[0x09, 1, 8, 0, 1, 0, 0, 0, 0, 0, 0, 0]);
+    bytes.extend_from_slice(&[0x16, 1]);
+    bytes.extend_from_slice(&(32 + size).to_le_bytes());
+    bytes.extend_from_slice(&[0, 0, 28, 0, 0, 0, 0, 0]);
+    bytes.extend_from_slice(&WRITER.entity.0);
+    bytes.extend_from_slice(&[0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0]);
+    bytes.extend_from_slice(&size.to_le_bytes());
+    bytes.extend_from_slice(&2_720_000_u32.to_le_bytes());
+    bytes.extend([0, 1, 0, 0].into_iter().cycle().take(size.into()));
+    bytes
+}
+
+fn writer_of(payload: &[u8]) -> Guid {
+    let mut writer = None;
+    walk::datagram(payload, &Envelope::default(), None, |found| {
+        writer = Some(found.record.writer());
+    });
+    writer.expect("an endpoint's submessage")
+}
+
+fn in_the_kernel(criterion: &mut Criterion) {
+    let mut kernel = Kernel::load();
+    for verdict in [Verdict::Ignore, Verdict::Meter, Verdict::Capture] {
+        let mut group = criterion.benchmark_group(format!("kernel {verdict:?}"));
+        group
+            .sample_size(20)
+            .measurement_time(Duration::from_secs(1));
+        for (name, payload) in datagrams() {
+            kernel.set_interest(&BTreeMap::from([(writer_of(&payload), verdict)]));
+            let mut frames = program_run::fragments(&payload, FRAME, false, 0);
+            let mut identification = 0_u16;
+            group.throughput(Throughput::Elements(1));
+            group.bench_function(name, |bencher| {
+                bencher.iter_custom(|iterations| {
+                    time(&mut kernel, &mut frames, &mut identification, iterations)
+                });
+            });
+        }
+        group.finish();
+    }
+}
+
+/// The time that `iterations` datagrams take, without what happens between them.
+fn time(
+    kernel: &mut Kernel,
+    frames: &mut [Vec<u8>],
+    identification: &mut u16,
+    iterations: u64,
+) -> Duration {
+    let mut total = Duration::ZERO;
+    let mut left = u32::try_from(iterations).unwrap();
+    while left > 0 {
+        let repeat = match frames {
+            [frame] => {
+                let repeat = left.min(BATCH);
+                total += kernel.time(frame, repeat);
+                repeat
+            }
+            _ => {
+                *identification = identification.wrapping_add(1);
+                for frame in frames.iter_mut() {
+                    frame[4..6].copy_from_slice(&identification.to_be_bytes());
+                    total += kernel.time(frame, 1);
+                }
+                1
+            }
+        };
+        left -= repeat;
+        kernel.drain();
+    }
+    total
+}
+
+fn in_user_space(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("user-space walk");
+    for (name, payload) in datagrams() {
+        group.throughput(Throughput::Elements(1));
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| {
+                let mut of_writers = 0_u32;
+                let envelope = Envelope::default();
+                walk::datagram(black_box(&payload), &envelope, None, |found| {
+                    of_writers += u32::from(walk::fate(&found.record) == walk::Fate::Writer);
+                });
+                of_writers
+            });
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, in_the_kernel, in_user_space);
+criterion_main!(benches);
