@@ -1,10 +1,5 @@
 //! The command line: what it answers, how it fails, how it ends.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    reason = "a test may panic"
-)]
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod local_agent;
 

@@ -1,16 +1,17 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
+mod local_agent;
 mod sample_robot;
 
 use std::collections::BTreeSet;
-use std::io::Write as _;
-use std::process::{Command, Stdio};
+use std::path::Path;
 use std::sync::Arc;
 
+use local_agent::promtool;
 use ros2probe::config::{Expectations, Watch};
 use ros2probe::model::snapshot::{Snapshot, WatchFacts, WatchState, WatchedTopicFacts};
-use ros2probe::surface::catalogue::{CATALOGUE, Kind};
+use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe::surface::{Board, Exposition, Format, Settings, SourceKind};
 
 fn settings() -> Settings {
@@ -33,34 +34,6 @@ fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
     let board = Arc::new(Board::new(SourceKind::Live, settings));
     board.publish(snapshot, sample_robot::agent());
     Exposition::new(board).render(format).unwrap()
-}
-
-/// Everything promtool has to say about a page in classic format.
-fn promtool(page: &str) -> String {
-    let mut promtool = Command::new("promtool")
-        .args(["check", "metrics"])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap_or_else(|error| panic!("promtool: {error}; `apt-get install prometheus`"));
-    promtool
-        .stdin
-        .take()
-        .unwrap()
-        .write_all(page.as_bytes())
-        .unwrap();
-    let output = promtool.wait_with_output().unwrap();
-    let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-    format!(
-        "{}{}",
-        said,
-        if output.status.success() {
-            ""
-        } else {
-            "(failed)"
-        }
-    )
 }
 
 fn sample<'a>(page: &'a str, series: &str) -> Option<&'a str> {
@@ -99,6 +72,24 @@ fn the_page_shows_the_whole_catalogue_and_nothing_else() {
             metric.name
         );
         assert!(page.contains(&format!("# HELP {} {}\n", metric.name, metric.help)));
+    }
+}
+
+#[test]
+fn the_readme_s_table_is_the_catalogue() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../README.md");
+    let readme = std::fs::read_to_string(&path).unwrap();
+    let (before, rest) = readme.split_once("catalogue.rs -->\n").unwrap();
+    let (table, after) = rest.split_once("<!-- metrics: end").unwrap();
+    if std::env::var_os("UPDATE_README").is_some() {
+        let readme = format!(
+            "{before}catalogue.rs -->\n{}<!-- metrics: end{after}",
+            markdown()
+        );
+        std::fs::write(path, readme).unwrap();
+    } else {
+        let hint = "run `UPDATE_README=1 cargo test -p ros2probe --test metrics` and commit";
+        assert_eq!(table, markdown(), "{hint}");
     }
 }
 

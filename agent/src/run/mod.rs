@@ -193,6 +193,8 @@ impl Source {
             Self::Live(live) => live_facts(live, now),
             Self::Replay(replay) => {
                 let (packets, bytes) = replay.progress();
+                let reassembly = replay.reassembly();
+                let counters = reassembly.counters();
                 AgentFacts {
                     finished: replay.is_finished(),
                     interfaces: vec![InterfaceFacts {
@@ -201,6 +203,8 @@ impl Source {
                         dropped: 0,
                     }],
                     copied_bytes: bytes,
+                    incomplete_datagrams: counters.evicted + counters.timed_out,
+                    reassembly_bytes: reassembly.bytes() as u64,
                     ..AgentFacts::new(SourceKind::Replay, now)
                 }
             }
@@ -237,13 +241,17 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     };
     AgentFacts {
         interfaces,
-        verdicts: counters
+        // Bytes are no events; those copied are counted below.
+        filter_events: counters
             .iter()
+            .filter(|(counter, _)| *counter != Counter::CapturedBytes)
             .map(|(counter, value)| (counter.label(), *value))
             .collect(),
         copied_bytes: live.copied_bytes(),
         records_dropped: value(Counter::RecordsLost),
-        flows_evicted: live.incomplete_datagrams(),
+        incomplete_datagrams: live.incomplete_datagrams(),
+        reassembly_bytes: live.reassembly_bytes() as u64,
+        refused_updates: live.refused_updates(),
         ..AgentFacts::new(SourceKind::Live, now)
     }
 }

@@ -11,7 +11,7 @@ use ros2probe_wire::frame::Link;
 use crate::capture::feed::Feed;
 use crate::capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed};
 use crate::model::observer::Observer;
-use crate::model::reassembly::Limits;
+use crate::model::reassembly::{Limits, Reassembly};
 
 /// How often a terminal is told how far it is.
 const PROGRESS: Duration = Duration::from_secs(1);
@@ -164,6 +164,12 @@ impl Replay {
     #[must_use]
     pub const fn progress(&self) -> (u64, u64) {
         (self.packets, self.bytes)
+    }
+
+    /// What puts its fragments together, for its counters.
+    #[must_use]
+    pub const fn reassembly(&self) -> &Reassembly {
+        self.feed.reassembly()
     }
 
     fn show_progress(&mut self) {

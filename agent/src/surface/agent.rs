@@ -36,14 +36,16 @@ pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
         })
     })?;
     page.single(&metric::CAPTURE_COPIED, agent.copied_bytes)?;
-    page.family(&metric::FILTER_VERDICTS, |family| {
+    page.family(&metric::FILTER_EVENTS, |family| {
         agent
-            .verdicts
+            .filter_events
             .iter()
-            .try_for_each(|(verdict, count)| family.sample(&[Label::Text(verdict)], *count))
+            .try_for_each(|(event, count)| family.sample(&[Label::Text(event)], *count))
     })?;
+    page.single(&metric::FILTER_REFUSED, agent.refused_updates)?;
     page.single(&metric::RECORDS_DROPPED, agent.records_dropped)?;
-    page.single(&metric::FLOWS_EVICTED, agent.flows_evicted)
+    page.single(&metric::INCOMPLETE_DATAGRAMS, agent.incomplete_datagrams)?;
+    page.single(&metric::REASSEMBLY, agent.reassembly_bytes)
 }
 
 /// The model's tables and what it could not read.

@@ -16,14 +16,18 @@ pub struct AgentFacts {
     pub finished: bool,
     /// Per interface, or per network namespace where the kernel counts no finer.
     pub interfaces: Vec<InterfaceFacts>,
-    /// The kernel filter's counters by verdict, complete and in a fixed order.
-    pub verdicts: Vec<(&'static str, u64)>,
+    /// The kernel filter's counters of events, complete and in a fixed order.
+    pub filter_events: Vec<(&'static str, u64)>,
     /// Bytes that reached user space: packets and records.
     pub copied_bytes: u64,
     /// Records lost because the record ring was full.
     pub records_dropped: u64,
-    /// Fragmented datagrams whose state the kernel filter gave up for newer ones.
-    pub flows_evicted: u64,
+    /// Fragmented datagrams that were begun and never became complete.
+    pub incomplete_datagrams: u64,
+    /// Bytes held to put fragments together.
+    pub reassembly_bytes: u64,
+    /// Changes of interest for which the kernel filter had no room.
+    pub refused_updates: u64,
 }
 
 /// Where packets come from.
@@ -56,10 +60,12 @@ impl AgentFacts {
             capture_progress: at,
             finished: false,
             interfaces: Vec::new(),
-            verdicts: Vec::new(),
+            filter_events: Vec::new(),
             copied_bytes: 0,
             records_dropped: 0,
-            flows_evicted: 0,
+            incomplete_datagrams: 0,
+            reassembly_bytes: 0,
+            refused_updates: 0,
         }
     }
 }

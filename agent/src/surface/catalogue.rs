@@ -318,7 +318,7 @@ pub(super) const READY: Metric = Metric::gauge(
 pub(super) const CAPTURE_PACKETS: Metric = Metric::counter(
     "ros2probe_capture_packets_total",
     &["interface"],
-    "Packets that the filter let through to user space.",
+    "Packets that the filter let through to user space; `any` where one socket sees them all.",
 );
 pub(super) const CAPTURE_DROPPED: Metric = Metric::counter(
     "ros2probe_capture_dropped_packets_total",
@@ -331,22 +331,33 @@ pub(super) const CAPTURE_COPIED: Metric = Metric::counter(
     "Bytes copied to user space, packets and records.",
 )
 .unit("bytes");
-pub(super) const FILTER_VERDICTS: Metric = Metric::counter(
-    "ros2probe_filter_verdicts_total",
-    &["verdict"],
-    "What the kernel filter decided.",
+pub(super) const FILTER_EVENTS: Metric = Metric::counter(
+    "ros2probe_filter_events_total",
+    &["event"],
+    "What the kernel filter met and did, by event.",
 )
 .experimental();
+pub(super) const FILTER_REFUSED: Metric = Metric::counter(
+    "ros2probe_filter_refused_updates_total",
+    &[],
+    "Changes of interest for which the kernel filter had no room: those writers stay unknown to it.",
+);
 pub(super) const RECORDS_DROPPED: Metric = Metric::counter(
     "ros2probe_records_dropped_total",
     &[],
     "Measurement records lost because their ring was full: above 0, counts are lower bounds.",
 );
-pub(super) const FLOWS_EVICTED: Metric = Metric::counter(
-    "ros2probe_filter_flows_evicted_total",
+pub(super) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
+    "ros2probe_incomplete_datagrams_total",
     &[],
-    "Fragmented datagrams that the kernel filter gave up for newer ones.",
+    "Fragmented datagrams that were begun and never became complete.",
 );
+pub(super) const REASSEMBLY: Metric = Metric::gauge(
+    "ros2probe_reassembly_bytes",
+    &[],
+    "Memory held to put captured fragments together, up to limits.reassembly_bytes.",
+)
+.unit("bytes");
 pub(super) const DATAGRAMS: Metric = Metric::counter(
     "ros2probe_datagrams_total",
     &[],
@@ -365,7 +376,7 @@ pub(super) const DECODE_ERRORS: Metric = Metric::counter(
 pub(super) const TABLE_ENTRIES: Metric = Metric::gauge(
     "ros2probe_table_entries",
     &["table"],
-    "Entries of a bounded table; bytes for reassembly.",
+    "Entries of a bounded table; bytes for samples.",
 );
 pub(super) const TABLE_LIMIT: Metric =
     Metric::gauge("ros2probe_table_limit", &["table"], "Its cap.");
@@ -472,9 +483,11 @@ pub const CATALOGUE: &[Metric] = &[
     CAPTURE_PACKETS,
     CAPTURE_DROPPED,
     CAPTURE_COPIED,
-    FILTER_VERDICTS,
+    FILTER_EVENTS,
+    FILTER_REFUSED,
     RECORDS_DROPPED,
-    FLOWS_EVICTED,
+    INCOMPLETE_DATAGRAMS,
+    REASSEMBLY,
     DATAGRAMS,
     RECORDS,
     DECODE_ERRORS,

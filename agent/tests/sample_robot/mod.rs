@@ -86,7 +86,7 @@ pub fn agent() -> AgentFacts {
             packets: 5,
             dropped: 0,
         }],
-        verdicts: vec![("ignore", 7), ("meter", 8), ("capture", 9)],
+        filter_events: vec![("ignore", 7), ("meter", 8), ("capture", 9)],
         copied_bytes: 12_345,
         ..AgentFacts::new(SourceKind::Live, Instant::now())
     }
