@@ -240,7 +240,7 @@ impl Discovery {
     pub fn was_buried(&self, guid: Guid, now: Timestamp) -> bool {
         self.buried
             .iter()
-            .any(|(buried, at, ..)| *buried == guid && at.0 + 4 * BURIED > now.0)
+            .any(|(buried, at, ..)| *buried == guid && at.0.saturating_add(4 * BURIED) > now.0)
     }
 
     /// What happened to endpoints since the last call.

@@ -189,7 +189,7 @@ impl Observer {
             self.clock = Timestamp(now.0 - now.0 % TICK);
             self.tick(self.clock);
         }
-        while self.clock.0 + TICK <= now.0 {
+        while now.0.saturating_sub(self.clock.0) >= TICK {
             self.clock = Timestamp(self.clock.0 + TICK);
             self.tick(self.clock);
         }
