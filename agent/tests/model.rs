@@ -503,7 +503,10 @@ fn one_malformed_datagram_costs_one_counter() {
     assert_eq!(after, before + 1);
     world.stream(alice(WRITER), 1..=100);
     let publishers = world.topic(0, "/chatter").unwrap().publishers;
-    let alice = publishers.iter().find(|each| each.guid == alice(WRITER)).unwrap();
+    let alice = publishers
+        .iter()
+        .find(|each| each.guid == alice(WRITER))
+        .unwrap();
     assert_eq!(alice.measurement.as_ref().unwrap().messages, 100);
 }
 

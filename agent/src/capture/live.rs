@@ -12,7 +12,7 @@ use ros2probe_wire::filter::Counter;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::record::{Verdict, kind};
 use ros2probe_wire::walk::Envelope;
-use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp, WireError};
+use ros2probe_wire::{Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
@@ -358,7 +358,8 @@ impl Tap {
         self.ring.wait(Duration::ZERO)?;
         let (number, reassembly, ahead) = (self.number, &mut self.reassembly, &mut self.ahead);
         while let Some(block) = self.ring.block() {
-            for captured in block.frames() {
+            let mut frames = block.frames();
+            for captured in frames.by_ref() {
                 self.copied_bytes += captured.bytes.len() as u64;
                 *self.packets.entry(captured.interface).or_default() += 1;
                 let datagram = Assembly {
@@ -369,6 +370,9 @@ impl Tap {
                 if let Err(error) = datagram.frame(&captured, observer) {
                     observer.decode_error("frame", error.reason);
                 }
+            }
+            if frames.damaged() {
+                observer.decode_error("frame", Reason::BadLength);
             }
         }
         Ok(())

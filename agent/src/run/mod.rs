@@ -199,8 +199,8 @@ impl Source {
                     finished: replay.is_finished(),
                     interfaces: vec![InterfaceFacts {
                         name: "replay".to_owned(),
-                        packets,
-                        dropped: 0,
+                        packets: Some(packets),
+                        dropped: None,
                     }],
                     copied_bytes: bytes,
                     incomplete_datagrams: counters.evicted + counters.timed_out,
@@ -223,14 +223,14 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         .into_iter()
         .map(|count| InterfaceFacts {
             name: named(count.namespace, "any"),
-            packets: 0,
-            dropped: count.dropped,
+            packets: None,
+            dropped: Some(count.dropped),
         })
         .collect();
     interfaces.extend(live.packets().map(|count| InterfaceFacts {
         name: named(count.namespace, &count.name),
-        packets: count.packets,
-        dropped: 0,
+        packets: Some(count.packets),
+        dropped: None,
     }));
     let counters = live.counters().unwrap_or_default();
     let value = |wanted: Counter| {

@@ -4,6 +4,7 @@
 use std::fmt;
 use std::time::{Duration, Instant, SystemTime};
 
+use super::agent_facts::InterfaceFacts;
 use super::board::{Reload, State};
 use super::catalogue as metric;
 use super::page::{Label, Page};
@@ -26,14 +27,20 @@ pub(super) fn identity(page: &mut Page<'_>, state: &State, now: Instant) -> fmt:
 pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
     let agent = &state.agent;
     page.family(&metric::CAPTURE_PACKETS, |family| {
-        agent.interfaces.iter().try_for_each(|interface| {
-            family.sample(&[Label::Text(&interface.name)], interface.packets)
-        })
+        let counted = |each: &InterfaceFacts| Some((each.name.clone(), each.packets?));
+        agent
+            .interfaces
+            .iter()
+            .filter_map(counted)
+            .try_for_each(|(name, packets)| family.sample(&[Label::Text(&name)], packets))
     })?;
     page.family(&metric::CAPTURE_DROPPED, |family| {
-        agent.interfaces.iter().try_for_each(|interface| {
-            family.sample(&[Label::Text(&interface.name)], interface.dropped)
-        })
+        let counted = |each: &InterfaceFacts| Some((each.name.clone(), each.dropped?));
+        agent
+            .interfaces
+            .iter()
+            .filter_map(counted)
+            .try_for_each(|(name, dropped)| family.sample(&[Label::Text(&name)], dropped))
     })?;
     page.single(&metric::CAPTURE_COPIED, agent.copied_bytes)?;
     page.family(&metric::FILTER_EVENTS, |family| {

@@ -44,10 +44,10 @@ pub enum SourceKind {
 pub struct InterfaceFacts {
     /// Name; with the namespace in front where it is not the agent's own.
     pub name: String,
-    /// Packets that the filter let through.
-    pub packets: u64,
-    /// Packets lost because the ring was full.
-    pub dropped: u64,
+    /// Packets that the filter let through, where they are counted so.
+    pub packets: Option<u64>,
+    /// Packets lost because the ring was full, where they are counted so.
+    pub dropped: Option<u64>,
 }
 
 impl AgentFacts {

@@ -318,12 +318,12 @@ pub(super) const READY: Metric = Metric::gauge(
 pub(super) const CAPTURE_PACKETS: Metric = Metric::counter(
     "ros2probe_capture_packets_total",
     &["interface"],
-    "Packets that the filter let through to user space; `any` where one socket sees them all.",
+    "Packets that the filter let through to user space.",
 );
 pub(super) const CAPTURE_DROPPED: Metric = Metric::counter(
     "ros2probe_capture_dropped_packets_total",
     &["interface"],
-    "Packets lost because the ring was full: above 0, everything else is a lower bound.",
+    "Packets lost because the ring was full, by socket (`any`: all interfaces of a namespace): above 0, everything else is a lower bound.",
 );
 pub(super) const CAPTURE_COPIED: Metric = Metric::counter(
     "ros2probe_capture_copied_bytes_total",

@@ -83,8 +83,8 @@ pub fn agent() -> AgentFacts {
     AgentFacts {
         interfaces: vec![InterfaceFacts {
             name: "eth0".to_owned(),
-            packets: 5,
-            dropped: 0,
+            packets: Some(5),
+            dropped: Some(0),
         }],
         filter_events: vec![("ignore", 7), ("meter", 8), ("capture", 9)],
         copied_bytes: 12_345,
