@@ -7,7 +7,7 @@
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
 use clap::Parser;
@@ -98,7 +98,7 @@ async fn demo(options: &Options) -> Result<()> {
             () = tokio::time::sleep(REFRESH) => {}
         }
         match agent.scrape() {
-            Ok(scrape) => summary.show(&scrape, Instant::now(), &relay, &link),
+            Ok(scrape) => summary.show(&scrape, &relay, &link),
             Err(error) => {
                 failure =
                     Some(error.context(format!("the agent said: {}", read_lossy(&log).trim())));

@@ -1,7 +1,6 @@
-//! The demo's table: one line per measured topic, from the differences between two scrapes.
+//! The demo's table: one line per topic that has sent anything.
 
 use std::collections::BTreeMap;
-use std::time::Instant;
 
 use crate::harness::agent::Scrape;
 use crate::harness::network::Link;
@@ -10,93 +9,67 @@ use crate::relay::Relay;
 pub(crate) struct Summary {
     /// Whether the table may replace the one before.
     redraws: bool,
-    earlier: Option<(Instant, BTreeMap<String, Counters>)>,
-}
-
-#[derive(Clone, Copy, Default)]
-struct Counters {
-    messages: f64,
-    bytes: f64,
-    lost: f64,
-    latency_sum: f64,
-    latency_count: f64,
+    /// Sum and count of each topic's latency at the scrape before.
+    latencies: BTreeMap<String, (f64, f64)>,
 }
 
 impl Summary {
     pub(crate) fn new(redraws: bool) -> Summary {
         Summary {
             redraws,
-            earlier: None,
+            latencies: BTreeMap::new(),
         }
     }
 
-    pub(crate) fn show(&mut self, scrape: &Scrape, now: Instant, relay: &Relay, link: &Link) {
-        let topics: BTreeMap<String, Counters> = scrape
-            .labels_of("ros2_topic_messages_total", "topic")
-            .into_iter()
-            .map(|topic| {
-                let counters = Counters::read(scrape, &topic);
-                (topic, counters)
-            })
-            .collect();
+    pub(crate) fn show(&mut self, scrape: &Scrape, relay: &Relay, link: &Link) {
         if self.redraws {
             print!("\x1b[H\x1b[J");
         }
         let count = |name| scrape.sum(name, &[]);
         println!(
-            "{} participants, {} topics measured",
+            "{} participants, {} nodes, {} topics measured\n",
             count("ros2_participants"),
-            topics.len()
+            count("ros2_nodes"),
+            count("ros2probe_tracked_topics"),
         );
         println!(
-            "{:<32} {:>9} {:>12} {:>7} {:>11}",
-            "topic", "rate", "bandwidth", "lost", "latency"
+            "{:<16} {:>8} {:>14} {:>9} {:>6} {:>11}",
+            "topic", "rate", "bandwidth", "messages", "lost", "latency"
         );
-        if let Some((then, earlier)) = &self.earlier {
-            let seconds = now.saturating_duration_since(*then).as_secs_f64();
-            for (topic, counters) in &topics {
-                println!(
-                    "{topic:<32} {}",
-                    counters.since(earlier.get(topic), seconds)
-                );
+        for topic in scrape.labels_of("ros2_topic_messages_total", "topic") {
+            let value = |name| scrape.sum(name, &[("topic", &topic)]);
+            let messages = value("ros2_topic_messages_total");
+            if messages == 0.0 {
+                continue;
             }
+            println!(
+                "{topic:<16} {:>5.1} Hz {:>9.3} MB/s {messages:>9} {:>6} {:>11}",
+                value("ros2_topic_rate_hertz"),
+                value("ros2_topic_bandwidth_bytes_per_second") / 1e6,
+                value("ros2_topic_lost_messages_total"),
+                self.latency(scrape, &topic),
+            );
         }
         println!("\ncurl http://{}/metrics", relay.address());
         println!(
             "ip netns exec {} tcpdump -ni eth0   (Ctrl-C ends the demo)",
             link.robot.name()
         );
-        self.earlier = Some((now, topics));
-    }
-}
-
-impl Counters {
-    fn read(scrape: &Scrape, topic: &str) -> Counters {
-        let sum = |name| scrape.sum(name, &[("topic", topic)]);
-        Counters {
-            messages: sum("ros2_topic_messages_total"),
-            bytes: sum("ros2_topic_bytes_total"),
-            lost: sum("ros2_topic_lost_messages_total"),
-            latency_sum: sum("ros2_topic_latency_seconds_sum"),
-            latency_count: sum("ros2_topic_latency_seconds_count"),
-        }
     }
 
-    fn since(&self, earlier: Option<&Counters>, seconds: f64) -> String {
-        let earlier = earlier.copied().unwrap_or_default();
-        let rate = (self.messages - earlier.messages) / seconds;
-        let megabytes = (self.bytes - earlier.bytes) / seconds / 1e6;
-        let measured = self.latency_count - earlier.latency_count;
-        let latency = match measured > 0.0 {
-            true => {
-                let mean = (self.latency_sum - earlier.latency_sum) / measured;
-                format!("{:.3} ms", mean * 1e3)
-            }
+    /// Mean time from the writer's timestamp to the wire since the scrape before.
+    fn latency(&mut self, scrape: &Scrape, topic: &str) -> String {
+        let value = |name| scrape.sum(name, &[("topic", topic)]);
+        let sum = value("ros2_topic_latency_seconds_sum");
+        let count = value("ros2_topic_latency_seconds_count");
+        let earlier = self.latencies.insert(topic.to_owned(), (sum, count));
+        let (earlier_sum, earlier_count) = earlier.unwrap_or_default();
+        match count > earlier_count {
+            true => format!(
+                "{:.3} ms",
+                (sum - earlier_sum) / (count - earlier_count) * 1e3
+            ),
             false => "-".to_owned(),
-        };
-        format!(
-            "{rate:>6.1} Hz {megabytes:>7.3} MB/s {:>7} {latency:>11}",
-            self.lost
-        )
+        }
     }
 }

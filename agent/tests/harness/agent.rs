@@ -82,7 +82,7 @@ impl<'a> Agent<'a> {
 
     /// A scrape after the agent has had time to take over what the kernel still held.
     pub(crate) fn settled_scrape(&self) -> Result<Scrape> {
-        std::thread::sleep(Duration::from_millis(1500));
+        std::thread::sleep(Duration::from_millis(3500));
         self.scrape()
     }
 
