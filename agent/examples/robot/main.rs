@@ -117,7 +117,9 @@ async fn lidar(
     let mut imu = node(context, "/imu_driver", NodeOptions::new())?;
     let points = advertise(&mut lidar, "/points", "sensor_msgs/PointCloud2", &sensor)?;
     let scan = advertise(&mut lidar, "/scan", "sensor_msgs/LaserScan", &sensor)?;
-    let measurements = advertise(&mut imu, "/imu", "sensor_msgs/Imu", &sensor)?;
+    // RustDDS drops what its history overwrites before it is sent: half a second survives a busy CPU.
+    let patient = QosProfile::default().history(History::KeepLast { depth: 100 });
+    let measurements = advertise(&mut imu, "/imu", "sensor_msgs/Imu", &patient)?;
     spin(&mut lidar)?;
     spin(&mut imu)?;
     println!("ready");
