@@ -108,7 +108,14 @@ fn small_samples(stack: Stack, per_mille: u16) -> Result<()> {
 fn point_clouds(stack: Stack, size: usize) -> Result<()> {
     let observed = Observed::stream(stack, &Stream::point_cloud(size, POINT_CLOUDS), 0)?;
     assert_eq!(observed.sent, POINT_CLOUDS);
-    assert_eq!(observed.count("ros2_topic_messages_total"), POINT_CLOUDS);
+    let counted = observed.count("ros2_topic_messages_total");
+    assert_eq!(
+        counted,
+        POINT_CLOUDS,
+        "{} received; {}",
+        observed.received,
+        observed.doubts()
+    );
     assert_eq!(
         observed.count("ros2_topic_bytes_total"),
         POINT_CLOUDS * size as u64
@@ -183,6 +190,25 @@ impl Observed {
             dropped,
             scrape,
         })
+    }
+
+    /// Every counter that could explain a difference.
+    fn doubts(&self) -> String {
+        let telling = [
+            "lost",
+            "dropped",
+            "incomplete",
+            "evict",
+            "duplicate",
+            "errors",
+            "recovered",
+        ];
+        let lines = self.scrape.0.lines().filter(|line| {
+            !line.starts_with('#')
+                && !line.ends_with(" 0")
+                && telling.iter().any(|word| line.contains(word))
+        });
+        lines.collect::<Vec<_>>().join("; ")
     }
 
     /// A counter of the stream's topic.

@@ -79,13 +79,14 @@ impl Stream {
         }
     }
 
-    /// A point cloud of `size` bytes at 20 Hz, best effort.
+    /// A point cloud of `size` bytes at 20 Hz, best effort. The history is a second long: RustDDS
+    /// drops what it overwrites before a busy CPU has sent it.
     pub(crate) fn point_cloud(size: usize, count: u64) -> Stream {
         Stream {
             topic: "/points",
             size,
             rate: 20.0,
-            depth: 5,
+            depth: 20,
             ..Stream::small(count)
         }
     }
