@@ -106,7 +106,7 @@ impl Row {
                 miss(
                     true,
                     format!(
-                        "{counted} of {} messages counted, {lost} lost, {dropped} records dropped",
+                        "{counted:.0} of {} messages counted, {lost:.0} lost, {dropped:.0} dropped",
                         window.sent
                     ),
                 );
