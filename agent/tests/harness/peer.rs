@@ -116,6 +116,17 @@ impl Peer {
         stream: &Stream,
         nodes: &[&str],
     ) -> Result<Peer> {
+        Peer::launch_behind(&host.inside(), stack, role, stream, nodes)
+    }
+
+    /// As [`Peer::launch`] behind words of the caller's, such as a host's and an environment's.
+    pub(crate) fn launch_behind(
+        enter: &[String],
+        stack: Stack,
+        role: Role,
+        stream: &Stream,
+        nodes: &[&str],
+    ) -> Result<Peer> {
         let directory = tempfile::tempdir().context("cannot create a directory for the log")?;
         let role_name = match role {
             Role::Publisher => "pub",
@@ -151,7 +162,7 @@ impl Peer {
         if stream.transient_local {
             words.push("--transient-local".to_owned());
         }
-        let process = Process::start(&host.inside(), stack.program()?, words)?;
+        let process = Process::start(enter, stack.program()?, words)?;
         Ok(Peer { process, directory })
     }
 
