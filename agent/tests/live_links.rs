@@ -1,8 +1,14 @@
 //! Every kind of link a robot talks over, against the agent's counts: each sample once, whatever
 //! carries it, and nothing of what the configuration leaves out.
 
-#![expect(clippy::unwrap_used, reason = "test code says what must hold by failing")]
-#![expect(clippy::indexing_slicing, reason = "test code says what must hold by failing")]
+#![expect(
+    clippy::unwrap_used,
+    reason = "test code says what must hold by failing"
+)]
+#![expect(
+    clippy::indexing_slicing,
+    reason = "test code says what must hold by failing"
+)]
 
 mod forged;
 mod harness;
@@ -11,7 +17,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
-use forged::frames::{Tun, Wire};
+use forged::frames::{Shuffle, Tun, Wire};
 use forged::{Carrier, Sender, Talker, introduce, talk};
 use harness::agent::{Agent, Scrape};
 use harness::network::{Link, Namespace};
@@ -57,7 +63,8 @@ fn cyclone_dds_over_ipv6_is_seen_as_over_ipv4() -> Result<()> {
         rate: 50.0,
         ..Stream::point_cloud(16_000, 100)
     };
-    let on_ipv6 = |host: &Namespace| [host.inside(), vec!["env".to_owned(), ipv6.to_owned()]].concat();
+    let on_ipv6 =
+        |host: &Namespace| [host.inside(), vec!["env".to_owned(), ipv6.to_owned()]].concat();
     let start = |host: &Namespace, role, node| {
         Peer::launch_behind(&on_ipv6(host), Stack::Cyclone, role, &stream, &[node])
     };
@@ -67,8 +74,14 @@ fn cyclone_dds_over_ipv6_is_seen_as_over_ipv4() -> Result<()> {
     subscriber.wait_matched()?;
     publisher.go()?;
     publisher.wait_sent(Duration::from_secs(20))?;
-    let nodes = observed.agent.scrape()?.labels_of("ros2_node_info", "ros_node");
-    assert!(nodes.contains("/listener") && nodes.contains("/lidar_driver"), "{nodes:?}");
+    let nodes = observed
+        .agent
+        .scrape()?
+        .labels_of("ros2_node_info", "ros_node");
+    assert!(
+        nodes.contains("/listener") && nodes.contains("/lidar_driver"),
+        "{nodes:?}"
+    );
     let scrape = observed.settled("/points", stream.count)?;
     assert_exact(&scrape, "/points", stream.count, stream.count * 16_000);
     Ok(())
@@ -91,7 +104,10 @@ fn vlan_tags_are_looked_behind_one_and_two() -> Result<()> {
 fn a_sample_that_passes_two_interfaces_of_one_host_counts_once() -> Result<()> {
     let link = Link::new()?;
     for (host, address) in [(&link.robot, "10.100.0.1"), (&link.monitor, "10.100.0.2")] {
-        ip(host, "link add link eth0 name macvlan0 type macvlan mode bridge")?;
+        ip(
+            host,
+            "link add link eth0 name macvlan0 type macvlan mode bridge",
+        )?;
         ip(host, &format!("addr add {address}/24 dev macvlan0"))?;
         ip(host, "link set macvlan0 up")?;
     }
@@ -140,7 +156,10 @@ fn an_interface_that_appears_later_is_seen_and_one_that_goes_down_does_not_make_
     let before = Usage::of(pid)?;
     std::thread::sleep(Duration::from_secs(3));
     let spent = Usage::of(pid)?.since(&before).cpu;
-    assert!(spent < Duration::from_millis(300), "{spent:?} in 3 s with a link down");
+    assert!(
+        spent < Duration::from_millis(300),
+        "{spent:?} in 3 s with a link down"
+    );
 
     ip(&link.monitor, "link set eth1 up")?;
     std::thread::sleep(Duration::from_millis(200));
@@ -182,7 +201,10 @@ fn nothing_of_an_excluded_interface_is_seen_also_when_it_appears_later() -> Resu
         let verdict = [("verdict", "interface_excluded")];
         assert!(scrape.sum("ros2probe_filter_verdicts_total", &verdict) >= 40.0);
         let interfaces = scrape.labels_of("ros2probe_capture_packets_total", "interface");
-        assert!(interfaces.iter().all(|name| !name.starts_with("wlan")), "{interfaces:?}");
+        assert!(
+            interfaces.iter().all(|name| !name.starts_with("wlan")),
+            "{interfaces:?}"
+        );
     }
     Ok(())
 }
@@ -196,7 +218,8 @@ fn interfaces_that_came_and_went_do_not_use_up_the_filters_table() -> Result<()>
     )?;
     // The table has room for 1024.
     for _ in 0..3 {
-        let pair = |number| format!("link add veth{number} group 7 type veth peer name vethx{number}");
+        let pair =
+            |number| format!("link add veth{number} group 7 type veth peer name vethx{number}");
         batch(&link.monitor, (0..200).map(pair))?;
         ip(&link.monitor, "link delete group 7")?;
     }
@@ -211,7 +234,10 @@ fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
     let path = forged::path(&link.robot);
     let observed = Observed::start(
         &link.monitor,
-        &format!("watch: [/**]\ncapture:\n  network_namespaces: [{}]\n", path.display()),
+        &format!(
+            "watch: [/**]\ncapture:\n  network_namespaces: [{}]\n",
+            path.display()
+        ),
     )?;
     // Inside it, where nothing of it can be seen from outside.
     let mut sender = Sender::new(&link.robot, "127.0.0.1:0", "127.0.0.1:7400")?;
@@ -230,12 +256,15 @@ fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
 fn fragments_in_any_order_make_one_sample() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(&link.monitor, WATCH_ALL)?;
-    let orders: [(&str, fn(&mut Vec<Vec<u8>>)); 4] = [
+    let orders: [(&str, Shuffle); 4] = [
         ("/backwards", |packets| packets.reverse()),
         ("/first_last", |packets| packets.rotate_left(1)),
         ("/last_first", |packets| packets.rotate_right(1)),
         ("/each_twice", |packets| {
-            *packets = packets.iter().flat_map(|packet| [packet.clone(), packet.clone()]).collect();
+            *packets = packets
+                .iter()
+                .flat_map(|packet| [packet.clone(), packet.clone()])
+                .collect();
         }),
     ];
     for (topic, shuffle) in orders {
@@ -311,13 +340,22 @@ impl<'a> Observed<'a> {
     }
 
     fn counts_each_sample_once(&self, topic: &str, carrier: &mut impl Carrier) -> Result<()> {
-        let number = topic.bytes().fold(0_u32, |sum, byte| sum.wrapping_mul(31) + u32::from(byte));
+        let number = topic
+            .bytes()
+            .fold(0_u32, |sum, byte| sum.wrapping_mul(31) + u32::from(byte));
         let mut talker = Talker::new(number, topic);
         introduce(&talker, carrier)?;
-        let sizes: Vec<usize> = SIZES.iter().copied().cycle().take(SIZES.len() * ROUNDS).collect();
+        let sizes: Vec<usize> = SIZES
+            .iter()
+            .copied()
+            .cycle()
+            .take(SIZES.len() * ROUNDS)
+            .collect();
         talk(&mut talker, carrier, sizes.iter().copied())?;
         let count = sizes.len() as u64;
-        let scrape = self.settled(topic, count).with_context(|| topic.to_owned())?;
+        let scrape = self
+            .settled(topic, count)
+            .with_context(|| topic.to_owned())?;
         assert_exact(&scrape, topic, count, sizes.iter().sum::<usize>() as u64);
         Ok(())
     }
@@ -358,7 +396,10 @@ fn ip(host: &Namespace, arguments: &str) -> Result<String> {
 fn batch(host: &Namespace, commands: impl Iterator<Item = String>) -> Result<()> {
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("batch");
-    std::fs::write(&file, commands.map(|command| command + "\n").collect::<String>())?;
+    std::fs::write(
+        &file,
+        commands.map(|command| command + "\n").collect::<String>(),
+    )?;
     ip(host, &format!("-batch {}", file.display()))?;
     Ok(())
 }

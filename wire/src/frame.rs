@@ -205,7 +205,8 @@ pub fn parse(link: Link, bytes: &[u8], length: u32) -> Result<Frame<'_>, WireErr
 /// and the packet type beside it.
 ///
 /// Of a doubly tagged frame the kernel strips the outer tag only. What arrives then begins with the
-/// inner tag, while what is sent begins with the IP header though its protocol names a tag.
+/// inner tag, while what is sent begins with the IP header though its protocol names a tag. Since
+/// Linux 6.11 the protocol is the one behind all tags, also where a tag is left.
 ///
 /// # Errors
 /// As [`parse`].
@@ -220,7 +221,30 @@ pub fn parse_cooked(
     if packet_type == PacketType::OUTGOING && ETHER_TYPES_VLAN.contains(&protocol) {
         return raw(cursor, length);
     }
+    if begins_with_unnamed_tag(protocol, bytes, length) {
+        let mut cursor = cursor;
+        cursor.take("VLAN tag", 4)?;
+        return network(protocol, cursor, length);
+    }
     network(protocol, cursor, length)
+}
+
+/// Whether a tag comes before the packet although `protocol` does not say so: two octets of control
+/// information and the packet's own ether type. What reads so and is no tag is an IPv4 packet of
+/// 2048 octets or an IPv6 packet of more than 24,000.
+fn begins_with_unnamed_tag(protocol: u16, bytes: &[u8], length: usize) -> bool {
+    const LEAST_AMBIGUOUS: usize = 2048;
+    let version = match protocol {
+        ETHER_TYPE_IPV4 => 4,
+        ETHER_TYPE_IPV6 => 6,
+        _ => return false,
+    };
+    let [first, _, high, low, behind, ..] = *bytes else {
+        return false;
+    };
+    u16::from_be_bytes([high, low]) == protocol
+        && behind >> 4 == version
+        && (first >> 4 != version || length < LEAST_AMBIGUOUS)
 }
 
 fn network(

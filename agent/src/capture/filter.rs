@@ -189,6 +189,14 @@ impl Filter {
             .map_err(failed("INTERFACES", "update"))
     }
 
+    /// Gives back the place of an interface that is gone.
+    ///
+    /// # Errors
+    /// When the kernel refuses.
+    pub fn forget_interface(&mut self, index: u32) -> Result<(), FilterError> {
+        absent_is_fine(self.interfaces.remove(&index)).map_err(failed("INTERFACES", "update"))
+    }
+
     /// Sets what unclassified writers may cost from now on, in bytes captured and records.
     ///
     /// # Errors

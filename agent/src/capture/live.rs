@@ -334,14 +334,23 @@ impl Tap {
         ]
     }
 
-    /// A list that cannot be read now is read the next time.
+    /// A list that cannot be read now is read the next time. Of an interface that is gone nothing
+    /// is kept: containers come and go for years.
     fn follow_interfaces(&mut self) {
         for change in self.interfaces.changes().unwrap_or_default() {
-            if let Change::Present(Interface { index, name, .. }) = change {
-                let accept = self.selection.accepts(&name);
-                let told = self.filter.accept_interface(index, accept);
-                self.refused_interfaces += u64::from(told.is_err());
-            }
+            let told = match change {
+                Change::Present(Interface { index, name, .. }) => {
+                    let accept = self.selection.accepts(&name);
+                    self.filter.accept_interface(index, accept)
+                }
+                Change::Gone(Interface { index, .. }) => {
+                    let interfaces = &self.interfaces;
+                    self.packets
+                        .retain(|index, _| interfaces.by_index(*index).is_some());
+                    self.filter.forget_interface(index)
+                }
+            };
+            self.refused_interfaces += u64::from(told.is_err());
         }
     }
 

@@ -15,13 +15,15 @@ use crate::harness::network::Namespace;
 const IPV4: [u8; 2] = [0x08, 0x00];
 const UDP: u8 = 17;
 
+/// Changes the IP packets of a datagram before they are sent.
+pub(crate) type Shuffle = fn(&mut Vec<Vec<u8>>);
+
 /// Puts Ethernet frames on an interface of a host, also fragments in an order no kernel sends.
 pub(crate) struct Wire {
     socket: File,
     from: [u8; 4],
     to: [u8; 4],
-    /// What to do with the fragments of a datagram before they are sent.
-    pub(crate) shuffle: fn(&mut Vec<Vec<u8>>),
+    pub(crate) shuffle: Shuffle,
     /// 802.1Q or 802.1ad tags, outermost first.
     pub(crate) tags: Vec<[u8; 4]>,
 }
@@ -45,9 +47,16 @@ impl Carrier for Wire {
         let mut packets = fragments(payload, self.from, self.to);
         (self.shuffle)(&mut packets);
         for packet in packets {
-            let link = [&[0xff; 6][..], &[2, 0, 0, 0, 0, 1], &self.tags.concat(), &IPV4];
+            let link = [
+                &[0xff; 6][..],
+                &[2, 0, 0, 0, 0, 1],
+                &self.tags.concat(),
+                &IPV4,
+            ];
             let frame = [&link.concat()[..], &packet].concat();
-            self.socket.write_all(&frame).context("cannot send a frame")?;
+            self.socket
+                .write_all(&frame)
+                .context("cannot send a frame")?;
         }
         Ok(())
     }
@@ -64,18 +73,16 @@ impl Tun {
     pub(crate) fn new(host: &Namespace, name: &str, from: [u8; 4], to: [u8; 4]) -> Result<Tun> {
         let device = netns::within(&path(host), || tun_device(name))?
             .with_context(|| format!("no tun device {name}"))?;
-        Ok(Tun {
-            device,
-            from,
-            to,
-        })
+        Ok(Tun { device, from, to })
     }
 }
 
 impl Carrier for Tun {
     fn carry(&mut self, payload: &[u8]) -> Result<()> {
         for packet in fragments(payload, self.from, self.to) {
-            self.device.write_all(&packet).context("cannot write to tun")?;
+            self.device
+                .write_all(&packet)
+                .context("cannot write to tun")?;
         }
         Ok(())
     }
@@ -126,7 +133,8 @@ fn packet_socket(interface: &str) -> io::Result<OwnedFd> {
     // SAFETY: a string that ends in zero and outlives the call.
     let index = unsafe { libc::if_nametoindex(name.as_ptr()) };
     // SAFETY: takes no pointers. Protocol 0: it only sends.
-    let descriptor = unsafe { libc::socket(libc::AF_PACKET, libc::SOCK_RAW | libc::SOCK_CLOEXEC, 0) };
+    let descriptor =
+        unsafe { libc::socket(libc::AF_PACKET, libc::SOCK_RAW | libc::SOCK_CLOEXEC, 0) };
     if index == 0 || descriptor < 0 {
         return Err(io::Error::last_os_error());
     }
@@ -153,7 +161,10 @@ fn packet_socket(interface: &str) -> io::Result<OwnedFd> {
 fn tun_device(name: &str) -> io::Result<File> {
     const IFF_TUN: u16 = 1;
     const IFF_NO_PI: u16 = 0x1000;
-    let device = File::options().read(true).write(true).open("/dev/net/tun")?;
+    let device = File::options()
+        .read(true)
+        .write(true)
+        .open("/dev/net/tun")?;
     // struct ifreq: 16 bytes of name, flags, and room for the rest.
     let mut request = [0_u8; 40];
     request[..name.len()].copy_from_slice(name.as_bytes());

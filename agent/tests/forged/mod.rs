@@ -63,10 +63,7 @@ impl Talker {
         list.add(0x15, &[2, 3, 0, 0]);
         list.add(0x16, &[1, 0x0f, 0, 0]);
         list.add(0x50, &[&self.prefix[..], &PARTICIPANT].concat());
-        list.add(
-            0x02,
-            &[FINITE_LEASE_SECONDS.to_le_bytes(), [0; 4]].concat(),
-        );
+        list.add(0x02, &[FINITE_LEASE_SECONDS.to_le_bytes(), [0; 4]].concat());
         list.add(0x0f, &[0; 4]);
         self.message(SPDP_WRITER, 1, &list.finish())
     }

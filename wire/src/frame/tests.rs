@@ -151,10 +151,27 @@ fn a_socket_that_strips_the_link_header_shows_the_same_packet() {
         parse_cooked(0x88a8, PacketType::OUTGOING, ip, length),
         Ok(expected)
     );
+    // Linux 6.11 and later: the tag is there, its ether type is not named.
+    assert_eq!(
+        parse_cooked(0x0800, PacketType::MULTICAST, &inner, length + 4),
+        Ok(expected)
+    );
     assert_eq!(
         parse_cooked(0x0806, PacketType::BROADCAST, ip, length),
         Ok(None)
     );
+}
+
+#[test]
+fn a_packet_that_reads_like_a_tag_is_still_a_packet() {
+    let mut packet = [
+        0x45, 0, 0x08, 0x00, 0x45, 0x45, 0, 0, 64, 17, 0, 0, 10, 0, 0, 1, 10, 0, 0, 2,
+    ]
+    .to_vec();
+    packet.extend_from_slice(&[0x1c, 0xe8, 0x1c, 0xe8, 0x07, 0xec, 0, 0]);
+    packet.resize(2048, 0);
+    let parsed = parse_cooked(0x0800, PacketType::HOST, &packet, 2048).unwrap();
+    assert_eq!(parsed.unwrap().source[12..], [10, 0, 0, 1]);
 }
 
 #[test]
