@@ -198,8 +198,8 @@ fn nothing_of_an_excluded_interface_is_seen_also_when_it_appears_later() -> Resu
         assert!(!scrape.0.contains("/private"), "{}", scrape.0);
         assert_eq!(scrape.sum("ros2_participants", &[]), 1.0);
         assert_eq!(scrape.sum("ros2_unknown_writers", &[]), 0.0);
-        let verdict = [("verdict", "interface_excluded")];
-        assert!(scrape.sum("ros2probe_filter_verdicts_total", &verdict) >= 40.0);
+        let event = [("event", "interface_excluded")];
+        assert!(scrape.sum("ros2probe_filter_events_total", &event) >= 40.0);
         let interfaces = scrape.labels_of("ros2probe_capture_packets_total", "interface");
         assert!(
             interfaces.iter().all(|name| !name.starts_with("wlan")),
