@@ -62,7 +62,7 @@ impl Message {
         body.extend_from_slice(&1u16.to_le_bytes());
         body.extend_from_slice(&fragment_size.to_le_bytes());
         body.extend_from_slice(&u32::try_from(payload.len()).unwrap().to_le_bytes());
-        body.extend_from_slice(&payload[begin..end]);
+        body.extend_from_slice(payload.get(begin..end).unwrap());
         self.submessage(0x16, 0x01, &body)
     }
 
