@@ -138,7 +138,7 @@ impl Observer {
             for id in self.topics.ids() {
                 let watched = self.topics.get(id).map(|topic| topic.watched);
                 if (watched == Some(Watched::Yes)) == (pass == Watched::Yes) {
-                    self.consult(id);
+                    self.consult(id, self.clock);
                 }
             }
         }
@@ -416,7 +416,7 @@ impl Observer {
         }
         if is_new {
             self.topics.shrink(self.settings.endpoints);
-            self.consult(id);
+            self.consult(id, now);
         }
         self.apply(id, guid, now);
         let opened = self
@@ -440,8 +440,7 @@ impl Observer {
     }
 
     /// Asks the watchlist about a topic and lets its endpoints follow.
-    fn consult(&mut self, id: TopicId) {
-        let now = self.clock;
+    fn consult(&mut self, id: TopicId, now: Timestamp) {
         self.topics
             .consult(id, &self.watchlist, self.settings.topics, now);
         let Some(topic) = self.topics.get(id) else {
@@ -523,7 +522,10 @@ impl Observer {
             .filter(|(_, topic)| topic.watched == Watched::Rejected);
         let rejected: Vec<_> = rejected.map(|(id, _)| id).collect();
         for id in rejected {
-            self.consult(id);
+            if self.topics.watched() >= self.settings.topics {
+                return;
+            }
+            self.consult(id, self.clock);
         }
     }
 

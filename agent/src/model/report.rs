@@ -13,7 +13,7 @@ use super::snapshot::{
     DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Snapshot,
     TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
 };
-use super::topic::Topic;
+use super::topic::{Topic, Watched};
 
 pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
     let nodes = nodes_of_endpoints(&observer.discovery);
@@ -228,8 +228,14 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
             });
         }
     }
+    let rejected = observer
+        .topics
+        .iter()
+        .filter(|(_, topic)| topic.watched == Watched::Rejected);
+    let rejected: BTreeSet<_> = rejected.map(|(_, topic)| &*topic.naming.name).collect();
+    let is_rejected = |name: &str| rejected.contains(name);
     for (watch, fact) in observer.watchlist.watches().iter().zip(&mut facts) {
-        if watch.is_literal() && fact.topics.is_empty() {
+        if watch.is_literal() && fact.topics.is_empty() && !is_rejected(&watch.pattern) {
             fact.topics.push(WatchedTopicFacts {
                 domain_id: watch.domain_id.unwrap_or(0),
                 topic: watch.pattern.clone(),

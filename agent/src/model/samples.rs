@@ -83,8 +83,10 @@ pub enum Progress {
     Complete(Facts),
     /// All of it was seen before.
     Duplicate,
-    /// Impossible numbers, or more of them than are kept.
+    /// Impossible numbers, or no room.
     Rejected,
+    /// More fragments than are kept track of: nothing can be said of this sample.
+    TooMany,
 }
 
 impl Samples {
@@ -98,9 +100,13 @@ impl Samples {
             size.div_ceil(fragment_size)
         };
         let end = start.saturating_add(count);
-        if total == 0 || total > MAX_FRAGMENTS || start == 0 || count == 0 || end - 1 > total {
+        if total == 0 || start == 0 || count == 0 || end - 1 > total {
             budget.rejected += 1;
             return Progress::Rejected;
+        }
+        if total > MAX_FRAGMENTS {
+            budget.rejected += 1;
+            return Progress::TooMany;
         }
         let index = match self.place(record.sequence_number) {
             Some(index) => index,
@@ -300,13 +306,10 @@ mod tests {
     #[test]
     fn a_claimed_size_allocates_nothing() {
         let (mut samples, mut budget) = (Samples::default(), budget());
-        let hostile = Record {
-            fragments: 1 << 16 | 0xffff,
-            ..fragment(1, 1, 1, u32::MAX)
-        };
+        let hostile = fragment(1, 1, 1, u32::MAX);
         assert_eq!(
             samples.fragment(&hostile, Timestamp(1), &mut budget),
-            Progress::Rejected
+            Progress::TooMany
         );
         let large = fragment(1, 1, 1, 88_000_000);
         assert_eq!(

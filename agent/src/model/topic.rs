@@ -4,7 +4,7 @@
 //! topic they stand beside. A topic whose last endpoint has gone is kept for a grace period with
 //! its counters, so that its silence is seen rather than its series missed.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
@@ -81,6 +81,10 @@ pub struct Topic {
 pub struct Topics {
     topics: HashMap<TopicId, Topic>,
     index: BTreeMap<(u32, Box<str>), TopicId>,
+    /// Those without endpoints, by the time when the last one went.
+    vanished: BTreeSet<(Timestamp, TopicId)>,
+    /// Those of them that hold a measuring place.
+    vanished_watched: BTreeSet<(Timestamp, TopicId)>,
     created: u64,
     watched: usize,
     /// How often the cap kept out a topic that somebody wanted.
@@ -245,7 +249,10 @@ impl Topics {
             None => (self.create(domain_id, naming), true),
         };
         if let Some(topic) = self.topics.get_mut(&id) {
-            topic.vanished = None;
+            if let Some(at) = topic.vanished.take() {
+                self.vanished.remove(&(at, id));
+                self.vanished_watched.remove(&(at, id));
+            }
             let list = match role {
                 _ if naming.beside => &mut topic.beside,
                 Role::Writer => &mut topic.writers,
@@ -271,8 +278,14 @@ impl Topics {
         for list in [&mut topic.writers, &mut topic.readers, &mut topic.beside] {
             list.retain(|each| *each != guid);
         }
-        if topic.writers.is_empty() && topic.readers.is_empty() && topic.beside.is_empty() {
+        let is_empty =
+            topic.writers.is_empty() && topic.readers.is_empty() && topic.beside.is_empty();
+        if is_empty && topic.vanished.is_none() {
             topic.vanished = Some(now);
+            self.vanished.insert((now, id));
+            if topic.watched == Watched::Yes {
+                self.vanished_watched.insert((now, id));
+            }
         }
     }
 
@@ -301,6 +314,12 @@ impl Topics {
             topic.retired.get_or_insert_default();
         }
         topic.watched = after;
+        if let Some(at) = topic.vanished {
+            match after {
+                Watched::Yes => self.vanished_watched.insert((at, id)),
+                _ => self.vanished_watched.remove(&(at, id)),
+            };
+        }
         topic.judgements = match after {
             Watched::Yes => covering
                 .into_iter()
@@ -312,23 +331,17 @@ impl Topics {
 
     /// Forgets topics that vanished longer than `grace` ago.
     pub fn expire(&mut self, now: Timestamp, grace: u64) {
-        let over = |at: Timestamp| at.0.saturating_add(grace) <= now.0;
-        let expired = self
-            .topics
-            .iter()
-            .filter(|(_, topic)| topic.vanished.is_some_and(over));
-        let expired: Vec<_> = expired.map(|(id, _)| *id).collect();
-        expired.into_iter().for_each(|id| self.forget(id));
+        while let Some((at, id)) = self.vanished.first().copied()
+            && at.0.saturating_add(grace) <= now.0
+        {
+            self.forget(id);
+        }
     }
 
     /// Forgets the topics that vanished first until at most `cap` are left, as far as that goes.
     pub fn shrink(&mut self, cap: usize) {
         while self.topics.len() > cap {
-            let vanished = self
-                .topics
-                .iter()
-                .filter_map(|(id, topic)| Some((topic.vanished?, *id)));
-            let Some((_, id)) = vanished.min() else {
+            let Some((_, id)) = self.vanished.first().copied() else {
                 return;
             };
             self.forget(id);
@@ -366,13 +379,8 @@ impl Topics {
 
     /// Frees the measuring place of the topic that vanished first.
     fn give_up_vanished(&mut self, keep: TopicId) -> bool {
-        let places = self.topics.iter().filter(|(id, topic)| {
-            **id != keep && topic.watched == Watched::Yes && topic.is_vanished()
-        });
-        let Some((_, id)) = places
-            .filter_map(|(id, topic)| Some((topic.vanished?, *id)))
-            .min()
-        else {
+        let mut places = self.vanished_watched.iter().map(|(_, id)| *id);
+        let Some(id) = places.find(|id| *id != keep) else {
             return false;
         };
         self.forget(id);
@@ -383,6 +391,10 @@ impl Topics {
     fn forget(&mut self, id: TopicId) {
         if let Some(topic) = self.topics.remove(&id) {
             self.watched -= usize::from(topic.watched == Watched::Yes);
+            if let Some(at) = topic.vanished {
+                self.vanished.remove(&(at, id));
+                self.vanished_watched.remove(&(at, id));
+            }
             self.index.remove(&(topic.domain_id, topic.naming.dds_name));
         }
     }

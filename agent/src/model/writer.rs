@@ -269,10 +269,17 @@ impl Writer {
         }
         match self.samples.fragment(record, now, scene.budget) {
             Progress::Rejected => {}
+            Progress::TooMany => {
+                self.sequence.begin(number);
+                let (sequence, mut settling) = self.parts(scene);
+                sequence.exists(number, now, &mut |settled| settling.take(settled));
+                sequence.excuse(number, number.saturating_add(1));
+            }
             Progress::Duplicate => self.tally.duplicates += 1,
             progress => {
-                // A sample that is joined in the middle does not count as one that was sent.
-                let joined = u64::from(record.fragment_start != 1);
+                // A sample that is joined in the middle does not count as one that was sent; the
+                // writer's first one cannot be.
+                let joined = u64::from(record.fragment_start != 1 && number > 1);
                 self.sequence.begin(number.saturating_add(joined));
                 let reliable = self.traits.reliable;
                 let (sequence, mut settling) = self.parts(scene);
@@ -572,6 +579,28 @@ mod tests {
         bench.fragments(7, 4..=10).fragments(8, 1..=10).wait(5000);
         let facts = bench.facts();
         assert_eq!((facts.messages, facts.lost, facts.incomplete), (1, 0, 0));
+    }
+
+    #[test]
+    fn the_very_first_sample_can_be_lost_with_its_first_fragment() {
+        let mut bench = Bench::new(Traits::default());
+        bench.fragments(1, 2..=10).fragments(2, 1..=10).wait(5000);
+        let facts = bench.facts();
+        assert_eq!((facts.messages, facts.lost, facts.incomplete), (1, 1, 1));
+    }
+
+    #[test]
+    fn a_sample_of_too_many_fragments_is_neither_counted_nor_lost() {
+        let mut bench = Bench::new(Traits::default());
+        bench.data(1);
+        bench.put(Record {
+            fragments: 1 << 16 | 8,
+            sample_size: u32::MAX,
+            ..fragment(2, 1)
+        });
+        bench.data(3).wait(5000);
+        let facts = bench.facts();
+        assert_eq!((facts.messages, facts.lost, facts.irrelevant), (2, 0, 1));
     }
 
     #[test]
