@@ -136,27 +136,65 @@ impl Collector for Scrape {
     }
 }
 
-/// Turns OpenMetrics into text format 0.0.4 line by line: families carry their full names, an info
-/// is a gauge, and there are no units and no end mark. Samples are the same in both.
+/// Turns OpenMetrics into text format 0.0.4: families carry their full names, an info is a gauge,
+/// and there are no units and no end mark. Samples are the same in both and pass through.
 struct Classic<'a> {
     out: &'a mut String,
-    line: String,
+    place: Place,
+    /// The comment line so far.
+    comment: String,
     help: String,
+}
+
+/// Where in a line the writer is.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Place {
+    Start,
+    Sample,
+    Comment,
 }
 
 impl<'a> Classic<'a> {
     fn new(out: &'a mut String) -> Self {
         Self {
             out,
-            line: String::new(),
+            place: Place::Start,
+            comment: String::new(),
             help: String::new(),
         }
     }
 
+    /// A part of a line.
+    fn part(&mut self, text: &str) {
+        if self.place == Place::Start && !text.is_empty() {
+            // Label values come later in a line, so nothing from outside can begin one.
+            self.place = if text.starts_with('#') {
+                Place::Comment
+            } else {
+                Place::Sample
+            };
+        }
+        match self.place {
+            Place::Comment => self.comment.push_str(text),
+            _ => self.out.push_str(text),
+        }
+    }
+
     fn end_line(&mut self) {
-        let line = std::mem::take(&mut self.line);
+        match self.place {
+            Place::Start => {}
+            Place::Sample => self.out.push('\n'),
+            Place::Comment => self.end_comment(),
+        }
+        self.place = Place::Start;
+    }
+
+    fn end_comment(&mut self) {
+        let line = std::mem::take(&mut self.comment);
         if let Some(help) = line.strip_prefix("# HELP ") {
-            self.help = help.split_once(' ').map_or("", |(_, text)| text).to_owned();
+            help.split_once(' ')
+                .map_or("", |(_, text)| text)
+                .clone_into(&mut self.help);
         } else if let Some((name, kind)) = line
             .strip_prefix("# TYPE ")
             .and_then(|rest| rest.split_once(' '))
@@ -166,41 +204,24 @@ impl<'a> Classic<'a> {
                 "info" => ("_info", "gauge"),
                 _ => ("", kind),
             };
-            let help = std::mem::take(&mut self.help);
-            for piece in [
-                "# HELP ",
-                name,
-                suffix,
-                " ",
-                &help,
-                "\n# TYPE ",
-                name,
-                suffix,
-                " ",
-                kind,
-                "\n",
-            ] {
-                self.out.push_str(piece);
-            }
-        } else if !line.starts_with("# ") {
-            self.out.push_str(&line);
-            self.out.push('\n');
+            let head = ["# HELP ", name, suffix, " ", &self.help, "\n"];
+            let kind = ["# TYPE ", name, suffix, " ", kind, "\n"];
+            self.out.extend(head.into_iter().chain(kind));
         }
-        // Keeps its memory for the next line.
-        self.line = line;
-        self.line.clear();
     }
 }
 
 impl Write for Classic<'_> {
     fn write_str(&mut self, text: &str) -> fmt::Result {
-        let mut pieces = text.split('\n');
-        if let Some(first) = pieces.next() {
-            self.line.push_str(first);
+        if !text.as_bytes().contains(&b'\n') {
+            self.part(text);
+            return Ok(());
         }
-        for piece in pieces {
-            self.end_line();
-            self.line.push_str(piece);
+        for (index, part) in text.split('\n').enumerate() {
+            if index > 0 {
+                self.end_line();
+            }
+            self.part(part);
         }
         Ok(())
     }
