@@ -755,6 +755,33 @@ fn a_storm_of_forgeries_leaves_memory_bounded_and_real_topics_counted() {
 }
 
 #[test]
+fn forgeries_with_endless_leases_that_repeated_themselves_do_not_fill_the_table_for_ever() {
+    let settings = Settings {
+        participants: 64,
+        ..Settings::default()
+    };
+    let mut world = World::with(&["/**"], settings);
+    let mut dice = Dice(5);
+    let forged: Vec<_> = (0..64).map(|_| dice.prefix()).collect();
+    for _ in 0..3 {
+        for prefix in &forged {
+            world.spdp(*prefix, u32::MAX >> 1);
+        }
+        world.wait(1500);
+    }
+    let is_there = |world: &World| {
+        let participants = world.snapshot().participants;
+        participants.iter().any(|each| each.guid.prefix == ALICE)
+    };
+    world.spdp(ALICE, 10);
+    assert!(!is_there(&world));
+    world.wait(90_000);
+    world.spdp(ALICE, 10);
+    assert!(is_there(&world));
+    assert_eq!(world.snapshot().participants.len(), 64);
+}
+
+#[test]
 fn a_storm_of_endpoints_of_one_participant_leaves_room_for_others() {
     let settings = Settings {
         endpoints: 10_000,

@@ -35,6 +35,8 @@ const UNKNOWN_RECORDS_PER_SECOND: u32 = 4096;
 const SECOND: u64 = 1_000_000_000;
 /// Blocks of a packet ring: enough for one to fill while others wait for us.
 const BLOCKS: usize = 8;
+/// Records taken in at a time: several rings of the built-in size.
+const RECORDS_PER_ROUND: usize = 32_768;
 
 /// Why capturing could not begin or go on.
 #[derive(Debug, thiserror::Error)]
@@ -355,8 +357,12 @@ impl Tap {
     }
 
     /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
+    /// A flood may fill it as fast as it is emptied: what is left is taken the next time.
     fn take_records(&mut self) {
-        while let Some(record) = self.filter.next_record() {
+        for _ in 0..RECORDS_PER_ROUND {
+            let Some(record) = self.filter.next_record() else {
+                return;
+            };
             self.copied_bytes += size_of::<Record>() as u64;
             self.records.push_back(record);
         }
@@ -366,7 +372,11 @@ impl Tap {
         // Clears what the socket reports when a link goes down; without, waiting would never wait.
         self.ring.wait(Duration::ZERO)?;
         let (number, reassembly, ahead) = (self.number, &mut self.reassembly, &mut self.ahead);
-        while let Some(block) = self.ring.block() {
+        // No more than the ring holds: a flood must not keep us from everything else.
+        for _ in 0..BLOCKS {
+            let Some(block) = self.ring.block() else {
+                break;
+            };
             let mut frames = block.frames();
             for captured in frames.by_ref() {
                 self.copied_bytes += captured.bytes.len() as u64;

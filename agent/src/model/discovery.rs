@@ -22,6 +22,9 @@ const SECOND: u64 = 1_000_000_000;
 const ESTABLISHED: u64 = 2 * SECOND;
 /// One that is not established makes room after this long without a word.
 const DOUBTFUL: u64 = 5 * SECOND;
+/// Any participant makes room after this long without a word, whatever its lease: real ones repeat
+/// themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
+const FORSAKEN: u64 = 90 * SECOND;
 /// How often a full table is searched for room.
 const SEARCH: u64 = SECOND / 10;
 /// Announcements older than a disposal are stale, for this long after it.
@@ -685,7 +688,12 @@ impl Discovery {
                 .last_seen
                 .0
                 .saturating_sub(participant.first_seen.0);
-            span < ESTABLISHED && participant.last_seen.0.saturating_add(DOUBTFUL) <= now.0
+            let patience = if span < ESTABLISHED {
+                DOUBTFUL
+            } else {
+                FORSAKEN
+            };
+            participant.last_seen.0.saturating_add(patience) <= now.0
         });
         let oldest = doubtful.min_by_key(|(prefix, participant)| (participant.last_seen, **prefix));
         let Some(prefix) = oldest.map(|(prefix, _)| *prefix) else {

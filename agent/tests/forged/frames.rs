@@ -24,6 +24,7 @@ pub(crate) struct Wire {
     from: [u8; 4],
     to: [u8; 4],
     pub(crate) shuffle: Shuffle,
+    pub(crate) port: u16,
     /// 802.1Q or 802.1ad tags, outermost first.
     pub(crate) tags: Vec<[u8; 4]>,
 }
@@ -37,6 +38,7 @@ impl Wire {
             from: host.address().octets(),
             to: other.address().octets(),
             shuffle: |_| {},
+            port: DISCOVERY_PORT,
             tags: Vec::new(),
         })
     }
@@ -44,7 +46,7 @@ impl Wire {
 
 impl Carrier for Wire {
     fn carry(&mut self, payload: &[u8]) -> Result<()> {
-        let mut packets = fragments(payload, self.from, self.to);
+        let mut packets = fragments(payload, self.from, self.to, self.port);
         (self.shuffle)(&mut packets);
         for packet in packets {
             let link = [
@@ -79,7 +81,7 @@ impl Tun {
 
 impl Carrier for Tun {
     fn carry(&mut self, payload: &[u8]) -> Result<()> {
-        for packet in fragments(payload, self.from, self.to) {
+        for packet in fragments(payload, self.from, self.to, DISCOVERY_PORT) {
             self.device
                 .write_all(&packet)
                 .context("cannot write to tun")?;
@@ -89,13 +91,13 @@ impl Carrier for Tun {
 }
 
 /// A UDP payload as IPv4 packets that leave room for tags.
-fn fragments(payload: &[u8], from: [u8; 4], to: [u8; 4]) -> Vec<Vec<u8>> {
+fn fragments(payload: &[u8], from: [u8; 4], to: [u8; 4], port: u16) -> Vec<Vec<u8>> {
     const STEP: usize = 1464;
     // As a host does, not to be mistaken for a repetition.
     static IDENTIFICATION: AtomicU16 = AtomicU16::new(0);
     let identification = IDENTIFICATION.fetch_add(1, Ordering::Relaxed);
     let length = u16::try_from(payload.len() + 8).unwrap_or(u16::MAX);
-    let port = DISCOVERY_PORT.to_be_bytes();
+    let port = port.to_be_bytes();
     let udp = [&port[..], &port, &length.to_be_bytes(), &[0; 2], payload].concat();
     let count = udp.len().div_ceil(STEP);
     let mut packets = Vec::with_capacity(count);

@@ -1,0 +1,243 @@
+//! Everything that somebody on the network can make up, as fast as one thread can send it.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+
+use anyhow::{Result, anyhow};
+
+use super::{Carrier, Talker, data};
+
+/// Different datagrams of a storm; their GUIDs do not repeat.
+const MOULDS: usize = 3000;
+const PREFIX: std::ops::Range<usize> = 8..20;
+
+/// Runs until it is ended.
+pub(crate) struct Storm {
+    stop: Arc<AtomicBool>,
+    sent: Arc<AtomicU64>,
+    thread: JoinHandle<()>,
+}
+
+impl Storm {
+    /// Sends what `forge` makes, each time under a GUID prefix that was never there before.
+    pub(crate) fn start(
+        mut carrier: impl Carrier + Send + 'static,
+        forge: fn(&mut Dice) -> Vec<u8>,
+    ) -> Storm {
+        let (stop, sent) = (Arc::<AtomicBool>::default(), Arc::<AtomicU64>::default());
+        let (stopped, counter) = (stop.clone(), sent.clone());
+        let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
+        let mut moulds: Vec<Mould> = (0..MOULDS).map(|_| Mould::new(forge(&mut dice))).collect();
+        let thread = std::thread::spawn(move || {
+            for mould in (0..moulds.len()).cycle() {
+                if stopped.load(Ordering::Relaxed) {
+                    break;
+                }
+                // A full queue on the way is no reason to stop.
+                let _ = carrier.carry(moulds[mould].cast(&mut dice));
+                counter.fetch_add(1, Ordering::Relaxed);
+            }
+        });
+        Storm { stop, sent, thread }
+    }
+
+    /// Ends it; the datagrams sent.
+    pub(crate) fn end(self) -> Result<u64> {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.join().map_err(|_| anyhow!("the storm died"))?;
+        Ok(self.sent.load(Ordering::Relaxed))
+    }
+}
+
+/// A datagram and where in it the GUID prefix of its sender stands.
+struct Mould {
+    bytes: Vec<u8>,
+    places: Vec<usize>,
+}
+
+impl Mould {
+    fn new(bytes: Vec<u8>) -> Mould {
+        let prefix = bytes[PREFIX].to_vec();
+        let places = (0..=bytes.len() - PREFIX.len())
+            .filter(|place| bytes[*place..].starts_with(&prefix))
+            .collect();
+        Mould { bytes, places }
+    }
+
+    fn cast(&mut self, dice: &mut Dice) -> &[u8] {
+        let random = [dice.roll().to_ne_bytes(), dice.roll().to_ne_bytes()].concat();
+        for place in &self.places {
+            self.bytes[*place..place + PREFIX.len()].copy_from_slice(&random[..PREFIX.len()]);
+        }
+        &self.bytes
+    }
+}
+
+/// Repeatable random numbers (xorshift64).
+pub(crate) struct Dice(u64);
+
+impl Dice {
+    pub(crate) fn roll(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    /// 0 to `sides` - 1.
+    pub(crate) fn pick(&mut self, sides: u64) -> u64 {
+        self.roll() % sides
+    }
+
+    /// One of these extremes, or anything.
+    fn number(&mut self) -> u64 {
+        match self.pick(8) {
+            0 => 0,
+            1 => u64::MAX,
+            2 => i64::MAX.cast_unsigned(),
+            3 => 1 << 63,
+            4 => u64::from(u32::MAX),
+            5 => 1,
+            _ => self.roll(),
+        }
+    }
+
+    fn bytes(&mut self, count: usize) -> Vec<u8> {
+        let words = (0..count.div_ceil(8)).flat_map(|_| self.roll().to_ne_bytes());
+        words.take(count).collect()
+    }
+}
+
+/// A datagram with nothing true in it.
+pub(crate) fn forgery(dice: &mut Dice) -> Vec<u8> {
+    let talker = stranger(dice);
+    match dice.pick(10) {
+        0 | 1 => participant_and_endpoints(dice, &talker),
+        2 => talker.entities(&name(dice)),
+        3 | 4 => {
+            let payload = vec![0x33; 320];
+            talker.message([0, 0, 2, 3], dice.roll() as u32, &payload)
+        }
+        5 => fragment(dice, &talker),
+        6 => sequence_set(dice, &talker, 0x08),
+        7 => heartbeat(dice, &talker),
+        8 => lying_length(dice, &talker),
+        _ => {
+            let length = dice.pick(1200) as usize;
+            [talker.header(), dice.bytes(length)].concat()
+        }
+    }
+}
+
+/// A participant that announces a writer and a reader at once, in one datagram.
+fn participant_and_endpoints(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
+    let mut bytes = talker.participant();
+    let topic = format!("rt/{}", name(dice));
+    for (number, entity) in [(1, 3), (2, 4)] {
+        let [high, low, ..] = dice.roll().to_ne_bytes();
+        let endpoint = [0, high, low, entity];
+        let message = if entity == 3 {
+            talker.publication(endpoint, &topic, &name(dice), number)
+        } else {
+            talker.subscription(endpoint, &topic, &name(dice), number)
+        };
+        bytes.extend_from_slice(&message[20..]);
+    }
+    bytes
+}
+
+/// What breaks a page of metrics if it gets there as it is.
+fn name(dice: &mut Dice) -> String {
+    match dice.pick(24) {
+        0 => "quote\"}\n# HELP injected 1\ninjected{a=\"b\"} 1\n".to_owned(),
+        1 => "long/".repeat(2000),
+        2 => "back\\slash\\\r\n\0\u{7f}\u{1b}[2J".to_owned(),
+        3 => format!("ünïcödé_{}", dice.pick(1 << 20)),
+        4 => String::new(),
+        _ => format!("topic_{}", dice.roll()),
+    }
+}
+
+/// DATA_FRAG that claims any size, up to 4 GB.
+fn fragment(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
+    let mut bytes = talker.header();
+    let number = dice.number();
+    let mut body = vec![0, 0, 28, 0, 0, 0, 0, 0, 0, 0, 2, 3];
+    body.extend_from_slice(&((number >> 32) as u32).to_le_bytes());
+    body.extend_from_slice(&(number as u32).to_le_bytes());
+    body.extend_from_slice(&(dice.number() as u32).to_le_bytes());
+    body.extend_from_slice(&(dice.number() as u16).to_le_bytes());
+    body.extend_from_slice(&(dice.number() as u16).to_le_bytes());
+    body.extend_from_slice(&(dice.number() as u32).to_le_bytes());
+    body.extend_from_slice(&dice.bytes(400));
+    submessage(&mut bytes, 0x16, &body);
+    bytes
+}
+
+/// GAP or ACKNACK with a set of up to 256 bits, or more.
+fn sequence_set(dice: &mut Dice, talker: &Talker, id: u8) -> Vec<u8> {
+    let mut bytes = talker.header();
+    let mut body = vec![0, 0, 0, 0, 0, 0, 2, 3];
+    for _ in 0..2 {
+        let number = dice.number();
+        body.extend_from_slice(&((number >> 32) as u32).to_le_bytes());
+        body.extend_from_slice(&(number as u32).to_le_bytes());
+    }
+    let bits = [256, 0, 255, 257, u32::MAX][dice.pick(5) as usize];
+    body.extend_from_slice(&bits.to_le_bytes());
+    body.extend_from_slice(&[0xff; 32]);
+    submessage(&mut bytes, id, &body);
+    bytes
+}
+
+fn heartbeat(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
+    let mut bytes = talker.header();
+    let mut body = vec![0, 0, 0, 0, 0, 0, 2, 3];
+    for _ in 0..2 {
+        let number = dice.number();
+        body.extend_from_slice(&((number >> 32) as u32).to_le_bytes());
+        body.extend_from_slice(&(number as u32).to_le_bytes());
+    }
+    body.extend_from_slice(&(dice.roll() as u32).to_le_bytes());
+    submessage(&mut bytes, 0x07, &body);
+    bytes
+}
+
+/// Submessages, parameters and strings that are longer or shorter than they say.
+fn lying_length(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
+    let mut bytes = match dice.pick(3) {
+        0 => talker.participant(),
+        1 => talker.publication([0, 0, 2, 3], "rt/lie", "lie", 1),
+        _ => {
+            let mut bytes = talker.header();
+            for number in 0..40 {
+                data(&mut bytes, [0, 0, 2, 3], number, &[0; 8]);
+            }
+            bytes
+        }
+    };
+    for _ in 0..1 + dice.pick(4) {
+        let place = 20 + dice.pick(bytes.len() as u64 - 20) as usize;
+        bytes[place] = dice.roll() as u8;
+    }
+    let keep = 20 + dice.pick(bytes.len() as u64 - 20) as usize;
+    if dice.pick(2) == 0 {
+        bytes.truncate(keep);
+    }
+    bytes
+}
+
+fn submessage(bytes: &mut Vec<u8>, id: u8, body: &[u8]) {
+    bytes.extend_from_slice(&[id, 1]);
+    bytes.extend_from_slice(&u16::try_from(body.len()).unwrap_or(0).to_le_bytes());
+    bytes.extend_from_slice(body);
+}
+
+/// A participant of a GUID that nobody has.
+fn stranger(dice: &mut Dice) -> Talker {
+    let mut talker = Talker::new(0, "/forged");
+    let random = [dice.roll().to_ne_bytes(), dice.roll().to_ne_bytes()].concat();
+    talker.prefix.copy_from_slice(&random[..12]);
+    talker
+}

@@ -1,0 +1,210 @@
+//! Somebody on the network who means harm, and an operator who gave too little privilege: the agent
+//! stays small, keeps counting what is real, and says what is wrong.
+
+#![expect(
+    clippy::indexing_slicing,
+    reason = "test code says what must hold by failing"
+)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "test code says what must hold by failing"
+)]
+
+mod forged;
+mod harness;
+mod local_agent;
+
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result};
+use forged::frames::Wire;
+use forged::storm::{Dice, Storm, forgery};
+use forged::{Sender, Talker, introduce, talk};
+use harness::agent::{Agent, Scrape};
+use harness::network::{Link, Namespace};
+use harness::peer::{Peer, Role, Stack, Stream};
+use harness::usage::Usage;
+
+/// A port that nothing on the robot listens to: the storm is for the agent alone.
+const NOBODY: u16 = 7399;
+const STORM: Duration = Duration::from_secs(10);
+/// What a storm may add to the agent's memory: every table filled to its cap.
+const GROWTH: u64 = 40 << 20;
+/// Forgeries give way when they have been silent for 5 s; Cyclone DDS repeats itself every 8 s.
+const RECOVERY: Duration = Duration::from_secs(15);
+
+#[test]
+fn a_storm_of_forged_rtps_leaves_memory_bounded_the_page_whole_and_a_real_topic_counted()
+-> Result<()> {
+    let link = Link::new()?;
+    let target = format!("{}:{NOBODY}", link.robot.address());
+    let sender = Sender::new(
+        &link.monitor,
+        &format!("{}:0", link.monitor.address()),
+        &target,
+    )?;
+    weather(&link, || Storm::start(sender, forgery))
+}
+
+#[test]
+fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_the_page_whole_and_a_real_topic_counted()
+-> Result<()> {
+    let link = Link::new()?;
+    let mut wire = Wire::new(&link.monitor, &link.robot, "eth0")?;
+    wire.port = NOBODY;
+    wire.shuffle = |packets| {
+        // Never the same ones missing, some twice, some over each other.
+        let lot = packets
+            .iter()
+            .fold(0, |sum, packet| sum ^ packet[5] ^ packet[7]) as usize;
+        let gone = lot % packets.len();
+        packets.remove(gone);
+        if let Some(packet) = packets.first_mut().filter(|_| lot % 3 == 0) {
+            packet[7] = packet[7].wrapping_add(1);
+        }
+        if lot % 2 == 0 {
+            packets.reverse();
+        }
+    };
+    let large = |dice: &mut Dice| {
+        let mut bytes = forgery(dice);
+        bytes.resize(3000 + dice.pick(50_000) as usize, 0x55);
+        bytes
+    };
+    weather(&link, || Storm::start(wire, large))
+}
+
+#[test]
+fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let file = |name: &str| directory.path().join(name);
+    // The build directory need not be open to everybody.
+    std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
+    std::fs::write(file("ros2probe.yaml"), "watch: [/**]\n")?;
+    let only = "-all,+net_raw,+bpf,+perfmon";
+    let script = format!(
+        "#!/bin/sh\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
+         --ambient-caps {only} --bounding-set {only} {} \"$@\"\n",
+        file("rp").display()
+    );
+    std::fs::write(file("start"), script)?;
+    for open in ["", "start", "rp"] {
+        std::fs::set_permissions(file(open), Permissions::from_mode(0o755))?;
+    }
+    let agent = Agent::start(&link.monitor, file("start"), &file("ros2probe.yaml"))?;
+    let status = std::fs::read_to_string(format!("/proc/{}/status", agent.process.pid()))?;
+    assert!(
+        status.contains("\nUid:\t65534\t65534\t65534\t65534\n"),
+        "{status}"
+    );
+    let mut sender = Sender::between(&link.robot, &link.monitor)?;
+    let mut talker = Talker::new(1, "/unprivileged");
+    introduce(&talker, &mut sender)?;
+    talk(&mut talker, &mut sender, [320; 500])?;
+    let page = agent.settled_scrape()?;
+    let counted = page.sum("ros2_topic_messages_total", &[("topic", "/unprivileged")]);
+    assert_eq!(counted, 500.0, "{}", page.0);
+    // Once the writer is classified the filter meters it: it was told so without privilege.
+    let metered = page.sum("ros2probe_filter_events_total", &[("event", "metered")]);
+    assert!(metered > 400.0, "{metered} of 500 metered");
+    assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
+    Ok(())
+}
+
+/// What must hold of an agent on the robot while a storm comes in.
+fn weather(link: &Link, storm: impl FnOnce() -> Storm) -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("ros2probe.yaml");
+    std::fs::write(&file, "watch: [/**]\nlog: warn\n")?;
+    let log = directory.path().join("log");
+    let rp = Path::new(env!("CARGO_BIN_EXE_rp"));
+    let agent = Agent::start_logging(&link.robot, rp, &file, &log)?;
+    let before = Usage::of(agent.process.pid())?;
+    let stream = Stream {
+        topic: "/real",
+        ..Stream::small(STORM.as_secs() * 200)
+    };
+    let start =
+        |host: &Namespace, role, node| Peer::start(host, Stack::Cyclone, role, &stream, &[node]);
+    let mut subscriber = start(&link.monitor, Role::Subscriber, "/listener")?;
+    let mut publisher = start(&link.robot, Role::Publisher, "/driver")?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+
+    publisher.go()?;
+    let storm = storm();
+    let began = Instant::now();
+    let (mut largest, mut oldest) = (0, 0_f64);
+    while began.elapsed() < STORM {
+        let page = agent.scrape()?;
+        well_formed(&page);
+        oldest = oldest.max(page.sum("ros2probe_snapshot_age_seconds", &[]));
+        largest = largest.max(Usage::of(agent.process.pid())?.pss);
+        std::thread::sleep(Duration::from_millis(300));
+    }
+    publisher.wait_sent(Duration::from_secs(20))?;
+    let cpu = Usage::of(agent.process.pid())?.since(&before).cpu;
+    let sent = storm.end()?;
+    let page = agent.settled_scrape()?;
+    largest = largest.max(Usage::of(agent.process.pid())?.pss);
+    well_formed(&page);
+    let growth = largest.saturating_sub(before.pss);
+    eprintln!(
+        "{sent} datagrams forged, {cpu:?} of CPU, {} KiB more memory, oldest page {oldest} s, {} frames \
+         and {} records dropped",
+        growth >> 10,
+        page.sum("ros2probe_capture_dropped_packets_total", &[]),
+        page.sum("ros2probe_records_dropped_total", &[]),
+    );
+    assert!(sent > 20_000, "{sent} datagrams are no storm");
+    assert!(growth < GROWTH, "{growth} bytes more");
+    assert!(oldest < 5.0, "a page was {oldest} s old");
+    let real = |name| page.sum(name, &[("topic", "/real")]);
+    assert_eq!(real("ros2_topic_messages_total"), stream.count as f64);
+    assert_eq!(real("ros2_topic_lost_messages_total"), 0.0);
+
+    // It is over: who comes now is seen, and what it sends is counted.
+    let stream = Stream {
+        topic: "/after",
+        count: 200,
+        ..stream
+    };
+    let came = Instant::now();
+    let start =
+        |host: &Namespace, role, node| Peer::start(host, Stack::Cyclone, role, &stream, &[node]);
+    let mut subscriber = start(&link.monitor, Role::Subscriber, "/late_listener")?;
+    let mut publisher = start(&link.robot, Role::Publisher, "/late_driver")?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+    let both = ["/late_listener", "/late_driver"];
+    loop {
+        let nodes = agent.scrape()?.labels_of("ros2_node_info", "ros_node");
+        if both.iter().all(|node| nodes.contains(*node)) {
+            break;
+        }
+        assert!(
+            came.elapsed() < RECOVERY,
+            "newcomers are not seen: {nodes:?}"
+        );
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    eprintln!("newcomers are seen after {:?}", came.elapsed());
+    publisher.go()?;
+    publisher.wait_sent(Duration::from_secs(20))?;
+    let page = agent.settled_scrape()?;
+    let after = page.sum("ros2_topic_messages_total", &[("topic", "/after")]);
+    assert_eq!(after, 200.0, "{}", page.0);
+    let log = std::fs::read_to_string(&log).context("the agent's log")?;
+    assert!(log.lines().count() < 20, "{log}");
+    Ok(())
+}
+
+fn well_formed(page: &Scrape) {
+    let said = local_agent::promtool(&page.0);
+    assert_eq!(said, "", "{}", page.0);
+}
