@@ -716,7 +716,7 @@ fn a_storm_of_forgeries_leaves_memory_bounded_and_real_topics_counted() {
         for _ in 0..20 {
             let prefix = dice.prefix();
             let writer = Guid::new(prefix, WRITER);
-            let topic = format!("rt/storm_{:x}{}", dice.roll(), "x".repeat(800));
+            let topic = format!("rt/storm_{:x}{}", dice.roll(), "x".repeat(200));
             let fragment = vec![0; 60_000];
             world.spdp(prefix, 1_000_000);
             world.sedp(writer, &topic);

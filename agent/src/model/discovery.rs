@@ -5,14 +5,19 @@
 //! again says nothing about it. Every table is capped: what was there before a flood of forgeries
 //! stays, newcomers are refused until there is room.
 
+mod facts;
+mod graveyard;
+
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 
-use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, Role, TypeHash};
-use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
-use ros2probe_wire::qos::Qos;
-use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
+use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
+
+use facts::domain;
+pub use facts::{DomainSource, Endpoint, Node, Origin, Participant, Portrait};
+use graveyard::Graveyard;
 
 use super::churn::{Churn, Entity, Event};
 use super::journal::{DiscoveryEvent, Journal};
@@ -27,16 +32,14 @@ const DOUBTFUL: u64 = 5 * SECOND;
 const FORSAKEN: u64 = 90 * SECOND;
 /// How often a full table is searched for room.
 const SEARCH: u64 = SECOND / 10;
-/// Announcements older than a disposal are stale, for this long after it.
-const BURIED: u64 = SECOND / 2;
-const BURIALS: usize = 256;
 /// Endpoints and nodes whose participant is not known yet: how many and how long.
 const PENDING: usize = 1024;
 const PENDING_FOR: u64 = 60 * SECOND;
+/// Longest topic or type name: `string<256>` in the builtin topics of DDS. What is longer is no
+/// name but an attempt on our memory.
+const MAX_NAME_LEN: usize = 256;
 /// Most endpoints of one participant.
 const PER_PARTICIPANT: usize = 4096;
-/// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
-const MAX_DOMAIN: u32 = 232;
 
 /// Caps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,103 +50,6 @@ pub struct Caps {
     pub endpoints: usize,
     /// Nodes.
     pub nodes: usize,
-}
-
-/// How sure a participant's domain is, least first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum DomainSource {
-    /// Nothing told.
-    Assumed,
-    /// A unicast port that has the form of a discovery port.
-    UnicastPort,
-    /// The multicast port it announces itself on.
-    MulticastPort,
-    /// It said so.
-    Announced,
-}
-
-/// Where an announcement came from.
-#[derive(Clone, Copy, Debug)]
-pub struct Origin {
-    /// When.
-    pub at: Timestamp,
-    /// Who sent it, perhaps on somebody else's behalf.
-    pub sender: GuidPrefix,
-    /// Its number among those of its writer.
-    pub sequence_number: u64,
-    /// Destination address, IPv4-mapped for IPv4.
-    pub destination: [u8; 16],
-    /// Destination port.
-    pub port: u16,
-}
-
-/// What a participant says about itself, as far as it is shown.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Portrait {
-    /// Implementation.
-    pub vendor: VendorId,
-    /// ROS enclave.
-    pub enclave: Option<Box<str>>,
-    /// Host name.
-    pub host: Option<Box<str>>,
-    /// Process name.
-    pub process_name: Option<Box<str>>,
-    /// Process id, or its low 16 bits.
-    pub process_id: Option<u32>,
-    /// Lease.
-    pub lease: Duration,
-    /// Announces security.
-    pub secured: bool,
-}
-
-/// One participant.
-#[derive(Debug)]
-pub struct Participant {
-    /// What it says.
-    pub portrait: Portrait,
-    /// Its domain.
-    pub domain_id: u32,
-    /// First announcement.
-    pub first_seen: Timestamp,
-    /// Last sign of life.
-    pub last_seen: Timestamp,
-    /// Its endpoints.
-    pub endpoints: BTreeSet<Guid>,
-    /// Its nodes.
-    pub nodes: Vec<Node>,
-    domain_source: DomainSource,
-    /// The `ros_discovery_info` sample that told the nodes.
-    nodes_from: Option<(Guid, u64)>,
-}
-
-/// One node.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Node {
-    /// Fully qualified name.
-    pub name: Arc<str>,
-    /// Its writers.
-    pub writers: Vec<Guid>,
-    /// Its readers.
-    pub readers: Vec<Guid>,
-}
-
-/// One writer or reader.
-#[derive(Clone, Debug)]
-pub struct Endpoint {
-    /// Writer or reader.
-    pub role: Role,
-    /// Domain of its participant.
-    pub domain_id: u32,
-    /// DDS topic.
-    pub topic: Arc<str>,
-    /// ROS type.
-    pub message_type: Arc<str>,
-    /// RIHS01 hash.
-    pub type_hash: Option<TypeHash>,
-    /// Quality of service.
-    pub qos: Qos,
-    /// First announcement.
-    pub first_seen: Timestamp,
 }
 
 /// What the rest of the model has to follow up.
@@ -174,8 +80,7 @@ pub struct Discovery {
     endpoints: HashMap<Guid, Endpoint>,
     pending_endpoints: VecDeque<(Timestamp, Box<EndpointAnnouncement>)>,
     pending_nodes: HashMap<GuidPrefix, PendingNodes>,
-    /// What was disposed of last: when, by which sender's which sample.
-    buried: VecDeque<(Guid, Timestamp, GuidPrefix, u64)>,
+    graveyard: Graveyard,
     node_count: usize,
     changes: Vec<Change>,
     /// Counters of events.
@@ -205,7 +110,7 @@ impl Discovery {
             endpoints: HashMap::new(),
             pending_endpoints: VecDeque::new(),
             pending_nodes: HashMap::new(),
-            buried: VecDeque::new(),
+            graveyard: Graveyard::default(),
             node_count: 0,
             changes: Vec::new(),
             churn: Churn::default(),
@@ -241,9 +146,7 @@ impl Discovery {
     /// Whether this endpoint was disposed of a moment ago: what it sent may still be on its way.
     #[must_use]
     pub fn was_buried(&self, guid: Guid, now: Timestamp) -> bool {
-        self.buried
-            .iter()
-            .any(|(buried, at, ..)| *buried == guid && at.0.saturating_add(4 * BURIED) > now.0)
+        self.graveyard.holds(guid, now)
     }
 
     /// What happened to endpoints since the last call.
@@ -266,7 +169,7 @@ impl Discovery {
         journal: &mut Journal,
     ) {
         let guid = announcement.guid;
-        if self.is_stale(guid, origin) {
+        if self.graveyard.is_stale(guid, origin) {
             return;
         }
         let (domain_id, source) = domain(announcement.domain_id, origin);
@@ -281,7 +184,7 @@ impl Discovery {
                     Entity::Participant,
                     Event::Changed,
                     guid,
-                    "",
+                    &Arc::default(),
                     origin.at,
                     journal,
                 );
@@ -311,7 +214,7 @@ impl Discovery {
             Entity::Participant,
             Event::Appeared,
             guid,
-            "",
+            &Arc::default(),
             origin.at,
             journal,
         );
@@ -323,7 +226,7 @@ impl Discovery {
         if guid.entity != EntityId::PARTICIPANT {
             return;
         }
-        self.bury(guid, origin);
+        self.graveyard.bury(guid, origin);
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
 
@@ -334,7 +237,12 @@ impl Discovery {
         origin: &Origin,
         journal: &mut Journal,
     ) {
-        if self.is_stale(announcement.guid, origin) {
+        let names = [announcement.topic.as_str(), announcement.type_name.as_str()];
+        if names.iter().any(|name| name.len() > MAX_NAME_LEN) {
+            self.evictions.endpoints += 1;
+            return;
+        }
+        if self.graveyard.is_stale(announcement.guid, origin) {
             return;
         }
         if self.participants.contains_key(&announcement.guid.prefix) {
@@ -354,7 +262,7 @@ impl Discovery {
 
     /// SEDP: an endpoint says goodbye.
     pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
-        self.bury(guid, origin);
+        self.graveyard.bury(guid, origin);
         self.pending_endpoints
             .retain(|(_, pending)| pending.guid != guid);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
@@ -608,7 +516,15 @@ impl Discovery {
         let domain_id = participant.domain_id;
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         if let Some(event) = event {
-            self.note(domain_id, Entity::Participant, event, guid, "", at, journal);
+            self.note(
+                domain_id,
+                Entity::Participant,
+                event,
+                guid,
+                &Arc::default(),
+                at,
+                journal,
+            );
         }
         let cascade = event.map(|_| Event::Cascaded);
         for endpoint in participant.endpoints {
@@ -706,27 +622,6 @@ impl Discovery {
             && self.endpoints.len() < self.caps.endpoints
     }
 
-    fn bury(&mut self, guid: Guid, origin: &Origin) {
-        if self.buried.len() >= BURIALS {
-            self.buried.pop_front();
-        }
-        self.buried
-            .push_back((guid, origin.at, origin.sender, origin.sequence_number));
-    }
-
-    /// A copy of an announcement that overtook or was overtaken by its own disposal.
-    fn is_stale(&self, guid: Guid, origin: &Origin) -> bool {
-        self.buried
-            .iter()
-            .rev()
-            .any(|(buried, at, sender, number)| {
-                *buried == guid
-                    && *sender == origin.sender
-                    && *number > origin.sequence_number
-                    && at.0.saturating_add(BURIED) > origin.at.0
-            })
-    }
-
     #[expect(clippy::too_many_arguments, reason = "an event has that many sides")]
     fn note(
         &mut self,
@@ -734,7 +629,7 @@ impl Discovery {
         entity: Entity,
         event: Event,
         guid: Guid,
-        name: &str,
+        name: &Arc<str>,
         at: Timestamp,
         journal: &mut Journal,
     ) {
@@ -745,33 +640,8 @@ impl Discovery {
             entity: entity.label(),
             event: event.label(),
             guid,
-            name: name.into(),
+            name: Arc::clone(name),
         });
-    }
-}
-
-impl Portrait {
-    fn of(announcement: &ParticipantAnnouncement) -> Self {
-        let low_bits = || announcement.process_id_low_bits().map(u32::from);
-        Self {
-            vendor: announcement.vendor,
-            enclave: announcement.enclave.as_deref().map(Into::into),
-            host: announcement.host_name().map(Into::into),
-            process_name: announcement.process_name().map(Into::into),
-            process_id: announcement.process_id().or_else(low_bits),
-            lease: announcement.lease,
-            secured: announcement.is_secured,
-        }
-    }
-}
-
-impl Node {
-    fn of(node: &NodeEntities) -> Self {
-        Self {
-            name: node.fully_qualified_name().into(),
-            writers: node.writers.clone(),
-            readers: node.readers.clone(),
-        }
     }
 }
 
@@ -786,27 +656,4 @@ fn difference(one: &[Arc<str>], other: &[Arc<str>]) -> Vec<Arc<str>> {
         }
     }
     missing
-}
-
-/// The participant's domain: as announced, else by the port its announcement went to (RTPS 2.5,
-/// 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p), else 0. Ports from 32768 on are
-/// mostly ephemeral ones and tell nothing.
-fn domain(announced: Option<u32>, origin: &Origin) -> (u32, DomainSource) {
-    const EPHEMERAL: u16 = 32_768;
-    if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= MAX_DOMAIN) {
-        return (domain_id, DomainSource::Announced);
-    }
-    let Some(offset) = origin.port.checked_sub(7400) else {
-        return (0, DomainSource::Assumed);
-    };
-    let (domain_id, rest) = (u32::from(offset / 250), offset % 250);
-    let [first, .., a, _, _, _] = origin.destination;
-    let is_multicast = first == 0xff || first == 0 && a & 0xf0 == 0xe0;
-    if is_multicast && rest == 0 && domain_id <= MAX_DOMAIN {
-        return (domain_id, DomainSource::MulticastPort);
-    }
-    if rest >= 10 && rest % 2 == 0 && origin.port < EPHEMERAL {
-        return (domain_id, DomainSource::UnicastPort);
-    }
-    (0, DomainSource::Assumed)
 }

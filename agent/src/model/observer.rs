@@ -404,9 +404,13 @@ impl Observer {
         let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
             return;
         };
-        let Some(naming) = naming(endpoint) else {
+        let Some(mut naming) = naming(endpoint) else {
             return;
         };
+        if naming.dds_name == endpoint.topic {
+            // One copy of the name for all who keep it.
+            naming.dds_name = Arc::clone(&endpoint.topic);
+        }
         let (role, message_type) = (endpoint.role, Arc::clone(&endpoint.message_type));
         let (id, is_new) = self
             .topics

@@ -23,9 +23,9 @@ pub struct TopicId(u64);
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Naming {
     /// DDS name; of a CPU buffer topic that of the topic beside it.
-    pub dds_name: Box<str>,
+    pub dds_name: Arc<str>,
     /// ROS name, or the DDS name.
-    pub name: Box<str>,
+    pub name: Arc<str>,
     /// Label of what it is.
     pub kind: &'static str,
     /// Hidden by ROS convention.
@@ -80,7 +80,7 @@ pub struct Topic {
 #[derive(Debug, Default)]
 pub struct Topics {
     topics: HashMap<TopicId, Topic>,
-    index: BTreeMap<(u32, Box<str>), TopicId>,
+    index: BTreeMap<(u32, Arc<str>), TopicId>,
     /// Those without endpoints, by the time when the last one went.
     vanished: BTreeSet<(Timestamp, TopicId)>,
     /// Those of them that hold a measuring place.
@@ -124,9 +124,9 @@ impl Naming {
     }
 
     fn verbatim(topic: &DdsTopic, kind: &'static str) -> Self {
-        let name: Box<str> = topic.as_str().into();
+        let name: Arc<str> = topic.as_str().into();
         Self {
-            dds_name: name.clone(),
+            dds_name: Arc::clone(&name),
             name,
             kind,
             hidden: false,
@@ -200,7 +200,7 @@ impl Topics {
     #[must_use]
     pub fn find(&self, domain_id: u32, naming: &Naming) -> Option<TopicId> {
         self.index
-            .get(&(domain_id, naming.dds_name.clone()))
+            .get(&(domain_id, Arc::clone(&naming.dds_name)))
             .copied()
     }
 
@@ -352,7 +352,8 @@ impl Topics {
     fn create(&mut self, domain_id: u32, naming: &Naming) -> TopicId {
         self.created += 1;
         let id = TopicId(self.created);
-        self.index.insert((domain_id, naming.dds_name.clone()), id);
+        self.index
+            .insert((domain_id, Arc::clone(&naming.dds_name)), id);
         self.topics.insert(
             id,
             Topic {

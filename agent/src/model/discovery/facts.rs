@@ -1,0 +1,158 @@
+//! What is kept of participants, endpoints and nodes, and where a participant's domain is read from.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
+use ros2probe_wire::entities::NodeEntities;
+use ros2probe_wire::qos::Qos;
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Duration, Guid, GuidPrefix, Timestamp};
+
+/// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
+const MAX_DOMAIN: u32 = 232;
+
+/// How sure a participant's domain is, least first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum DomainSource {
+    /// Nothing told.
+    Assumed,
+    /// A unicast port that has the form of a discovery port.
+    UnicastPort,
+    /// The multicast port it announces itself on.
+    MulticastPort,
+    /// It said so.
+    Announced,
+}
+
+/// Where an announcement came from.
+#[derive(Clone, Copy, Debug)]
+pub struct Origin {
+    /// When.
+    pub at: Timestamp,
+    /// Who sent it, perhaps on somebody else's behalf.
+    pub sender: GuidPrefix,
+    /// Its number among those of its writer.
+    pub sequence_number: u64,
+    /// Destination address, IPv4-mapped for IPv4.
+    pub destination: [u8; 16],
+    /// Destination port.
+    pub port: u16,
+}
+
+/// What a participant says about itself, as far as it is shown.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Portrait {
+    /// Implementation.
+    pub vendor: VendorId,
+    /// ROS enclave.
+    pub enclave: Option<Box<str>>,
+    /// Host name.
+    pub host: Option<Box<str>>,
+    /// Process name.
+    pub process_name: Option<Box<str>>,
+    /// Process id, or its low 16 bits.
+    pub process_id: Option<u32>,
+    /// Lease.
+    pub lease: Duration,
+    /// Announces security.
+    pub secured: bool,
+}
+
+/// One participant.
+#[derive(Debug)]
+pub struct Participant {
+    /// What it says.
+    pub portrait: Portrait,
+    /// Its domain.
+    pub domain_id: u32,
+    /// First announcement.
+    pub first_seen: Timestamp,
+    /// Last sign of life.
+    pub last_seen: Timestamp,
+    /// Its endpoints.
+    pub endpoints: BTreeSet<Guid>,
+    /// Its nodes.
+    pub nodes: Vec<Node>,
+    pub(super) domain_source: DomainSource,
+    /// The `ros_discovery_info` sample that told the nodes.
+    pub(super) nodes_from: Option<(Guid, u64)>,
+}
+
+/// One node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Node {
+    /// Fully qualified name.
+    pub name: Arc<str>,
+    /// Its writers.
+    pub writers: Vec<Guid>,
+    /// Its readers.
+    pub readers: Vec<Guid>,
+}
+
+/// One writer or reader.
+#[derive(Clone, Debug)]
+pub struct Endpoint {
+    /// Writer or reader.
+    pub role: Role,
+    /// Domain of its participant.
+    pub domain_id: u32,
+    /// DDS topic.
+    pub topic: Arc<str>,
+    /// ROS type.
+    pub message_type: Arc<str>,
+    /// RIHS01 hash.
+    pub type_hash: Option<TypeHash>,
+    /// Quality of service.
+    pub qos: Qos,
+    /// First announcement.
+    pub first_seen: Timestamp,
+}
+
+impl Portrait {
+    pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
+        let low_bits = || announcement.process_id_low_bits().map(u32::from);
+        Self {
+            vendor: announcement.vendor,
+            enclave: announcement.enclave.as_deref().map(Into::into),
+            host: announcement.host_name().map(Into::into),
+            process_name: announcement.process_name().map(Into::into),
+            process_id: announcement.process_id().or_else(low_bits),
+            lease: announcement.lease,
+            secured: announcement.is_secured,
+        }
+    }
+}
+
+impl Node {
+    pub(super) fn of(node: &NodeEntities) -> Self {
+        Self {
+            name: node.fully_qualified_name().into(),
+            writers: node.writers.clone(),
+            readers: node.readers.clone(),
+        }
+    }
+}
+
+/// The participant's domain: as announced, else by the port its announcement went to (RTPS 2.5,
+/// 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p), else 0. Ports from 32768 on are
+/// mostly ephemeral ones and tell nothing.
+pub(super) fn domain(announced: Option<u32>, origin: &Origin) -> (u32, DomainSource) {
+    const EPHEMERAL: u16 = 32_768;
+    if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= MAX_DOMAIN) {
+        return (domain_id, DomainSource::Announced);
+    }
+    let Some(offset) = origin.port.checked_sub(7400) else {
+        return (0, DomainSource::Assumed);
+    };
+    let (domain_id, rest) = (u32::from(offset / 250), offset % 250);
+    let [first, .., a, _, _, _] = origin.destination;
+    let is_multicast = first == 0xff || first == 0 && a & 0xf0 == 0xe0;
+    if is_multicast && rest == 0 && domain_id <= MAX_DOMAIN {
+        return (domain_id, DomainSource::MulticastPort);
+    }
+    if rest >= 10 && rest % 2 == 0 && origin.port < EPHEMERAL {
+        return (domain_id, DomainSource::UnicastPort);
+    }
+    (0, DomainSource::Assumed)
+}
