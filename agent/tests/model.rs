@@ -536,7 +536,7 @@ fn interest_follows_discovery() {
         (alice(OTHER), Some(Verdict::Meter)),
         (bob(READER), None),
     ];
-    expected.sort_unstable();
+    expected.sort_unstable_by_key(|(guid, verdict)| (verdict.is_some(), *guid));
     assert_eq!(changes, expected);
 
     world.wait(11_000);
@@ -625,6 +625,20 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
     world.stream(alice(WRITER), 401..=500);
     assert_eq!(world.measurement("/chatter").messages, 500);
     assert!(world.observer.interest_changes().is_empty());
+}
+
+#[test]
+fn what_the_kernels_budget_for_strangers_leaves_out_is_not_lost() {
+    let mut world = World::new(&["/chatter"]);
+    for number in [1, 2, 3, 40, 90, 91, 200] {
+        world.sample(alice(WRITER), number);
+        world.wait(400);
+    }
+    world.wait(1000);
+    world.stream(alice(WRITER), 500..=700);
+    world.stream(alice(WRITER), 711..=900);
+    let unknown = world.snapshot().unknown_writers.remove(0).measurement;
+    assert_eq!((unknown.messages, unknown.lost), (7 + 201 + 190, 10));
 }
 
 #[test]

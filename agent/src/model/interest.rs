@@ -73,7 +73,8 @@ impl Interest {
         self.entries.get(&guid)?.wanted
     }
 
-    /// What changed since the last call, in the order of the GUIDs; `None` = remove.
+    /// What changed since the last call, in the order of the GUIDs; `None` = remove. Removals come
+    /// first: the kernel's map has no more room than this table.
     pub fn changes(&mut self) -> Vec<(Guid, Option<Verdict>)> {
         let mut changes = Vec::with_capacity(self.changed.len());
         for guid in std::mem::take(&mut self.changed) {
@@ -86,6 +87,7 @@ impl Interest {
                 self.entries.remove(&guid);
             }
         }
+        changes.sort_by_key(|(_, verdict)| verdict.is_some());
         changes
     }
 
@@ -95,8 +97,8 @@ impl Interest {
         (self.entries.len(), self.limit, self.evictions)
     }
 
-    /// Makes room by forgetting one uninteresting entry. Its removal may be told late: the kernel's
-    /// map has room for twice the changes.
+    /// Makes room by forgetting one uninteresting entry, one the kernel does not know if there is
+    /// any.
     fn give_up_one(&mut self) -> bool {
         let mut ignored = self
             .entries

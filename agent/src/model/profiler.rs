@@ -114,6 +114,10 @@ impl Profiler {
         };
         let now = Timestamp(record.time);
         measured.last_seen = measured.last_seen.max(now);
+        if measured.topic.is_none() && !measured.metered {
+            // The kernel filter's budget for strangers may leave samples out: no gap is a loss.
+            measured.opened = now;
+        }
         let budget = match measured.topic {
             Some(_) => &mut self.budget,
             None => &mut self.strangers_budget,
@@ -161,6 +165,7 @@ impl Profiler {
             known.writer.learn(traits);
             known.opened = opened;
             if known.topic.is_none() {
+                known.opened = opened.max(now);
                 // Its unfinished samples are paid for by the other budget from now on.
                 known
                     .writer
@@ -229,7 +234,7 @@ impl Profiler {
             if measured.last_seen.0.saturating_add(FORGET) <= now.0 {
                 strangers.forgotten.push(*guid);
             } else if !measured.metered && measured.first_seen.0.saturating_add(STRANGE) <= now.0 {
-                measured.metered = true;
+                (measured.metered, measured.opened) = (true, now);
                 strangers.metered.push(*guid);
             }
         }
