@@ -1,5 +1,5 @@
 //! The agent's one working thread: takes packets from the source, feeds the model, pins a snapshot
-//! to the board about once a second. Surfaces never reach in here; they read the board.
+//! to the board once a second and when a scrape asks for one. Surfaces never reach in here; they read the board.
 
 pub mod replay;
 
@@ -22,8 +22,9 @@ use replay::Replay;
 
 /// Longest time without looking at commands and the clock.
 const SLICE: Duration = Duration::from_millis(100);
-/// How often surfaces get a new snapshot.
+/// How often surfaces get a new snapshot unasked, and how often at most when they ask.
 const PUBLISH: Duration = Duration::from_secs(1);
+const PUBLISH_ASKED: Duration = Duration::from_millis(50);
 
 /// Where packets come from.
 pub enum Source {
@@ -101,7 +102,9 @@ impl Run {
             if let Source::Live(live) = &mut self.source {
                 live.apply(&self.observer.interest_changes());
             }
-            if finished || polled.is_err() || published.elapsed() >= PUBLISH {
+            let age = published.elapsed();
+            let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
+            if finished || polled.is_err() || due {
                 self.publish();
                 published = Instant::now();
             }

@@ -1,11 +1,14 @@
 //! The board on which the capture thread pins what it knows and from which surfaces read.
 //!
-//! Nobody waits here: a reader takes the latest state, the writer replaces it.
+//! A reader takes the latest state, the writer replaces it; neither holds the other up. A reader
+//! may ask for a newer state and wait for it, as long as it has patience.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
+use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
 use crate::config::{Config, Watch};
@@ -20,6 +23,9 @@ pub struct Board {
     state: ArcSwap<State>,
     settings: ArcSwap<Settings>,
     reload: ArcSwap<Reload>,
+    /// Somebody waits for a newer state.
+    asked: AtomicBool,
+    news: Notify,
 }
 
 /// What the capture thread found out.
@@ -82,6 +88,8 @@ impl Board {
             }),
             settings: ArcSwap::from_pointee(settings),
             reload: ArcSwap::from_pointee(reload),
+            asked: AtomicBool::new(false),
+            news: Notify::new(),
         }
     }
 
@@ -91,6 +99,26 @@ impl Board {
             snapshot: Some(snapshot),
             agent,
         }));
+        self.asked.store(false, Ordering::Relaxed);
+        self.news.notify_waiters();
+    }
+
+    /// Whether somebody waits for a newer state.
+    #[must_use]
+    pub fn is_asked(&self) -> bool {
+        self.asked.load(Ordering::Relaxed)
+    }
+
+    /// Asks for a newer state and waits for it, but no longer than `patience`: counters that a
+    /// scrape reads should be those of its moment, or rates over short windows would be off.
+    pub async fn refresh(&self, patience: Duration) {
+        let news = self.news.notified();
+        if self.state.load().agent.finished {
+            return;
+        }
+        self.asked.store(true, Ordering::Relaxed);
+        // Late or not: what is on the board is shown, with its age.
+        let _ = tokio::time::timeout(patience, news).await;
     }
 
     /// Pins new settings after a reload that worked.
@@ -209,6 +237,23 @@ mod tests {
             agent,
         };
         assert_eq!(state.ready(start + Duration::from_hours(1)), Ok(()));
+    }
+
+    #[tokio::test]
+    async fn who_asks_gets_the_next_state_and_waits_for_a_stuck_writer_only_so_long() {
+        let board = Board::new(SourceKind::Live, Settings::default());
+        let writer = async {
+            while !board.is_asked() {
+                tokio::task::yield_now().await;
+            }
+            board.publish(
+                Snapshot::default(),
+                AgentFacts::new(SourceKind::Live, Instant::now()),
+            );
+        };
+        tokio::join!(board.refresh(Duration::from_secs(3600)), writer);
+        assert!(board.state().snapshot.is_some() && !board.is_asked());
+        board.refresh(Duration::from_millis(1)).await;
     }
 
     #[test]

@@ -113,6 +113,9 @@ fn router(board: Arc<Board>) -> Router {
         .with_state(Pages { board, exposition })
 }
 
+/// The capture thread looks for askers at least every 100 ms.
+const REFRESH_PATIENCE: Duration = Duration::from_millis(300);
+
 async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response {
     let accepts: Vec<&str> = headers
         .get_all(ACCEPT)
@@ -120,6 +123,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
         .filter_map(|value| value.to_str().ok())
         .collect();
     let format = Format::negotiate(&accepts.join(","));
+    pages.board.refresh(REFRESH_PATIENCE).await;
     match pages.exposition.render(format) {
         Ok(page) => (
             [
