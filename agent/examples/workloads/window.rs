@@ -112,7 +112,7 @@ impl Window {
 
 impl Told {
     fn of(scrape: &Scrape, stream: &Stream, traffic: f64) -> Told {
-        let topic = [("topic", stream.topic)];
+        let topic = [("topic", stream.topic.as_str())];
         Told {
             counted: scrape.sum("ros2_topic_messages_total", &topic),
             lost: scrape.sum("ros2_topic_lost_messages_total", &topic),

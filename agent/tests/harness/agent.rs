@@ -114,6 +114,25 @@ impl Scrape {
         values.collect()
     }
 
+    /// Every counter above zero that could explain a difference.
+    pub(crate) fn doubts(&self) -> String {
+        let telling = [
+            "lost",
+            "dropped",
+            "incomplete",
+            "evict",
+            "duplicate",
+            "errors",
+            "recovered",
+        ];
+        let lines = self.0.lines().filter(|line| {
+            !line.starts_with('#')
+                && !line.ends_with(" 0")
+                && telling.iter().any(|word| line.contains(word))
+        });
+        lines.collect::<Vec<_>>().join("; ")
+    }
+
     fn samples(&self, name: &str, labels: &[(&str, &str)]) -> impl Iterator<Item = f64> {
         let wanted: Vec<String> = labels
             .iter()

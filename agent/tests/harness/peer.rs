@@ -29,7 +29,7 @@ pub(crate) enum Role {
 /// What the publisher sends or the subscriber expects.
 #[derive(Clone, Debug)]
 pub(crate) struct Stream {
-    pub(crate) topic: &'static str,
+    pub(crate) topic: String,
     pub(crate) size: usize,
     pub(crate) rate: f64,
     pub(crate) count: u64,
@@ -67,7 +67,7 @@ impl Stream {
     /// Small samples as from an IMU: 320 B at 200 Hz, best effort.
     pub(crate) fn small(count: u64) -> Stream {
         Stream {
-            topic: "/imu",
+            topic: "/imu".to_owned(),
             size: 320,
             rate: 200.0,
             count,
@@ -83,7 +83,7 @@ impl Stream {
     /// drops what it overwrites before a busy CPU has sent it.
     pub(crate) fn point_cloud(size: usize, count: u64) -> Stream {
         Stream {
-            topic: "/points",
+            topic: "/points".to_owned(),
             size,
             rate: 20.0,
             depth: 20,
@@ -132,7 +132,7 @@ impl Peer {
             Role::Publisher => "pub",
             Role::Subscriber => "sub",
         };
-        let mut words: Vec<String> = ["--role", role_name, "--topic", stream.topic, "--hold"]
+        let mut words: Vec<String> = ["--role", role_name, "--topic", &stream.topic, "--hold"]
             .into_iter()
             .filter(|word| *word != "--hold" || role == Role::Publisher)
             .map(str::to_owned)
