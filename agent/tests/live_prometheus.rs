@@ -50,7 +50,7 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     }
     // A publisher that logs every sample: the truth to compare with.
     let stream = Stream {
-        topic: "/truth",
+        topic: "/truth".to_owned(),
         ..Stream::small(4000)
     };
     let mut subscriber = Peer::start(
