@@ -126,7 +126,7 @@ fn weather(link: &Link, storm: impl FnOnce() -> Storm) -> Result<()> {
     let agent = Agent::start_logging(&link.robot, rp, &file, &log)?;
     let before = Usage::of(agent.process.pid())?;
     let stream = Stream {
-        topic: "/real",
+        topic: "/real".to_owned(),
         ..Stream::small(STORM.as_secs() * 200)
     };
     let start =
@@ -170,7 +170,7 @@ fn weather(link: &Link, storm: impl FnOnce() -> Storm) -> Result<()> {
 
     // It is over: who comes now is seen, and what it sends is counted.
     let stream = Stream {
-        topic: "/after",
+        topic: "/after".to_owned(),
         count: 200,
         ..stream
     };
