@@ -63,10 +63,10 @@ fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_the_page_whole_and_a_real_
             .fold(0, |sum, packet| sum ^ packet[5] ^ packet[7]) as usize;
         let gone = lot % packets.len();
         packets.remove(gone);
-        if let Some(packet) = packets.first_mut().filter(|_| lot % 3 == 0) {
+        if let Some(packet) = packets.first_mut().filter(|_| lot.is_multiple_of(3)) {
             packet[7] = packet[7].wrapping_add(1);
         }
-        if lot % 2 == 0 {
+        if lot.is_multiple_of(2) {
             packets.reverse();
         }
     };
