@@ -228,7 +228,7 @@ impl Level {
 /// What is not written in the file.
 mod defaults {
     pub(super) const PARTICIPANTS: usize = 1_000;
-    pub(super) const ENDPOINTS: usize = 20_000;
+    pub(super) const ENDPOINTS: usize = 8_192;
     pub(super) const TOPICS: usize = 1_000;
     pub(super) const UNKNOWN_WRITERS: usize = 256;
     pub(super) const REASSEMBLY_BYTES: usize = 4 << 20;
