@@ -3,7 +3,7 @@
 //!
 //! Each namespace has a tap of its own: packet socket, ring, kernel filter. Nothing is ever sent.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::path::PathBuf;
 use std::time::Duration;
@@ -17,6 +17,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
 use super::netns::{self, NetnsError};
+use super::order::{Next, Order};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::{Clocks, wait};
 use crate::config::CaptureSettings;
@@ -128,7 +129,7 @@ impl LiveSource {
         for tap in &mut self.taps {
             tap.follow_interfaces();
             tap.take_records();
-            tap.take_frames(observer)?;
+            tap.take_frames(&clocks, observer)?;
             tap.deliver(&clocks, SETTLE_NANOSECONDS, observer);
         }
         self.clock = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
@@ -280,8 +281,8 @@ struct Tap {
     packets: BTreeMap<u32, u64>,
     reassembly: Reassembly,
     ahead: Ahead,
-    /// Records that wait for older frames.
-    records: VecDeque<Record>,
+    /// What is to be counted, waiting for its turn.
+    order: Order,
     copied_bytes: u64,
     refused_interfaces: u64,
 }
@@ -322,7 +323,7 @@ impl Tap {
             packets: BTreeMap::new(),
             reassembly: Reassembly::new(limits),
             ahead: Ahead::default(),
-            records: VecDeque::new(),
+            order: Order::default(),
             copied_bytes: 0,
             refused_interfaces: 0,
         })
@@ -364,14 +365,20 @@ impl Tap {
                 return;
             };
             self.copied_bytes += size_of::<Record>() as u64;
-            self.records.push_back(record);
+            self.order.kernel(record);
         }
     }
 
-    fn take_frames(&mut self, observer: &mut Observer) -> Result<(), CaptureError> {
+    /// What frames announce the model gets at once, what they count for in its turn.
+    fn take_frames(
+        &mut self,
+        clocks: &Clocks,
+        observer: &mut Observer,
+    ) -> Result<(), CaptureError> {
         // Clears what the socket reports when a link goes down; without, waiting would never wait.
         self.ring.wait(Duration::ZERO)?;
-        let (number, reassembly, ahead) = (self.number, &mut self.reassembly, &mut self.ahead);
+        let (reassembly, ahead) = (&mut self.reassembly, &mut self.ahead);
+        let order = &mut self.order;
         // No more than the ring holds: a flood must not keep us from everything else.
         for _ in 0..BLOCKS {
             let Some(block) = self.ring.block() else {
@@ -382,9 +389,11 @@ impl Tap {
                 self.copied_bytes += captured.bytes.len() as u64;
                 *self.packets.entry(captured.interface).or_default() += 1;
                 let datagram = Assembly {
-                    number,
+                    number: self.number,
+                    clocks,
                     reassembly: &mut *reassembly,
                     ahead: &mut *ahead,
+                    order: &mut *order,
                 };
                 if let Err(error) = datagram.frame(&captured, observer) {
                     observer.decode_error("frame", error.reason);
@@ -399,15 +408,19 @@ impl Tap {
 
     /// Gives the model the records that are older than `settle` nanoseconds.
     fn deliver(&mut self, clocks: &Clocks, settle: u64, observer: &mut Observer) {
-        let horizon = clocks.monotonic.saturating_sub(settle);
-        while let Some(record) = self.records.front()
-            && record.time <= horizon
-            && let Some(mut record) = self.records.pop_front()
-        {
-            let at = clocks.calendar(record.time);
-            record.time = at.0;
+        while let Some(next) = self.order.next(clocks, settle) {
+            let record = match next {
+                Next::Kernel(record) => record,
+                Next::Walked(record) => {
+                    observer.record(&record);
+                    continue;
+                }
+            };
             if record.kind == kind::HANDOVER {
-                let key = FlowKey::of_handover(self.number, &record);
+                let (at, key) = (
+                    Timestamp(record.time),
+                    FlowKey::of_handover(self.number, &record),
+                );
                 if let Some(rest) = self.reassembly.hand_over(at, key, &record) {
                     let ready = |each| take_in(each, observer);
                     self.ahead.rest(self.number, rest, ready);
@@ -424,8 +437,10 @@ impl Tap {
 /// What turns one tap's frames into datagrams.
 struct Assembly<'a> {
     number: u32,
+    clocks: &'a Clocks,
     reassembly: &'a mut Reassembly,
     ahead: &'a mut Ahead,
+    order: &'a mut Order,
 }
 
 impl Assembly<'_> {
@@ -448,7 +463,7 @@ impl Assembly<'_> {
         match &packet.payload {
             Payload::Datagram(udp) => {
                 envelope.destination_port = udp.destination_port;
-                observer.datagram(&envelope, udp.payload, None);
+                take_in_frame(&envelope, udp.payload, self.clocks, self.order, observer);
             }
             Payload::Fragment(fragment) => {
                 let key =
@@ -462,13 +477,29 @@ impl Assembly<'_> {
                 } else {
                     envelope.destination_port = whole.destination_port;
                     envelope.fragmented = true;
-                    observer.datagram(&envelope, whole.payload(), None);
+                    let payload = whole.payload();
+                    take_in_frame(&envelope, payload, self.clocks, self.order, observer);
                 }
             }
             _ => {}
         }
         Ok(())
     }
+}
+
+/// A captured datagram.
+fn take_in_frame(
+    envelope: &Envelope,
+    payload: &[u8],
+    clocks: &Clocks,
+    order: &mut Order,
+    observer: &mut Observer,
+) {
+    observer.announcements(envelope, payload, |observer, record| {
+        if let Some(record) = order.walked(clocks, record) {
+            observer.record(&record);
+        }
+    });
 }
 
 /// What has become complete.

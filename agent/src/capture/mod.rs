@@ -5,6 +5,7 @@ pub mod filter;
 pub mod interfaces;
 pub mod live;
 pub mod netns;
+pub mod order;
 pub mod pcap;
 pub mod ring;
 pub mod system;

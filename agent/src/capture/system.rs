@@ -58,6 +58,13 @@ impl Clocks {
         let ago = self.monotonic.wrapping_sub(monotonic);
         Timestamp(self.now.0.wrapping_sub(ago))
     }
+
+    /// A calendar time of the past as a monotonic time; one of the future is now.
+    #[must_use]
+    pub const fn monotonic_of(&self, calendar: Timestamp) -> u64 {
+        let ago = self.now.0.saturating_sub(calendar.0);
+        self.monotonic.saturating_sub(ago)
+    }
 }
 
 fn nanoseconds(clock: libc::clockid_t) -> u64 {

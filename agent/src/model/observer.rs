@@ -147,17 +147,24 @@ impl Observer {
     /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`
     /// the kernel filter has reported what lies before its offset.
     pub fn datagram(&mut self, envelope: &Envelope, payload: &[u8], handover: Option<&Handover>) {
-        self.datagrams += 1;
-        let vendor = payload
-            .get(6..8)
-            .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
-        let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
-        let outcome = walk::datagram(payload, envelope, handover, |found| {
-            self.found(&found, vendor, envelope);
+        self.walk(envelope, payload, handover, Self::count);
+    }
+
+    /// Takes in what a datagram announces. What is to be counted is left to `later`, which puts it
+    /// in order with what comes another way and gives it to [`Self::record`].
+    pub fn announcements(
+        &mut self,
+        envelope: &Envelope,
+        payload: &[u8],
+        mut later: impl FnMut(&mut Self, Record),
+    ) {
+        self.walk(envelope, payload, None, |observer, record| {
+            if record.writer().entity.is_builtin() {
+                observer.count(record);
+            } else {
+                later(observer, *record);
+            }
         });
-        if outcome == Outcome::Malformed {
-            self.decode_error("rtps", Reason::BadLength);
-        }
     }
 
     /// Takes in a datagram of which a capture kept only the beginning: what it says about its
@@ -247,7 +254,28 @@ impl Observer {
         }
     }
 
-    fn found(&mut self, found: &Found<'_>, vendor: Option<VendorId>, envelope: &Envelope) {
+    fn walk(
+        &mut self,
+        envelope: &Envelope,
+        payload: &[u8],
+        handover: Option<&Handover>,
+        mut count: impl FnMut(&mut Self, &Record),
+    ) {
+        self.datagrams += 1;
+        let vendor = payload
+            .get(6..8)
+            .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
+        let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
+        let outcome = walk::datagram(payload, envelope, handover, |found| {
+            self.announced(&found, vendor, envelope);
+            count(self, &found.record);
+        });
+        if outcome == Outcome::Malformed {
+            self.decode_error("rtps", Reason::BadLength);
+        }
+    }
+
+    fn announced(&mut self, found: &Found<'_>, vendor: Option<VendorId>, envelope: &Envelope) {
         let record = &found.record;
         if matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
             let prefix = record.writer().prefix;
@@ -263,7 +291,6 @@ impl Observer {
             self.read(found, vendor, &origin);
             self.follow_up(origin.at);
         }
-        self.count(record);
     }
 
     /// Reads what is of use to discovery.
