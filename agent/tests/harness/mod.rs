@@ -9,6 +9,7 @@
 
 pub(crate) mod agent;
 pub(crate) mod capture;
+pub(crate) mod dissection;
 pub(crate) mod event_log;
 pub(crate) mod loss;
 pub(crate) mod network;

@@ -39,6 +39,8 @@ pub(crate) struct Stream {
     pub(crate) domain: u16,
     /// Whether the peers log every sample.
     pub(crate) logged: bool,
+    /// Seconds for which a publisher stays after its last sample, unless it is terminated.
+    pub(crate) linger: f64,
 }
 
 pub(crate) struct Peer {
@@ -76,6 +78,7 @@ impl Stream {
             depth: 100,
             domain: 0,
             logged: true,
+            linger: 1.0,
         }
     }
 
@@ -147,6 +150,7 @@ impl Peer {
         }
         if role == Role::Publisher {
             option("--count", stream.count.to_string());
+            option("--linger", stream.linger.to_string());
         }
         for node in nodes {
             option("--node", (*node).to_owned());
