@@ -218,9 +218,10 @@ inline void wait_for_start(const Options& options, const std::function<int()>& m
   pollfd input{0, POLLIN, 0};
   while (!stopped && poll(&input, 1, 50) <= 0) {
   }
+  if (stopped) return;
   char byte;
   do {
-    if (stopped || read(0, &byte, 1) != 1) fail("standard input ended before the start");
+    if (read(0, &byte, 1) != 1) fail("standard input ended before the start");
   } while (byte != '\n');
 }
 
