@@ -13,6 +13,7 @@ use ros2probe_wire::{
 
 use crate::{
     maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Scratch, copy, count, scratch},
+    runs,
     verdict::{self, progress},
 };
 
@@ -200,7 +201,7 @@ fn send_pending(flow: &mut Flow, flags: u16) {
         flow.has_pending = 0;
         flow.pending.flags |= flags;
         flow.ahead = 1;
-        verdict::write(&flow.pending);
+        runs::give(&flow.pending, false);
     }
 }
 
@@ -270,7 +271,8 @@ fn finish(scratch: &Scratch, flow: &mut Flow) {
     }
     flow.has_pending = 0;
     flow.pending.time = scratch.packet.now;
-    verdict::write(&flow.pending);
+    // After records that were sent ahead, this one is the sign that the datagram is complete.
+    runs::give(&flow.pending, flow.ahead == 0);
 }
 
 #[inline(always)]

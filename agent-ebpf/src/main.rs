@@ -13,6 +13,7 @@
 mod fragment;
 mod maps;
 mod packet;
+mod runs;
 mod verdict;
 
 use aya_ebpf::{bindings::__sk_buff, macros::socket_filter, programs::SkBuffContext};

@@ -8,7 +8,7 @@ use ros2probe_wire::{
     Record,
     filter::{
         Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,
-        UNKNOWN_CAPACITY,
+        RUN_CAPACITY, UNKNOWN_CAPACITY,
     },
     walk::Walk,
 };
@@ -59,6 +59,9 @@ pub static FLOWS: LruHashMap<FlowKey, Flow> = LruHashMap::with_max_entries(FLOW_
 /// A flow that has seen nothing; never written.
 #[map]
 pub static NEW_FLOW: PerCpuArray<Flow> = PerCpuArray::with_max_entries(1, 0);
+/// DATA_FRAGs of samples that are not complete yet, one after the other so far.
+#[map]
+pub static RUNS: HashMap<RunKey, Record> = HashMap::with_max_entries(RUN_CAPACITY, 0);
 /// What user space polls about every 100 ms.
 #[map]
 pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
@@ -78,6 +81,19 @@ pub struct FlowKey {
     pub identification: u32,
     /// Interface index, and the highest bit for frames on their way out.
     pub interface: u32,
+}
+
+/// One stream of fragments: a writer's to one destination, as one CPU sees it. So no two CPUs ever
+/// change the same run.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct RunKey {
+    pub writer: [u32; 4],
+    pub destination: [u32; 4],
+    pub destination_port: u32,
+    /// Interface index, and the highest bit for frames on their way out.
+    pub interface: u32,
+    pub cpu: u32,
 }
 
 /// What is known of a fragmented datagram so far.

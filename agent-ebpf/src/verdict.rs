@@ -13,6 +13,7 @@ use crate::{
         count, scratch, setting,
     },
     packet::{Payload, load},
+    runs,
 };
 
 /// Submessages that one run of the program follows; a datagram with more is captured.
@@ -257,7 +258,7 @@ pub extern "C" fn flush(records: u32, flags: u32) -> u32 {
         }
         if let Some(record) = scratch.records.get_mut(index as usize) {
             record.flags |= flags as u16;
-            write(record);
+            runs::give(record, flags & u32::from(flag::AHEAD) == 0);
         }
         index += 1;
     }

@@ -20,7 +20,7 @@ use program_run::{Kernel, Seen};
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::frame::{self, Link, PacketType, Payload};
-use ros2probe_wire::record::{Record, Verdict, flag, guid_words};
+use ros2probe_wire::record::{Record, Verdict, flag, guid_words, kind};
 use ros2probe_wire::walk::{self, Envelope, Fate};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
@@ -192,6 +192,7 @@ fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
     let mut kernel = Kernel::load();
     kernel.set_interest(interest);
     let (mut user, mut records, mut captures) = (user_space(), 0, 0);
+    let mut runs = Runs::default();
     for (number, packet) in packets.iter().enumerate() {
         let Seen {
             kept,
@@ -203,7 +204,10 @@ fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
         user.packet(packet, |payload, envelope| {
             let (capture, records) = expected(payload, envelope, interest);
             captured = capture;
-            wanted.extend(records);
+            let joins = records.len() == 1 || !envelope.fragmented;
+            records
+                .into_iter()
+                .for_each(|record| runs.give(record, joins, &mut wanted));
             finished = true;
         });
         if finished {
@@ -215,7 +219,41 @@ fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
         assert_eq!(found, wanted, "{} packet {number}: records", path.display());
         records += found.len();
     }
-    (records, captures)
+    let mut stalled: Vec<_> = kernel.take_stalled().into_iter().map(comparable).collect();
+    let mut wanted: Vec<_> = runs.0.into_values().map(comparable).collect();
+    stalled.sort_by_key(|record| (record.writer, record.destination, record.sequence_number));
+    wanted.sort_by_key(|record| (record.writer, record.destination, record.sequence_number));
+    assert_eq!(stalled, wanted, "{}: runs left over", path.display());
+    (records + stalled.len(), captures)
+}
+
+/// Fragments that follow each other, joined as the filter joins them: by stream, one CPU.
+#[derive(Default)]
+struct Runs(BTreeMap<([u32; 4], [u32; 4], u16), Record>);
+
+impl Runs {
+    fn give(&mut self, record: Record, joins: bool, out: &mut Vec<Record>) {
+        if record.kind != kind::DATA_FRAG {
+            return out.push(record);
+        }
+        let key = (record.writer, record.destination, record.destination_port);
+        if let Some(mut run) = self.0.remove(&key) {
+            if joins && run.extend(&record) {
+                if run.ends_sample() {
+                    out.push(run);
+                } else {
+                    self.0.insert(key, run);
+                }
+                return;
+            }
+            out.push(run);
+        }
+        if joins && record.fragment_start == 1 && !record.ends_sample() {
+            self.0.insert(key, record);
+        } else {
+            out.push(record);
+        }
+    }
 }
 
 #[test]
@@ -432,5 +470,34 @@ fn foreign_and_damaged_frames_are_never_kept() {
         !kernel
             .frame(&program_run::datagram(b"not RTPS at all, but long enough"))
             .kept
+    );
+}
+
+#[test]
+fn a_sample_in_many_datagrams_is_one_record_and_a_hole_ends_it() {
+    let writer = Guid::new(GuidPrefix(*b"\x01\x12manyframes"), EntityId([0, 0, 1, 3]));
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    let mut show = |fragments: &[u32]| -> Vec<(u32, u32)> {
+        let frames = fragments
+            .iter()
+            .map(|start| program_run::fragment(writer, 1, *start, 20));
+        let mut records: Vec<_> = frames
+            .flat_map(|frame| kernel.frame(&frame).records)
+            .collect();
+        records.extend(kernel.take_stalled());
+        records
+            .iter()
+            .map(|each| (each.fragment_start, each.fragments_in_submessage()))
+            .collect()
+    };
+    let all: Vec<_> = (1..=20).collect();
+    assert_eq!(show(&all), [(1, 20)]);
+    assert_eq!(show(&[1, 2, 3, 5, 6]), [(1, 3), (5, 1), (6, 1)]);
+    assert_eq!(show(&[7]), [(7, 1)], "a retransmission waits for nothing");
+    assert_eq!(
+        show(&[1, 2]),
+        [(1, 2)],
+        "what nobody continues is taken out"
     );
 }

@@ -123,6 +123,8 @@ pub const UNKNOWN_CAPACITY: u32 = 1_024;
 pub const FLOW_CAPACITY: u32 = 2_048;
 /// Interfaces of one network namespace.
 pub const INTERFACE_CAPACITY: u32 = 1_024;
+/// Runs of DATA_FRAGs that wait for the sample's next fragments.
+pub const RUN_CAPACITY: u32 = 512;
 /// Bytes captured of one unclassified writer before it is only metered: enough for the whole
 /// `ros_discovery_info` burst of a node that starts, a few datagrams of a point cloud.
 pub const UNKNOWN_CAPTURE_BYTES: u32 = 256 * 1024;

@@ -139,6 +139,52 @@ impl Record {
         self.fragments & 0xffff
     }
 
+    /// DATA_FRAG: whether it holds the sample's last fragment.
+    #[inline(always)]
+    #[must_use]
+    pub const fn ends_sample(&self) -> bool {
+        let size = self.fragment_size();
+        if size == 0 {
+            return true;
+        }
+        let end = self
+            .fragment_start
+            .wrapping_add(self.fragments_in_submessage());
+        // The last fragment begins within the sample, and its end reaches the sample's.
+        end as u64 > (self.sample_size as u64).div_ceil(size as u64)
+    }
+
+    /// Takes `next` into this DATA_FRAG when it goes on where this one ends: one record then speaks
+    /// for fragments of several datagrams, with the time of the last. `false` when it does not.
+    #[inline(always)]
+    pub fn extend(&mut self, next: &Self) -> bool {
+        const OF_THE_DATAGRAM: u16 = flag::FRAGMENTED | flag::STAMP;
+        let count = self.fragments_in_submessage();
+        let more = next.fragments_in_submessage();
+        let goes_on = self.sequence_number == next.sequence_number
+            && self.fragment_start.wrapping_add(count) == next.fragment_start
+            && self.fragment_size() == next.fragment_size()
+            && self.sample_size == next.sample_size
+            && self.reader[3] == next.reader[3]
+            && self.reader[2] == next.reader[2]
+            && self.reader[1] == next.reader[1]
+            && self.reader[0] == next.reader[0]
+            && self.status_info == next.status_info
+            && (self.flags ^ next.flags) & !OF_THE_DATAGRAM == 0
+            && count + more <= 0xffff;
+        if !goes_on {
+            return false;
+        }
+        self.time = next.time;
+        self.fragments = (count + more) << 16 | self.fragment_size();
+        self.payload_len = self.payload_len.wrapping_add(next.payload_len);
+        if self.source_timestamp == 0 {
+            // Cyclone DDS says INFO_TS with the first fragment only, others with each.
+            self.source_timestamp = next.source_timestamp;
+        }
+        true
+    }
+
     /// HEARTBEAT's lastSN, GAP's gapList base.
     #[must_use]
     pub const fn second_sequence_number(&self) -> u64 {
@@ -239,4 +285,79 @@ pub fn guid_from_words(words: [u32; 4]) -> Guid {
 #[must_use]
 pub fn entity_from_word(word: u32) -> EntityId {
     EntityId(word.to_ne_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fragments(start: u32, count: u32, time: u64) -> Record {
+        Record {
+            kind: kind::DATA_FRAG,
+            sequence_number: 7,
+            fragment_start: start,
+            fragments: count << 16 | 1344,
+            sample_size: 1344 * 10 + 1,
+            payload_len: count * 1344,
+            time,
+            ..Record::default()
+        }
+    }
+
+    #[test]
+    fn fragments_that_follow_each_other_become_one_record() {
+        let mut run = fragments(1, 5, 100);
+        assert!(!run.ends_sample());
+        assert!(run.extend(&fragments(6, 5, 200)));
+        assert!(!run.ends_sample());
+        assert!(run.extend(&fragments(11, 1, 300)));
+        assert!(run.ends_sample());
+        assert_eq!((run.fragment_start, run.fragments_in_submessage()), (1, 11));
+        assert_eq!((run.time, run.payload_len), (300, 11 * 1344));
+    }
+
+    #[test]
+    fn a_hole_a_repetition_another_sample_and_another_reader_do_not_follow() {
+        let run = fragments(1, 5, 100);
+        let strangers = [
+            fragments(7, 1, 1),
+            fragments(5, 5, 1),
+            Record {
+                sequence_number: 8,
+                ..fragments(6, 5, 1)
+            },
+            Record {
+                reader: [0, 0, 0, 1],
+                ..fragments(6, 5, 1)
+            },
+            Record {
+                sample_size: 9,
+                ..fragments(6, 5, 1)
+            },
+            Record {
+                flags: flag::OUTGOING,
+                ..fragments(6, 5, 1)
+            },
+            Record {
+                fragments: 0xffff << 16 | 1344,
+                ..fragments(6, 5, 1)
+            },
+        ];
+        for stranger in strangers {
+            let mut same = run;
+            assert!(!same.extend(&stranger), "{stranger:?}");
+            assert_eq!(same, run);
+        }
+    }
+
+    #[test]
+    fn a_sample_of_impossible_size_ends_at_once() {
+        assert!(
+            Record {
+                fragments: 1 << 16,
+                ..fragments(1, 1, 1)
+            }
+            .ends_sample()
+        );
+    }
 }

@@ -20,6 +20,9 @@ static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/fi
 #[repr(align(8))]
 struct Aligned<T: ?Sized>(T);
 
+/// The kernel filter's key of a run: writer, destination, port, interface, CPU.
+type RunKey = [u32; 11];
+
 /// Why the filter is not running.
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
@@ -73,6 +76,8 @@ pub struct Filter {
     participants: HashMap<MapData, [u32; 3], u64>,
     interfaces: HashMap<MapData, u32, u32>,
     budget: Array<MapData, i64>,
+    /// Values are [`Record`]s.
+    runs: HashMap<MapData, RunKey, [u64; 15]>,
     counters: PerCpuArray<MapData, u64>,
     records: RingBuf<MapData>,
 }
@@ -118,6 +123,7 @@ impl Filter {
             participants: take(&mut ebpf, "PARTICIPANTS")?,
             interfaces: take(&mut ebpf, "INTERFACES")?,
             budget,
+            runs: take(&mut ebpf, "RUNS")?,
             counters: take(&mut ebpf, "COUNTERS")?,
             records: take(&mut ebpf, "RECORDS")?,
         })
@@ -225,6 +231,25 @@ impl Filter {
                     .map_err(failed("COUNTERS", "read"))?;
                 Ok((counter, values.iter().sum()))
             })
+            .collect()
+    }
+
+    /// Takes out the runs of DATA_FRAGs that nobody has continued since `before`
+    /// (CLOCK_MONOTONIC nanoseconds): their samples lack fragments, or another CPU goes on.
+    pub fn stalled_runs(&mut self, before: u64) -> Vec<Record> {
+        let stalled: Vec<_> = self
+            .runs
+            .iter()
+            .filter_map(Result::ok)
+            .map(|(key, run)| (key, zerocopy::transmute!(run)))
+            .filter(|(_, run): &(RunKey, Record)| run.time <= before)
+            .collect();
+        // A fragment that comes between looking and removing is lost to the count; it would have
+        // had to pause for as long as it takes to stall, and then come within a microsecond.
+        stalled
+            .into_iter()
+            .filter(|(key, _)| self.runs.remove(key).is_ok())
+            .map(|(_, run)| run)
             .collect()
     }
 

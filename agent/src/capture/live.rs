@@ -26,16 +26,19 @@ use crate::model::observer::Observer;
 use crate::model::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 
 /// A frame waits this long for its block to fill.
-const RETIRE: Duration = Duration::from_millis(60);
+const RETIRE: Duration = Duration::from_millis(100);
 /// Records younger than this wait, so that frames captured before them are taken in first.
-const SETTLE_NANOSECONDS: u64 = 80_000_000;
+const SETTLE_NANOSECONDS: u64 = 120_000_000;
+/// Fragments of one sample follow each other within microseconds; after this they do not.
+const STALLED_NANOSECONDS: u64 = 60_000_000;
 /// What unclassified writers may cost each second, all together: a dozen nodes that start at once
 /// stay far below, a storm of forged ones stays bounded.
 const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 const UNKNOWN_RECORDS_PER_SECOND: u32 = 4096;
 const SECOND: u64 = 1_000_000_000;
-/// Blocks of a packet ring: enough for one to fill while others wait for us.
-const BLOCKS: usize = 8;
+/// The largest frame, a 64 KiB datagram on loopback, fits twice. A block changes hands when it is
+/// full or [`RETIRE`] old, so the number of blocks is also the time for which we may be held up.
+const BLOCK_BYTES: usize = 128 << 10;
 /// Records taken in at a time: several rings of the built-in size.
 const RECORDS_PER_ROUND: usize = 32_768;
 
@@ -128,7 +131,7 @@ impl LiveSource {
         }
         for tap in &mut self.taps {
             tap.follow_interfaces();
-            tap.take_records();
+            tap.take_records(clocks.monotonic.saturating_sub(STALLED_NANOSECONDS));
             tap.take_frames(&clocks, observer)?;
             tap.deliver(&clocks, SETTLE_NANOSECONDS, observer);
         }
@@ -140,7 +143,7 @@ impl LiveSource {
     pub fn drain(&mut self, observer: &mut Observer) {
         let clocks = Clocks::read();
         for tap in &mut self.taps {
-            tap.take_records();
+            tap.take_records(clocks.monotonic);
             tap.deliver(&clocks, 0, observer);
         }
     }
@@ -274,6 +277,8 @@ struct Tap {
     number: u32,
     path: Option<PathBuf>,
     ring: Ring,
+    /// Of the ring.
+    blocks: usize,
     filter: Filter,
     interfaces: Interfaces,
     selection: Selection,
@@ -305,10 +310,11 @@ impl Tap {
         for interface in interfaces.iter() {
             filter.accept_interface(interface.index, selection.accepts(&interface.name))?;
         }
+        let blocks = (settings.ring_bytes / BLOCK_BYTES).max(2);
         let ring = Ring::open(
             ring::Settings {
-                block_size: settings.ring_bytes / BLOCKS,
-                blocks: BLOCKS,
+                block_size: BLOCK_BYTES,
+                blocks,
                 retire: RETIRE,
             },
             Some(filter.program()),
@@ -317,6 +323,7 @@ impl Tap {
             number,
             path,
             ring,
+            blocks,
             filter,
             interfaces,
             selection,
@@ -359,11 +366,15 @@ impl Tap {
 
     /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
     /// A flood may fill it as fast as it is emptied: what is left is taken the next time.
-    fn take_records(&mut self) {
+    fn take_records(&mut self, stalled_before: u64) {
         for _ in 0..RECORDS_PER_ROUND {
             let Some(record) = self.filter.next_record() else {
-                return;
+                break;
             };
+            self.copied_bytes += size_of::<Record>() as u64;
+            self.order.kernel(record);
+        }
+        for record in self.filter.stalled_runs(stalled_before) {
             self.copied_bytes += size_of::<Record>() as u64;
             self.order.kernel(record);
         }
@@ -380,7 +391,7 @@ impl Tap {
         let (reassembly, ahead) = (&mut self.reassembly, &mut self.ahead);
         let order = &mut self.order;
         // No more than the ring holds: a flood must not keep us from everything else.
-        for _ in 0..BLOCKS {
+        for _ in 0..self.blocks {
             let Some(block) = self.ring.block() else {
                 break;
             };

@@ -39,6 +39,7 @@ pub struct Kernel {
 
 impl Kernel {
     pub fn load() -> Self {
+        stay_on_this_cpu();
         let settings = FilterSettings {
             record_ring_bytes: 1 << 20,
             ..FilterSettings::default()
@@ -73,6 +74,11 @@ impl Kernel {
     /// Records that user space read from what the filter handed over since the last call.
     pub fn take_rest(&mut self) -> Vec<Record> {
         std::mem::take(&mut self.rest)
+    }
+
+    /// Runs of fragments that nobody has continued.
+    pub fn take_stalled(&mut self) -> Vec<Record> {
+        self.filter.stalled_runs(u64::MAX)
     }
 
     /// One IP packet.
@@ -195,6 +201,24 @@ impl Kernel {
     }
 }
 
+/// The filter joins fragments by CPU, as packets arrive by CPU.
+fn stay_on_this_cpu() {
+    // SAFETY: no preconditions.
+    let cpu = usize::try_from(unsafe { libc::sched_getcpu() }).unwrap();
+    // SAFETY: a set of bits, for which all zero is valid.
+    let mut set: libc::cpu_set_t = unsafe { std::mem::zeroed() };
+    // SAFETY: `cpu` is a CPU of this machine, so it is within the set.
+    unsafe { libc::CPU_SET(cpu, &mut set) };
+    // SAFETY: 0 is this thread, and the set outlives the call.
+    let pinned = unsafe { libc::sched_setaffinity(0, size_of_val(&set), &raw const set) };
+    assert_eq!(
+        pinned,
+        0,
+        "sched_setaffinity: {}",
+        io::Error::last_os_error()
+    );
+}
+
 /// An RTPS message of one DATA per sequence number, each with `size` bytes of payload.
 pub fn message(writer: Guid, numbers: RangeInclusive<u32>, size: usize) -> Vec<u8> {
     let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
@@ -214,6 +238,23 @@ pub fn message(writer: Guid, numbers: RangeInclusive<u32>, size: usize) -> Vec<u
 /// One DATA as an IPv4 packet.
 pub fn data(writer: Guid, number: u32, size: usize) -> Vec<u8> {
     datagram(&message(writer, number..=number, size))
+}
+
+/// One DATA_FRAG with one fragment of 1000 bytes, as an IPv4 packet.
+pub fn fragment(writer: Guid, number: u32, start: u32, of: u32) -> Vec<u8> {
+    let mut bytes = b"RTPS\x02\x04\x01\x12".to_vec();
+    bytes.extend_from_slice(&writer.prefix.0);
+    bytes.extend_from_slice(&[0x16, 1]);
+    bytes.extend_from_slice(&u16::try_from(32 + 1000).unwrap().to_le_bytes());
+    bytes.extend_from_slice(&[0, 0, 28, 0, 0, 0, 0, 0]);
+    bytes.extend_from_slice(&writer.entity.0);
+    for word in [0, number, start] {
+        bytes.extend_from_slice(&word.to_le_bytes());
+    }
+    bytes.extend_from_slice(&[1, 0, 0xe8, 0x03]);
+    bytes.extend_from_slice(&(of * 1000).to_le_bytes());
+    bytes.extend(std::iter::repeat_n(0x33, 1000));
+    datagram(&bytes)
 }
 
 /// A UDP payload as an IPv4 packet.
