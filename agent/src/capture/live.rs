@@ -131,9 +131,13 @@ impl LiveSource {
         }
         for tap in &mut self.taps {
             tap.follow_interfaces();
-            tap.take_records(clocks.monotonic.saturating_sub(STALLED_NANOSECONDS));
             tap.take_frames(&clocks, observer)?;
-            tap.deliver(&clocks, SETTLE_NANOSECONDS, observer);
+            tap.intake.take_records(&mut tap.filter);
+            let stalled = clocks.monotonic.saturating_sub(STALLED_NANOSECONDS);
+            tap.intake.take_stalled(&mut tap.filter, stalled);
+            let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
+            tap.intake.deliver(&clocks, settled, observer);
+            tap.intake.advance(&clocks);
         }
         self.clock = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
         Ok(())
@@ -143,8 +147,9 @@ impl LiveSource {
     pub fn drain(&mut self, observer: &mut Observer) {
         let clocks = Clocks::read();
         for tap in &mut self.taps {
-            tap.take_records(clocks.monotonic);
-            tap.deliver(&clocks, 0, observer);
+            tap.intake.take_records(&mut tap.filter);
+            tap.intake.take_stalled(&mut tap.filter, clocks.monotonic);
+            tap.intake.deliver(&clocks, u64::MAX, observer);
         }
     }
 
@@ -240,7 +245,7 @@ impl LiveSource {
     /// Bytes that came from the kernel: frames and records.
     #[must_use]
     pub fn copied_bytes(&self) -> u64 {
-        self.taps.iter().map(|tap| tap.copied_bytes).sum()
+        self.taps.iter().map(|tap| tap.intake.copied_bytes).sum()
     }
 
     /// Fragmented datagrams that were begun and never became complete: the kernel filter's and
@@ -250,8 +255,8 @@ impl LiveSource {
         self.taps
             .iter()
             .map(|tap| {
-                let reassembly = tap.reassembly.counters();
-                tap.ahead.given_up() + reassembly.evicted + reassembly.timed_out
+                let reassembly = tap.intake.reassembly.counters();
+                tap.intake.ahead.given_up() + reassembly.evicted + reassembly.timed_out
             })
             .sum()
     }
@@ -259,7 +264,10 @@ impl LiveSource {
     /// Bytes held for reassembly.
     #[must_use]
     pub fn reassembly_bytes(&self) -> usize {
-        self.taps.iter().map(|tap| tap.reassembly.bytes()).sum()
+        self.taps
+            .iter()
+            .map(|tap| tap.intake.reassembly.bytes())
+            .sum()
     }
 
     fn refill(&mut self, monotonic: u64) {
@@ -274,7 +282,6 @@ impl LiveSource {
 
 /// One network namespace.
 struct Tap {
-    number: u32,
     path: Option<PathBuf>,
     ring: Ring,
     /// Of the ring.
@@ -284,11 +291,7 @@ struct Tap {
     selection: Selection,
     /// Frames captured by interface index.
     packets: BTreeMap<u32, u64>,
-    reassembly: Reassembly,
-    ahead: Ahead,
-    /// What is to be counted, waiting for its turn.
-    order: Order,
-    copied_bytes: u64,
+    intake: Intake,
     refused_interfaces: u64,
 }
 
@@ -320,7 +323,6 @@ impl Tap {
             Some(filter.program()),
         )?;
         Ok(Self {
-            number,
             path,
             ring,
             blocks,
@@ -328,10 +330,13 @@ impl Tap {
             interfaces,
             selection,
             packets: BTreeMap::new(),
-            reassembly: Reassembly::new(limits),
-            ahead: Ahead::default(),
-            order: Order::default(),
-            copied_bytes: 0,
+            intake: Intake {
+                number,
+                reassembly: Reassembly::new(limits),
+                ahead: Ahead::default(),
+                order: Order::default(),
+                copied_bytes: 0,
+            },
             refused_interfaces: 0,
         })
     }
@@ -364,23 +369,8 @@ impl Tap {
         }
     }
 
-    /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
-    /// A flood may fill it as fast as it is emptied: what is left is taken the next time.
-    fn take_records(&mut self, stalled_before: u64) {
-        for _ in 0..RECORDS_PER_ROUND {
-            let Some(record) = self.filter.next_record() else {
-                break;
-            };
-            self.copied_bytes += size_of::<Record>() as u64;
-            self.order.kernel(record);
-        }
-        for record in self.filter.stalled_runs(stalled_before) {
-            self.copied_bytes += size_of::<Record>() as u64;
-            self.order.kernel(record);
-        }
-    }
-
-    /// What frames announce the model gets at once, what they count for in its turn.
+    /// What frames announce the model gets at once, what they count for in its turn. Before each
+    /// frame it gets what is older: a writer's last samples count before its farewell is read.
     fn take_frames(
         &mut self,
         clocks: &Clocks,
@@ -388,25 +378,16 @@ impl Tap {
     ) -> Result<(), CaptureError> {
         // Clears what the socket reports when a link goes down; without, waiting would never wait.
         self.ring.wait(Duration::ZERO)?;
-        let (reassembly, ahead) = (&mut self.reassembly, &mut self.ahead);
-        let order = &mut self.order;
         // No more than the ring holds: a flood must not keep us from everything else.
         for _ in 0..self.blocks {
             let Some(block) = self.ring.block() else {
                 break;
             };
+            self.intake.take_records(&mut self.filter);
             let mut frames = block.frames();
             for captured in frames.by_ref() {
-                self.copied_bytes += captured.bytes.len() as u64;
                 *self.packets.entry(captured.interface).or_default() += 1;
-                let datagram = Assembly {
-                    number: self.number,
-                    clocks,
-                    reassembly: &mut *reassembly,
-                    ahead: &mut *ahead,
-                    order: &mut *order,
-                };
-                if let Err(error) = datagram.frame(&captured, observer) {
+                if let Err(error) = self.intake.frame(clocks, &captured, observer) {
                     observer.decode_error("frame", error.reason);
                 }
             }
@@ -416,10 +397,42 @@ impl Tap {
         }
         Ok(())
     }
+}
 
-    /// Gives the model the records that are older than `settle` nanoseconds.
-    fn deliver(&mut self, clocks: &Clocks, settle: u64, observer: &mut Observer) {
-        while let Some(next) = self.order.next(clocks, settle) {
+/// One tap's frames and records on their way to the model.
+struct Intake {
+    number: u32,
+    reassembly: Reassembly,
+    ahead: Ahead,
+    /// What is to be counted, waiting for its turn.
+    order: Order,
+    copied_bytes: u64,
+}
+
+impl Intake {
+    /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
+    /// A flood may fill it as fast as it is emptied: what is left is taken the next time.
+    fn take_records(&mut self, filter: &mut Filter) {
+        for _ in 0..RECORDS_PER_ROUND {
+            let Some(record) = filter.next_record() else {
+                return;
+            };
+            self.copied_bytes += size_of::<Record>() as u64;
+            self.order.kernel(record);
+        }
+    }
+
+    /// Takes runs of fragments that nobody has continued since `before` in the filter's clock.
+    fn take_stalled(&mut self, filter: &mut Filter, before: u64) {
+        for record in filter.stalled_runs(before) {
+            self.copied_bytes += size_of::<Record>() as u64;
+            self.order.kernel(record);
+        }
+    }
+
+    /// Gives the model the records up to a time of the filter's clock.
+    fn deliver(&mut self, clocks: &Clocks, until: u64, observer: &mut Observer) {
+        while let Some(next) = self.order.next(clocks, until) {
             let record = match next {
                 Next::Kernel(record) => record,
                 Next::Walked(record) => {
@@ -440,22 +453,24 @@ impl Tap {
             let ready = |each| take_in(each, observer);
             self.ahead.record(self.number, record, ready);
         }
+    }
+
+    /// Gives up what has waited too long for its rest.
+    fn advance(&mut self, clocks: &Clocks) {
         self.ahead.advance(clocks.now);
         self.reassembly.advance(clocks.now);
     }
-}
 
-/// What turns one tap's frames into datagrams.
-struct Assembly<'a> {
-    number: u32,
-    clocks: &'a Clocks,
-    reassembly: &'a mut Reassembly,
-    ahead: &'a mut Ahead,
-    order: &'a mut Order,
-}
-
-impl Assembly<'_> {
-    fn frame(self, captured: &RingFrame<'_>, observer: &mut Observer) -> Result<(), WireError> {
+    fn frame(
+        &mut self,
+        clocks: &Clocks,
+        captured: &RingFrame<'_>,
+        observer: &mut Observer,
+    ) -> Result<(), WireError> {
+        self.copied_bytes += captured.bytes.len() as u64;
+        let since = captured.time.nanoseconds_since(clocks.now);
+        let until = clocks.monotonic.saturating_add_signed(since);
+        self.deliver(clocks, until, observer);
         let packet = frame::parse_cooked(
             captured.protocol,
             captured.packet_type,
@@ -474,7 +489,7 @@ impl Assembly<'_> {
         match &packet.payload {
             Payload::Datagram(udp) => {
                 envelope.destination_port = udp.destination_port;
-                take_in_frame(&envelope, udp.payload, self.clocks, self.order, observer);
+                take_in_frame(&envelope, udp.payload, clocks, &mut self.order, observer);
             }
             Payload::Fragment(fragment) => {
                 let key =
@@ -489,7 +504,7 @@ impl Assembly<'_> {
                     envelope.destination_port = whole.destination_port;
                     envelope.fragmented = true;
                     let payload = whole.payload();
-                    take_in_frame(&envelope, payload, self.clocks, self.order, observer);
+                    take_in_frame(&envelope, payload, clocks, &mut self.order, observer);
                 }
             }
             _ => {}

@@ -49,17 +49,16 @@ impl Order {
         None
     }
 
-    /// The oldest record, if it is older than `settle` nanoseconds.
-    pub fn next(&mut self, clocks: &Clocks, settle: u64) -> Option<Next> {
-        let horizon = clocks.monotonic.saturating_sub(settle);
+    /// The oldest record, if it is not younger than `until` in the filter's clock.
+    pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
         let kernel = self.kernel.front().map(|record| record.time);
         let walked = self.walked.front().map(|(at, _)| *at);
         if walked.is_some_and(|walked| kernel.is_none_or(|kernel| walked < kernel)) {
-            walked.filter(|at| *at <= horizon)?;
+            walked.filter(|at| *at <= until)?;
             let (_, record) = self.walked.pop_front()?;
             return Some(Next::Walked(record));
         }
-        kernel.filter(|at| *at <= horizon)?;
+        kernel.filter(|at| *at <= until)?;
         let mut record = self.kernel.pop_front()?;
         record.time = clocks.calendar(record.time).0;
         Some(Next::Kernel(record))
@@ -97,7 +96,7 @@ mod tests {
     }
 
     fn numbers(order: &mut Order, clocks: &Clocks) -> Vec<u64> {
-        std::iter::from_fn(|| order.next(clocks, SETTLE))
+        std::iter::from_fn(|| order.next(clocks, clocks.monotonic.saturating_sub(SETTLE)))
             .map(|next| {
                 let (Next::Kernel(record) | Next::Walked(record)) = next;
                 let age = clocks.now.nanoseconds_since(Timestamp(record.time));
@@ -125,7 +124,7 @@ mod tests {
         let mut order = Order::default();
         let back = of_a_frame(1, 3_600_000);
         assert!(order.walked(&clocks(10), back).is_none());
-        let next = order.next(&clocks(90), SETTLE);
+        let next = order.next(&clocks(90), 10 * MILLISECOND);
         assert!(matches!(next, Some(Next::Walked(_))), "{next:?}");
     }
 
