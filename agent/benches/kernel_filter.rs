@@ -36,26 +36,26 @@ const WRITER: Guid = Guid::new(
 fn datagrams() -> [(&'static str, Vec<u8>); 3] {
     [
         ("320 B DATA", program_run::message(WRITER, 1..=1, 320)),
-        ("14.7 KB, 10 DATA_FRAG, as Cyclone DDS", fragments(10, 1344)),
-        ("65 KB, 1 DATA_FRAG, as Fast DDS", fragments(1, 65_000)),
+        ("13.4 KB, 10 fragments, as Cyclone DDS", fragments(10, 1344)),
+        ("65 KB, 1 fragment, as Fast DDS", fragments(1, 65_000)),
     ]
 }
 
 /// An RTPS message of INFO_TS and the first fragments, each of `size` bytes, of a large sample.
-fn fragments(count: u8, size: u16) -> Vec<u8> {
+fn fragments(count: u16, size: u16) -> Vec<u8> {
     let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
     bytes.extend_from_slice(&WRITER.prefix.0);
     bytes.extend_from_slice(&[0x09, 1, 8, 0, 1, 0, 0, 0, 0, 0, 0, 0]);
-    for number in 1..=count {
-        bytes.extend_from_slice(&[0x16, 1]);
-        bytes.extend_from_slice(&(32 + size).to_le_bytes());
-        bytes.extend_from_slice(&[0, 0, 28, 0, 0, 0, 0, 0]);
-        bytes.extend_from_slice(&WRITER.entity.0);
-        bytes.extend_from_slice(&[0, 0, 0, 0, 1, 0, 0, 0, number, 0, 0, 0, 1, 0]);
-        bytes.extend_from_slice(&size.to_le_bytes());
-        bytes.extend_from_slice(&2_720_000_u32.to_le_bytes());
-        bytes.extend([0, 1, 0, 0].into_iter().cycle().take(size.into()));
-    }
+    bytes.extend_from_slice(&[0x16, 1]);
+    bytes.extend_from_slice(&(32 + count * size).to_le_bytes());
+    bytes.extend_from_slice(&[0, 0, 28, 0, 0, 0, 0, 0]);
+    bytes.extend_from_slice(&WRITER.entity.0);
+    bytes.extend_from_slice(&[0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]);
+    bytes.extend_from_slice(&count.to_le_bytes());
+    bytes.extend_from_slice(&size.to_le_bytes());
+    bytes.extend_from_slice(&2_720_000_u32.to_le_bytes());
+    let payload = [0, 1, 0, 0].into_iter().cycle();
+    bytes.extend(payload.take((count * size).into()));
     bytes
 }
 
