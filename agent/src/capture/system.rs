@@ -7,6 +7,11 @@ use std::time::Duration;
 use libc::c_int;
 use ros2probe_wire::Timestamp;
 
+/// Clock readings that are tried.
+const READINGS: usize = 8;
+/// Nanoseconds between two clocks that are read at one moment.
+const CLOSE: u64 = 5_000;
+
 /// Waits until one of `descriptors` is readable or in error, a signal comes, or the time is over.
 ///
 /// # Errors
@@ -43,13 +48,31 @@ pub struct Clocks {
 }
 
 impl Clocks {
-    /// Both clocks now.
+    /// Both clocks now. A thread that loses its CPU between the two would set all captured times
+    /// off by as long, so the closest of a few readings counts.
     #[must_use]
     pub fn read() -> Self {
-        Self {
-            now: Timestamp(nanoseconds(libc::CLOCK_REALTIME)),
-            monotonic: nanoseconds(libc::CLOCK_MONOTONIC),
+        let mut best = Self::read_once();
+        for _ in 1..READINGS {
+            if best.1 <= CLOSE {
+                break;
+            }
+            let again = Self::read_once();
+            if again.1 < best.1 {
+                best = again;
+            }
         }
+        best.0
+    }
+
+    /// One reading, and within how many nanoseconds it was taken.
+    fn read_once() -> (Self, u64) {
+        let before = nanoseconds(libc::CLOCK_MONOTONIC);
+        let now = Timestamp(nanoseconds(libc::CLOCK_REALTIME));
+        let after = nanoseconds(libc::CLOCK_MONOTONIC);
+        let within = after.saturating_sub(before);
+        let monotonic = before + within / 2;
+        (Self { now, monotonic }, within)
     }
 
     /// A monotonic time as a calendar time. Wrong by the step if the calendar clock was set between.
