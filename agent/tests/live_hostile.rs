@@ -79,6 +79,15 @@ fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_the_page_whole_and_a_real_
 }
 
 #[test]
+fn a_flood_of_samples_of_a_watched_topic_takes_nothing_from_the_others() -> Result<()> {
+    let link = Link::new()?;
+    let target = format!("{}:{NOBODY}", link.robot.address());
+    let source = format!("{}:0", link.monitor.address());
+    let sender = Sender::new(&link.monitor, &source, &target)?;
+    weather(&link, || Storm::of_samples(sender, "/flood"))
+}
+
+#[test]
 fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;

@@ -110,6 +110,7 @@ fn a_sample_that_passes_two_interfaces_of_one_host_counts_once() -> Result<()> {
         )?;
         ip(host, &format!("addr add {address}/24 dev macvlan0"))?;
         ip(host, "link set macvlan0 up")?;
+        wait_carrying_at(host, "macvlan0")?;
     }
     for host in [&link.monitor, &link.robot] {
         let observed = Observed::start(host, WATCH_ALL)?;
@@ -162,7 +163,7 @@ fn an_interface_that_appears_later_is_seen_and_one_that_goes_down_does_not_make_
     );
 
     ip(&link.monitor, "link set eth1 up")?;
-    std::thread::sleep(Duration::from_millis(200));
+    wait_carrying(&link, "eth1")?;
     observed.counts_each_sample_once("/up_again", &mut sender)?;
     ip(&link.monitor, "link del eth1")?;
     add_cable(&link, "eth2", "10.103.0")?;
@@ -206,6 +207,35 @@ fn nothing_of_an_excluded_interface_is_seen_also_when_it_appears_later() -> Resu
             "{interfaces:?}"
         );
     }
+    Ok(())
+}
+
+#[test]
+fn an_interface_is_judged_by_its_new_name_after_it_was_renamed() -> Result<()> {
+    let link = Link::new()?;
+    let observed = Observed::start(
+        &link.monitor,
+        "watch: [/**]\ncapture:\n  interfaces:\n    include: [eth*]\n",
+    )?;
+    // As udev does with what it finds.
+    add_cable(&link, "wlan0", "10.106.0")?;
+    let rename = |from: &str, to: &str| -> Result<()> {
+        ip(&link.monitor, &format!("link set {from} down"))?;
+        ip(&link.monitor, &format!("link set {from} name {to}"))?;
+        ip(&link.monitor, &format!("link set {to} up"))?;
+        wait_carrying_at(&link.monitor, to)?;
+        wait_carrying_at(&link.robot, "wlan0")
+    };
+    let mut sender = Sender::new(&link.robot, "10.106.0.1:0", "10.106.0.2:7400")?;
+    rename("wlan0", "eth7")?;
+    observed.counts_each_sample_once("/wanted", &mut sender)?;
+    rename("eth7", "wlan7")?;
+    let mut talker = Talker::new(1, "/unwanted");
+    introduce(&talker, &mut sender)?;
+    talk(&mut talker, &mut sender, [320; 20])?;
+    let scrape = observed.agent.settled_scrape()?;
+    assert!(!scrape.0.contains("/unwanted"), "{}", scrape.0);
+    assert_eq!(scrape.sum("ros2_unknown_writers", &[]), 0.0);
     Ok(())
 }
 
@@ -311,6 +341,7 @@ fn a_bridge_and_its_port_show_a_sample_once() -> Result<()> {
     ip(&link.monitor, "link set eth0 master br0")?;
     ip(&link.monitor, &format!("addr add {address}/24 dev br0"))?;
     ip(&link.monitor, "link set br0 up")?;
+    wait_carrying_at(&link.monitor, "br0")?;
     let observed = Observed::start(&link.monitor, WATCH_ALL)?;
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     observed.counts_each_sample_once("/bridged", &mut sender)?;
@@ -413,6 +444,21 @@ fn add_cable(link: &Link, name: &str, network: &str) -> Result<()> {
     for (host, number) in [(&link.robot, 1), (&link.monitor, 2)] {
         ip(host, &format!("addr add {network}.{number}/24 dev {name}"))?;
         ip(host, &format!("link set {name} up"))?;
+    }
+    wait_carrying(link, name)
+}
+
+/// Waits until both ends of a cable carry frames: the kernel drops them silently for up to a second.
+fn wait_carrying(link: &Link, name: &str) -> Result<()> {
+    wait_carrying_at(&link.robot, name)?;
+    wait_carrying_at(&link.monitor, name)
+}
+
+fn wait_carrying_at(host: &Namespace, name: &str) -> Result<()> {
+    let deadline = Instant::now() + Duration::from_secs(5);
+    while !ip(host, &format!("-o link show dev {name}"))?.contains(" state UP ") {
+        anyhow::ensure!(Instant::now() < deadline, "{name} does not come up");
+        std::thread::sleep(Duration::from_millis(20));
     }
     Ok(())
 }

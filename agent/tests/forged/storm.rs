@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 
 use anyhow::{Result, anyhow};
 
-use super::{Carrier, Talker, data};
+use super::{Carrier, Talker, data, introduce};
 
 /// Different datagrams of a storm; their GUIDs do not repeat.
 const MOULDS: usize = 3000;
@@ -36,6 +36,27 @@ impl Storm {
                 }
                 // A full queue on the way is no reason to stop.
                 let _ = carrier.carry(moulds[mould].cast(&mut dice));
+                counter.fetch_add(1, Ordering::Relaxed);
+            }
+        });
+        Storm { stop, sent, thread }
+    }
+
+    /// Sends the samples of one announced writer as fast as it can.
+    pub(crate) fn of_samples(mut carrier: impl Carrier + Send + 'static, topic: &str) -> Storm {
+        const NUMBER: std::ops::Range<usize> = 40..44;
+        let (stop, sent) = (Arc::<AtomicBool>::default(), Arc::<AtomicU64>::default());
+        let (stopped, counter) = (stop.clone(), sent.clone());
+        let mut talker = Talker::new(1, topic);
+        let thread = std::thread::spawn(move || {
+            let _ = introduce(&talker, &mut carrier);
+            let mut bytes = talker.sample(320);
+            for number in 1_u32.. {
+                if stopped.load(Ordering::Relaxed) {
+                    break;
+                }
+                bytes[NUMBER].copy_from_slice(&number.to_le_bytes());
+                let _ = carrier.carry(&bytes);
                 counter.fetch_add(1, Ordering::Relaxed);
             }
         });
