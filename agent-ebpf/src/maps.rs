@@ -62,12 +62,18 @@ pub static NEW_FLOW: PerCpuArray<Flow> = PerCpuArray::with_max_entries(1, 0);
 /// DATA_FRAGs of samples that are not complete yet, one after the other so far.
 #[map]
 pub static RUNS: HashMap<RunKey, Record> = HashMap::with_max_entries(RUN_CAPACITY, 0);
+/// The CPU that last added to a run of a stream: a sender that moves on leaves its run behind.
+#[map]
+pub static RUN_CPUS: LruHashMap<Stream, u32> = LruHashMap::with_max_entries(RUN_CAPACITY, 0);
 /// What user space polls about every 100 ms.
 #[map]
 pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
 /// By `filter::Counter`.
 #[map]
 pub static COUNTERS: PerCpuArray<u64> = PerCpuArray::with_max_entries(Counter::ALL.len() as u32, 0);
+/// Keys that are too large for the stack.
+#[map]
+static RUN_KEYS: PerCpuArray<RunKeys> = PerCpuArray::with_max_entries(1, 0);
 /// The frame at hand.
 #[map]
 static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(1, 0);
@@ -83,17 +89,30 @@ pub struct FlowKey {
     pub interface: u32,
 }
 
-/// One stream of fragments: a writer's to one destination, as one CPU sees it. So no two CPUs ever
-/// change the same run.
+/// A writer's fragments to one destination.
 #[repr(C)]
 #[derive(Clone, Copy)]
-pub struct RunKey {
+pub struct Stream {
     pub writer: [u32; 4],
     pub destination: [u32; 4],
     pub destination_port: u32,
     /// Interface index, and the highest bit for frames on their way out.
     pub interface: u32,
+}
+
+/// A stream as one CPU sees it, so that no two CPUs ever add to the same run.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct RunKey {
+    pub stream: Stream,
     pub cpu: u32,
+}
+
+/// Where [`RunKey`]s are put together.
+#[repr(C)]
+pub struct RunKeys {
+    pub here: RunKey,
+    pub elsewhere: RunKey,
 }
 
 /// What is known of a fragmented datagram so far.
@@ -160,6 +179,13 @@ pub fn scratch() -> Option<&'static mut Scratch> {
     SCRATCH
         .get_ptr_mut(0)
         .map(|scratch| unsafe { &mut *scratch })
+}
+
+/// This CPU's keys.
+#[inline(always)]
+pub fn run_keys() -> Option<&'static mut RunKeys> {
+    // SAFETY: as for `scratch`.
+    RUN_KEYS.get_ptr_mut(0).map(|keys| unsafe { &mut *keys })
 }
 
 /// Adds to a counter of this CPU.

@@ -1,14 +1,15 @@
 //! Joins the DATA_FRAGs of one sample: a point cloud in two thousand fragments is one record.
 //!
 //! A run begins with a sample's first fragment and ends with its last, or where the next fragment is
-//! missing. Everything else (a retransmission, the rest behind a gap) is written as it comes. A run
-//! that nobody continues is taken out by user space, which looks about ten times a second.
+//! missing. Everything else (a retransmission, the rest behind a gap) is written as it comes. When
+//! the sender moves to another CPU in the middle, the run is written and a new one goes on there. A
+//! run that nobody continues is taken out by user space, which looks about ten times a second.
 
 use aya_ebpf::helpers::bpf_get_smp_processor_id;
 use ros2probe_wire::record::{Record, flag, kind};
 
 use crate::{
-    maps::{RUNS, RunKey, copy},
+    maps::{RUN_CPUS, RUNS, RunKeys, copy, run_keys},
     verdict::write,
 };
 
@@ -20,22 +21,24 @@ pub fn give(record: &Record, joins: bool) {
         write(record);
         return;
     }
-    let key = RunKey {
-        writer: record.writer,
-        destination: record.destination,
-        destination_port: u32::from(record.destination_port),
-        interface: record.interface | u32::from(record.flags & flag::OUTGOING) << 29,
-        // SAFETY: no preconditions.
-        cpu: unsafe { bpf_get_smp_processor_id() } as u32,
+    let Some(keys) = run_keys() else {
+        return;
     };
-    if let Some(run) = RUNS.get_ptr_mut(key) {
+    copy(&record.writer, &mut keys.here.stream.writer);
+    copy(&record.destination, &mut keys.here.stream.destination);
+    keys.here.stream.destination_port = u32::from(record.destination_port);
+    keys.here.stream.interface = record.interface | u32::from(record.flags & flag::OUTGOING) << 29;
+    // SAFETY: no preconditions.
+    keys.here.cpu = unsafe { bpf_get_smp_processor_id() } as u32;
+    let mut goes_on = false;
+    if let Some(run) = RUNS.get_ptr_mut(&keys.here) {
         // SAFETY: a map value pointer checked against null; the key names this CPU, and packet taps
-        // run with bottom halves disabled, so nobody else is in here.
+        // run with bottom halves disabled, so nobody else adds to it.
         let run = unsafe { &mut *run };
         if joins && run.extend(record) {
             if run.ends_sample() {
                 write(run);
-                let _ = RUNS.remove(key);
+                let _ = RUNS.remove(&keys.here);
             }
             return;
         }
@@ -44,9 +47,14 @@ pub fn give(record: &Record, joins: bool) {
             copy(record, run);
             return;
         }
-        let _ = RUNS.remove(key);
-    } else if joins && begins(record) && RUNS.insert(key, record, 0).is_ok() {
-        return;
+        let _ = RUNS.remove(&keys.here);
+    } else if joins {
+        goes_on = take_over(keys, record);
+    }
+    if joins && (goes_on || begins(record)) && !record.ends_sample() {
+        if RUNS.insert(&keys.here, record, 0).is_ok() {
+            return;
+        }
     }
     write(record);
 }
@@ -55,4 +63,34 @@ pub fn give(record: &Record, joins: bool) {
 #[inline(always)]
 fn begins(record: &Record) -> bool {
     record.fragment_start == 1 && !record.ends_sample()
+}
+
+/// Writes the run that the stream has left behind on another CPU; whether `record` goes on where it
+/// ends.
+#[inline(always)]
+fn take_over(keys: &mut RunKeys, record: &Record) -> bool {
+    let Some(last) = RUN_CPUS.get_ptr_mut(&keys.here.stream) else {
+        let _ = RUN_CPUS.insert(&keys.here.stream, &keys.here.cpu, 0);
+        return false;
+    };
+    // SAFETY: a map value pointer checked against null.
+    let before = unsafe { *last };
+    if before == keys.here.cpu {
+        return false;
+    }
+    // SAFETY: as above.
+    unsafe { *last = keys.here.cpu };
+    copy(&keys.here.stream, &mut keys.elsewhere.stream);
+    keys.elsewhere.cpu = before;
+    let Some(run) = RUNS.get_ptr_mut(&keys.elsewhere) else {
+        return false;
+    };
+    // SAFETY: a map value pointer checked against null. The other CPU has nothing to add to this
+    // run, whose next fragment is here; should it write the run at this very moment too, fragments
+    // are seen twice, which counts nothing.
+    let run = unsafe { &mut *run };
+    let goes_on = run.is_followed_by(record);
+    write(run);
+    let _ = RUNS.remove(&keys.elsewhere);
+    goes_on
 }

@@ -136,5 +136,5 @@ fn limits_are_generous_for_a_robot_and_small_for_a_storm() {
         topics,
         ..
     } = Config::default().limits;
-    assert!(participants >= 200 && endpoints >= 10_000 && topics >= 1_000);
+    assert!(participants >= 200 && endpoints >= 8_000 && topics >= 1_000);
 }

@@ -501,3 +501,28 @@ fn a_sample_in_many_datagrams_is_one_record_and_a_hole_ends_it() {
         "what nobody continues is taken out"
     );
 }
+
+#[test]
+fn a_sender_that_moves_to_another_cpu_leaves_no_fragments_behind() {
+    if std::thread::available_parallelism().unwrap().get() < 2 {
+        return; // nowhere to move to
+    }
+    let writer = Guid::new(GuidPrefix(*b"\x01\x12wanderers!"), EntityId([0, 0, 1, 3]));
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    let mut records = Vec::new();
+    for start in 1..=20 {
+        program_run::go_to_cpu(usize::from((8..15).contains(&start)));
+        records.extend(
+            kernel
+                .frame(&program_run::fragment(writer, 1, start, 20))
+                .records,
+        );
+    }
+    let runs: Vec<_> = records
+        .iter()
+        .map(|record| (record.fragment_start, record.fragments_in_submessage()))
+        .collect();
+    assert_eq!(runs, [(1, 7), (8, 7), (15, 6)]);
+    assert!(kernel.take_stalled().is_empty());
+}

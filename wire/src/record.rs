@@ -154,14 +154,13 @@ impl Record {
         end as u64 > (self.sample_size as u64).div_ceil(size as u64)
     }
 
-    /// Takes `next` into this DATA_FRAG when it goes on where this one ends: one record then speaks
-    /// for fragments of several datagrams, with the time of the last. `false` when it does not.
+    /// DATA_FRAG: whether `next` goes on where this one ends, for the same sample and reader.
     #[inline(always)]
-    pub fn extend(&mut self, next: &Self) -> bool {
+    #[must_use]
+    pub const fn is_followed_by(&self, next: &Self) -> bool {
         const OF_THE_DATAGRAM: u16 = flag::FRAGMENTED | flag::STAMP;
         let count = self.fragments_in_submessage();
-        let more = next.fragments_in_submessage();
-        let goes_on = self.sequence_number == next.sequence_number
+        self.sequence_number == next.sequence_number
             && self.fragment_start.wrapping_add(count) == next.fragment_start
             && self.fragment_size() == next.fragment_size()
             && self.sample_size == next.sample_size
@@ -171,12 +170,18 @@ impl Record {
             && self.reader[0] == next.reader[0]
             && self.status_info == next.status_info
             && (self.flags ^ next.flags) & !OF_THE_DATAGRAM == 0
-            && count + more <= 0xffff;
-        if !goes_on {
+    }
+
+    /// Takes `next` into this DATA_FRAG when it follows: one record then speaks for fragments of
+    /// several datagrams, with the time of the last. `false` when it does not.
+    #[inline(always)]
+    pub const fn extend(&mut self, next: &Self) -> bool {
+        let count = self.fragments_in_submessage() + next.fragments_in_submessage();
+        if !self.is_followed_by(next) || count > 0xffff {
             return false;
         }
         self.time = next.time;
-        self.fragments = (count + more) << 16 | self.fragment_size();
+        self.fragments = count << 16 | self.fragment_size();
         self.payload_len = self.payload_len.wrapping_add(next.payload_len);
         if self.source_timestamp == 0 {
             // Cyclone DDS says INFO_TS with the first fragment only, others with each.

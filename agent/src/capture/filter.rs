@@ -277,17 +277,15 @@ impl FilterError {
     }
 }
 
-/// The permission error at the end of an error's chain of causes.
+/// The EPERM at the end of an error's chain of causes. EACCES is not it: that is the verifier's no.
 fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error> {
     let mut cause = Some(error);
     while let Some(error) = cause {
-        if let Some(io) = error.downcast_ref::<io::Error>()
-            && io.kind() == io::ErrorKind::PermissionDenied
-        {
-            return Some(io.raw_os_error().map_or_else(
-                || io::ErrorKind::PermissionDenied.into(),
-                io::Error::from_raw_os_error,
-            ));
+        let code = error
+            .downcast_ref::<io::Error>()
+            .and_then(io::Error::raw_os_error);
+        if code == Some(libc::EPERM) {
+            return Some(io::Error::from_raw_os_error(libc::EPERM));
         }
         cause = error.source();
     }

@@ -39,7 +39,7 @@ pub struct Kernel {
 
 impl Kernel {
     pub fn load() -> Self {
-        stay_on_this_cpu();
+        go_to_cpu(0);
         let settings = FilterSettings {
             record_ring_bytes: 1 << 20,
             ..FilterSettings::default()
@@ -201,13 +201,11 @@ impl Kernel {
     }
 }
 
-/// The filter joins fragments by CPU, as packets arrive by CPU.
-fn stay_on_this_cpu() {
-    // SAFETY: no preconditions.
-    let cpu = usize::try_from(unsafe { libc::sched_getcpu() }).unwrap();
+/// Moves this thread to a CPU: the filter joins fragments by CPU, as packets arrive by CPU.
+pub fn go_to_cpu(cpu: usize) {
     // SAFETY: a set of bits, for which all zero is valid.
     let mut set: libc::cpu_set_t = unsafe { std::mem::zeroed() };
-    // SAFETY: `cpu` is a CPU of this machine, so it is within the set.
+    // SAFETY: `cpu` is far below the 1024 bits of the set.
     unsafe { libc::CPU_SET(cpu, &mut set) };
     // SAFETY: 0 is this thread, and the set outlives the call.
     let pinned = unsafe { libc::sched_setaffinity(0, size_of_val(&set), &raw const set) };
