@@ -409,8 +409,9 @@ impl End {
                 messages,
                 "{name} {latency}"
             );
+            // One clock: anything beyond a busy machine's delays is a wrong epoch or unit.
             let median = self.median(latency)?;
-            assert!(median <= 0.05, "{name}: {latency} {median} s");
+            assert!(median <= 1.0, "{name}: {latency} {median} s");
         }
         let latency = self.sum("ros2_topic_latency_seconds_sum");
         let header_latency = self.sum("ros2_topic_header_latency_seconds_sum");
