@@ -106,6 +106,7 @@ impl World {
     fn measurement(&self, name: &str) -> Measurement {
         self.topic(0, name)
             .and_then(|topic| topic.measurement)
+            .map(|measurement| *measurement)
             .unwrap_or_default()
     }
 
@@ -820,6 +821,27 @@ fn a_storm_of_endpoints_of_one_participant_leaves_room_for_others() {
         .into_iter()
         .find(|table| table.table == "endpoints");
     assert!(endpoints.is_some_and(|table| table.size <= 4097 && table.evictions >= 15_000));
+}
+
+#[test]
+fn a_topic_kept_out_by_a_crowd_is_measured_once_the_crowd_has_gone() {
+    let settings = Settings {
+        topics: 4,
+        ..Settings::default()
+    };
+    let mut world = World::with(&["/**"], settings);
+    world.spdp(BOB, 10);
+    for index in 0..9_u8 {
+        let writer = bob(EntityId([0, 1, index, 3]));
+        world.sedp(writer, &format!("rt/crowd_{index}"));
+    }
+    world.spdp(ALICE, 100);
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.stream(alice(WRITER), 1..=10);
+    assert!(world.topic(0, "/chatter").unwrap().measurement.is_none());
+    world.wait(12_000);
+    world.stream(alice(WRITER), 11..=20);
+    assert_eq!(world.measurement("/chatter").messages, 10);
 }
 
 #[test]

@@ -542,18 +542,18 @@ impl Observer {
         }
     }
 
-    /// Gives free measuring places to topics that were kept out.
+    /// Gives free measuring places, and those of vanished topics, to topics that were kept out.
     fn promote(&mut self) {
-        if self.topics.watched() >= self.settings.topics {
+        if !self.topics.has_place(self.settings.topics) {
             return;
         }
         let rejected = self
             .topics
             .iter()
-            .filter(|(_, topic)| topic.watched == Watched::Rejected);
+            .filter(|(_, topic)| topic.watched == Watched::Rejected && !topic.is_vanished());
         let rejected: Vec<_> = rejected.map(|(id, _)| id).collect();
         for id in rejected {
-            if self.topics.watched() >= self.settings.topics {
+            if !self.topics.has_place(self.settings.topics) {
                 return;
             }
             self.consult(id, self.clock);

@@ -110,7 +110,7 @@ fn topic(
             .profiler
             .get(*guid)
             .filter(|measured| measured.topic.is_some());
-        let measurement = measured.map(|measured| measured.writer.measurement(now));
+        let measurement = measured.map(|measured| Box::new(measured.writer.measurement(now)));
         Some(endpoint_facts(
             *guid,
             endpoint,
@@ -118,15 +118,21 @@ fn topic(
             measurement,
         ))
     };
-    let publishers: Vec<_> = topic.writers.iter().filter_map(endpoint).collect();
-    let subscriptions: Vec<_> = topic.readers.iter().filter_map(endpoint).collect();
+    let publishers = fitting(
+        topic.writers.len(),
+        topic.writers.iter().filter_map(endpoint),
+    );
+    let subscriptions = fitting(
+        topic.readers.len(),
+        topic.readers.iter().filter_map(endpoint),
+    );
     let all = || publishers.iter().chain(&subscriptions);
     let mut message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
     if topic.is_vanished() {
         message_types.extend(topic.last_type.as_deref().map(ToOwned::to_owned));
     }
     let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash.clone()).collect();
-    let mut measurement = topic.retired.as_deref().cloned();
+    let mut measurement = topic.retired.clone();
     if let Some(sum) = &mut measurement {
         let beside = topic
             .beside
@@ -153,11 +159,18 @@ fn topic(
     }
 }
 
+/// Most topics have one endpoint; collecting would make room for four.
+fn fitting<T>(length: usize, items: impl Iterator<Item = T>) -> Vec<T> {
+    let mut list = Vec::with_capacity(length);
+    list.extend(items);
+    list
+}
+
 fn endpoint_facts(
     guid: Guid,
     endpoint: &Endpoint,
     node: Option<&str>,
-    measurement: Option<Measurement>,
+    measurement: Option<Box<Measurement>>,
 ) -> EndpointFacts {
     let qos = &endpoint.qos;
     let history = match qos.history {

@@ -102,7 +102,7 @@ pub struct TopicFacts {
     pub subscriptions: Vec<EndpointFacts>,
     /// Present when somebody is or was interested in the topic: the sum over its writers, also
     /// those that have gone.
-    pub measurement: Option<Measurement>,
+    pub measurement: Option<Box<Measurement>>,
     /// The last endpoint has gone; kept for the grace period.
     pub vanished: bool,
 }
@@ -135,7 +135,7 @@ pub struct EndpointFacts {
     /// When it was announced.
     pub first_seen: Timestamp,
     /// What was measured of this writer while its topic was watched.
-    pub measurement: Option<Measurement>,
+    pub measurement: Option<Box<Measurement>>,
 }
 
 /// What was counted while the topic was watched. Counters never go down while the topic lives.

@@ -329,6 +329,12 @@ impl Topics {
         };
     }
 
+    /// Whether one more topic can be measured: a place is free, or a vanished topic has it.
+    #[must_use]
+    pub fn has_place(&self, cap: usize) -> bool {
+        self.watched < cap || !self.vanished_watched.is_empty()
+    }
+
     /// Forgets topics that vanished longer than `grace` ago.
     pub fn expire(&mut self, now: Timestamp, grace: u64) {
         while let Some((at, id)) = self.vanished.first().copied()

@@ -98,7 +98,7 @@ impl<'a> Row<'a> {
     }
 
     pub(super) fn measurement(&self) -> Option<&'a Measurement> {
-        self.facts.and_then(|facts| facts.measurement.as_ref())
+        self.facts.and_then(|facts| facts.measurement.as_deref())
     }
 }
 

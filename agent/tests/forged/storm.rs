@@ -22,40 +22,76 @@ pub(crate) struct Storm {
 impl Storm {
     /// Sends what `forge` makes, each time under a GUID prefix that was never there before.
     pub(crate) fn start(
-        mut carrier: impl Carrier + Send + 'static,
+        carrier: impl Carrier + Send + 'static,
         forge: fn(&mut Dice) -> Vec<u8>,
     ) -> Storm {
-        let (stop, sent) = (Arc::<AtomicBool>::default(), Arc::<AtomicU64>::default());
-        let (stopped, counter) = (stop.clone(), sent.clone());
         let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
-        let mut moulds: Vec<Mould> = (0..MOULDS).map(|_| Mould::new(forge(&mut dice))).collect();
-        let thread = std::thread::spawn(move || {
-            for mould in (0..moulds.len()).cycle() {
-                if stopped.load(Ordering::Relaxed) {
-                    break;
-                }
-                // A full queue on the way is no reason to stop.
-                let _ = carrier.carry(moulds[mould].cast(&mut dice));
-                counter.fetch_add(1, Ordering::Relaxed);
-            }
-        });
-        Storm { stop, sent, thread }
+        let moulds: Vec<Mould> = (0..MOULDS).map(|_| Mould::new(forge(&mut dice))).collect();
+        let mut next = (0..moulds.len()).cycle();
+        Storm::run(carrier, move |bytes| {
+            let mould = next.next().unwrap_or(0);
+            moulds[mould].cast(&mut dice, bytes);
+        })
     }
 
     /// Sends the samples of one announced writer as fast as it can.
-    pub(crate) fn of_samples(mut carrier: impl Carrier + Send + 'static, topic: &str) -> Storm {
+    pub(crate) fn of_samples(
+        mut carrier: impl Carrier + Send + 'static,
+        topic: &str,
+    ) -> Result<Storm> {
         const NUMBER: std::ops::Range<usize> = 40..44;
+        let mut talker = Talker::new(1, topic);
+        introduce(&talker, &mut carrier)?;
+        let sample = talker.sample(320);
+        let mut number = 0_u32;
+        Ok(Storm::run(carrier, move |bytes| {
+            number += 1;
+            bytes.clone_from(&sample);
+            bytes[NUMBER].copy_from_slice(&number.to_le_bytes());
+        }))
+    }
+
+    /// Announces `participants` with `endpoints` each, every one on a topic of its own, again and
+    /// again.
+    pub(crate) fn of_a_crowd(
+        carrier: impl Carrier + Send + 'static,
+        participants: u32,
+        endpoints: u8,
+    ) -> Storm {
+        let mut crowd = Vec::new();
+        for number in 0..participants {
+            let talker = Talker::new(number, "/crowd");
+            let mut bytes = talker.participant();
+            for endpoint in 0..endpoints {
+                let topic = format!("rt/crowd/{number}/{}/{endpoint}", "x".repeat(80));
+                let entity = [0, 1, endpoint, if endpoint % 2 == 0 { 3 } else { 4 }];
+                let kind = "sensor_msgs::msg::dds_::PointCloud2_";
+                let message = match endpoint % 2 {
+                    0 => talker.publication(entity, &topic, kind, endpoint.into()),
+                    _ => talker.subscription(entity, &topic, kind, endpoint.into()),
+                };
+                bytes.extend_from_slice(&message[PREFIX.end..]);
+            }
+            crowd.push(bytes);
+            crowd.push(talker.entities(&format!("node_{number}_{}", "y".repeat(80))));
+        }
+        let mut next = (0..crowd.len()).cycle();
+        Storm::run(carrier, move |bytes| {
+            bytes.clone_from(&crowd[next.next().unwrap_or(0)]);
+        })
+    }
+
+    fn run(
+        mut carrier: impl Carrier + Send + 'static,
+        mut next: impl FnMut(&mut Vec<u8>) + Send + 'static,
+    ) -> Storm {
         let (stop, sent) = (Arc::<AtomicBool>::default(), Arc::<AtomicU64>::default());
         let (stopped, counter) = (stop.clone(), sent.clone());
-        let mut talker = Talker::new(1, topic);
         let thread = std::thread::spawn(move || {
-            let _ = introduce(&talker, &mut carrier);
-            let mut bytes = talker.sample(320);
-            for number in 1_u32.. {
-                if stopped.load(Ordering::Relaxed) {
-                    break;
-                }
-                bytes[NUMBER].copy_from_slice(&number.to_le_bytes());
+            let mut bytes = Vec::new();
+            while !stopped.load(Ordering::Relaxed) {
+                next(&mut bytes);
+                // A full queue on the way is no reason to stop.
                 let _ = carrier.carry(&bytes);
                 counter.fetch_add(1, Ordering::Relaxed);
             }
@@ -86,12 +122,12 @@ impl Mould {
         Mould { bytes, places }
     }
 
-    fn cast(&mut self, dice: &mut Dice) -> &[u8] {
+    fn cast(&self, dice: &mut Dice, bytes: &mut Vec<u8>) {
+        bytes.clone_from(&self.bytes);
         let random = [dice.roll().to_ne_bytes(), dice.roll().to_ne_bytes()].concat();
         for place in &self.places {
-            self.bytes[*place..place + PREFIX.len()].copy_from_slice(&random[..PREFIX.len()]);
+            bytes[*place..place + PREFIX.len()].copy_from_slice(&random[..PREFIX.len()]);
         }
-        &self.bytes
     }
 }
 

@@ -108,7 +108,7 @@ pub fn topic(name: &str) -> TopicFacts {
         message_type: "sensor_msgs/msg/PointCloud2".to_owned(),
         type_hash: None,
         first_seen: Timestamp(4),
-        measurement: Some(measurement()),
+        measurement: Some(Box::new(measurement())),
     };
     TopicFacts {
         domain_id: 0,
@@ -120,7 +120,7 @@ pub fn topic(name: &str) -> TopicFacts {
         type_hashes: Vec::new(),
         publishers: vec![endpoint(guid(1))],
         subscriptions: vec![endpoint(guid(2))],
-        measurement: Some(measurement()),
+        measurement: Some(Box::new(measurement())),
         vanished: false,
     }
 }
