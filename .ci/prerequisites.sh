@@ -66,12 +66,7 @@ prometheus() {
 }
 
 rust() {
-    if ! command -v cargo >/dev/null; then
-        packages curl ca-certificates
-        say "installing Rust with rustup into ${CARGO_HOME:-$HOME/.cargo}"
-        curl --proto '=https' --tlsv1.2 -sSf https://sh.rustup.rs |
-            sh -s -- -y -q --profile minimal --component clippy --component rustfmt
-    fi
+    command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
     version=$(rustc --version | sed -E 's/rustc 1\.([0-9]+).*/\1/')
     [ "$version" -ge 95 ] || die "rustc 1.95 or newer is needed, here is $(rustc --version): rustup update stable"
@@ -95,7 +90,7 @@ nightly() {
 nightly_toolchain() {
     local toolchain
     toolchain=$(nightly)
-    command -v rustup >/dev/null || die "rustup is needed for $toolchain: see https://rustup.rs"
+    command -v rustup >/dev/null || die "rustup is needed to install $toolchain"
     if ! rustc "+$toolchain" --version >/dev/null 2>&1; then
         say "installing the Rust toolchain $toolchain"
         rustup toolchain install "$toolchain" --profile minimal
@@ -124,7 +119,7 @@ ebpf() {
         say "installing bpf-linker 0.10.2 with the LLVM of $(nightly)"
         cargo "+$(nightly)" install bpf-linker --version 0.10.2 --locked
     else
-        die "bpf-linker needs llvm-22-dev, which this system does not have: see https://apt.llvm.org"
+        die "bpf-linker needs llvm-22-dev, which this system does not have: add LLVM's own package source"
     fi
 }
 

@@ -30,6 +30,9 @@ separator=$'\x1f'
 flags="--cfg=bpf_target_arch=\"x86_64\"${separator}-Cdebuginfo=2${separator}-Clink-arg=--btf"
 flags+="${separator}--remap-path-prefix=$(cd .. && pwd)=/ros2probe"
 flags+="${separator}--remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=/cargo"
+for registry in "${CARGO_HOME:-$HOME/.cargo}"/registry/src/*; do
+    flags+="${separator}--remap-path-prefix=$registry=/cargo"
+done
 flags+="${separator}--remap-path-prefix=$(rustc "+$nightly" --print sysroot)=/rust"
 CARGO_ENCODED_RUSTFLAGS="$flags" cargo "+$nightly" build --quiet --release --locked \
     --target bpfel-unknown-none -Z build-std=core
