@@ -1,0 +1,236 @@
+use super::*;
+
+const SECOND: u64 = 1_000_000_000;
+
+/// A sequence with virtual time and the verdicts in lists.
+#[derive(Default)]
+struct Bench {
+    sequence: Sequence,
+    now: u64,
+    recovered: Vec<u64>,
+    duplicates: Vec<u64>,
+    lost: Vec<u64>,
+    irrelevant: Vec<u64>,
+}
+
+impl Bench {
+    fn receive(&mut self, numbers: impl IntoIterator<Item = u64>) -> &mut Self {
+        for number in numbers {
+            self.now += SECOND / 1000;
+            self.receive_at(number, None);
+        }
+        self
+    }
+
+    fn receive_at(&mut self, number: u64, source: Option<u64>) {
+        let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
+        self.sequence.recognise(number, source.map(Timestamp));
+        let arrival = self.sequence.receive(
+            number,
+            Delivery::Reliable,
+            Timestamp(self.now),
+            &mut |settled| note(settled, lost, irrelevant),
+        );
+        match arrival {
+            Arrival::New {
+                recovered: true, ..
+            } => self.recovered.push(number),
+            Arrival::New { .. } => {}
+            Arrival::Duplicate => self.duplicates.push(number),
+        }
+    }
+
+    fn wait(&mut self, seconds: u64) -> &mut Self {
+        let end = self.now + seconds * SECOND;
+        while self.now < end {
+            self.now += SECOND / 10;
+            let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
+            self.sequence
+                .advance(Timestamp(self.now), SECOND, None, &mut |settled| {
+                    note(settled, lost, irrelevant);
+                });
+        }
+        self
+    }
+}
+
+fn note(settled: Settled, lost: &mut Vec<u64>, irrelevant: &mut Vec<u64>) {
+    match settled {
+        Settled::Lost(number) => lost.push(number),
+        Settled::LostRun(start, end) => lost.extend(start..end),
+        Settled::Irrelevant(number) => irrelevant.push(number),
+    }
+}
+
+#[test]
+fn order_1_2_4_3_5_is_no_loss_and_no_recovery() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2, 4, 3, 5]).wait(5);
+    assert_eq!(
+        (
+            bench.lost.len(),
+            bench.recovered.len(),
+            bench.duplicates.len()
+        ),
+        (0, 0, 0)
+    );
+}
+
+#[test]
+fn a_gap_is_lost_once_after_the_window() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2, 5]);
+    assert!(bench.lost.is_empty());
+    bench.wait(3);
+    assert_eq!(bench.lost, [3, 4]);
+    bench.wait(5);
+    assert_eq!(bench.lost, [3, 4]);
+}
+
+#[test]
+fn a_retransmission_recovers() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2, 4]);
+    bench.now += SECOND / 5;
+    bench.receive([3]).wait(5);
+    assert_eq!(
+        (bench.lost.as_slice(), bench.recovered.as_slice()),
+        (&[][..], &[3][..])
+    );
+}
+
+#[test]
+fn a_fast_retransmission_that_was_asked_for_is_no_reordering() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2, 4]);
+    bench.sequence.requested([3].into_iter());
+    bench.receive([3]);
+    assert_eq!(bench.recovered, [3]);
+}
+
+#[test]
+fn nothing_before_the_first_sight_is_lost() {
+    let mut bench = Bench::default();
+    bench.receive([385, 386]).wait(5);
+    assert!(bench.lost.is_empty());
+}
+
+#[test]
+fn gap_and_heartbeat_excuse() {
+    let mut bench = Bench::default();
+    bench.receive([1, 4, 7, 9]);
+    bench
+        .sequence
+        .gap(2, 4, [].into_iter(), Timestamp(bench.now), &mut |_| {});
+    bench
+        .sequence
+        .heartbeat(7, 9, Timestamp(bench.now), &mut |_| {});
+    bench.wait(3);
+    assert_eq!(
+        (bench.irrelevant.as_slice(), bench.lost.as_slice()),
+        (&[2, 3, 5, 6][..], &[8][..])
+    );
+}
+
+#[test]
+fn a_gap_ahead_of_the_data_does_not_hide_data() {
+    let mut bench = Bench::default();
+    bench.receive([1]);
+    bench
+        .sequence
+        .gap(2, 4, [4].into_iter(), Timestamp(bench.now), &mut |_| {});
+    bench.receive([3, 5]).wait(3);
+    assert_eq!(
+        (bench.irrelevant.as_slice(), bench.lost.len()),
+        (&[2, 4][..], 0)
+    );
+    assert!(bench.duplicates.is_empty());
+}
+
+#[test]
+fn the_last_sample_of_a_burst_is_missed_by_its_heartbeat() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2]);
+    bench
+        .sequence
+        .heartbeat(1, 3, Timestamp(bench.now), &mut |_| {});
+    bench.wait(3);
+    assert_eq!(bench.lost, [3]);
+}
+
+#[test]
+fn forged_heartbeats_and_gaps_make_no_losses() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2]);
+    let now = Timestamp(bench.now);
+    for (first, last) in [(1, u64::MAX), (0, 5), (9, 3), (u64::MAX, u64::MAX)] {
+        bench.sequence.heartbeat(first, last, now, &mut |_| {});
+    }
+    bench
+        .sequence
+        .gap(1, u64::MAX, [u64::MAX].into_iter(), now, &mut |_| {});
+    bench.sequence.gap(0, 0, [].into_iter(), now, &mut |_| {});
+    bench.receive([3, 4]).wait(3);
+    assert!(bench.lost.is_empty());
+}
+
+#[test]
+fn a_restart_under_the_same_guid_begins_anew() {
+    let mut bench = Bench::default();
+    for number in 1..=100 {
+        bench.now += SECOND / 100;
+        bench.receive_at(number, Some(bench.now));
+    }
+    bench.wait(3);
+    for number in 1..=50 {
+        bench.now += SECOND / 100;
+        bench.receive_at(number, Some(bench.now));
+    }
+    bench.wait(3);
+    assert!(bench.duplicates.is_empty() && bench.lost.is_empty());
+}
+
+#[test]
+fn history_for_a_late_joiner_is_duplicate() {
+    let mut bench = Bench::default();
+    for number in 1..=100 {
+        bench.now += SECOND / 100;
+        bench.receive_at(number, Some(number * SECOND / 100));
+    }
+    for number in 60..=100 {
+        bench.receive_at(number, Some(number * SECOND / 100));
+    }
+    assert_eq!(bench.duplicates.len(), 41);
+}
+
+#[test]
+fn a_forged_jump_is_not_a_million_losses() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2, u64::MAX >> 1, 1 << 40]).wait(3);
+    assert!(bench.lost.is_empty());
+    let mut numbers = 3..;
+    bench.receive(numbers.by_ref().take(2000)).wait(3);
+    assert!(bench.lost.is_empty());
+    assert!(bench.duplicates.len() <= 1100, "{}", bench.duplicates.len());
+}
+
+#[test]
+fn more_undecided_than_the_window_holds_is_decided_at_once() {
+    let mut bench = Bench::default();
+    bench.receive([1, 200_000]);
+    bench.wait(3);
+    assert_eq!(bench.lost.len(), 199_998);
+    assert!(bench.sequence.received.len() <= MAX_WINDOW);
+}
+
+#[test]
+fn a_late_sample_after_settling_still_counts_once() {
+    let mut bench = Bench::default();
+    bench.receive([1, 3]).wait(3);
+    bench.receive([2, 2]);
+    assert_eq!(
+        (bench.lost.as_slice(), bench.recovered.as_slice()),
+        (&[2][..], &[2][..])
+    );
+    assert_eq!(bench.duplicates, [2]);
+}

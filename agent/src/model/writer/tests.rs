@@ -1,0 +1,320 @@
+use super::*;
+
+const MILLISECOND: u64 = 1_000_000;
+const SECOND: u64 = 1000 * MILLISECOND;
+const START: u64 = 1_795_143_000 * SECOND;
+
+/// One writer with everything around it, in virtual time.
+struct Bench {
+    writer: Writer,
+    budget: Budget,
+    journal: Journal,
+    now: u64,
+    opened: Timestamp,
+}
+
+impl Bench {
+    fn new(traits: Traits) -> Self {
+        Self {
+            writer: Writer::new(Guid::default(), traits),
+            budget: Budget::new(1 << 20),
+            journal: Journal::default(),
+            now: START,
+            opened: Timestamp(0),
+        }
+    }
+
+    fn put(&mut self, record: Record) -> &mut Self {
+        let record = Record {
+            time: self.now,
+            ..record
+        };
+        let mut scene = Scene {
+            now: Timestamp(self.now),
+            budget: &mut self.budget,
+            journal: &mut self.journal,
+        };
+        self.writer.record(&record, self.opened, &mut scene);
+        self
+    }
+
+    fn data(&mut self, number: u64) -> &mut Self {
+        self.put(data(number))
+    }
+
+    fn fragments(&mut self, number: u64, range: std::ops::RangeInclusive<u32>) -> &mut Self {
+        for start in range {
+            self.put(fragment(number, start));
+        }
+        self
+    }
+
+    fn wait(&mut self, milliseconds: u64) -> &mut Self {
+        let end = self.now + milliseconds * MILLISECOND;
+        while self.now < end {
+            self.now = (self.now + 100 * MILLISECOND).min(end);
+            let mut scene = Scene {
+                now: Timestamp(self.now),
+                budget: &mut self.budget,
+                journal: &mut self.journal,
+            };
+            self.writer.advance(&mut scene);
+        }
+        self
+    }
+
+    fn facts(&self) -> Measurement {
+        self.writer.measurement(Timestamp(self.now))
+    }
+}
+
+const RELIABLE: Traits = Traits {
+    reliable: true,
+    keeps_history: false,
+    has_header: false,
+};
+
+fn data(number: u64) -> Record {
+    Record {
+        kind: kind::DATA,
+        submessage_flags: DATA_FLAG | 1,
+        sequence_number: number,
+        payload_len: 100,
+        ..Record::default()
+    }
+}
+
+/// Of a sample in ten fragments.
+fn fragment(number: u64, start: u32) -> Record {
+    Record {
+        kind: kind::DATA_FRAG,
+        submessage_flags: 1,
+        sequence_number: number,
+        fragment_start: start,
+        fragments: 1 << 16 | 1000,
+        sample_size: 9500,
+        payload_len: 1000,
+        ..Record::default()
+    }
+}
+
+#[test]
+fn a_sample_seen_on_several_interfaces_counts_once() {
+    let mut bench = Bench::new(Traits::default());
+    bench.data(1).data(1).data(2).data(2).data(1);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.bytes, facts.duplicates), (2, 200, 3));
+}
+
+#[test]
+fn a_late_retransmitted_fragment_does_not_reopen_a_finished_sample() {
+    let mut bench = Bench::new(RELIABLE);
+    bench.fragments(1, 1..=10).wait(1000);
+    for _ in 0..1000 {
+        bench.fragments(1, 3..=4);
+    }
+    let facts = bench.facts();
+    assert_eq!(
+        (facts.messages, facts.bytes, facts.duplicates),
+        (1, 9500, 2000)
+    );
+    assert_eq!((bench.budget.bytes, bench.budget.samples), (0, 0));
+}
+
+#[test]
+fn an_incomplete_sample_is_lost_although_its_number_was_seen() {
+    let mut bench = Bench::new(Traits::default());
+    bench
+        .fragments(1, 1..=10)
+        .fragments(2, 1..=9)
+        .fragments(3, 1..=10)
+        .wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.incomplete), (2, 1, 1));
+    assert_eq!(
+        bench
+            .journal
+            .losses()
+            .map(|loss| loss.first)
+            .collect::<Vec<_>>(),
+        [2]
+    );
+    assert_eq!(bench.budget.samples, 0);
+}
+
+#[test]
+fn the_last_incomplete_sample_is_lost_too() {
+    let mut bench = Bench::new(Traits::default());
+    bench.fragments(1, 1..=10).fragments(2, 2..=10).wait(5000);
+    assert_eq!(bench.facts().lost, 1);
+}
+
+#[test]
+fn a_slow_large_sample_is_not_settled_while_it_grows() {
+    let mut bench = Bench::new(Traits::default());
+    bench.data(1);
+    for start in 1..=10 {
+        bench.fragments(2, start..=start).wait(700);
+    }
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost), (2, 0));
+}
+
+#[test]
+fn a_sample_joined_in_the_middle_is_no_loss() {
+    let mut bench = Bench::new(Traits::default());
+    bench.fragments(7, 4..=10).fragments(8, 1..=10).wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.incomplete), (1, 0, 0));
+}
+
+#[test]
+fn the_very_first_sample_can_be_lost_with_its_first_fragment() {
+    let mut bench = Bench::new(Traits::default());
+    bench.fragments(1, 2..=10).fragments(2, 1..=10).wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.incomplete), (1, 1, 1));
+}
+
+#[test]
+fn a_sample_of_too_many_fragments_is_neither_counted_nor_lost() {
+    let mut bench = Bench::new(Traits::default());
+    bench.data(1);
+    bench.put(Record {
+        fragments: 1 << 16 | 8,
+        sample_size: u32::MAX,
+        ..fragment(2, 1)
+    });
+    bench.data(3).wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.irrelevant), (2, 0, 1));
+}
+
+#[test]
+fn a_repaired_fragment_counts_as_recovered() {
+    let mut bench = Bench::new(RELIABLE);
+    bench
+        .fragments(1, 1..=4)
+        .fragments(1, 6..=10)
+        .wait(50)
+        .fragments(1, 5..=5);
+    assert_eq!((bench.facts().messages, bench.facts().recovered), (1, 1));
+}
+
+#[test]
+fn reliable_gaps_stay_open_for_retransmissions() {
+    let mut bench = Bench::new(RELIABLE);
+    bench.data(1).data(3).wait(8000).data(2).wait(12_000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.recovered), (3, 0, 1));
+}
+
+#[test]
+fn an_unannounced_writer_that_sends_heartbeats_is_reliable() {
+    let mut bench = Bench::new(Traits::default());
+    bench.data(1).data(3);
+    bench.put(Record {
+        kind: kind::HEARTBEAT,
+        sequence_number: 1,
+        encapsulation: 3,
+        ..Record::default()
+    });
+    bench.wait(5000);
+    assert_eq!(bench.facts().lost, 0);
+    bench.wait(7000);
+    assert_eq!(bench.facts().lost, 1);
+}
+
+#[test]
+fn disposals_take_a_number_but_are_no_messages() {
+    let mut bench = Bench::new(Traits::default());
+    bench.data(1);
+    bench.put(Record {
+        status_info: 3,
+        submessage_flags: 0x09,
+        ..data(2)
+    });
+    bench.data(3).wait(5000);
+    assert_eq!((bench.facts().messages, bench.facts().lost), (2, 0));
+}
+
+#[test]
+fn negative_delays_are_not_made_positive() {
+    let mut bench = Bench::new(Traits {
+        has_header: true,
+        ..Traits::default()
+    });
+    let at = |nanoseconds: u64| (nanoseconds / SECOND) << 32;
+    bench.put(Record {
+        source_timestamp: at(START + 2 * SECOND),
+        ..data(1)
+    });
+    bench.put(Record {
+        source_timestamp: at(START - 2 * SECOND),
+        ..data(2)
+    });
+    let facts = bench.facts();
+    assert_eq!(
+        (facts.negative_latency, facts.source_latency.count()),
+        (1, 1)
+    );
+    assert_eq!(facts.source_latency.range(), Some((2.0, 2.0)));
+}
+
+#[test]
+fn history_for_a_late_joiner_is_no_latency() {
+    let mut bench = Bench::new(Traits {
+        keeps_history: true,
+        ..RELIABLE
+    });
+    let old = ((START - 3600 * SECOND) / SECOND) << 32;
+    bench.put(Record {
+        source_timestamp: old,
+        ..data(1)
+    });
+    assert_eq!(
+        (bench.facts().messages, bench.facts().source_latency.count()),
+        (1, 0)
+    );
+}
+
+#[test]
+fn intervals_are_exact() {
+    let mut bench = Bench::new(Traits::default());
+    for number in 1..=201 {
+        bench.data(number);
+        bench.now += 5 * MILLISECOND;
+    }
+    let facts = bench.facts();
+    assert_eq!(facts.interarrival.count(), 200);
+    assert_eq!(facts.interarrival.range(), Some((0.005, 0.005)));
+}
+
+#[test]
+fn what_went_elsewhere_while_nobody_listened_here_is_not_lost() {
+    let mut bench = Bench::new(Traits::default());
+    bench.data(1).data(2).wait(60_000);
+    bench.opened = Timestamp(bench.now);
+    bench.now += MILLISECOND;
+    bench.data(500).data(501).wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.irrelevant), (4, 0, 497));
+}
+
+#[test]
+fn two_hundred_hertz_reads_two_hundred() {
+    let mut bench = Bench::new(Traits::default());
+    bench.now += 1234;
+    for number in 1..=200 * 15 {
+        bench.data(number);
+        bench.now += 5 * MILLISECOND;
+    }
+    let facts = bench.facts();
+    assert!((facts.rate_hz - 200.0).abs() < 1e-9, "{}", facts.rate_hz);
+    assert!((facts.bandwidth - 20_000.0).abs() < 1e-6);
+}
+
+#[test]
+fn an_idle_writer_is_small() {
+    assert!(size_of::<Writer>() <= 1400, "{}", size_of::<Writer>());
+}

@@ -1,0 +1,308 @@
+use std::vec::Vec;
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::guid::{Guid, GuidPrefix};
+
+const SOURCE: [u8; 12] = *b"\x01\x0fsourcepref";
+const OTHER: [u8; 12] = *b"\x01\x10otherprefi";
+const READER: [u8; 4] = [0, 0, 0x12, 0x04];
+const WRITER: [u8; 4] = [0, 0, 0x11, 0x03];
+
+fn message(submessages: &[Vec<u8>]) -> Vec<u8> {
+    let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
+    bytes.extend_from_slice(&SOURCE);
+    submessages
+        .iter()
+        .for_each(|submessage| bytes.extend_from_slice(submessage));
+    bytes
+}
+
+fn submessage(id: u8, flags: u8, body: &[u8]) -> Vec<u8> {
+    let len = u16::try_from(body.len()).unwrap();
+    let len = if flags & 1 == 1 {
+        len.to_le_bytes()
+    } else {
+        len.to_be_bytes()
+    };
+    [&[id, flags][..], &len, body].concat()
+}
+
+fn data_body(little: bool, sequence_number: u32, tail: &[u8]) -> Vec<u8> {
+    let number = |n: u32| {
+        if little {
+            n.to_le_bytes()
+        } else {
+            n.to_be_bytes()
+        }
+    };
+    let sixteen = if little { [0, 0, 16, 0] } else { [0, 0, 0, 16] };
+    [
+        &sixteen[..],
+        &READER,
+        &WRITER,
+        &number(0),
+        &number(sequence_number),
+        tail,
+    ]
+    .concat()
+}
+
+fn walk_all(bytes: &[u8]) -> (Outcome, Vec<(Record, Vec<u8>)>) {
+    let mut found = Vec::new();
+    let outcome = datagram(bytes, &Envelope::default(), None, |each| {
+        found.push((each.record, each.payload.to_vec()));
+    });
+    (outcome, found)
+}
+
+fn guid(prefix: [u8; 12], entity: [u8; 4]) -> Guid {
+    Guid::new(GuidPrefix(prefix), EntityId(entity))
+}
+
+#[test]
+fn data_in_either_byte_order_reads_the_same() {
+    let payload = [0, 1, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0, 0xaa, 0xbb];
+    for little in [true, false] {
+        let body = data_body(little, 7, &payload);
+        let bytes = message(&[submessage(0x15, 0x04 | u8::from(little), &body)]);
+        let (outcome, found) = walk_all(&bytes);
+        assert_eq!(outcome, Outcome::Complete);
+        let [(record, seen)] = found.as_slice() else {
+            panic!("one DATA")
+        };
+        assert_eq!(record.writer(), guid(SOURCE, WRITER));
+        assert_eq!(record.reader(), guid([0; 12], READER));
+        assert_eq!(record.sequence_number, 7);
+        assert_eq!(record.payload_len, 14);
+        assert_eq!(record.header_stamp(), Some((1, 2)));
+        assert_eq!(seen, &payload);
+    }
+}
+
+#[test]
+fn every_data_of_a_datagram_is_seen_also_the_fortieth() {
+    let submessages: Vec<_> = (1..=40)
+        .map(|sn| submessage(0x15, 5, &data_body(true, sn, &[0, 1, 0, 0])))
+        .collect();
+    let (_, found) = walk_all(&message(&submessages));
+    let numbers: Vec<_> = found
+        .iter()
+        .map(|(record, _)| record.sequence_number)
+        .collect();
+    assert_eq!(numbers, (1..=40).collect::<Vec<u64>>());
+}
+
+#[test]
+fn the_reader_guid_has_the_prefix_of_info_dst_and_info_src_changes_the_writer() {
+    let info_source = [&[0; 4][..], &[2, 1, 1, 0x10], &OTHER].concat();
+    let bytes = message(&[
+        submessage(0x09, 1, &[5, 0, 0, 0, 0, 0, 0, 0x80]),
+        submessage(0x0e, 1, &OTHER),
+        submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0])),
+        submessage(0x0c, 1, &info_source),
+        submessage(0x15, 5, &data_body(true, 2, &[0, 1, 0, 0])),
+    ]);
+    let (_, found) = walk_all(&bytes);
+    assert_eq!(found[0].0.reader(), guid(OTHER, READER));
+    assert_eq!(found[0].0.writer(), guid(SOURCE, WRITER));
+    assert_eq!(found[0].0.source_timestamp, 5 << 32 | 0x8000_0000);
+    assert_eq!(found[1].0.writer(), guid(OTHER, WRITER));
+    assert_eq!(
+        found[1].0.source_timestamp, 0,
+        "INFO_SRC resets the timestamp"
+    );
+}
+
+#[test]
+fn status_info_is_big_endian_and_inline_qos_is_not_payload() {
+    let tail = [
+        0x70, 0, 16, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, // KEY_HASH
+        0x71, 0, 4, 0, 0, 0, 0, 3, // STATUS_INFO
+        1, 0, 0, 0, // SENTINEL
+    ];
+    let bytes = message(&[submessage(0x15, 0x03, &data_body(true, 9, &tail))]);
+    let (outcome, found) = walk_all(&bytes);
+    assert_eq!(outcome, Outcome::Complete);
+    assert_eq!((found[0].0.status_info, found[0].0.payload_len), (3, 0));
+
+    let with_data = [&tail[..], &[0, 1, 0, 0, 9, 9, 9, 9]].concat();
+    let bytes = message(&[submessage(0x15, 0x07, &data_body(true, 9, &with_data))]);
+    assert_eq!(walk_all(&bytes).1[0].0.payload_len, 8);
+}
+
+#[test]
+fn data_frag_gives_fragment_numbers_and_sizes() {
+    let head = [
+        &[0, 0, 28, 0][..],
+        &READER,
+        &WRITER,
+        &[0; 4],
+        &[3, 0, 0, 0],
+        &[11, 0, 0, 0],
+        &[10, 0, 0x40, 5],
+        &[0xa4, 0xd4, 9, 0],
+        &[0xcc; 40],
+    ]
+    .concat();
+    let bytes = message(&[submessage(0x16, 1, &head)]);
+    let (_, found) = walk_all(&bytes);
+    let record = found[0].0;
+    assert_eq!(record.fragment_start, 11);
+    assert_eq!(
+        (record.fragments_in_submessage(), record.fragment_size()),
+        (10, 1344)
+    );
+    assert_eq!(record.sample_size, 644_260);
+    assert_eq!((record.payload_len, record.header_stamp()), (40, None));
+}
+
+#[test]
+fn a_length_of_zero_reaches_the_end_but_not_for_pad_and_info_ts() {
+    let mut last = submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0, 7, 7, 7, 7]));
+    last[2..4].copy_from_slice(&[0, 0]);
+    let bytes = message(&[submessage(0x01, 1, &[]), submessage(0x09, 3, &[]), last]);
+    let (outcome, found) = walk_all(&bytes);
+    assert_eq!((outcome, found[0].0.payload_len), (Outcome::Complete, 8));
+}
+
+#[test]
+fn a_gap_of_256_becomes_two_records() {
+    let body = [
+        &READER[..],
+        &WRITER,
+        &[0; 4],
+        &[10, 0, 0, 0],
+        &[0; 4],
+        &[20, 0, 0, 0],
+        &[0, 1, 0, 0],
+        &[0xff; 32],
+    ]
+    .concat();
+    let (_, found) = walk_all(&message(&[submessage(0x08, 1, &body)]));
+    assert_eq!(found.len(), 2);
+    let irrelevant = |record: &Record| {
+        let base = record.second_sequence_number();
+        (record.sequence_number..base)
+            .chain(record.bitmap().map(|bit| base + u64::from(bit)))
+            .collect::<Vec<_>>()
+    };
+    let all: Vec<_> = found
+        .iter()
+        .flat_map(|(record, _)| irrelevant(record))
+        .collect();
+    assert_eq!(all, (10..20 + 256).collect::<Vec<u64>>());
+}
+
+#[test]
+fn only_discovery_is_captured_without_being_asked_for() {
+    let record = |writer: EntityId, kind| Record {
+        writer: crate::record::guid_words(Guid::new(GuidPrefix(SOURCE), writer)),
+        kind,
+        ..Record::default()
+    };
+    assert_eq!(
+        fate(&record(EntityId::SPDP_WRITER, kind::DATA)),
+        Fate::Capture
+    );
+    assert_eq!(
+        fate(&record(EntityId::SPDP_WRITER, kind::HEARTBEAT)),
+        Fate::Ignore
+    );
+    assert_eq!(
+        fate(&record(EntityId::PARTICIPANT_MESSAGE_WRITER, kind::DATA)),
+        Fate::Ignore
+    );
+    assert_eq!(fate(&record(EntityId(WRITER), kind::GAP)), Fate::Writer);
+}
+
+#[test]
+fn the_first_malformed_submessage_ends_the_walk_but_not_what_came_before() {
+    let mut bytes = message(&[
+        submessage(0x15, 5, &data_body(true, 1, &[0, 1, 0, 0])),
+        submessage(0x15, 5, &data_body(true, 2, &[0, 1, 0, 0])),
+    ]);
+    bytes.truncate(bytes.len() - 1);
+    let (outcome, found) = walk_all(&bytes);
+    assert_eq!((outcome, found.len()), (Outcome::Malformed, 1));
+}
+
+/// A valid message with one of everything, to be cut and damaged.
+fn sampler() -> Vec<u8> {
+    let set = [
+        &READER[..],
+        &WRITER,
+        &[0; 4],
+        &[1, 0, 0, 0],
+        &[40, 0, 0, 0],
+        &[0xff; 8],
+        &[0; 4],
+    ];
+    message(&[
+        submessage(0x09, 1, &[5, 0, 0, 0, 0, 0, 0, 0x80]),
+        submessage(0x0e, 1, &OTHER),
+        submessage(0x06, 1, &set.concat()),
+        submessage(0x07, 1, &[&READER[..], &WRITER, &[0; 20]].concat()),
+        submessage(
+            0x15,
+            7,
+            &data_body(
+                true,
+                1,
+                &[0x71, 0, 4, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0],
+            ),
+        ),
+        submessage(0x80, 1, &[1, 2, 3, 4]),
+    ])
+}
+
+#[test]
+fn every_truncation_and_every_single_byte_corruption_is_survived() {
+    let whole = sampler();
+    assert_eq!(walk_all(&whole).0, Outcome::Complete);
+    for len in 0..whole.len() {
+        walk_all(&whole[..len]);
+    }
+    for at in 0..whole.len() {
+        for value in [0, 1, 0x7f, 0x80, 0xff] {
+            let mut damaged = whole.clone();
+            damaged[at] = value;
+            walk_all(&damaged);
+        }
+    }
+}
+
+proptest! {
+    /// The kernel sees a datagram fragment by fragment: stopping anywhere and going on with
+    /// more bytes must find the same as one go, unless the walk says that it is split.
+    #[test]
+    fn pausing_between_fragments_changes_nothing(cuts in proptest::collection::vec(8u32..300, 1..6)) {
+        let bytes = sampler();
+        let whole = walk_all(&bytes).1.len();
+        let mut walk = Walk::default();
+        walk.begin([0; 3], u32::try_from(bytes.len()).unwrap());
+        let mut found = 0;
+        let mut ends: Vec<u32> = cuts.iter().scan(20, |at, cut| { *at += cut; Some(*at) }).collect();
+        ends.push(walk.datagram_len);
+        for present in ends {
+            let present = present.min(walk.datagram_len);
+            loop {
+                match step(&mut walk, &bytes.as_slice(), present) {
+                    Step::Endpoint => found += 1,
+                    Step::Passed => {}
+                    Step::Later | Step::End | Step::Split => break,
+                    other => panic!("{other:?}"),
+                }
+            }
+        }
+        prop_assert_eq!(found, whole);
+    }
+
+    #[test]
+    fn arbitrary_bytes_never_panic(tail in proptest::collection::vec(any::<u8>(), 0..600)) {
+        let mut bytes = message(&[]);
+        bytes.extend(tail);
+        walk_all(&bytes);
+    }
+}
