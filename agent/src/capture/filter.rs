@@ -203,18 +203,14 @@ impl Filter {
         absent_is_fine(self.interfaces.remove(&index)).map_err(failed("INTERFACES", "update"))
     }
 
-    /// Sets what unclassified writers may cost from now on, in bytes captured and records.
+    /// Sets what unclassified writers may cost from now on.
     ///
     /// # Errors
     /// When the kernel refuses.
-    pub fn set_unknown_budget(&mut self, bytes: u32, records: u32) -> Result<(), FilterError> {
-        let entries = [(Budget::CaptureBytes, bytes), (Budget::Records, records)];
-        for (index, value) in entries {
-            self.budget
-                .set(index as u32, i64::from(value), 0)
-                .map_err(failed("BUDGET", "refill"))?;
-        }
-        Ok(())
+    pub fn set_unknown_budget(&mut self, budget: Budget, amount: u32) -> Result<(), FilterError> {
+        self.budget
+            .set(budget as u32, i64::from(amount), 0)
+            .map_err(failed("BUDGET", "refill"))
     }
 
     /// All counters, summed over CPUs.

@@ -8,7 +8,7 @@ use std::os::fd::{AsFd as _, BorrowedFd};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use ros2probe_wire::filter::Counter;
+use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::record::{Verdict, kind};
 use ros2probe_wire::walk::Envelope;
@@ -34,8 +34,11 @@ const STALLED_NANOSECONDS: u64 = 60_000_000;
 /// What unclassified writers may cost each second, all together: a dozen nodes that start at once
 /// stay far below, a storm of forged ones stays bounded.
 const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
-const UNKNOWN_RECORDS_PER_SECOND: u32 = 4096;
+/// Handed out in small portions, so that a storm that comes while we are held up leaves most of the
+/// record ring to the writers we know.
+const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
 const SECOND: u64 = 1_000_000_000;
+const TENTH: u64 = SECOND / 10;
 /// The largest frame, a 64 KiB datagram on loopback, fits twice. A block changes hands when it is
 /// full or [`RETIRE`] old, so the number of blocks is also the time for which we may be held up.
 const BLOCK_BYTES: usize = 128 << 10;
@@ -68,7 +71,9 @@ pub enum CaptureError {
 /// All taps.
 pub struct LiveSource {
     taps: Vec<Tap>,
-    refilled: u64,
+    /// When unclassified writers last got bytes and records to spend.
+    bytes_refilled: u64,
+    records_refilled: u64,
     refused_updates: u64,
     clock: Timestamp,
 }
@@ -110,7 +115,8 @@ impl LiveSource {
         let clocks = Clocks::read();
         let mut source = Self {
             taps,
-            refilled: 0,
+            bytes_refilled: 0,
+            records_refilled: 0,
             refused_updates: 0,
             clock: clocks.now,
         };
@@ -126,9 +132,7 @@ impl LiveSource {
         let descriptors: Vec<_> = self.taps.iter().flat_map(Tap::descriptors).collect();
         wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let clocks = Clocks::read();
-        if clocks.monotonic.wrapping_sub(self.refilled) >= SECOND {
-            self.refill(clocks.monotonic);
-        }
+        self.refill(clocks.monotonic);
         for tap in &mut self.taps {
             tap.follow_interfaces();
             tap.take_frames(&clocks, observer)?;
@@ -271,11 +275,19 @@ impl LiveSource {
     }
 
     fn refill(&mut self, monotonic: u64) {
-        self.refilled = monotonic;
-        for tap in &mut self.taps {
-            let (bytes, records) = (UNKNOWN_BYTES_PER_SECOND, UNKNOWN_RECORDS_PER_SECOND);
-            let refilled = tap.filter.set_unknown_budget(bytes, records);
-            self.refused_updates += u64::from(refilled.is_err());
+        let mut set = |budget, amount| {
+            for tap in &mut self.taps {
+                let refilled = tap.filter.set_unknown_budget(budget, amount);
+                self.refused_updates += u64::from(refilled.is_err());
+            }
+        };
+        if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND {
+            self.bytes_refilled = monotonic;
+            set(Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND);
+        }
+        if monotonic.wrapping_sub(self.records_refilled) >= TENTH {
+            self.records_refilled = monotonic;
+            set(Budget::Records, UNKNOWN_RECORDS_PER_TENTH);
         }
     }
 }

@@ -11,6 +11,7 @@ use std::time::Duration;
 use ros2probe::capture::filter::{Filter, FilterSettings};
 use ros2probe::model::ahead::{Ahead, Ready};
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_wire::filter::Budget;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::record::{Record, Verdict, kind};
 use ros2probe_wire::walk::{self, Envelope};
@@ -63,7 +64,9 @@ impl Kernel {
     }
 
     pub fn set_unknown_budget(&mut self, bytes: u32, records: u32) {
-        self.filter.set_unknown_budget(bytes, records).unwrap();
+        for (budget, amount) in [(Budget::CaptureBytes, bytes), (Budget::Records, records)] {
+            self.filter.set_unknown_budget(budget, amount).unwrap();
+        }
     }
 
     pub fn next_identification(&mut self) -> u32 {
