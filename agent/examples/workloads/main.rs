@@ -78,7 +78,7 @@ fn main() -> Result<ExitCode> {
         bail!("{} is missing: run `make bench`", program.display());
     }
     println!(
-        "{} windows of {} s each; CPU seconds are per 20 s; machine = all processes and the kernel\n",
+        "{} windows of {} s each; CPU seconds are per 20 s; workload = publisher, subscriber, observer and ksoftirqd\n",
         options.rounds, options.seconds
     );
     println!("{}", report::HEAD);

@@ -6,8 +6,8 @@ use crate::harness::peer::Stack;
 use crate::window::{Observer, Told, Window};
 
 pub(crate) const HEAD: &str = "\
-| workload | DDS | agent CPU s | subscriber CPU s | of it | of reference | agent PSS MB | subscriber PSS MB | machine s: nobody | agent | subscriber | copied | counted / sent |
-| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |";
+| workload | DDS | agent CPU s | subscriber CPU s | ratio | of reference | agent PSS MB | subscriber PSS MB | workload CPU s: alone, + agent, + subscriber | machine CPU s: likewise | copied | counted / sent |
+| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |";
 
 /// All windows of one workload and DDS.
 pub(crate) struct Row {
@@ -131,8 +131,10 @@ impl Row {
         median(self.of(observer).map(|window| window.cpu))
     }
 
-    fn machine(&self, observer: Observer) -> f64 {
-        median(self.of(observer).map(|window| window.machine))
+    /// Medians with nobody, with the agent and with a subscriber.
+    fn three(&self, value: impl Fn(&Window) -> f64) -> String {
+        let medians = Observer::ALL.map(|who| median(self.of(who).map(&value)));
+        medians.map(|median| format!("{median:.2}")).join(", ")
     }
 
     fn pss(&self, observer: Observer) -> u64 {
@@ -150,14 +152,15 @@ impl fmt::Display for Row {
         let of_reference = self
             .reference
             .map_or_else(|| "-".to_owned(), |theirs| format!("{:.3}", agent / theirs));
-        let [nobody, with_agent, with_subscriber] = Observer::ALL.map(|who| self.machine(who));
+        let workload = self.three(|window| window.workload);
+        let machine = self.three(|window| window.machine);
         let copied = median(self.told().map(|(_, told)| told.copied)) * 100.0;
         let counted: f64 = self.told().map(|(_, told)| told.counted).sum();
         let sent: u64 = self.told().map(|(window, _)| window.sent).sum();
         write!(
             formatter,
             "| {} | {:?} | {agent:.4} | {subscriber:.3} | {:.3} | {of_reference} | {:.1} | {:.1} \
-             | {nobody:.2} | {with_agent:.2} | {with_subscriber:.2} | {copied:.3} % | {counted} / {sent} |",
+             | {workload} | {machine} | {copied:.3} % | {counted} / {sent} |",
             self.name,
             self.stack,
             agent / subscriber,

@@ -10,7 +10,7 @@ use crate::harness::network::{INTERFACE, Link, Namespace};
 use crate::harness::peer::{Peer, Role, Stack, Stream};
 use crate::harness::process::Process;
 use crate::harness::run;
-use crate::harness::usage::{Usage, machine_cpu};
+use crate::harness::usage::{Usage, machine_idle, softirq_cpu};
 
 /// Time for discovery to settle and caches to fill before the window opens.
 const WARM_UP: Duration = Duration::from_secs(3);
@@ -31,6 +31,8 @@ pub(crate) struct Window {
     pub(crate) observer: Observer,
     /// CPU seconds of the whole machine, per 20 s.
     pub(crate) machine: f64,
+    /// Those of publisher, subscriber, observer and the kernel's packet threads.
+    pub(crate) workload: f64,
     /// CPU seconds of the observer, per 20 s.
     pub(crate) cpu: f64,
     /// The most memory of the observer seen in the window.
@@ -93,7 +95,8 @@ impl Window {
             (None, Some(second)) => Some(&second.process),
             (None, None) => None,
         };
-        let spent = Spent::during(length, watching)?;
+        let parts = [&publisher.process, &listener.process];
+        let spent = Spent::during(length, watching, &parts)?;
 
         publisher.process.terminate()?;
         let sent = publisher.log()?.sequences("pub").len() as u64;
@@ -102,6 +105,7 @@ impl Window {
         Ok(Window {
             observer,
             machine: spent.machine,
+            workload: spent.workload,
             cpu: spent.cpu,
             pss: spent.pss,
             sent,
@@ -125,14 +129,22 @@ impl Told {
 
 struct Spent {
     machine: f64,
+    workload: f64,
     cpu: f64,
     pss: u64,
 }
 
 impl Spent {
-    fn during(length: Duration, watching: Option<&Process>) -> Result<Spent> {
+    fn during(length: Duration, watching: Option<&Process>, parts: &[&Process]) -> Result<Spent> {
         let look = || watching.map(|process| Usage::of(process.pid())).transpose();
-        let (first, machine, began) = (look()?, machine_cpu()?, Instant::now());
+        let rest = || {
+            parts.iter().try_fold(softirq_cpu()?, |sum, part| {
+                anyhow::Ok(sum + Usage::of(part.pid())?.cpu)
+            })
+        };
+        let cpus = std::thread::available_parallelism().context("cannot count CPUs")?;
+        let (rest_before, first) = (rest()?, look()?);
+        let (idle, began) = (machine_idle()?, Instant::now());
         let mut last = first;
         let mut pss = 0;
         while let Some(left) = length.checked_sub(began.elapsed()) {
@@ -140,13 +152,16 @@ impl Spent {
             last = look()?;
             pss = last.map_or(0, |usage| usage.pss).max(pss);
         }
-        let unit = UNIT_SECONDS / began.elapsed().as_secs_f64();
-        let machine = machine_cpu()?.saturating_sub(machine);
+        let elapsed = began.elapsed().as_secs_f64();
+        let unit = UNIT_SECONDS / elapsed;
+        let idle = machine_idle()?.saturating_sub(idle).as_secs_f64();
+        let rest = rest()?.saturating_sub(rest_before);
         let cpu = last
             .zip(first)
             .map_or(Duration::ZERO, |(last, first)| last.since(&first).cpu);
         Ok(Spent {
-            machine: machine.as_secs_f64() * unit,
+            machine: (elapsed * cpus.get() as f64 - idle).max(0.0) * unit,
+            workload: (rest + cpu).as_secs_f64() * unit,
             cpu: cpu.as_secs_f64() * unit,
             pss,
         })

@@ -1,6 +1,7 @@
 //! What a process and the whole machine have spent, from `/proc`.
 
 use std::fs;
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
@@ -23,14 +24,7 @@ impl Usage {
         let tasks = fs::read_dir(format!("/proc/{pid}/task"))
             .with_context(|| format!("process {pid} is gone"))?;
         for task in tasks.flatten() {
-            let Ok(statistics) = fs::read_to_string(task.path().join("schedstat")) else {
-                continue;
-            };
-            let run = statistics
-                .split_whitespace()
-                .next()
-                .and_then(|run| run.parse().ok());
-            cpu += Duration::from_nanos(run.unwrap_or(0));
+            cpu += run_time(&task.path());
         }
         let memory = fs::read_to_string(format!("/proc/{pid}/smaps_rollup"))
             .with_context(|| format!("cannot read the memory of process {pid}"))?;
@@ -59,20 +53,38 @@ impl Usage {
     }
 }
 
-/// Time that all CPUs of the machine have spent on anything, interrupts included.
-pub(crate) fn machine_cpu() -> Result<Duration> {
+/// Time that all CPUs of the machine have been idle. What they worked is the rest of the time: the
+/// kernel's counters of work are sampled at its ticks, and miss what a timer starts just after one.
+pub(crate) fn machine_idle() -> Result<Duration> {
     let statistics = fs::read_to_string("/proc/stat").context("cannot read /proc/stat")?;
     let times = statistics.lines().next().context("/proc/stat is empty")?;
-    let ticks: Vec<u32> = times
+    // cpu user nice system idle iowait ...
+    let idle = times.split_whitespace().skip(4).take(2);
+    let ticks = idle.filter_map(|ticks| ticks.parse::<u32>().ok());
+    Ok(ticks.map(|ticks| TICK * ticks).sum())
+}
+
+/// Time on a CPU of the threads to which the kernel puts off packets that it has no time for.
+pub(crate) fn softirq_cpu() -> Result<Duration> {
+    let mut cpu = Duration::ZERO;
+    for entry in fs::read_dir("/proc")
+        .context("cannot read /proc")?
+        .flatten()
+    {
+        let name = fs::read_to_string(entry.path().join("comm"));
+        if name.is_ok_and(|name| name.starts_with("ksoftirqd/")) {
+            cpu += run_time(&entry.path());
+        }
+    }
+    Ok(cpu)
+}
+
+/// The first number of `schedstat`: nanoseconds on a CPU.
+fn run_time(task: &Path) -> Duration {
+    let statistics = fs::read_to_string(task.join("schedstat")).unwrap_or_default();
+    let run = statistics
         .split_whitespace()
-        .skip(1)
-        .filter_map(|ticks| ticks.parse().ok())
-        .collect();
-    // user nice system idle iowait irq softirq steal guest guest_nice; guests are in user already.
-    let busy = ticks
-        .iter()
-        .take(8)
-        .enumerate()
-        .filter(|(at, _)| *at != 3 && *at != 4);
-    Ok(busy.map(|(_, ticks)| TICK * *ticks).sum())
+        .next()
+        .and_then(|run| run.parse().ok());
+    Duration::from_nanos(run.unwrap_or(0))
 }
