@@ -15,13 +15,14 @@ use ros2probe::surface::{Board, Settings};
 use sd_notify::NotifyState;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
-use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
 
 use crate::logging::Log;
 
-/// How often readiness and the watchdog are looked at.
-const TICK: Duration = Duration::from_millis(500);
+/// How often readiness is looked at until the agent is ready, and the watchdog from then on.
+const STARTING_TICK: Duration = Duration::from_millis(100);
+const TICK: Duration = Duration::from_secs(2);
 /// For answers that have begun and the working thread's last round.
 const DRAIN: Duration = Duration::from_secs(3);
 
@@ -59,8 +60,7 @@ impl Supervisor {
         let mut worker = Worker::start(run).context("cannot start the working thread")?;
         let serving = server.map(|server| tokio::spawn(server.serve(self.stop.clone())));
         let mut watchdog = Watchdog::new();
-        let mut tick = interval(TICK);
-        tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut tick = ticks(STARTING_TICK);
         let mut working = true;
 
         let outcome = loop {
@@ -80,7 +80,11 @@ impl Supervisor {
                         Err(_) => break Err(anyhow!("the working thread died")),
                     }
                 }
-                _ = tick.tick() => watchdog.look(&self.board),
+                _ = tick.tick() => {
+                    if watchdog.look(&self.board) {
+                        tick = ticks(watchdog.period.map_or(TICK, |period| period.min(TICK)));
+                    }
+                }
             }
         };
 
@@ -161,6 +165,12 @@ impl Supervisor {
     }
 }
 
+fn ticks(period: Duration) -> Interval {
+    let mut ticks = interval(period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
+}
+
 /// Adds the command line's watches to the configured ones.
 pub(crate) fn add_watches(config: &mut Config, extra: &[Watch]) {
     for watch in extra {
@@ -212,18 +222,22 @@ impl Watchdog {
         }
     }
 
-    /// Not a timer: what feeds the watchdog is the capture's progress.
-    fn look(&mut self, board: &Board) {
+    /// Not a timer: what feeds the watchdog is the capture's progress. Whether the agent has just
+    /// become ready.
+    fn look(&mut self, board: &Board) -> bool {
         let now = Instant::now();
         if board.state().ready(now).is_err() {
-            return;
+            return false;
         }
-        if !self.ready {
+        let first = !self.ready;
+        if first {
             self.ready = true;
             tracing::info!("ready");
             let _ = sd_notify::notify(&[NotifyState::Ready]);
         }
-        let Some(period) = self.period else { return };
+        let Some(period) = self.period else {
+            return first;
+        };
         if self
             .fed
             .is_none_or(|fed| now.saturating_duration_since(fed) >= period)
@@ -231,5 +245,6 @@ impl Watchdog {
             self.fed = Some(now);
             let _ = sd_notify::notify(&[NotifyState::Watchdog]);
         }
+        first
     }
 }

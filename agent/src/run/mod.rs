@@ -20,8 +20,9 @@ use crate::model::snapshot::Snapshot;
 use crate::surface::{AgentFacts, Board, InterfaceFacts, SourceKind};
 use replay::Replay;
 
-/// Longest time without looking at commands and the clock.
-const SLICE: Duration = Duration::from_millis(100);
+/// Longest time without looking at commands and the clock. Captured frames and a record ring that
+/// is half full end it earlier; each round costs a wake-up, and on a quiet host nothing else does.
+const SLICE: Duration = Duration::from_millis(250);
 /// How often surfaces get a new snapshot unasked, and how often at most when they ask.
 const PUBLISH: Duration = Duration::from_secs(1);
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);

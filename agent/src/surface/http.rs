@@ -113,8 +113,8 @@ fn router(board: Arc<Board>) -> Router {
         .with_state(Pages { board, exposition })
 }
 
-/// The capture thread looks for askers at least every 100 ms.
-const REFRESH_PATIENCE: Duration = Duration::from_millis(300);
+/// The capture thread looks for askers at least every 250 ms.
+const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
 
 async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response {
     let accepts: Vec<&str> = headers
