@@ -124,12 +124,19 @@ impl LiveSource {
         Ok(source)
     }
 
-    /// Waits for packets, up to `timeout`, and gives the model all there is.
+    /// Waits for packets, up to `timeout` or until `bell` is readable, and gives the model all there
+    /// is.
     ///
     /// # Errors
     /// The kernel refuses to go on.
-    pub fn poll(&mut self, timeout: Duration, observer: &mut Observer) -> Result<(), CaptureError> {
-        let descriptors: Vec<_> = self.taps.iter().flat_map(Tap::descriptors).collect();
+    pub fn poll(
+        &mut self,
+        timeout: Duration,
+        bell: Option<BorrowedFd<'_>>,
+        observer: &mut Observer,
+    ) -> Result<(), CaptureError> {
+        let descriptors = self.taps.iter().flat_map(Tap::descriptors);
+        let descriptors: Vec<_> = descriptors.chain(bell).collect();
         wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let clocks = Clocks::read();
         self.refill(clocks.monotonic);

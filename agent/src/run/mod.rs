@@ -4,6 +4,7 @@
 pub mod replay;
 
 use std::collections::BTreeSet;
+use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
@@ -93,7 +94,14 @@ impl Run {
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
             self.take_orders();
-            let polled = self.source.poll(SLICE, &mut self.observer);
+            let slice = if self.board.is_asked() {
+                PUBLISH_ASKED
+            } else {
+                SLICE
+            };
+            let bell = self.board.bell();
+            let polled = self.source.poll(slice, bell, &mut self.observer);
+            self.board.hear();
             let finished = self.source.is_finished();
             if finished {
                 self.observer.settle();
@@ -170,9 +178,14 @@ impl Source {
         }
     }
 
-    fn poll(&mut self, timeout: Duration, observer: &mut Observer) -> Result<(), RunError> {
+    fn poll(
+        &mut self,
+        timeout: Duration,
+        bell: Option<BorrowedFd<'_>>,
+        observer: &mut Observer,
+    ) -> Result<(), RunError> {
         match self {
-            Self::Live(live) => Ok(live.poll(timeout, observer)?),
+            Self::Live(live) => Ok(live.poll(timeout, bell, observer)?),
             Self::Replay(replay) => replay.poll(timeout, observer).map_err(RunError::Replay),
         }
     }

@@ -3,6 +3,9 @@
 //! A reader takes the latest state, the writer replaces it; neither holds the other up. A reader
 //! may ask for a newer state and wait for it, as long as it has patience.
 
+use std::io::{self, Read as _, Write as _};
+use std::os::fd::{AsFd as _, BorrowedFd};
+use std::os::unix::net::UnixStream;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime};
@@ -25,7 +28,15 @@ pub struct Board {
     reload: ArcSwap<Reload>,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
+    bell: Option<Bell>,
     news: Notify,
+}
+
+/// Wakes the capture thread while it waits for packets.
+#[derive(Debug)]
+struct Bell {
+    ringer: UnixStream,
+    listener: UnixStream,
 }
 
 /// What the capture thread found out.
@@ -89,6 +100,8 @@ impl Board {
             settings: ArcSwap::from_pointee(settings),
             reload: ArcSwap::from_pointee(reload),
             asked: AtomicBool::new(false),
+            // Without one, askers wait until the capture thread looks by itself.
+            bell: Bell::new().ok(),
             news: Notify::new(),
         }
     }
@@ -109,6 +122,19 @@ impl Board {
         self.asked.load(Ordering::Relaxed)
     }
 
+    /// Readable when somebody has asked since [`Self::hear`].
+    #[must_use]
+    pub fn bell(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.bell.as_ref()?.listener.as_fd())
+    }
+
+    /// Silences the bell. Whether somebody waits is still told by [`Self::is_asked`].
+    pub fn hear(&self) {
+        if let Some(bell) = &self.bell {
+            let _ = (&bell.listener).read(&mut [0; 64]);
+        }
+    }
+
     /// Asks for a newer state and waits for it, but no longer than `patience`: counters that a
     /// scrape reads should be those of its moment, or rates over short windows would be off.
     pub async fn refresh(&self, patience: Duration) {
@@ -117,6 +143,10 @@ impl Board {
             return;
         }
         self.asked.store(true, Ordering::Relaxed);
+        if let Some(bell) = &self.bell {
+            // A full pipe has been rung often enough.
+            let _ = (&bell.ringer).write(&[1]);
+        }
         // Late or not: what is on the board is shown, with its age.
         let _ = tokio::time::timeout(patience, news).await;
     }
@@ -156,6 +186,15 @@ impl Board {
     #[must_use]
     pub fn reload(&self) -> Reload {
         **self.reload.load()
+    }
+}
+
+impl Bell {
+    fn new() -> io::Result<Self> {
+        let (ringer, listener) = UnixStream::pair()?;
+        ringer.set_nonblocking(true)?;
+        listener.set_nonblocking(true)?;
+        Ok(Self { ringer, listener })
     }
 }
 
@@ -254,6 +293,22 @@ mod tests {
         tokio::join!(board.refresh(Duration::from_secs(3600)), writer);
         assert!(board.state().snapshot.is_some() && !board.is_asked());
         board.refresh(Duration::from_millis(1)).await;
+    }
+
+    #[tokio::test]
+    async fn asking_rings_the_bell_until_it_is_heard() {
+        let board = Board::new(SourceKind::Live, Settings::default());
+        let rings = || {
+            let mut listener = &board.bell.as_ref().unwrap().listener;
+            listener.read(&mut [0; 1]).is_ok()
+        };
+        assert!(!rings());
+        for _ in 0..3 {
+            board.refresh(Duration::ZERO).await;
+        }
+        assert!(rings());
+        board.hear();
+        assert!(!rings() && board.is_asked());
     }
 
     #[test]

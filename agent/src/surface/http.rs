@@ -113,7 +113,7 @@ fn router(board: Arc<Board>) -> Router {
         .with_state(Pages { board, exposition })
 }
 
-/// The capture thread looks for askers at least every 250 ms.
+/// The capture thread hears the bell at once, unless it has a flood of packets to read.
 const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
 
 async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response {
