@@ -504,9 +504,11 @@ fn a_sample_in_many_datagrams_is_one_record_and_a_hole_ends_it() {
 
 #[test]
 fn a_sender_that_moves_to_another_cpu_leaves_no_fragments_behind() {
-    if std::thread::available_parallelism().unwrap().get() < 2 {
-        return; // nowhere to move to
-    }
+    let cpus = std::thread::available_parallelism().unwrap().get();
+    assert!(
+        cpus >= 2,
+        "with one CPU there is nowhere to move to: run this on two"
+    );
     let writer = Guid::new(GuidPrefix(*b"\x01\x12wanderers!"), EntityId([0, 0, 1, 3]));
     let mut kernel = Kernel::load();
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
