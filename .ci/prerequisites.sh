@@ -133,7 +133,7 @@ for need; do
         rust
         ;;
     test)
-        packages "${network_tools[@]}" gcc g++ make tshark strace jq \
+        packages "${network_tools[@]}" gcc g++ make tshark systemd \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
         prometheus
         rust
