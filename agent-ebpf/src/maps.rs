@@ -65,7 +65,7 @@ pub static RUNS: HashMap<RunKey, Record> = HashMap::with_max_entries(RUN_CAPACIT
 /// The CPU that last added to a run of a stream: a sender that moves on leaves its run behind.
 #[map]
 pub static RUN_CPUS: LruHashMap<Stream, u32> = LruHashMap::with_max_entries(RUN_CAPACITY, 0);
-/// What user space polls about every 100 ms.
+/// What user space reads a few times a second, or when it is half full.
 #[map]
 pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
 /// By `filter::Counter`.

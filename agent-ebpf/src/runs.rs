@@ -3,7 +3,7 @@
 //! A run begins with a sample's first fragment and ends with its last, or where the next fragment is
 //! missing. Everything else (a retransmission, the rest behind a gap) is written as it comes. When
 //! the sender moves to another CPU in the middle, the run is written and a new one goes on there. A
-//! run that nobody continues is taken out by user space, which looks about ten times a second.
+//! run that nobody continues is taken out by user space, which looks a few times a second.
 
 use aya_ebpf::helpers::bpf_get_smp_processor_id;
 use ros2probe_wire::record::{Record, flag, kind};
@@ -22,6 +22,7 @@ pub fn give(record: &Record, joins: bool) {
         return;
     }
     let Some(keys) = run_keys() else {
+        write(record);
         return;
     };
     copy(&record.writer, &mut keys.here.stream.writer);

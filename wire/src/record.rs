@@ -6,7 +6,7 @@
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
-use crate::guid::{EntityId, Guid, GuidPrefix};
+use crate::guid::{Guid, GuidPrefix};
 use crate::time::RtpsTime;
 
 /// Submessage kinds (RTPS 2.5, 9.4.5.1.1) and the two that only this ABI knows.
@@ -278,18 +278,6 @@ pub enum Verdict {
 #[must_use]
 pub fn guid_words(guid: Guid) -> [u32; 4] {
     zerocopy::transmute!(guid)
-}
-
-/// GUID from the words of [`Record`].
-#[must_use]
-pub fn guid_from_words(words: [u32; 4]) -> Guid {
-    zerocopy::transmute!(words)
-}
-
-/// Entity id from one word of wire bytes.
-#[must_use]
-pub fn entity_from_word(word: u32) -> EntityId {
-    EntityId(word.to_ne_bytes())
 }
 
 #[cfg(test)]
