@@ -25,9 +25,8 @@ use crate::model::ahead::{Ahead, Ready};
 use crate::model::observer::Observer;
 use crate::model::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 
-/// A frame waits this long for its block to fill.
-const RETIRE: Duration = Duration::from_millis(100);
-/// Records younger than this wait, so that frames captured before them are taken in first.
+/// Records younger than this wait, so that frames captured before them are taken in first: a frame
+/// waits up to 100 ms for its block to fill.
 const SETTLE_NANOSECONDS: u64 = 120_000_000;
 /// Fragments of one sample follow each other within microseconds; after this they do not.
 const STALLED_NANOSECONDS: u64 = 60_000_000;
@@ -39,9 +38,6 @@ const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
 const SECOND: u64 = 1_000_000_000;
 const TENTH: u64 = SECOND / 10;
-/// The largest frame, a 64 KiB datagram on loopback, fits twice. A block changes hands when it is
-/// full or [`RETIRE`] old, so the number of blocks is also the time for which we may be held up.
-const BLOCK_BYTES: usize = 128 << 10;
 /// Records taken in at a time: several rings of the built-in size.
 const RECORDS_PER_ROUND: usize = 32_768;
 
@@ -303,8 +299,6 @@ impl LiveSource {
 struct Tap {
     path: Option<PathBuf>,
     ring: Ring,
-    /// Of the ring.
-    blocks: usize,
     filter: Filter,
     interfaces: Interfaces,
     selection: Selection,
@@ -332,19 +326,13 @@ impl Tap {
         for interface in interfaces.iter() {
             filter.accept_interface(interface.index, selection.accepts(&interface.name))?;
         }
-        let blocks = (settings.ring_bytes / BLOCK_BYTES).max(2);
         let ring = Ring::open(
-            ring::Settings {
-                block_size: BLOCK_BYTES,
-                blocks,
-                retire: RETIRE,
-            },
+            ring::Settings::with_memory(settings.ring_bytes),
             Some(filter.program()),
         )?;
         Ok(Self {
             path,
             ring,
-            blocks,
             filter,
             interfaces,
             selection,
@@ -398,7 +386,7 @@ impl Tap {
         // Clears what the socket reports when a link goes down; without, waiting would never wait.
         self.ring.wait(Duration::ZERO)?;
         // No more than the ring holds: a flood must not keep us from everything else.
-        for _ in 0..self.blocks {
+        for _ in 0..self.ring.blocks() {
             let Some(block) = self.ring.block() else {
                 break;
             };

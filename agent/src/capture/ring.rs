@@ -24,8 +24,12 @@ pub use block::{Frames, RingFrame};
 
 /// The kernel wants a frame size in TPACKET_V3 too, but packs frames as tightly as they fit.
 const NOMINAL_FRAME: usize = 2048;
-/// Room for a frame of 64 KiB, its header and the block's.
-const SMALLEST_BLOCK: usize = 128 << 10;
+/// The largest frame, a 64 KiB datagram on loopback, fits with its header and the block's. A block
+/// changes hands when it is full or [`Settings::retire`] old, so the number of blocks is also the
+/// time for which the reader may be held up: small blocks, and many.
+const BLOCK: usize = 128 << 10;
+/// Memory of a ring unless somebody says otherwise.
+const MEMORY: usize = 4 << 20;
 /// Between two looks at a socket that reports an error again and again.
 const ERROR_PAUSE: Duration = Duration::from_millis(10);
 
@@ -42,11 +46,7 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self {
-            block_size: 256 << 10,
-            blocks: 8,
-            retire: Duration::from_millis(60),
-        }
+        Self::with_memory(MEMORY)
     }
 }
 
@@ -54,13 +54,10 @@ impl Settings {
     /// A ring of about this much memory, in blocks that hold the largest frame (64 KiB on `lo`).
     #[must_use]
     pub fn with_memory(bytes: usize) -> Self {
-        let settings = Self::default();
-        let blocks = (bytes / settings.block_size).max(2);
-        let block_size = (bytes / blocks).clamp(SMALLEST_BLOCK, settings.block_size);
         Self {
-            block_size,
-            blocks,
-            ..settings
+            block_size: BLOCK,
+            blocks: (bytes / BLOCK).max(2),
+            retire: Duration::from_millis(100),
         }
     }
 }
@@ -186,6 +183,12 @@ impl Ring {
         };
         bind(&ring.socket, interface)?;
         Ok(ring)
+    }
+
+    /// How many blocks there are.
+    #[must_use]
+    pub const fn blocks(&self) -> usize {
+        self.blocks
     }
 
     /// The next block if the kernel is done with it.

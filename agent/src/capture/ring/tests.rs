@@ -281,12 +281,12 @@ fn impossible_sizes_are_refused() {
 
 #[test]
 fn any_amount_of_memory_makes_a_ring_for_the_largest_frames() {
-    assert_eq!(Settings::with_memory(2 << 20), Settings::default());
+    assert_eq!(Settings::with_memory(4 << 20), Settings::default());
     for (memory, block_size, blocks) in [
         (0, 128 << 10, 2),
-        (300_000, 150_000, 2),
-        (1 << 20, 256 << 10, 4),
-        (16 << 20, 256 << 10, 64),
+        (300_000, 128 << 10, 2),
+        (1 << 20, 128 << 10, 8),
+        (16 << 20, 128 << 10, 128),
     ] {
         let settings = Settings::with_memory(memory);
         assert_eq!((settings.block_size, settings.blocks), (block_size, blocks));
