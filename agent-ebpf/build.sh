@@ -14,7 +14,7 @@ nightly=${NIGHTLY:-nightly}
 
 sources() {
     cat Cargo.toml Cargo.lock build.sh src/*.rs ../wire/Cargo.toml \
-        ../wire/src/{cursor,filter,guid,lib,record,time,walk}.rs
+        ../wire/src/{cursor,filter,guid,host,lib,record,time,walk}.rs
 }
 hash_sources() { sources | sha256sum | cut -d' ' -f1; }
 # Another compiler may order instructions differently without anything being wrong.

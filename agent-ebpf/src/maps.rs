@@ -98,6 +98,8 @@ pub struct Stream {
     pub destination_port: u32,
     /// Interface index, and the highest bit for frames on their way out.
     pub interface: u32,
+    /// Cookie of the receiving or sending socket, where it is known.
+    pub socket: [u32; 2],
 }
 
 /// A stream as one CPU sees it, so that no two CPUs ever add to the same run.

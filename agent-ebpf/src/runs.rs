@@ -29,6 +29,7 @@ pub fn give(record: &Record, joins: bool) {
     copy(&record.destination, &mut keys.here.stream.destination);
     keys.here.stream.destination_port = u32::from(record.destination_port);
     keys.here.stream.interface = record.interface | u32::from(record.flags & flag::OUTGOING) << 29;
+    keys.here.stream.socket = [record.socket as u32, (record.socket >> 32) as u32];
     // SAFETY: no preconditions.
     keys.here.cpu = unsafe { bpf_get_smp_processor_id() } as u32;
     let mut goes_on = false;

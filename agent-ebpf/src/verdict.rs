@@ -99,8 +99,12 @@ pub fn begin(skb: *mut __sk_buff, scratch: &mut Scratch) -> Option<()> {
     record.time = now;
     record.destination = destination;
     record.destination_port = (u32::from_be(ports) & 0xffff) as u16;
+    record.source_port = (u32::from_be(ports) >> 16) as u16;
     record.interface = interface;
     record.datagram = 0;
+    record.socket = 0;
+    record.elapsed = 0;
+    record.unused = 0;
     record.flags = flags;
     scratch.walk.begin(source, udp_len - 8);
     if let Some(last) = PARTICIPANTS.get_ptr_mut(source) {

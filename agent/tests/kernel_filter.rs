@@ -110,14 +110,16 @@ impl UserSpace {
         };
         match parsed.payload {
             Payload::Datagram(udp) => {
-                envelope.destination_port = udp.destination_port;
+                (envelope.source_port, envelope.destination_port) =
+                    (udp.source_port, udp.destination_port);
                 datagram(udp.payload, &envelope);
             }
             Payload::Fragment(fragment) => {
                 let at = ros2probe_wire::Timestamp(packet.time);
                 let key = FlowKey::new(0, program_run::INTERFACE, false, &parsed, &fragment);
                 if let Some(whole) = self.reassembly.fragment(at, key, &fragment) {
-                    envelope.destination_port = whole.destination_port;
+                    (envelope.source_port, envelope.destination_port) =
+                        (whole.source_port, whole.destination_port);
                     envelope.fragmented = true;
                     datagram(whole.payload(), &envelope);
                 }
@@ -182,6 +184,7 @@ fn comparable(record: Record) -> Record {
     Record {
         time: 0,
         datagram: 0,
+        elapsed: 0,
         flags: record.flags & !flag::AHEAD,
         ..record
     }

@@ -20,6 +20,7 @@ pub mod entities;
 pub mod filter;
 pub mod frame;
 pub mod guid;
+pub mod host;
 #[cfg(feature = "alloc")]
 pub mod names;
 pub mod parameters;

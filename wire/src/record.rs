@@ -27,6 +27,9 @@ pub mod kind {
     /// Not a submessage: from `offset` on, user space has to walk this fragmented datagram itself;
     /// its remaining IP fragments are captured. See [`super::Record::handover`].
     pub const HANDOVER: u8 = 0xf1;
+    /// Not a submessage: the captured datagram [`super::Record::datagram`] was not delivered to
+    /// [`super::Record::socket`], which had no room for it.
+    pub const UNDELIVERED: u8 = 0xf2;
 }
 
 /// Bits of [`Record::flags`].
@@ -45,9 +48,20 @@ pub mod flag {
     pub const INLINE_QOS_UNREAD: u16 = 1 << 4;
     /// `stamp_seconds` and `stamp_nanoseconds` hold the payload's bytes 4..12.
     pub const STAMP: u16 = 1 << 5;
+    /// Seen at a socket of this host, as a whole datagram, not on an interface: on its way out
+    /// with [`OUTGOING`], otherwise on its way into the receive buffer of
+    /// [`super::Record::socket`].
+    pub const HOST: u16 = 1 << 6;
+    /// A copy of a record of the same time: the socket had no room, the datagram was not delivered
+    /// to it. DATA and DATA_FRAG only.
+    pub const NO_ROOM: u16 = 1 << 7;
+    /// The datagram never became complete: the kernel gave up waiting for IP fragments. Written
+    /// when it does (`net.ipv4.ipfrag_time`, 30 s), for what its first fragment shows. DATA and
+    /// DATA_FRAG only; `socket` is 0.
+    pub const NOT_REASSEMBLED: u16 = 1 << 8;
 }
 
-/// One submessage of one writer or reader. 120 bytes.
+/// One submessage of one writer or reader. 136 bytes.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
@@ -100,9 +114,18 @@ pub struct Record {
     pub sample_size: u32,
     /// DATA, DATA_FRAG: PID_STATUS_INFO of the inline QoS, 0 = alive. GAP, ACKNACK: bitmap word 4.
     pub status_info: u32,
+    /// Cookie of the socket that receives or sends the datagram (`SO_COOKIE`); 0 = unknown.
+    pub socket: u64,
+    /// DATA_FRAG: nanoseconds from the first datagram that this record speaks for to the last, which
+    /// is at `time`; `u32::MAX` = that or more.
+    pub elapsed: u32,
+    /// Source UDP port; 0 = unknown.
+    pub source_port: u16,
+    /// Zero.
+    pub unused: u16,
 }
 
-const _: () = assert!(size_of::<Record>() == 120 && align_of::<Record>() == 8);
+const _: () = assert!(size_of::<Record>() == 136 && align_of::<Record>() == 8);
 
 impl Record {
     /// Sequence numbers a GAP's or ACKNACK's bitmap can hold in a record; longer sets (up to 256)
@@ -169,6 +192,7 @@ impl Record {
             && self.reader[1] == next.reader[1]
             && self.reader[0] == next.reader[0]
             && self.status_info == next.status_info
+            && self.socket == next.socket
             && (self.flags ^ next.flags) & !OF_THE_DATAGRAM == 0
     }
 
@@ -180,6 +204,12 @@ impl Record {
         if !self.is_followed_by(next) || count > 0xffff {
             return false;
         }
+        let elapsed = next.time.saturating_sub(self.time) + self.elapsed as u64;
+        self.elapsed = if elapsed > u32::MAX as u64 {
+            u32::MAX
+        } else {
+            elapsed as u32
+        };
         self.time = next.time;
         self.fragments = count << 16 | self.fragment_size();
         self.payload_len = self.payload_len.wrapping_add(next.payload_len);
@@ -307,6 +337,7 @@ mod tests {
         assert!(run.ends_sample());
         assert_eq!((run.fragment_start, run.fragments_in_submessage()), (1, 11));
         assert_eq!((run.time, run.payload_len), (300, 11 * 1344));
+        assert_eq!(run.elapsed, 200);
     }
 
     #[test]
@@ -329,6 +360,10 @@ mod tests {
             },
             Record {
                 flags: flag::OUTGOING,
+                ..fragments(6, 5, 1)
+            },
+            Record {
+                socket: 1,
                 ..fragments(6, 5, 1)
             },
             Record {

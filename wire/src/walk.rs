@@ -270,7 +270,7 @@ fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
     record.reader = [destination[0], destination[1], destination[2], reader];
     record.kind = id as u8;
     record.submessage_flags = flags as u8;
-    record.flags &= flag::FRAGMENTED | flag::OUTGOING | flag::IPV6;
+    record.flags &= flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
     let zero = zero();
     record.source_timestamp = u64::from(zero);
     record.payload_len = zero;
@@ -555,6 +555,12 @@ pub struct Envelope {
     pub outgoing: bool,
     /// Came in several IP fragments.
     pub fragmented: bool,
+    /// Source UDP port, 0 = unknown.
+    pub source_port: u16,
+    /// Cookie of the socket that it was seen at; 0 = unknown.
+    pub socket: u64,
+    /// Seen at a socket, not on an interface.
+    pub host: bool,
 }
 
 impl Envelope {
@@ -568,6 +574,8 @@ impl Envelope {
             interface: record.interface,
             outgoing: record.flags & flag::OUTGOING != 0,
             fragmented: true,
+            source_port: record.source_port,
+            ..Self::default()
         }
     }
 
@@ -584,11 +592,16 @@ impl Envelope {
         if !self.destination.starts_with(&IPV4_MAPPED) {
             flags |= flag::IPV6;
         }
+        if self.host {
+            flags |= flag::HOST;
+        }
         Record {
             time: self.time,
             destination: zerocopy::transmute!(self.destination),
             destination_port: self.destination_port,
             interface: self.interface,
+            source_port: self.source_port,
+            socket: self.socket,
             flags,
             ..Record::default()
         }

@@ -68,9 +68,9 @@ impl Feed {
         };
         match packet.payload {
             Payload::Datagram(datagram) => {
-                let destination_port = datagram.destination_port;
                 let envelope = Envelope {
-                    destination_port,
+                    source_port: datagram.source_port,
+                    destination_port: datagram.destination_port,
                     ..envelope
                 };
                 give(observer, &envelope, datagram.payload, datagram.length);
@@ -79,9 +79,9 @@ impl Feed {
                 let key = FlowKey::new(0, interface, outgoing, &packet, &fragment);
                 let whole = self.reassembly.fragment(captured.time, key, &fragment);
                 if let Some(whole) = whole {
-                    let destination_port = whole.destination_port;
                     let envelope = Envelope {
-                        destination_port,
+                        source_port: whole.source_port,
+                        destination_port: whole.destination_port,
                         fragmented: true,
                         ..envelope
                     };

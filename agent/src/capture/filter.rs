@@ -20,8 +20,8 @@ static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/fi
 #[repr(align(8))]
 struct Aligned<T: ?Sized>(T);
 
-/// The kernel filter's key of a run: writer, destination, port, interface, CPU.
-type RunKey = [u32; 11];
+/// The kernel filter's key of a run: writer, destination, port, interface, socket, CPU.
+type RunKey = [u32; 13];
 
 /// Why the filter is not running.
 #[derive(Debug, thiserror::Error)]
@@ -77,7 +77,7 @@ pub struct Filter {
     interfaces: HashMap<MapData, u32, u32>,
     budget: Array<MapData, i64>,
     /// Values are [`Record`]s.
-    runs: HashMap<MapData, RunKey, [u64; 15]>,
+    runs: HashMap<MapData, RunKey, [u64; 17]>,
     counters: PerCpuArray<MapData, u64>,
     records: RingBuf<MapData>,
 }

@@ -495,7 +495,8 @@ impl Intake {
         };
         match &packet.payload {
             Payload::Datagram(udp) => {
-                envelope.destination_port = udp.destination_port;
+                (envelope.source_port, envelope.destination_port) =
+                    (udp.source_port, udp.destination_port);
                 take_in_frame(&envelope, udp.payload, clocks, &mut self.order, observer);
             }
             Payload::Fragment(fragment) => {
@@ -508,7 +509,8 @@ impl Intake {
                     let ready = |each| take_in(each, observer);
                     self.ahead.rest(self.number, whole, ready);
                 } else {
-                    envelope.destination_port = whole.destination_port;
+                    (envelope.source_port, envelope.destination_port) =
+                        (whole.source_port, whole.destination_port);
                     envelope.fragmented = true;
                     let payload = whole.payload();
                     take_in_frame(&envelope, payload, clocks, &mut self.order, observer);

@@ -355,7 +355,7 @@ fn handed_over(flow: &Flow, transport: Vec<u8>, record: &Record) -> Reassembled 
         length: u32::from(record.datagram_len),
         first_seen: flow.first_seen,
         last_seen: flow.last_seen,
-        source_port: 0,
+        source_port: record.source_port,
         destination_port: record.destination_port,
     }
 }
