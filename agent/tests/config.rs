@@ -69,6 +69,8 @@ fn the_shipped_file_measures_everything_and_changes_nothing_else() {
 fn the_defaults_in_the_comments_are_the_defaults() {
     let yaml = uncommented(&shipped("ros2probe.yaml"));
     for key in [
+        "source",
+        "mirror_interfaces",
         "reassembly_bytes",
         "record_ring_bytes",
         "exclude",
@@ -118,6 +120,8 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
         "limits: {topics: 1.5}",
         "metrics: {listen: 17400}",
         "log: loud",
+        "capture: {source: socket}",
+        "watch: [{topic: /a, per_subscriber: 1}]",
         "topic_grace_s: -1",
     ] {
         assert!(

@@ -132,6 +132,7 @@ fn watchlist(patterns: &[&str]) -> Watchlist {
         pattern: (*pattern).to_owned(),
         domain_id: None,
         expectations: Expectations::default(),
+        per_subscriber: false,
     };
     Watchlist::new(patterns.iter().map(watch).collect()).unwrap()
 }
@@ -666,6 +667,7 @@ fn expectations_are_judged_in_the_sources_time() {
         pattern: "/chatter".to_owned(),
         domain_id: None,
         expectations,
+        per_subscriber: false,
     };
     world
         .observer

@@ -12,7 +12,7 @@ use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{CaptureShape, ConfigShape, MetricsShape, WatchEntryShape, WatchShape};
 use super::watch::{Expectations, Watch, check_pattern};
-use super::{CaptureSettings, Config, Limits, MetricsSettings};
+use super::{CaptureSettings, Config, Limits, MetricsSettings, SourceChoice};
 
 /// A watchlist that long should be globs.
 const MAX_WATCHES: usize = 1_000;
@@ -88,7 +88,7 @@ impl Reader {
                 unknown_writers: limits.unknown_writers,
                 reassembly_bytes: limits.reassembly_bytes,
             },
-            capture: capture(shape.capture.unwrap_or_default()),
+            capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(&shape.metrics.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             log: shape.log,
@@ -112,6 +112,7 @@ impl Reader {
                     pattern,
                     domain_id: None,
                     expectations: Expectations::default(),
+                    per_subscriber: false,
                 },
                 WatchShape::Entry(entry) => self.entry(&key, *entry),
             };
@@ -145,6 +146,66 @@ impl Reader {
                 max_latency_ms: entry.max_latency_ms,
                 max_silence_s: entry.max_silence_s,
             },
+            per_subscriber: entry.per_subscriber,
+        }
+    }
+
+    fn capture(&mut self, shape: CaptureShape) -> CaptureSettings {
+        let interfaces = shape.interfaces.unwrap_or_default();
+        let namespaces = shape.network_namespaces.unwrap_or_default();
+        let settings = CaptureSettings {
+            source: shape.source,
+            cgroup: shape.cgroup.map(PathBuf::from),
+            mirror_interfaces: shape.mirror_interfaces.unwrap_or_default(),
+            include_interfaces: interfaces.include.unwrap_or_default(),
+            exclude_interfaces: interfaces.exclude.unwrap_or_default(),
+            network_namespaces: namespaces.into_iter().map(PathBuf::from).collect(),
+            ring_bytes: shape.ring_bytes,
+            record_ring_bytes: shape.record_ring_bytes,
+        };
+        self.check_source(&settings);
+        settings
+    }
+
+    /// Keys that have a meaning for one source alone.
+    fn check_source(&mut self, settings: &CaptureSettings) {
+        let set = |keys: [(&'static str, bool); 2]| {
+            let set = keys.into_iter().filter(|(_, set)| *set);
+            set.map(|(key, _)| key).collect::<Vec<_>>()
+        };
+        let of_wire = set([
+            (
+                "interfaces.include",
+                !settings.include_interfaces.is_empty(),
+            ),
+            (
+                "interfaces.exclude",
+                !settings.exclude_interfaces.is_empty(),
+            ),
+        ]);
+        let of_host = set([
+            ("cgroup", settings.cgroup.is_some()),
+            ("mirror_interfaces", !settings.mirror_interfaces.is_empty()),
+        ]);
+        for key in &of_wire {
+            let message = match (settings.source, of_host.first()) {
+                (SourceChoice::Host, _) => {
+                    "selects frames on a wire, which `source: host` does not look at; use \
+                     mirror_interfaces or `source: wire`"
+                        .to_owned()
+                }
+                (SourceChoice::Auto, Some(other)) => {
+                    format!("makes the wire the source, for which {other} has no meaning")
+                }
+                _ => continue,
+            };
+            self.wrong(&format!("capture.{key}"), message);
+        }
+        if settings.source == SourceChoice::Wire {
+            for key in of_host {
+                let message = "has no meaning for `source: wire`";
+                self.wrong(&format!("capture.{key}"), message);
+            }
         }
     }
 }
@@ -153,13 +214,18 @@ impl Reader {
 pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
     match without_indices(key).as_str() {
         "watch[]" | "watch[].topic" => check_pattern(text).map_err(|error| error.to_string()),
-        "capture.interfaces.include[]" | "capture.interfaces.exclude[]" => {
+        "capture.interfaces.include[]"
+        | "capture.interfaces.exclude[]"
+        | "capture.mirror_interfaces[]" => {
             if text.is_empty() || text.contains(|c: char| c.is_whitespace() || c == '/') {
                 return Err("must be an interface name or glob, as in `eth*`".to_owned());
             }
             Glob::new(text)
                 .map(|_| ())
                 .map_err(|error| error.kind().to_string())
+        }
+        "capture.cgroup" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/sys/fs/cgroup/robot.slice`".to_owned())
         }
         "capture.network_namespaces[]" if !text.starts_with('/') => {
             Err("must be an absolute path, as in `/run/netns/robot`".to_owned())
@@ -181,18 +247,6 @@ fn without_indices(key: &str) -> String {
         shown
     };
     key.chars().filter(|c| shown(*c)).collect()
-}
-
-fn capture(shape: CaptureShape) -> CaptureSettings {
-    let interfaces = shape.interfaces.unwrap_or_default();
-    let namespaces = shape.network_namespaces.unwrap_or_default();
-    CaptureSettings {
-        include_interfaces: interfaces.include.unwrap_or_default(),
-        exclude_interfaces: interfaces.exclude.unwrap_or_default(),
-        network_namespaces: namespaces.into_iter().map(PathBuf::from).collect(),
-        ring_bytes: shape.ring_bytes,
-        record_ring_bytes: shape.record_ring_bytes,
-    }
 }
 
 fn metrics(shape: &MetricsShape) -> MetricsSettings {
@@ -305,6 +359,50 @@ watch:
     }
 
     #[test]
+    fn what_belongs_to_the_other_source_is_a_mistake() {
+        let source = "\
+capture:
+  source: host
+  cgroup: robot.slice
+  interfaces: {include: [eth0], exclude: []}
+";
+        assert_eq!(
+            report(source),
+            "f:3:11: capture.cgroup: must be an absolute path, as in `/sys/fs/cgroup/robot.slice`"
+        );
+        let source = source.replace("robot.slice", "/cg");
+        assert_eq!(
+            report(&source),
+            "f:4:25: capture.interfaces.include: selects frames on a wire, which `source: host` \
+             does not look at; use mirror_interfaces or `source: wire`"
+        );
+        assert_eq!(
+            report(&source.replace("host", "auto")),
+            "f:4:25: capture.interfaces.include: makes the wire the source, for which cgroup has \
+             no meaning"
+        );
+        assert_eq!(
+            report("capture: {source: wire, mirror_interfaces: [mirror0], cgroup: /cg}"),
+            "f:1:44: capture.mirror_interfaces: has no meaning for `source: wire`\n\
+             f:1:63: capture.cgroup: has no meaning for `source: wire`"
+        );
+        assert_eq!(
+            report("capture: {source: both, mirror_interfaces: ['a b']}"),
+            "f:1:19: capture.source: is the text `both`, must be one of auto, host, wire\n\
+             f:1:45: capture.mirror_interfaces[0]: must be an interface name or glob, as in `eth*`"
+        );
+        for good in [
+            "capture: {source: host, mirror_interfaces: [mirror*], cgroup: /sys/fs/cgroup/robot}",
+            "capture: {source: wire, interfaces: {include: [eth0]}}",
+            "capture: {interfaces: {exclude: [docker*]}}",
+            "capture: {mirror_interfaces: [eth1]}",
+            "capture: {source: wire, mirror_interfaces: [], cgroup: }",
+        ] {
+            assert_eq!(report(good), "", "{good}");
+        }
+    }
+
+    #[test]
     fn a_key_that_is_called_otherwise_is_named() {
         assert_eq!(
             report("watchlist: []"),
@@ -377,9 +475,10 @@ watch:
 watch:
   - /tf
   - {topic: /points, domain: 5, min_rate_hz: 18, max_rate_hz: 22.5, max_loss_ratio: 0.01,
-     max_latency_ms: 50, max_silence_s: 1}
+     max_latency_ms: 50, max_silence_s: 1, per_subscriber: true}
 limits: {topics: 5, participants: 6, endpoints: 7, unknown_writers: 8, reassembly_bytes: 65536}
 capture:
+  source: wire
   interfaces: {include: [eth*], exclude: [docker0]}
   network_namespaces: [/run/netns/a]
   ring_bytes: 4194304
@@ -395,6 +494,8 @@ log: debug
             ("/points", Some(5))
         );
         assert_eq!(points.expectations.max_rate_hz, Some(22.5));
+        assert!(points.per_subscriber && !config.watches.first().unwrap().per_subscriber);
+        assert_eq!(config.capture.source, SourceChoice::Wire);
         assert_eq!(config.limits.unknown_writers, 8);
         assert_eq!(config.capture.exclude_interfaces, ["docker0"]);
         assert_eq!(config.metrics.listen, None);

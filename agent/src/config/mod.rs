@@ -59,6 +59,12 @@ pub struct Limits {
 /// Where packets come from and the memory used for it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CaptureSettings {
+    /// At the sockets of this host, or on the wire.
+    pub source: SourceChoice,
+    /// Only sockets of this cgroup; `None` = the whole host.
+    pub cgroup: Option<PathBuf>,
+    /// Interface globs whose wire is looked at besides the host's sockets.
+    pub mirror_interfaces: Vec<String>,
     /// Interface globs to look at; empty = all.
     pub include_interfaces: Vec<String>,
     /// Interface globs never looked at.
@@ -69,6 +75,19 @@ pub struct CaptureSettings {
     pub ring_bytes: usize,
     /// Ring for measurement records.
     pub record_ring_bytes: usize,
+}
+
+/// Where the agent looks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum SourceChoice {
+    /// `host` where the kernel and the configuration allow it, otherwise `wire`.
+    #[default]
+    Auto,
+    /// Datagrams at the sockets of this host: whole, once per socket, in every container.
+    Host,
+    /// Frames on the interfaces.
+    Wire,
 }
 
 /// The metrics surface.
@@ -194,6 +213,9 @@ impl Default for Config {
                 reassembly_bytes: defaults::REASSEMBLY_BYTES,
             },
             capture: CaptureSettings {
+                source: SourceChoice::default(),
+                cgroup: None,
+                mirror_interfaces: Vec::new(),
                 include_interfaces: Vec::new(),
                 exclude_interfaces: Vec::new(),
                 network_namespaces: Vec::new(),
@@ -207,6 +229,18 @@ impl Default for Config {
             },
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             log: Level::default(),
+        }
+    }
+}
+
+impl SourceChoice {
+    /// As written in the file.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Host => "host",
+            Self::Wire => "wire",
         }
     }
 }

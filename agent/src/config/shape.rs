@@ -6,7 +6,7 @@
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::{Level, defaults};
+use super::{Level, SourceChoice, defaults};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
@@ -51,6 +51,10 @@ pub(super) struct WatchEntryShape {
     /// Only in this domain; every domain when left out.
     #[schemars(range(min = 0, max = 232))]
     pub(super) domain: Option<u32>,
+    /// Series per delivery of each covered topic (what each writer sends where, what each
+    /// subscriber received), besides those per topic.
+    #[serde(default)]
+    pub(super) per_subscriber: bool,
     /// At least this many messages a second.
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) min_rate_hz: Option<f64>,
@@ -95,9 +99,18 @@ pub(super) struct LimitsShape {
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct CaptureShape {
-    /// Which interfaces are looked at.
+    /// At the sockets of this host, or on the wire.
+    pub(super) source: SourceChoice,
+    /// Only the sockets of this cgroup (v2) and those below it, by absolute path; every socket of
+    /// the host when left out. Not with `source: wire`.
+    pub(super) cgroup: Option<String>,
+    /// Interfaces (names or globs) whose wire is looked at besides the host's sockets, for traffic
+    /// that no local socket receives: a mirror port, a gateway. Not with `source: wire`.
+    pub(super) mirror_interfaces: Option<Vec<String>>,
+    /// Which interfaces are looked at on the wire. Naming any rules out `source: host`.
     pub(super) interfaces: Option<InterfacesShape>,
-    /// Further network namespaces to look into, by path (`/run/netns/robot`). Needs CAP_SYS_ADMIN.
+    /// Further network namespaces to look into on the wire, by path (`/run/netns/robot`). Needs
+    /// CAP_SYS_ADMIN. The host's sockets are seen in all of them.
     pub(super) network_namespaces: Option<Vec<String>>,
     /// Packet ring of each network namespace, in bytes.
     #[schemars(range(min = 262_144, max = 1_073_741_824))]
@@ -146,6 +159,9 @@ impl Default for LimitsShape {
 impl Default for CaptureShape {
     fn default() -> Self {
         Self {
+            source: SourceChoice::default(),
+            cgroup: None,
+            mirror_interfaces: None,
             interfaces: None,
             network_namespaces: None,
             ring_bytes: defaults::RING_BYTES,

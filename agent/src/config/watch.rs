@@ -12,6 +12,8 @@ pub struct Watch {
     pub domain_id: Option<u32>,
     /// What should hold.
     pub expectations: Expectations,
+    /// Series per delivery.
+    pub per_subscriber: bool,
 }
 
 /// Limits on a topic; `None` = no opinion.
@@ -67,6 +69,7 @@ impl Watch {
             pattern,
             domain_id: None,
             expectations: Expectations::default(),
+            per_subscriber: false,
         })
     }
 
