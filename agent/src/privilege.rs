@@ -1,4 +1,4 @@
-//! What the agent may do: which capabilities live capture needs, and giving up the rest once
+//! What the agent may do: which capabilities each source needs, and giving up the rest once
 //! sockets and BPF programs are open.
 
 use std::fmt;
@@ -6,11 +6,18 @@ use std::fmt;
 use caps::errors::CapsError;
 use caps::{CapSet, Capability, CapsHashSet};
 
-use crate::config::CaptureSettings;
+use crate::config::{CaptureSettings, SourceChoice};
 
-/// Packet sockets; the kernel filter; tracing helpers and the verifier's leave to skip Spectre
-/// barriers, without which 5.15 to 6.8 refuse the filter.
-const LIVE: [Capability; 3] = [
+/// Attaching programs to a cgroup (`CAP_NET_ADMIN`); loading them; tracepoints, iterators and the
+/// verifier's leave to skip Spectre barriers, without which 5.15 to 6.8 refuse the filter.
+const HOST: [Capability; 3] = [
+    Capability::CAP_NET_ADMIN,
+    Capability::CAP_BPF,
+    Capability::CAP_PERFMON,
+];
+
+/// Packet sockets (`CAP_NET_RAW`); the rest as for the host's sockets.
+const WIRE: [Capability; 3] = [
     Capability::CAP_NET_RAW,
     Capability::CAP_BPF,
     Capability::CAP_PERFMON,
@@ -18,14 +25,20 @@ const LIVE: [Capability; 3] = [
 
 /// Live capture is not possible for lack of these.
 #[derive(Debug, PartialEq, Eq)]
-pub struct Missing(Vec<Capability>);
+pub struct Missing {
+    /// Each source that would do, with what it lacks.
+    sources: Vec<(SourceChoice, Vec<Capability>)>,
+    /// What grants everything that the configuration can make use of.
+    grant: Vec<Capability>,
+}
 
 /// Why privileges could not be given up.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot give up privileges: {0}")]
 pub struct DropError(CapsError);
 
-/// Looks for what capturing as `settings` say needs.
+/// Looks for what capturing as `settings` say needs. Where the choice of the source is the
+/// agent's, having what one of them needs is enough.
 ///
 /// # Errors
 /// The capabilities that are not effective. When they cannot be read, opening the sockets will tell.
@@ -33,25 +46,46 @@ pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     let Ok(effective) = caps::read(None, CapSet::Effective) else {
         return Ok(());
     };
-    let missing = missing(&effective, !settings.network_namespaces.is_empty());
-    if missing.is_empty() {
-        Ok(())
-    } else {
-        Err(Missing(missing))
-    }
+    missing(&effective, settings).map_or(Ok(()), Err)
 }
 
-fn missing(effective: &CapsHashSet, namespaces: bool) -> Vec<Capability> {
-    // The old, wider capability still counts for both of its successors.
+fn missing(effective: &CapsHashSet, settings: &CaptureSettings) -> Option<Missing> {
+    // The old, wider capability still counts for its successors.
     let admin = effective.contains(&Capability::CAP_SYS_ADMIN);
     let has = |capability: &Capability| {
-        effective.contains(capability) || (admin && *capability != Capability::CAP_NET_RAW)
+        let inherited = matches!(capability, Capability::CAP_BPF | Capability::CAP_PERFMON);
+        effective.contains(capability) || (admin && inherited)
     };
-    let entering = namespaces.then_some(Capability::CAP_SYS_ADMIN);
-    LIVE.into_iter()
-        .chain(entering)
-        .filter(|capability| !has(capability))
-        .collect()
+    let mut sources = Vec::new();
+    let mut grant = Vec::new();
+    for (source, needed) in candidates(settings) {
+        let lacking = needed.iter().copied().filter(|one| !has(one)).collect();
+        sources.push((source, lacking));
+        let new = needed.into_iter().filter(|one| !grant.contains(one));
+        grant.extend(new.collect::<Vec<_>>());
+    }
+    let able = |(_, lacking): &(_, Vec<_>)| lacking.is_empty();
+    (!sources.iter().any(able)).then_some(Missing { sources, grant })
+}
+
+/// The sources that `settings` allow, each with what it needs.
+fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)> {
+    let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
+    let mirrors = !settings.mirror_interfaces.is_empty();
+    let entering = (!settings.network_namespaces.is_empty()).then_some(Capability::CAP_SYS_ADMIN);
+    let wire = || WIRE.into_iter().chain(entering).collect();
+    let host = || {
+        let packets = [Some(Capability::CAP_NET_RAW), entering];
+        let packets = packets.into_iter().flatten().filter(|_| mirrors);
+        HOST.into_iter().chain(packets).collect()
+    };
+    match settings.source {
+        SourceChoice::Host => vec![(SourceChoice::Host, host())],
+        SourceChoice::Auto if !named => {
+            vec![(SourceChoice::Host, host()), (SourceChoice::Wire, wire())]
+        }
+        SourceChoice::Auto | SourceChoice::Wire => vec![(SourceChoice::Wire, wire())],
+    }
 }
 
 /// Gives up every capability but `CAP_BPF`, which later changes of the filter's maps need where
@@ -81,24 +115,23 @@ pub fn give_up() -> Result<(), DropError> {
 
 impl fmt::Display for Missing {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let names: Vec<String> = self.0.iter().map(Capability::to_string).collect();
-        let grant: Vec<String> = LIVE
+        let needs: Vec<String> = self
+            .sources
             .iter()
-            .chain(
-                self.0
-                    .iter()
-                    .filter(|capability| !LIVE.contains(capability)),
-            )
-            .map(|capability| capability.to_string().to_lowercase())
+            .map(|(source, lacking)| {
+                let names: Vec<String> = lacking.iter().map(Capability::to_string).collect();
+                format!("{} for the source `{}`", names.join(", "), source.label())
+            })
             .collect();
+        let grant = self.grant.iter().map(|one| one.to_string().to_lowercase());
         let program = std::env::current_exe();
         let program = program.map_or_else(|_| "rp".to_owned(), |path| path.display().to_string());
         write!(
             f,
             "live capture needs {}: run `sudo setcap {}+ep {program}`, use sudo, or start the \
              service ros2probe",
-            names.join(", "),
-            grant.join(","),
+            needs.join(", or "),
+            grant.collect::<Vec<_>>().join(","),
         )
     }
 }
@@ -107,30 +140,82 @@ impl std::error::Error for Missing {}
 
 #[cfg(test)]
 mod tests {
+    use std::path::PathBuf;
+
     use super::*;
+    use crate::config::Config;
 
     fn set(capabilities: &[Capability]) -> CapsHashSet {
         capabilities.iter().copied().collect()
     }
 
-    #[test]
-    fn three_capabilities_are_enough_for_this_host() {
-        assert_eq!(missing(&set(&LIVE), false), []);
-        assert_eq!(missing(&set(&LIVE), true), [Capability::CAP_SYS_ADMIN]);
-        assert_eq!(missing(&set(&[]), false), LIVE);
-        let old = set(&[Capability::CAP_NET_RAW, Capability::CAP_SYS_ADMIN]);
-        assert_eq!(missing(&old, true), []);
+    fn settings(source: SourceChoice) -> CaptureSettings {
+        CaptureSettings {
+            source,
+            ..Config::default().capture
+        }
+    }
+
+    fn lacks(has: &[Capability], settings: &CaptureSettings) -> Vec<Vec<Capability>> {
+        let missing = missing(&set(has), settings);
+        let sources = missing.map_or_else(Vec::new, |missing| missing.sources);
+        sources.into_iter().map(|(_, lacking)| lacking).collect()
     }
 
     #[test]
-    fn the_message_names_what_is_missing_and_the_command_that_grants_it() {
-        let message = Missing(vec![Capability::CAP_BPF]).to_string();
+    fn three_capabilities_are_enough_for_either_source() {
+        let nothing: [Vec<Capability>; 0] = [];
+        let auto = settings(SourceChoice::Auto);
+        assert_eq!(lacks(&HOST, &settings(SourceChoice::Host)), nothing);
+        assert_eq!(lacks(&WIRE, &settings(SourceChoice::Wire)), nothing);
+        assert_eq!(lacks(&HOST, &auto), nothing);
+        assert_eq!(lacks(&WIRE, &auto), nothing);
+        assert_eq!(lacks(&[], &auto), [HOST, WIRE]);
+        assert_eq!(
+            lacks(&WIRE, &settings(SourceChoice::Host)),
+            [[Capability::CAP_NET_ADMIN]]
+        );
+        assert_eq!(
+            lacks(&HOST, &settings(SourceChoice::Wire)),
+            [[Capability::CAP_NET_RAW]]
+        );
+    }
+
+    #[test]
+    fn what_the_configuration_asks_for_beyond_that_is_needed_too() {
+        let named = CaptureSettings {
+            include_interfaces: vec!["eth0".to_owned()],
+            ..settings(SourceChoice::Auto)
+        };
+        assert_eq!(lacks(&HOST, &named), [[Capability::CAP_NET_RAW]]);
+        let mirroring = CaptureSettings {
+            mirror_interfaces: vec!["mirror0".to_owned()],
+            ..settings(SourceChoice::Host)
+        };
+        assert_eq!(lacks(&HOST, &mirroring), [[Capability::CAP_NET_RAW]]);
+        let entering = CaptureSettings {
+            network_namespaces: vec![PathBuf::from("/run/netns/a")],
+            ..settings(SourceChoice::Wire)
+        };
+        assert_eq!(lacks(&WIRE, &entering), [[Capability::CAP_SYS_ADMIN]]);
+        let old = [Capability::CAP_NET_RAW, Capability::CAP_SYS_ADMIN];
+        assert!(lacks(&old, &entering).is_empty());
+    }
+
+    #[test]
+    fn the_message_names_what_each_source_lacks_and_the_command_that_grants_it() {
+        let has = set(&[Capability::CAP_BPF, Capability::CAP_PERFMON]);
+        let missing = missing(&has, &settings(SourceChoice::Auto)).unwrap();
+        let message = missing.to_string();
         assert!(
-            message.starts_with("live capture needs CAP_BPF: "),
+            message.starts_with(
+                "live capture needs CAP_NET_ADMIN for the source `host`, or CAP_NET_RAW for the \
+                 source `wire`: "
+            ),
             "{message}"
         );
         assert!(
-            message.contains("sudo setcap cap_net_raw,cap_bpf,cap_perfmon+ep /"),
+            message.contains("sudo setcap cap_net_admin,cap_bpf,cap_perfmon,cap_net_raw+ep /"),
             "{message}"
         );
     }

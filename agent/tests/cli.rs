@@ -126,8 +126,10 @@ fn without_privilege_the_missing_capabilities_and_the_command_are_named() {
         .output()
         .unwrap();
     let program = program.to_str().unwrap();
-    let grant = format!("sudo setcap cap_net_raw,cap_bpf,cap_perfmon+ep {program}");
-    fails_with(&output, 77, &["CAP_NET_RAW, CAP_BPF, CAP_PERFMON", &grant]);
+    let grant = format!("sudo setcap cap_net_admin,cap_bpf,cap_perfmon,cap_net_raw+ep {program}");
+    let host = "CAP_NET_ADMIN, CAP_BPF, CAP_PERFMON for the source `host`";
+    let wire = "CAP_NET_RAW, CAP_BPF, CAP_PERFMON for the source `wire`";
+    fails_with(&output, 77, &[host, wire, &grant]);
 }
 
 #[test]

@@ -62,7 +62,7 @@ fn systemd_understands_every_line() {
 fn the_agent_may_do_what_it_needs_and_nothing_else() {
     let text = std::fs::read_to_string(unit()).unwrap();
     for set in ["CapabilityBoundingSet", "AmbientCapabilities"] {
-        let line = format!("\n{set}=CAP_NET_RAW CAP_BPF CAP_PERFMON\n");
+        let line = format!("\n{set}=CAP_NET_ADMIN CAP_NET_RAW CAP_BPF CAP_PERFMON\n");
         assert!(text.contains(&line), "{set}");
     }
     for line in [
