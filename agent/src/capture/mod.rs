@@ -9,3 +9,5 @@ pub mod order;
 pub mod pcap;
 pub mod ring;
 pub mod system;
+pub mod whole;
+pub mod wire;
