@@ -7,9 +7,16 @@ pub const BOUNDS: [f64; 16] = [
     10.0,
 ];
 
-/// Counts by [`BOUNDS`], plus one for what lies above the last.
+/// Upper bounds for what happens within one host: the same steps from 10 µs to 1 s.
+pub const FINE_BOUNDS: [f64; 16] = [
+    0.00001, 0.00002, 0.00005, 0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1,
+    0.2, 0.5, 1.0,
+];
+
+/// Counts by [`BOUNDS`] or [`FINE_BOUNDS`], plus one for what lies above the last.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Histogram {
+    fine: bool,
     counts: [u64; BOUNDS.len() + 1],
     sum: f64,
     minimum: f64,
@@ -17,12 +24,21 @@ pub struct Histogram {
 }
 
 impl Histogram {
+    /// Empty, with [`FINE_BOUNDS`].
+    #[must_use]
+    pub fn fine() -> Self {
+        Self {
+            fine: true,
+            ..Self::default()
+        }
+    }
+
     /// Takes in one value, in seconds.
     pub fn observe(&mut self, seconds: f64) {
         if self.count() == 0 {
             (self.minimum, self.maximum) = (seconds, seconds);
         }
-        let bucket = BOUNDS.partition_point(|bound| seconds > *bound);
+        let bucket = self.bounds().partition_point(|bound| seconds > *bound);
         if let Some(count) = self.counts.get_mut(bucket) {
             *count += 1;
         }
@@ -31,7 +47,7 @@ impl Histogram {
         self.maximum = self.maximum.max(seconds);
     }
 
-    /// Adds all of `other`.
+    /// Adds all of `other`, which has the same bounds.
     pub fn merge(&mut self, other: &Self) {
         if other.count() == 0 {
             return;
@@ -68,11 +84,15 @@ impl Histogram {
 
     /// `(upper bound, values in this bucket)`, not cumulative; the last bound is infinite.
     pub fn buckets(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
-        BOUNDS
+        self.bounds()
             .iter()
             .copied()
             .chain([f64::INFINITY])
             .zip(self.counts.iter().copied())
+    }
+
+    const fn bounds(&self) -> &'static [f64; 16] {
+        if self.fine { &FINE_BOUNDS } else { &BOUNDS }
     }
 }
 
@@ -92,6 +112,19 @@ mod tests {
             .collect();
         assert_eq!(filled, [(0.001, 1), (0.002, 1), (f64::INFINITY, 1)]);
         assert_eq!(histogram.range(), Some((0.001, 99.0)));
+    }
+
+    #[test]
+    fn fine_bounds_tell_microseconds_apart() {
+        let mut histogram = Histogram::fine();
+        histogram.observe(0.000_011);
+        histogram.observe(0.000_021);
+        let filled: Vec<_> = histogram
+            .buckets()
+            .filter(|(_, count)| *count > 0)
+            .collect();
+        assert_eq!(filled, [(0.000_02, 1), (0.000_05, 1)]);
+        assert!(FINE_BOUNDS.is_sorted() && BOUNDS.is_sorted());
     }
 
     #[test]

@@ -1,12 +1,19 @@
 //! The latest events, oldest first: bounded lists for whoever asks what happened, not how often.
 
 use std::collections::VecDeque;
+use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
-/// Entries kept of either kind.
+use super::cause::LossCause;
+
+/// Entries kept of discovery events and of writers' losses each.
 const LIMIT: usize = 1024;
+/// Entries kept of receivers' losses: several receivers may miss what one writer sent.
+const DELIVERY_LIMIT: usize = 4096;
+/// Latest entries among which a loss looks for the one it continues.
+const RECENT: usize = 16;
 
 /// What happened to one participant, endpoint or node.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -38,11 +45,33 @@ pub struct Loss {
     pub last: u64,
 }
 
-/// Both lists.
+/// Consecutive samples that one receiver lost, told once the cause is known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct DeliveryLoss {
+    /// When the cause was settled.
+    pub at: Timestamp,
+    /// Whose samples.
+    pub writer: Guid,
+    /// The participant that missed them, where it was known.
+    pub participant: Option<GuidPrefix>,
+    /// Cookie of the socket by which the writer's new samples come; 0 on a wire source.
+    pub socket: u64,
+    /// Where they come to.
+    pub destination: SocketAddr,
+    /// Where they died.
+    pub cause: LossCause,
+    /// First lost sequence number.
+    pub first: u64,
+    /// Last lost sequence number.
+    pub last: u64,
+}
+
+/// All lists.
 #[derive(Debug, Default)]
 pub struct Journal {
     discovery: VecDeque<DiscoveryEvent>,
     losses: VecDeque<Loss>,
+    delivery_losses: VecDeque<DeliveryLoss>,
 }
 
 impl Journal {
@@ -54,6 +83,11 @@ impl Journal {
     /// Losses, oldest first.
     pub fn losses(&self) -> impl Iterator<Item = &Loss> {
         self.losses.iter()
+    }
+
+    /// Losses of receivers, by the time when their cause was settled.
+    pub fn delivery_losses(&self) -> impl Iterator<Item = &DeliveryLoss> {
+        self.delivery_losses.iter()
     }
 
     /// Adds an event.
@@ -77,5 +111,32 @@ impl Journal {
             self.losses.pop_front();
         }
         self.losses.push_back(loss);
+    }
+
+    /// Adds a receiver's loss, to an entry of the latest when it continues that one.
+    pub fn lose_delivery(&mut self, loss: DeliveryLoss) {
+        let whose = |loss: &DeliveryLoss| {
+            let DeliveryLoss {
+                writer,
+                participant,
+                socket,
+                destination,
+                cause,
+                ..
+            } = *loss;
+            (writer, participant, socket, destination, cause)
+        };
+        let mut recent = self.delivery_losses.iter_mut().rev().take(RECENT);
+        let continued = recent.find(|entry| {
+            whose(entry) == whose(&loss) && entry.last.checked_add(1) == Some(loss.first)
+        });
+        if let Some(entry) = continued {
+            (entry.last, entry.at) = (loss.last, loss.at);
+            return;
+        }
+        if self.delivery_losses.len() >= DELIVERY_LIMIT {
+            self.delivery_losses.pop_front();
+        }
+        self.delivery_losses.push_back(loss);
     }
 }

@@ -1,6 +1,7 @@
 //! The core: a plain state machine. Time and bytes in, facts out; no I/O, no clock, no thread.
 
 pub mod ahead;
+pub mod cause;
 pub mod churn;
 pub mod discovery;
 pub mod expectation;
@@ -17,5 +18,6 @@ mod report;
 pub mod samples;
 pub mod sequence;
 pub mod snapshot;
+pub mod sockets;
 pub mod topic;
 pub mod writer;

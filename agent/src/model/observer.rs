@@ -26,7 +26,8 @@ use super::journal::Journal;
 use super::pieces::Pieces;
 use super::profiler::Profiler;
 use super::rate::Slot;
-use super::snapshot::Snapshot;
+use super::snapshot::{Snapshot, SocketFacts};
+use super::sockets::Sockets;
 use super::topic::{Naming, TopicId, Topics, Watched};
 use super::writer::Traits;
 use crate::config::{Limits, Watchlist};
@@ -50,6 +51,8 @@ pub struct Settings {
     pub topics: usize,
     /// Writers that send without a known announcement.
     pub unknown_writers: usize,
+    /// Receivers and destinations of all measured writers; likewise sockets.
+    pub deliveries: usize,
     /// Entries of the kernel's interest map.
     pub interest: usize,
     /// Bytes for the bitmaps of fragmented samples.
@@ -66,6 +69,7 @@ impl Default for Settings {
             nodes: 4096,
             topics: 1000,
             unknown_writers: 256,
+            deliveries: 4096,
             interest: 16_384,
             sample_bytes: 1 << 20,
             topic_grace: 600 * SECOND,
@@ -97,6 +101,7 @@ pub struct Observer {
     pub(super) interest: Interest,
     pub(super) profiler: Profiler,
     pub(super) pieces: Pieces,
+    pub(super) sockets: Sockets,
     pub(super) decode_errors: BTreeMap<(&'static str, &'static str), u64>,
     pub(super) datagrams: u64,
     pub(super) records: u64,
@@ -122,6 +127,7 @@ impl Observer {
             interest: Interest::new(settings.interest),
             profiler: Profiler::new(settings.unknown_writers, settings.sample_bytes),
             pieces: Pieces::default(),
+            sockets: Sockets::new(settings.deliveries),
             decode_errors: BTreeMap::new(),
             datagrams: 0,
             records: 0,
@@ -205,6 +211,16 @@ impl Observer {
     /// Nothing more will come: decides what is still open, without letting time pass.
     pub fn settle(&mut self) {
         self.profiler.settle(self.clock, &mut self.journal);
+    }
+
+    /// Says what is known of a socket, again whenever that changes.
+    pub fn socket(&mut self, facts: SocketFacts) {
+        self.sockets.put(facts);
+    }
+
+    /// This socket was closed.
+    pub fn socket_closed(&mut self, cookie: u64) {
+        self.sockets.remove(cookie);
     }
 
     /// What the kernel filter has to be told since the last call; `None` = remove the entry.

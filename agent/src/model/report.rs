@@ -27,6 +27,7 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
             .map(|(_, topic)| self::topic(observer, topic, &nodes, now))
             .collect(),
         unknown_writers: unknown_writers(observer, now),
+        sockets: Vec::new(),
         watches: watches(observer),
         churn: observer.discovery.churn.facts(),
         decode_errors: decode_errors(observer),
@@ -155,6 +156,11 @@ fn topic(
         publishers,
         subscriptions,
         measurement,
+        received: None,
+        sent: None,
+        breakdown: None,
+        deliveries: Vec::new(),
+        acknowledgements: Vec::new(),
         vanished: topic.is_vanished(),
     }
 }
@@ -286,6 +292,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     };
     let (writers, unknown, unknown_limit, unknown_evictions) = profiler.size();
     let (interest, interest_limit, interest_evictions) = observer.interest.size();
+    let (sockets, sockets_limit, sockets_evictions) = observer.sockets.size();
     let budgets = profiler.budgets();
     let samples: usize = budgets.iter().map(|budget| budget.bytes).sum();
     let samples_limit: usize = budgets.iter().map(|budget| budget.limit).sum();
@@ -322,6 +329,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
             samples_evictions + observer.pieces.evictions(),
         ),
         table("interest", interest, interest_limit, interest_evictions),
+        table("sockets", sockets, sockets_limit, sockets_evictions),
     ]
 }
 

@@ -3,7 +3,13 @@
 //! The model builds one about once a second; surfaces read it without ever blocking the model.
 //! Nothing here computes: every number was settled when the snapshot was taken.
 
+mod delivery;
+
 use ros2probe_wire::{Guid, Timestamp};
+
+pub use delivery::{
+    AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts,
+};
 
 use super::histogram::Histogram;
 
@@ -20,6 +26,8 @@ pub struct Snapshot {
     pub topics: Vec<TopicFacts>,
     /// Writers seen sending whose announcement was not seen.
     pub unknown_writers: Vec<UnknownWriterFacts>,
+    /// Sockets by which measured samples come or leave, as far as they are known, by cookie.
+    pub sockets: Vec<SocketFacts>,
     /// Watchlist entries, in configuration order.
     pub watches: Vec<WatchFacts>,
     /// Discovery churn since the start.
@@ -103,6 +111,18 @@ pub struct TopicFacts {
     /// Present when somebody is or was interested in the topic: the sum over its writers, also
     /// those that have gone.
     pub measurement: Option<Box<Measurement>>,
+    /// Sum over all receivers and writers, also those that have gone; present once a sample of the
+    /// topic was seen arriving while it was measured.
+    pub received: Option<Box<Delivered>>,
+    /// Likewise over all destinations to which samples were seen leaving this host.
+    pub sent: Option<Box<Delivered>>,
+    /// Where its samples spent their time, as far as this host sees it.
+    pub breakdown: Option<Box<Breakdown>>,
+    /// Every receiver and destination of live writers, sorted by writer, direction, destination and
+    /// subscriber.
+    pub deliveries: Vec<DeliveryFacts>,
+    /// Every reliable reader that acknowledges, sorted by writer and reader.
+    pub acknowledgements: Vec<AcknowledgementFacts>,
     /// The last endpoint has gone; kept for the grace period.
     pub vanished: bool,
 }
@@ -295,7 +315,7 @@ pub struct DecodeErrorCount {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
-    /// `reassembly`, `interest`.
+    /// `reassembly`, `interest`, `deliveries`, `sockets`.
     pub table: &'static str,
     /// Entries (bytes for `reassembly`).
     pub size: u64,

@@ -36,6 +36,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             lease_nanoseconds: Some(20_000_000_000),
             secured: false,
         }],
+        sockets: Vec::new(),
         nodes: vec![NodeFacts {
             domain_id: 0,
             name: "/lidar".to_owned(),
@@ -121,6 +122,11 @@ pub fn topic(name: &str) -> TopicFacts {
         publishers: vec![endpoint(guid(1))],
         subscriptions: vec![endpoint(guid(2))],
         measurement: Some(Box::new(measurement())),
+        received: None,
+        sent: None,
+        breakdown: None,
+        deliveries: Vec::new(),
+        acknowledgements: Vec::new(),
         vanished: false,
     }
 }

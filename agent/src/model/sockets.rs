@@ -1,0 +1,81 @@
+//! What is known of this host's sockets from outside the packets: who holds them, and what died
+//! there without a name.
+//!
+//! Told by whoever reads the kernel's tables; nothing here looks anywhere. Bounded: when full, a
+//! new socket is refused and counted, for the ones at hand have been told apart already.
+
+use std::collections::BTreeMap;
+
+use super::snapshot::SocketFacts;
+
+/// All known sockets.
+#[derive(Debug)]
+pub struct Sockets {
+    sockets: BTreeMap<u64, SocketFacts>,
+    limit: usize,
+    evictions: u64,
+}
+
+impl Sockets {
+    /// None known, at most `limit`.
+    #[must_use]
+    pub const fn new(limit: usize) -> Self {
+        Self {
+            sockets: BTreeMap::new(),
+            limit,
+            evictions: 0,
+        }
+    }
+
+    /// Takes in what is known of one; whether that is new.
+    pub fn put(&mut self, facts: SocketFacts) -> bool {
+        let known = self.sockets.get(&facts.cookie);
+        if known == Some(&facts) {
+            return false;
+        }
+        if known.is_none() && self.sockets.len() >= self.limit {
+            self.evictions += 1;
+            return false;
+        }
+        self.sockets.insert(facts.cookie, facts);
+        true
+    }
+
+    /// One was closed; whether it was known.
+    pub fn remove(&mut self, cookie: u64) -> bool {
+        self.sockets.remove(&cookie).is_some()
+    }
+
+    /// One of them.
+    #[must_use]
+    pub fn get(&self, cookie: u64) -> Option<&SocketFacts> {
+        self.sockets.get(&cookie)
+    }
+
+    /// Entries, cap, and sockets refused because of it.
+    #[must_use]
+    pub fn size(&self) -> (usize, usize, u64) {
+        (self.sockets.len(), self.limit, self.evictions)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_full_table_keeps_whom_it_knows() {
+        let mut sockets = Sockets::new(2);
+        let socket = |cookie, drops| SocketFacts {
+            cookie,
+            unidentified_drops: drops,
+            ..SocketFacts::default()
+        };
+        assert!(sockets.put(socket(1, 0)) && sockets.put(socket(2, 0)));
+        assert!(!sockets.put(socket(3, 0)) && !sockets.put(socket(2, 0)));
+        assert!(sockets.put(socket(2, 7)));
+        assert_eq!(sockets.get(2).map(|each| each.unidentified_drops), Some(7));
+        assert_eq!((sockets.get(3), sockets.size()), (None, (2, 2, 1)));
+        assert!(sockets.remove(1) && sockets.put(socket(3, 0)));
+    }
+}
