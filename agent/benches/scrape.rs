@@ -20,7 +20,7 @@ fn scrape(criterion: &mut Criterion) {
             max_topics: 1_000,
             ..Settings::default()
         };
-        let board = Arc::new(Board::new(SourceKind::Live, settings));
+        let board = Arc::new(Board::new(SourceKind::Wire, settings));
         let snapshot = sample_robot::snapshot(names.iter().map(String::as_str));
         board.publish(snapshot, sample_robot::agent());
         let exposition = Exposition::new(board);

@@ -147,7 +147,10 @@ fn a_report_is_the_metrics_page_and_nothing_else() {
     let page = String::from_utf8(output.stdout).unwrap();
     assert_eq!(promtool(&page), "");
     assert_eq!(
-        metric(&page, "ros2probe_source_info{source=\"replay\"}"),
+        metric(
+            &page,
+            "ros2probe_capture_source_info{source=\"replay\",reason=\"\"}"
+        ),
         Some(1.0)
     );
     let packets = metric(

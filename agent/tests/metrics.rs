@@ -12,7 +12,7 @@ use local_agent::promtool;
 use ros2probe::config::{Expectations, Watch};
 use ros2probe::model::snapshot::{Snapshot, WatchFacts, WatchState, WatchedTopicFacts};
 use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
-use ros2probe::surface::{Board, Exposition, Format, Settings, SourceKind};
+use ros2probe::surface::{Ability, AgentFacts, Board, Exposition, Format, Settings, SourceKind};
 
 fn settings() -> Settings {
     let expectations = Expectations {
@@ -31,7 +31,7 @@ fn settings() -> Settings {
 }
 
 fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
-    let board = Arc::new(Board::new(SourceKind::Live, settings));
+    let board = Arc::new(Board::new(SourceKind::Wire, settings));
     board.publish(snapshot, sample_robot::agent());
     Exposition::new(board).render(format).unwrap()
 }
@@ -148,7 +148,7 @@ fn values_are_what_the_snapshot_says() {
 
 #[test]
 fn promtool_finds_nothing_to_say() {
-    let board = Arc::new(Board::new(SourceKind::Live, settings()));
+    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
     let starting = Exposition::new(board).render(Format::Classic).unwrap();
     assert_eq!(promtool(&starting), "");
     let page = page(
@@ -259,8 +259,31 @@ fn measured_topics_come_first_when_the_cap_is_reached() {
 }
 
 #[test]
+fn what_the_source_sees_and_why_it_is_not_the_other_one_is_said() {
+    let facts = AgentFacts {
+        source_reason: Some("no cgroup v2 hierarchy".to_owned()),
+        ..sample_robot::agent()
+    };
+    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
+    board.publish(Snapshot::default(), facts);
+    let wire = Exposition::new(board).render(Format::Classic).unwrap();
+    let info = "source=\"wire\",reason=\"no cgroup v2 hierarchy\"";
+    let info = format!("ros2probe_capture_source_info{{{info}}}");
+    assert_eq!(sample(&wire, &info), Some("1"), "{wire}");
+    for ability in Ability::ALL {
+        let series = format!(
+            "ros2probe_capture_ability{{ability=\"{}\"}}",
+            ability.label()
+        );
+        let able = [Ability::Sent, Ability::Forwarded].contains(&ability);
+        let value = if able { "1" } else { "0" };
+        assert_eq!(sample(&wire, &series), Some(value), "{series}");
+    }
+}
+
+#[test]
 fn both_formats_hold_the_same_samples() {
-    let board = Arc::new(Board::new(SourceKind::Live, settings()));
+    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
     board.publish(
         sample_robot::snapshot(["/points", "/imu"]),
         sample_robot::agent(),

@@ -173,7 +173,7 @@ impl Source {
     #[must_use]
     pub const fn kind(&self) -> SourceKind {
         match self {
-            Self::Live(_) => SourceKind::Live,
+            Self::Live(_) => SourceKind::Wire,
             Self::Replay(_) => SourceKind::Replay,
         }
     }
@@ -269,6 +269,6 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         incomplete_datagrams: live.incomplete_datagrams(),
         reassembly_bytes: live.reassembly_bytes() as u64,
         refused_updates: live.refused_updates(),
-        ..AgentFacts::new(SourceKind::Live, now)
+        ..AgentFacts::new(SourceKind::Wire, now)
     }
 }

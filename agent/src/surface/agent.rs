@@ -4,7 +4,7 @@
 use std::fmt;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::agent_facts::InterfaceFacts;
+use super::agent_facts::{Ability, InterfaceFacts};
 use super::board::{Reload, State};
 use super::catalogue as metric;
 use super::page::{Label, Page};
@@ -18,7 +18,14 @@ pub(super) fn identity(page: &mut Page<'_>, state: &State, now: Instant) -> fmt:
         family.info(&[version, Label::Text(std::env::consts::ARCH)])
     })?;
     page.family(&metric::SOURCE_INFO, |family| {
-        family.info(&[Label::Text(state.agent.source.label())])
+        let reason = state.agent.source_reason.as_deref().unwrap_or_default();
+        family.info(&[Label::Text(state.agent.source.label()), Label::Text(reason)])
+    })?;
+    page.family(&metric::ABILITY, |family| {
+        Ability::ALL.into_iter().try_for_each(|ability| {
+            let able = state.agent.abilities.contains(&ability);
+            family.sample(&[Label::Text(ability.label())], able)
+        })
     })?;
     page.single(&metric::READY, state.ready(now).is_ok())
 }
@@ -51,6 +58,8 @@ pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
     })?;
     page.single(&metric::FILTER_REFUSED, agent.refused_updates)?;
     page.single(&metric::RECORDS_DROPPED, agent.records_dropped)?;
+    page.single(&metric::PIECES_DROPPED, agent.pieces_dropped)?;
+    page.single(&metric::CONTENDED, agent.contended)?;
     page.single(&metric::INCOMPLETE_DATAGRAMS, agent.incomplete_datagrams)?;
     page.single(&metric::REASSEMBLY, agent.reassembly_bytes)
 }

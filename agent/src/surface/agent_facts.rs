@@ -8,6 +8,10 @@ use std::time::Instant;
 pub struct AgentFacts {
     /// Where packets come from.
     pub source: SourceKind,
+    /// Why it is not the one that sees more; `None` where it is, or where it was asked for.
+    pub source_reason: Option<String>,
+    /// What the source can see, each ability once; what is not listed it cannot.
+    pub abilities: Vec<Ability>,
     /// When this was filled in.
     pub at: Instant,
     /// When the source last came back from waiting for packets, with or without any.
@@ -22,6 +26,10 @@ pub struct AgentFacts {
     pub copied_bytes: u64,
     /// Records lost because the record ring was full.
     pub records_dropped: u64,
+    /// Captured datagrams of the host's sockets of which a piece was lost for want of room.
+    pub pieces_dropped: u64,
+    /// Datagrams that the host's hook could not look at: its working memory was in use.
+    pub contended: u64,
     /// Fragmented datagrams that were begun and never became complete.
     pub incomplete_datagrams: u64,
     /// Bytes held to put fragments together.
@@ -33,10 +41,31 @@ pub struct AgentFacts {
 /// Where packets come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SourceKind {
-    /// This host's interfaces.
-    Live,
+    /// Datagrams at this host's sockets.
+    Host,
+    /// Frames on this host's interfaces.
+    Wire,
     /// A capture file.
     Replay,
+}
+
+/// What a source may be able to see.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Ability {
+    /// What each subscriber received, also where several share a destination.
+    Subscribers,
+    /// Messages leaving this host.
+    Sent,
+    /// Which messages died in the full buffer of a subscriber's socket.
+    SocketLosses,
+    /// Which messages died in IP reassembly.
+    ReassemblyLosses,
+    /// Process and control group of sockets.
+    Owners,
+    /// Sockets in every network namespace: all containers.
+    Containers,
+    /// Traffic that no local socket sends or receives.
+    Forwarded,
 }
 
 /// Counters of one interface.
@@ -56,6 +85,8 @@ impl AgentFacts {
     pub fn new(source: SourceKind, at: Instant) -> Self {
         Self {
             source,
+            source_reason: None,
+            abilities: source.abilities().to_vec(),
             at,
             capture_progress: at,
             finished: false,
@@ -63,6 +94,8 @@ impl AgentFacts {
             filter_events: Vec::new(),
             copied_bytes: 0,
             records_dropped: 0,
+            pieces_dropped: 0,
+            contended: 0,
             incomplete_datagrams: 0,
             reassembly_bytes: 0,
             refused_updates: 0,
@@ -75,8 +108,46 @@ impl SourceKind {
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
-            Self::Live => "live",
+            Self::Host => "host",
+            Self::Wire => "wire",
             Self::Replay => "replay",
+        }
+    }
+
+    /// What every source of this kind can see; the kernel and the configuration may allow more.
+    #[must_use]
+    pub const fn abilities(self) -> &'static [Ability] {
+        match self {
+            Self::Host => &[Ability::Subscribers, Ability::Sent],
+            Self::Wire => &[Ability::Sent, Ability::Forwarded],
+            Self::Replay => &[Ability::Forwarded],
+        }
+    }
+}
+
+impl Ability {
+    /// All of them.
+    pub const ALL: [Self; 7] = [
+        Self::Subscribers,
+        Self::Sent,
+        Self::SocketLosses,
+        Self::ReassemblyLosses,
+        Self::Owners,
+        Self::Containers,
+        Self::Forwarded,
+    ];
+
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Subscribers => "subscribers",
+            Self::Sent => "sent",
+            Self::SocketLosses => "socket_losses",
+            Self::ReassemblyLosses => "reassembly_losses",
+            Self::Owners => "owners",
+            Self::Containers => "containers",
+            Self::Forwarded => "forwarded",
         }
     }
 }

@@ -231,7 +231,7 @@ mod tests {
 
     #[test]
     fn an_agent_is_ready_only_while_it_sees() {
-        let board = Board::new(SourceKind::Live, Settings::default());
+        let board = Board::new(SourceKind::Wire, Settings::default());
         let start = Instant::now();
         assert!(
             board
@@ -243,7 +243,7 @@ mod tests {
 
         board.publish(
             Snapshot::default(),
-            AgentFacts::new(SourceKind::Live, start),
+            AgentFacts::new(SourceKind::Wire, start),
         );
         assert_eq!(board.state().ready(start + Duration::from_secs(4)), Ok(()));
         let reason = board
@@ -255,7 +255,7 @@ mod tests {
         let later = start + Duration::from_secs(60);
         let agent = AgentFacts {
             capture_progress: later,
-            ..AgentFacts::new(SourceKind::Live, start)
+            ..AgentFacts::new(SourceKind::Wire, start)
         };
         board.publish(Snapshot::default(), agent);
         assert_eq!(
@@ -280,14 +280,14 @@ mod tests {
 
     #[tokio::test]
     async fn who_asks_gets_the_next_state_and_waits_for_a_stuck_writer_only_so_long() {
-        let board = Board::new(SourceKind::Live, Settings::default());
+        let board = Board::new(SourceKind::Wire, Settings::default());
         let writer = async {
             while !board.is_asked() {
                 tokio::task::yield_now().await;
             }
             board.publish(
                 Snapshot::default(),
-                AgentFacts::new(SourceKind::Live, Instant::now()),
+                AgentFacts::new(SourceKind::Wire, Instant::now()),
             );
         };
         tokio::join!(board.refresh(Duration::from_secs(3600)), writer);
@@ -297,7 +297,7 @@ mod tests {
 
     #[tokio::test]
     async fn asking_rings_the_bell_until_it_is_heard() {
-        let board = Board::new(SourceKind::Live, Settings::default());
+        let board = Board::new(SourceKind::Wire, Settings::default());
         let rings = || {
             let mut listener = &board.bell.as_ref().unwrap().listener;
             listener.read(&mut [0; 1]).is_ok()
@@ -317,7 +317,7 @@ mod tests {
             per_writer: true,
             ..Settings::default()
         };
-        let board = Board::new(SourceKind::Live, settings.clone());
+        let board = Board::new(SourceKind::Wire, settings.clone());
         let first = board.reload().last_success;
         board.reload_failed();
         assert_eq!(*board.settings(), settings);

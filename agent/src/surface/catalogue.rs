@@ -306,9 +306,14 @@ pub(super) const BUILD_INFO: Metric = Metric::info(
     "What is running.",
 );
 pub(super) const SOURCE_INFO: Metric = Metric::info(
-    "ros2probe_source_info",
-    &["source"],
-    "Where packets come from: live or replay.",
+    "ros2probe_capture_source_info",
+    &["source", "reason"],
+    "Where packets come from: the host's sockets, the wire or a replay, and why not from one that shows more.",
+);
+pub(super) const ABILITY: Metric = Metric::gauge(
+    "ros2probe_capture_ability",
+    &["ability"],
+    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded.",
 );
 pub(super) const READY: Metric = Metric::gauge(
     "ros2probe_ready",
@@ -346,6 +351,16 @@ pub(super) const RECORDS_DROPPED: Metric = Metric::counter(
     "ros2probe_records_dropped_total",
     &[],
     "Measurement records lost because their ring was full: above 0, counts are lower bounds.",
+);
+pub(super) const PIECES_DROPPED: Metric = Metric::counter(
+    "ros2probe_dropped_datagrams_total",
+    &[],
+    "Datagrams captured at the host's sockets that were lost because their ring was full: discovery may be incomplete.",
+);
+pub(super) const CONTENDED: Metric = Metric::counter(
+    "ros2probe_contended_datagrams_total",
+    &[],
+    "Datagrams not looked at because the hook's working memory was in use: above 0, counts are lower bounds.",
 );
 pub(super) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
     "ros2probe_incomplete_datagrams_total",
@@ -479,6 +494,7 @@ pub const CATALOGUE: &[Metric] = &[
     WATCH_VIOLATED,
     BUILD_INFO,
     SOURCE_INFO,
+    ABILITY,
     READY,
     CAPTURE_PACKETS,
     CAPTURE_DROPPED,
@@ -486,6 +502,8 @@ pub const CATALOGUE: &[Metric] = &[
     FILTER_EVENTS,
     FILTER_REFUSED,
     RECORDS_DROPPED,
+    PIECES_DROPPED,
+    CONTENDED,
     INCOMPLETE_DATAGRAMS,
     REASSEMBLY,
     DATAGRAMS,

@@ -11,6 +11,6 @@ mod page;
 mod process;
 mod robot;
 
-pub use agent_facts::{AgentFacts, InterfaceFacts, SourceKind};
+pub use agent_facts::{Ability, AgentFacts, InterfaceFacts, SourceKind};
 pub use board::{Board, Settings, State};
 pub use exposition::{Exposition, Format};

@@ -89,7 +89,7 @@ pub fn agent() -> AgentFacts {
         }],
         filter_events: vec![("ignore", 7), ("meter", 8), ("capture", 9)],
         copied_bytes: 12_345,
-        ..AgentFacts::new(SourceKind::Live, Instant::now())
+        ..AgentFacts::new(SourceKind::Wire, Instant::now())
     }
 }
 
