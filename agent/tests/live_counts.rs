@@ -14,7 +14,7 @@ use std::sync::{PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use harness::agent::{Agent, Scrape};
+use harness::agent::{Agent, ON_THE_WIRE, Scrape};
 use harness::capture::{self, Capture};
 use harness::dissection::{Dissection, Samples};
 use harness::event_log::EventLog;
@@ -252,7 +252,7 @@ impl Exchange {
         let link = Link::new()?;
         let directory = tempfile::tempdir()?;
         let configuration = directory.path().join("ros2probe.yaml");
-        std::fs::write(&configuration, "watch:\n  - /**\n")?;
+        std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
         let robot = Observer::start("robot", &link.robot, &configuration)?;
         let monitor = Observer::start("monitor", &link.monitor, &configuration)?;
 

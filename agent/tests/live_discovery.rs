@@ -14,7 +14,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
-use harness::agent::{Agent, Scrape};
+use harness::agent::{Agent, ON_THE_WIRE, Scrape};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
 use tempfile::TempDir;
@@ -312,7 +312,7 @@ impl<'a> Watcher<'a> {
     fn start(host: &'a Namespace) -> Result<Watcher<'a>> {
         let directory = tempfile::tempdir()?;
         let file = directory.path().join("ros2probe.yaml");
-        std::fs::write(&file, "watch: [/**]\nlog: warn\n")?;
+        std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{ON_THE_WIRE}"))?;
         let agent = Agent::start(host, Path::new(env!("CARGO_BIN_EXE_rp")), &file)?;
         Ok(Watcher {
             agent,

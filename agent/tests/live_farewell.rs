@@ -6,7 +6,7 @@ mod harness;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
-use harness::agent::Agent;
+use harness::agent::{Agent, ON_THE_WIRE};
 use harness::network::Link;
 use harness::peer::{Peer, Role, Stack, Stream};
 
@@ -15,7 +15,8 @@ fn the_last_samples_before_a_farewell_are_counted() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir().context("cannot create a directory")?;
     let configuration = directory.path().join("ros2probe.yaml");
-    std::fs::write(&configuration, "watch: [/**]\n").context("cannot write a configuration")?;
+    std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))
+        .context("cannot write a configuration")?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
     let stream = Stream::small(0);
     let (host, role) = (&link.monitor, Role::Subscriber);

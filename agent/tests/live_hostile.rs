@@ -24,7 +24,7 @@ use anyhow::{Context as _, Result};
 use forged::frames::Wire;
 use forged::storm::{Dice, Storm, forgery};
 use forged::{Sender, Talker, introduce, talk};
-use harness::agent::{Agent, Scrape};
+use harness::agent::{Agent, ON_THE_WIRE, Scrape};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
 use harness::usage::Usage;
@@ -108,7 +108,8 @@ fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()>
     let file = |name: &str| directory.path().join(name);
     // The build directory need not be open to everybody.
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
-    std::fs::write(file("ros2probe.yaml"), "watch: [/**]\n")?;
+    let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
+    std::fs::write(file("ros2probe.yaml"), configuration)?;
     let only = "-all,+net_raw,+bpf,+perfmon";
     let script = format!(
         "#!/bin/sh\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
@@ -143,7 +144,7 @@ fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()>
 fn weather(link: &Link, recovery: Duration, storm: impl FnOnce() -> Result<Storm>) -> Result<()> {
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
-    std::fs::write(&file, "watch: [/**]\nlog: warn\n")?;
+    std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{ON_THE_WIRE}"))?;
     let log = directory.path().join("log");
     let rp = Path::new(env!("CARGO_BIN_EXE_rp"));
     let agent = Agent::start_logging(&link.robot, rp, &file, &log)?;

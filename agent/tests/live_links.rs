@@ -26,7 +26,7 @@ use harness::run;
 use harness::usage::Usage;
 use tempfile::TempDir;
 
-const WATCH_ALL: &str = "watch: [/**]\n";
+const WATCH_ALL: &str = "watch: [/**]\ncapture:\n  source: wire\n";
 /// Whole frames, frames near the MTU, few and many IP fragments.
 const SIZES: [usize; 6] = [320, 1300, 1440, 4000, 20_000, 60_000];
 const ROUNDS: usize = 20;
@@ -175,8 +175,9 @@ fn an_interface_that_appears_later_is_seen_and_one_that_goes_down_does_not_make_
 fn nothing_of_an_excluded_interface_is_seen_also_when_it_appears_later() -> Result<()> {
     let link = Link::new()?;
     add_cable(&link, "wlan0", "10.104.0")?;
-    let all_but_wlan = "watch: [/**]\ncapture:\n  interfaces:\n    exclude: [wlan*]\n";
-    let only_eth = "watch: [/**]\ncapture:\n  interfaces:\n    include: [eth*]\n";
+    let all_but_wlan =
+        "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    exclude: [wlan*]\n";
+    let only_eth = "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    include: [eth*]\n";
     for (round, configuration) in (0..).zip([all_but_wlan, only_eth]) {
         let observed = Observed::start(&link.monitor, configuration)?;
         let (wlan, eth) = (format!("wlan{}", 1 + round), format!("eth{}", 1 + round));
@@ -215,7 +216,7 @@ fn an_interface_is_judged_by_its_new_name_after_it_was_renamed() -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(
         &link.monitor,
-        "watch: [/**]\ncapture:\n  interfaces:\n    include: [eth*]\n",
+        "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    include: [eth*]\n",
     )?;
     // As udev does with what it finds.
     add_cable(&link, "wlan0", "10.106.0")?;
@@ -244,7 +245,7 @@ fn interfaces_that_came_and_went_do_not_use_up_the_filters_table() -> Result<()>
     let link = Link::new()?;
     let observed = Observed::start(
         &link.monitor,
-        "watch: [/**]\ncapture:\n  interfaces:\n    exclude: [veth*]\n",
+        "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    exclude: [veth*]\n",
     )?;
     // The table has room for 1024.
     for _ in 0..3 {
@@ -265,7 +266,7 @@ fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
     let observed = Observed::start(
         &link.monitor,
         &format!(
-            "watch: [/**]\ncapture:\n  network_namespaces: [{}]\n",
+            "watch: [/**]\ncapture:\n  source: wire\n  network_namespaces: [{}]\n",
             path.display()
         ),
     )?;

@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use harness::agent::{Agent, get};
+use harness::agent::{Agent, ON_THE_WIRE, get};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream, robot};
 use harness::process::Process;
@@ -21,7 +21,7 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = directory.path().join("ros2probe.yaml");
-    std::fs::write(&configuration, "watch:\n  - /**\n")?;
+    std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
     let scraping = directory.path().join("prometheus.yml");
     std::fs::write(

@@ -13,7 +13,7 @@ use std::process::Command;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
-use harness::agent::Agent;
+use harness::agent::{Agent, ON_THE_WIRE};
 use harness::capture::{self, Capture};
 use harness::dissection::{Content, Dissection, Frame};
 use harness::network::{INTERFACE, Link, Namespace};
@@ -331,7 +331,7 @@ fn talking<'a>(frames: impl Iterator<Item = &'a Frame>) -> BTreeSet<String> {
 
 fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
     let configuration = directory.join("ros2probe.yaml");
-    fs::write(&configuration, "watch:\n  - /**\n")?;
+    fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
     Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)
 }
 

@@ -78,7 +78,10 @@ async fn demo(options: &Options) -> Result<()> {
     );
     let directory = tempfile::tempdir().context("cannot create a directory")?;
     let log = directory.path().join("agent.log");
-    let agent = Agent::start_logging(&link.robot, agent, &options.config, &log)
+    let config = directory.path().join("ros2probe.yaml");
+    std::fs::write(&config, for_one_host(&options.config, link.robot.cgroup())?)
+        .context("cannot write a configuration")?;
+    let agent = Agent::start_logging(&link.robot, agent, &config, &log)
         .with_context(|| format!("the agent said: {}", read_lossy(&log).trim()))?;
     let relay = Relay::start(&link.robot, directory.path(), PORT)?;
     let robots = [
@@ -118,6 +121,15 @@ async fn demo(options: &Options) -> Result<()> {
         None if !status.success() => bail!("the agent ended with {status}"),
         None => Ok(()),
     }
+}
+
+/// The configuration, with the sockets of one of the two hosts only: both are this machine.
+fn for_one_host(config: &Path, cgroup: &Path) -> Result<String> {
+    let text = std::fs::read_to_string(config)
+        .with_context(|| format!("cannot read {}", config.display()))?;
+    let key = format!("  cgroup: {}\n", cgroup.display());
+    let (before, after) = text.split_once("\ncapture:\n").unwrap_or((&text, ""));
+    Ok(format!("{before}\ncapture:\n{key}{after}"))
 }
 
 fn beside_this_program() -> Result<PathBuf> {

@@ -72,8 +72,9 @@ impl Window {
         };
         let directory = tempfile::tempdir().context("cannot create a directory")?;
         let configuration = directory.path().join("ros2probe.yaml");
-        std::fs::write(&configuration, "watch:\n  - /**\nlog: warn\n")
-            .context("cannot write a configuration")?;
+        let cgroup = link.robot.cgroup().display();
+        let text = format!("watch: [/**]\nlog: warn\ncapture: {{cgroup: {cgroup}}}\n");
+        std::fs::write(&configuration, text).context("cannot write a configuration")?;
 
         let agent = (observer == Observer::Agent)
             .then(|| Agent::start(&link.robot, program, &configuration))

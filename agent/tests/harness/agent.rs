@@ -15,6 +15,9 @@ use super::process::Process;
 /// The metrics listener's built-in address: every host is its own, so the port is free.
 pub(crate) const METRICS: &str = "http://127.0.0.1:17400";
 
+/// What a test of packet sockets adds to its configuration.
+pub(crate) const ON_THE_WIRE: &str = "capture: {source: wire}\n";
+
 /// `rp run` on a host.
 pub(crate) struct Agent<'a> {
     pub(crate) process: Process,
@@ -23,6 +26,12 @@ pub(crate) struct Agent<'a> {
 
 /// One answer of `/metrics`.
 pub(crate) struct Scrape(pub(crate) String);
+
+/// What a test of the host's sockets adds to its configuration.
+pub(crate) fn at_the_sockets_of(host: &Namespace) -> String {
+    let cgroup = host.cgroup().display();
+    format!("capture: {{source: host, cgroup: {cgroup}}}\n")
+}
 
 impl<'a> Agent<'a> {
     /// Starts `rp run` (`env!("CARGO_BIN_EXE_rp")` in a test) and waits until it is ready.
@@ -160,9 +169,7 @@ fn has_label(labels: &str, pair: &str) -> bool {
 
 /// GETs a URL from inside a host.
 pub(crate) fn get(host: &Namespace, url: &str) -> Result<String> {
-    let [program, arguments @ ..] = &host.on_network()[..] else {
-        bail!("no command to enter the host");
-    };
+    let [program, arguments @ ..] = &host.outside();
     let output = Command::new(program)
         .args(arguments)
         .args([

@@ -1,5 +1,5 @@
-//! What the live tests and the demo stand on: hosts made of network namespaces, DDS peers and the
-//! agent started inside them, packet loss, and the logs and metrics they leave behind.
+//! What the live tests and the demo stand on: hosts made of a network namespace and a cgroup, DDS
+//! peers and the agent started inside them, packet loss, and the logs and metrics they leave behind.
 //!
 //! Everything is named after the process and a counter, so tests run side by side, and everything
 //! goes when its value is dropped, also when a test panics. Where something is missing the harness
@@ -9,6 +9,7 @@
 
 pub(crate) mod agent;
 pub(crate) mod capture;
+pub(crate) mod cgroup;
 pub(crate) mod dissection;
 pub(crate) mod event_log;
 pub(crate) mod loss;
@@ -17,6 +18,7 @@ pub(crate) mod peer;
 pub(crate) mod process;
 pub(crate) mod usage;
 
+use std::path::Path;
 use std::process::Command;
 
 use anyhow::{Context as _, Result, bail};
@@ -31,6 +33,9 @@ const TOOLS: [(&str, &str); 7] = [
     ("curl", "curl"),
     ("tcpdump", "tcpdump"),
 ];
+
+/// What namespaces and cgroups are named with, before the process that made them.
+const PREFIX: &str = "r2p";
 
 /// Fails unless this process is root and every tool is there.
 pub(crate) fn require() -> Result<()> {
@@ -63,4 +68,22 @@ pub(crate) fn run(line: &str) -> Result<String> {
         );
     }
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// Calls `remove` with each name in a directory that a process made which is gone.
+fn remove_leftovers(directory: &Path, remove: impl Fn(&str)) {
+    let Ok(entries) = std::fs::read_dir(directory) else {
+        return;
+    };
+    for entry in entries.flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let mut parts = name.split('-');
+        let (prefix, owner) = (parts.next(), parts.next());
+        let Some(owner) = owner.filter(|_| prefix == Some(PREFIX)) else {
+            continue;
+        };
+        if !Path::new("/proc").join(owner).exists() {
+            remove(&name);
+        }
+    }
 }

@@ -1,6 +1,6 @@
-//! Hosts: network namespaces joined by a veth pair of MTU 1500 with real checksums.
+//! Hosts: network namespaces joined by a veth pair of MTU 1500 with real checksums, each with a
+//! cgroup for its processes.
 
-use std::fs;
 use std::net::Ipv4Addr;
 use std::path::Path;
 use std::sync::Once;
@@ -8,11 +8,11 @@ use std::sync::atomic::{AtomicU16, Ordering};
 
 use anyhow::Result;
 
-use super::{require, run};
+use super::cgroup::{self, Cgroup};
+use super::{PREFIX, remove_leftovers, require, run};
 
 /// The interface of every host.
 pub(crate) const INTERFACE: &str = "eth0";
-const PREFIX: &str = "r2p";
 
 static NEXT: AtomicU16 = AtomicU16::new(0);
 
@@ -20,6 +20,7 @@ static NEXT: AtomicU16 = AtomicU16::new(0);
 pub(crate) struct Namespace {
     name: String,
     address: Ipv4Addr,
+    cgroup: Cgroup,
 }
 
 /// Two hosts on one cable.
@@ -64,37 +65,54 @@ impl Namespace {
         self.address
     }
 
+    /// The cgroup that its processes are in.
+    pub(crate) fn cgroup(&self) -> &Path {
+        self.cgroup.path()
+    }
+
     /// The words that run a command in this host with the host's own `/sys`.
     pub(crate) fn inside(&self) -> Vec<String> {
-        ["ip", "netns", "exec", &self.name]
-            .map(str::to_owned)
-            .to_vec()
+        let mut words = self.cgroup.inside();
+        words.extend(["ip", "netns", "exec", &self.name].map(str::to_owned));
+        words
     }
 
     /// The words that run a command on this host's network only: `/sys/fs/cgroup` and the rest of
     /// the file system stay as they are, as for a system service.
     pub(crate) fn on_network(&self) -> Vec<String> {
-        vec![
-            "nsenter".to_owned(),
-            format!("--net=/run/netns/{}", self.name),
-        ]
+        let mut words = self.cgroup.inside();
+        words.extend(self.outside());
+        words
+    }
+
+    /// The words that run a command on this host's network which is none of its processes.
+    pub(crate) fn outside(&self) -> [String; 2] {
+        let network = format!("--net=/run/netns/{}", self.name);
+        ["nsenter".to_owned(), network]
     }
 
     fn create(role: &str, subnet: u16, host: u8) -> Result<Namespace> {
         require()?;
         static SWEPT: Once = Once::new();
-        SWEPT.call_once(remove_leftovers);
+        SWEPT.call_once(|| {
+            remove_leftovers(Path::new("/run/netns"), |name| {
+                let _ = run(&format!("ip netns delete {name}"));
+            });
+            cgroup::sweep();
+        });
         let name = format!("{PREFIX}-{}-{subnet}-{role}", std::process::id());
         let [_, third] = subnet.to_be_bytes();
+        let cgroup = Cgroup::create(&name)?;
         run(&format!("ip netns add {name}"))?;
         Ok(Namespace {
             name,
+            cgroup,
             address: Ipv4Addr::new(10, 99, third, host),
         })
     }
 
     fn configure(&self, interface: &str) -> Result<()> {
-        let Namespace { name, address } = self;
+        let Namespace { name, address, .. } = self;
         run(&format!("ip -n {name} link set lo multicast on up"))?;
         run(&format!(
             "ip -n {name} addr add {address}/24 dev {interface}"
@@ -121,22 +139,4 @@ impl Drop for Namespace {
 
 fn next_subnet() -> u16 {
     NEXT.fetch_add(1, Ordering::Relaxed)
-}
-
-/// Removes the hosts of processes that were killed before they could.
-fn remove_leftovers() {
-    let Ok(entries) = fs::read_dir("/run/netns") else {
-        return;
-    };
-    for entry in entries.flatten() {
-        let name = entry.file_name().to_string_lossy().into_owned();
-        let mut parts = name.split('-');
-        let (prefix, owner) = (parts.next(), parts.next());
-        let Some(owner) = owner.filter(|_| prefix == Some(PREFIX)) else {
-            continue;
-        };
-        if !Path::new("/proc").join(owner).exists() {
-            let _ = run(&format!("ip netns delete {name}"));
-        }
-    }
 }

@@ -1,0 +1,71 @@
+//! The cgroup of a host: what its processes open is told apart from other tests' sockets, which the
+//! agent's host source would see as well.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result};
+
+use super::remove_leftovers;
+
+/// How long killed processes may take to leave.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+pub(crate) struct Cgroup {
+    path: PathBuf,
+}
+
+impl Cgroup {
+    pub(crate) fn create(name: &str) -> Result<Cgroup> {
+        let path = hierarchy()?.join(name);
+        fs::create_dir(&path).with_context(|| format!("cannot create {}", path.display()))?;
+        Ok(Cgroup { path })
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The words that run a command in it.
+    pub(crate) fn inside(&self) -> Vec<String> {
+        let enter = r#"echo 0 >"$0/cgroup.procs" && exec "$@""#;
+        let path = self.path.display().to_string();
+        vec!["sh".to_owned(), "-c".to_owned(), enter.to_owned(), path]
+    }
+}
+
+impl Drop for Cgroup {
+    fn drop(&mut self) {
+        let deadline = Instant::now() + PATIENCE;
+        // Linux 5.14 and newer; elsewhere its processes have been ended one by one.
+        let _ = fs::write(self.path.join("cgroup.kill"), "1");
+        while let Err(error) = fs::remove_dir(&self.path) {
+            if Instant::now() > deadline {
+                eprintln!("cannot remove {}: {error}", self.path.display());
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+/// Where the v2 hierarchy is mounted.
+pub(crate) fn hierarchy() -> Result<PathBuf> {
+    let mounts = fs::read_to_string("/proc/self/mounts").context("cannot read the mounts")?;
+    let path = mounts.lines().find_map(|line| {
+        let mut words = line.split(' ').skip(1);
+        let path = words.next()?;
+        (words.next() == Some("cgroup2")).then(|| PathBuf::from(path))
+    });
+    path.context("no cgroup2 is mounted: `mount -t cgroup2 none /sys/fs/cgroup/unified`")
+}
+
+/// Removes those of processes that were killed before they could.
+pub(crate) fn sweep() {
+    if let Ok(hierarchy) = hierarchy() {
+        remove_leftovers(&hierarchy, |name| {
+            let _ = fs::remove_dir(hierarchy.join(name));
+        });
+    }
+}
