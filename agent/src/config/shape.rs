@@ -138,7 +138,8 @@ pub(super) struct InterfacesShape {
 pub(super) struct MetricsShape {
     /// `address:port` to serve `/metrics`, `/healthz` and `/readyz` on, or `off`.
     pub(super) listen: String,
-    /// Histograms of inter-arrival time and latency of watched topics. Applied on reload.
+    /// Histograms of inter-arrival time, latency and where it arises, of watched topics. Applied
+    /// on reload.
     pub(super) histograms: bool,
     /// Series per writer of watched topics, besides those per topic. Applied on reload.
     pub(super) per_writer: bool,

@@ -65,7 +65,12 @@ pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
 }
 
 /// The model's tables and what it could not read.
-pub(super) fn model(page: &mut Page<'_>, state: &State, rows: &Rows<'_>) -> fmt::Result {
+pub(super) fn model(
+    page: &mut Page<'_>,
+    state: &State,
+    rows: &Rows<'_>,
+    hidden_deliveries: usize,
+) -> fmt::Result {
     let snapshot = state.snapshot.as_ref();
     let tables = || snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
     page.single(
@@ -106,7 +111,8 @@ pub(super) fn model(page: &mut Page<'_>, state: &State, rows: &Rows<'_>) -> fmt:
         &metric::TOPICS_REJECTED,
         snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
     )?;
-    page.single(&metric::TOPICS_HIDDEN, rows.hidden)
+    page.single(&metric::TOPICS_HIDDEN, rows.hidden)?;
+    page.single(&metric::DELIVERIES_HIDDEN, hidden_deliveries)
 }
 
 /// The surface itself.

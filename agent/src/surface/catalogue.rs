@@ -4,6 +4,12 @@
 //! Names follow the Prometheus naming practices; labels of topic series are `domain_id` and `topic`
 //! alone, details are in one info series.
 
+mod agent;
+mod delivery;
+
+pub(super) use agent::*;
+pub(super) use delivery::*;
+
 /// One metric family.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Metric {
@@ -197,7 +203,7 @@ pub(super) const TOPIC_SUBSCRIPTIONS: Metric =
 pub(super) const TOPIC_MESSAGES: Metric = Metric::counter(
     "ros2_topic_messages_total",
     TOPIC,
-    "Messages seen whole on the wire, each counted once.",
+    "Messages seen whole, each counted once, in however many copies.",
 );
 pub(super) const TOPIC_BYTES: Metric = Metric::counter(
     "ros2_topic_bytes_total",
@@ -299,168 +305,6 @@ pub(super) const WATCH_VIOLATED: Metric = Metric::gauge(
     "1 while a configured expectation is broken, after hysteresis.",
 );
 
-// The agent.
-pub(super) const BUILD_INFO: Metric = Metric::info(
-    "ros2probe_build_info",
-    &["version", "arch"],
-    "What is running.",
-);
-pub(super) const SOURCE_INFO: Metric = Metric::info(
-    "ros2probe_capture_source_info",
-    &["source", "reason"],
-    "Where packets come from: the host's sockets, the wire or a replay, and why not from one that shows more.",
-);
-pub(super) const ABILITY: Metric = Metric::gauge(
-    "ros2probe_capture_ability",
-    &["ability"],
-    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded.",
-);
-pub(super) const READY: Metric = Metric::gauge(
-    "ros2probe_ready",
-    &[],
-    "1 while packets are captured and the model is fresh, as /readyz answers.",
-);
-pub(super) const CAPTURE_PACKETS: Metric = Metric::counter(
-    "ros2probe_capture_packets_total",
-    &["interface"],
-    "Packets that the filter let through to user space.",
-);
-pub(super) const CAPTURE_DROPPED: Metric = Metric::counter(
-    "ros2probe_capture_dropped_packets_total",
-    &["interface"],
-    "Packets lost because the ring was full, by socket (`any`: all interfaces of a namespace): above 0, everything else is a lower bound.",
-);
-pub(super) const CAPTURE_COPIED: Metric = Metric::counter(
-    "ros2probe_capture_copied_bytes_total",
-    &[],
-    "Bytes copied to user space, packets and records.",
-)
-.unit("bytes");
-pub(super) const FILTER_EVENTS: Metric = Metric::counter(
-    "ros2probe_filter_events_total",
-    &["event"],
-    "What the kernel filter met and did, by event.",
-)
-.experimental();
-pub(super) const FILTER_REFUSED: Metric = Metric::counter(
-    "ros2probe_filter_refused_updates_total",
-    &[],
-    "Changes of interest for which the kernel filter had no room: those writers stay unknown to it.",
-);
-pub(super) const RECORDS_DROPPED: Metric = Metric::counter(
-    "ros2probe_records_dropped_total",
-    &[],
-    "Measurement records lost because their ring was full: above 0, counts are lower bounds.",
-);
-pub(super) const PIECES_DROPPED: Metric = Metric::counter(
-    "ros2probe_dropped_datagrams_total",
-    &[],
-    "Datagrams captured at the host's sockets that were lost because their ring was full: discovery may be incomplete.",
-);
-pub(super) const CONTENDED: Metric = Metric::counter(
-    "ros2probe_contended_datagrams_total",
-    &[],
-    "Datagrams not looked at because the hook's working memory was in use: above 0, counts are lower bounds.",
-);
-pub(super) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
-    "ros2probe_incomplete_datagrams_total",
-    &[],
-    "Fragmented datagrams that were begun and never became complete.",
-);
-pub(super) const REASSEMBLY: Metric = Metric::gauge(
-    "ros2probe_reassembly_bytes",
-    &[],
-    "Memory held to put captured fragments together, up to limits.reassembly_bytes.",
-)
-.unit("bytes");
-pub(super) const DATAGRAMS: Metric = Metric::counter(
-    "ros2probe_datagrams_total",
-    &[],
-    "Datagrams looked at in user space.",
-);
-pub(super) const RECORDS: Metric = Metric::counter(
-    "ros2probe_records_total",
-    &[],
-    "Measurement records taken in.",
-);
-pub(super) const DECODE_ERRORS: Metric = Metric::counter(
-    "ros2probe_decode_errors_total",
-    &["stage", "reason"],
-    "Packets and submessages that could not be read, by what was being read and why.",
-);
-pub(super) const TABLE_ENTRIES: Metric = Metric::gauge(
-    "ros2probe_table_entries",
-    &["table"],
-    "Entries of a bounded table; bytes for samples.",
-);
-pub(super) const TABLE_LIMIT: Metric =
-    Metric::gauge("ros2probe_table_limit", &["table"], "Its cap.");
-pub(super) const TABLE_EVICTIONS: Metric = Metric::counter(
-    "ros2probe_table_evictions_total",
-    &["table"],
-    "Entries given up because of the cap.",
-);
-pub(super) const TRACKED_TOPICS: Metric = Metric::gauge(
-    "ros2probe_tracked_topics",
-    &[],
-    "Topics that are or were measured and shown.",
-);
-pub(super) const TOPICS_REJECTED: Metric = Metric::counter(
-    "ros2probe_topics_rejected_total",
-    &[],
-    "Topics that the watchlist matched but the cap kept from being measured.",
-);
-pub(super) const TOPICS_HIDDEN: Metric = Metric::gauge(
-    "ros2probe_topics_not_shown",
-    &[],
-    "Topics without series of their own because of the cap or an ambiguous name.",
-);
-pub(super) const SNAPSHOT_AGE: Metric = Metric::gauge(
-    "ros2probe_snapshot_age_seconds",
-    &[],
-    "How old the state shown here is.",
-)
-.unit("seconds");
-pub(super) const SCRAPE_DURATION: Metric = Metric::gauge(
-    "ros2probe_scrape_duration_seconds",
-    &[],
-    "How long writing the previous scrape took.",
-)
-.unit("seconds");
-pub(super) const RELOAD_SUCCESSFUL: Metric = Metric::gauge(
-    "ros2probe_config_last_reload_successful",
-    &[],
-    "1 unless the last reload of the configuration was refused.",
-);
-pub(super) const RELOAD_TIMESTAMP: Metric = Metric::gauge(
-    "ros2probe_config_last_reload_success_timestamp_seconds",
-    &[],
-    "Unix time when a configuration was last taken over.",
-)
-.unit("seconds");
-
-// The process, under the names every exporter uses.
-pub(super) const PROCESS_CPU: Metric = Metric::counter(
-    "process_cpu_seconds_total",
-    &[],
-    "User and system CPU time.",
-)
-.unit("seconds");
-pub(super) const PROCESS_RESIDENT: Metric =
-    Metric::gauge("process_resident_memory_bytes", &[], "Resident memory.").unit("bytes");
-pub(super) const PROCESS_VIRTUAL: Metric =
-    Metric::gauge("process_virtual_memory_bytes", &[], "Virtual memory.").unit("bytes");
-pub(super) const PROCESS_OPEN_FDS: Metric =
-    Metric::gauge("process_open_fds", &[], "Open file descriptors.");
-pub(super) const PROCESS_MAX_FDS: Metric =
-    Metric::gauge("process_max_fds", &[], "File descriptors that may be open.");
-pub(super) const PROCESS_START_TIME: Metric = Metric::gauge(
-    "process_start_time_seconds",
-    &[],
-    "Unix time when the process started.",
-)
-.unit("seconds");
-
 /// All of them, in the order of the page.
 pub const CATALOGUE: &[Metric] = &[
     PARTICIPANTS,
@@ -487,9 +331,40 @@ pub const CATALOGUE: &[Metric] = &[
     TOPIC_INTERARRIVAL,
     TOPIC_LATENCY,
     TOPIC_HEADER_LATENCY,
+    TOPIC_SENT,
+    TOPIC_SENT_BYTES,
+    TOPIC_DELIVERED,
+    TOPIC_DELIVERED_BYTES,
+    TOPIC_DELIVERY_LOST,
+    TOPIC_DELIVERY_PENDING,
+    TOPIC_DELIVERY_RECOVERED,
+    TOPIC_DELIVERY_IRRELEVANT,
+    TOPIC_DELIVERY_UNMATCHED,
+    TOPIC_LAG,
+    TOPIC_LAG_SECONDS,
+    TOPIC_SEND_DELAY,
+    TOPIC_TRANSIT,
+    TOPIC_TRANSFER,
+    TOPIC_RETRANSMISSION,
     WRITER_MESSAGES,
     WRITER_BYTES,
     WRITER_LOST,
+    WRITER_SENT,
+    WRITER_SENT_BYTES,
+    SUBSCRIBER_INFO,
+    SUBSCRIBER_RECEIVED,
+    SUBSCRIBER_RECEIVED_BYTES,
+    SUBSCRIBER_LOST,
+    SUBSCRIBER_PENDING,
+    SUBSCRIBER_RECOVERED,
+    SUBSCRIBER_RECOVERY_SECONDS,
+    SUBSCRIBER_IRRELEVANT,
+    SUBSCRIBER_UNMATCHED,
+    READER_LAG,
+    READER_LAG_SECONDS,
+    READER_MISSING,
+    READER_REQUESTED,
+    SOCKET_DROPS,
     WATCH_STATE,
     WATCH_VIOLATED,
     BUILD_INFO,
@@ -515,6 +390,7 @@ pub const CATALOGUE: &[Metric] = &[
     TRACKED_TOPICS,
     TOPICS_REJECTED,
     TOPICS_HIDDEN,
+    DELIVERIES_HIDDEN,
     SNAPSHOT_AGE,
     SCRAPE_DURATION,
     RELOAD_SUCCESSFUL,

@@ -12,6 +12,7 @@ use prometheus_client::registry::Registry;
 
 use super::agent;
 use super::board::Board;
+use super::deliveries::{self, Deliveries};
 use super::page::Page;
 use super::robot::{self, Rows};
 use crate::model::snapshot::Snapshot;
@@ -120,17 +121,22 @@ impl Collector for Scrape {
         let (state, settings) = (self.board.state(), self.board.settings());
         let nothing = Snapshot::default();
         let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
-        let rows = Rows::new(snapshot, settings.max_topics);
+        let rows = Rows::new(snapshot, &settings);
         let now = Instant::now();
         let last_scrape = Duration::from_nanos(self.last_scrape.load(Ordering::Relaxed));
 
         let mut page = Page::new(encoder);
         robot::graph(&mut page, snapshot)?;
+        let deliveries = Deliveries::new(&rows.shown);
         robot::topics(&mut page, &rows.shown, &settings)?;
+        deliveries::sums(&mut page, &rows.shown, &settings)?;
+        robot::writers(&mut page, &rows.shown, &settings)?;
+        deliveries.write(&mut page)?;
+        deliveries::sockets(&mut page, &snapshot.sockets)?;
         robot::watches(&mut page, snapshot, &settings.watches)?;
         agent::identity(&mut page, &state, now)?;
         agent::capture(&mut page, &state)?;
-        agent::model(&mut page, &state, &rows)?;
+        agent::model(&mut page, &state, &rows, deliveries.hidden)?;
         agent::surface(&mut page, &state, self.board.reload(), last_scrape, now)?;
         agent::process(&mut page)
     }

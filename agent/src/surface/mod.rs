@@ -5,6 +5,7 @@ mod agent;
 pub mod agent_facts;
 pub mod board;
 pub mod catalogue;
+mod deliveries;
 pub mod exposition;
 pub mod http;
 mod page;

@@ -4,6 +4,7 @@
 use std::collections::hash_map::DefaultHasher;
 use std::fmt::{self, Write as _};
 use std::hash::{Hash as _, Hasher as _};
+use std::net::SocketAddr;
 
 use prometheus_client::encoding::{
     CounterValueEncoder, DescriptorEncoder, EncodeCounterValue, EncodeGaugeValue, EncodeLabelSet,
@@ -23,8 +24,9 @@ const MAX_LABEL_BYTES: usize = 256;
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Label<'a> {
     Text(&'a str),
-    Number(u32),
+    Number(u64),
     Guid(Guid),
+    Address(SocketAddr),
 }
 
 /// A sample value.
@@ -150,6 +152,7 @@ impl Label<'_> {
             Self::Text(text) => write_capped(&mut value, text)?,
             Self::Number(number) => write!(value, "{number}")?,
             Self::Guid(guid) => write!(value, "{guid}")?,
+            Self::Address(address) => write!(value, "{address}")?,
         }
         value.finish()
     }

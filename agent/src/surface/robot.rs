@@ -28,8 +28,10 @@ pub(super) struct Row<'a> {
     domain_id: u32,
     name: Cow<'a, str>,
     /// `None`: watched by name, but nobody has announced it.
-    facts: Option<&'a TopicFacts>,
+    pub(super) facts: Option<&'a TopicFacts>,
     watched: bool,
+    /// A watch asks for series per delivery.
+    pub(super) per_subscriber: bool,
 }
 
 /// The topics to show, sorted, and how many are left out.
@@ -40,7 +42,8 @@ pub(super) struct Rows<'a> {
 
 impl<'a> Rows<'a> {
     /// Topics that are measured come first; services and other plumbing are shown when measured.
-    pub(super) fn new(snapshot: &'a Snapshot, max_topics: usize) -> Self {
+    pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
+        let max_topics = settings.max_topics;
         let mut rows: BTreeMap<(u32, Cow<'a, str>), Row<'a>> = BTreeMap::new();
         let mut hidden = 0;
         let shown = |facts: &&TopicFacts| {
@@ -64,15 +67,25 @@ impl<'a> Rows<'a> {
                         name,
                         facts: Some(facts),
                         watched: false,
+                        per_subscriber: false,
                     },
                 );
             }
         }
-        for topic in snapshot.watches.iter().flat_map(|watch| &watch.topics) {
+        let watched = snapshot.watches.iter().flat_map(|watch| {
+            let configured = configured(watch, &settings.watches);
+            let per_subscriber = configured.is_some_and(|watch| watch.per_subscriber);
+            watch
+                .topics
+                .iter()
+                .map(move |topic| (topic, per_subscriber))
+        });
+        for (topic, per_subscriber) in watched {
             let (domain_id, name) = (topic.domain_id, Cow::Borrowed(topic.topic.as_str()));
             let key = (domain_id, name.clone());
             if let Some(row) = rows.get_mut(&key) {
                 row.watched = true;
+                row.per_subscriber |= per_subscriber;
             } else if rows.len() < max_topics {
                 rows.insert(
                     key,
@@ -81,6 +94,7 @@ impl<'a> Rows<'a> {
                         name,
                         facts: None,
                         watched: true,
+                        per_subscriber: false,
                     },
                 );
             }
@@ -93,8 +107,11 @@ impl<'a> Rows<'a> {
 }
 
 impl<'a> Row<'a> {
-    fn labels(&self) -> [Label<'_>; 2] {
-        [Label::Number(self.domain_id), Label::Text(&self.name)]
+    pub(super) fn labels(&self) -> [Label<'_>; 2] {
+        [
+            Label::Number(self.domain_id.into()),
+            Label::Text(&self.name),
+        ]
     }
 
     pub(super) fn measurement(&self) -> Option<&'a Measurement> {
@@ -142,13 +159,16 @@ pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
             *kinds.entry((topic.domain_id, topic.kind)).or_default() += 1;
         }
         kinds.iter().try_for_each(|((domain_id, kind), count)| {
-            family.sample(&[Label::Number(*domain_id), Label::Text(kind)], *count)
+            family.sample(
+                &[Label::Number((*domain_id).into()), Label::Text(kind)],
+                *count,
+            )
         })
     })?;
     page.family(&metric::DISCOVERY_EVENTS, |family| {
         snapshot.churn.iter().try_for_each(|churn| {
             let labels = [
-                Label::Number(churn.domain_id),
+                Label::Number(churn.domain_id.into()),
                 Label::Text(churn.entity),
                 Label::Text(churn.event),
             ];
@@ -175,7 +195,7 @@ fn per_domain(
     count: fn(&(usize, usize, usize)) -> usize,
 ) -> fmt::Result {
     domains.iter().try_for_each(|(domain_id, counts)| {
-        family.sample(&[Label::Number(*domain_id)], count(counts))
+        family.sample(&[Label::Number((*domain_id).into())], count(counts))
     })
 }
 
@@ -195,7 +215,7 @@ fn nodes(family: &mut Family<'_>, snapshot: &Snapshot) -> fmt::Result {
         let vendor = participant.map_or("", |participant| participant.vendor.as_str());
         let host = participant.and_then(|participant| participant.host.as_deref());
         family.info(&[
-            Label::Number(node.domain_id),
+            Label::Number(node.domain_id.into()),
             Label::Text(&node.name),
             Label::Guid(node.participant),
             Label::Text(vendor),
@@ -205,7 +225,7 @@ fn nodes(family: &mut Family<'_>, snapshot: &Snapshot) -> fmt::Result {
     Ok(())
 }
 
-/// Topics, and writers when `settings` asks for them.
+/// Topics.
 pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -> fmt::Result {
     page.family(&metric::TOPIC_INFO, |family| {
         rows.iter().try_for_each(|row| topic_info(family, row))
@@ -279,6 +299,11 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
             Ok(())
         })?;
     }
+    Ok(())
+}
+
+/// Writers, when `settings` ask for them.
+pub(super) fn writers(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -> fmt::Result {
     let per_writer: [(&Metric, Count); 3] = [
         (&metric::WRITER_MESSAGES, |measured| measured.messages),
         (&metric::WRITER_BYTES, |measured| measured.bytes),
@@ -288,7 +313,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
         page.family(metric, |family| {
             rows.iter()
                 .filter(|_| settings.per_writer)
-                .try_for_each(|row| writers(family, row, value))
+                .try_for_each(|row| each_writer(family, row, value))
         })?;
     }
     Ok(())
@@ -353,7 +378,7 @@ fn joined<'a>(values: impl Iterator<Item = &'a String>) -> String {
     text
 }
 
-fn writers(family: &mut Family<'_>, row: &Row<'_>, value: Count) -> fmt::Result {
+fn each_writer(family: &mut Family<'_>, row: &Row<'_>, value: Count) -> fmt::Result {
     let mut seen = BTreeSet::new();
     for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
         let Some(measured) = &writer.measurement else {
@@ -387,7 +412,7 @@ pub(super) fn watches(
             for topic in &watch.topics {
                 for state in WatchState::ALL {
                     let labels = [
-                        Label::Number(topic.domain_id),
+                        Label::Number(topic.domain_id.into()),
                         Label::Text(&topic.topic),
                         Label::Text(&name),
                         Label::Text(state.label()),
@@ -400,10 +425,7 @@ pub(super) fn watches(
     })?;
     page.family(&metric::WATCH_VIOLATED, |family| {
         for watch in &snapshot.watches {
-            let same = |other: &&Watch| {
-                other.pattern == watch.pattern && other.domain_id == watch.domain_id
-            };
-            let Some(configured) = configured.iter().find(same) else {
+            let Some(configured) = self::configured(watch, configured) else {
                 continue;
             };
             let expectations = configured.expectations.keys();
@@ -411,7 +433,7 @@ pub(super) fn watches(
             for topic in &watch.topics {
                 for (expectation, _) in expectations.iter().filter(|(_, set)| *set) {
                     let labels = [
-                        Label::Number(topic.domain_id),
+                        Label::Number(topic.domain_id.into()),
                         Label::Text(&topic.topic),
                         Label::Text(&name),
                         Label::Text(expectation),
@@ -422,6 +444,13 @@ pub(super) fn watches(
         }
         Ok(())
     })
+}
+
+/// The entry of the configuration that is in force for what the model calls `watch`.
+fn configured<'c>(watch: &WatchFacts, configured: &'c [Watch]) -> Option<&'c Watch> {
+    let same =
+        |other: &&Watch| (&other.pattern, other.domain_id) == (&watch.pattern, watch.domain_id);
+    configured.iter().find(same)
 }
 
 /// `/points`, or `/points@5` when it is for one domain; `@` is in no ROS name.

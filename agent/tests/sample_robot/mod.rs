@@ -4,9 +4,9 @@ use std::time::{Duration, Instant};
 
 use ros2probe::model::histogram::Histogram;
 use ros2probe::model::snapshot::{
-    ChurnCount, DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts,
-    Snapshot, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
-    WatchedTopicFacts,
+    AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
+    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Snapshot, SocketFacts,
+    TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe::surface::{AgentFacts, InterfaceFacts, SourceKind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
@@ -36,7 +36,13 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             lease_nanoseconds: Some(20_000_000_000),
             secured: false,
         }],
-        sockets: Vec::new(),
+        sockets: vec![SocketFacts {
+            cookie: 77,
+            process_id: Some(42),
+            process: Some("mapper".to_owned()),
+            cgroup: Some("/robot.slice".to_owned()),
+            unidentified_drops: 5,
+        }],
         nodes: vec![NodeFacts {
             domain_id: 0,
             name: "/lidar".to_owned(),
@@ -122,13 +128,87 @@ pub fn topic(name: &str) -> TopicFacts {
         publishers: vec![endpoint(guid(1))],
         subscriptions: vec![endpoint(guid(2))],
         measurement: Some(Box::new(measurement())),
-        received: None,
-        sent: None,
-        breakdown: None,
-        deliveries: Vec::new(),
-        acknowledgements: Vec::new(),
+        received: Some(Box::new(delivered())),
+        sent: Some(Box::new(sent())),
+        breakdown: Some(Box::new(breakdown())),
+        deliveries: vec![delivery(Direction::Sent), delivery(Direction::Received)],
+        acknowledgements: vec![AcknowledgementFacts {
+            writer: guid(1),
+            reader: guid(2),
+            node: Some("/mapper".to_owned()),
+            acknowledged: 123_400,
+            missing: 2,
+            requested: 9,
+            acknacks: 1_000,
+            lag_samples: 56,
+            lag_seconds: Some(2.75),
+            last_seen: Timestamp(1_700_000_000_000_000_000),
+        }],
         vanished: false,
     }
+}
+
+/// What one writer sends to the destination of one subscriber, or what that one received.
+pub fn delivery(direction: Direction) -> DeliveryFacts {
+    let guid = |entity: [u8; 4]| Guid::new(GuidPrefix([1; 12]), EntityId(entity));
+    let received = direction == Direction::Received;
+    let participant = guid([0, 0, 1, 0xc1]);
+    DeliveryFacts {
+        writer: guid([0, 0, 1, 3]),
+        direction,
+        destination: "10.0.0.2:7411".parse().unwrap(),
+        subscriber: if received {
+            format!("participant {participant}")
+        } else {
+            String::new()
+        },
+        participant: received.then_some(participant),
+        readers: vec![guid([0, 0, 2, 4])],
+        nodes: vec!["/mapper".to_owned()],
+        sockets: vec![77],
+        process_id: Some(42),
+        process: Some("mapper".to_owned()),
+        cgroup: Some("/robot.slice".to_owned()),
+        first_seen: Timestamp(5),
+        last_seen: Timestamp(6),
+        delivered: if received { delivered() } else { sent() },
+    }
+}
+
+fn delivered() -> Delivered {
+    Delivered {
+        messages: 900,
+        bytes: 580_000_000,
+        recovered: 3,
+        recovery_seconds: 0.25,
+        unmatched: 4,
+        irrelevant: 5,
+        lost_before_host: 60,
+        lost_in_reassembly: 20,
+        lost_in_socket_buffer: 15,
+        pending: 1,
+        ..Delivered::default()
+    }
+}
+
+fn sent() -> Delivered {
+    Delivered {
+        messages: 1_000,
+        bytes: 644_000_000,
+        ..Delivered::default()
+    }
+}
+
+fn breakdown() -> Breakdown {
+    let mut breakdown = Breakdown::default();
+    for step in 1..=1_000 {
+        let seconds = Duration::from_micros(step * 7).as_secs_f64();
+        breakdown.send_delay.observe(seconds);
+        breakdown.transit.observe(seconds);
+        breakdown.transfer.observe(seconds);
+        breakdown.retransmission.observe(seconds);
+    }
+    breakdown
 }
 
 fn measurement() -> Measurement {

@@ -1,0 +1,169 @@
+//! What the agent says of itself (`ros2probe_*`, `process_*`): what it drops, cannot read or cannot hold.
+
+use super::Metric;
+
+pub(in crate::surface) const BUILD_INFO: Metric = Metric::info(
+    "ros2probe_build_info",
+    &["version", "arch"],
+    "What is running.",
+);
+pub(in crate::surface) const SOURCE_INFO: Metric = Metric::info(
+    "ros2probe_capture_source_info",
+    &["source", "reason"],
+    "Where packets come from: the host's sockets, the wire or a replay, and why not from one that shows more.",
+);
+pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
+    "ros2probe_capture_ability",
+    &["ability"],
+    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded.",
+);
+pub(in crate::surface) const READY: Metric = Metric::gauge(
+    "ros2probe_ready",
+    &[],
+    "1 while packets are captured and the model is fresh, as /readyz answers.",
+);
+pub(in crate::surface) const CAPTURE_PACKETS: Metric = Metric::counter(
+    "ros2probe_capture_packets_total",
+    &["interface"],
+    "Packets that the filter let through to user space.",
+);
+pub(in crate::surface) const CAPTURE_DROPPED: Metric = Metric::counter(
+    "ros2probe_capture_dropped_packets_total",
+    &["interface"],
+    "Packets lost because the ring was full, by socket (`any`: all interfaces of a namespace): above 0, everything else is a lower bound.",
+);
+pub(in crate::surface) const CAPTURE_COPIED: Metric = Metric::counter(
+    "ros2probe_capture_copied_bytes_total",
+    &[],
+    "Bytes copied to user space, packets and records.",
+)
+.unit("bytes");
+pub(in crate::surface) const FILTER_EVENTS: Metric = Metric::counter(
+    "ros2probe_filter_events_total",
+    &["event"],
+    "What the kernel filter met and did, by event.",
+)
+.experimental();
+pub(in crate::surface) const FILTER_REFUSED: Metric = Metric::counter(
+    "ros2probe_filter_refused_updates_total",
+    &[],
+    "Changes of interest for which the kernel filter had no room: those writers stay unknown to it.",
+);
+pub(in crate::surface) const RECORDS_DROPPED: Metric = Metric::counter(
+    "ros2probe_records_dropped_total",
+    &[],
+    "Measurement records lost because their ring was full: above 0, counts are lower bounds.",
+);
+pub(in crate::surface) const PIECES_DROPPED: Metric = Metric::counter(
+    "ros2probe_dropped_datagrams_total",
+    &[],
+    "Datagrams captured at the host's sockets that were lost because their ring was full: discovery may be incomplete.",
+);
+pub(in crate::surface) const CONTENDED: Metric = Metric::counter(
+    "ros2probe_contended_datagrams_total",
+    &[],
+    "Datagrams not looked at because the hook's working memory was in use: above 0, counts are lower bounds.",
+);
+pub(in crate::surface) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
+    "ros2probe_incomplete_datagrams_total",
+    &[],
+    "Fragmented datagrams that were begun and never became complete.",
+);
+pub(in crate::surface) const REASSEMBLY: Metric = Metric::gauge(
+    "ros2probe_reassembly_bytes",
+    &[],
+    "Memory held to put captured fragments together, up to limits.reassembly_bytes.",
+)
+.unit("bytes");
+pub(in crate::surface) const DATAGRAMS: Metric = Metric::counter(
+    "ros2probe_datagrams_total",
+    &[],
+    "Datagrams looked at in user space.",
+);
+pub(in crate::surface) const RECORDS: Metric = Metric::counter(
+    "ros2probe_records_total",
+    &[],
+    "Measurement records taken in.",
+);
+pub(in crate::surface) const DECODE_ERRORS: Metric = Metric::counter(
+    "ros2probe_decode_errors_total",
+    &["stage", "reason"],
+    "Packets and submessages that could not be read, by what was being read and why.",
+);
+pub(in crate::surface) const TABLE_ENTRIES: Metric = Metric::gauge(
+    "ros2probe_table_entries",
+    &["table"],
+    "Entries of a bounded table; bytes for samples.",
+);
+pub(in crate::surface) const TABLE_LIMIT: Metric =
+    Metric::gauge("ros2probe_table_limit", &["table"], "Its cap.");
+pub(in crate::surface) const TABLE_EVICTIONS: Metric = Metric::counter(
+    "ros2probe_table_evictions_total",
+    &["table"],
+    "Entries given up because of the cap.",
+);
+pub(in crate::surface) const TRACKED_TOPICS: Metric = Metric::gauge(
+    "ros2probe_tracked_topics",
+    &[],
+    "Topics that are or were measured and shown.",
+);
+pub(in crate::surface) const TOPICS_REJECTED: Metric = Metric::counter(
+    "ros2probe_topics_rejected_total",
+    &[],
+    "Topics that the watchlist matched but the cap kept from being measured.",
+);
+pub(in crate::surface) const TOPICS_HIDDEN: Metric = Metric::gauge(
+    "ros2probe_topics_not_shown",
+    &[],
+    "Topics without series of their own because of the cap or an ambiguous name.",
+);
+pub(in crate::surface) const DELIVERIES_HIDDEN: Metric = Metric::gauge(
+    "ros2probe_deliveries_not_shown",
+    &[],
+    "Deliveries and acknowledging readers of per_subscriber topics beyond the first 1000 of each: they are in the topic's sums alone.",
+);
+pub(in crate::surface) const SNAPSHOT_AGE: Metric = Metric::gauge(
+    "ros2probe_snapshot_age_seconds",
+    &[],
+    "How old the state shown here is.",
+)
+.unit("seconds");
+pub(in crate::surface) const SCRAPE_DURATION: Metric = Metric::gauge(
+    "ros2probe_scrape_duration_seconds",
+    &[],
+    "How long writing the previous scrape took.",
+)
+.unit("seconds");
+pub(in crate::surface) const RELOAD_SUCCESSFUL: Metric = Metric::gauge(
+    "ros2probe_config_last_reload_successful",
+    &[],
+    "1 unless the last reload of the configuration was refused.",
+);
+pub(in crate::surface) const RELOAD_TIMESTAMP: Metric = Metric::gauge(
+    "ros2probe_config_last_reload_success_timestamp_seconds",
+    &[],
+    "Unix time when a configuration was last taken over.",
+)
+.unit("seconds");
+
+// The process, under the names every exporter uses.
+pub(in crate::surface) const PROCESS_CPU: Metric = Metric::counter(
+    "process_cpu_seconds_total",
+    &[],
+    "User and system CPU time.",
+)
+.unit("seconds");
+pub(in crate::surface) const PROCESS_RESIDENT: Metric =
+    Metric::gauge("process_resident_memory_bytes", &[], "Resident memory.").unit("bytes");
+pub(in crate::surface) const PROCESS_VIRTUAL: Metric =
+    Metric::gauge("process_virtual_memory_bytes", &[], "Virtual memory.").unit("bytes");
+pub(in crate::surface) const PROCESS_OPEN_FDS: Metric =
+    Metric::gauge("process_open_fds", &[], "Open file descriptors.");
+pub(in crate::surface) const PROCESS_MAX_FDS: Metric =
+    Metric::gauge("process_max_fds", &[], "File descriptors that may be open.");
+pub(in crate::surface) const PROCESS_START_TIME: Metric = Metric::gauge(
+    "process_start_time_seconds",
+    &[],
+    "Unix time when the process started.",
+)
+.unit("seconds");

@@ -1,0 +1,213 @@
+//! What became of messages on their way to each receiver: sums per topic, always, and series per
+//! delivery where a watch asks for them.
+
+use super::{Metric, TOPIC};
+
+/// What is sent; received series bear the same, so that PromQL can subtract them across hosts.
+const DESTINATION: &[&str] = &["domain_id", "topic", "writer", "destination"];
+const SUBSCRIBER: &[&str] = &["domain_id", "topic", "writer", "destination", "subscriber"];
+const SUBSCRIBER_CAUSE: &[&str] = &[
+    "domain_id",
+    "topic",
+    "writer",
+    "destination",
+    "subscriber",
+    "cause",
+];
+const READER: &[&str] = &["domain_id", "topic", "writer", "reader", "ros_node"];
+
+// Sums over all receivers and destinations of a topic.
+pub(in crate::surface) const TOPIC_SENT: Metric = Metric::counter(
+    "ros2_topic_sent_messages_total",
+    TOPIC,
+    "Messages seen leaving this host, once for each destination.",
+);
+pub(in crate::surface) const TOPIC_SENT_BYTES: Metric = Metric::counter(
+    "ros2_topic_sent_bytes_total",
+    TOPIC,
+    "Payload bytes of those messages.",
+)
+.unit("bytes");
+pub(in crate::surface) const TOPIC_DELIVERED: Metric = Metric::counter(
+    "ros2_topic_delivered_messages_total",
+    TOPIC,
+    "Messages that reached a receiver on this host whole, once for each receiver.",
+);
+pub(in crate::surface) const TOPIC_DELIVERED_BYTES: Metric = Metric::counter(
+    "ros2_topic_delivered_bytes_total",
+    TOPIC,
+    "Payload bytes of those messages.",
+)
+.unit("bytes");
+pub(in crate::surface) const TOPIC_DELIVERY_LOST: Metric = Metric::counter(
+    "ros2_topic_delivery_lost_messages_total",
+    &["domain_id", "topic", "cause"],
+    "Messages that a receiver on this host never got, by where they died: before_host, reassembly or socket_buffer.",
+);
+pub(in crate::surface) const TOPIC_DELIVERY_PENDING: Metric = Metric::gauge(
+    "ros2_topic_delivery_pending_messages",
+    TOPIC,
+    "Messages that are lost too, but it takes the kernel up to 35 s to say where.",
+);
+pub(in crate::surface) const TOPIC_DELIVERY_RECOVERED: Metric = Metric::counter(
+    "ros2_topic_delivery_recovered_messages_total",
+    TOPIC,
+    "Delivered messages that were missing first and came by retransmission.",
+);
+pub(in crate::surface) const TOPIC_DELIVERY_IRRELEVANT: Metric = Metric::counter(
+    "ros2_topic_delivery_irrelevant_messages_total",
+    TOPIC,
+    "Messages that did not come because their writer said that they would not (GAP, HEARTBEAT): no losses.",
+);
+pub(in crate::surface) const TOPIC_DELIVERY_UNMATCHED: Metric = Metric::counter(
+    "ros2_topic_delivery_unmatched_messages_total",
+    TOPIC,
+    "Delivered messages that arrived where no reader of the topic is known.",
+);
+pub(in crate::surface) const TOPIC_LAG: Metric = Metric::gauge(
+    "ros2_topic_acknowledgement_lag_messages",
+    TOPIC,
+    "Messages that the slowest reliable reader has not acknowledged.",
+);
+pub(in crate::surface) const TOPIC_LAG_SECONDS: Metric = Metric::gauge(
+    "ros2_topic_acknowledgement_lag_seconds",
+    TOPIC,
+    "Age of the oldest message that a reliable reader has not acknowledged; infinite when older than is remembered.",
+)
+.unit("seconds");
+pub(in crate::surface) const TOPIC_SEND_DELAY: Metric = Metric::histogram(
+    "ros2_topic_send_delay_seconds",
+    TOPIC,
+    "From the writer's timestamp to the message's first datagram leaving this host.",
+)
+.unit("seconds");
+pub(in crate::surface) const TOPIC_TRANSIT: Metric = Metric::histogram(
+    "ros2_topic_transit_seconds",
+    TOPIC,
+    "From leaving to arriving, last datagram to last datagram, where both happen on this host; one value for each receiver.",
+)
+.unit("seconds");
+pub(in crate::surface) const TOPIC_TRANSFER: Metric = Metric::histogram(
+    "ros2_topic_transfer_seconds",
+    TOPIC,
+    "From the first to the last datagram of a message that came in several.",
+)
+.unit("seconds");
+pub(in crate::surface) const TOPIC_RETRANSMISSION: Metric = Metric::histogram(
+    "ros2_topic_retransmission_delay_seconds",
+    TOPIC,
+    "From noticing that a message is missing to its arrival by retransmission; one value for each receiver.",
+)
+.unit("seconds");
+
+// Deliveries, on request.
+pub(in crate::surface) const WRITER_SENT: Metric = Metric::counter(
+    "ros2_writer_sent_messages_total",
+    DESTINATION,
+    "Messages of a writer seen leaving this host, by destination.",
+)
+.experimental();
+pub(in crate::surface) const WRITER_SENT_BYTES: Metric = Metric::counter(
+    "ros2_writer_sent_bytes_total",
+    DESTINATION,
+    "Payload bytes of those messages.",
+)
+.unit("bytes")
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_INFO: Metric = Metric::info(
+    "ros2_subscriber_info",
+    &[
+        "domain_id",
+        "topic",
+        "destination",
+        "subscriber",
+        "ros_node",
+        "participant",
+        "process",
+        "pid",
+        "cgroup",
+    ],
+    "Who receives: nodes with readers of the topic, participant, and process and control group of the socket where they can be had.",
+)
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_RECEIVED: Metric = Metric::counter(
+    "ros2_subscriber_received_messages_total",
+    SUBSCRIBER,
+    "Messages of a writer that reached this receiver whole.",
+)
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_RECEIVED_BYTES: Metric = Metric::counter(
+    "ros2_subscriber_received_bytes_total",
+    SUBSCRIBER,
+    "Payload bytes of those messages.",
+)
+.unit("bytes")
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_LOST: Metric = Metric::counter(
+    "ros2_subscriber_lost_messages_total",
+    SUBSCRIBER_CAUSE,
+    "Messages of a writer that this receiver never got, by where they died.",
+)
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_PENDING: Metric = Metric::gauge(
+    "ros2_subscriber_pending_messages",
+    SUBSCRIBER,
+    "Messages that are lost too, while it is not known where.",
+)
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_RECOVERED: Metric = Metric::counter(
+    "ros2_subscriber_recovered_messages_total",
+    SUBSCRIBER,
+    "Received messages that came by retransmission.",
+)
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_RECOVERY_SECONDS: Metric = Metric::counter(
+    "ros2_subscriber_recovery_seconds_total",
+    SUBSCRIBER,
+    "Time for which those were missing, summed.",
+)
+.unit("seconds")
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_IRRELEVANT: Metric = Metric::counter(
+    "ros2_subscriber_irrelevant_messages_total",
+    SUBSCRIBER,
+    "Messages that the writer excused (GAP, HEARTBEAT).",
+)
+.experimental();
+pub(in crate::surface) const SUBSCRIBER_UNMATCHED: Metric = Metric::counter(
+    "ros2_subscriber_unmatched_messages_total",
+    SUBSCRIBER,
+    "Received messages without a known reader of the topic.",
+)
+.experimental();
+pub(in crate::surface) const READER_LAG: Metric = Metric::gauge(
+    "ros2_reader_acknowledgement_lag_messages",
+    READER,
+    "Messages that exist and that this reliable reader has not acknowledged.",
+)
+.experimental();
+pub(in crate::surface) const READER_LAG_SECONDS: Metric = Metric::gauge(
+    "ros2_reader_acknowledgement_lag_seconds",
+    READER,
+    "Age of the oldest of them; infinite when older than is remembered.",
+)
+.unit("seconds")
+.experimental();
+pub(in crate::surface) const READER_MISSING: Metric = Metric::gauge(
+    "ros2_reader_missing_messages",
+    READER,
+    "Messages that the reader asked for in its last ACKNACK.",
+)
+.experimental();
+pub(in crate::surface) const READER_REQUESTED: Metric = Metric::counter(
+    "ros2_reader_requested_messages_total",
+    READER,
+    "Messages that the reader asked for again, every request counted.",
+)
+.experimental();
+pub(in crate::surface) const SOCKET_DROPS: Metric = Metric::counter(
+    "ros2_socket_unidentified_drops_total",
+    &["socket", "process", "pid", "cgroup"],
+    "Datagrams that a socket had no room for and of which it is not known what they held; for the first 64 sockets with any.",
+)
+.experimental();
