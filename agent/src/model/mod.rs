@@ -14,6 +14,7 @@ pub mod pieces;
 pub mod profiler;
 pub mod rate;
 pub mod reassembly;
+pub mod reception;
 mod report;
 pub mod samples;
 pub mod sequence;

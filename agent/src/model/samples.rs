@@ -70,6 +70,8 @@ pub struct Facts {
     pub stamp: Option<(i32, u32)>,
     /// Size in bytes.
     pub size: u32,
+    /// The first datagram of the record that came first.
+    pub began: Timestamp,
     /// Its last missing fragment came this long after its last fragment number, nanoseconds.
     pub repaired_after: i64,
 }
@@ -222,6 +224,7 @@ impl Samples {
             latest: now,
             facts: Facts {
                 size: record.sample_size,
+                began: Timestamp(now.0.saturating_sub(record.elapsed.into())),
                 ..Facts::default()
             },
         });

@@ -75,7 +75,7 @@ pub enum Arrival {
 
 /// How a sample was delivered, for telling a retransmission.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Delivery {
+pub enum Manner {
     /// The writer never retransmits.
     BestEffort,
     /// The writer retransmits what a reader misses.
@@ -124,7 +124,7 @@ impl Sequence {
     pub fn receive(
         &mut self,
         number: u64,
-        delivery: Delivery,
+        manner: Manner,
         now: Timestamp,
         settled: &mut impl FnMut(Settled),
     ) -> Arrival {
@@ -152,7 +152,7 @@ impl Sequence {
             return Arrival::Duplicate;
         }
         self.received.set(number);
-        let recovered = number >= self.first && self.was_retransmitted(number, delivery, now);
+        let recovered = number >= self.first && self.was_retransmitted(number, manner, now);
         Arrival::New {
             recovered,
             newest: false,
@@ -184,6 +184,43 @@ impl Sequence {
     pub fn begin(&mut self, number: u64) {
         if !self.started() && number > 0 && number < u64::MAX >> 1 {
             self.restart(number);
+        }
+    }
+
+    /// All below are decided.
+    #[must_use]
+    pub const fn settled(&self) -> u64 {
+        self.settled
+    }
+
+    /// When it was noticed that this one was missing, as far as that is remembered.
+    #[must_use]
+    pub fn missed_since(&self, number: u64) -> Option<Timestamp> {
+        let mut gaps = self.gaps.iter().rev();
+        let gap = gaps.find(|gap| gap.start <= number && number < gap.end);
+        gap.map(|gap| gap.noticed)
+    }
+
+    /// This one came another way: it is no loss here, and no sample either.
+    pub fn know(&mut self, number: u64) {
+        if self.started() && number >= self.floor() && number < self.next {
+            self.received.set(number);
+        }
+    }
+
+    /// Takes over what `other` received of the same writer's numbers; where both go, this one's
+    /// beginning counts.
+    pub fn absorb(&mut self, other: &Self, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+        if !self.started() || !other.started() {
+            return;
+        }
+        if other.next > self.next && other.next - self.next <= MAX_AHEAD {
+            self.extend(other.next - 1, other.next, now, settled);
+        }
+        for number in self.floor().max(other.floor())..self.next.min(other.next) {
+            if other.received.get(number) {
+                self.received.set(number);
+            }
         }
     }
 
@@ -373,18 +410,18 @@ impl Sequence {
         });
     }
 
-    fn was_retransmitted(&self, number: u64, delivery: Delivery, now: Timestamp) -> bool {
+    fn was_retransmitted(&self, number: u64, manner: Manner, now: Timestamp) -> bool {
         let gap = self
             .gaps
             .iter()
             .rev()
             .find(|gap| gap.start <= number && number < gap.end);
         let late = |gap: &Gap| gap.requested || now.nanoseconds_since(gap.noticed) >= REORDERING;
-        match delivery {
-            Delivery::BestEffort => false,
+        match manner {
+            Manner::BestEffort => false,
             // A gap that was forgotten is an old one.
-            Delivery::Reliable => gap.is_none_or(late),
-            Delivery::ReliableFragments => gap.is_some_and(late),
+            Manner::Reliable => gap.is_none_or(late),
+            Manner::ReliableFragments => gap.is_some_and(late),
         }
     }
 

@@ -4,27 +4,23 @@
 //! it. An idle writer takes under 2 KiB; what grows with traffic (bitmaps) is bounded in
 //! [`super::sequence`] and [`super::samples`].
 
-use ros2probe_wire::record::kind;
+use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::header::stamp_time;
 use super::histogram::Histogram;
 use super::journal::{Journal, Loss};
 use super::rate::{SECONDS, Slot, Window};
-use super::samples::{Budget, Progress, Samples};
-use super::sequence::{Arrival, Delivery, Sequence, Settled};
+use super::reception::{Decision, Outcome, Reception};
+use super::samples::Budget;
 use super::snapshot::Measurement;
 
 /// How long a gap of a best-effort writer may fill by reordering.
 pub const BEST_EFFORT_WINDOW: u64 = 1_000_000_000;
 /// How long a reliable writer may take to retransmit: three of Fast DDS's HEARTBEAT periods.
 pub const RELIABLE_WINDOW: u64 = 10_000_000_000;
-/// A fragment that completes its sample this late after the sample's last one was retransmitted.
-const REPAIR: i64 = 5_000_000;
 /// A first sample older than this is history that a late joiner asked for.
 const HISTORY: u64 = 10_000_000_000;
-const DATA_FLAG: u8 = 0x04;
-const FRAGMENT_KEY_FLAG: u8 = 0x04;
 
 /// What discovery says about the writer; all false while it is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -53,8 +49,7 @@ pub struct Scene<'a> {
 pub struct Writer {
     guid: Guid,
     traits: Traits,
-    sequence: Sequence,
-    samples: Samples,
+    reception: Reception,
     tally: Tally,
     interarrival: Histogram,
     source_latency: Histogram,
@@ -83,8 +78,7 @@ impl Writer {
         Self {
             guid,
             traits,
-            sequence: Sequence::default(),
-            samples: Samples::default(),
+            reception: Reception::default(),
             tally: Tally::default(),
             interarrival: Histogram::default(),
             source_latency: Histogram::default(),
@@ -101,7 +95,24 @@ impl Writer {
 
     /// Moves what its unfinished samples take from one budget to another.
     pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
-        self.samples.transfer(from, to);
+        self.reception.transfer(from, to);
+    }
+
+    /// What discovery and its HEARTBEATs said.
+    #[must_use]
+    pub const fn traits(&self) -> Traits {
+        self.traits
+    }
+
+    /// One past the highest number known to exist.
+    #[must_use]
+    pub const fn next(&self) -> u64 {
+        self.reception.sequence().next()
+    }
+
+    /// A sample or fragment came again the way it had come before.
+    pub const fn came_again(&mut self) {
+        self.tally.duplicates += 1;
     }
 
     /// Messages counted.
@@ -119,55 +130,51 @@ impl Writer {
     /// Takes in a record of this writer. `opened` is when last a way for its samples was opened
     /// that this host sees: what is missing before it went elsewhere.
     pub fn record(&mut self, record: &Record, opened: Timestamp, scene: &mut Scene<'_>) {
-        let before = (self.sequence.next(), self.sequence.last_advance());
+        let sequence = self.reception.sequence();
+        let before = (sequence.next(), sequence.last_advance());
         match record.kind {
-            kind::DATA => self.data(record, scene),
-            kind::DATA_FRAG => self.fragment(record, scene),
+            kind::DATA | kind::DATA_FRAG => self.sample(record, scene),
             kind::HEARTBEAT => {
                 self.traits.reliable = true;
-                let (first, last) = (record.sequence_number, record.second_sequence_number());
-                let (sequence, mut settling) = self.parts(scene);
-                sequence.heartbeat(first, last, record_time(record), &mut |settled| {
-                    settling.take(settled);
+                let (reception, mut settling) = self.parts(scene.journal, scene.now);
+                reception.heartbeat(record, scene.budget, &mut |decision| {
+                    settling.take(decision);
                 });
             }
             kind::GAP => {
-                let (start, base) = (record.sequence_number, record.second_sequence_number());
-                let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
-                let (sequence, mut settling) = self.parts(scene);
-                sequence.gap(start, base, set, record_time(record), &mut |settled| {
-                    settling.take(settled);
+                let (reception, mut settling) = self.parts(scene.journal, scene.now);
+                reception.gap(record, scene.budget, &mut |decision| {
+                    settling.take(decision);
                 });
             }
             kind::ACKNACK => {
                 let base = record.sequence_number;
                 let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
-                self.sequence.requested(set);
+                self.reception.sequence_mut().requested(set);
             }
             _ => {}
         }
         let (next, advanced) = before;
-        if next > 0 && advanced < opened && self.sequence.next() > next {
+        let sequence = self.reception.sequence_mut();
+        if next > 0 && advanced < opened && sequence.next() > next {
             // The newest one is excused too, which means nothing once it is received.
-            self.sequence.excuse(next, self.sequence.next());
+            sequence.excuse(next, sequence.next());
         }
     }
 
     /// Settles what has waited long enough.
     pub fn advance(&mut self, scene: &mut Scene<'_>) {
-        let window = self.settle_window();
-        let hold = self.samples.growing(scene.now, window);
-        let now = scene.now;
-        let (sequence, mut settling) = self.parts(scene);
-        sequence.advance(now, window, hold, &mut |settled| settling.take(settled));
-        self.samples.expire(now, 2 * window, scene.budget);
+        let (now, window) = (scene.now, settle_window(self.traits.reliable));
+        let (reception, mut settling) = self.parts(scene.journal, scene.now);
+        reception.advance(now, window, scene.budget, &mut |decision| {
+            settling.take(decision);
+        });
     }
 
     /// Settles everything: nothing more will come.
     pub fn settle(&mut self, scene: &mut Scene<'_>) {
-        let (sequence, mut settling) = self.parts(scene);
-        sequence.settle_all(&mut |settled| settling.take(settled));
-        self.samples.clear(scene.budget);
+        let (reception, mut settling) = self.parts(scene.journal, scene.now);
+        reception.settle(scene.budget, &mut |decision| settling.take(decision));
     }
 
     /// Everything counted so far.
@@ -209,102 +216,39 @@ impl Writer {
         self.tally.window.sum(now, seconds)
     }
 
-    /// The sequence, and what its verdicts change.
-    const fn parts<'a>(&'a mut self, scene: &'a mut Scene<'_>) -> (&'a mut Sequence, Settling<'a>) {
+    /// The reception, and what its decisions change.
+    const fn parts<'a>(
+        &'a mut self,
+        journal: &'a mut Journal,
+        at: Timestamp,
+    ) -> (&'a mut Reception, Settling<'a>) {
         let settling = Settling {
             tally: &mut self.tally,
-            samples: &mut self.samples,
-            budget: scene.budget,
-            journal: scene.journal,
+            journal,
             writer: self.guid,
-            at: scene.now,
+            at,
         };
-        (&mut self.sequence, settling)
+        (&mut self.reception, settling)
     }
 
-    const fn settle_window(&self) -> u64 {
-        if self.traits.reliable {
-            RELIABLE_WINDOW
-        } else {
-            BEST_EFFORT_WINDOW
-        }
-    }
-
-    fn data(&mut self, record: &Record, scene: &mut Scene<'_>) {
-        let number = record.sequence_number;
-        self.sequence
-            .recognise(number, record.source_timestamp().timestamp());
-        let delivery = if self.traits.reliable {
-            Delivery::Reliable
-        } else {
-            Delivery::BestEffort
-        };
+    fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) {
         let now = record_time(record);
-        let (sequence, mut settling) = self.parts(scene);
-        let arrival =
-            sequence.receive(number, delivery, now, &mut |settled| settling.take(settled));
-        self.samples.forget(number, scene.budget);
-        match arrival {
-            Arrival::Duplicate => self.tally.duplicates += 1,
-            Arrival::New { recovered, newest } => {
-                // A key alone is a disposal, and it takes a sequence number like any sample.
-                if record.submessage_flags & DATA_FLAG == 0 || record.status_info != 0 {
-                    return;
-                }
-                self.count(now, record.payload_len.into(), recovered);
-                let stamp = record.header_stamp();
-                self.delays(number, newest, record.source_timestamp(), stamp, now);
+        let reliable = self.traits.reliable;
+        let (reception, mut settling) = self.parts(scene.journal, scene.now);
+        let outcome = reception.sample(record, reliable, scene.budget, &mut |decision| {
+            settling.take(decision);
+        });
+        match outcome {
+            Outcome::Open => {}
+            // Seen at several sockets is not sent again: there the caller knows.
+            Outcome::Again => {
+                self.tally.duplicates += u64::from(record.flags & flag::HOST == 0);
             }
-        }
-    }
-
-    fn fragment(&mut self, record: &Record, scene: &mut Scene<'_>) {
-        let number = record.sequence_number;
-        let now = record_time(record);
-        self.sequence
-            .recognise(number, record.source_timestamp().timestamp());
-        if self.sequence.has(number) {
-            self.tally.duplicates += 1;
-            return;
-        }
-        match self.samples.fragment(record, now, scene.budget) {
-            Progress::Rejected => {}
-            Progress::TooMany => {
-                self.sequence.begin(number);
-                let (sequence, mut settling) = self.parts(scene);
-                sequence.exists(number, now, &mut |settled| settling.take(settled));
-                sequence.excuse(number, number.saturating_add(1));
+            Outcome::Whole(whole) if whole.is_message => {
+                self.count(now, whole.bytes, whole.recovered);
+                self.delays(whole.number, whole.newest, whole.source, whole.stamp, now);
             }
-            Progress::Duplicate => self.tally.duplicates += 1,
-            progress => {
-                // A sample that is joined in the middle does not count as one that was sent; the
-                // writer's first one cannot be.
-                let joined = u64::from(record.fragment_start != 1 && number > 1);
-                self.sequence.begin(number.saturating_add(joined));
-                let reliable = self.traits.reliable;
-                let (sequence, mut settling) = self.parts(scene);
-                sequence.exists(number, now, &mut |settled| settling.take(settled));
-                let Progress::Complete(facts) = progress else {
-                    return;
-                };
-                let delivery = if reliable {
-                    Delivery::ReliableFragments
-                } else {
-                    Delivery::BestEffort
-                };
-                let arrival =
-                    sequence.receive(number, delivery, now, &mut |settled| settling.take(settled));
-                let Arrival::New { recovered, .. } = arrival else {
-                    return;
-                };
-                let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
-                if is_key || record.status_info != 0 {
-                    return;
-                }
-                let repaired = reliable && facts.repaired_after >= REPAIR;
-                self.count(now, facts.size.into(), recovered || repaired);
-                self.delays(number, true, facts.source, facts.stamp, now);
-            }
+            Outcome::Whole(_) => {}
         }
     }
 
@@ -333,7 +277,8 @@ impl Writer {
         let source = source.timestamp();
         if self.traits.keeps_history {
             let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < now.0);
-            if !newest || number < self.sequence.first() || number == self.sequence.first() && old {
+            let first = self.reception.sequence().first();
+            if !newest || number < first || number == first && old {
                 return;
             }
         }
@@ -362,29 +307,36 @@ impl Writer {
     }
 }
 
+/// How long the gap of a writer may fill that retransmits, or does not.
+#[must_use]
+pub const fn settle_window(reliable: bool) -> u64 {
+    if reliable {
+        RELIABLE_WINDOW
+    } else {
+        BEST_EFFORT_WINDOW
+    }
+}
+
 /// What settling does to the counters.
 struct Settling<'a> {
     tally: &'a mut Tally,
-    samples: &'a mut Samples,
-    budget: &'a mut Budget,
     journal: &'a mut Journal,
     writer: Guid,
     at: Timestamp,
 }
 
 impl Settling<'_> {
-    fn take(&mut self, settled: Settled) {
-        let (first, last) = match settled {
-            Settled::Lost(number) => (number, number),
-            Settled::LostRun(start, end) => (start, end.saturating_sub(1)),
-            // A sample of which fragments came was sent: no excuse holds.
-            Settled::Irrelevant(number) if self.samples.is_partial(number) => (number, number),
-            Settled::Irrelevant(_) => {
-                self.tally.irrelevant += 1;
-                return;
-            }
+    fn take(&mut self, decision: Decision) {
+        let Decision::Lost {
+            first,
+            last,
+            incomplete,
+        } = decision
+        else {
+            self.tally.irrelevant += 1;
+            return;
         };
-        self.tally.incomplete += u64::from(self.samples.forget(first, self.budget));
+        self.tally.incomplete += u64::from(incomplete);
         let count = last - first + 1;
         self.tally.lost += count;
         self.tally.window.current(self.at).lost += count;

@@ -27,7 +27,7 @@ impl Bench {
         self.sequence.recognise(number, source.map(Timestamp));
         let arrival = self.sequence.receive(
             number,
-            Delivery::Reliable,
+            Manner::Reliable,
             Timestamp(self.now),
             &mut |settled| note(settled, lost, irrelevant),
         );

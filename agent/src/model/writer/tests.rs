@@ -77,7 +77,7 @@ const RELIABLE: Traits = Traits {
 fn data(number: u64) -> Record {
     Record {
         kind: kind::DATA,
-        submessage_flags: DATA_FLAG | 1,
+        submessage_flags: 5,
         sequence_number: number,
         payload_len: 100,
         ..Record::default()

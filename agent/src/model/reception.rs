@@ -1,0 +1,300 @@
+//! Which samples of one writer came whole at one place: on this host at all, or at one receiver.
+//!
+//! Puts sequence numbers and fragments together: a sample in fragments is there when all of them
+//! are, a late fragment does not reopen it, and what stays away is decided once. It counts nothing;
+//! what it finds is for the caller to count.
+
+use ros2probe_wire::record::kind;
+use ros2probe_wire::{Record, RtpsTime, Timestamp};
+
+use super::samples::{Budget, Progress, Samples};
+use super::sequence::{Arrival, Manner, Sequence, Settled};
+
+/// A fragment that completes its sample this late after the sample's last one was retransmitted.
+const REPAIR: i64 = 5_000_000;
+const DATA_FLAG: u8 = 0x04;
+const FRAGMENT_KEY_FLAG: u8 = 0x04;
+
+/// State of one writer's samples at one place.
+#[derive(Debug, Default)]
+pub struct Reception {
+    sequence: Sequence,
+    samples: Samples,
+}
+
+/// A sample that is complete.
+#[derive(Clone, Copy, Debug)]
+pub struct Whole {
+    /// Its sequence number.
+    pub number: u64,
+    /// Payload bytes, encapsulation included.
+    pub bytes: u64,
+    /// Not a disposal: those take a sequence number and are no message.
+    pub is_message: bool,
+    /// It was retransmitted.
+    pub recovered: bool,
+    /// It is the newest so far, so its delay is a delivery delay and not a repetition's.
+    pub newest: bool,
+    /// INFO_TS.
+    pub source: RtpsTime,
+    /// What lies where a header's stamp would.
+    pub stamp: Option<(i32, u32)>,
+    /// Its first datagram.
+    pub began: Timestamp,
+    /// Its last missing fragment came this long after its last fragment number, nanoseconds.
+    pub repaired_after: i64,
+}
+
+/// What a record did.
+#[derive(Clone, Copy, Debug)]
+pub enum Outcome {
+    /// It completed a sample.
+    Whole(Whole),
+    /// It brought nothing that had not come before.
+    Again,
+    /// Something is missing still, or it was of no use.
+    Open,
+}
+
+/// What became of samples that stayed away.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Decision {
+    /// They never came.
+    Lost {
+        /// The first.
+        first: u64,
+        /// The last.
+        last: u64,
+        /// Fragments of it came; then it is one sample.
+        incomplete: bool,
+    },
+    /// The writer will not send it.
+    Irrelevant(u64),
+}
+
+impl Reception {
+    /// The numbers.
+    #[must_use]
+    pub const fn sequence(&self) -> &Sequence {
+        &self.sequence
+    }
+
+    /// The numbers.
+    pub const fn sequence_mut(&mut self) -> &mut Sequence {
+        &mut self.sequence
+    }
+
+    /// Whether fragments of this sample came and others are missing.
+    #[must_use]
+    pub fn is_partial(&self, number: u64) -> bool {
+        self.samples.is_partial(number)
+    }
+
+    /// Moves what the unfinished samples take from one budget to another.
+    pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
+        self.samples.transfer(from, to);
+    }
+
+    /// Takes in a DATA or DATA_FRAG of a writer that retransmits, or does not.
+    pub fn sample(
+        &mut self,
+        record: &Record,
+        reliable: bool,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> Outcome {
+        let source = record.source_timestamp().timestamp();
+        self.sequence.recognise(record.sequence_number, source);
+        if record.kind == kind::DATA_FRAG {
+            self.fragment(record, reliable, budget, decide)
+        } else {
+            self.data(record, reliable, budget, decide)
+        }
+    }
+
+    /// Takes in a HEARTBEAT.
+    pub fn heartbeat(
+        &mut self,
+        record: &Record,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        let (first, last) = (record.sequence_number, record.second_sequence_number());
+        let Self { sequence, samples } = self;
+        sequence.heartbeat(first, last, Timestamp(record.time), &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// Takes in a GAP.
+    pub fn gap(&mut self, record: &Record, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+        let (start, base) = (record.sequence_number, record.second_sequence_number());
+        let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
+        let Self { sequence, samples } = self;
+        sequence.gap(start, base, set, Timestamp(record.time), &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// This sample exists, whether it came or not.
+    pub fn exists(
+        &mut self,
+        number: u64,
+        now: Timestamp,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        let Self { sequence, samples } = self;
+        sequence.exists(number, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// Takes over what `other` received; `other`'s unfinished samples are given up.
+    pub fn absorb(
+        &mut self,
+        mut other: Self,
+        now: Timestamp,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        other.samples.clear(budget);
+        let Self { sequence, samples } = self;
+        sequence.absorb(&other.sequence, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+    }
+
+    /// Decides what has been open for `window` nanoseconds.
+    pub fn advance(
+        &mut self,
+        now: Timestamp,
+        window: u64,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) {
+        let Self { sequence, samples } = self;
+        let hold = samples.growing(now, window);
+        sequence.advance(now, window, hold, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+        samples.expire(now, 2 * window, budget);
+    }
+
+    /// Decides everything: nothing more will come.
+    pub fn settle(&mut self, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+        let Self { sequence, samples } = self;
+        sequence.settle_all(&mut |settled| decide(decision(settled, samples, budget)));
+        samples.clear(budget);
+    }
+
+    fn data(
+        &mut self,
+        record: &Record,
+        reliable: bool,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> Outcome {
+        let number = record.sequence_number;
+        let manner = if reliable {
+            Manner::Reliable
+        } else {
+            Manner::BestEffort
+        };
+        let now = Timestamp(record.time);
+        let Self { sequence, samples } = self;
+        let arrival = sequence.receive(number, manner, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+        samples.forget(number, budget);
+        let Arrival::New { recovered, newest } = arrival else {
+            return Outcome::Again;
+        };
+        Outcome::Whole(Whole {
+            number,
+            bytes: record.payload_len.into(),
+            // A key alone is a disposal.
+            is_message: record.submessage_flags & DATA_FLAG != 0 && record.status_info == 0,
+            recovered,
+            newest,
+            source: record.source_timestamp(),
+            stamp: record.header_stamp(),
+            began: now,
+            repaired_after: 0,
+        })
+    }
+
+    fn fragment(
+        &mut self,
+        record: &Record,
+        reliable: bool,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> Outcome {
+        let number = record.sequence_number;
+        let now = Timestamp(record.time);
+        if self.sequence.has(number) {
+            return Outcome::Again;
+        }
+        let progress = self.samples.fragment(record, now, budget);
+        match progress {
+            Progress::Rejected => return Outcome::Open,
+            Progress::Duplicate => return Outcome::Again,
+            Progress::TooMany => {
+                self.sequence.begin(number);
+                self.exists(number, now, budget, decide);
+                self.sequence.excuse(number, number.saturating_add(1));
+                return Outcome::Open;
+            }
+            Progress::Partial | Progress::Complete(_) => {}
+        }
+        // A sample that is joined in the middle does not count as one that was sent; the writer's
+        // first one cannot be.
+        let joined = u64::from(record.fragment_start != 1 && number > 1);
+        self.sequence.begin(number.saturating_add(joined));
+        self.exists(number, now, budget, decide);
+        let Progress::Complete(facts) = progress else {
+            return Outcome::Open;
+        };
+        let manner = if reliable {
+            Manner::ReliableFragments
+        } else {
+            Manner::BestEffort
+        };
+        let Self { sequence, samples } = self;
+        let arrival = sequence.receive(number, manner, now, &mut |settled| {
+            decide(decision(settled, samples, budget));
+        });
+        let Arrival::New { recovered, .. } = arrival else {
+            return Outcome::Open;
+        };
+        let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
+        let repaired = reliable && facts.repaired_after >= REPAIR;
+        Outcome::Whole(Whole {
+            number,
+            bytes: facts.size.into(),
+            is_message: !is_key && record.status_info == 0,
+            recovered: recovered || repaired,
+            newest: true,
+            source: facts.source,
+            stamp: facts.stamp,
+            began: facts.began,
+            repaired_after: facts.repaired_after,
+        })
+    }
+}
+
+fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Decision {
+    let (first, last) = match settled {
+        Settled::Lost(number) => (number, number),
+        Settled::LostRun(start, end) => (start, end.saturating_sub(1)),
+        // A sample of which fragments came was sent: no excuse holds.
+        Settled::Irrelevant(number) if samples.is_partial(number) => (number, number),
+        Settled::Irrelevant(number) => return Decision::Irrelevant(number),
+    };
+    Decision::Lost {
+        first,
+        last,
+        incomplete: samples.forget(first, budget),
+    }
+}
