@@ -40,8 +40,10 @@ mod state {
 /// One IP fragment; 1 = keep the frame.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn pass(skb: *mut __sk_buff) -> u32 {
-    let Some(scratch) = scratch() else { return 0 };
+pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(scratch) = scratch(slot) else {
+        return 0;
+    };
     count(Counter::Fragments, 1);
     let Some(flow) = flow(scratch) else {
         count(Counter::FlowTableFull, 1);
@@ -72,12 +74,12 @@ pub extern "C" fn pass(skb: *mut __sk_buff) -> u32 {
     }
     let complete = flow.expected != 0 && flow.expected == flow.seen;
     let keep = if offset == 0 {
-        first(skb, scratch, flow)
+        first(skb, slot, scratch, flow)
     } else {
-        trailing(skb, scratch, flow)
+        trailing(skb, slot, scratch, flow)
     };
     if complete {
-        finish(scratch, flow);
+        finish(slot, scratch, flow);
     }
     keep
 }
@@ -116,8 +118,8 @@ fn flow(scratch: &mut Scratch) -> Option<&'static mut Flow> {
 
 /// The fragment with the UDP header.
 #[inline(always)]
-fn first(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
-    if verdict::begin(skb, scratch).is_none() {
+fn first(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
+    if verdict::begin(skb, slot, scratch).is_none() {
         flow.state = state::FOREIGN;
         return 0;
     }
@@ -126,7 +128,7 @@ fn first(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
     let alone = flow.seen == scratch.packet.len;
     let (base, present) = (scratch.packet.body + 8, scratch.packet.len - 8);
     let result = if alone {
-        verdict::run(skb, base, present)
+        verdict::run(skb, base, present, slot)
     } else {
         progress::CAPTURE
     };
@@ -137,13 +139,13 @@ fn first(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
         return 1;
     }
     flow.state = state::WALKING;
-    keep_walk(scratch, flow);
+    keep_walk(slot, scratch, flow);
     0
 }
 
 /// A later fragment.
 #[inline(always)]
-fn trailing(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
+fn trailing(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
     if flow.state == state::HEADLESS {
         // Nobody may fill the packet ring with fragments of nothing.
         return u32::from(verdict::charge(scratch.packet.len));
@@ -165,28 +167,28 @@ fn trailing(skb: *mut __sk_buff, scratch: &mut Scratch, flow: &mut Flow) -> u32 
     let result = if next < start {
         progress::SPLIT
     } else {
-        verdict::run(skb, scratch.packet.body.wrapping_sub(start), end)
+        verdict::run(skb, scratch.packet.body.wrapping_sub(start), end, slot)
     };
-    keep_walk(scratch, flow);
+    keep_walk(slot, scratch, flow);
     if result < progress::CAPTURE {
         return 0;
     }
-    hand_over(scratch, flow);
+    hand_over(slot, scratch, flow);
     verdict::captured(scratch);
     1
 }
 
 /// Sends ahead what was found, but for the last record, and puts the walk's state away.
 #[inline(always)]
-fn keep_walk(scratch: &mut Scratch, flow: &mut Flow) {
+fn keep_walk(slot: u32, scratch: &mut Scratch, flow: &mut Flow) {
     let found = scratch.count;
     copy(&scratch.walk, &mut flow.walk);
     if found == 0 {
         return;
     }
-    send_pending(flow, flag::AHEAD);
+    send_pending(slot, flow, flag::AHEAD);
     if found > 1 {
-        verdict::flush(found - 1, u32::from(flag::AHEAD));
+        verdict::flush(found - 1, u32::from(flag::AHEAD), slot);
         flow.ahead = 1;
     }
     if let Some(last) = scratch.records.get(found as usize - 1) {
@@ -196,19 +198,19 @@ fn keep_walk(scratch: &mut Scratch, flow: &mut Flow) {
 }
 
 #[inline(always)]
-fn send_pending(flow: &mut Flow, flags: u16) {
+fn send_pending(slot: u32, flow: &mut Flow, flags: u16) {
     if flow.has_pending != 0 {
         flow.has_pending = 0;
         flow.pending.flags |= flags;
         flow.ahead = 1;
-        runs::give(&flow.pending, false);
+        runs::give(slot, &flow.pending, false);
     }
 }
 
 /// Tells user space how to go on with the datagram.
 #[inline(always)]
-fn hand_over(scratch: &Scratch, flow: &mut Flow) {
-    send_pending(flow, flag::AHEAD);
+fn hand_over(slot: u32, scratch: &Scratch, flow: &mut Flow) {
+    send_pending(slot, flow, flag::AHEAD);
     flow.state = state::HANDED_OVER;
     flow.ahead = 1;
     let (walk, packet) = (&scratch.walk, &scratch.packet);
@@ -241,7 +243,7 @@ fn hand_over(scratch: &Scratch, flow: &mut Flow) {
 
 /// All fragments have come.
 #[inline(always)]
-fn finish(scratch: &Scratch, flow: &mut Flow) {
+fn finish(slot: u32, scratch: &Scratch, flow: &mut Flow) {
     let (walked, handed_over) = (
         flow.state == state::WALKING,
         flow.state == state::HANDED_OVER,
@@ -272,7 +274,7 @@ fn finish(scratch: &Scratch, flow: &mut Flow) {
     flow.has_pending = 0;
     flow.pending.time = scratch.packet.now;
     // After records that were sent ahead, this one is the sign that the datagram is complete.
-    runs::give(&flow.pending, flow.ahead == 0);
+    runs::give(slot, &flow.pending, flow.ahead == 0);
 }
 
 #[inline(always)]

@@ -2,24 +2,35 @@
 //!
 //! Thin on purpose. What a submessage is and what becomes of it is decided by
 //! `ros2probe_wire::walk`, the same code that user space runs; here are the socket buffer, the maps
-//! and the fragments. A second hook is another entry point beside [`wire`].
+//! and the fragments. Two hooks: [`wire`] sees frames on interfaces, [`host_ingress`] and
+//! [`host_egress`] see datagrams at sockets.
 //!
 //! Stays inside what Linux 5.10 verifies: bounded loops, global functions that are verified once,
 //! reads of fixed size, no spin lock, no atomics that return a value.
 
 #![no_std]
 #![no_main]
+#![feature(asm_experimental_arch)]
 
 mod fragment;
+mod host;
 mod maps;
 mod packet;
+mod pieces;
 mod runs;
 mod verdict;
 
-use aya_ebpf::{bindings::__sk_buff, macros::socket_filter, programs::SkBuffContext};
+use aya_ebpf::{
+    bindings::__sk_buff,
+    macros::{cgroup_skb, socket_filter},
+    programs::SkBuffContext,
+};
 use ros2probe_wire::filter::Counter;
 
-use crate::maps::{INTERFACES, count, setting};
+use crate::{
+    maps::{INTERFACES, SLOTS, claim, count, release, setting},
+    packet::hook,
+};
 
 /// `skb->pkt_type` of a frame that this host sends.
 const PACKET_OUTGOING: u32 = 4;
@@ -31,6 +42,21 @@ const LOOPBACK: u32 = 1;
 #[socket_filter]
 pub fn wire(context: SkBuffContext) -> i64 {
     frame(context.skb.skb).unwrap_or(0)
+}
+
+/// For a cgroup: a datagram on its way into a socket begins at the IP header, reassembled. Returns 1:
+/// the kernel goes on with it.
+#[cgroup_skb(ingress)]
+pub fn host_ingress(context: SkBuffContext) -> i32 {
+    host::look(context.skb.skb, hook::INGRESS);
+    1
+}
+
+/// As [`host_ingress`], for a datagram on its way out of a socket, not fragmented yet.
+#[cgroup_skb(egress)]
+pub fn host_egress(context: SkBuffContext) -> i32 {
+    host::look(context.skb.skb, hook::EGRESS);
+    1
 }
 
 #[inline(always)]
@@ -52,17 +78,25 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
         count(Counter::InterfaceExcluded, 1);
         return Some(0);
     }
-    if packet::parse(skb) == 0 {
+    let slot = claim(0, SLOTS)?;
+    let kept = claimed(skb, segments, slot);
+    release(slot);
+    kept
+}
+
+#[inline(always)]
+fn claimed(skb: *mut __sk_buff, segments: u32, slot: u32) -> Option<i64> {
+    if packet::parse(skb, slot, hook::WIRE) == 0 {
         return Some(0);
     }
     if segments > 1 {
         count(Counter::Segmented, 1);
         return Some(0);
     }
-    let keep = if packet::is_fragment()? {
-        fragment::pass(skb)
+    let keep = if packet::is_fragment(slot)? {
+        fragment::pass(skb, slot)
     } else {
-        verdict::whole(skb)
+        verdict::whole(skb, slot)
     };
     if keep == 0 {
         return Some(0);

@@ -1,5 +1,7 @@
 //! The filter's maps and per-CPU state.
 
+use core::arch::asm;
+
 use aya_ebpf::{
     macros::map,
     maps::{Array, HashMap, LruHashMap, PerCpuArray, RingBuf},
@@ -10,6 +12,7 @@ use ros2probe_wire::{
         Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,
         RUN_CAPACITY, UNKNOWN_CAPACITY,
     },
+    host::{PIECE_BYTES, Piece, SOCKET_CAPACITY, Socket},
     walk::Walk,
 };
 
@@ -19,12 +22,23 @@ const NO_PREALLOC: u32 = 1;
 /// Records of one datagram that the filter writes itself; more make it capture the datagram.
 pub const RECORDS_PER_DATAGRAM: u32 = 32;
 
+/// Runs of programs that may be under way on one CPU, see [`claim`]: those for datagrams on their
+/// way in (and for frames) take the slots before [`OUTGOING_SLOT`], the others those from there on.
+pub const SLOTS: u32 = 6;
+/// First slot for datagrams on their way out.
+pub const OUTGOING_SLOT: u32 = 2;
+/// Captures that a CPU remembers, a power of two.
+const RECENT_CAPACITY: u32 = 16;
+
 /// Whether frames of an interface that is not in [`INTERFACES`] are looked at. Set by the loader.
 #[unsafe(no_mangle)]
 pub static NEW_INTERFACES: u32 = 1;
 /// Ring bytes from which on a record wakes user space; below, user space polls. Set by the loader.
 #[unsafe(no_mangle)]
 pub static WAKE_BYTES: u64 = 128 * 1024;
+/// Likewise for pieces of captured datagrams.
+#[unsafe(no_mangle)]
+pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
 
 /// Reads a setting that the loader may have changed.
 macro_rules! setting {
@@ -71,12 +85,27 @@ pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
 /// By `filter::Counter`.
 #[map]
 pub static COUNTERS: PerCpuArray<u64> = PerCpuArray::with_max_entries(Counter::ALL.len() as u32, 0);
-/// Keys that are too large for the stack.
+/// Captured datagrams of the host hook, in [`PieceBuffer`]s cut to their length.
 #[map]
-static RUN_KEYS: PerCpuArray<RunKeys> = PerCpuArray::with_max_entries(1, 0);
-/// The frame at hand.
+pub static PIECES: RingBuf = RingBuf::with_byte_size(1024 * 1024, 0);
+/// Sockets that the host hook has met, by cookie.
 #[map]
-static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(1, 0);
+pub static SOCKETS: LruHashMap<u64, Socket> = LruHashMap::with_max_entries(SOCKET_CAPACITY, 0);
+/// Keys that are too large for the stack, by slot.
+#[map]
+static RUN_KEYS: PerCpuArray<RunKeys> = PerCpuArray::with_max_entries(SLOTS, 0);
+/// Where pieces are put together, by slot.
+#[map]
+static PIECE: PerCpuArray<PieceBuffer> = PerCpuArray::with_max_entries(SLOTS, 0);
+/// The frame or datagram at hand, by slot.
+#[map]
+static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(SLOTS, 0);
+/// What this CPU has captured lately, by a hash of it.
+#[map]
+static RECENT: PerCpuArray<Recent> = PerCpuArray::with_max_entries(RECENT_CAPACITY, 0);
+/// The datagram that a socket of this host received last on this CPU.
+#[map]
+static LAST: PerCpuArray<Last> = PerCpuArray::with_max_entries(1, 0);
 
 /// Names one fragmented datagram (RFC 791, RFC 8200 4.5), per interface and direction.
 #[repr(C)]
@@ -157,11 +186,12 @@ pub struct Packet {
     pub ipv6: u32,
     pub outgoing: u32,
     pub interface: u32,
-    pub unused: u32,
+    /// Seen at a socket, not on an interface.
+    pub host: u32,
     pub now: u64,
 }
 
-/// Per-CPU working memory: too large for the 512 bytes of BPF stack.
+/// Working memory of one run of a program: too large for the 512 bytes of BPF stack.
 #[repr(C)]
 pub struct Scratch {
     pub walk: Walk,
@@ -171,31 +201,139 @@ pub struct Scratch {
     pub count: u32,
     /// The capture is owed to an unclassified writer.
     pub unknown: u32,
+    /// Host hook: a copy of the datagram was captured just before.
+    pub repeated: u32,
+    /// Host hook: datagrams that this slot has named.
+    pub named: u32,
+    /// Runs that hold this slot or are about to notice that they do not.
+    claims: u64,
 }
 
-/// This CPU's working memory.
+/// A datagram that was captured, by the submessage that asked for it.
+#[repr(C)]
+pub struct Recent {
+    pub time: u64,
+    pub sequence_number: u64,
+    pub writer: [u32; 4],
+    pub fragment_start: u32,
+    pub datagram_len: u32,
+}
+
+/// What the host hook leaves for a program that learns, directly afterwards and on the same CPU,
+/// that the datagram was not delivered. Its records are still in the slot: slots of datagrams on
+/// their way in are taken by nothing else, and those come one after the other.
+#[repr(C)]
+pub struct Last {
+    /// The receiving socket; 0 = the datagram was not RTPS.
+    pub socket: u64,
+    /// The datagram's name, as in `scratch(slot).walk.record.datagram` unless that has moved on.
+    pub token: u32,
+    /// Of the working memory with its records, see `Scratch::count`.
+    pub slot: u32,
+    /// 1 = captured, then there are no records.
+    pub captured: u32,
+}
+
+/// A piece with room for the longest.
+#[repr(C)]
+pub struct PieceBuffer {
+    pub piece: Piece,
+    pub bytes: [u8; PIECE_BYTES as usize],
+}
+
+/// Takes one of the slots from `first` on before `end` for this run of a program, until
+/// [`release`].
+///
+/// Runs on one CPU interrupt each other: a datagram on its way out is handled by a task, which may
+/// be preempted (the kernel only keeps it on its CPU), and datagrams on their way in interrupt it.
+/// Atomics that return a value need Linux 5.12. So each adds itself to the slot's claims and looks:
+/// all see the additions in one order, since they share a CPU, and at most one sees itself alone.
 #[inline(always)]
-pub fn scratch() -> Option<&'static mut Scratch> {
-    // SAFETY: one program run at a time uses a CPU's entry: packet taps run with bottom halves
-    // disabled and do not nest.
+pub fn claim(first: u32, end: u32) -> Option<u32> {
+    let mut slot = first;
+    while slot < end {
+        if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
+            // SAFETY: a map value pointer checked against null; `claims` is only touched here and in
+            // `release`, by its address.
+            let claims = unsafe { &raw mut (*scratch).claims };
+            add(claims, 1);
+            // SAFETY: as above.
+            if unsafe { core::ptr::read_volatile(claims) } == 1 {
+                return Some(slot);
+            }
+            add(claims, u64::MAX);
+        }
+        slot += 1;
+    }
+    count(Counter::Contended, 1);
+    None
+}
+
+/// Gives a slot back.
+#[inline(always)]
+pub fn release(slot: u32) {
+    if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
+        // SAFETY: a map value pointer checked against null.
+        add(unsafe { &raw mut (*scratch).claims }, u64::MAX);
+    }
+}
+
+/// The working memory of a slot.
+#[inline(always)]
+pub fn scratch(slot: u32) -> Option<&'static mut Scratch> {
+    // SAFETY: the run that has claimed the slot uses it alone, and one reference at a time.
     SCRATCH
-        .get_ptr_mut(0)
+        .get_ptr_mut(slot)
         .map(|scratch| unsafe { &mut *scratch })
 }
 
-/// This CPU's keys.
+/// The keys of a slot.
 #[inline(always)]
-pub fn run_keys() -> Option<&'static mut RunKeys> {
+pub fn run_keys(slot: u32) -> Option<&'static mut RunKeys> {
     // SAFETY: as for `scratch`.
-    RUN_KEYS.get_ptr_mut(0).map(|keys| unsafe { &mut *keys })
+    RUN_KEYS.get_ptr_mut(slot).map(|keys| unsafe { &mut *keys })
+}
+
+/// The piece buffer of a slot.
+#[inline(always)]
+pub fn piece(slot: u32) -> Option<&'static mut PieceBuffer> {
+    // SAFETY: as for `scratch`.
+    PIECE.get_ptr_mut(slot).map(|piece| unsafe { &mut *piece })
+}
+
+/// Where a capture with this hash is noted.
+#[inline(always)]
+pub fn recent(hash: u32) -> Option<&'static mut Recent> {
+    // SAFETY: a map value pointer checked against null. Runs that interrupt each other here may
+    // capture a copy more or note a capture that is half another's: that matches nothing.
+    RECENT
+        .get_ptr_mut(hash & (RECENT_CAPACITY - 1))
+        .map(|recent| unsafe { &mut *recent })
+}
+
+/// This CPU's last datagram on its way in.
+#[inline(always)]
+pub fn last() -> Option<&'static mut Last> {
+    // SAFETY: a map value pointer checked against null; datagrams on their way in are handled one
+    // after the other on a CPU.
+    LAST.get_ptr_mut(0).map(|last| unsafe { &mut *last })
 }
 
 /// Adds to a counter of this CPU.
 #[inline(always)]
 pub fn count(counter: Counter, by: u64) {
     if let Some(value) = COUNTERS.get_ptr_mut(counter as u32) {
-        // SAFETY: this CPU's own entry, see `scratch`.
-        unsafe { *value += by }
+        add(value, by);
+    }
+}
+
+/// Adds in one instruction, so that nothing on this CPU comes between.
+#[inline(always)]
+fn add(to: *mut u64, by: u64) {
+    // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that
+    // every BPF verifier knows.
+    unsafe {
+        asm!("lock *(u64 *)({to} + 0) += {by}", to = in(reg) to, by = in(reg) by, options(nostack));
     }
 }
 

@@ -12,6 +12,16 @@ use crate::{
     maps::{Packet, count, scratch},
 };
 
+/// Where a program sees a packet; values cross a function boundary as `u32`.
+pub mod hook {
+    /// A frame on an interface.
+    pub const WIRE: u32 = 0;
+    /// A datagram on its way into a socket.
+    pub const INGRESS: u32 = 1;
+    /// A datagram on its way out of a socket.
+    pub const EGRESS: u32 = 2;
+}
+
 const UDP: u32 = 17;
 /// First two words of an IPv4-mapped address as they lie in memory.
 const IPV4_MAPPED: u32 = u32::from_ne_bytes([0, 0, 0xff, 0xff]);
@@ -55,26 +65,36 @@ pub fn load<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
 
 /// Whether the packet at hand is an IP fragment.
 #[inline(always)]
-pub fn is_fragment() -> Option<bool> {
-    Some(scratch()?.packet.fragmented != 0)
+pub fn is_fragment(slot: u32) -> Option<bool> {
+    Some(scratch(slot)?.packet.fragmented != 0)
 }
 
-/// Fills in the scratch packet; 1 when it is (part of) a UDP datagram.
+/// Fills in the scratch packet; 1 when it is (part of) a UDP datagram. `at` is one of [`hook`].
 // Global (not inlined) functions are verified once each, whatever calls them.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn parse(skb: *mut __sk_buff) -> u32 {
-    let Some(scratch) = scratch() else { return 0 };
+pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
+    let Some(scratch) = scratch(slot) else {
+        return 0;
+    };
     let packet = &mut scratch.packet;
     // SAFETY: the verifier rewrites reads of these fields.
     let (pkt_type, protocol, interface) =
         unsafe { ((*skb).pkt_type, (*skb).protocol, (*skb).ifindex) };
-    packet.outgoing = u32::from(pkt_type == PACKET_OUTGOING);
+    let host = at != hook::WIRE;
+    // At a socket the type says nothing: that of a datagram on its way out is not set yet.
+    let outgoing = if host {
+        at == hook::EGRESS
+    } else {
+        pkt_type == PACKET_OUTGOING
+    };
+    packet.host = u32::from(host);
+    packet.outgoing = u32::from(outgoing);
     packet.interface = interface;
     // SAFETY: no preconditions.
     packet.now = unsafe { bpf_ktime_get_ns() };
     // The kernel strips the outer VLAN tag on the way in; a second one is still there.
-    let start = if pkt_type != PACKET_OUTGOING && (protocol == VLAN || protocol == SERVICE_VLAN) {
+    let start = if !host && !outgoing && (protocol == VLAN || protocol == SERVICE_VLAN) {
         4
     } else {
         0

@@ -16,12 +16,12 @@ use crate::{
 /// Writes a record, or keeps it for the fragments that follow if it `joins` others: that is if it
 /// counts now and is not the sign that its datagram is complete.
 #[inline(always)]
-pub fn give(record: &Record, joins: bool) {
+pub fn give(slot: u32, record: &Record, joins: bool) {
     if record.kind != kind::DATA_FRAG {
         write(record);
         return;
     }
-    let Some(keys) = run_keys() else {
+    let Some(keys) = run_keys(slot) else {
         write(record);
         return;
     };
@@ -35,7 +35,9 @@ pub fn give(record: &Record, joins: bool) {
     let mut goes_on = false;
     if let Some(run) = RUNS.get_ptr_mut(&keys.here) {
         // SAFETY: a map value pointer checked against null; the key names this CPU, and packet taps
-        // run with bottom halves disabled, so nobody else adds to it.
+        // run with bottom halves disabled, so nobody else adds to it. A task that sends may be
+        // preempted here: should another send fragments of the same writer from the same socket
+        // then, fragments are counted in two records or not at all, but memory is not at stake.
         let run = unsafe { &mut *run };
         if joins && run.extend(record) {
             if run.ends_sample() {

@@ -8,6 +8,7 @@ use ros2probe_wire::{
 };
 
 use crate::{
+    host,
     maps::{
         BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, UNKNOWN, copy,
         count, scratch, setting,
@@ -19,9 +20,9 @@ use crate::{
 /// Submessages that one run of the program follows; a datagram with more is captured.
 const SUBMESSAGES: u32 = 64;
 /// `BPF_RB_NO_WAKEUP`, `BPF_RB_FORCE_WAKEUP`, `BPF_RB_AVAIL_DATA`.
-const NO_WAKEUP: u64 = 1;
-const FORCE_WAKEUP: u64 = 2;
-const AVAILABLE_DATA: u64 = 0;
+pub const NO_WAKEUP: u64 = 1;
+pub const FORCE_WAKEUP: u64 = 2;
+pub const AVAILABLE_DATA: u64 = 0;
 
 /// What [`advance`] says; values cross a function boundary as `u32`.
 pub mod progress {
@@ -38,9 +39,11 @@ pub mod progress {
 /// A datagram in one frame; 1 = keep the frame.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn whole(skb: *mut __sk_buff) -> u32 {
-    let Some(scratch) = scratch() else { return 0 };
-    if begin(skb, scratch).is_none() {
+pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(scratch) = scratch(slot) else {
+        return 0;
+    };
+    if begin(skb, slot, scratch).is_none() {
         return 0;
     }
     if scratch.walk.datagram_len + 8 > scratch.packet.len {
@@ -48,7 +51,7 @@ pub extern "C" fn whole(skb: *mut __sk_buff) -> u32 {
         return 0;
     }
     let (base, present) = (scratch.packet.body + 8, scratch.walk.datagram_len);
-    if run(skb, base, present) >= progress::CAPTURE {
+    if run(skb, base, present, slot) >= progress::CAPTURE {
         captured(scratch);
         return 1;
     }
@@ -61,14 +64,14 @@ pub extern "C" fn whole(skb: *mut __sk_buff) -> u32 {
         },
         1,
     );
-    flush(records, 0);
+    flush(records, 0, slot);
     0
 }
 
 /// Reads the UDP and RTPS headers of the packet at hand and starts the walk; `None` when it is not
 /// RTPS.
 #[inline(always)]
-pub fn begin(skb: *mut __sk_buff, scratch: &mut Scratch) -> Option<()> {
+pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()> {
     let packet = &scratch.packet;
     if packet.len < 8 + walk::HEADER_LEN {
         return None;
@@ -92,17 +95,24 @@ pub fn begin(skb: *mut __sk_buff, scratch: &mut Scratch) -> Option<()> {
         flag::OUTGOING
     } else {
         0
-    }) | (if packet.ipv6 != 0 { flag::IPV6 } else { 0 });
+    }) | (if packet.ipv6 != 0 { flag::IPV6 } else { 0 })
+        | (if packet.host != 0 { flag::HOST } else { 0 });
     scratch.count = 0;
     scratch.unknown = 0;
+    scratch.repeated = 0;
+    let (token, socket) = if packet.host != 0 {
+        host::identify(skb, slot, &mut scratch.named)
+    } else {
+        (0, 0)
+    };
     let record = &mut scratch.walk.record;
     record.time = now;
     record.destination = destination;
     record.destination_port = (u32::from_be(ports) & 0xffff) as u16;
     record.source_port = (u32::from_be(ports) >> 16) as u16;
     record.interface = interface;
-    record.datagram = 0;
-    record.socket = 0;
+    record.datagram = token;
+    record.socket = socket;
     record.elapsed = 0;
     record.unused = 0;
     record.flags = flags;
@@ -116,10 +126,10 @@ pub fn begin(skb: *mut __sk_buff, scratch: &mut Scratch) -> Option<()> {
 
 /// Walks the submessages that begin before `present`; the strongest [`progress`] met.
 #[inline(always)]
-pub fn run(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
+pub fn run(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
     let mut submessages = 0;
     while submessages < SUBMESSAGES {
-        let result = advance(skb, base, present);
+        let result = advance(skb, base, present, slot);
         if result != progress::ON {
             return result;
         }
@@ -131,8 +141,8 @@ pub fn run(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
 /// One submessage.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
-    let Some(scratch) = scratch() else {
+pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
+    let Some(scratch) = scratch(slot) else {
         return progress::STOP;
     };
     let before = scratch.walk.offset;
@@ -157,17 +167,22 @@ pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32) -> u32 {
 /// Asks the interest map about the submessage at hand.
 #[inline(always)]
 fn endpoint(scratch: &mut Scratch, long_gap: bool) -> u32 {
-    let record = &scratch.walk.record;
-    let (key, unknown_counts) = match walk::fate(record) {
+    let (key, unknown_counts) = match walk::fate(&scratch.walk.record) {
         Fate::Ignore => return progress::ON,
+        Fate::Capture if host::captured_before(scratch) => return progress::ON,
         Fate::Capture => return progress::CAPTURE,
-        Fate::Writer => (record.writer, true),
-        Fate::Reader => (record.reader, false),
+        Fate::Writer => (scratch.walk.record.writer, true),
+        Fate::Reader => (scratch.walk.record.reader, false),
     };
     let meter = match INTEREST.get_ptr(key) {
         // SAFETY: a map value pointer checked against null.
         Some(verdict) => match unsafe { *verdict } {
-            verdict if verdict == Verdict::Capture as u32 => return progress::CAPTURE,
+            verdict if verdict == Verdict::Capture as u32 => {
+                if !host::captured_before(scratch) {
+                    return progress::CAPTURE;
+                }
+                true
+            }
             verdict => verdict == Verdict::Meter as u32,
         },
         None if unknown_counts => match unknown(scratch, key) {
@@ -207,7 +222,7 @@ fn unknown(scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     };
     // SAFETY: a map value pointer checked against null.
     let used = unsafe { &mut *used };
-    if *used < UNKNOWN_CAPTURE_BYTES && charge(len) {
+    if *used < UNKNOWN_CAPTURE_BYTES && !host::captured_before(scratch) && charge(len) {
         *used += len;
         scratch.unknown = 1;
         return progress::CAPTURE;
@@ -253,8 +268,10 @@ pub fn captured(scratch: &Scratch) {
 /// Writes the first `records` scratch records, each with `flags` added.
 #[unsafe(no_mangle)]
 #[inline(never)]
-pub extern "C" fn flush(records: u32, flags: u32) -> u32 {
-    let Some(scratch) = scratch() else { return 0 };
+pub extern "C" fn flush(records: u32, flags: u32, slot: u32) -> u32 {
+    let Some(scratch) = scratch(slot) else {
+        return 0;
+    };
     let mut index = 0;
     while index < RECORDS_PER_DATAGRAM {
         if index >= records {
@@ -262,7 +279,7 @@ pub extern "C" fn flush(records: u32, flags: u32) -> u32 {
         }
         if let Some(record) = scratch.records.get_mut(index as usize) {
             record.flags |= flags as u16;
-            runs::give(record, flags & u32::from(flag::AHEAD) == 0);
+            runs::give(slot, record, flags & u32::from(flag::AHEAD) == 0);
         }
         index += 1;
     }

@@ -46,11 +46,18 @@ pub enum Counter {
     InterfaceExcluded,
     /// Frames that hold several datagrams (UDP segmentation offload); not taken apart.
     Segmented,
+    /// Frames or datagrams not looked at, because too many runs of the program had interrupted each
+    /// other on one CPU.
+    Contended,
+    /// Host hook: captured datagrams of which a piece found no room in the ring.
+    PiecesLost,
+    /// Host hook: copies of a datagram that was captured just before, not captured again.
+    CopiesNotCaptured,
 }
 
 impl Counter {
     /// All of them, in index order.
-    pub const ALL: [Self; 21] = [
+    pub const ALL: [Self; 24] = [
         Self::Frames,
         Self::Messages,
         Self::Ignored,
@@ -72,6 +79,9 @@ impl Counter {
         Self::LoopbackCopies,
         Self::InterfaceExcluded,
         Self::Segmented,
+        Self::Contended,
+        Self::PiecesLost,
+        Self::CopiesNotCaptured,
     ];
 
     /// Label value.
@@ -99,6 +109,9 @@ impl Counter {
             Self::LoopbackCopies => "loopback_copies",
             Self::InterfaceExcluded => "interface_excluded",
             Self::Segmented => "segmented",
+            Self::Contended => "contended",
+            Self::PiecesLost => "pieces_lost",
+            Self::CopiesNotCaptured => "copies_not_captured",
         }
     }
 }

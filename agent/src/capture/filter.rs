@@ -1,18 +1,23 @@
 //! The kernel filter from user space: load it, tell it what is of interest, read what it found.
 //!
 //! The object is committed beside its source (`agent-ebpf/`), so no BPF toolchain is needed here.
-//! Needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8).
+//! Needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8); attaching the host hook to a
+//! cgroup needs CAP_NET_ADMIN besides.
+
+mod host;
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 
 use aya::maps::{Array, HashMap, Map, MapData, MapError, PerCpuArray, RingBuf};
-use aya::programs::{ProgramError, ProgramFd, SocketFilter};
+use aya::programs::{Program, ProgramError, ProgramFd};
 use aya::{Ebpf, EbpfError, EbpfLoader};
 use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::record::{Verdict, guid_words};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 use zerocopy::FromBytes;
+
+pub use host::CapturedPiece;
 
 /// The object `agent-ebpf/build.sh` made. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
@@ -35,6 +40,12 @@ pub enum FilterError {
     /// The verifier refuses the program.
     #[error("the kernel refuses the filter program")]
     Program(#[source] ProgramError),
+    /// The kernel refuses to attach a program to the cgroup.
+    #[error("attaching the host hook to the cgroup needs CAP_NET_ADMIN")]
+    AttachNotPermitted(#[source] io::Error),
+    /// The cgroup takes no program.
+    #[error("the host hook does not attach to the cgroup")]
+    Attach(#[source] ProgramError),
     /// The object lacks a part that this binary needs.
     #[error("the kernel filter object has no {0}")]
     Missing(&'static str),
@@ -56,6 +67,8 @@ pub enum FilterError {
 pub struct FilterSettings {
     /// Bytes of the record ring; rounded up to a power of two of at least a page.
     pub record_ring_bytes: u32,
+    /// Host hook: bytes of the ring for captured datagrams, rounded up likewise.
+    pub piece_ring_bytes: u32,
     /// Whether to look at interfaces that [`Filter::accept_interface`] has not been told about.
     pub accept_new_interfaces: bool,
 }
@@ -64,14 +77,17 @@ impl Default for FilterSettings {
     fn default() -> Self {
         Self {
             record_ring_bytes: 512 * 1024,
+            piece_ring_bytes: 1024 * 1024,
             accept_new_interfaces: true,
         }
     }
 }
 
-/// One loaded filter with its maps.
+/// One loaded filter with its maps: of the wire hook, or of the host hook.
 pub struct Filter {
+    /// The wire hook's program, or the host hook's for datagrams on their way in.
     program: ProgramFd,
+    host: Option<host::Hook>,
     interest: HashMap<MapData, [u32; 4], u32>,
     participants: HashMap<MapData, [u32; 3], u64>,
     interfaces: HashMap<MapData, u32, u32>,
@@ -83,35 +99,22 @@ pub struct Filter {
 }
 
 impl Filter {
-    /// Loads the program and its maps; attaches it to nothing.
+    /// Loads the wire hook's program and its maps; attaches it to nothing.
     ///
     /// # Errors
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
-        let ring = settings
-            .record_ring_bytes
-            .next_power_of_two()
-            .max(page_size());
-        let accept = u32::from(settings.accept_new_interfaces);
-        let wake = u64::from(ring / 2);
-        let mut ebpf = EbpfLoader::new()
-            .override_global("NEW_INTERFACES", &accept, true)
-            .override_global("WAKE_BYTES", &wake, true)
-            .map_max_entries("RECORDS", ring)
-            .load(&OBJECT.0)
-            .map_err(FilterError::load)?;
-        let program: &mut SocketFilter = ebpf
-            .program_mut("wire")
-            .ok_or(FilterError::Missing("program wire"))?
-            .try_into()
-            .map_err(FilterError::Program)?;
-        program.load().map_err(FilterError::program)?;
-        let program = program
-            .fd()
-            .map_err(FilterError::Program)?
-            .try_clone()
-            .map_err(|error| FilterError::Program(ProgramError::IOError(error)))?;
-        let mut budget: Array<_, i64> = take(&mut ebpf, "BUDGET")?;
+        let mut ebpf = open(settings, &[("PIECES", page_size()), ("SOCKETS", UNUSED)])?;
+        let program = load_program(&mut ebpf, "wire")?;
+        Self::with_maps(&mut ebpf, program, None)
+    }
+
+    fn with_maps(
+        ebpf: &mut Ebpf,
+        program: ProgramFd,
+        host: Option<host::Hook>,
+    ) -> Result<Self, FilterError> {
+        let mut budget: Array<_, i64> = take(ebpf, "BUDGET")?;
         for index in [Budget::CaptureBytes, Budget::Records] {
             budget
                 .set(index as u32, 0, 0)
@@ -119,17 +122,18 @@ impl Filter {
         }
         Ok(Self {
             program,
-            interest: take(&mut ebpf, "INTEREST")?,
-            participants: take(&mut ebpf, "PARTICIPANTS")?,
-            interfaces: take(&mut ebpf, "INTERFACES")?,
+            host,
+            interest: take(ebpf, "INTEREST")?,
+            participants: take(ebpf, "PARTICIPANTS")?,
+            interfaces: take(ebpf, "INTERFACES")?,
             budget,
-            runs: take(&mut ebpf, "RUNS")?,
-            counters: take(&mut ebpf, "COUNTERS")?,
-            records: take(&mut ebpf, "RECORDS")?,
+            runs: take(ebpf, "RUNS")?,
+            counters: take(ebpf, "COUNTERS")?,
+            records: take(ebpf, "RECORDS")?,
         })
     }
 
-    /// The loaded program, for attaching it to a socket.
+    /// The loaded program: the wire hook's, for attaching it to a socket.
     #[must_use]
     pub fn program(&self) -> BorrowedFd<'_> {
         self.program.as_fd()
@@ -286,6 +290,49 @@ fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error>
         cause = error.source();
     }
     None
+}
+
+/// Entries of a map that the other hook uses: an LRU map has at least some.
+const UNUSED: u32 = 64;
+
+/// Opens the object and creates its maps, of which those named have another size.
+fn open(settings: &FilterSettings, sizes: &[(&'static str, u32)]) -> Result<Ebpf, FilterError> {
+    let ring = ring_size(settings.record_ring_bytes);
+    let accept = u32::from(settings.accept_new_interfaces);
+    let (wake, wake_pieces) = (
+        u64::from(ring / 2),
+        u64::from(ring_size(settings.piece_ring_bytes) / 2),
+    );
+    let mut loader = EbpfLoader::new();
+    loader
+        .override_global("NEW_INTERFACES", &accept, true)
+        .override_global("WAKE_BYTES", &wake, true)
+        .override_global("WAKE_PIECE_BYTES", &wake_pieces, true)
+        .map_max_entries("RECORDS", ring);
+    for (map, size) in sizes {
+        loader.map_max_entries(map, *size);
+    }
+    loader.load(&OBJECT.0).map_err(FilterError::load)
+}
+
+/// Hands a program to the kernel's verifier.
+fn load_program(ebpf: &mut Ebpf, name: &'static str) -> Result<ProgramFd, FilterError> {
+    let program = ebpf.program_mut(name).ok_or(FilterError::Missing(name))?;
+    match program {
+        Program::SocketFilter(program) => program.load(),
+        Program::CgroupSkb(program) => program.load(),
+        _ => return Err(FilterError::Missing(name)),
+    }
+    .map_err(FilterError::program)?;
+    program
+        .fd()
+        .map_err(FilterError::Program)?
+        .try_clone()
+        .map_err(|error| FilterError::Program(ProgramError::IOError(error)))
+}
+
+fn ring_size(bytes: u32) -> u32 {
+    bytes.next_power_of_two().max(page_size())
 }
 
 fn take<T>(ebpf: &mut Ebpf, name: &'static str) -> Result<T, FilterError>

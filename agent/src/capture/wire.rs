@@ -87,6 +87,7 @@ impl WireTap {
         let mut filter = Filter::load(&FilterSettings {
             record_ring_bytes: u32::try_from(settings.record_ring_bytes).unwrap_or(u32::MAX >> 1),
             accept_new_interfaces: selection.accepts_unknown(),
+            ..FilterSettings::default()
         })?;
         let interfaces = Interfaces::open()?;
         for interface in interfaces.iter() {

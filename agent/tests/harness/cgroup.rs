@@ -3,6 +3,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
@@ -11,6 +12,9 @@ use super::remove_leftovers;
 
 /// How long killed processes may take to leave.
 const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Held while this process is in one of its tests' cgroups.
+static MOVED: Mutex<()> = Mutex::new(());
 
 pub(crate) struct Cgroup {
     path: PathBuf,
@@ -33,6 +37,20 @@ impl Cgroup {
         let path = self.path.display().to_string();
         vec!["sh".to_owned(), "-c".to_owned(), enter.to_owned(), path]
     }
+
+    /// Runs `make` with this process in it and moves back: sockets belong where they were created.
+    /// Tests of one process take turns.
+    pub(crate) fn hold<T>(&self, make: impl FnOnce() -> T) -> Result<T> {
+        let turn = MOVED.lock();
+        let own = fs::read_to_string("/proc/self/cgroup").context("cannot read /proc")?;
+        let own = own.lines().find_map(|line| line.strip_prefix("0::/"));
+        let back = hierarchy()?.join(own.unwrap_or_default());
+        enter(&self.path)?;
+        let made = make();
+        enter(&back)?;
+        drop(turn);
+        Ok(made)
+    }
 }
 
 impl Drop for Cgroup {
@@ -48,6 +66,12 @@ impl Drop for Cgroup {
             std::thread::sleep(Duration::from_millis(10));
         }
     }
+}
+
+/// Moves this process.
+fn enter(cgroup: &Path) -> Result<()> {
+    fs::write(cgroup.join("cgroup.procs"), "0")
+        .with_context(|| format!("cannot move to {}", cgroup.display()))
 }
 
 /// Where the v2 hierarchy is mounted.

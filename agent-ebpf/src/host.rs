@@ -1,0 +1,187 @@
+//! The host hook: datagrams at the sockets of this host, whole, whatever the links cut them into.
+//!
+//! A datagram passes once for each socket that receives it and once for each way it is sent. Its
+//! records name the socket. What has to go to user space whole goes there in pieces, and once,
+//! however many sockets receive it: the other copies are metered. The kernel's return value is not
+//! decided here: the entry programs say 1, always.
+
+use aya_ebpf::{
+    bindings::__sk_buff,
+    helpers::{
+        bpf_get_smp_processor_id,
+        generated::{bpf_get_socket_cookie, bpf_skb_cgroup_id},
+    },
+};
+use ros2probe_wire::{filter::Counter, host::Socket};
+
+use crate::{
+    maps::{
+        OUTGOING_SLOT, Recent, SLOTS, SOCKETS, Scratch, claim, count, last, recent, release,
+        scratch,
+    },
+    packet::{self, hook, load},
+    pieces, verdict,
+};
+
+/// How long after a capture the same bytes at another socket are a copy. The kernel hands out the
+/// copies of one datagram one after the other, in microseconds; a writer that repeats itself waits
+/// for an answer first.
+const COPY_NANOSECONDS: u64 = 1_000_000;
+const TCP: u32 = 6;
+const ICMPV6: u32 = 58;
+const UDP: u32 = 17;
+
+/// One datagram; `at` is one of [`hook`].
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn look(skb: *mut __sk_buff, at: u32) -> u32 {
+    if !may_be_udp(skb) {
+        return 0;
+    }
+    let incoming = at == hook::INGRESS;
+    if incoming && let Some(last) = last() {
+        last.socket = 0;
+        last.token = 0;
+    }
+    let (first, end) = if incoming {
+        (0, OUTGOING_SLOT)
+    } else {
+        (OUTGOING_SLOT, SLOTS)
+    };
+    if let Some(slot) = claim(first, end) {
+        let _ = datagram(skb, slot, at);
+        release(slot);
+    }
+    0
+}
+
+/// Most of what passes here is TCP: decided on the first words.
+#[inline(always)]
+fn may_be_udp(skb: *mut __sk_buff) -> bool {
+    let Some([first, second, third]) = load::<[u32; 3]>(skb, 0) else {
+        return false;
+    };
+    match u32::from_be(first) >> 28 {
+        4 => u32::from_be(third) >> 16 & 0xff == UDP,
+        // Others may be extension headers.
+        6 => !matches!(u32::from_be(second) >> 8 & 0xff, TCP | ICMPV6),
+        _ => false,
+    }
+}
+
+#[inline(always)]
+fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
+    if packet::parse(skb, slot, at) == 0 {
+        return None;
+    }
+    // SAFETY: the verifier rewrites reads of this field; `skb` is the program's context.
+    if unsafe { (*skb).gso_segs } > 1 {
+        count(Counter::Segmented, 1);
+        return None;
+    }
+    let scratch = scratch(slot)?;
+    if scratch.packet.fragmented != 0 {
+        // Made by a raw socket; what sockets receive is reassembled.
+        count(Counter::Fragments, 1);
+        return None;
+    }
+    scratch.walk.record.datagram = 0;
+    let capture = verdict::whole(skb, slot) != 0;
+    let (socket, token) = (scratch.walk.record.socket, scratch.walk.record.datagram);
+    if token == 0 {
+        return None;
+    }
+    if at == hook::INGRESS
+        && let Some(last) = last()
+    {
+        last.socket = socket;
+        last.token = token;
+        last.slot = slot;
+        last.captured = u32::from(capture);
+    }
+    if capture {
+        scratch.count = 0;
+        if pieces::capture(skb, slot) != 0 {
+            note(scratch);
+        }
+    } else if scratch.count == 0 {
+        return None;
+    }
+    if SOCKETS.get_ptr(socket).is_none() {
+        let met = Socket {
+            // SAFETY: `skb` is the program's context.
+            cgroup: unsafe { bpf_skb_cgroup_id(skb) },
+            no_room: 0,
+        };
+        let _ = SOCKETS.insert(socket, met, 0);
+    }
+    Some(())
+}
+
+/// A name for the datagram at hand and its socket's cookie. `named` counts for the slot, which this
+/// run holds alone.
+#[inline(always)]
+pub fn identify(skb: *mut __sk_buff, slot: u32, named: &mut u32) -> (u32, u64) {
+    *named = named.wrapping_add(1);
+    // SAFETY: no preconditions.
+    let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
+    // Unique among 2^20 datagrams of a CPU, unless there are more than 256 of those. Slots count
+    // from one, so it is never 0.
+    let token = *named << 12 | (slot + 1) << 8 | (cpu & 0xff);
+    // SAFETY: `skb` is the program's context.
+    (token, unsafe { bpf_get_socket_cookie(skb.cast()) })
+}
+
+/// Whether a copy of the datagram at hand, known by the submessage that asks for its capture, was
+/// captured just before. Never on the wire hook.
+#[inline(always)]
+pub fn captured_before(scratch: &mut Scratch) -> bool {
+    if scratch.packet.host == 0 {
+        return false;
+    }
+    if scratch.repeated != 0 {
+        return true;
+    }
+    let record = &scratch.walk.record;
+    let Some(recent) = noted(scratch) else {
+        return false;
+    };
+    let same = scratch.packet.now.wrapping_sub(recent.time) < COPY_NANOSECONDS
+        && recent.sequence_number == record.sequence_number
+        && recent.fragment_start == record.fragment_start
+        && recent.datagram_len == scratch.walk.datagram_len
+        && recent.writer[3] == record.writer[3]
+        && recent.writer[2] == record.writer[2]
+        && recent.writer[1] == record.writer[1]
+        && recent.writer[0] == record.writer[0];
+    if same {
+        scratch.repeated = 1;
+        count(Counter::CopiesNotCaptured, 1);
+    }
+    same
+}
+
+/// Notes that the datagram at hand is captured.
+#[inline(always)]
+fn note(scratch: &Scratch) {
+    let Some(recent) = noted(scratch) else {
+        return;
+    };
+    let record = &scratch.walk.record;
+    recent.time = scratch.packet.now;
+    recent.sequence_number = record.sequence_number;
+    recent.writer = record.writer;
+    recent.fragment_start = record.fragment_start;
+    recent.datagram_len = scratch.walk.datagram_len;
+}
+
+#[inline(always)]
+fn noted(scratch: &Scratch) -> Option<&'static mut Recent> {
+    let record = &scratch.walk.record;
+    recent(
+        record.writer[2]
+            ^ record.writer[3] >> 24
+            ^ record.sequence_number as u32
+            ^ record.fragment_start,
+    )
+}
