@@ -1,8 +1,10 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
+pub mod control_groups;
 pub mod feed;
 pub mod filter;
 pub mod interfaces;
+pub mod kernel_types;
 pub mod live;
 pub mod netns;
 pub mod order;

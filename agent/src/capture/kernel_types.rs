@@ -1,0 +1,371 @@
+//! What the running kernel's types look like: where a structure has a member, what an enumerator's
+//! number is. Read from BTF (Documentation/bpf/btf.rst), which the kernel shows in
+//! `/sys/kernel/btf/vmlinux`.
+//!
+//! Only looked up, never interpreted further; the file is the kernel's own, still every read is
+//! bounded and what cannot be read is an error. Whoever asks copes with a member that is not there:
+//! kernels differ.
+
+use std::io;
+
+/// Where the kernel shows its types.
+const PATH: &str = "/sys/kernel/btf/vmlinux";
+const MAGIC: u32 = 0xeb9f;
+/// Anonymous structures and unions inside each other that a search enters.
+const DEPTH: u32 = 8;
+
+/// Kinds of types.
+mod kind {
+    pub(super) const INT: u32 = 1;
+    pub(super) const ARRAY: u32 = 3;
+    pub(super) const STRUCT: u32 = 4;
+    pub(super) const UNION: u32 = 5;
+    pub(super) const ENUM: u32 = 6;
+    pub(super) const FUNC_PROTO: u32 = 13;
+    pub(super) const VAR: u32 = 14;
+    pub(super) const DATASEC: u32 = 15;
+    pub(super) const DECL_TAG: u32 = 17;
+    pub(super) const ENUM64: u32 = 19;
+}
+
+/// Why the kernel's types are not known.
+#[derive(Debug, thiserror::Error)]
+pub enum KernelTypesError {
+    /// A kernel without CONFIG_DEBUG_INFO_BTF has no such file.
+    #[error("the kernel does not describe its types ({PATH})")]
+    Unreadable(#[source] io::Error),
+    /// The file is not what it should be.
+    #[error("the kernel's description of its types ({PATH}) is not understood at byte {0}")]
+    Malformed(usize),
+}
+
+/// The kernel's types, as bytes and an index.
+pub struct KernelTypes {
+    bytes: Vec<u8>,
+    /// Offset in `bytes` of each type, from id 1 on.
+    types: Vec<usize>,
+    /// Offset in `bytes` of the strings, and of their end.
+    strings: (usize, usize),
+}
+
+/// The first three words of a type.
+#[derive(Clone, Copy)]
+struct Head {
+    at: usize,
+    name: u32,
+    info: u32,
+    /// Size in bytes, or the id of another type, by kind.
+    size: u32,
+}
+
+impl Head {
+    const LEN: usize = 12;
+
+    fn kind(self) -> u32 {
+        self.info >> 24 & 0x1f
+    }
+
+    /// Members, enumerators or parameters that follow.
+    fn count(self) -> usize {
+        (self.info & 0xffff) as usize
+    }
+
+    /// Bit offsets of members are joined with a bit field's size.
+    fn has_bit_fields(self) -> bool {
+        self.info >> 31 == 1
+    }
+
+    /// Bytes that follow the head; `None` for a kind that this reader does not know.
+    fn tail(self) -> Option<usize> {
+        let count = self.count();
+        Some(match self.kind() {
+            kind::INT | kind::VAR | kind::DECL_TAG => 4,
+            kind::ARRAY => 12,
+            kind::STRUCT | kind::UNION | kind::DATASEC | kind::ENUM64 => 12 * count,
+            kind::ENUM | kind::FUNC_PROTO => 8 * count,
+            // Pointers, forward declarations, aliases, qualifiers, functions, floats, tags.
+            2 | 7..=12 | 16 | 18 => 0,
+            _ => return None,
+        })
+    }
+}
+
+impl KernelTypes {
+    /// Of the running kernel.
+    ///
+    /// # Errors
+    /// The kernel shows none, or in a form that is not understood.
+    pub fn read() -> Result<Self, KernelTypesError> {
+        Self::parse(std::fs::read(PATH).map_err(KernelTypesError::Unreadable)?)
+    }
+
+    /// From the bytes of such a file.
+    ///
+    /// # Errors
+    /// [`KernelTypesError::Malformed`].
+    pub fn parse(bytes: Vec<u8>) -> Result<Self, KernelTypesError> {
+        let malformed = KernelTypesError::Malformed;
+        let header = |index: usize| word(&bytes, 4 * index).ok_or(malformed(4 * index));
+        if header(0)? & 0xffff != MAGIC {
+            return Err(malformed(0));
+        }
+        let header_len = header(1)? as usize;
+        let section = |index: usize| -> Result<(usize, usize), KernelTypesError> {
+            let start = header_len.saturating_add(header(index)? as usize);
+            let end = start.saturating_add(header(index + 1)? as usize);
+            if end > bytes.len() {
+                return Err(malformed(4 * index));
+            }
+            Ok((start, end))
+        };
+        let (mut at, end) = section(2)?;
+        let strings = section(4)?;
+        let mut types = Vec::new();
+        while at < end {
+            let head = head(&bytes, at).ok_or(malformed(at))?;
+            types.push(at);
+            at += Head::LEN + head.tail().ok_or(malformed(at))?;
+        }
+        Ok(Self {
+            bytes,
+            types,
+            strings,
+        })
+    }
+
+    /// Where in `structure` a member is, in bytes. Dots lead into members:
+    /// `__sk_common.skc_cookie`. `None` when there is none, or it is a bit field.
+    #[must_use]
+    pub fn offset(&self, structure: &str, member: &str) -> Option<u32> {
+        self.named(structure, &[kind::STRUCT, kind::UNION])
+            .find_map(|head| {
+                let (mut head, mut bits) = (head, 0);
+                let mut parts = member.split('.').peekable();
+                while let Some(part) = parts.next() {
+                    let (offset, of_type) = self.member(head, part, DEPTH)?;
+                    bits += offset;
+                    if parts.peek().is_some() {
+                        head = self.by_id(of_type)?;
+                    }
+                }
+                (bits % 8 == 0).then_some(bits / 8)
+            })
+    }
+
+    /// Bytes of a structure.
+    #[must_use]
+    pub fn size(&self, structure: &str) -> Option<u32> {
+        let head = self.named(structure, &[kind::STRUCT]).next()?;
+        Some(head.size)
+    }
+
+    /// The number behind a name in an enumeration.
+    #[must_use]
+    pub fn enumerator(&self, enumeration: &str, name: &str) -> Option<u32> {
+        self.named(enumeration, &[kind::ENUM]).find_map(|head| {
+            (0..head.count()).find_map(|index| {
+                let at = head.at + Head::LEN + 8 * index;
+                let found = self.is_named(word(&self.bytes, at)?, name);
+                found.then(|| word(&self.bytes, at + 4)).flatten()
+            })
+        })
+    }
+
+    /// Bit offset and type id of a member, also inside anonymous structures and unions.
+    fn member(&self, of: Head, name: &str, depth: u32) -> Option<(u32, u32)> {
+        (0..of.count()).find_map(|index| {
+            let at = of.at + Head::LEN + 12 * index;
+            let member_name = word(&self.bytes, at)?;
+            let of_type = word(&self.bytes, at + 4)?;
+            let mut offset = word(&self.bytes, at + 8)?;
+            let mut bit_field = 0;
+            if of.has_bit_fields() {
+                (bit_field, offset) = (offset >> 24, offset & 0x00ff_ffff);
+            }
+            if member_name != 0 {
+                let found = bit_field == 0 && self.is_named(member_name, name);
+                return found.then_some((offset, of_type));
+            }
+            let inner = self.by_id(of_type)?;
+            if depth == 0 || !matches!(inner.kind(), kind::STRUCT | kind::UNION) {
+                return None;
+            }
+            let (inside, of_type) = self.member(inner, name, depth - 1)?;
+            Some((offset + inside, of_type))
+        })
+    }
+
+    fn named<'a>(&'a self, name: &'a str, kinds: &'a [u32]) -> impl Iterator<Item = Head> + 'a {
+        self.types
+            .iter()
+            .filter_map(|at| head(&self.bytes, *at))
+            .filter(|head| kinds.contains(&head.kind()) && self.is_named(head.name, name))
+    }
+
+    fn by_id(&self, id: u32) -> Option<Head> {
+        let index = usize::try_from(id).ok()?.checked_sub(1)?;
+        head(&self.bytes, *self.types.get(index)?)
+    }
+
+    fn is_named(&self, name: u32, wanted: &str) -> bool {
+        let (start, end) = self.strings;
+        let strings = self.bytes.get(start..end).unwrap_or(&[]);
+        strings
+            .get(name as usize..)
+            .and_then(|tail| tail.strip_prefix(wanted.as_bytes()))
+            .is_some_and(|rest| rest.first() == Some(&0))
+    }
+}
+
+fn head(bytes: &[u8], at: usize) -> Option<Head> {
+    Some(Head {
+        at,
+        name: word(bytes, at)?,
+        info: word(bytes, at + 4)?,
+        size: word(bytes, at + 8)?,
+    })
+}
+
+/// The kernel writes its types in its own byte order.
+fn word(bytes: &[u8], at: usize) -> Option<u32> {
+    let bytes = bytes.get(at..)?.first_chunk()?;
+    Some(u32::from_ne_bytes(*bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NAMES: &str = "\0sock\0common\0cookie\0inner\0reason\0DROPPED\0flag\0";
+
+    fn name(of: &str) -> u32 {
+        let at = NAMES.find(&format!("\0{of}\0")).unwrap();
+        u32::try_from(at + 1).unwrap()
+    }
+
+    /// `struct sock { struct common inner; union { struct { u32 flag:1; u64 cookie; }; }; }`, an
+    /// enumeration, and an integer.
+    fn types() -> Vec<u8> {
+        let structure =
+            |kind: u32, bit_fields: u32, count: u32| bit_fields << 31 | kind << 24 | count;
+        let words = [
+            vec![
+                name("reason"),
+                structure(kind::ENUM, 0, 1),
+                4,
+                name("DROPPED"),
+                77,
+            ],
+            vec![
+                name("common"),
+                structure(kind::STRUCT, 0, 1),
+                16,
+                name("cookie"),
+                3,
+                64,
+            ],
+            vec![0, kind::INT << 24, 8, 0],
+            vec![
+                name("sock"),
+                structure(kind::STRUCT, 0, 2),
+                40,
+                name("inner"),
+                2,
+                128,
+                0,
+                5,
+                256,
+            ],
+            vec![0, structure(kind::UNION, 0, 1), 16, 0, 6, 0],
+            vec![
+                0,
+                structure(kind::STRUCT, 1, 2),
+                16,
+                name("flag"),
+                3,
+                1 << 24,
+                name("cookie"),
+                3,
+                64,
+            ],
+        ]
+        .concat();
+        let len = u32::try_from(4 * words.len()).unwrap();
+        let strings = u32::try_from(NAMES.len()).unwrap();
+        let header = [MAGIC | 1 << 16, 24, 0, len, len, strings];
+        let words = header.iter().chain(&words);
+        let mut bytes: Vec<u8> = words.flat_map(|word| word.to_ne_bytes()).collect();
+        bytes.extend_from_slice(NAMES.as_bytes());
+        bytes
+    }
+
+    #[test]
+    fn members_are_found_by_path_and_inside_anonymous_members() {
+        let types = KernelTypes::parse(types()).unwrap();
+        assert_eq!(types.offset("common", "cookie"), Some(8));
+        assert_eq!(types.offset("sock", "inner"), Some(16));
+        assert_eq!(types.offset("sock", "inner.cookie"), Some(24));
+        assert_eq!(types.offset("sock", "cookie"), Some(40));
+        assert_eq!(types.size("sock"), Some(40));
+        assert_eq!(types.enumerator("reason", "DROPPED"), Some(77));
+    }
+
+    #[test]
+    fn what_is_not_there_and_bit_fields_have_no_offset() {
+        let types = KernelTypes::parse(types()).unwrap();
+        assert_eq!(types.offset("sock", "flag"), None);
+        assert_eq!(types.offset("sock", "cook"), None);
+        assert_eq!(types.offset("sock", "inner.flag"), None);
+        assert_eq!(types.offset("so", "inner"), None);
+        assert_eq!(types.enumerator("reason", "DROP"), None);
+        assert_eq!(types.enumerator("sock", "DROPPED"), None);
+        assert_eq!(types.size("missing"), None);
+    }
+
+    #[test]
+    fn a_file_cut_anywhere_or_changed_anywhere_never_panics() {
+        let whole = types();
+        for end in 0..whole.len() {
+            assert!(KernelTypes::parse(whole[..end].to_vec()).is_err(), "{end}");
+        }
+        for at in 0..whole.len() {
+            let mut changed = whole.clone();
+            changed[at] ^= 0xff;
+            if let Ok(types) = KernelTypes::parse(changed) {
+                let _ = types.offset("sock", "inner.cookie");
+                let _ = types.offset("sock", "cookie");
+                let _ = types.enumerator("reason", "DROPPED");
+            }
+        }
+    }
+
+    #[test]
+    fn an_anonymous_type_that_contains_itself_is_left() {
+        let mut bytes = types();
+        // The union's only member is of the union's own type.
+        let header = 24;
+        let union = header + 4 * (5 + 6 + 4 + 9);
+        bytes[union + 16..union + 20].copy_from_slice(&5_u32.to_ne_bytes());
+        let types = KernelTypes::parse(bytes).unwrap();
+        assert_eq!(types.offset("sock", "cookie"), None);
+    }
+
+    #[test]
+    fn the_running_kernel_describes_a_socket_and_a_packet() {
+        let Ok(types) = KernelTypes::read() else {
+            return;
+        };
+        assert_eq!(types.offset("sock", "__sk_common"), Some(0));
+        for (structure, member) in [
+            ("sock", "__sk_common.skc_cookie"),
+            ("sk_buff", "head"),
+            ("sk_buff", "network_header"),
+            ("task_struct", "tgid"),
+        ] {
+            assert!(
+                types.offset(structure, member).is_some(),
+                "{structure}.{member}"
+            );
+        }
+    }
+}
