@@ -35,7 +35,7 @@ const TOOLS: [(&str, &str); 7] = [
 ];
 
 /// What namespaces and cgroups are named with, before the process that made them.
-const PREFIX: &str = "r2p";
+pub(crate) const PREFIX: &str = "r2p";
 
 /// Fails unless this process is root and every tool is there.
 pub(crate) fn require() -> Result<()> {
