@@ -1,10 +1,5 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    reason = "a test may panic"
-)]
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod local_agent;
 mod sample_robot;

@@ -1,5 +1,6 @@
 //! A robot of any size as the model would describe it, with every fact filled in.
 
+use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 
 use ros2probe::model::histogram::Histogram;
@@ -156,7 +157,7 @@ pub fn delivery(direction: Direction) -> DeliveryFacts {
     DeliveryFacts {
         writer: guid([0, 0, 1, 3]),
         direction,
-        destination: "10.0.0.2:7411".parse().unwrap(),
+        destination: (Ipv4Addr::new(10, 0, 0, 2), 7411).into(),
         subscriber: if received {
             format!("participant {participant}")
         } else {
