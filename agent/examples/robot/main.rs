@@ -69,6 +69,9 @@ struct Options {
     /// Seconds to stay after the last sample was sent
     #[arg(long, default_value_t = 1.0)]
     linger: f64,
+    /// Bytes of each socket's receive buffer, as far as net.core.rmem_max goes
+    #[arg(long, default_value_t = 4 << 20)]
+    receive_buffer: usize,
 }
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
@@ -91,7 +94,7 @@ async fn main() -> Result<()> {
     let log = Arc::new(Log::open(&options)?);
 
     let participant = DomainParticipantBuilder::new(options.domain)
-        .socket_receive_buffer_size(4 << 20)
+        .socket_receive_buffer_size(options.receive_buffer)
         .build()
         .map_err(|error| anyhow!("cannot create a DDS participant: {error:?}"))?;
     let context = Context::from_domain_participant(participant)

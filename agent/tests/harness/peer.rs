@@ -41,6 +41,8 @@ pub(crate) struct Stream {
     pub(crate) logged: bool,
     /// Seconds for which a publisher stays after its last sample, unless it is terminated.
     pub(crate) linger: f64,
+    /// Bytes of each of the peers' receive buffers, as far as net.core.rmem_max goes.
+    pub(crate) receive_buffer: u32,
 }
 
 pub(crate) struct Peer {
@@ -79,6 +81,7 @@ impl Stream {
             domain: 0,
             logged: true,
             linger: 1.0,
+            receive_buffer: 4 << 20,
         }
     }
 
@@ -145,6 +148,7 @@ impl Peer {
         option("--rate", stream.rate.to_string());
         option("--depth", stream.depth.to_string());
         option("--domain", stream.domain.to_string());
+        option("--receive-buffer", stream.receive_buffer.to_string());
         if stream.logged {
             option("--log", directory.path().join("log").display().to_string());
         }

@@ -70,10 +70,12 @@ struct Options {
   int peers = 1;
   bool hold = false;
   double linger = 1.0;
+  // Of each socket, as far as net.core.rmem_max goes: room for bursts of point cloud fragments.
+  uint32_t receive_buffer = 4 << 20;
 
   static Options parse(int argc, char** argv) {
     enum { kRole = 1, kTopic, kSize, kRate, kCount, kReliable, kBestEffort, kTransientLocal, kDepth,
-           kDomain, kGidSize, kNode, kLog, kPeers, kHold, kLinger, kHelp };
+           kDomain, kGidSize, kNode, kLog, kPeers, kHold, kLinger, kReceiveBuffer, kHelp };
     static const option names[] = {
         {"role", 1, nullptr, kRole},           {"topic", 1, nullptr, kTopic},
         {"size", 1, nullptr, kSize},           {"rate", 1, nullptr, kRate},
@@ -84,6 +86,7 @@ struct Options {
         {"gid-size", 1, nullptr, kGidSize},    {"node", 1, nullptr, kNode},
         {"log", 1, nullptr, kLog},             {"peers", 1, nullptr, kPeers},
         {"hold", 0, nullptr, kHold},           {"linger", 1, nullptr, kLinger},
+        {"receive-buffer", 1, nullptr, kReceiveBuffer},
         {"help", 0, nullptr, kHelp},           {nullptr, 0, nullptr, 0}};
     Options options;
     bool role_given = false;
@@ -109,11 +112,14 @@ struct Options {
         case kPeers: options.peers = atoi(optarg); break;
         case kHold: options.hold = true; break;
         case kLinger: options.linger = strtod(optarg, nullptr); break;
+        case kReceiveBuffer:
+          options.receive_buffer = static_cast<uint32_t>(strtoul(optarg, nullptr, 10));
+          break;
         default:
           fail("usage: --role pub|sub [--topic /t] [--size BYTES] [--rate HZ] [--count N]\n"
                "  [--reliable|--best-effort] [--transient-local] [--depth N] [--domain D]\n"
                "  [--gid-size 24|16] [--node /ns/name]... [--log FILE] [--peers N] [--hold]\n"
-               "  [--linger SECONDS]");
+               "  [--linger SECONDS] [--receive-buffer BYTES]");
       }
     }
     if (!role_given) fail("--role pub|sub is missing");
@@ -165,6 +171,12 @@ class Log {
   void received(uint64_t seq, size_t length, int64_t stamp) {
     line("{\"ev\":\"sub\",\"t\":%" PRId64 ",\"seq\":%" PRIu64 ",\"len\":%zu,\"stamp_ns\":%" PRId64 "}\n",
          unix_ns(), seq, length, stamp);
+  }
+
+  // With the writer's sequence number, where the middleware tells it.
+  void received(uint64_t seq, int64_t sn, size_t length, int64_t stamp) {
+    line("{\"ev\":\"sub\",\"t\":%" PRId64 ",\"seq\":%" PRIu64 ",\"sn\":%" PRId64 ",\"len\":%zu,\"stamp_ns\":%" PRId64 "}\n",
+         unix_ns(), seq, sn, length, stamp);
   }
 
   void event(const char* name) { line("{\"ev\":\"%s\",\"t\":%" PRId64 "}\n", name, unix_ns()); }

@@ -185,14 +185,15 @@ void on_cloud(dds_entity_t reader, void* argument) {
   }
 }
 
-// Lets the socket buffer hold a burst of point cloud fragments, as far as net.core.rmem_max goes.
-// Cyclone DDS 0.8 cannot be told so.
-void make_room_for_bursts() {
+// Cyclone DDS 0.8 cannot be told. What the caller configures stays.
+void size_receive_buffer([[maybe_unused]] uint32_t bytes) {
 #if DDS_VERSION_MAJOR > 0 || DDS_VERSION_MINOR >= 10
-  setenv("CYCLONEDDS_URI",
-         "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize max=\"4MB\"/></Internal></Domain>"
-         "</CycloneDDS>",
-         0);
+  const std::string size = std::to_string(bytes) + "B";
+  const std::string configuration =
+      "<CycloneDDS><Domain><Internal><SocketReceiveBufferSize min=\"default\" max=\"" + size +
+      "\"/></Internal></Domain></CycloneDDS>";
+  const char* given = getenv("CYCLONEDDS_URI");
+  setenv("CYCLONEDDS_URI", given ? (configuration + "," + given).c_str() : configuration.c_str(), 1);
 #endif
 }
 
@@ -201,7 +202,7 @@ void make_room_for_bursts() {
 int main(int argc, char** argv) {
   const peer::Options options = peer::Options::parse(argc, argv);
   peer::stop_on_signals();
-  make_room_for_bursts();
+  size_receive_buffer(options.receive_buffer);
   peer::Log log(options, "cyclonedds");
   Receiver receiver{options, log};
   Context context(options);

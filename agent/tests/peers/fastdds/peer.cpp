@@ -123,7 +123,9 @@ class Receiver : public DataReaderListener {
       uint64_t seq;
       memcpy(stamp, &sample_[kStampOffset], sizeof stamp);
       memcpy(&seq, &sample_[kDataOffset], sizeof seq);
-      log_.received(seq, sample_.size(), stamp[0] * 1000000000LL + stamp[1]);
+      const auto& number = info.sample_identity.sequence_number();
+      log_.received(seq, static_cast<int64_t>(number.to64long()), sample_.size(),
+                    stamp[0] * 1000000000LL + stamp[1]);
       if (++received_ == options_.count) peer::stopped = 1;
     }
   }
@@ -145,7 +147,7 @@ class Context {
     const char enclave[] = "enclave=/;";
     qos.user_data().setValue(std::vector<uint8_t>(enclave, enclave + sizeof enclave));
     auto udp = std::make_shared<UDPv4TransportDescriptor>();
-    udp->receiveBufferSize = 4 << 20;
+    udp->receiveBufferSize = options.receive_buffer;
     qos.transport().use_builtin_transports = false;
     qos.transport().user_transports.push_back(udp);
     participant_ = factory->create_participant(options.domain, qos);
