@@ -26,6 +26,7 @@ use serde_json::json;
 use crate::messages::{AddTwoIntsRequest, AddTwoIntsResponse, Imu, LaserScan, PointCloud2, Twist};
 
 mod messages;
+mod patience;
 
 #[derive(Parser)]
 #[command(about = "Demo robot and test peer made of ROS 2 participants in Rust")]

@@ -27,6 +27,13 @@ impl Cgroup {
         Ok(Cgroup { path })
     }
 
+    /// One below this, which is removed first.
+    pub(crate) fn create_below(&self, name: &str) -> Result<Cgroup> {
+        let path = self.path.join(name);
+        fs::create_dir(&path).with_context(|| format!("cannot create {}", path.display()))?;
+        Ok(Cgroup { path })
+    }
+
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }
@@ -89,7 +96,11 @@ pub(crate) fn hierarchy() -> Result<PathBuf> {
 pub(crate) fn sweep() {
     if let Ok(hierarchy) = hierarchy() {
         remove_leftovers(&hierarchy, |name| {
-            let _ = fs::remove_dir(hierarchy.join(name));
+            let path = hierarchy.join(name);
+            for below in fs::read_dir(&path).into_iter().flatten().flatten() {
+                let _ = fs::remove_dir(below.path());
+            }
+            let _ = fs::remove_dir(path);
         });
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 use serde::Deserialize;
 
 /// One line. Which fields are there depends on `ev`.
@@ -15,6 +15,8 @@ pub(crate) struct Event {
     pub(crate) t: u64,
     /// The application's sequence number from 0; the DDS writer counts from 1.
     pub(crate) seq: Option<u64>,
+    /// The DDS writer's sequence number, where the stack tells a subscriber.
+    pub(crate) sn: Option<u64>,
     /// Serialized size with the encapsulation header.
     pub(crate) len: Option<u64>,
     pub(crate) stamp_ns: Option<u64>,
@@ -45,6 +47,20 @@ impl EventLog {
             .filter(|event| event.ev == ev)
             .filter_map(|event| event.seq)
             .collect()
+    }
+
+    /// The DDS writer's sequence numbers of the events of one kind.
+    pub(crate) fn writer_numbers(&self, ev: &str) -> Result<BTreeSet<u64>> {
+        let mut numbers = BTreeSet::new();
+        for event in self.0.iter().filter(|event| event.ev == ev) {
+            let number = event.seq.context("an event without a number")? + 1;
+            ensure!(
+                event.sn.is_none_or(|told| told == number),
+                "the writer did not number its samples one by one: {event:?}"
+            );
+            ensure!(numbers.insert(number), "twice: {event:?}");
+        }
+        Ok(numbers)
     }
 
     /// How many samples are missing between the first and the last that this subscriber was given:

@@ -1,5 +1,6 @@
 //! Packet loss at a host's outgoing interface, before any packet tap: both ends of the link miss
-//! the same frames. Stateless, so nothing but the chosen datagrams is touched.
+//! the same frames, and the sender's socket hooks have seen the datagram. Nothing but the chosen
+//! datagrams is touched.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -15,8 +16,22 @@ use super::run;
 const LEAST_OVERHEAD: usize = 60;
 const MOST_OVERHEAD: usize = 180;
 
+/// Marks doomed datagrams on their way from the socket to the interface.
+const MARK: u32 = 0x7232;
+
 pub(crate) struct Loss<'a> {
     host: &'a Namespace,
+    /// The family of the table that chooses.
+    chosen_in: &'static str,
+}
+
+/// What is kept back of a doomed datagram.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Part {
+    /// All of it.
+    Whole,
+    /// All its IP fragments but the first: it dies when the receiver gives up waiting.
+    Trailing,
 }
 
 /// What the rule has met so far.
@@ -63,6 +78,51 @@ impl<'a> Loss<'a> {
                 }}
             }}"
         );
+        Loss::load(host, &rules)?;
+        Ok(Loss {
+            host,
+            chosen_in: "netdev",
+        })
+    }
+
+    /// Dooms every `nth` datagram that an nftables expression such as `udp length > 1000` matches,
+    /// as it was sent, before it is cut into IP fragments. The sender's socket is told that all
+    /// went well; the kernel itself does not send what follows a dropped fragment.
+    pub(crate) fn of_datagrams(
+        host: &'a Namespace,
+        matches: &str,
+        nth: u64,
+        part: Part,
+    ) -> Result<Loss<'a>> {
+        let kept_back = match part {
+            Part::Whole => "",
+            Part::Trailing => "ip frag-off & 0x1fff != 0",
+        };
+        let last = nth.saturating_sub(1);
+        let rules = format!(
+            "table ip loss {{
+                counter matched {{ }}
+                chain output {{
+                    type filter hook output priority 0;
+                    {matches} counter name matched numgen inc mod {nth} == {last} meta mark set {MARK}
+                }}
+            }}
+            table netdev loss {{
+                counter dropped {{ }}
+                chain egress {{
+                    type filter hook egress device {INTERFACE} priority 0;
+                    meta mark {MARK} {kept_back} counter name dropped drop
+                }}
+            }}"
+        );
+        Loss::load(host, &rules)?;
+        Ok(Loss {
+            host,
+            chosen_in: "ip",
+        })
+    }
+
+    fn load(host: &Namespace, rules: &str) -> Result<()> {
         let [program, arguments @ ..] = &host.inside()[..] else {
             bail!("no command to enter the host");
         };
@@ -84,19 +144,19 @@ impl<'a> Loss<'a> {
                 String::from_utf8_lossy(&output.stderr)
             );
         }
-        Ok(Loss { host })
+        Ok(())
     }
 
     pub(crate) fn counts(&self) -> Result<Counts> {
         Ok(Counts {
-            matched: self.counter("matched")?,
-            dropped: self.counter("dropped")?,
+            matched: self.counter(self.chosen_in, "matched")?,
+            dropped: self.counter("netdev", "dropped")?,
         })
     }
 
-    fn counter(&self, name: &str) -> Result<u64> {
+    fn counter(&self, family: &str, name: &str) -> Result<u64> {
         let listing = run(&format!(
-            "ip netns exec {} nft list counter netdev loss {name}",
+            "ip netns exec {} nft list counter {family} loss {name}",
             self.host.name()
         ))?;
         let mut words = listing
@@ -111,9 +171,11 @@ impl<'a> Loss<'a> {
 
 impl Drop for Loss<'_> {
     fn drop(&mut self) {
-        let _ = run(&format!(
-            "ip netns exec {} nft delete table netdev loss",
-            self.host.name()
-        ));
+        for family in ["netdev", self.chosen_in] {
+            let _ = run(&format!(
+                "ip netns exec {} nft delete table {family} loss",
+                self.host.name()
+            ));
+        }
     }
 }

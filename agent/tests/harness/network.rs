@@ -27,27 +27,41 @@ pub(crate) struct Namespace {
 pub(crate) struct Link {
     pub(crate) robot: Namespace,
     pub(crate) monitor: Namespace,
+    /// That of both hosts, as if one machine ran them as containers.
+    cgroup: Cgroup,
 }
 
 impl Link {
     pub(crate) fn new() -> Result<Link> {
+        sweep()?;
         let subnet = next_subnet();
-        let robot = Namespace::create("robot", subnet, 1)?;
-        let monitor = Namespace::create("monitor", subnet, 2)?;
+        let cgroup = Cgroup::create(&name_of("link", subnet))?;
+        let robot = Namespace::create("robot", subnet, 1, Some(&cgroup))?;
+        let monitor = Namespace::create("monitor", subnet, 2, Some(&cgroup))?;
         run(&format!(
             "ip link add {INTERFACE} netns {} mtu 1500 type veth peer name {INTERFACE} mtu 1500 netns {}",
             robot.name, monitor.name
         ))?;
         robot.configure(INTERFACE)?;
         monitor.configure(INTERFACE)?;
-        Ok(Link { robot, monitor })
+        Ok(Link {
+            robot,
+            monitor,
+            cgroup,
+        })
+    }
+
+    /// The cgroup that holds those of both hosts.
+    pub(crate) fn cgroup(&self) -> &Path {
+        self.cgroup.path()
     }
 }
 
 impl Namespace {
     /// A host whose cable ends nowhere: its nodes talk over loopback only.
     pub(crate) fn alone() -> Result<Namespace> {
-        let host = Namespace::create("robot", next_subnet(), 1)?;
+        sweep()?;
+        let host = Namespace::create("robot", next_subnet(), 1, None)?;
         run(&format!(
             "ip -n {0} link add {INTERFACE} type veth peer name unplugged",
             host.name
@@ -91,18 +105,13 @@ impl Namespace {
         ["nsenter".to_owned(), network]
     }
 
-    fn create(role: &str, subnet: u16, host: u8) -> Result<Namespace> {
-        require()?;
-        static SWEPT: Once = Once::new();
-        SWEPT.call_once(|| {
-            remove_leftovers(Path::new("/run/netns"), |name| {
-                let _ = run(&format!("ip netns delete {name}"));
-            });
-            cgroup::sweep();
-        });
-        let name = format!("{PREFIX}-{}-{subnet}-{role}", std::process::id());
+    fn create(role: &str, subnet: u16, host: u8, above: Option<&Cgroup>) -> Result<Namespace> {
+        let name = name_of(role, subnet);
         let [_, third] = subnet.to_be_bytes();
-        let cgroup = Cgroup::create(&name)?;
+        let cgroup = match above {
+            Some(above) => above.create_below(role)?,
+            None => Cgroup::create(&name)?,
+        };
         run(&format!("ip netns add {name}"))?;
         Ok(Namespace {
             name,
@@ -135,6 +144,23 @@ impl Drop for Namespace {
             eprintln!("{error:#}");
         }
     }
+}
+
+/// Fails where tests cannot run; removes what killed ones left behind.
+fn sweep() -> Result<()> {
+    require()?;
+    static SWEPT: Once = Once::new();
+    SWEPT.call_once(|| {
+        remove_leftovers(Path::new("/run/netns"), |name| {
+            let _ = run(&format!("ip netns delete {name}"));
+        });
+        cgroup::sweep();
+    });
+    Ok(())
+}
+
+fn name_of(role: &str, subnet: u16) -> String {
+    format!("{PREFIX}-{}-{subnet}-{role}", std::process::id())
 }
 
 fn next_subnet() -> u16 {

@@ -41,6 +41,8 @@ pub(crate) struct Stream {
     pub(crate) logged: bool,
     /// Seconds for which a publisher stays after its last sample, unless it is terminated.
     pub(crate) linger: f64,
+    /// How many of the other role a peer waits for.
+    pub(crate) peers: usize,
     /// Bytes of each of the peers' receive buffers, as far as net.core.rmem_max goes.
     pub(crate) receive_buffer: u32,
 }
@@ -81,6 +83,7 @@ impl Stream {
             domain: 0,
             logged: true,
             linger: 1.0,
+            peers: 1,
             receive_buffer: 4 << 20,
         }
     }
@@ -148,6 +151,7 @@ impl Peer {
         option("--rate", stream.rate.to_string());
         option("--depth", stream.depth.to_string());
         option("--domain", stream.domain.to_string());
+        option("--peers", stream.peers.to_string());
         option("--receive-buffer", stream.receive_buffer.to_string());
         if stream.logged {
             option("--log", directory.path().join("log").display().to_string());

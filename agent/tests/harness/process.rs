@@ -1,7 +1,9 @@
 //! A program running on a host, ended with its value. It also dies with the thread that started it,
 //! so a killed test leaves nothing behind: start it from the thread that keeps it.
 
+use std::collections::BTreeSet;
 use std::ffi::OsStr;
+use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -70,6 +72,29 @@ impl Process {
 
     pub(crate) fn pid(&self) -> u32 {
         self.child.id()
+    }
+
+    /// The UDP ports that it has bound.
+    pub(crate) fn udp_ports(&self) -> Result<BTreeSet<u16>> {
+        let of_process = |name: &str| format!("/proc/{}/{name}", self.pid());
+        let mut sockets = BTreeSet::new();
+        for entry in fs::read_dir(of_process("fd"))? {
+            if let Ok(target) = fs::read_link(entry?.path()) {
+                sockets.insert(target.to_string_lossy().into_owned());
+            }
+        }
+        let table = fs::read_to_string(of_process("net/udp"))?;
+        let rows = table.lines().map(|row| row.split_whitespace().collect());
+        let own = rows.filter(|row: &Vec<&str>| {
+            let inode = row.get(9).map(|inode| format!("socket:[{inode}]"));
+            inode.is_some_and(|inode| sockets.contains(&inode))
+        });
+        let ports = own.map(|row| {
+            let port = row.get(1).and_then(|local| local.split_once(':'));
+            let (_, port) = port.context("not an address")?;
+            Ok(u16::from_str_radix(port, 16)?)
+        });
+        ports.collect()
     }
 
     /// Waits until the program prints this line.
