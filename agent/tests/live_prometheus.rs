@@ -5,16 +5,14 @@ mod harness;
 
 use std::io::Write as _;
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use anyhow::{Context as _, Result, bail, ensure};
-use harness::agent::{Agent, ON_THE_WIRE, get};
-use harness::network::{Link, Namespace};
+use anyhow::{Context as _, Result, ensure};
+use harness::agent::{Agent, ON_THE_WIRE};
+use harness::network::Link;
 use harness::peer::{Peer, Role, Stack, Stream, robot};
 use harness::process::Process;
-
-const INSTALL: &str = "run `make prerequisites` or `apt-get install prometheus`";
-const SERVER: &str = "127.0.0.1:9090";
+use harness::prometheus::{INSTALL, Prometheus};
 
 #[test]
 fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()> {
@@ -23,23 +21,7 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     let configuration = directory.path().join("ros2probe.yaml");
     std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
-    let scraping = directory.path().join("prometheus.yml");
-    std::fs::write(
-        &scraping,
-        "global: {scrape_interval: 1s}\n\
-         scrape_configs: [{job_name: robot, static_configs: [{targets: ['127.0.0.1:17400']}]}]\n",
-    )?;
-    let arguments = [
-        format!("--config.file={}", scraping.display()),
-        format!(
-            "--storage.tsdb.path={}",
-            directory.path().join("data").display()
-        ),
-        format!("--web.listen-address={SERVER}"),
-        "--log.level=error".to_owned(),
-    ];
-    let _prometheus =
-        Process::start(&link.robot.on_network(), "prometheus", arguments).context(INSTALL)?;
+    let prometheus = Prometheus::start(&link.robot, &["127.0.0.1:17400".to_owned()], &[])?;
     let mut roles = Vec::new();
     for (host, role) in [
         (&link.robot, "base"),
@@ -69,16 +51,13 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     )?;
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
-    ensure!(query(&link.robot, "up")? > 0.5, "the scrape works");
+    ensure!(prometheus.query("up")? > 0.5, "the scrape works");
     publisher.go()?;
     // Well into the 20 seconds of the stream, so that every window asked for lies in it.
     std::thread::sleep(Duration::from_secs(17));
     let rate = |topic: &str| {
         let counter = format!("ros2_topic_messages_total{{topic=\"{topic}\"}}");
-        query(
-            &link.robot,
-            &format!("avg_over_time(rate({counter}[10s])[5s:1s])"),
-        )
+        prometheus.query(&format!("avg_over_time(rate({counter}[10s])[5s:1s])"))
     };
     let rates = [rate("/truth")?, rate("/imu")?, rate("/points")?];
     publisher.wait_sent(Duration::from_secs(60))?;
@@ -97,40 +76,13 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     }
     // The last samples are in the scrape after next.
     std::thread::sleep(Duration::from_secs(3));
-    let total = query(&link.robot, "ros2_topic_messages_total{topic=\"/truth\"}")?;
+    let total = prometheus.query("ros2_topic_messages_total{topic=\"/truth\"}")?;
     ensure!(
         total as u64 == times.len() as u64,
         "{total} counted, {} sent",
         times.len()
     );
     promtool(&agent.scrape()?.0)
-}
-
-/// Asks until there is an answer; the value of its first sample.
-fn query(host: &Namespace, expression: &str) -> Result<f64> {
-    let encoded: String = expression
-        .bytes()
-        .map(|byte| format!("%{byte:02X}"))
-        .collect();
-    let deadline = Instant::now() + Duration::from_secs(20);
-    loop {
-        let body = get(
-            host,
-            &format!("http://{SERVER}/api/v1/query?query={encoded}"),
-        );
-        let answer: serde_json::Value =
-            serde_json::from_str(body.as_deref().unwrap_or_default()).unwrap_or_default();
-        let value = answer
-            .pointer("/data/result/0/value/1")
-            .and_then(|value| value.as_str());
-        if let Some(value) = value.and_then(|value| value.parse().ok()) {
-            return Ok(value);
-        }
-        if Instant::now() > deadline {
-            bail!("{expression}: {body:?}; is `prometheus` there? {INSTALL}");
-        }
-        std::thread::sleep(Duration::from_millis(300));
-    }
 }
 
 fn promtool(page: &str) -> Result<()> {

@@ -16,7 +16,9 @@ pub(crate) mod loss;
 pub(crate) mod network;
 pub(crate) mod peer;
 pub(crate) mod process;
+pub(crate) mod prometheus;
 pub(crate) mod snmp;
+pub(crate) mod switch;
 pub(crate) mod usage;
 pub(crate) mod witness;
 

@@ -120,7 +120,7 @@ impl Namespace {
         })
     }
 
-    fn configure(&self, interface: &str) -> Result<()> {
+    pub(super) fn configure(&self, interface: &str) -> Result<()> {
         let Namespace { name, address, .. } = self;
         run(&format!("ip -n {name} link set lo multicast on up"))?;
         run(&format!(

@@ -1,0 +1,112 @@
+//! A real Prometheus on a host, and what it answers.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail};
+use tempfile::TempDir;
+
+use super::agent::get;
+use super::network::Namespace;
+use super::process::Process;
+
+pub(crate) const INSTALL: &str = "run `make prerequisites` or `apt-get install prometheus`";
+const SERVER: &str = "127.0.0.1:9090";
+/// How long a query may have no answer.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+pub(crate) struct Prometheus<'a> {
+    host: &'a Namespace,
+    _process: Process,
+    _directory: TempDir,
+}
+
+impl<'a> Prometheus<'a> {
+    /// Scrapes these targets (`address:port`) and evaluates these files of rules each second.
+    pub(crate) fn start(
+        host: &'a Namespace,
+        targets: &[String],
+        rules: &[PathBuf],
+    ) -> Result<Prometheus<'a>> {
+        let directory = tempfile::tempdir()?;
+        let configuration = directory.path().join("prometheus.yml");
+        let text = format!(
+            "global: {{scrape_interval: 1s, evaluation_interval: 1s}}\n\
+             rule_files: {rules:?}\n\
+             scrape_configs: [{{job_name: robots, static_configs: [{{targets: {targets:?}}}]}}]\n",
+        );
+        std::fs::write(&configuration, text)?;
+        let arguments = [
+            format!("--config.file={}", configuration.display()),
+            format!(
+                "--storage.tsdb.path={}",
+                directory.path().join("data").display()
+            ),
+            format!("--web.listen-address={SERVER}"),
+            "--log.level=error".to_owned(),
+        ];
+        let process = Process::start(&host.outside(), "prometheus", arguments).context(INSTALL)?;
+        Ok(Prometheus {
+            host,
+            _process: process,
+            _directory: directory,
+        })
+    }
+
+    /// Asks until there is an answer; the value of its first sample.
+    pub(crate) fn query(&self, expression: &str) -> Result<f64> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let answer = self.ask(expression);
+            let value = answer
+                .as_ref()
+                .ok()
+                .and_then(|answer| answer.pointer("/data/result/0/value/1"))
+                .and_then(|value| value.as_str());
+            if let Some(value) = value.and_then(|value| value.parse().ok()) {
+                return Ok(value);
+            }
+            if Instant::now() > deadline {
+                bail!("{expression}: {answer:?}; is `prometheus` there? {INSTALL}");
+            }
+            std::thread::sleep(Duration::from_millis(300));
+        }
+    }
+
+    /// Asks until this is the answer.
+    pub(crate) fn wait_for(&self, expression: &str, wanted: f64) -> Result<()> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let value = self.query(expression)?;
+            if value == wanted {
+                return Ok(());
+            }
+            if Instant::now() > deadline {
+                bail!("{expression} is {value} and not {wanted}");
+            }
+            std::thread::sleep(Duration::from_millis(300));
+        }
+    }
+
+    /// How many series an expression has now.
+    pub(crate) fn series(&self, expression: &str) -> Result<usize> {
+        let answer = self.ask(expression)?;
+        let result = answer.pointer("/data/result");
+        let series = result.and_then(|result| result.as_array());
+        Ok(series
+            .with_context(|| format!("{expression}: {answer}"))?
+            .len())
+    }
+
+    fn ask(&self, expression: &str) -> Result<serde_json::Value> {
+        let encoded: String = expression
+            .bytes()
+            .map(|byte| format!("%{byte:02X}"))
+            .collect();
+        let body = get(
+            self.host,
+            &format!("http://{SERVER}/api/v1/query?query={encoded}"),
+        )?;
+        serde_json::from_str(&body).with_context(|| format!("not JSON: {body}"))
+    }
+}
