@@ -266,6 +266,8 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
             .collect(),
         copied_bytes: live.copied_bytes(),
         records_dropped: value(Counter::RecordsLost),
+        pieces_dropped: value(Counter::PiecesLost),
+        contended: value(Counter::Contended),
         incomplete_datagrams: live.incomplete_datagrams(),
         reassembly_bytes: live.reassembly_bytes() as u64,
         refused_updates: live.refused_updates(),

@@ -28,7 +28,8 @@ pub struct AgentFacts {
     pub records_dropped: u64,
     /// Captured datagrams of the host's sockets of which a piece was lost for want of room.
     pub pieces_dropped: u64,
-    /// Datagrams that the host's hook could not look at: its working memory was in use.
+    /// Frames and datagrams that the kernel programs could not look at: their working memory was
+    /// in use.
     pub contended: u64,
     /// Fragmented datagrams that were begun and never became complete.
     pub incomplete_datagrams: u64,

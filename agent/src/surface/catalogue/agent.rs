@@ -62,7 +62,7 @@ pub(in crate::surface) const PIECES_DROPPED: Metric = Metric::counter(
 pub(in crate::surface) const CONTENDED: Metric = Metric::counter(
     "ros2probe_contended_datagrams_total",
     &[],
-    "Datagrams not looked at because the hook's working memory was in use: above 0, counts are lower bounds.",
+    "Frames and datagrams that the kernel programs could not look at, having interrupted each other too often: above 0, counts are lower bounds.",
 );
 pub(in crate::surface) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
     "ros2probe_incomplete_datagrams_total",
