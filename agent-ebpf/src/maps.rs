@@ -21,6 +21,7 @@ const NO_PREALLOC: u32 = 1;
 
 /// Records of one datagram that the filter writes itself; more make it capture the datagram.
 pub const RECORDS_PER_DATAGRAM: u32 = 32;
+const _: () = assert!(RECORDS_PER_DATAGRAM.is_power_of_two());
 
 /// Runs of programs that may be under way on one CPU, see [`claim`]: those for datagrams on their
 /// way in (and for frames) take the slots before [`OUTGOING_SLOT`], the others those from there on.
@@ -39,6 +40,10 @@ pub static WAKE_BYTES: u64 = 128 * 1024;
 /// Likewise for pieces of captured datagrams.
 #[unsafe(no_mangle)]
 pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
+
+/// Whether runs of the programs interrupt each other on a CPU, see [`claim`]. Set by the loader.
+#[unsafe(no_mangle)]
+pub static INTERRUPTED: u32 = 1;
 
 /// Reads a setting that the loader may have changed.
 macro_rules! setting {
@@ -248,8 +253,14 @@ pub struct PieceBuffer {
 /// be preempted (the kernel only keeps it on its CPU), and datagrams on their way in interrupt it.
 /// Atomics that return a value need Linux 5.12. So each adds itself to the slot's claims and looks:
 /// all see the additions in one order, since they share a CPU, and at most one sees itself alone.
+///
+/// Frames on interfaces are handled with bottom halves disabled, one after the other, except on
+/// kernels that preempt even those (PREEMPT_RT).
 #[inline(always)]
 pub fn claim(first: u32, end: u32) -> Option<u32> {
+    if setting!(INTERRUPTED) == 0 {
+        return Some(first);
+    }
     let mut slot = first;
     while slot < end {
         if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
@@ -272,6 +283,9 @@ pub fn claim(first: u32, end: u32) -> Option<u32> {
 /// Gives a slot back.
 #[inline(always)]
 pub fn release(slot: u32) {
+    if setting!(INTERRUPTED) == 0 {
+        return;
+    }
     if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
         // SAFETY: a map value pointer checked against null.
         add(unsafe { &raw mut (*scratch).claims }, u64::MAX);
@@ -323,7 +337,12 @@ pub fn last() -> Option<&'static mut Last> {
 #[inline(always)]
 pub fn count(counter: Counter, by: u64) {
     if let Some(value) = COUNTERS.get_ptr_mut(counter as u32) {
-        add(value, by);
+        if setting!(INTERRUPTED) == 0 {
+            // SAFETY: a map value pointer checked against null, and nothing comes between.
+            unsafe { *value += by }
+        } else {
+            add(value, by);
+        }
     }
 }
 
@@ -335,6 +354,17 @@ fn add(to: *mut u64, by: u64) {
     unsafe {
         asm!("lock *(u64 *)({to} + 0) += {by}", to = in(reg) to, by = in(reg) by, options(nostack));
     }
+}
+
+/// The same number, of which the optimizer no longer knows the bounds: a mask that follows stays
+/// where it is, and every verifier sees it.
+#[inline(always)]
+pub fn opaque(value: u32) -> u64 {
+    let mut value = u64::from(value);
+    // An instruction that does nothing: line information of none at all would be refused.
+    // SAFETY: changes nothing.
+    unsafe { asm!("{0} = {0}", inout(reg) value, options(pure, nomem, nostack, preserves_flags)) }
+    value
 }
 
 /// Copies a whole value from one map to another. Plain assignment would become a call of `memmove`,

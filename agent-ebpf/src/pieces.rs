@@ -1,8 +1,6 @@
 //! Captured datagrams on their way to user space, in pieces: what a program can copy at a time is
 //! bounded, and discovery should not pay for the longest datagram there is.
 
-use core::arch::asm;
-
 use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
 use ros2probe_wire::{
     filter::Counter,
@@ -11,7 +9,7 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{PIECES, count, piece, scratch, setting},
+    maps::{PIECES, count, opaque, piece, scratch, setting},
     verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
 };
 
@@ -97,9 +95,6 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
 /// directly before it is used, which the optimizer must not know to be superfluous.
 #[inline(always)]
 fn bounded(len: u32) -> usize {
-    let mut len = u64::from(len);
-    // An instruction that does nothing: the line information of none at all would be refused.
-    // SAFETY: changes nothing.
-    unsafe { asm!("{0} = {0}", inout(reg) len, options(pure, nomem, nostack, preserves_flags)) }
+    let len = opaque(len);
     ((len.wrapping_sub(1) & (PIECE_BYTES as u64 - 1)) + 1) as usize
 }

@@ -18,7 +18,7 @@ use std::hint::black_box;
 use std::time::Duration;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use program_run::Kernel;
+use program_run::{Hook, Kernel};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
@@ -81,6 +81,48 @@ fn in_the_kernel(criterion: &mut Criterion) {
     }
 }
 
+/// The hooks side by side on what passes most: a datagram in one frame, and what is not RTPS.
+fn by_hook(criterion: &mut Criterion) {
+    let writer = program_run::message(WRITER, 1..=1, 320);
+    let mut tcp = program_run::datagram(&[0; 400]);
+    tcp[9] = 6;
+    let packets = [
+        ("TCP", Verdict::Ignore, tcp),
+        (
+            "other UDP",
+            Verdict::Ignore,
+            program_run::datagram(&[0; 400]),
+        ),
+        (
+            "DATA, ignored",
+            Verdict::Ignore,
+            program_run::datagram(&writer),
+        ),
+        (
+            "DATA, metered",
+            Verdict::Meter,
+            program_run::datagram(&writer),
+        ),
+    ];
+    for (name, verdict, packet) in packets {
+        let mut group = criterion.benchmark_group(name);
+        group
+            .sample_size(20)
+            .measurement_time(Duration::from_secs(1));
+        for hook in [Hook::Wire, Hook::Ingress, Hook::Egress] {
+            let mut kernel = Kernel::load_hook(hook);
+            kernel.set_interest(&BTreeMap::from([(WRITER, verdict)]));
+            let mut frames = [packet.clone()];
+            group.throughput(Throughput::Elements(1));
+            group.bench_function(format!("{hook:?}"), |bencher| {
+                bencher
+                    .iter_custom(|iterations| time(&mut kernel, &mut frames, &mut 0, iterations));
+            });
+        }
+        group.finish();
+    }
+}
+
 /// The time that `iterations` datagrams take, without what happens between them.
 fn time(
     kernel: &mut Kernel,
@@ -130,5 +172,5 @@ fn in_user_space(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, in_the_kernel, in_user_space);
+criterion_group!(benches, in_the_kernel, by_hook, in_user_space);
 criterion_main!(benches);

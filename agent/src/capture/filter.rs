@@ -104,7 +104,8 @@ impl Filter {
     /// # Errors
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
-        let mut ebpf = open(settings, &[("PIECES", page_size()), ("SOCKETS", UNUSED)])?;
+        let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
+        let mut ebpf = open(settings, preempts_everything(), &sizes)?;
         let program = load_program(&mut ebpf, "wire")?;
         Self::with_maps(&mut ebpf, program, None)
     }
@@ -295,8 +296,14 @@ fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error>
 /// Entries of a map that the other hook uses: an LRU map has at least some.
 const UNUSED: u32 = 64;
 
-/// Opens the object and creates its maps, of which those named have another size.
-fn open(settings: &FilterSettings, sizes: &[(&'static str, u32)]) -> Result<Ebpf, FilterError> {
+/// Opens the object and creates its maps, of which those named have another size. `interrupted`:
+/// runs of its programs may interrupt each other on a CPU.
+fn open(
+    settings: &FilterSettings,
+    interrupted: bool,
+    sizes: &[(&'static str, u32)],
+) -> Result<Ebpf, FilterError> {
+    let interrupted = u32::from(interrupted);
     let ring = ring_size(settings.record_ring_bytes);
     let accept = u32::from(settings.accept_new_interfaces);
     let (wake, wake_pieces) = (
@@ -306,6 +313,7 @@ fn open(settings: &FilterSettings, sizes: &[(&'static str, u32)]) -> Result<Ebpf
     let mut loader = EbpfLoader::new();
     loader
         .override_global("NEW_INTERFACES", &accept, true)
+        .override_global("INTERRUPTED", &interrupted, true)
         .override_global("WAKE_BYTES", &wake, true)
         .override_global("WAKE_PIECE_BYTES", &wake_pieces, true)
         .map_max_entries("RECORDS", ring);
@@ -329,6 +337,12 @@ fn load_program(ebpf: &mut Ebpf, name: &'static str) -> Result<ProgramFd, Filter
         .map_err(FilterError::Program)?
         .try_clone()
         .map_err(|error| FilterError::Program(ProgramError::IOError(error)))
+}
+
+/// Whether this kernel preempts what others run with bottom halves disabled: PREEMPT_RT.
+fn preempts_everything() -> bool {
+    std::fs::read_to_string("/proc/sys/kernel/version")
+        .map_or(true, |version| version.contains("PREEMPT_RT"))
 }
 
 fn ring_size(bytes: u32) -> u32 {

@@ -5,7 +5,7 @@
 use std::collections::BTreeMap;
 use std::io;
 use std::ops::RangeInclusive;
-use std::os::fd::AsRawFd as _;
+use std::os::fd::{AsRawFd as _, BorrowedFd};
 use std::time::Duration;
 
 use ros2probe::capture::filter::{Filter, FilterSettings};
@@ -28,9 +28,18 @@ pub struct Seen {
     pub records: Vec<Record>,
 }
 
+/// Which of the kernel's programs.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Hook {
+    Wire,
+    Ingress,
+    Egress,
+}
+
 /// A loaded filter, and the user-space side of fragments.
 pub struct Kernel {
-    filter: Filter,
+    pub filter: Filter,
+    hook: Hook,
     ahead: Ahead,
     reassembly: Reassembly,
     rest: Vec<Record>,
@@ -40,15 +49,23 @@ pub struct Kernel {
 
 impl Kernel {
     pub fn load() -> Self {
+        Self::load_hook(Hook::Wire)
+    }
+
+    pub fn load_hook(hook: Hook) -> Self {
         go_to_cpu(0);
         let settings = FilterSettings {
             record_ring_bytes: 1 << 20,
             ..FilterSettings::default()
         };
-        let filter = Filter::load(&settings)
-            .expect("loading the kernel filter needs root: run the tests with sudo");
+        let filter = match hook {
+            Hook::Wire => Filter::load(&settings),
+            Hook::Ingress | Hook::Egress => Filter::load_host(&settings),
+        };
+        let filter = filter.expect("loading the kernel filter needs root: run the tests with sudo");
         Self {
             filter,
+            hook,
             ahead: Ahead::default(),
             reassembly: Reassembly::new(Limits::default()),
             rest: Vec::new(),
@@ -87,6 +104,7 @@ impl Kernel {
     /// One IP packet.
     pub fn frame(&mut self, packet: &[u8]) -> Seen {
         let (kept, _) = self.run(packet, 1);
+        let kept = kept != 0;
         self.now += 1;
         let mut ready = Vec::new();
         if kept {
@@ -140,13 +158,22 @@ impl Kernel {
         mean * repeat
     }
 
-    /// Forgets the records that nobody has read.
+    /// Forgets the records and pieces that nobody has read.
     pub fn drain(&mut self) {
         while self.filter.next_record().is_some() {}
+        while self.filter.next_piece().is_some() {}
     }
 
-    /// BPF_PROG_TEST_RUN: whether the program keeps the packet, and the mean time it takes.
-    fn run(&self, packet: &[u8], repeat: u32) -> (bool, Duration) {
+    /// The program that [`Self::run`] runs.
+    pub fn program(&self) -> BorrowedFd<'_> {
+        match self.hook {
+            Hook::Wire | Hook::Ingress => self.filter.program(),
+            Hook::Egress => self.filter.egress_program().unwrap(),
+        }
+    }
+
+    /// BPF_PROG_TEST_RUN: what the program returns, and the mean time it takes.
+    pub fn run(&self, packet: &[u8], repeat: u32) -> (u32, Duration) {
         /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
         #[repr(C)]
         #[derive(Default)]
@@ -177,7 +204,7 @@ impl Kernel {
         ]
         .concat();
         let mut attributes = TestRun {
-            prog_fd: self.filter.program().as_raw_fd().cast_unsigned(),
+            prog_fd: self.program().as_raw_fd().cast_unsigned(),
             data_size_in: u32::try_from(frame.len()).unwrap(),
             data_in: frame.as_ptr() as u64,
             repeat,
@@ -198,7 +225,7 @@ impl Kernel {
             io::Error::last_os_error()
         );
         (
-            attributes.retval != 0,
+            attributes.retval,
             Duration::from_nanos(attributes.duration.into()),
         )
     }

@@ -58,7 +58,7 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses them.
     pub fn load_host(settings: &FilterSettings) -> Result<Self, FilterError> {
         let pieces = ring_size(settings.piece_ring_bytes);
-        let mut ebpf = open(settings, &[("PIECES", pieces), ("FLOWS", UNUSED)])?;
+        let mut ebpf = open(settings, true, &[("PIECES", pieces), ("FLOWS", UNUSED)])?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
