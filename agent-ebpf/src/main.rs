@@ -14,16 +14,20 @@
 
 mod fragment;
 mod host;
+mod inside;
 mod maps;
+mod no_room;
+mod owners;
 mod packet;
 mod pieces;
+mod reassembly;
 mod runs;
 mod verdict;
 
 use aya_ebpf::{
     bindings::__sk_buff,
-    macros::{cgroup_skb, socket_filter},
-    programs::SkBuffContext,
+    macros::{cgroup_skb, raw_tracepoint, socket_filter},
+    programs::{RawTracePointContext, SkBuffContext},
 };
 use ros2probe_wire::filter::Counter;
 
@@ -57,6 +61,20 @@ pub fn host_ingress(context: SkBuffContext) -> i32 {
 pub fn host_egress(context: SkBuffContext) -> i32 {
     host::look(context.skb.skb, hook::EGRESS);
     1
+}
+
+/// For every datagram that a socket has no room for, directly after [`host_ingress`].
+#[raw_tracepoint]
+pub fn no_room(context: RawTracePointContext) -> u32 {
+    no_room::refused(&context);
+    0
+}
+
+/// For every packet that the kernel throws away, with the reason; attached where it tells one.
+#[raw_tracepoint]
+pub fn not_reassembled(context: RawTracePointContext) -> u32 {
+    reassembly::dropped(&context);
+    0
 }
 
 #[inline(always)]

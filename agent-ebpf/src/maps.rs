@@ -346,9 +346,9 @@ pub fn count(counter: Counter, by: u64) {
     }
 }
 
-/// Adds in one instruction, so that nothing on this CPU comes between.
+/// Adds in one instruction, so that nothing comes between.
 #[inline(always)]
-fn add(to: *mut u64, by: u64) {
+pub fn add(to: *mut u64, by: u64) {
     // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that
     // every BPF verifier knows.
     unsafe {

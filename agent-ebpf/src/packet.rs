@@ -24,7 +24,7 @@ pub mod hook {
 
 const UDP: u32 = 17;
 /// First two words of an IPv4-mapped address as they lie in memory.
-const IPV4_MAPPED: u32 = u32::from_ne_bytes([0, 0, 0xff, 0xff]);
+pub const IPV4_MAPPED: u32 = u32::from_ne_bytes([0, 0, 0xff, 0xff]);
 /// EtherTypes 802.1Q and 802.1ad, as `skb->protocol` holds them.
 const VLAN: u32 = 0x8100_u16.to_be() as u32;
 const SERVICE_VLAN: u32 = 0x88a8_u16.to_be() as u32;

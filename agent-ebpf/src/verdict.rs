@@ -241,8 +241,9 @@ pub fn charge(len: u32) -> bool {
     spend(Budget::CaptureBytes, len)
 }
 
+/// Takes from a budget, if there is anything left.
 #[inline(always)]
-fn spend(budget: Budget, amount: u32) -> bool {
+pub fn spend(budget: Budget, amount: u32) -> bool {
     let Some(left) = BUDGET.get_ptr_mut(budget as u32) else {
         return false;
     };

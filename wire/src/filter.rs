@@ -53,11 +53,20 @@ pub enum Counter {
     PiecesLost,
     /// Host hook: copies of a datagram that was captured just before, not captured again.
     CopiesNotCaptured,
+    /// RTPS datagrams that a socket had no room for.
+    NoRoom,
+    /// Datagrams that a socket had no room for and that the host hook had not just seen there.
+    NoRoomUnseen,
+    /// RTPS datagrams that lacked IP fragments until the kernel gave up, and whose first fragment
+    /// was there.
+    NotReassembled,
+    /// UDP datagrams likewise whose first fragment was not there, or not where it can be read.
+    NotReassembledUnnamed,
 }
 
 impl Counter {
     /// All of them, in index order.
-    pub const ALL: [Self; 24] = [
+    pub const ALL: [Self; 28] = [
         Self::Frames,
         Self::Messages,
         Self::Ignored,
@@ -82,6 +91,10 @@ impl Counter {
         Self::Contended,
         Self::PiecesLost,
         Self::CopiesNotCaptured,
+        Self::NoRoom,
+        Self::NoRoomUnseen,
+        Self::NotReassembled,
+        Self::NotReassembledUnnamed,
     ];
 
     /// Label value.
@@ -112,6 +125,10 @@ impl Counter {
             Self::Contended => "contended",
             Self::PiecesLost => "pieces_lost",
             Self::CopiesNotCaptured => "copies_not_captured",
+            Self::NoRoom => "no_room",
+            Self::NoRoomUnseen => "no_room_unseen",
+            Self::NotReassembled => "not_reassembled",
+            Self::NotReassembledUnnamed => "not_reassembled_unnamed",
         }
     }
 }

@@ -60,3 +60,87 @@ pub struct Socket {
     /// Datagrams that it had no room for, RTPS or not.
     pub no_room: u64,
 }
+
+/// A process that holds a socket, as the iterator over open files writes it.
+#[derive(
+    Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
+#[repr(C)]
+pub struct Owner {
+    /// Cookie of the socket; never 0.
+    pub socket: u64,
+    /// Inode of the socket, as `/proc/<pid>/fd` shows it.
+    pub inode: u64,
+    /// Datagrams that the socket has dropped, as `/proc/net/udp` shows them.
+    pub drops: u32,
+    /// Zero where the kernel does not say where it counts `drops`.
+    pub drops_known: u32,
+    /// Process id as the host's first process sees it.
+    pub process_id: u32,
+    /// Process id as the process itself sees it: another one in a container.
+    pub own_process_id: u32,
+    /// Name of the process, filled up with zeros.
+    pub name: [u8; 16],
+}
+
+const _: () = assert!(size_of::<Owner>() == 48 && align_of::<Owner>() == 8);
+
+/// Places in the running kernel's types that the programs read, by index in their `LAYOUT` array:
+/// offsets of members in bytes, enumerators. Filled in by the loader.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[repr(u32)]
+pub enum Layout {
+    /// `sk_buff.head`, where a packet's bytes begin.
+    BufferHead = 0,
+    /// `sk_buff.tail`: bytes from the head to the end of the linear part.
+    BufferTail,
+    /// `sk_buff.network_header`: bytes from the head to the IP header.
+    BufferNetworkHeader,
+    /// `sk_buff.skb_iif`: the interface it came in on.
+    BufferInterface,
+    /// `SKB_DROP_REASON_FRAG_REASM_TIMEOUT`.
+    ReasonTimeout,
+    /// `SKB_DROP_REASON_FRAG_TOO_FAR`.
+    ReasonTooFar,
+    /// `sock.__sk_common.skc_cookie`.
+    SocketCookie,
+    /// `sock.sk_drops`.
+    SocketDrops,
+    /// `sock.sk_drop_counters`, instead of the former where it is not null (Linux 6.18).
+    SocketDropCounters,
+    /// Bytes between the two counters of `numa_drop_counters`.
+    SecondDropCounter,
+    /// `file.f_inode`.
+    FileInode,
+    /// `file.private_data`: of a socket's file, the `socket`.
+    FilePrivate,
+    /// `inode.i_mode`.
+    InodeMode,
+    /// `inode.i_ino`.
+    InodeNumber,
+    /// `socket.file`.
+    SocketFile,
+    /// `socket.sk`.
+    SocketSock,
+    /// `task_struct.group_leader`.
+    TaskLeader,
+    /// `task_struct.tgid`.
+    TaskProcess,
+    /// `task_struct.comm`.
+    TaskName,
+    /// `task_struct.thread_pid`.
+    TaskPid,
+    /// `pid.level`: how many process id namespaces lie above its own.
+    PidLevel,
+    /// `pid.numbers[0].nr`.
+    PidNumbers,
+    /// Bytes of one of `pid.numbers`.
+    PidNumberSize,
+}
+
+impl Layout {
+    /// How many places there are.
+    pub const COUNT: usize = Self::PidNumberSize as usize + 1;
+    /// What the running kernel does not have, or does not tell.
+    pub const ABSENT: u32 = u32::MAX;
+}

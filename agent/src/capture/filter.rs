@@ -17,6 +17,8 @@ use ros2probe_wire::record::{Verdict, guid_words};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 use zerocopy::FromBytes;
 
+use super::inside::Places;
+
 pub use host::CapturedPiece;
 
 /// The object `agent-ebpf/build.sh` made. Aligned, because ELF is read in place.
@@ -105,7 +107,8 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
-        let mut ebpf = open(settings, preempts_everything(), &sizes)?;
+        let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
+        let mut ebpf = open(settings, preempts_everything(), &sizes, None)?;
         let program = load_program(&mut ebpf, "wire")?;
         Self::with_maps(&mut ebpf, program, None)
     }
@@ -297,11 +300,13 @@ fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error>
 const UNUSED: u32 = 64;
 
 /// Opens the object and creates its maps, of which those named have another size. `interrupted`:
-/// runs of its programs may interrupt each other on a CPU.
+/// runs of its programs may interrupt each other on a CPU. `places`: for programs that read the
+/// kernel's structures.
 fn open(
     settings: &FilterSettings,
     interrupted: bool,
     sizes: &[(&'static str, u32)],
+    places: Option<&Places>,
 ) -> Result<Ebpf, FilterError> {
     let interrupted = u32::from(interrupted);
     let ring = ring_size(settings.record_ring_bytes);
@@ -319,6 +324,9 @@ fn open(
         .map_max_entries("RECORDS", ring);
     for (map, size) in sizes {
         loader.map_max_entries(map, *size);
+    }
+    if let Some(places) = places {
+        places.tell(&mut loader);
     }
     loader.load(&OBJECT.0).map_err(FilterError::load)
 }

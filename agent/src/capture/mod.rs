@@ -3,11 +3,13 @@
 pub mod control_groups;
 pub mod feed;
 pub mod filter;
+pub mod inside;
 pub mod interfaces;
 pub mod kernel_types;
 pub mod live;
 pub mod netns;
 pub mod order;
+pub mod owners;
 pub mod pcap;
 pub mod ring;
 pub mod system;

@@ -67,6 +67,12 @@ impl<'a> Loss<'a> {
 
     /// Drops `per_mille` of what an nftables expression such as `meta l4proto udp` matches.
     pub(crate) fn of(host: &'a Namespace, matches: &str, per_mille: u16) -> Result<Loss<'a>> {
+        // A limit that is never reached is not accepted.
+        let chance = if per_mille < 1000 {
+            format!("numgen random mod 1000 < {per_mille}")
+        } else {
+            String::new()
+        };
         let rules = format!(
             "table netdev loss {{
                 counter matched {{ }}
@@ -74,7 +80,7 @@ impl<'a> Loss<'a> {
                 chain egress {{
                     type filter hook egress device {INTERFACE} priority 0;
                     {matches} counter name matched
-                    {matches} numgen random mod 1000 < {per_mille} counter name dropped drop
+                    {matches} {chance} counter name dropped drop
                 }}
             }}"
         );

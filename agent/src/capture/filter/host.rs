@@ -15,6 +15,7 @@ use aya::programs::{CgroupAttachMode, CgroupSkb, CgroupSkbAttachType, ProgramErr
 use ros2probe_wire::host::{Piece, Socket};
 use zerocopy::FromBytes;
 
+use super::super::inside::{Inside, Places};
 use super::{
     Filter, FilterError, FilterSettings, UNUSED, failed, load_program, not_permitted, open,
     ring_size, take,
@@ -29,6 +30,8 @@ const PROGRAMS: [(&str, CgroupSkbAttachType); 2] = [
 /// What the host hook has besides what both hooks have.
 pub(super) struct Hook {
     programs: Ebpf,
+    places: Places,
+    inside: Option<Inside>,
     egress: ProgramFd,
     links: Vec<FdLink>,
     pieces: RingBuf<MapData>,
@@ -58,13 +61,17 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses them.
     pub fn load_host(settings: &FilterSettings) -> Result<Self, FilterError> {
         let pieces = ring_size(settings.piece_ring_bytes);
-        let mut ebpf = open(settings, true, &[("PIECES", pieces), ("FLOWS", UNUSED)])?;
+        let places = Places::look_up();
+        let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
+        let mut ebpf = open(settings, true, &sizes, Some(&places))?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
         let mut filter = Self::with_maps(&mut ebpf, ingress, None)?;
         filter.host = Some(Hook {
             programs: ebpf,
+            places,
+            inside: None,
             egress,
             links: Vec::new(),
             pieces,
@@ -105,6 +112,21 @@ impl Filter {
         }
         host.links.append(&mut links);
         Ok(())
+    }
+
+    /// Attaches the programs that look further inside the kernel, as many as it allows. `whole_host`:
+    /// the hook is attached to the topmost cgroup, so it sees every socket. Nothing on the wire hook.
+    pub fn look_inside(&mut self, whole_host: bool) {
+        if let Some(host) = &mut self.host {
+            let inside = Inside::attach(&mut host.programs, &host.places, whole_host);
+            host.inside = Some(inside);
+        }
+    }
+
+    /// What [`Filter::look_inside`] has put in place.
+    #[must_use]
+    pub fn inside(&self) -> Option<&Inside> {
+        self.host.as_ref()?.inside.as_ref()
     }
 
     /// The program for datagrams on their way out, `None` on the wire hook.

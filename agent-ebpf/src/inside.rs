@@ -1,0 +1,46 @@
+//! Reading the kernel's own structures, at places that the loader has looked up.
+//!
+//! A wrong address gives zeros, never a fault: the helper refuses it.
+
+use core::mem::MaybeUninit;
+
+use aya_ebpf::helpers::generated::bpf_probe_read_kernel;
+use ros2probe_wire::host::Layout;
+
+/// By `host::Layout`. Set by the loader.
+#[unsafe(no_mangle)]
+pub static LAYOUT: [u32; Layout::COUNT] = [Layout::ABSENT; Layout::COUNT];
+
+/// Where the running kernel has something; [`Layout::ABSENT`] if nowhere.
+#[inline(always)]
+pub fn place(of: Layout) -> u32 {
+    // SAFETY: an index below the array's length.
+    let place = unsafe { (&raw const LAYOUT).cast::<u32>().add(of as usize) };
+    // SAFETY: a constant of the loaded object, never written while the program runs.
+    unsafe { core::ptr::read_volatile(place) }
+}
+
+/// The member at `place` of the structure at `address`.
+#[inline(always)]
+pub fn member<T: Copy>(address: u64, of: Layout) -> Option<T> {
+    read(address.wrapping_add(u64::from(place(of))))
+}
+
+/// A plain value in kernel memory.
+#[inline(always)]
+pub fn read<T: Copy>(address: u64) -> Option<T> {
+    let mut value = MaybeUninit::<T>::uninit();
+    // SAFETY: the destination has the size given; the kernel checks the address.
+    let result = unsafe {
+        bpf_probe_read_kernel(
+            value.as_mut_ptr().cast(),
+            size_of::<T>() as u32,
+            address as *const _,
+        )
+    };
+    if result != 0 {
+        return None;
+    }
+    // SAFETY: the helper has filled all of it; only integers and arrays of them are read.
+    Some(unsafe { value.assume_init() })
+}

@@ -1,0 +1,262 @@
+//! Datagrams that never became complete: the kernel has given up waiting for IP fragments.
+//!
+//! Looks at every packet that the kernel throws away, and at nothing of it but the reason, unless
+//! it is a fragment's. The first fragment of such a datagram tells which samples are lost; without
+//! it nothing can be named, and the datagram is only counted. So is one whose first bytes are not
+//! in the linear part of the buffer, as some network drivers leave them.
+
+use aya_ebpf::{
+    helpers::bpf_ktime_get_ns, macros::map, maps::PerCpuArray, programs::RawTracePointContext,
+};
+use ros2probe_wire::{
+    filter::{Budget, Counter},
+    host::Layout,
+    record::{Record, Verdict, flag, kind},
+    walk::{self, Fate, MAGIC, Step, Walk},
+};
+
+use crate::{
+    inside::{member, place, read},
+    maps::{INTEREST, copy, count},
+    packet::IPV4_MAPPED,
+    verdict::{spend, write},
+};
+
+const UDP: u32 = 17;
+/// Extension header numbers of IPv6 (RFC 8200).
+const HOP_BY_HOP: u32 = 0;
+const ROUTING: u32 = 43;
+const FRAGMENT: u32 = 44;
+const DESTINATION_OPTIONS: u32 = 60;
+/// Submessages of a first fragment that are looked at.
+const SUBMESSAGES: u32 = 64;
+
+/// Working memory. Fragments are thrown away with bottom halves disabled, so nobody interferes.
+#[map]
+static INCOMPLETE: PerCpuArray<Incomplete> = PerCpuArray::with_max_entries(1, 0);
+
+#[repr(C)]
+struct Incomplete {
+    walk: Walk,
+    /// Record to be written.
+    record: Record,
+    /// Source, destination and identification of the datagram at hand.
+    name: [u32; 9],
+    /// Likewise of the one before: its fragments are thrown away one after the other.
+    last: [u32; 9],
+    ipv6: u32,
+    /// 0 for a datagram's first fragment.
+    offset: u32,
+    /// The fragment header's next header, or the IPv4 protocol.
+    protocol: u32,
+    /// Address of the IP payload.
+    body: u64,
+}
+
+#[inline(always)]
+fn incomplete() -> Option<&'static mut Incomplete> {
+    // SAFETY: one program run at a time uses a CPU's entry, see `INCOMPLETE`.
+    INCOMPLETE
+        .get_ptr_mut(0)
+        .map(|incomplete| unsafe { &mut *incomplete })
+}
+
+/// The linear part of a buffer, from the UDP payload on.
+struct Linear {
+    address: u64,
+    len: u32,
+}
+
+impl walk::Bytes for Linear {
+    #[inline(always)]
+    fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]> {
+        if offset + 4 * N as u32 > self.len {
+            return None;
+        }
+        read(self.address + u64::from(offset))
+    }
+}
+
+/// `kfree_skb(skb, location, reason)`.
+#[inline(always)]
+pub fn dropped(context: &RawTracePointContext) {
+    let reason: u64 = context.arg(2);
+    let reason = reason as u32;
+    if reason != place(Layout::ReasonTimeout) && reason != place(Layout::ReasonTooFar) {
+        return;
+    }
+    let skb: u64 = context.arg(0);
+    let _ = fragment(skb);
+}
+
+#[inline(always)]
+fn fragment(skb: u64) -> Option<()> {
+    let head: u64 = member(skb, Layout::BufferHead)?;
+    let tail: u32 = member(skb, Layout::BufferTail)?;
+    let network: u16 = member(skb, Layout::BufferNetworkHeader)?;
+    let ip = head + u64::from(network);
+    let [first]: [u8; 1] = read(ip)?;
+    let this = incomplete()?;
+    let parsed = if first >> 4 == 4 {
+        ipv4(ip, this)
+    } else {
+        ipv6(ip, this)
+    };
+    if parsed.is_none() || this.protocol != UDP {
+        return None;
+    }
+    let again = is_again(this);
+    if this.offset != 0 {
+        // Behind its first fragment, or behind another of its kind.
+        if !again {
+            count(Counter::NotReassembledUnnamed, 1);
+        }
+        return None;
+    }
+    let linear = (head + u64::from(tail)).wrapping_sub(this.body + 8) as u32;
+    if linear > 0xffff || linear < walk::HEADER_LEN {
+        count(Counter::NotReassembledUnnamed, 1);
+        return None;
+    }
+    let [ports, lengths, magic, _version, source @ ..]: [u32; 7] = read(this.body)?;
+    if magic != MAGIC {
+        return None;
+    }
+    let udp_len = u32::from_be(lengths) >> 16;
+    if udp_len < 8 + walk::HEADER_LEN {
+        return None;
+    }
+    count(Counter::NotReassembled, 1);
+    let zero = core::hint::black_box(0);
+    let interface = member(skb, Layout::BufferInterface)?;
+    let destination = [this.name[4], this.name[5], this.name[6], this.name[7]];
+    let record = &mut this.walk.record;
+    // SAFETY: no preconditions.
+    record.time = unsafe { bpf_ktime_get_ns() };
+    record.destination = destination;
+    record.destination_port = (u32::from_be(ports) & 0xffff) as u16;
+    record.source_port = (u32::from_be(ports) >> 16) as u16;
+    record.interface = interface;
+    record.datagram = zero;
+    record.socket = u64::from(zero);
+    record.elapsed = zero;
+    record.unused = zero as u16;
+    record.flags = flag::FRAGMENTED | if this.ipv6 != 0 { flag::IPV6 } else { 0 };
+    this.walk.begin(source, udp_len - 8);
+    let payload = this.body + 8;
+    let mut submessages = 0;
+    while submessages < SUBMESSAGES {
+        if lost(payload, linear) == 0 {
+            break;
+        }
+        submessages += 1;
+    }
+    Some(())
+}
+
+/// Whether the fragment at hand is of the datagram of the one before; from now on it is that one.
+#[inline(always)]
+fn is_again(this: &mut Incomplete) -> bool {
+    // Word by word: a comparison of arrays would become a call of `memcmp`.
+    let mut different = 0;
+    let mut index = 0;
+    while index < this.name.len() {
+        different |= this.name[index] ^ this.last[index];
+        index += 1;
+    }
+    copy(&this.name, &mut this.last);
+    different == 0
+}
+
+/// One submessage of a first fragment; 0 = nothing more to be seen.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn lost(payload: u64, linear: u32) -> u32 {
+    let Some(this) = incomplete() else { return 0 };
+    let bytes = Linear {
+        address: payload,
+        len: linear,
+    };
+    match walk::step(&mut this.walk, &bytes, linear) {
+        Step::End | Step::Later | Step::Split | Step::Malformed => return 0,
+        Step::Passed | Step::LongGap => return 1,
+        Step::Endpoint => {}
+    }
+    let record = &this.walk.record;
+    if record.kind != kind::DATA && record.kind != kind::DATA_FRAG {
+        return 1;
+    }
+    match walk::fate(record) {
+        Fate::Writer => {}
+        _ => return 1,
+    }
+    match INTEREST.get_ptr(record.writer) {
+        // SAFETY: a map value pointer checked against null.
+        Some(verdict) if unsafe { *verdict } == Verdict::Ignore as u32 => return 1,
+        Some(_) => {}
+        None if spend(Budget::Records, 1) => count(Counter::MeteredUnknown, 1),
+        None => {
+            count(Counter::UnknownOverBudget, 1);
+            return 1;
+        }
+    }
+    copy(&this.walk.record, &mut this.record);
+    this.record.flags |= flag::NOT_REASSEMBLED;
+    write(&this.record);
+    1
+}
+
+/// RFC 791.
+#[inline(always)]
+fn ipv4(ip: u64, this: &mut Incomplete) -> Option<()> {
+    let [first, second, third, source, destination]: [u32; 5] = read(ip)?;
+    let (first, second) = (u32::from_be(first), u32::from_be(second));
+    this.protocol = u32::from_be(third) >> 16 & 0xff;
+    this.offset = second & 0x1fff;
+    this.ipv6 = core::hint::black_box(0);
+    let zero = this.ipv6;
+    this.name = [
+        zero,
+        zero,
+        IPV4_MAPPED,
+        source,
+        zero,
+        zero,
+        IPV4_MAPPED,
+        destination,
+        second >> 16,
+    ];
+    this.body = ip + u64::from((first >> 24 & 0xf) * 4);
+    Some(())
+}
+
+/// RFC 8200; a fragment has its fragment header behind up to four extension headers.
+#[inline(always)]
+fn ipv6(ip: u64, this: &mut Incomplete) -> Option<()> {
+    let header: [u32; 10] = read(ip)?;
+    let mut next = u32::from_be(header[1]) >> 8 & 0xff;
+    let mut at = ip + 40;
+    let mut extensions = 0;
+    while extensions < 4 {
+        let [word, second]: [u32; 2] = read(at)?;
+        let word = u32::from_be(word);
+        if next == FRAGMENT {
+            this.protocol = word >> 24;
+            this.offset = word & 0xfff8;
+            this.ipv6 = 1;
+            this.name = [
+                header[2], header[3], header[4], header[5], header[6], header[7], header[8],
+                header[9], second,
+            ];
+            this.body = at + 8;
+            return Some(());
+        }
+        if next != HOP_BY_HOP && next != ROUTING && next != DESTINATION_OPTIONS {
+            return None;
+        }
+        at += u64::from(((word >> 16 & 0xff) + 1) * 8);
+        next = word >> 24;
+        extensions += 1;
+    }
+    None
+}

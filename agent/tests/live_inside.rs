@@ -1,0 +1,610 @@
+//! Where datagrams die inside this host, told by name: in full receive buffers and in reassembly;
+//! and who holds a socket. Needs root.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::indexing_slicing,
+    reason = "test code says what must hold by failing"
+)]
+
+mod forged;
+mod harness;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
+use std::os::fd::{AsRawFd as _, FromRawFd as _, OwnedFd};
+use std::process::Command;
+use std::sync::atomic::{AtomicU16, Ordering};
+use std::time::{Duration, Instant};
+
+use forged::frames::Wire;
+use forged::{Carrier as _, SAMPLES_WRITER, Talker};
+use harness::cgroup::Cgroup;
+use harness::loss::Loss;
+use harness::network::{INTERFACE, Link, Namespace};
+use harness::{PREFIX, run};
+use ros2probe::capture::filter::{Filter, FilterSettings};
+use ros2probe::capture::netns;
+use ros2probe::capture::owners::Owner;
+use ros2probe_wire::filter::Counter;
+use ros2probe_wire::record::{Record, Verdict, flag, kind};
+use ros2probe_wire::walk::{self, Envelope};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+static NEXT: AtomicU16 = AtomicU16::new(0);
+
+/// A cgroup, the host hook on it, and what looks further inside.
+struct Observed {
+    filter: Filter,
+    cgroup: Cgroup,
+}
+
+impl Observed {
+    fn new() -> Observed {
+        harness::require().unwrap();
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let name = format!("{PREFIX}-{}-inside{number}", std::process::id());
+        let cgroup = Cgroup::create(&name).unwrap();
+        let mut filter = Filter::load_host(&FilterSettings::default()).unwrap();
+        filter.attach(&File::open(cgroup.path()).unwrap()).unwrap();
+        filter.look_inside(false);
+        Observed { filter, cgroup }
+    }
+
+    fn owners(&self, socket: u64) -> BTreeMap<u64, Owner> {
+        let owners = self.filter.inside().unwrap().owners().expect("owners");
+        owners.refresh(&BTreeSet::from([socket])).unwrap()
+    }
+
+    /// The records of a writer that come within the time given.
+    fn records(&mut self, writer: Guid, within: Duration) -> Vec<Record> {
+        let deadline = Instant::now() + within;
+        let mut found = Vec::new();
+        loop {
+            while let Some(record) = self.filter.next_record() {
+                if record.writer() == writer {
+                    found.push(record);
+                }
+            }
+            if Instant::now() >= deadline {
+                return found;
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    fn counted(&self, counter: Counter) -> u64 {
+        let counters = self.filter.counters().unwrap();
+        counters
+            .iter()
+            .find(|(each, _)| *each == counter)
+            .unwrap()
+            .1
+    }
+
+    /// A socket of the cgroup in a host's network.
+    fn socket(&self, host: &Namespace, address: &str) -> UdpSocket {
+        let address: SocketAddr = address.parse().unwrap();
+        let path = forged::path(host);
+        let open = || netns::within(&path, || shared_socket(address));
+        self.cgroup.hold(open).unwrap().unwrap()
+    }
+}
+
+/// A bound socket that others may share the address with.
+fn shared_socket(address: SocketAddr) -> UdpSocket {
+    let domain = if address.is_ipv4() {
+        libc::AF_INET
+    } else {
+        libc::AF_INET6
+    };
+    // SAFETY: takes no pointers.
+    let descriptor = unsafe { libc::socket(domain, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
+    assert!(descriptor >= 0);
+    // SAFETY: a descriptor that was just made and that nobody else has.
+    let socket = unsafe { UdpSocket::from_raw_fd(descriptor) };
+    set(&socket, libc::SO_REUSEADDR, 1);
+    let (storage, len) = raw(address);
+    // SAFETY: a socket address of the length given.
+    let bound = unsafe { libc::bind(descriptor, storage.as_ptr().cast(), len) };
+    assert_eq!(bound, 0, "{address}: {}", std::io::Error::last_os_error());
+    socket
+}
+
+/// `struct sockaddr_in` or `sockaddr_in6`.
+fn raw(address: SocketAddr) -> (Vec<u8>, libc::socklen_t) {
+    let family = if address.is_ipv4() {
+        libc::AF_INET
+    } else {
+        libc::AF_INET6
+    };
+    let family = u16::try_from(family).unwrap().to_ne_bytes();
+    let port = address.port().to_be_bytes();
+    let bytes = match address.ip() {
+        IpAddr::V4(ip) => [&family[..], &port, &ip.octets(), &[0; 8]].concat(),
+        IpAddr::V6(ip) => [&family[..], &port, &[0; 4], &ip.octets(), &[0; 4]].concat(),
+    };
+    let len = libc::socklen_t::try_from(bytes.len()).unwrap();
+    (bytes, len)
+}
+
+fn set(socket: &UdpSocket, option: libc::c_int, value: libc::c_int) {
+    // SAFETY: the option's value is an int, which both pointers say and which outlive the call.
+    let result = unsafe {
+        libc::setsockopt(
+            socket.as_raw_fd(),
+            libc::SOL_SOCKET,
+            option,
+            (&raw const value).cast(),
+            size_of_val(&value) as libc::socklen_t,
+        )
+    };
+    assert_eq!(result, 0);
+}
+
+/// SO_COOKIE: the number that the kernel gives a socket when it is asked for it.
+fn cookie(socket: &UdpSocket) -> u64 {
+    let mut cookie = 0_u64;
+    let mut len = libc::socklen_t::try_from(size_of_val(&cookie)).unwrap();
+    // SAFETY: the option's value is 8 bytes, which both pointers say and which outlive the call.
+    let result = unsafe {
+        libc::getsockopt(
+            socket.as_raw_fd(),
+            libc::SOL_SOCKET,
+            libc::SO_COOKIE,
+            (&raw mut cookie).cast(),
+            &raw mut len,
+        )
+    };
+    assert_eq!(result, 0, "SO_COOKIE");
+    cookie
+}
+
+#[test]
+fn a_socket_is_known_by_process_name_inode_and_drops() {
+    let observed = Observed::new();
+    let abilities = observed.filter.inside().unwrap().abilities();
+    assert!(abilities.owners.is_ok(), "{abilities:?}");
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let cookie = cookie(&socket);
+    let found = observed.owners(cookie);
+    let owner = &found[&cookie];
+    assert_eq!(owner.process_id, std::process::id());
+    assert_eq!(owner.own_process_id, std::process::id());
+    let link = std::fs::read_link(format!("/proc/self/fd/{}", socket.as_raw_fd())).unwrap();
+    assert_eq!(link.to_str().unwrap(), format!("socket:[{}]", owner.inode));
+    let name = std::fs::read_to_string("/proc/self/comm").unwrap();
+    assert_eq!(owner.process_name, name.trim_end());
+    assert_eq!(owner.drops, Some(0));
+}
+
+#[test]
+fn a_socket_of_another_network_and_process_id_namespace_is_known_by_both_its_process_ids() {
+    let observed = Observed::new();
+    let host = Namespace::alone().unwrap();
+    let bind = || UdpSocket::bind("127.0.0.1:0").unwrap();
+    let socket = netns::within(&forged::path(&host), bind).unwrap();
+    let cookie = cookie(&socket);
+    // A thread's children are born in the process id namespace that it has made.
+    let contained = std::thread::spawn(|| {
+        // SAFETY: takes no pointers.
+        assert_eq!(unsafe { libc::unshare(libc::CLONE_NEWPID) }, 0);
+        let mut sleep = Command::new("sleep");
+        sleep
+            .arg("60")
+            .stdin(OwnedFd::from(socket))
+            .spawn()
+            .unwrap()
+    });
+    let mut child = contained.join().unwrap();
+    // The name changes only after the parent has heard that all is well.
+    let name = format!("/proc/{}/comm", child.id());
+    while std::fs::read_to_string(&name).unwrap() != "sleep\n" {
+        std::thread::yield_now();
+    }
+    let other = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let unwanted = self::cookie(&other);
+    let found = observed.owners(cookie);
+    let again = observed.owners(cookie);
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let gone = observed.owners(cookie);
+    let owner = &found[&cookie];
+    assert_eq!((owner.process_id, owner.own_process_id), (child.id(), 1));
+    assert_eq!(owner.process_name, "sleep");
+    assert!(!found.contains_key(&unwanted));
+    assert_eq!(found, again);
+    assert!(gone.is_empty());
+}
+
+/// Makes the kernel of a host give up on fragments after a second.
+fn hurry(host: &Namespace) {
+    netns::within(&forged::path(host), || {
+        for path in ["ipv4/ipfrag_time", "ipv6/ip6frag_time"] {
+            std::fs::write(format!("/proc/sys/net/{path}"), "1").unwrap();
+        }
+    })
+    .unwrap();
+}
+
+fn talker(number: u32) -> (Talker, Guid) {
+    let talker = Talker::new(std::process::id() << 4 | number, "/points");
+    let guid = Guid {
+        prefix: GuidPrefix(talker.prefix),
+        entity: EntityId(SAMPLES_WRITER),
+    };
+    (talker, guid)
+}
+
+/// Long enough for a kernel in a hurry to give up.
+const GIVEN_UP: Duration = Duration::from_millis(2500);
+
+#[test]
+fn a_datagram_that_lacks_its_last_fragment_is_named() {
+    let mut observed = Observed::new();
+    let link = Link::new().unwrap();
+    hurry(&link.monitor);
+    let (mut talker, writer) = talker(1);
+    observed
+        .filter
+        .set_interest(writer, Some(Verdict::Meter))
+        .unwrap();
+    let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
+    let before = observed.counted(Counter::NotReassembled);
+    wire.carry(&talker.sample(30_000)).unwrap();
+    wire.shuffle = |packets| drop(packets.pop());
+    for _ in 2..=4 {
+        wire.carry(&talker.sample(30_000)).unwrap();
+    }
+    wire.shuffle = |packets| drop(packets.remove(3));
+    wire.carry(&talker.sample(5_000)).unwrap();
+    wire.shuffle = |_| {};
+    wire.carry(&talker.sample(30_000)).unwrap();
+    let found = observed.records(writer, GIVEN_UP);
+    let mut numbers: Vec<_> = found.iter().map(|record| record.sequence_number).collect();
+    numbers.sort_unstable();
+    assert_eq!(numbers, [2, 3, 4, 5]);
+    for record in found {
+        assert_eq!(record.kind, kind::DATA);
+        assert_eq!(
+            record.flags & !flag::STAMP,
+            flag::FRAGMENTED | flag::NOT_REASSEMBLED
+        );
+        assert_eq!(record.destination_port, forged::DISCOVERY_PORT);
+        let destination: [u8; 16] = zerocopy::transmute!(record.destination);
+        assert_eq!(destination[12..], link.monitor.address().octets());
+        assert_eq!(record.socket, 0);
+        let payload = if record.sequence_number == 5 {
+            5_000
+        } else {
+            30_000
+        };
+        assert_eq!(record.payload_len, payload);
+    }
+    assert!(observed.counted(Counter::NotReassembled) >= before + 4);
+}
+
+#[test]
+fn without_its_first_fragment_a_datagram_is_counted_once_and_cannot_be_named() {
+    let mut observed = Observed::new();
+    let link = Link::new().unwrap();
+    hurry(&link.monitor);
+    let (mut talker, writer) = talker(2);
+    observed
+        .filter
+        .set_interest(writer, Some(Verdict::Meter))
+        .unwrap();
+    let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
+    let before = observed.counted(Counter::NotReassembledUnnamed);
+    wire.shuffle = |packets| drop(packets.remove(0));
+    for _ in 0..5 {
+        wire.carry(&talker.sample(30_000)).unwrap();
+    }
+    assert_eq!(observed.records(writer, GIVEN_UP), []);
+    // Other tests may lose some at the same time, but not one per fragment.
+    let unnamed = observed.counted(Counter::NotReassembledUnnamed) - before;
+    assert!((5..20).contains(&unnamed), "{unnamed}");
+}
+
+#[test]
+fn over_ipv6_it_is_named_likewise() {
+    let mut observed = Observed::new();
+    let link = Link::new().unwrap();
+    hurry(&link.monitor);
+    for (host, address) in [(&link.robot, "fd99::1"), (&link.monitor, "fd99::2")] {
+        let name = host.name();
+        run(&format!(
+            "ip -n {name} addr add {address}/64 dev {INTERFACE} nodad"
+        ))
+        .unwrap();
+    }
+    let (mut talker, writer) = talker(3);
+    observed
+        .filter
+        .set_interest(writer, Some(Verdict::Meter))
+        .unwrap();
+    let mut sender = forged::Sender::new(&link.robot, "[fd99::1]:0", "[fd99::2]:7411").unwrap();
+    // The receiver's link address has to be found first.
+    sender.carry(&talker.sample(100)).unwrap();
+    std::thread::sleep(SETTLED);
+    let lossy = Loss::of(
+        &link.robot,
+        "meta protocol ip6 frag more-fragments 0 frag frag-off > 0",
+        1000,
+    )
+    .unwrap();
+    for _ in 2..=4 {
+        sender.carry(&talker.sample(60_000)).unwrap();
+    }
+    drop(lossy);
+    sender.carry(&talker.sample(60_000)).unwrap();
+    let found = observed.records(writer, GIVEN_UP);
+    let mut numbers: Vec<_> = found.iter().map(|record| record.sequence_number).collect();
+    numbers.sort_unstable();
+    assert_eq!(numbers, [2, 3, 4]);
+    for record in found {
+        let flags = flag::FRAGMENTED | flag::NOT_REASSEMBLED | flag::IPV6;
+        assert_eq!(record.flags & !flag::STAMP, flags);
+        let destination: [u8; 16] = zerocopy::transmute!(record.destination);
+        let expected: std::net::Ipv6Addr = "fd99::2".parse().unwrap();
+        assert_eq!(destination, expected.octets());
+        assert_eq!(record.payload_len, 60_000);
+    }
+}
+
+/// What of `sent` a socket that reads afterwards has got, and what is missing; samples by sequence
+/// number and first fragment.
+type Told = BTreeSet<(u64, u32)>;
+
+fn read_all(socket: &UdpSocket) -> Told {
+    socket.set_nonblocking(true).unwrap();
+    let mut buffer = vec![0; 65_536];
+    let mut got = Told::new();
+    while let Ok(len) = socket.recv(&mut buffer) {
+        got.extend(samples(&buffer[..len]));
+    }
+    got
+}
+
+fn samples(payload: &[u8]) -> Told {
+    let mut found = Told::new();
+    walk::datagram(payload, &Envelope::default(), None, |each| {
+        found.insert((each.record.sequence_number, each.record.fragment_start));
+    });
+    found
+}
+
+fn told<'a>(records: impl IntoIterator<Item = &'a Record>) -> Told {
+    let all = records.into_iter();
+    all.map(|record| (record.sequence_number, record.fragment_start))
+        .collect()
+}
+
+/// A message with one DATA_FRAG: one fragment of `size` bytes.
+fn fragment(talker: &Talker, number: u32, start: u32, size: u16) -> Vec<u8> {
+    let mut bytes = talker.header();
+    bytes.extend_from_slice(&[0x16, 1]);
+    // The last submessage of a message may leave its length open (RTPS 2.5, 9.4.5.1.3).
+    bytes.extend_from_slice(&[0, 0, 0, 0, 28, 0, 0, 0, 0, 0]);
+    bytes.extend_from_slice(&SAMPLES_WRITER);
+    for word in [0, number, start] {
+        bytes.extend_from_slice(&word.to_le_bytes());
+    }
+    bytes.extend_from_slice(&1_u16.to_le_bytes());
+    bytes.extend_from_slice(&size.to_le_bytes());
+    bytes.extend_from_slice(&(u32::from(size) * 4).to_le_bytes());
+    bytes.resize(bytes.len() + usize::from(size), 0x33);
+    bytes
+}
+
+/// The receive buffer errors of a host: over IPv4 and over IPv6.
+fn full_buffers(host: &Namespace) -> (u64, u64) {
+    let read = |path: &str| std::fs::read_to_string(format!("/proc/thread-self/net/{path}"));
+    let (v4, v6) = netns::within(&forged::path(host), || {
+        (read("snmp").unwrap(), read("snmp6").unwrap())
+    })
+    .unwrap();
+    let mut udp = v4.lines().filter_map(|line| line.strip_prefix("Udp: "));
+    let names = udp.next().unwrap().split(' ');
+    let mut values = names.zip(udp.next().unwrap().split(' '));
+    let v4 = values.find(|(name, _)| *name == "RcvbufErrors").unwrap().1;
+    let v6 = v6.lines().find(|line| line.starts_with("Udp6RcvbufErrors"));
+    let v6 = v6.unwrap().split_whitespace().last().unwrap();
+    (v4.parse().unwrap(), v6.parse().unwrap())
+}
+
+/// Time for what was sent to have come through.
+const SETTLED: Duration = Duration::from_millis(200);
+
+fn observed_link(number: u32, verdict: Verdict) -> (Observed, Link, Talker, Guid) {
+    let mut observed = Observed::new();
+    let abilities = observed.filter.inside().unwrap().abilities();
+    assert!(abilities.socket_losses.is_ok(), "{abilities:?}");
+    let link = Link::new().unwrap();
+    for (host, address) in [(&link.robot, "fd99::1"), (&link.monitor, "fd99::2")] {
+        let name = host.name();
+        run(&format!(
+            "ip -n {name} addr add {address}/64 dev {INTERFACE} nodad"
+        ))
+        .unwrap();
+    }
+    let (talker, writer) = talker(number);
+    observed.filter.set_interest(writer, Some(verdict)).unwrap();
+    (observed, link, talker, writer)
+}
+
+#[test]
+fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
+    let (mut observed, link, mut talker, writer) = observed_link(4, Verdict::Meter);
+    let robot = link.robot.address();
+    let monitor = link.monitor.address();
+    for (from, to) in [
+        (format!("{robot}:0"), format!("{monitor}:7411")),
+        ("[fd99::1]:0".to_owned(), "[fd99::2]:7411".to_owned()),
+    ] {
+        let receiver = observed.socket(&link.monitor, &to);
+        set(&receiver, libc::SO_RCVBUF, 32 * 1024);
+        let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
+        let before = full_buffers(&link.monitor);
+        let mut sent = Told::new();
+        // Half of them find some room again.
+        let mut got = Told::new();
+        for round in 0..2 {
+            for _ in 0..150 {
+                let message = talker.sample(1_000 + 4 * round);
+                sent.extend(samples(&message));
+                sender.carry(&message).unwrap();
+            }
+            std::thread::sleep(SETTLED);
+            got.extend(read_all(&receiver));
+        }
+        let missing: Told = sent.difference(&got).copied().collect();
+        assert!(
+            missing.len() > 100 && got.len() > 20,
+            "{} of {}",
+            got.len(),
+            sent.len()
+        );
+        let records = observed.records(writer, SETTLED);
+        let (refused, seen): (Vec<_>, Vec<_>) = records
+            .iter()
+            .partition(|record| record.flags & flag::NO_ROOM != 0);
+        assert_eq!(told(refused.iter().copied()), missing);
+        assert_eq!(refused.len(), missing.len());
+        assert_eq!(told(seen.iter().copied()), sent);
+        for record in &refused {
+            // Each cancels one arrival: the same record but for the flag.
+            let arrival = Record {
+                flags: record.flags & !flag::NO_ROOM,
+                ..**record
+            };
+            assert!(seen.contains(&&arrival), "{record:?}");
+            assert_eq!(record.socket, cookie(&receiver));
+        }
+        let after = full_buffers(&link.monitor);
+        let errors = after.0 + after.1 - before.0 - before.1;
+        assert_eq!(errors, missing.len() as u64);
+        let socket = observed.filter.socket(cookie(&receiver)).unwrap().unwrap();
+        assert_eq!(socket.no_room, errors);
+        let owner = &observed.owners(cookie(&receiver))[&cookie(&receiver)];
+        assert_eq!(owner.drops.map(u64::from), Some(errors));
+    }
+}
+
+#[test]
+fn of_two_sockets_in_one_group_only_the_full_one_is_reported() {
+    let (mut observed, link, mut talker, writer) = observed_link(5, Verdict::Meter);
+    let group = Ipv4Addr::new(239, 255, 0, 7);
+    let join = |socket: &UdpSocket| {
+        socket
+            .join_multicast_v4(&group, &link.monitor.address())
+            .unwrap();
+    };
+    let slow = observed.socket(&link.monitor, &format!("{group}:7411"));
+    let quick = observed.socket(&link.monitor, &format!("{group}:7411"));
+    set(&slow, libc::SO_RCVBUF, 32 * 1024);
+    join(&slow);
+    join(&quick);
+    let from = format!("{}:0", link.robot.address());
+    let mut sender = forged::Sender::new(&link.robot, &from, &format!("{group}:7411")).unwrap();
+    let (mut sent, mut got) = (Told::new(), Told::new());
+    for _ in 0..200 {
+        let message = talker.sample(2_000);
+        sent.extend(samples(&message));
+        sender.carry(&message).unwrap();
+        std::thread::sleep(Duration::from_micros(200));
+        got.extend(read_all(&quick));
+    }
+    std::thread::sleep(SETTLED);
+    got.extend(read_all(&quick));
+    assert_eq!(got, sent);
+    let missing: Told = sent.difference(&read_all(&slow)).copied().collect();
+    assert!(!missing.is_empty() && missing.len() < sent.len());
+    let records = observed.records(writer, SETTLED);
+    let refused: Vec<_> = records
+        .iter()
+        .filter(|record| record.flags & flag::NO_ROOM != 0)
+        .collect();
+    assert!(refused.iter().all(|record| record.socket == cookie(&slow)));
+    assert_eq!(told(refused.iter().copied()), missing);
+    assert_eq!(refused.len(), missing.len());
+    let no_room = |socket| {
+        observed
+            .filter
+            .socket(cookie(socket))
+            .unwrap()
+            .unwrap()
+            .no_room
+    };
+    assert_eq!((no_room(&slow), no_room(&quick)), (missing.len() as u64, 0));
+}
+
+#[test]
+fn of_samples_in_pieces_the_lost_fragments_are_named() {
+    let (mut observed, link, talker, writer) = observed_link(6, Verdict::Meter);
+    let to = format!("{}:7411", link.monitor.address());
+    let receiver = observed.socket(&link.monitor, &to);
+    set(&receiver, libc::SO_RCVBUF, 200 * 1024);
+    let from = format!("{}:0", link.robot.address());
+    let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
+    let mut sent = Told::new();
+    for number in 1..=10 {
+        for start in 1..=4 {
+            let message = fragment(&talker, number, start, 60_000);
+            sent.extend(samples(&message));
+            sender.carry(&message).unwrap();
+        }
+    }
+    std::thread::sleep(SETTLED);
+    let missing: Told = sent.difference(&read_all(&receiver)).copied().collect();
+    assert!(
+        !missing.is_empty() && missing.len() < sent.len(),
+        "{missing:?}"
+    );
+    let records = observed.records(writer, SETTLED);
+    let refused = || {
+        let refused = |record: &&Record| record.flags & flag::NO_ROOM != 0;
+        records.iter().filter(refused)
+    };
+    assert_eq!(
+        (told(refused()), refused().count()),
+        (missing.clone(), missing.len())
+    );
+    assert!(refused().all(|record| record.kind == kind::DATA_FRAG));
+    assert!(refused().all(|record| record.payload_len == 60_000));
+}
+
+#[test]
+fn a_captured_datagram_that_found_no_room_is_told_by_its_token() {
+    let (mut observed, link, mut talker, _) = observed_link(7, Verdict::Capture);
+    let to = format!("{}:7411", link.monitor.address());
+    let receiver = observed.socket(&link.monitor, &to);
+    set(&receiver, libc::SO_RCVBUF, 32 * 1024);
+    let from = format!("{}:0", link.robot.address());
+    let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
+    let mut sent = Told::new();
+    for _ in 0..150 {
+        let message = talker.sample(2_000);
+        sent.extend(samples(&message));
+        sender.carry(&message).unwrap();
+    }
+    std::thread::sleep(SETTLED);
+    let missing: Told = sent.difference(&read_all(&receiver)).copied().collect();
+    assert!(!missing.is_empty() && missing.len() < sent.len());
+    let mut captured = BTreeMap::new();
+    while let Some(piece) = observed.filter.next_piece() {
+        let (piece, bytes) = piece.read().unwrap();
+        captured.insert((piece.datagram, piece.socket), samples(bytes));
+    }
+    assert_eq!(captured.len(), sent.len());
+    let mut refused = Told::new();
+    while let Some(record) = observed.filter.next_record() {
+        if record.socket == cookie(&receiver) {
+            assert_eq!(record.kind, kind::UNDELIVERED);
+            refused.extend(&captured[&(record.datagram, record.socket)]);
+        }
+    }
+    assert_eq!(refused, missing);
+}
