@@ -107,7 +107,6 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
-        let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
         let mut ebpf = open(settings, preempts_everything(), &sizes, None)?;
         let program = load_program(&mut ebpf, "wire")?;
         Self::with_maps(&mut ebpf, program, None)
