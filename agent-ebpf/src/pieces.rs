@@ -3,6 +3,7 @@
 
 use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
 use ros2probe_wire::{
+    EntityId,
     filter::Counter,
     host::{PIECE_BYTES, Piece},
     record::flag,
@@ -16,6 +17,10 @@ use crate::{
 /// Of the longest UDP datagram.
 const PIECES_PER_DATAGRAM: u32 = 65_536 / PIECE_BYTES;
 const OF_THE_DATAGRAM: u16 = flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
+
+/// Participants say again and again that they are there. Everything else that is captured is said
+/// once, and user space should know of it before what follows from it.
+const SPDP_WRITER: u32 = u32::from_ne_bytes(EntityId::SPDP_WRITER.0);
 
 const _: () = assert!(PIECE_BYTES.is_power_of_two());
 
@@ -80,7 +85,9 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
     if loaded != 0 {
         return 0;
     }
-    let wake = if PIECES.query(AVAILABLE_DATA) > setting!(WAKE_PIECE_BYTES) {
+    let wake = if scratch(slot).is_some_and(|scratch| scratch.walk.record.writer[3] != SPDP_WRITER)
+        || PIECES.query(AVAILABLE_DATA) > setting!(WAKE_PIECE_BYTES)
+    {
         FORCE_WAKEUP
     } else {
         NO_WAKEUP
