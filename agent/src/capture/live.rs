@@ -1,21 +1,26 @@
 //! This host's traffic: what its taps find, given to the model in the order in which it was captured.
 //!
-//! Each namespace has a tap of its own. Nothing is ever sent.
+//! At the sockets where the kernel and the configuration allow it, otherwise on the wire with a tap
+//! for each namespace; also both, for interfaces with traffic that no socket receives. Nothing is
+//! ever sent.
 
 use std::collections::BTreeMap;
+use std::error::Error;
 use std::os::fd::BorrowedFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
+use super::filter::{Filter, FilterError};
+use super::host::{self, HostError, HostSettings, HostTap};
 use super::interfaces::Selection;
 use super::netns::{self, NetnsError};
 use super::system::{Clocks, wait};
 use super::wire::{self, TapError, WireSettings, WireTap};
-use crate::config::CaptureSettings;
+use crate::config::{CaptureSettings, SourceChoice};
 use crate::model::observer::Observer;
 use crate::model::reassembly::Limits;
 
@@ -25,12 +30,18 @@ const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 /// Handed out in small portions, so that a storm that comes while we are held up leaves most of the
 /// record ring to the writers we know.
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
+/// How long news from the host hook is gathered: a node that starts announces its endpoints one by
+/// one, and each round costs.
+const GATHER: Duration = Duration::from_millis(20);
 const SECOND: u64 = 1_000_000_000;
 const TENTH: u64 = SECOND / 10;
 
 /// Why capturing could not begin or go on.
 #[derive(Debug, thiserror::Error)]
 pub enum CaptureError {
+    /// The host hook was asked for and is not to be had.
+    #[error("the host hook cannot be used")]
+    Host(#[from] HostError),
     /// An interface cannot be looked at.
     #[error(transparent)]
     Tap(#[from] TapError),
@@ -40,6 +51,9 @@ pub enum CaptureError {
     /// An interface glob.
     #[error("capture.interfaces")]
     Selection(#[from] globset::Error),
+    /// The kernel programs.
+    #[error(transparent)]
+    Filter(#[from] FilterError),
     /// Waiting for packets.
     #[error("waiting for packets")]
     Wait(#[source] std::io::Error),
@@ -47,7 +61,10 @@ pub enum CaptureError {
 
 /// All taps.
 pub struct LiveSource {
-    taps: Vec<WireTap>,
+    host: Option<HostTap>,
+    wires: Vec<WireTap>,
+    /// Why the host hook is not used although it would show more.
+    without_host: Option<String>,
     /// When unclassified writers last got bytes and records to spend.
     bytes_refilled: u64,
     records_refilled: u64,
@@ -76,26 +93,30 @@ pub struct DropCount {
 }
 
 impl LiveSource {
-    /// Opens a tap in this network namespace and in each configured one. When this returns, every
-    /// tap is capturing.
+    /// Opens what the settings ask for, or the best there is. When this returns, every tap is
+    /// capturing.
     ///
     /// # Errors
     /// A capability is missing, a namespace does not exist, the kernel refuses.
     pub fn open(settings: &CaptureSettings, limits: Limits) -> Result<Self, CaptureError> {
-        let wire = WireSettings {
-            selection: Selection::new(&settings.include_interfaces, &settings.exclude_interfaces)?,
-            ring_bytes: settings.ring_bytes,
-            record_ring_bytes: settings.record_ring_bytes,
-            reassembly: limits,
+        let (host, without_host) = open_host(settings)?;
+        let wires = match &host {
+            None => {
+                let (include, exclude) =
+                    (&settings.include_interfaces, &settings.exclude_interfaces);
+                open_wires(settings, limits, Selection::new(include, exclude)?)?
+            }
+            Some(_) if settings.mirror_interfaces.is_empty() => Vec::new(),
+            Some(_) => {
+                let mirrors = Selection::new(&settings.mirror_interfaces, &[])?;
+                open_wires(settings, limits, mirrors)?
+            }
         };
-        let mut taps = vec![WireTap::open(&wire, 0, None)?];
-        for (number, path) in (1..).zip(&settings.network_namespaces) {
-            let open = || WireTap::open(&wire, number, Some(path.clone()));
-            taps.push(netns::within(path, open)??);
-        }
         let clocks = Clocks::read();
         let mut source = Self {
-            taps,
+            host,
+            wires,
+            without_host,
             bytes_refilled: 0,
             records_refilled: 0,
             refused_updates: 0,
@@ -103,6 +124,24 @@ impl LiveSource {
         };
         source.refill(clocks.monotonic);
         Ok(source)
+    }
+
+    /// The tap at the host's sockets, if that is where this looks.
+    #[must_use]
+    pub const fn host(&self) -> Option<&HostTap> {
+        self.host.as_ref()
+    }
+
+    /// Whether interfaces are looked at.
+    #[must_use]
+    pub const fn is_on_the_wire(&self) -> bool {
+        !self.wires.is_empty()
+    }
+
+    /// Why the host hook is not used although it would show more, in plain words.
+    #[must_use]
+    pub fn without_host(&self) -> Option<&str> {
+        self.without_host.as_deref()
     }
 
     /// Waits for packets, up to `timeout` or until `bell` is readable, and gives the model all there
@@ -116,49 +155,59 @@ impl LiveSource {
         bell: Option<BorrowedFd<'_>>,
         observer: &mut Observer,
     ) -> Result<(), CaptureError> {
-        let descriptors = self.taps.iter().flat_map(WireTap::descriptors);
-        let descriptors: Vec<_> = descriptors.chain(bell).collect();
-        wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
+        let sockets = self.host.iter().flat_map(HostTap::descriptors);
+        let interfaces = self.wires.iter().flat_map(WireTap::descriptors);
+        let rings = bell.is_some().into();
+        let bell = bell.into_iter();
+        let descriptors: Vec<_> = bell.chain(sockets).chain(interfaces).collect();
+        let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
+        if self.host.is_some() && ready.is_some_and(|first| first >= rings) {
+            // News seldom comes alone.
+            std::thread::sleep(GATHER);
+        }
         let clocks = Clocks::read();
         self.refill(clocks.monotonic);
-        for tap in &mut self.taps {
-            tap.take_in(&clocks, observer)?;
+        let mut settle = 0;
+        if let Some(host) = &mut self.host {
+            host.take_in(&clocks, observer);
+            settle = host::SETTLE_NANOSECONDS;
         }
-        self.clock = Timestamp(clocks.now.0.saturating_sub(wire::SETTLE_NANOSECONDS));
+        for wire in &mut self.wires {
+            wire.take_in(&clocks, observer)?;
+            settle = settle.max(wire::SETTLE_NANOSECONDS);
+        }
+        self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         Ok(())
     }
 
     /// Gives the model what still waits, at the end.
     pub fn drain(&mut self, observer: &mut Observer) {
         let clocks = Clocks::read();
-        for tap in &mut self.taps {
-            tap.drain(&clocks, observer);
+        if let Some(host) = &mut self.host {
+            host.drain(&clocks, observer);
+        }
+        for wire in &mut self.wires {
+            wire.drain(&clocks, observer);
         }
     }
 
-    /// Tells the kernel filters what has become of interest. What they have no room for stays
+    /// Tells the kernel programs what has become of interest. What they have no room for stays
     /// unknown to them, and is counted.
     pub fn apply(&mut self, changes: &[(Guid, Option<Verdict>)]) {
-        for tap in &mut self.taps {
-            for (endpoint, verdict) in changes {
-                let told = tap.filter_mut().set_interest(*endpoint, *verdict);
-                self.refused_updates += u64::from(told.is_err());
-            }
+        for (endpoint, verdict) in changes {
+            self.tell(|filter| filter.set_interest(*endpoint, *verdict));
         }
     }
 
     /// Notes from now on, or no longer, when a participant last sent anything.
     pub fn follow(&mut self, participant: GuidPrefix, follow: bool) {
-        for tap in &mut self.taps {
-            let told = tap.filter_mut().follow_participant(participant, follow);
-            self.refused_updates += u64::from(told.is_err());
-        }
+        self.tell(|filter| filter.follow_participant(participant, follow));
     }
 
     /// Updates that a kernel map had no room for, or that the kernel refused.
     #[must_use]
     pub fn refused_updates(&self) -> u64 {
-        let interfaces: u64 = self.taps.iter().map(WireTap::refused_interfaces).sum();
+        let interfaces: u64 = self.wires.iter().map(WireTap::refused_interfaces).sum();
         self.refused_updates + interfaces
     }
 
@@ -173,7 +222,7 @@ impl LiveSource {
     pub fn last_seen(&self) -> BTreeMap<GuidPrefix, Timestamp> {
         let clocks = Clocks::read();
         let mut seen = BTreeMap::new();
-        for (participant, at) in self.taps.iter().flat_map(|tap| tap.filter().participants()) {
+        for (participant, at) in self.filters().flat_map(Filter::participants) {
             let at = clocks.calendar(at);
             let latest = seen.entry(participant).or_insert(at);
             *latest = at.max(*latest);
@@ -183,9 +232,9 @@ impl LiveSource {
 
     /// Captured frames by interface.
     pub fn packets(&self) -> impl Iterator<Item = InterfaceCount> + '_ {
-        self.taps.iter().flat_map(|tap| {
-            tap.packets().map(|(name, packets)| InterfaceCount {
-                namespace: tap.namespace().map(Into::into),
+        self.wires.iter().flat_map(|wire| {
+            wire.packets().map(|(name, packets)| InterfaceCount {
+                namespace: wire.namespace().map(Path::to_path_buf),
                 name,
                 packets,
             })
@@ -197,67 +246,144 @@ impl LiveSource {
     /// # Errors
     /// The kernel does not tell.
     pub fn drops(&mut self) -> Result<Vec<DropCount>, CaptureError> {
-        self.taps
+        self.wires
             .iter_mut()
-            .map(|tap| {
+            .map(|wire| {
                 Ok(DropCount {
-                    namespace: tap.namespace().map(Into::into),
-                    dropped: tap.drops()?,
+                    dropped: wire.drops()?,
+                    namespace: wire.namespace().map(Path::to_path_buf),
                 })
             })
             .collect()
     }
 
-    /// The kernel filters' counters, summed.
+    /// The kernel programs' counters, summed.
     ///
     /// # Errors
     /// The kernel does not tell.
     pub fn counters(&self) -> Result<Vec<(Counter, u64)>, CaptureError> {
         let mut sums: Vec<_> = Counter::ALL.map(|counter| (counter, 0)).into();
-        for tap in &self.taps {
-            for ((_, sum), (_, value)) in sums
-                .iter_mut()
-                .zip(tap.filter().counters().map_err(TapError::from)?)
-            {
+        for filter in self.filters() {
+            for ((_, sum), (_, value)) in sums.iter_mut().zip(filter.counters()?) {
                 *sum += value;
             }
         }
         Ok(sums)
     }
 
-    /// Bytes that came from the kernel: frames and records.
+    /// Bytes that came from the kernel: frames, datagrams and records.
     #[must_use]
     pub fn copied_bytes(&self) -> u64 {
-        self.taps.iter().map(|tap| tap.copied_bytes()).sum()
+        let host: u64 = self.host.iter().map(HostTap::copied_bytes).sum();
+        host + self.wires.iter().map(WireTap::copied_bytes).sum::<u64>()
     }
 
-    /// Fragmented datagrams that were begun and never became complete: the kernel filter's and
-    /// those reassembled here.
+    /// Datagrams that were begun and never became complete: the kernel programs' and those put
+    /// together here.
     #[must_use]
     pub fn incomplete_datagrams(&self) -> u64 {
-        self.taps.iter().map(WireTap::incomplete_datagrams).sum()
+        let host: u64 = self.host.iter().map(HostTap::incomplete_datagrams).sum();
+        let wires = self.wires.iter().map(WireTap::incomplete_datagrams);
+        host + wires.sum::<u64>()
     }
 
     /// Bytes held for reassembly.
     #[must_use]
     pub fn reassembly_bytes(&self) -> usize {
-        self.taps.iter().map(WireTap::reassembly_bytes).sum()
+        let host: usize = self.host.iter().map(HostTap::waiting_bytes).sum();
+        host + self
+            .wires
+            .iter()
+            .map(WireTap::reassembly_bytes)
+            .sum::<usize>()
+    }
+
+    fn filters(&self) -> impl Iterator<Item = &Filter> {
+        let host = self.host.iter().map(HostTap::filter);
+        host.chain(self.wires.iter().map(WireTap::filter))
+    }
+
+    fn tell(&mut self, mut what: impl FnMut(&mut Filter) -> Result<(), FilterError>) {
+        let host = self.host.iter_mut().map(HostTap::filter_mut);
+        for filter in host.chain(self.wires.iter_mut().map(WireTap::filter_mut)) {
+            self.refused_updates += u64::from(what(filter).is_err());
+        }
     }
 
     fn refill(&mut self, monotonic: u64) {
-        let mut set = |budget, amount| {
-            for tap in &mut self.taps {
-                let refilled = tap.filter_mut().set_unknown_budget(budget, amount);
-                self.refused_updates += u64::from(refilled.is_err());
-            }
-        };
         if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND {
             self.bytes_refilled = monotonic;
-            set(Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND);
+            let (budget, amount) = (Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND);
+            self.tell(|filter| filter.set_unknown_budget(budget, amount));
         }
         if monotonic.wrapping_sub(self.records_refilled) >= TENTH {
             self.records_refilled = monotonic;
-            set(Budget::Records, UNKNOWN_RECORDS_PER_TENTH);
+            let (budget, amount) = (Budget::Records, UNKNOWN_RECORDS_PER_TENTH);
+            self.tell(|filter| filter.set_unknown_budget(budget, amount));
         }
     }
+}
+
+/// The tap at the sockets, or why there is none.
+fn open_host(
+    settings: &CaptureSettings,
+) -> Result<(Option<HostTap>, Option<String>), CaptureError> {
+    let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
+    match settings.source {
+        SourceChoice::Wire => return Ok((None, None)),
+        SourceChoice::Auto if named => {
+            let reason = "the configuration names interfaces (capture.interfaces)";
+            return Ok((None, Some(reason.to_owned())));
+        }
+        SourceChoice::Host | SourceChoice::Auto => {}
+    }
+    let opened = HostTap::open(&HostSettings {
+        cgroup: settings.cgroup.clone(),
+        ring_bytes: settings.ring_bytes,
+        record_ring_bytes: settings.record_ring_bytes,
+    });
+    match opened {
+        Ok(host) => Ok((Some(host), None)),
+        Err(error) if settings.source == SourceChoice::Host => Err(error.into()),
+        Err(error) => Ok((None, Some(in_words(&error)))),
+    }
+}
+
+/// A tap for this namespace and one for each configured one.
+fn open_wires(
+    settings: &CaptureSettings,
+    limits: Limits,
+    selection: Selection,
+) -> Result<Vec<WireTap>, CaptureError> {
+    let wire = WireSettings {
+        selection,
+        ring_bytes: settings.ring_bytes,
+        record_ring_bytes: settings.record_ring_bytes,
+        reassembly: limits,
+    };
+    let mut wires = vec![WireTap::open(&wire, 0, None)?];
+    for (number, path) in (1..).zip(&settings.network_namespaces) {
+        let open = || WireTap::open(&wire, number, Some(path.clone()));
+        wires.push(netns::within(path, open)??);
+    }
+    Ok(wires)
+}
+
+/// An error and its causes in one line; of a verifier's log, the first line.
+fn in_words(error: &dyn Error) -> String {
+    let mut words = String::new();
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        let message = error.to_string();
+        let first = message.lines().next().unwrap_or_default();
+        // A transparent error says what its cause says.
+        if !words.ends_with(first) {
+            if !words.is_empty() {
+                words.push_str(": ");
+            }
+            words.push_str(first);
+        }
+        cause = error.source();
+    }
+    words
 }

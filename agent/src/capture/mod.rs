@@ -3,6 +3,8 @@
 pub mod control_groups;
 pub mod feed;
 pub mod filter;
+pub mod hierarchy;
+pub mod host;
 pub mod inside;
 pub mod interfaces;
 pub mod kernel_types;

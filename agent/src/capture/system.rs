@@ -13,10 +13,11 @@ const READINGS: usize = 8;
 const CLOSE: u64 = 5_000;
 
 /// Waits until one of `descriptors` is readable or in error, a signal comes, or the time is over.
+/// Which of them it was, the first if several.
 ///
 /// # Errors
 /// `poll` itself fails.
-pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<()> {
+pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<Option<usize>> {
     let mut poll: Vec<_> = descriptors
         .iter()
         .map(|descriptor| libc::pollfd {
@@ -34,8 +35,9 @@ pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<()>
         if error.kind() != io::ErrorKind::Interrupted {
             return Err(error);
         }
+        return Ok(None);
     }
-    Ok(())
+    Ok(poll.iter().position(|descriptor| descriptor.revents != 0))
 }
 
 /// The kernel filter's clock beside the calendar's, read at one moment.
@@ -113,10 +115,14 @@ mod tests {
     #[test]
     fn waiting_ends_with_the_time_and_with_data() {
         let (mut one, two) = UnixStream::pair().unwrap();
-        wait(&[two.as_fd()], Duration::from_millis(1)).unwrap();
+        let descriptors = [one.as_fd(), two.as_fd()];
+        let waited = wait(&descriptors, Duration::from_millis(1)).unwrap();
+        assert_eq!(waited, None);
         io::Write::write_all(&mut one, b"x").unwrap();
         let start = Instant::now();
-        wait(&[two.as_fd()], Duration::from_secs(60)).unwrap();
+        let descriptors = [one.as_fd(), two.as_fd()];
+        let waited = wait(&descriptors, Duration::from_secs(60)).unwrap();
+        assert_eq!(waited, Some(1));
         assert!(start.elapsed() < Duration::from_secs(30));
     }
 

@@ -2,15 +2,14 @@
 //! to the board once a second and when a scrape asks for one. Surfaces never reach in here; they read the board.
 
 pub mod replay;
+mod source;
 
 use std::collections::BTreeSet;
-use std::os::fd::BorrowedFd;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
-use ros2probe_wire::filter::Counter;
-use ros2probe_wire::{GuidPrefix, Timestamp};
+use ros2probe_wire::GuidPrefix;
 use tokio_util::sync::CancellationToken;
 
 use crate::capture::live::{CaptureError, LiveSource};
@@ -18,8 +17,8 @@ use crate::capture::pcap::PcapError;
 use crate::config::Watchlist;
 use crate::model::observer::Observer;
 use crate::model::snapshot::Snapshot;
-use crate::surface::{AgentFacts, Board, InterfaceFacts, SourceKind};
-use replay::Replay;
+use crate::surface::Board;
+pub use source::Source;
 
 /// Longest time without looking at commands and the clock. Captured frames and a record ring that
 /// is half full end it earlier; each round costs a wake-up, and on a quiet host nothing else does.
@@ -27,14 +26,6 @@ const SLICE: Duration = Duration::from_millis(250);
 /// How often surfaces get a new snapshot unasked, and how often at most when they ask.
 const PUBLISH: Duration = Duration::from_secs(1);
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);
-
-/// Where packets come from.
-pub enum Source {
-    /// This host's interfaces.
-    Live(Box<LiveSource>),
-    /// A capture.
-    Replay(Box<Replay>),
-}
 
 /// What the agent is told while it runs.
 #[derive(Debug)]
@@ -166,111 +157,4 @@ fn follow(live: &mut LiveSource, followed: &mut BTreeSet<GuidPrefix>, snapshot: 
         live.follow(*new, true);
     }
     *followed = present;
-}
-
-impl Source {
-    /// Live or replay.
-    #[must_use]
-    pub const fn kind(&self) -> SourceKind {
-        match self {
-            Self::Live(_) => SourceKind::Wire,
-            Self::Replay(_) => SourceKind::Replay,
-        }
-    }
-
-    fn poll(
-        &mut self,
-        timeout: Duration,
-        bell: Option<BorrowedFd<'_>>,
-        observer: &mut Observer,
-    ) -> Result<(), RunError> {
-        match self {
-            Self::Live(live) => Ok(live.poll(timeout, bell, observer)?),
-            Self::Replay(replay) => replay.poll(timeout, observer).map_err(RunError::Replay),
-        }
-    }
-
-    fn clock(&self) -> Timestamp {
-        match self {
-            Self::Live(live) => live.clock(),
-            Self::Replay(replay) => replay.clock(),
-        }
-    }
-
-    fn is_finished(&self) -> bool {
-        match self {
-            Self::Live(_) => false,
-            Self::Replay(replay) => replay.is_finished(),
-        }
-    }
-
-    fn facts(&mut self) -> AgentFacts {
-        let now = Instant::now();
-        match self {
-            Self::Live(live) => live_facts(live, now),
-            Self::Replay(replay) => {
-                let (packets, bytes) = replay.progress();
-                let reassembly = replay.reassembly();
-                let counters = reassembly.counters();
-                AgentFacts {
-                    finished: replay.is_finished(),
-                    interfaces: vec![InterfaceFacts {
-                        name: "replay".to_owned(),
-                        packets: Some(packets),
-                        dropped: None,
-                    }],
-                    copied_bytes: bytes,
-                    incomplete_datagrams: counters.evicted + counters.timed_out,
-                    reassembly_bytes: reassembly.bytes() as u64,
-                    ..AgentFacts::new(SourceKind::Replay, now)
-                }
-            }
-        }
-    }
-}
-
-fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
-    let named = |namespace: Option<std::path::PathBuf>, name: &str| match namespace {
-        Some(path) => format!("{}:{name}", path.display()),
-        None => name.to_owned(),
-    };
-    // A socket for all interfaces of a namespace has one drop counter.
-    let drops = live.drops().unwrap_or_default();
-    let mut interfaces: Vec<_> = drops
-        .into_iter()
-        .map(|count| InterfaceFacts {
-            name: named(count.namespace, "any"),
-            packets: None,
-            dropped: Some(count.dropped),
-        })
-        .collect();
-    interfaces.extend(live.packets().map(|count| InterfaceFacts {
-        name: named(count.namespace, &count.name),
-        packets: Some(count.packets),
-        dropped: None,
-    }));
-    let counters = live.counters().unwrap_or_default();
-    let value = |wanted: Counter| {
-        counters
-            .iter()
-            .find(|(counter, _)| *counter == wanted)
-            .map_or(0, |(_, value)| *value)
-    };
-    AgentFacts {
-        interfaces,
-        // Bytes are no events; those copied are counted below.
-        filter_events: counters
-            .iter()
-            .filter(|(counter, _)| *counter != Counter::CapturedBytes)
-            .map(|(counter, value)| (counter.label(), *value))
-            .collect(),
-        copied_bytes: live.copied_bytes(),
-        records_dropped: value(Counter::RecordsLost),
-        pieces_dropped: value(Counter::PiecesLost),
-        contended: value(Counter::Contended),
-        incomplete_datagrams: live.incomplete_datagrams(),
-        reassembly_bytes: live.reassembly_bytes() as u64,
-        refused_updates: live.refused_updates(),
-        ..AgentFacts::new(SourceKind::Wire, now)
-    }
 }

@@ -21,7 +21,7 @@ pub(crate) const ON_THE_WIRE: &str = "capture: {source: wire}\n";
 /// `rp run` on a host.
 pub(crate) struct Agent<'a> {
     pub(crate) process: Process,
-    host: &'a Namespace,
+    pub(crate) host: &'a Namespace,
 }
 
 /// One answer of `/metrics`.

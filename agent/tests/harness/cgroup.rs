@@ -1,7 +1,9 @@
 //! The cgroup of a host: what its processes open is told apart from other tests' sockets, which the
 //! agent's host source would see as well.
 
-use std::fs;
+use std::fs::{self, File};
+use std::io;
+use std::os::fd::AsRawFd as _;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
@@ -90,6 +92,48 @@ pub(crate) fn hierarchy() -> Result<PathBuf> {
         (words.next() == Some("cgroup2")).then(|| PathBuf::from(path))
     });
     path.context("no cgroup2 is mounted: `mount -t cgroup2 none /sys/fs/cgroup/unified`")
+}
+
+/// How many programs see the datagrams that its sockets receive and send, besides those attached
+/// further up.
+pub(crate) fn attached(cgroup: &Path) -> Result<[u32; 2]> {
+    /// The part of `union bpf_attr` for BPF_PROG_QUERY (linux/bpf.h).
+    #[repr(C)]
+    #[derive(Default)]
+    struct Query {
+        target_fd: u32,
+        attach_type: u32,
+        query_flags: u32,
+        attach_flags: u32,
+        prog_ids: u64,
+        prog_cnt: u32,
+        unused: u32,
+    }
+    const BPF_PROG_QUERY: libc::c_int = 16;
+    const INGRESS_AND_EGRESS: [u32; 2] = [0, 1];
+    let directory = File::open(cgroup)?;
+    let mut counts = [0; 2];
+    for (count, attach_type) in counts.iter_mut().zip(INGRESS_AND_EGRESS) {
+        let mut query = Query {
+            target_fd: directory.as_raw_fd().cast_unsigned(),
+            attach_type,
+            ..Query::default()
+        };
+        // SAFETY: the attribute's size is given; without room for ids the kernel writes none.
+        let result = unsafe {
+            libc::syscall(
+                libc::SYS_bpf,
+                BPF_PROG_QUERY,
+                &raw mut query,
+                size_of::<Query>(),
+            )
+        };
+        if result < 0 {
+            return Err(io::Error::last_os_error()).context("BPF_PROG_QUERY");
+        }
+        *count = query.prog_cnt;
+    }
+    Ok(counts)
 }
 
 /// Removes those of processes that were killed before they could.

@@ -1,0 +1,179 @@
+//! Where packets come from: this host or a capture, behind one face for the working thread.
+//!
+//! Also what the agent says of it: in the log once, at the start, and on the board.
+
+use std::os::fd::BorrowedFd;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::filter::Counter;
+
+use super::RunError;
+use super::replay::Replay;
+use crate::capture::host::HostTap;
+use crate::capture::live::LiveSource;
+use crate::model::observer::Observer;
+use crate::surface::{Ability, AgentFacts, InterfaceFacts, SourceKind};
+
+/// Where packets come from.
+pub enum Source {
+    /// This host.
+    Live(Box<LiveSource>),
+    /// A capture.
+    Replay(Box<Replay>),
+}
+
+impl Source {
+    /// Sockets, wire or replay.
+    #[must_use]
+    pub const fn kind(&self) -> SourceKind {
+        match self {
+            Self::Live(live) => kind(live),
+            Self::Replay(_) => SourceKind::Replay,
+        }
+    }
+
+    /// Says in the log what this looks at, what it can tell and what it cannot.
+    pub fn announce(&self) {
+        let Self::Live(live) = self else { return };
+        if let Some(reason) = live.without_host() {
+            tracing::warn!("host hook not used: {reason}; using packet sockets");
+        }
+        let able = abilities(live);
+        let (sees, blind): (Vec<_>, Vec<_>) = Ability::ALL
+            .into_iter()
+            .partition(|ability| able.contains(ability));
+        let words = |list: Vec<Ability>| list.into_iter().map(Ability::label).collect::<Vec<_>>();
+        tracing::info!(
+            source = self.kind().label(),
+            cgroup = live.host().map(|host| host.cgroup().display().to_string()),
+            sees = words(sees).join(", "),
+            blind = words(blind).join(", "),
+            "looking"
+        );
+    }
+
+    pub(super) fn poll(
+        &mut self,
+        timeout: Duration,
+        bell: Option<BorrowedFd<'_>>,
+        observer: &mut Observer,
+    ) -> Result<(), RunError> {
+        match self {
+            Self::Live(live) => Ok(live.poll(timeout, bell, observer)?),
+            Self::Replay(replay) => replay.poll(timeout, observer).map_err(RunError::Replay),
+        }
+    }
+
+    pub(super) fn clock(&self) -> Timestamp {
+        match self {
+            Self::Live(live) => live.clock(),
+            Self::Replay(replay) => replay.clock(),
+        }
+    }
+
+    pub(super) fn is_finished(&self) -> bool {
+        match self {
+            Self::Live(_) => false,
+            Self::Replay(replay) => replay.is_finished(),
+        }
+    }
+
+    pub(super) fn facts(&mut self) -> AgentFacts {
+        let now = Instant::now();
+        match self {
+            Self::Live(live) => live_facts(live, now),
+            Self::Replay(replay) => {
+                let (packets, bytes) = replay.progress();
+                let reassembly = replay.reassembly();
+                let counters = reassembly.counters();
+                AgentFacts {
+                    finished: replay.is_finished(),
+                    interfaces: vec![InterfaceFacts {
+                        name: "replay".to_owned(),
+                        packets: Some(packets),
+                        dropped: None,
+                    }],
+                    copied_bytes: bytes,
+                    incomplete_datagrams: counters.evicted + counters.timed_out,
+                    reassembly_bytes: reassembly.bytes() as u64,
+                    ..AgentFacts::new(SourceKind::Replay, now)
+                }
+            }
+        }
+    }
+}
+
+fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
+    let named = |namespace: Option<PathBuf>, name: &str| match namespace {
+        Some(path) => format!("{}:{name}", path.display()),
+        None => name.to_owned(),
+    };
+    // A socket for all interfaces of a namespace has one drop counter.
+    let drops = live.drops().unwrap_or_default();
+    let mut interfaces: Vec<_> = drops
+        .into_iter()
+        .map(|count| InterfaceFacts {
+            name: named(count.namespace, "any"),
+            packets: None,
+            dropped: Some(count.dropped),
+        })
+        .collect();
+    interfaces.extend(live.packets().map(|count| InterfaceFacts {
+        name: named(count.namespace, &count.name),
+        packets: Some(count.packets),
+        dropped: None,
+    }));
+    interfaces.extend(live.host().map(|host| InterfaceFacts {
+        name: "sockets".to_owned(),
+        packets: Some(host.datagrams()),
+        dropped: None,
+    }));
+    let counters = live.counters().unwrap_or_default();
+    let value = |wanted: Counter| {
+        counters
+            .iter()
+            .find(|(counter, _)| *counter == wanted)
+            .map_or(0, |(_, value)| *value)
+    };
+    AgentFacts {
+        interfaces,
+        // Bytes are no events; those copied are counted below.
+        filter_events: counters
+            .iter()
+            .filter(|(counter, _)| *counter != Counter::CapturedBytes)
+            .map(|(counter, value)| (counter.label(), *value))
+            .collect(),
+        copied_bytes: live.copied_bytes(),
+        records_dropped: value(Counter::RecordsLost),
+        incomplete_datagrams: live.incomplete_datagrams(),
+        reassembly_bytes: live.reassembly_bytes() as u64,
+        refused_updates: live.refused_updates(),
+        source_reason: live.without_host().map(str::to_owned),
+        abilities: abilities(live),
+        pieces_dropped: value(Counter::PiecesLost),
+        contended: value(Counter::Contended),
+        ..AgentFacts::new(kind(live), now)
+    }
+}
+
+/// What this source can see on this kernel and with this configuration.
+fn abilities(live: &LiveSource) -> Vec<Ability> {
+    let mut abilities = kind(live).abilities().to_vec();
+    if live.host().is_some_and(HostTap::is_whole_host) {
+        abilities.push(Ability::Containers);
+    }
+    if live.host().is_some() && live.is_on_the_wire() {
+        abilities.push(Ability::Forwarded);
+    }
+    abilities
+}
+
+const fn kind(live: &LiveSource) -> SourceKind {
+    if live.host().is_some() {
+        SourceKind::Host
+    } else {
+        SourceKind::Wire
+    }
+}
