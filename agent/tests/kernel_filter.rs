@@ -16,9 +16,10 @@ mod program_run;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use program_run::{Kernel, Seen};
+use program_run::{Hook, Kernel, Seen};
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_wire::filter::Counter;
 use ros2probe_wire::frame::{self, Link, PacketType, Payload};
 use ros2probe_wire::record::{Record, Verdict, flag, guid_words, kind};
 use ros2probe_wire::walk::{self, Envelope, Fate};
@@ -275,6 +276,203 @@ fn the_kernel_and_user_space_make_the_same_records_of_every_capture() {
             .zip(verdicts.into_iter().cycle())
             .collect();
         compare(&path, &mixed);
+    }
+}
+
+/// A datagram as sockets see it: one IP packet, however many fragments it came in.
+struct Datagram {
+    packet: Vec<u8>,
+    payload: Vec<u8>,
+    envelope: Envelope,
+}
+
+fn datagrams(packets: &[IpPacket]) -> Vec<Datagram> {
+    let (mut user, mut found) = (user_space(), Vec::new());
+    for packet in packets {
+        user.packet(packet, |payload, envelope| {
+            let mut envelope = Envelope {
+                host: true,
+                ..*envelope
+            };
+            let packet = if envelope.fragmented {
+                envelope.fragmented = false;
+                envelope.source_port = 7411;
+                envelope.destination_port = 7411;
+                envelope.destination = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255, 255, 10, 99, 0, 2];
+                program_run::datagram(payload)
+            } else {
+                packet.bytes.clone()
+            };
+            found.push(Datagram {
+                packet,
+                payload: payload.to_vec(),
+                envelope,
+            });
+        });
+    }
+    // A program run takes a page at most; longer ones pass real sockets in `live_host_hook`.
+    found.retain(|datagram| datagram.packet.len() <= 3000);
+    found
+}
+
+/// What the host hook says of a datagram besides what [`comparable`] leaves out.
+fn of_any_socket(record: Record) -> Record {
+    assert_ne!(record.flags & flag::HOST, 0);
+    assert_ne!((record.socket, record.datagram), (0, 0));
+    Record {
+        socket: 0,
+        ..comparable(record)
+    }
+}
+
+fn compare_host(path: &Path, hook: Hook, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
+    let mut kernel = Kernel::load_hook(hook);
+    kernel.set_interest(interest);
+    let (mut records, mut captures) = (0, 0);
+    let mut copied = 0;
+    for (number, datagram) in datagrams(&ip_packets(path)).into_iter().enumerate() {
+        let case = format!("{} {hook:?} datagram {number}", path.display());
+        let envelope = Envelope {
+            outgoing: hook == Hook::Egress,
+            ..datagram.envelope
+        };
+        let seen = kernel.datagram(&datagram.packet);
+        let (capture, mut wanted) = expected(&datagram.payload, &envelope, interest);
+        if let Some((piece, bytes)) = &seen.captured {
+            assert!(capture, "{case}: captured");
+            assert!(*bytes == datagram.payload, "{case}: captured bytes");
+            assert_eq!(piece.destination_port, envelope.destination_port, "{case}");
+            assert_eq!(piece.source_port, envelope.source_port, "{case}");
+            captures += 1;
+        } else if capture {
+            // The run before was within a millisecond, however long ago the captured one was.
+            copied += 1;
+            assert_eq!(kernel.counter(Counter::CopiesNotCaptured), copied, "{case}");
+            let metered = interest.iter().map(|(guid, verdict)| match verdict {
+                Verdict::Capture => (*guid, Verdict::Meter),
+                verdict => (*guid, *verdict),
+            });
+            wanted = metered_records(&datagram.payload, &envelope, &metered.collect());
+        }
+        // Each run has a socket of its own, so fragments join within one datagram only.
+        let (mut runs, mut joined) = (Runs::default(), Vec::new());
+        for record in wanted {
+            runs.give(record, true, &mut joined);
+        }
+        joined.extend(runs.0.into_values());
+        let key = |record: &Record| (record.writer, record.sequence_number, record.kind);
+        let mut found: Vec<_> = seen.records.into_iter().map(of_any_socket).collect();
+        let mut joined: Vec<_> = joined.into_iter().map(comparable).collect();
+        found.sort_by_key(key);
+        joined.sort_by_key(key);
+        assert_eq!(found, joined, "{case}: records");
+        records += found.len();
+    }
+    (records, captures)
+}
+
+/// The records of everything that is metered, whatever else is in the datagram.
+fn metered_records(
+    payload: &[u8],
+    envelope: &Envelope,
+    interest: &BTreeMap<Guid, Verdict>,
+) -> Vec<Record> {
+    let mut records = Vec::new();
+    walk::datagram(payload, envelope, None, |found| {
+        let endpoint = match walk::fate(&found.record) {
+            Fate::Ignore | Fate::Capture => return,
+            Fate::Writer => found.record.writer(),
+            Fate::Reader => found.record.reader(),
+        };
+        if interest.get(&endpoint) == Some(&Verdict::Meter) {
+            records.push(found.record);
+        }
+    });
+    records
+}
+
+#[test]
+fn the_host_hook_makes_the_same_records_of_every_capture_in_both_directions() {
+    for path in captures() {
+        let all = endpoints(&ip_packets(&path));
+        let meter_all = all.iter().map(|guid| (*guid, Verdict::Meter)).collect();
+        let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
+        let mixed = all
+            .iter()
+            .copied()
+            .zip(verdicts.into_iter().cycle())
+            .collect();
+        for hook in [Hook::Ingress, Hook::Egress] {
+            let (records, captured) = compare_host(&path, hook, &meter_all);
+            assert!(captured > 0, "{}: no discovery seen", path.display());
+            println!(
+                "{} {hook:?}: {records} records, {captured} captured",
+                path.display()
+            );
+            compare_host(&path, hook, &mixed);
+        }
+    }
+}
+
+#[test]
+fn the_host_hook_lets_everything_pass() {
+    let writer = Guid::new(GuidPrefix(*b"\x01\x0fpasspasspa"), EntityId([0, 0, 1, 3]));
+    let mut noise = 1_u32;
+    let mut random = || {
+        noise = noise.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (noise >> 24) as u8
+    };
+    for hook in [Hook::Ingress, Hook::Egress] {
+        let mut kernel = Kernel::load_hook(hook);
+        kernel.set_unknown_budget(1 << 20, 1 << 20);
+        let whole = program_run::data(writer, 1, 100);
+        let mut packets: Vec<_> = captures()
+            .iter()
+            .take(3)
+            .flat_map(|path| ip_packets(path))
+            .map(|packet| packet.bytes)
+            .collect();
+        packets.extend((20..whole.len()).map(|len| whole[..len].to_vec()));
+        packets.extend((0..whole.len()).map(|at| {
+            let mut damaged = whole.clone();
+            damaged[at] ^= 0xff;
+            damaged
+        }));
+        packets.extend((0..2000).map(|len| {
+            let mut bytes: Vec<_> = (0..40 + len % 200).map(|_| random()).collect();
+            bytes[0] = if len % 2 == 0 { 0x45 } else { 0x60 };
+            bytes[9] = 17;
+            bytes[6] = if len % 2 == 0 { 0 } else { 17 };
+            bytes
+        }));
+        for packet in &packets {
+            assert_eq!(kernel.run(packet, 1).0, 1, "{hook:?}: {packet:02x?}");
+            kernel.drain();
+        }
+    }
+}
+
+#[test]
+fn the_verified_host_programs_can_only_return_one() {
+    const EXIT: u8 = 0x95;
+    const CALL: u8 = 0x85;
+    for hook in [Hook::Ingress, Hook::Egress] {
+        let kernel = Kernel::load_hook(hook);
+        let main = kernel.verified_main();
+        assert!(main.iter().any(|[code, ..]| *code == EXIT));
+        for (at, [code, registers, low, high, immediate @ ..]) in main.iter().enumerate() {
+            let (class, offset) = (code & 7, i16::from_le_bytes([*low, *high]));
+            if *code == EXIT {
+                // r0 = 1, in 32 or 64 bits.
+                let [before, registers, _, _, value @ ..] = main[at - 1];
+                assert!(matches!(before, 0xb4 | 0xb7), "{hook:?}: {main:02x?}");
+                assert_eq!((registers & 0x0f, value), (0, [1, 0, 0, 0]), "{hook:?}");
+            } else if matches!(class, 5 | 6) && *code != CALL {
+                let target = at.strict_add_signed(1 + isize::from(offset));
+                assert_ne!(main[target][0], EXIT, "{hook:?}: a jump past the value");
+                assert_ne!(*code, 0x06, "{hook:?}: {registers} {immediate:?}");
+            }
+        }
     }
 }
 

@@ -11,8 +11,9 @@ use std::time::Duration;
 use ros2probe::capture::filter::{Filter, FilterSettings};
 use ros2probe::model::ahead::{Ahead, Ready};
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
-use ros2probe_wire::filter::Budget;
+use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::frame::{self, PacketType, Payload};
+use ros2probe_wire::host::Piece;
 use ros2probe_wire::record::{Record, Verdict, kind};
 use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{Guid, Timestamp};
@@ -25,6 +26,14 @@ pub struct Seen {
     /// User space gets it.
     pub kept: bool,
     /// Records that may count now.
+    pub records: Vec<Record>,
+}
+
+/// What became of one datagram at a socket.
+pub struct SeenAtSocket {
+    /// Its first piece and all its bytes, when user space gets it.
+    pub captured: Option<(Piece, Vec<u8>)>,
+    /// Its records, also those that would have waited for more fragments.
     pub records: Vec<Record>,
 }
 
@@ -137,6 +146,29 @@ impl Kernel {
         Seen { kept, records }
     }
 
+    /// One datagram in one IP packet, shown to a program of the host hook.
+    pub fn datagram(&mut self, packet: &[u8]) -> SeenAtSocket {
+        let (verdict, _) = self.run(packet, 1);
+        assert_eq!(verdict, 1, "a datagram was dropped: {packet:02x?}");
+        let mut captured: Option<(Piece, Vec<u8>)> = None;
+        while let Some(piece) = self.filter.next_piece() {
+            let (piece, bytes) = piece.read().unwrap();
+            let (first, so_far) = captured.get_or_insert((piece, Vec::new()));
+            assert_eq!(first.datagram, piece.datagram, "one datagram was shown");
+            assert_eq!(piece.offset as usize, so_far.len(), "pieces come in order");
+            so_far.extend_from_slice(bytes);
+        }
+        let mut records: Vec<_> = std::iter::from_fn(|| self.filter.next_record()).collect();
+        records.extend(self.take_stalled());
+        SeenAtSocket { captured, records }
+    }
+
+    pub fn counter(&self, which: Counter) -> u64 {
+        let counters = self.filter.counters().unwrap();
+        let found = counters.iter().find(|(counter, _)| *counter == which);
+        found.unwrap().1
+    }
+
     fn keep(&mut self, packet: &[u8], ready: &mut Vec<Ready>) {
         let protocol = if packet[0] >> 4 == 4 { 0x0800 } else { 0x86dd };
         let len = u32::try_from(packet.len()).unwrap();
@@ -170,6 +202,79 @@ impl Kernel {
             Hook::Wire | Hook::Ingress => self.filter.program(),
             Hook::Egress => self.filter.egress_program().unwrap(),
         }
+    }
+
+    /// The program's own instructions as the kernel runs them, without those of the functions that
+    /// it calls (BPF_OBJ_GET_INFO_BY_FD).
+    pub fn verified_main(&self) -> Vec<[u8; 8]> {
+        /// The head of `struct bpf_prog_info` (linux/bpf.h).
+        #[repr(C)]
+        #[derive(Clone, Default)]
+        struct ProgramInfo {
+            head: [u32; 4],
+            jited_len: u32,
+            xlated_len: u32,
+            jited: u64,
+            xlated: u64,
+            load_time: u64,
+            created_by_uid: u32,
+            map_id_count: u32,
+            map_ids: u64,
+            name: [u8; 16],
+            interface: [u32; 2],
+            namespace: [u64; 2],
+            jited_counts: [u32; 2],
+            jited_symbols: [u64; 2],
+            btf_id: u32,
+            function_size: u32,
+            functions: u64,
+            function_count: u32,
+            line_count: u32,
+        }
+        #[repr(C)]
+        struct Query {
+            fd: u32,
+            len: u32,
+            info: u64,
+        }
+        const BPF_OBJ_GET_INFO_BY_FD: libc::c_int = 15;
+        let ask = |info: &mut ProgramInfo| {
+            let mut query = Query {
+                fd: self.program().as_raw_fd().cast_unsigned(),
+                len: u32::try_from(size_of::<ProgramInfo>()).unwrap(),
+                info: (&raw mut *info) as u64,
+            };
+            // SAFETY: the attribute and the information have the sizes given, and the buffers that
+            // the information names have those that the kernel asked for.
+            let result = unsafe {
+                libc::syscall(
+                    libc::SYS_bpf,
+                    BPF_OBJ_GET_INFO_BY_FD,
+                    &raw mut query,
+                    size_of::<Query>(),
+                )
+            };
+            let error = io::Error::last_os_error();
+            assert!(result >= 0, "BPF_OBJ_GET_INFO_BY_FD: {error}");
+        };
+        let mut sizes = ProgramInfo::default();
+        ask(&mut sizes);
+        let mut instructions = vec![[0_u8; 8]; sizes.xlated_len as usize / 8];
+        let mut functions = vec![[0_u32; 2]; sizes.function_count as usize];
+        assert_eq!(sizes.function_size, 8, "struct bpf_func_info");
+        let mut info = ProgramInfo {
+            xlated_len: sizes.xlated_len,
+            xlated: instructions.as_mut_ptr() as u64,
+            function_size: sizes.function_size,
+            functions: functions.as_mut_ptr() as u64,
+            function_count: sizes.function_count,
+            ..ProgramInfo::default()
+        };
+        ask(&mut info);
+        // The first function is the program, the next begins where it ends.
+        let end = functions.get(1).map_or(usize::MAX, |each| each[0] as usize);
+        instructions.truncate(end);
+        instructions
     }
 
     /// BPF_PROG_TEST_RUN: what the program returns, and the mean time it takes.
