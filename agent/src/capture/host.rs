@@ -14,8 +14,10 @@ use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record};
 
 use super::filter::{Filter, FilterError, FilterSettings};
-use super::hierarchy::{Cgroup, HierarchyError};
+use super::hierarchy::{self, Cgroup, HierarchyError};
+use super::inside::Abilities;
 use super::order::{Next, Order};
+use super::sockets::Sockets;
 use super::system::Clocks;
 use super::whole::Wholes;
 use crate::model::observer::Observer;
@@ -63,6 +65,7 @@ pub struct HostTap {
     wholes: Wholes,
     /// Captured datagrams that wait.
     fresh: VecDeque<(Piece, Vec<u8>)>,
+    sockets: Sockets,
     datagrams: u64,
     copied_bytes: u64,
 }
@@ -83,8 +86,15 @@ impl HostTap {
             piece_ring_bytes: size(settings.ring_bytes),
             ..FilterSettings::default()
         })?;
+        // First, so that nothing dies unseen behind the hook.
+        filter.look_inside(cgroup.is_whole_host());
         filter.attach(cgroup.directory())?;
+        let hierarchy = match &settings.cgroup {
+            Some(path) => hierarchy::mount_point().unwrap_or_else(|_| path.clone()),
+            None => cgroup.path().to_path_buf(),
+        };
         Ok(Self {
+            sockets: Sockets::new(hierarchy),
             cgroup,
             filter,
             order: Order::default(),
@@ -107,6 +117,12 @@ impl HostTap {
         self.cgroup.is_whole_host()
     }
 
+    /// What can be told of what happens behind the hook.
+    #[must_use]
+    pub fn abilities(&self) -> Option<&Abilities> {
+        Some(self.filter.inside()?.abilities())
+    }
+
     /// Readable when a ring is half full.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.filter
@@ -127,6 +143,8 @@ impl HostTap {
         let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
         deliver(&mut self.order, clocks, settled, observer);
         self.wholes.advance(clocks.monotonic);
+        self.sockets
+            .follow(&self.filter, clocks.monotonic, observer);
     }
 
     /// Gives the model what still waits, at the end.

@@ -40,6 +40,11 @@ impl Source {
         if let Some(reason) = live.without_host() {
             tracing::warn!("host hook not used: {reason}; using packet sockets");
         }
+        for (ability, able) in inside(live).into_iter().flatten() {
+            if let Err(reason) = able {
+                tracing::warn!(ability = ability.label(), reason, "not to be had here");
+            }
+        }
         let able = abilities(live);
         let (sees, blind): (Vec<_>, Vec<_>) = Ability::ALL
             .into_iter()
@@ -164,10 +169,22 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     if live.host().is_some_and(HostTap::is_whole_host) {
         abilities.push(Ability::Containers);
     }
+    let inside = inside(live).into_iter().flatten();
+    abilities.extend(inside.filter_map(|(ability, able)| able.is_ok().then_some(ability)));
     if live.host().is_some() && live.is_on_the_wire() {
         abilities.push(Ability::Forwarded);
     }
     abilities
+}
+
+/// What depends on the kernel.
+fn inside(live: &LiveSource) -> Option<[(Ability, &Result<(), String>); 3]> {
+    let abilities = live.host()?.abilities()?;
+    Some([
+        (Ability::SocketLosses, &abilities.socket_losses),
+        (Ability::ReassemblyLosses, &abilities.reassembly_losses),
+        (Ability::Owners, &abilities.owners),
+    ])
 }
 
 const fn kind(live: &LiveSource) -> SourceKind {

@@ -1,0 +1,224 @@
+//! The sockets that the host hook meets: who holds them, in which control group they are, and what
+//! died there without a name. Told to the model, again when something changes.
+//!
+//! Asks seldom: going through all open files of the host costs. Keeps no more sockets than the hook
+//! remembers.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use ros2probe_wire::host::Socket;
+
+use super::control_groups::ControlGroups;
+use super::filter::Filter;
+use super::inside::Inside;
+use super::owners::Owner;
+use crate::model::observer::Observer;
+use crate::model::snapshot::SocketFacts;
+
+const SECOND: u64 = 1_000_000_000;
+/// How often new sockets are looked for.
+const PERIOD: u64 = 2 * SECOND;
+/// How often all owners are asked for anew: sockets are closed, and count what they drop.
+const ALL_PERIOD: u64 = 15 * SECOND;
+/// How often owners are asked for because of a socket that nobody was found to hold.
+const MOST_QUESTIONS: u8 = 3;
+
+/// What is known of all of them.
+#[derive(Debug)]
+pub struct Sockets {
+    groups: ControlGroups,
+    known: BTreeMap<u64, Known>,
+    looked: u64,
+    asked: u64,
+    failed: bool,
+}
+
+#[derive(Debug, Default)]
+struct Known {
+    owner: Option<Owner>,
+    /// What it had dropped before it was known, named or not.
+    dropped_before: Option<u64>,
+    questions: u8,
+    told: Option<SocketFacts>,
+}
+
+impl Sockets {
+    /// None known. `hierarchy` is where the control groups are mounted.
+    #[must_use]
+    pub const fn new(hierarchy: PathBuf) -> Self {
+        Self {
+            groups: ControlGroups::new(hierarchy),
+            known: BTreeMap::new(),
+            looked: 0,
+            asked: 0,
+            failed: false,
+        }
+    }
+
+    /// Looks when it is time, and tells the model what is new.
+    pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
+        if now.saturating_sub(self.looked) < PERIOD {
+            return;
+        }
+        self.looked = now;
+        let met: BTreeMap<u64, Socket> = filter.sockets().collect();
+        self.forget(&met, observer);
+        if let Some(owners) = self.owners(filter.inside(), &met, now) {
+            self.take_in(owners, &met, observer);
+        }
+        let groups: BTreeSet<u64> = met.values().map(|socket| socket.cgroup).collect();
+        self.groups.refresh(&groups);
+        for (cookie, socket) in &met {
+            let known = self.known.entry(*cookie).or_default();
+            let facts = known.facts(*cookie, socket, &self.groups);
+            if known.told.as_ref() != Some(&facts) {
+                known.told = Some(facts.clone());
+                observer.socket(facts);
+            }
+        }
+    }
+
+    /// Those that the hook remembers no longer: others have taken their places.
+    fn forget(&mut self, met: &BTreeMap<u64, Socket>, observer: &mut Observer) {
+        self.known.retain(|cookie, known| {
+            let stays = met.contains_key(cookie);
+            if !stays && known.told.is_some() {
+                observer.socket_closed(*cookie);
+            }
+            stays
+        });
+    }
+
+    /// All owners, when it is worth asking.
+    fn owners(
+        &mut self,
+        inside: Option<&Inside>,
+        met: &BTreeMap<u64, Socket>,
+        now: u64,
+    ) -> Option<BTreeMap<u64, Owner>> {
+        let owners = inside?.owners()?;
+        let unknown = |cookie: &u64| {
+            let known = self.known.get(cookie);
+            known.is_none_or(|known| known.owner.is_none() && known.questions < MOST_QUESTIONS)
+        };
+        let due = now.saturating_sub(self.asked) >= ALL_PERIOD;
+        if met.is_empty() || !(due || met.keys().any(unknown)) {
+            return None;
+        }
+        self.asked = now;
+        let found = owners.refresh(&met.keys().copied().collect());
+        if let Err(error) = &found
+            && !self.failed
+        {
+            self.failed = true;
+            tracing::warn!(%error, "it is no longer known who holds which socket");
+        }
+        found.ok()
+    }
+
+    fn take_in(
+        &mut self,
+        mut owners: BTreeMap<u64, Owner>,
+        met: &BTreeMap<u64, Socket>,
+        observer: &mut Observer,
+    ) {
+        for (cookie, socket) in met {
+            let known = self.known.entry(*cookie).or_default();
+            known.questions = known.questions.saturating_add(1);
+            let owner = owners.remove(cookie);
+            if owner.is_none() && known.owner.is_some() {
+                // Nobody has it open any more.
+                *known = Known {
+                    questions: MOST_QUESTIONS,
+                    ..Known::default()
+                };
+                observer.socket_closed(*cookie);
+                continue;
+            }
+            known.owner = owner.or(known.owner.take());
+            if known.dropped_before.is_none() {
+                known.dropped_before = known.unnamed(socket);
+            }
+        }
+    }
+}
+
+impl Known {
+    /// What the socket dropped beyond what was named.
+    fn unnamed(&self, socket: &Socket) -> Option<u64> {
+        let dropped = u64::from(self.owner.as_ref()?.drops?);
+        Some(dropped.saturating_sub(socket.no_room))
+    }
+
+    fn facts(&self, cookie: u64, socket: &Socket, groups: &ControlGroups) -> SocketFacts {
+        let owner = self.owner.as_ref();
+        let unnamed = self.unnamed(socket).zip(self.dropped_before);
+        SocketFacts {
+            cookie,
+            process_id: owner.map(|owner| owner.process_id),
+            process: owner.map(|owner| owner.process_name.clone()),
+            cgroup: groups.path(socket.cgroup).map(str::to_owned),
+            unidentified_drops: unnamed.map_or(0, |(now, before)| now.saturating_sub(before)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::observer::Settings;
+
+    fn owner(drops: u32) -> Owner {
+        Owner {
+            inode: 1,
+            process_id: 7,
+            own_process_id: 7,
+            process_name: "listener".to_owned(),
+            drops: Some(drops),
+        }
+    }
+
+    fn sockets(cookies: &[u64], no_room: u64) -> BTreeMap<u64, Socket> {
+        let socket = Socket { cgroup: 1, no_room };
+        cookies.iter().map(|cookie| (*cookie, socket)).collect()
+    }
+
+    #[test]
+    fn what_was_dropped_before_or_is_named_is_not_unidentified() {
+        let mut observer = Observer::new(Settings::default());
+        let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
+        let drops = |all: &Sockets, no_room| {
+            let met = sockets(&[1], no_room);
+            let known = all.known.get(&1).unwrap();
+            known.facts(1, &met[&1], &all.groups).unidentified_drops
+        };
+        let mut look = |all: &mut Sockets, dropped, no_room| {
+            let owners = BTreeMap::from([(1, owner(dropped))]);
+            all.take_in(owners, &sockets(&[1], no_room), &mut observer);
+            drops(all, no_room)
+        };
+        assert_eq!(look(&mut all, 100, 0), 0);
+        assert_eq!(look(&mut all, 110, 10), 0);
+        assert_eq!(look(&mut all, 125, 20), 5);
+        // Named since the counter was read.
+        assert_eq!(drops(&all, 40), 0);
+        assert_eq!(look(&mut all, 125, 20), 5);
+    }
+
+    #[test]
+    fn a_socket_that_nobody_holds_any_more_is_told_as_closed_and_not_asked_for_again() {
+        let mut observer = Observer::new(Settings::default());
+        let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
+        let met = sockets(&[1, 2], 0);
+        let owners = BTreeMap::from([(1, owner(0)), (2, owner(0))]);
+        all.take_in(owners, &met, &mut observer);
+        all.take_in(BTreeMap::from([(2, owner(0))]), &met, &mut observer);
+        let questions = |all: &Sockets, cookie| all.known.get(&cookie).unwrap().questions;
+        assert_eq!(questions(&all, 1), MOST_QUESTIONS);
+        assert!(all.known.get(&1).unwrap().owner.is_none());
+        assert_eq!(questions(&all, 2), 2);
+        all.forget(&sockets(&[2], 0), &mut observer);
+        assert_eq!(all.known.len(), 1);
+    }
+}
