@@ -16,12 +16,13 @@ use std::fs::File;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
 use std::os::fd::{AsRawFd as _, FromRawFd as _, OwnedFd};
 use std::process::Command;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 
 use forged::frames::Wire;
 use forged::{Carrier as _, SAMPLES_WRITER, Talker};
-use harness::cgroup::Cgroup;
+use harness::cgroup::{self, Cgroup};
 use harness::loss::Loss;
 use harness::network::{INTERFACE, Link, Namespace};
 use harness::{PREFIX, run};
@@ -43,11 +44,15 @@ struct Observed {
 
 impl Observed {
     fn new() -> Observed {
+        Observed::with(&FilterSettings::default())
+    }
+
+    fn with(settings: &FilterSettings) -> Observed {
         harness::require().unwrap();
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let name = format!("{PREFIX}-{}-inside{number}", std::process::id());
         let cgroup = Cgroup::create(&name).unwrap();
-        let mut filter = Filter::load_host(&FilterSettings::default()).unwrap();
+        let mut filter = Filter::load_host(settings).unwrap();
         filter.attach(&File::open(cgroup.path()).unwrap()).unwrap();
         filter.look_inside(false);
         Observed { filter, cgroup }
@@ -309,6 +314,35 @@ fn without_its_first_fragment_a_datagram_is_counted_once_and_cannot_be_named() {
 }
 
 #[test]
+fn one_that_too_many_others_have_overtaken_is_named_when_it_is_given_up() {
+    static HELD: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
+    let mut observed = Observed::new();
+    let link = Link::new().unwrap();
+    hurry(&link.monitor);
+    let limit = || std::fs::write("/proc/sys/net/ipv4/ipfrag_max_dist", "2").unwrap();
+    netns::within(&forged::path(&link.monitor), limit).unwrap();
+    let (mut talker, writer) = talker(8);
+    observed
+        .filter
+        .set_interest(writer, Some(Verdict::Meter))
+        .unwrap();
+    let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
+    wire.shuffle = |packets| *HELD.lock().unwrap() = packets.split_off(2);
+    wire.carry(&talker.sample(20_000)).unwrap();
+    wire.shuffle = |packets| packets.truncate(1);
+    for _ in 2..=6 {
+        wire.carry(&talker.sample(20_000)).unwrap();
+    }
+    wire.shuffle = |packets| *packets = HELD.lock().unwrap().drain(..).collect();
+    wire.carry(&talker.sample(20_000)).unwrap();
+    let at_once = observed.records(writer, SETTLED);
+    assert_eq!(told(&at_once), Told::from([(1, 0)]));
+    let later = observed.records(writer, GIVEN_UP);
+    assert_eq!(told(&later), (2..=6).map(|number| (number, 0)).collect());
+    assert_eq!(at_once.len() + later.len(), 6);
+}
+
+#[test]
 fn over_ipv6_it_is_named_likewise() {
     let mut observed = Observed::new();
     let link = Link::new().unwrap();
@@ -491,6 +525,47 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
         let owner = &observed.owners(cookie(&receiver))[&cookie(&receiver)];
         assert_eq!(owner.drops.map(u64::from), Some(errors));
     }
+}
+
+#[test]
+fn without_the_kernels_types_full_sockets_are_told_as_long_as_every_socket_is_seen() {
+    let settings = FilterSettings {
+        kernel_types: false,
+        ..FilterSettings::default()
+    };
+    let one_cgroup = Observed::with(&settings);
+    let abilities = one_cgroup.filter.inside().unwrap().abilities();
+    let reason = abilities.socket_losses.clone().unwrap_err();
+    assert!(reason.contains("only one cgroup"), "{reason}");
+    assert!(abilities.owners.is_err() && abilities.reassembly_losses.is_err());
+
+    let mut filter = Filter::load_host(&settings).unwrap();
+    let all = File::open(cgroup::hierarchy().unwrap()).unwrap();
+    filter.attach(&all).unwrap();
+    filter.look_inside(true);
+    let (mut talker, writer) = talker(9);
+    filter.set_interest(writer, Some(Verdict::Meter)).unwrap();
+    let host = Namespace::alone().unwrap();
+    let receiver = one_cgroup.socket(&host, "127.0.0.1:7411");
+    set(&receiver, libc::SO_RCVBUF, 32 * 1024);
+    let mut sender = forged::Sender::new(&host, "127.0.0.1:0", "127.0.0.1:7411").unwrap();
+    let mut sent = Told::new();
+    for _ in 0..100 {
+        let message = talker.sample(1_000);
+        sent.extend(samples(&message));
+        sender.carry(&message).unwrap();
+    }
+    std::thread::sleep(SETTLED);
+    let missing: Told = sent.difference(&read_all(&receiver)).copied().collect();
+    assert!(!missing.is_empty() && missing.len() < sent.len());
+    let records = std::iter::from_fn(|| filter.next_record());
+    let refused: Vec<_> = records
+        .filter(|record| record.writer() == writer && record.flags & flag::NO_ROOM != 0)
+        .collect();
+    assert_eq!(
+        (told(&refused), refused.len()),
+        (missing.clone(), missing.len())
+    );
 }
 
 #[test]

@@ -73,6 +73,9 @@ pub struct FilterSettings {
     pub piece_ring_bytes: u32,
     /// Whether to look at interfaces that [`Filter::accept_interface`] has not been told about.
     pub accept_new_interfaces: bool,
+    /// Host hook: whether to ask the kernel for its types. Without them it is as on a kernel that
+    /// does not tell.
+    pub kernel_types: bool,
 }
 
 impl Default for FilterSettings {
@@ -81,6 +84,7 @@ impl Default for FilterSettings {
             record_ring_bytes: 512 * 1024,
             piece_ring_bytes: 1024 * 1024,
             accept_new_interfaces: true,
+            kernel_types: true,
         }
     }
 }

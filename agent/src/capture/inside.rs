@@ -85,10 +85,16 @@ impl Places {
     pub fn look_up() -> Self {
         match KernelTypes::read() {
             Ok(types) => Self::of(&types),
-            Err(error) => Self {
-                array: [Layout::ABSENT; Layout::COUNT],
-                unknown: Some(chain(&error)),
-            },
+            Err(error) => Self::unknown(chain(&error)),
+        }
+    }
+
+    /// None are known, for this reason.
+    #[must_use]
+    pub const fn unknown(reason: String) -> Self {
+        Self {
+            array: [Layout::ABSENT; Layout::COUNT],
+            unknown: Some(reason),
         }
     }
 
@@ -238,4 +244,38 @@ fn chain(error: &dyn Error) -> String {
         cause = error.source();
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_place_has_its_name_once() {
+        for index in 0..Layout::COUNT {
+            let named = TABLE
+                .iter()
+                .filter(|(place, _, _)| *place as usize == index);
+            assert_eq!(named.count(), 1, "{index}");
+        }
+    }
+
+    #[test]
+    fn a_reason_names_what_the_kernel_does_not_have() {
+        let mut places = Places {
+            array: [7; Layout::COUNT],
+            unknown: None,
+        };
+        let needed = [Layout::BufferHead, Layout::ReasonTimeout];
+        assert_eq!(places.need(&needed), Ok(()));
+        places.array[Layout::ReasonTimeout as usize] = Layout::ABSENT;
+        let reason = places.need(&needed).unwrap_err();
+        assert_eq!(
+            reason,
+            "this kernel has no skb_drop_reason SKB_DROP_REASON_FRAG_REASM_TIMEOUT"
+        );
+        assert_eq!(places.need(&[Layout::BufferHead]), Ok(()));
+        let unknown = Places::unknown("no types".to_owned());
+        assert_eq!(unknown.need(&needed), Err("no types".to_owned()));
+    }
 }

@@ -61,7 +61,11 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses them.
     pub fn load_host(settings: &FilterSettings) -> Result<Self, FilterError> {
         let pieces = ring_size(settings.piece_ring_bytes);
-        let places = Places::look_up();
+        let places = if settings.kernel_types {
+            Places::look_up()
+        } else {
+            Places::unknown("the kernel was not asked for its types".to_owned())
+        };
         let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
         let mut ebpf = open(settings, true, &sizes, Some(&places))?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
