@@ -42,6 +42,7 @@ pub extern "C" fn look(skb: *mut __sk_buff, at: u32) -> u32 {
     if incoming && let Some(last) = last() {
         last.socket = 0;
         last.token = 0;
+        last.told = 0;
     }
     let (first, end) = if incoming {
         (0, OUTGOING_SLOT)
@@ -98,6 +99,8 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         last.token = token;
         last.slot = slot;
         last.captured = u32::from(capture);
+        // What the program knows as its context is the packet itself.
+        last.buffer = skb as u64;
     }
     if capture {
         scratch.count = 0;

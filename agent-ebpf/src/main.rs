@@ -70,6 +70,21 @@ pub fn no_room(context: RawTracePointContext) -> u32 {
     0
 }
 
+/// For every packet that the kernel throws away, with the reason; attached where [`no_room`] is not
+/// told of IPv6.
+#[raw_tracepoint]
+pub fn no_room_freed(context: RawTracePointContext) -> u32 {
+    no_room::freed(&context);
+    0
+}
+
+/// As [`no_room_freed`], where the kernel tells no reason.
+#[raw_tracepoint]
+pub fn no_room_unexplained(context: RawTracePointContext) -> u32 {
+    no_room::unexplained(&context);
+    0
+}
+
 /// For every packet that the kernel throws away, with the reason; attached where it tells one.
 #[raw_tracepoint]
 pub fn not_reassembled(context: RawTracePointContext) -> u32 {

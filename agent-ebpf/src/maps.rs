@@ -237,6 +237,11 @@ pub struct Last {
     pub slot: u32,
     /// 1 = captured, then there are no records.
     pub captured: u32,
+    pub unused: u32,
+    /// Address of the kernel's packet, by which its end is known.
+    pub buffer: u64,
+    /// The socket of which it has been told that it had no room.
+    pub told: u64,
 }
 
 /// A piece with room for the longest.

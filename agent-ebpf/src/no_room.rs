@@ -4,8 +4,11 @@
 //! datagram and left what it found. So nothing is parsed here, and it works alike on every kernel.
 //! Where the kernel's types are known, the socket is compared: a datagram that the hook has not seen
 //! (another kind of traffic, a socket outside the hook's cgroup) is never taken for another.
+//!
+//! Before Linux 6.6 the kernel tells of it for IPv4 only. There the end of the packet itself is
+//! looked at: the one that the hook has just seen is thrown away.
 
-use aya_ebpf::programs::RawTracePointContext;
+use aya_ebpf::{helpers::bpf_ktime_get_ns, programs::RawTracePointContext};
 use ros2probe_wire::{
     filter::Counter,
     host::Layout,
@@ -14,9 +17,13 @@ use ros2probe_wire::{
 
 use crate::{
     inside::{member, place},
-    maps::{RECORDS_PER_DATAGRAM, SOCKETS, add, count, last, scratch},
+    maps::{Last, RECORDS_PER_DATAGRAM, SOCKETS, add, count, last, scratch},
     verdict::write,
 };
+
+/// A packet that is thrown away later than this after the hook has seen it has been in the socket's
+/// buffer, or is another one in the same place.
+const AT_ONCE_NANOSECONDS: u64 = 2_000_000;
 
 /// `udp_fail_queue_rcv_skb(rc, sk)`.
 #[inline(always)]
@@ -28,18 +35,74 @@ pub fn refused(context: &RawTracePointContext) {
         let sk: u64 = context.arg(1);
         socket = member(sk, Layout::SocketCookie).unwrap_or(0);
     }
+    if seen == 0 {
+        // Not RTPS, or told already.
+        if last.told != socket {
+            refusal(socket);
+        }
+        return;
+    }
+    refusal(socket);
+    if seen == socket {
+        tell(last);
+    } else {
+        count(Counter::NoRoomUnseen, 1);
+    }
+}
+
+/// `kfree_skb(skb, location, reason)`.
+#[inline(always)]
+pub fn freed(context: &RawTracePointContext) {
+    let reason: u64 = context.arg(2);
+    let reason = reason as u32;
+    if reason != place(Layout::ReasonBufferFull) && reason != place(Layout::ReasonMemory) {
+        return;
+    }
+    let buffer: u64 = context.arg(0);
+    if let Some(last) = seen(buffer) {
+        end(last);
+    }
+}
+
+/// `kfree_skb(skb, location)`. That it is thrown away at once is all that there is to know.
+#[inline(always)]
+pub fn unexplained(context: &RawTracePointContext) {
+    let buffer: u64 = context.arg(0);
+    let Some(last) = seen(buffer) else { return };
+    let Some(scratch) = scratch(last.slot) else {
+        return;
+    };
+    // SAFETY: no preconditions.
+    let age = unsafe { bpf_ktime_get_ns() }.wrapping_sub(scratch.walk.record.time);
+    if age < AT_ONCE_NANOSECONDS {
+        end(last);
+    }
+}
+
+/// The hook's last datagram, if this is it and nothing has been told of its end.
+#[inline(always)]
+fn seen(buffer: u64) -> Option<&'static mut Last> {
+    last().filter(|last| last.socket != 0 && last.buffer == buffer)
+}
+
+#[inline(always)]
+fn end(last: &mut Last) {
+    refusal(last.socket);
+    last.told = last.socket;
+    tell(last);
+}
+
+/// Counts for a known socket.
+#[inline(always)]
+fn refusal(socket: u64) {
     if let Some(known) = SOCKETS.get_ptr_mut(&socket) {
         // SAFETY: a map value pointer checked against null.
         add(unsafe { &raw mut (*known).no_room }, 1);
     }
-    if seen == 0 {
-        // Not RTPS.
-        return;
-    }
-    if seen != socket {
-        count(Counter::NoRoomUnseen, 1);
-        return;
-    }
+}
+
+#[inline(always)]
+fn tell(last: &mut Last) {
     last.socket = 0;
     count(Counter::NoRoom, 1);
     undelivered(last.slot, last.token, last.captured);

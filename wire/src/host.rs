@@ -98,6 +98,10 @@ pub enum Layout {
     BufferNetworkHeader,
     /// `sk_buff.skb_iif`: the interface it came in on.
     BufferInterface,
+    /// `SKB_DROP_REASON_SOCKET_RCVBUFF`.
+    ReasonBufferFull,
+    /// `SKB_DROP_REASON_PROTO_MEM`.
+    ReasonMemory,
     /// `SKB_DROP_REASON_FRAG_REASM_TIMEOUT`.
     ReasonTimeout,
     /// `SKB_DROP_REASON_FRAG_TOO_FAR`.

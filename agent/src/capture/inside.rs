@@ -37,12 +37,21 @@ pub struct Places {
 /// The enumeration of reasons why a packet is thrown away: Linux 5.17; what is asked of it: 6.2.
 const REASONS: &str = "skb_drop_reason";
 
+/// From this release on the kernel tells of datagrams over IPv6 that a socket had no room for.
+const TELLS_IPV6: (u32, u32) = (6, 6);
+
 /// What each place is called: a structure's member, its size where there is none, or an enumerator.
 const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::BufferHead, "sk_buff", "head"),
     (Layout::BufferTail, "sk_buff", "tail"),
     (Layout::BufferNetworkHeader, "sk_buff", "network_header"),
     (Layout::BufferInterface, "sk_buff", "skb_iif"),
+    (
+        Layout::ReasonBufferFull,
+        REASONS,
+        "SKB_DROP_REASON_SOCKET_RCVBUFF",
+    ),
+    (Layout::ReasonMemory, REASONS, "SKB_DROP_REASON_PROTO_MEM"),
     (
         Layout::ReasonTimeout,
         REASONS,
@@ -142,9 +151,9 @@ impl Inside {
     #[must_use]
     pub fn attach(ebpf: &mut Ebpf, places: &Places, whole_host: bool) -> Self {
         let mut links = Vec::new();
-        let mut keep = |link| links.push(link);
-        let socket_losses = socket_losses(ebpf, places, whole_host).map(&mut keep);
-        let reassembly_losses = reassembly_losses(ebpf, places).map(&mut keep);
+        let socket_losses =
+            socket_losses(ebpf, places, whole_host).map(|mut more| links.append(&mut more));
+        let reassembly_losses = reassembly_losses(ebpf, places).map(|link| links.push(link));
         let owners = owners(ebpf, places);
         Self {
             abilities: Abilities {
@@ -174,12 +183,29 @@ fn socket_losses(
     ebpf: &mut Ebpf,
     places: &Places,
     whole_host: bool,
-) -> Result<RawTracePointLink, String> {
+) -> Result<Vec<RawTracePointLink>, String> {
     if !whole_host && let Err(reason) = places.need(&[Layout::SocketCookie]) {
         // A socket that the hook does not see could be taken for one that it does.
         return Err(format!("only one cgroup is looked at, and {reason}"));
     }
-    tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")
+    let mut links = vec![tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")?];
+    if !release().is_some_and(|release| release >= TELLS_IPV6) {
+        let reasons = [Layout::ReasonBufferFull, Layout::ReasonMemory];
+        let program = if places.need(&reasons).is_ok() {
+            "no_room_freed"
+        } else {
+            "no_room_unexplained"
+        };
+        links.push(tracepoint(ebpf, program, "kfree_skb")?);
+    }
+    Ok(links)
+}
+
+/// The kernel's major and minor version.
+fn release() -> Option<(u32, u32)> {
+    let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").ok()?;
+    let mut parts = release.split(['.', '-', '+']);
+    Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))
 }
 
 fn reassembly_losses(ebpf: &mut Ebpf, places: &Places) -> Result<RawTracePointLink, String> {
