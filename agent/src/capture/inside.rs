@@ -189,7 +189,7 @@ fn socket_losses(
         return Err(format!("only one cgroup is looked at, and {reason}"));
     }
     let mut links = vec![tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")?];
-    if !release().is_some_and(|release| release >= TELLS_IPV6) {
+    if release().is_none_or(|release| release < TELLS_IPV6) {
         let reasons = [Layout::ReasonBufferFull, Layout::ReasonMemory];
         let program = if places.need(&reasons).is_ok() {
             "no_room_freed"
