@@ -11,7 +11,7 @@ mod graveyard;
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 
-use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
+use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -63,6 +63,14 @@ pub enum Change {
     Gone(Guid, Box<Endpoint>),
 }
 
+/// An endpoint that came before its participant.
+#[derive(Debug)]
+struct PendingEndpoint {
+    at: Timestamp,
+    tells_readers: bool,
+    announcement: Box<EndpointAnnouncement>,
+}
+
 /// Samples of `ros_discovery_info` that came before their participant.
 #[derive(Debug)]
 struct PendingNodes {
@@ -78,7 +86,7 @@ pub struct Discovery {
     caps: Caps,
     participants: HashMap<GuidPrefix, Participant>,
     endpoints: HashMap<Guid, Endpoint>,
-    pending_endpoints: VecDeque<(Timestamp, Box<EndpointAnnouncement>)>,
+    pending_endpoints: VecDeque<PendingEndpoint>,
     pending_nodes: HashMap<GuidPrefix, PendingNodes>,
     graveyard: Graveyard,
     node_count: usize,
@@ -205,6 +213,7 @@ impl Discovery {
                 last_seen: origin.at,
                 endpoints: BTreeSet::new(),
                 nodes: Vec::new(),
+                readers_told: false,
                 domain_source: source,
                 nodes_from: None,
             },
@@ -245,26 +254,31 @@ impl Discovery {
         if self.graveyard.is_stale(announcement.guid, origin) {
             return;
         }
-        if self.participants.contains_key(&announcement.guid.prefix) {
+        let tells_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
+        if let Some(participant) = self.participants.get_mut(&announcement.guid.prefix) {
+            participant.readers_told |= tells_readers;
             self.admit(announcement, origin.at, journal);
             return;
         }
         let guid = announcement.guid;
         self.pending_endpoints
-            .retain(|(_, pending)| pending.guid != guid);
+            .retain(|pending| pending.announcement.guid != guid);
         if self.pending_endpoints.len() >= PENDING {
             self.pending_endpoints.pop_front();
             self.evictions.endpoints += 1;
         }
-        self.pending_endpoints
-            .push_back((origin.at, Box::new(announcement)));
+        self.pending_endpoints.push_back(PendingEndpoint {
+            at: origin.at,
+            tells_readers,
+            announcement: Box::new(announcement),
+        });
     }
 
     /// SEDP: an endpoint says goodbye.
     pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
         self.graveyard.bury(guid, origin);
         self.pending_endpoints
-            .retain(|(_, pending)| pending.guid != guid);
+            .retain(|pending| pending.announcement.guid != guid);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.remove(&guid);
         }
@@ -354,7 +368,7 @@ impl Discovery {
         while self
             .pending_endpoints
             .front()
-            .is_some_and(|(at, _)| !fresh(*at))
+            .is_some_and(|pending| !fresh(pending.at))
         {
             self.pending_endpoints.pop_front();
         }
@@ -431,11 +445,14 @@ impl Discovery {
     fn adopt_pending(&mut self, prefix: GuidPrefix, at: Timestamp, journal: &mut Journal) {
         let (adopted, waiting) = std::mem::take(&mut self.pending_endpoints)
             .into_iter()
-            .partition(|(_, pending)| pending.guid.prefix == prefix);
+            .partition(|pending| pending.announcement.guid.prefix == prefix);
         self.pending_endpoints = waiting;
-        let adopted: VecDeque<(Timestamp, Box<EndpointAnnouncement>)> = adopted;
-        for (_, announcement) in adopted {
-            self.admit(*announcement, at, journal);
+        let adopted: VecDeque<PendingEndpoint> = adopted;
+        for pending in adopted {
+            if let Some(participant) = self.participants.get_mut(&prefix) {
+                participant.readers_told |= pending.tells_readers;
+            }
+            self.admit(*pending.announcement, at, journal);
         }
         if let Some(pending) = self.pending_nodes.remove(&prefix) {
             let PendingNodes {
@@ -509,7 +526,7 @@ impl Discovery {
     ) {
         self.pending_nodes.remove(&prefix);
         self.pending_endpoints
-            .retain(|(_, pending)| pending.guid.prefix != prefix);
+            .retain(|pending| pending.announcement.guid.prefix != prefix);
         let Some(participant) = self.participants.remove(&prefix) else {
             return;
         };

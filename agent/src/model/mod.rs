@@ -1,8 +1,13 @@
 //! The core: a plain state machine. Time and bytes in, facts out; no I/O, no clock, no thread.
 
+pub mod acknowledgement;
 pub mod ahead;
+pub mod cancelled;
 pub mod cause;
 pub mod churn;
+pub mod deaths;
+pub mod delivery;
+pub mod departures;
 pub mod discovery;
 pub mod expectation;
 pub mod header;
@@ -14,11 +19,15 @@ pub mod pieces;
 pub mod profiler;
 pub mod rate;
 pub mod reassembly;
+pub mod receivers;
 pub mod reception;
 mod report;
 pub mod samples;
 pub mod sequence;
 pub mod snapshot;
 pub mod sockets;
+pub mod subscribers;
 pub mod topic;
+pub mod way;
+pub mod ways;
 pub mod writer;

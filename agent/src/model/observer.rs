@@ -26,9 +26,10 @@ use super::journal::Journal;
 use super::pieces::Pieces;
 use super::profiler::Profiler;
 use super::rate::Slot;
+use super::receivers::{Around, Receivers};
 use super::snapshot::{Snapshot, SocketFacts};
-use super::sockets::Sockets;
 use super::topic::{Naming, TopicId, Topics, Watched};
+use super::way::Place;
 use super::writer::Traits;
 use crate::config::{Limits, Watchlist};
 
@@ -91,6 +92,17 @@ impl Settings {
     }
 }
 
+/// What deliveries are seen against. Borrows these fields alone, which a method could not.
+macro_rules! around {
+    ($observer:expr) => {
+        Around {
+            receivers: &$observer.receivers,
+            discovery: &$observer.discovery,
+            topics: &$observer.topics,
+        }
+    };
+}
+
 /// The core.
 #[derive(Debug)]
 pub struct Observer {
@@ -101,7 +113,7 @@ pub struct Observer {
     pub(super) interest: Interest,
     pub(super) profiler: Profiler,
     pub(super) pieces: Pieces,
-    pub(super) sockets: Sockets,
+    pub(super) receivers: Receivers,
     pub(super) decode_errors: BTreeMap<(&'static str, &'static str), u64>,
     pub(super) datagrams: u64,
     pub(super) records: u64,
@@ -125,9 +137,13 @@ impl Observer {
             discovery: Discovery::new(caps),
             topics: Topics::default(),
             interest: Interest::new(settings.interest),
-            profiler: Profiler::new(settings.unknown_writers, settings.sample_bytes),
+            profiler: Profiler::new(
+                settings.unknown_writers,
+                settings.sample_bytes,
+                settings.deliveries,
+            ),
             pieces: Pieces::default(),
-            sockets: Sockets::new(settings.deliveries),
+            receivers: Receivers::new(settings.deliveries),
             decode_errors: BTreeMap::new(),
             datagrams: 0,
             records: 0,
@@ -210,17 +226,18 @@ impl Observer {
 
     /// Nothing more will come: decides what is still open, without letting time pass.
     pub fn settle(&mut self) {
-        self.profiler.settle(self.clock, &mut self.journal);
+        let around = around!(self);
+        self.profiler.settle(self.clock, &mut self.journal, around);
     }
 
     /// Says what is known of a socket, again whenever that changes.
     pub fn socket(&mut self, facts: SocketFacts) {
-        self.sockets.put(facts);
+        self.receivers.socket(facts);
     }
 
     /// This socket was closed.
     pub fn socket_closed(&mut self, cookie: u64) {
-        self.sockets.remove(cookie);
+        self.receivers.socket_closed(cookie);
     }
 
     /// What the kernel filter has to be told since the last call; `None` = remove the entry.
@@ -256,17 +273,23 @@ impl Observer {
         } else {
             self.discovery.seen(writer.prefix, at);
         }
-        if writer.entity.is_builtin() || record.kind == kind::HANDOVER {
+        if record.kind == kind::HANDOVER || record.kind == kind::UNDELIVERED {
             return;
         }
-        if self.profiler.record(writer, record, &mut self.journal) {
+        self.receivers.learn(record);
+        if writer.entity.is_builtin() {
+            return;
+        }
+        let around = around!(self);
+        let journal = &mut self.journal;
+        if self.profiler.record(writer, record, journal, around) {
             return;
         }
         let is_strange = writer.entity.is_writer()
             && !self.discovery.endpoints().contains_key(&writer)
             && !self.discovery.was_buried(writer, at);
         if is_strange {
-            self.profiler.stranger(writer, record, &mut self.journal);
+            self.profiler.stranger(writer, record, journal, around);
         }
     }
 
@@ -379,6 +402,12 @@ impl Observer {
             discovery::Discovery::Alive(announcement) => {
                 self.discovery
                     .participant(&announcement, origin, &mut self.journal);
+                let unicast = announcement
+                    .default_unicast
+                    .iter()
+                    .chain(&announcement.metatraffic_unicast);
+                let places = unicast.filter_map(|locator| locator.udp().map(Place::from));
+                self.receivers.announce(announcement.guid.prefix, places);
             }
             discovery::Discovery::Gone { guid, .. } => {
                 self.discovery
@@ -430,6 +459,7 @@ impl Observer {
     /// Lets topics, interest and measurement follow discovery.
     fn follow_up(&mut self, now: Timestamp) {
         for change in self.discovery.changes() {
+            self.receivers.changed();
             match change {
                 Change::Appeared(guid) => self.appeared(guid, now),
                 Change::Changed(guid) => {
@@ -533,18 +563,20 @@ impl Observer {
 
     /// Measures this writer no more; its topic keeps what it had counted.
     fn retire(&mut self, guid: Guid, now: Timestamp) {
-        let Some((id, measurement)) = self.profiler.stop(guid, now, &mut self.journal) else {
+        let around = around!(self);
+        let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, around) else {
             return;
         };
-        if let Some(topic) = self.topics.get_mut(id) {
-            topic.retire(&measurement);
+        if let Some(topic) = self.topics.get_mut(retired.topic) {
+            topic.retire(&retired.measurement, retired.totals.as_ref());
         }
     }
 
     fn tick(&mut self, now: Timestamp) {
         self.discovery.advance(now, &mut self.journal);
         self.follow_up(now);
-        let strangers = self.profiler.advance(now, &mut self.journal);
+        let around = around!(self);
+        let strangers = self.profiler.advance(now, &mut self.journal, around);
         for guid in strangers.metered {
             self.interest.set(guid, Verdict::Meter);
         }
@@ -553,6 +585,7 @@ impl Observer {
         }
         if now.0.is_multiple_of(SECOND) {
             self.topics.expire(now, self.settings.topic_grace);
+            self.receivers.tidy(&self.discovery);
             self.promote();
             self.judge(now);
         }

@@ -6,12 +6,15 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::record::kind;
+use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, Timestamp};
 
+use super::delivery::Totals;
 use super::journal::Journal;
+use super::receivers::Around;
 use super::samples::Budget;
 use super::snapshot::Measurement;
+use super::subscribers::{Room, Stage, Subscribers};
 use super::topic::TopicId;
 use super::writer::{Scene, Traits, Writer};
 
@@ -25,12 +28,19 @@ const DOUBTFUL: u64 = 3 * SECOND;
 const SOMEBODY: u64 = 10;
 /// Strangers may use this part of the memory for fragmented samples.
 const STRANGERS_SHARE: usize = 4;
+/// Deliveries that make room for new ones: silent for so long, so many at once.
+const SILENT: u64 = 10 * SECOND;
+const GIVEN_UP: usize = 64;
+/// Records of what did not arrive: nothing that was sent.
+const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
 
 /// One measured writer.
 #[derive(Debug)]
 pub struct Measured {
     /// What is measured.
     pub writer: Box<Writer>,
+    /// Who gets its samples; only of a writer of a topic.
+    pub subscribers: Option<Box<Subscribers>>,
     /// Its topic; `None` for a stranger.
     pub topic: Option<TopicId>,
     /// First record or announcement.
@@ -51,7 +61,20 @@ pub struct Profiler {
     stranger_evictions: u64,
     budget: Budget,
     strangers_budget: Budget,
+    deliveries_budget: Budget,
+    room: Room,
     search_after: Timestamp,
+}
+
+/// What had been counted of a writer that is measured no more.
+#[derive(Debug)]
+pub struct Retired {
+    /// Its topic.
+    pub topic: TopicId,
+    /// What was measured of it.
+    pub measurement: Measurement,
+    /// What became of its samples.
+    pub totals: Option<Totals>,
 }
 
 /// What became of the strangers.
@@ -66,7 +89,7 @@ pub struct Strangers {
 impl Profiler {
     /// Nobody measured.
     #[must_use]
-    pub fn new(stranger_limit: usize, sample_bytes: usize) -> Self {
+    pub fn new(stranger_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
         Self {
             writers: HashMap::new(),
             strangers: 0,
@@ -74,6 +97,13 @@ impl Profiler {
             stranger_evictions: 0,
             budget: Budget::new(sample_bytes),
             strangers_budget: Budget::new(sample_bytes / STRANGERS_SHARE),
+            deliveries_budget: Budget::new(sample_bytes),
+            room: Room {
+                used: 0,
+                limit: deliveries,
+                evictions: 0,
+                wanted: false,
+            },
             search_after: Timestamp(0),
         }
     }
@@ -101,14 +131,30 @@ impl Profiler {
         )
     }
 
-    /// Memory for fragmented samples, of writers of topics and of strangers.
+    /// Memory for fragmented samples: of writers of topics, of strangers, and of deliveries.
     #[must_use]
-    pub const fn budgets(&self) -> [&Budget; 2] {
-        [&self.budget, &self.strangers_budget]
+    pub const fn budgets(&self) -> [&Budget; 3] {
+        [
+            &self.budget,
+            &self.strangers_budget,
+            &self.deliveries_budget,
+        ]
+    }
+
+    /// Room for deliveries.
+    #[must_use]
+    pub const fn room(&self) -> &Room {
+        &self.room
     }
 
     /// Takes in a record of a measured writer; `false` if it is of another.
-    pub fn record(&mut self, guid: Guid, record: &Record, journal: &mut Journal) -> bool {
+    pub fn record(
+        &mut self,
+        guid: Guid,
+        record: &Record,
+        journal: &mut Journal,
+        around: Around<'_>,
+    ) -> bool {
         let Some(measured) = self.writers.get_mut(&guid) else {
             return false;
         };
@@ -122,6 +168,25 @@ impl Profiler {
             Some(_) => &mut self.budget,
             None => &mut self.strangers_budget,
         };
+        let mut came_again = false;
+        if measured.topic.is_some() {
+            let mut stage = Stage {
+                now,
+                writer: guid,
+                reliable: measured.writer.traits().reliable,
+                topic: measured.topic,
+                budget: &mut self.deliveries_budget,
+                journal,
+                room: &mut self.room,
+                around,
+            };
+            let subscribers = measured.subscribers.get_or_insert_default();
+            came_again = subscribers.record(record, &mut stage);
+        }
+        if record.flags & UNDELIVERED != 0 {
+            return true;
+        }
+        let next = measured.writer.next();
         measured.writer.record(
             record,
             measured.opened,
@@ -131,16 +196,31 @@ impl Profiler {
                 journal,
             },
         );
+        if came_again && record.flags & flag::HOST != 0 {
+            measured.writer.came_again();
+        }
+        if let Some(subscribers) = &mut measured.subscribers
+            && measured.writer.next() > next
+        {
+            subscribers.wrote(measured.writer.next() - 1, now);
+        }
         true
     }
 
     /// Takes in a record of a writer nobody announced.
-    pub fn stranger(&mut self, guid: Guid, record: &Record, journal: &mut Journal) {
-        if !matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
+    pub fn stranger(
+        &mut self,
+        guid: Guid,
+        record: &Record,
+        journal: &mut Journal,
+        around: Around<'_>,
+    ) {
+        let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
+        if !is_sample || record.flags & UNDELIVERED != 0 {
             return;
         }
         let now = Timestamp(record.time);
-        if self.strangers >= self.stranger_limit && !self.make_room(now) {
+        if self.strangers >= self.stranger_limit && !self.make_room(now, around) {
             self.stranger_evictions += 1;
             return;
         }
@@ -149,7 +229,7 @@ impl Profiler {
             guid,
             Measured::new(Writer::new(guid, Traits::default()), None, now),
         );
-        self.record(guid, record, journal);
+        self.record(guid, record, journal, around);
     }
 
     /// Measures this writer of a topic from now on; what it was measured as a stranger comes along.
@@ -200,7 +280,8 @@ impl Profiler {
         guid: Guid,
         now: Timestamp,
         journal: &mut Journal,
-    ) -> Option<(TopicId, Measurement)> {
+        around: Around<'_>,
+    ) -> Option<Retired> {
         let mut measured = self.writers.remove(&guid)?;
         let budget = match measured.topic {
             Some(_) => &mut self.budget,
@@ -212,11 +293,34 @@ impl Profiler {
             journal,
         });
         self.strangers -= usize::from(measured.topic.is_none());
-        Some((measured.topic?, measured.writer.measurement(now)))
+        let (topic, reliable) = (measured.topic, measured.writer.traits().reliable);
+        let subscribers = measured.subscribers.take();
+        let totals = subscribers.map(|subscribers| {
+            subscribers.stop(&mut Stage {
+                now,
+                writer: guid,
+                reliable,
+                topic,
+                budget: &mut self.deliveries_budget,
+                journal,
+                room: &mut self.room,
+                around,
+            })
+        });
+        Some(Retired {
+            topic: topic?,
+            measurement: measured.writer.measurement(now),
+            totals,
+        })
     }
 
     /// Settles what has waited long enough.
-    pub fn advance(&mut self, now: Timestamp, journal: &mut Journal) -> Strangers {
+    pub fn advance(
+        &mut self,
+        now: Timestamp,
+        journal: &mut Journal,
+        around: Around<'_>,
+    ) -> Strangers {
         let mut strangers = Strangers::default();
         for (guid, measured) in &mut self.writers {
             let budget = match measured.topic {
@@ -229,6 +333,18 @@ impl Profiler {
                 journal,
             });
             if measured.topic.is_some() {
+                if let Some(subscribers) = &mut measured.subscribers {
+                    subscribers.advance(&mut Stage {
+                        now,
+                        writer: *guid,
+                        reliable: measured.writer.traits().reliable,
+                        topic: measured.topic,
+                        budget: &mut self.deliveries_budget,
+                        journal,
+                        room: &mut self.room,
+                        around,
+                    });
+                }
                 continue;
             }
             if measured.last_seen.0.saturating_add(FORGET) <= now.0 {
@@ -241,13 +357,16 @@ impl Profiler {
         strangers.metered.sort_unstable();
         strangers.forgotten.sort_unstable();
         for guid in &strangers.forgotten {
-            self.stop(*guid, now, journal);
+            self.stop(*guid, now, journal, around);
+        }
+        if std::mem::take(&mut self.room.wanted) {
+            self.give_up_silent(now, journal, around);
         }
         strangers
     }
 
     /// Settles everything: nothing more will come.
-    pub fn settle(&mut self, now: Timestamp, journal: &mut Journal) {
+    pub fn settle(&mut self, now: Timestamp, journal: &mut Journal, around: Around<'_>) {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();
         guids.sort_unstable();
         for guid in guids {
@@ -263,13 +382,55 @@ impl Profiler {
                 budget,
                 journal,
             });
+            if let Some(subscribers) = &mut measured.subscribers {
+                subscribers.settle(&mut Stage {
+                    now,
+                    writer: guid,
+                    reliable: measured.writer.traits().reliable,
+                    topic: measured.topic,
+                    budget: &mut self.deliveries_budget,
+                    journal,
+                    room: &mut self.room,
+                    around,
+                });
+            }
             // Who sent twice and was not announced until the end is a stranger.
             measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
         }
     }
 
+    /// Gives up the deliveries that have been silent longest: somebody found no room.
+    fn give_up_silent(&mut self, now: Timestamp, journal: &mut Journal, around: Around<'_>) {
+        let mut silent: Vec<_> = self
+            .writers
+            .iter()
+            .filter_map(|(guid, measured)| Some((guid, measured.subscribers.as_ref()?)))
+            .flat_map(|(guid, subscribers)| subscribers.silent_since().map(|at| (at, *guid)))
+            .filter(|(at, _)| at.0.saturating_add(SILENT) <= now.0)
+            .collect();
+        silent.sort_unstable();
+        for (at, guid) in silent.into_iter().take(GIVEN_UP) {
+            let Some(measured) = self.writers.get_mut(&guid) else {
+                continue;
+            };
+            if let Some(subscribers) = &mut measured.subscribers {
+                let mut stage = Stage {
+                    now,
+                    writer: guid,
+                    reliable: measured.writer.traits().reliable,
+                    topic: measured.topic,
+                    budget: &mut self.deliveries_budget,
+                    journal,
+                    room: &mut self.room,
+                    around,
+                };
+                subscribers.give_up(at, 1, &mut stage);
+            }
+        }
+    }
+
     /// Forgets the stranger that has been silent longest, if it never was anybody.
-    fn make_room(&mut self, now: Timestamp) -> bool {
+    fn make_room(&mut self, now: Timestamp, around: Around<'_>) -> bool {
         if now < self.search_after {
             return false;
         }
@@ -284,7 +445,7 @@ impl Profiler {
             return false;
         };
         self.stranger_evictions += 1;
-        self.stop(guid, now, &mut Journal::default());
+        self.stop(guid, now, &mut Journal::default(), around);
         true
     }
 }
@@ -293,6 +454,7 @@ impl Measured {
     fn new(writer: Writer, topic: Option<TopicId>, now: Timestamp) -> Self {
         Self {
             writer: Box::new(writer),
+            subscribers: None,
             topic,
             first_seen: now,
             last_seen: now,

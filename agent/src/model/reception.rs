@@ -165,6 +165,18 @@ impl Reception {
         });
     }
 
+    /// Nobody is there any more for what has not come since the last sample that came.
+    pub fn close(&mut self, budget: &mut Budget) {
+        let sequence = &mut self.sequence;
+        for number in (sequence.settled()..sequence.next()).rev() {
+            if sequence.has(number) {
+                return;
+            }
+            self.samples.forget(number, budget);
+            sequence.excuse(number, number + 1);
+        }
+    }
+
     /// Decides what has been open for `window` nanoseconds.
     pub fn advance(
         &mut self,

@@ -1,6 +1,8 @@
 //! Turns the core's state into a [`Snapshot`]: sorted copies, nothing computed that was not
 //! settled before.
 
+mod deliveries;
+
 use std::collections::{BTreeSet, HashMap};
 
 use ros2probe_wire::discovery::TypeHash;
@@ -27,7 +29,7 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
             .map(|(_, topic)| self::topic(observer, topic, &nodes, now))
             .collect(),
         unknown_writers: unknown_writers(observer, now),
-        sockets: Vec::new(),
+        sockets: deliveries::sockets(observer),
         watches: watches(observer),
         churn: observer.discovery.churn.facts(),
         decode_errors: decode_errors(observer),
@@ -145,6 +147,7 @@ fn topic(
             .filter_map(|each| each.measurement.as_ref());
         own.for_each(|own| sum.add(own));
     }
+    let totals = deliveries::totals(observer, topic);
     TopicFacts {
         domain_id: topic.domain_id,
         name: topic.naming.name.as_ref().to_owned(),
@@ -156,11 +159,11 @@ fn topic(
         publishers,
         subscriptions,
         measurement,
-        received: None,
-        sent: None,
-        breakdown: None,
-        deliveries: Vec::new(),
-        acknowledgements: Vec::new(),
+        received: totals.seen[0].then(|| Box::new(totals.received)),
+        sent: totals.seen[1].then(|| Box::new(totals.sent)),
+        breakdown: totals.breakdown,
+        deliveries: deliveries::deliveries(observer, topic, nodes),
+        acknowledgements: deliveries::acknowledgements(observer, topic, nodes, now),
         vanished: topic.is_vanished(),
     }
 }
@@ -292,7 +295,13 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     };
     let (writers, unknown, unknown_limit, unknown_evictions) = profiler.size();
     let (interest, interest_limit, interest_evictions) = observer.interest.size();
-    let (sockets, sockets_limit, sockets_evictions) = observer.sockets.size();
+    let (sockets, sockets_limit, sockets_evictions) = observer.receivers.sockets().size();
+    let room = profiler.room();
+    let refused = profiler.iter().filter_map(|(_, measured)| {
+        let subscribers = measured.subscribers.as_ref()?;
+        Some(subscribers.refused())
+    });
+    let refused: u64 = refused.sum();
     let budgets = profiler.budgets();
     let samples: usize = budgets.iter().map(|budget| budget.bytes).sum();
     let samples_limit: usize = budgets.iter().map(|budget| budget.limit).sum();
@@ -329,6 +338,12 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
             samples_evictions + observer.pieces.evictions(),
         ),
         table("interest", interest, interest_limit, interest_evictions),
+        table(
+            "deliveries",
+            room.used,
+            room.limit,
+            room.evictions + refused,
+        ),
         table("sockets", sockets, sockets_limit, sockets_evictions),
     ]
 }

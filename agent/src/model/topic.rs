@@ -11,6 +11,7 @@ use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::{ActionPart, DdsTopic, RosName, TopicKind};
 use ros2probe_wire::{Guid, Timestamp};
 
+use super::delivery::Totals;
 use super::expectation::Judgement;
 use super::snapshot::Measurement;
 use crate::config::Watchlist;
@@ -68,6 +69,8 @@ pub struct Topic {
     pub judgements: Vec<(usize, Judgement)>,
     /// What writers had counted that are measured no more.
     pub retired: Option<Box<Measurement>>,
+    /// What had become of their samples.
+    pub retired_totals: Option<Box<Totals>>,
     /// When a reader appeared last.
     pub reader_appeared: Timestamp,
     /// Since when it has been both published and watched.
@@ -176,7 +179,10 @@ impl Topic {
     }
 
     /// Takes over what a writer had counted.
-    pub fn retire(&mut self, measurement: &Measurement) {
+    pub fn retire(&mut self, measurement: &Measurement, totals: Option<&Totals>) {
+        if let Some(totals) = totals {
+            self.retired_totals.get_or_insert_default().add(totals);
+        }
         let retired = self.retired.get_or_insert_default();
         retired.add(measurement);
         // What is gone sends no more.
@@ -376,6 +382,7 @@ impl Topics {
                 watched: Watched::No,
                 judgements: Vec::new(),
                 retired: None,
+                retired_totals: None,
                 reader_appeared: Timestamp(0),
                 published: Timestamp(0),
                 vanished: None,

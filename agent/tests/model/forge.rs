@@ -1,5 +1,7 @@
 //! Writes RTPS messages as real participants do, and as nobody should.
 
+use std::net::SocketAddrV4;
+
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
@@ -116,6 +118,16 @@ fn text(text: &str) -> Vec<u8> {
 
 /// SPDP payload; the domain is left to the port when `None`.
 pub fn participant(prefix: GuidPrefix, lease_seconds: u32, domain_id: Option<u32>) -> Vec<u8> {
+    participant_at(prefix, lease_seconds, domain_id, &[])
+}
+
+/// SPDP payload of a participant that is reached by unicast at these addresses.
+pub fn participant_at(
+    prefix: GuidPrefix,
+    lease_seconds: u32,
+    domain_id: Option<u32>,
+    unicast: &[SocketAddrV4],
+) -> Vec<u8> {
     let guid = Guid::new(prefix, EntityId::PARTICIPANT);
     let mut list = vec![
         (0x15, vec![2, 1]),
@@ -126,6 +138,16 @@ pub fn participant(prefix: GuidPrefix, lease_seconds: u32, domain_id: Option<u32
     ];
     if let Some(domain_id) = domain_id {
         list.push((0x0f, domain_id.to_le_bytes().to_vec()));
+    }
+    for address in unicast {
+        let mut locator = [
+            &1u32.to_le_bytes()[..],
+            &u32::from(address.port()).to_le_bytes(),
+        ]
+        .concat();
+        locator.extend_from_slice(&[0; 12]);
+        locator.extend_from_slice(&address.ip().octets());
+        list.push((0x31, locator));
     }
     encapsulated(&list)
 }

@@ -74,6 +74,8 @@ pub struct Participant {
     pub endpoints: BTreeSet<Guid>,
     /// Its nodes.
     pub nodes: Vec<Node>,
+    /// Its announcements of readers were seen from the first on.
+    pub readers_told: bool,
     pub(super) domain_source: DomainSource,
     /// The `ros_discovery_info` sample that told the nodes.
     pub(super) nodes_from: Option<(Guid, u64)>,

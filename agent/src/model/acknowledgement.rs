@@ -1,0 +1,266 @@
+//! What the readers of one reliable writer acknowledged, and how far behind they are.
+//!
+//! How old the oldest unacknowledged sample is needs the times of samples: the latest are kept
+//! exactly, older ones ever more coarsely, so that a reader that hangs for an hour is told in bounded
+//! memory. Nothing is kept of a writer that nobody acknowledges.
+
+use std::collections::VecDeque;
+
+use ros2probe_wire::record::flag;
+use ros2probe_wire::{Guid, Record, Timestamp};
+
+use super::snapshot::AcknowledgementFacts;
+
+/// Times of samples that are kept of one writer.
+const TIMES: usize = 256;
+/// Readers of one writer.
+const READERS: usize = 512;
+
+/// All readers that acknowledge to one writer.
+#[derive(Debug, Default)]
+pub struct Acknowledgements {
+    /// By GUID.
+    readers: Vec<Reader>,
+    /// Samples and when they were first seen, by number.
+    times: VecDeque<(u64, Timestamp)>,
+    /// Readers for which there was no room.
+    pub refused: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Reader {
+    guid: Guid,
+    /// All below are acknowledged.
+    base: u64,
+    missing: u64,
+    requested: u64,
+    acknacks: u64,
+    last_seen: Timestamp,
+    /// The last one seen leaving, not arriving yet.
+    leaving: Option<[u32; 6]>,
+}
+
+impl Acknowledgements {
+    /// Takes in an ACKNACK.
+    pub fn record(&mut self, record: &Record) {
+        let guid = record.reader();
+        let place = self.readers.binary_search_by_key(&guid, |each| each.guid);
+        let index = match place {
+            Ok(index) => index,
+            Err(_) if self.readers.len() >= READERS => {
+                self.refused += 1;
+                return;
+            }
+            Err(index) => {
+                self.readers.insert(index, Reader::new(guid));
+                index
+            }
+        };
+        if let Some(reader) = self.readers.get_mut(index) {
+            reader.record(record);
+        }
+        self.trim();
+    }
+
+    /// The writer's newest sample is this one.
+    pub fn wrote(&mut self, number: u64, at: Timestamp) {
+        if self.readers.is_empty() {
+            return;
+        }
+        if self.times.back().is_some_and(|(last, _)| *last >= number) {
+            // A writer that began anew.
+            self.times.clear();
+        }
+        if self.times.len() >= TIMES {
+            let mut index = 0;
+            self.times.retain(|_| {
+                index += 1;
+                index % 2 == 1 || index > TIMES / 2
+            });
+        }
+        self.times.push_back((number, at));
+    }
+
+    /// Forgets readers that are no more.
+    pub fn retain(&mut self, is_there: impl Fn(Guid) -> bool) {
+        self.readers.retain(|reader| is_there(reader.guid));
+        if self.readers.is_empty() {
+            self.times = VecDeque::new();
+        }
+    }
+
+    /// How it stands with each reader of `writer`, whose next sample will be `next`.
+    pub fn facts(
+        &self,
+        writer: Guid,
+        next: u64,
+        now: Timestamp,
+    ) -> impl Iterator<Item = AcknowledgementFacts> + '_ {
+        self.readers.iter().map(move |reader| AcknowledgementFacts {
+            writer,
+            reader: reader.guid,
+            node: None,
+            acknowledged: reader.base.saturating_sub(1),
+            missing: reader.missing,
+            requested: reader.requested,
+            acknacks: reader.acknacks,
+            lag_samples: next.saturating_sub(reader.base.max(1)),
+            lag_seconds: self.lag(reader.base.max(1), next, now),
+            last_seen: reader.last_seen,
+        })
+    }
+
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "nanoseconds of a delay stay exact to 104 days"
+    )]
+    fn lag(&self, base: u64, next: u64, now: Timestamp) -> Option<f64> {
+        if base >= next {
+            return Some(0.0);
+        }
+        let after = self.times.partition_point(|(number, _)| *number < base);
+        let (number, at) = self.times.get(after)?;
+        // A sample between two whose times are known was written no earlier than the first.
+        let at = match after
+            .checked_sub(1)
+            .and_then(|before| self.times.get(before))
+        {
+            Some((_, before)) if *number > base => before,
+            None if *number > base => return None,
+            _ => at,
+        };
+        Some(now.nanoseconds_since(*at).max(0) as f64 / 1e9)
+    }
+
+    /// Forgets the times of what everybody acknowledged.
+    fn trim(&mut self) {
+        let Some(base) = self.readers.iter().map(|reader| reader.base).min() else {
+            return;
+        };
+        // One before it tells how old those can be that follow.
+        while let Some((second, _)) = self.times.get(1)
+            && *second < base
+        {
+            self.times.pop_front();
+        }
+    }
+}
+
+impl Reader {
+    const fn new(guid: Guid) -> Self {
+        Self {
+            guid,
+            base: 0,
+            missing: 0,
+            requested: 0,
+            acknacks: 0,
+            last_seen: Timestamp(0),
+            leaving: None,
+        }
+    }
+
+    fn record(&mut self, record: &Record) {
+        self.last_seen = self.last_seen.max(Timestamp(record.time));
+        self.base = record.sequence_number;
+        self.missing = record.bitmap().count() as u64;
+        let content = [
+            record.sequence_number as u32,
+            record.stamp_seconds,
+            record.stamp_nanoseconds,
+            record.fragment_start,
+            record.fragments,
+            record.sample_size,
+        ];
+        // Where both ends are local it is seen leaving, then arriving.
+        let is_leaving = record.flags & flag::OUTGOING != 0;
+        if !is_leaving && self.leaving.take() == Some(content) {
+            return;
+        }
+        self.leaving = is_leaving.then_some(content);
+        self.acknacks += 1;
+        self.requested += self.missing;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::record::{guid_words, kind};
+    use ros2probe_wire::{EntityId, GuidPrefix};
+
+    use super::*;
+
+    fn guid(number: u8) -> Guid {
+        Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, number, 4]))
+    }
+
+    fn acknack(reader: u8, base: u64, bits: u32, bitmap: u32) -> Record {
+        Record {
+            kind: kind::ACKNACK,
+            reader: guid_words(guid(reader)),
+            sequence_number: base,
+            stamp_seconds: bits,
+            stamp_nanoseconds: bitmap,
+            time: 1,
+            ..Record::default()
+        }
+    }
+
+    fn facts(all: &Acknowledgements, next: u64, seconds: u64) -> Vec<AcknowledgementFacts> {
+        let now = Timestamp(seconds * 1_000_000_000);
+        all.facts(guid(9), next, now).collect()
+    }
+
+    #[test]
+    fn a_reader_that_hangs_falls_behind_in_samples_and_in_time() {
+        let mut all = Acknowledgements::default();
+        all.record(&acknack(1, 1, 0, 0));
+        all.record(&acknack(2, 1, 0, 0));
+        for number in 1..=100 {
+            all.wrote(number, Timestamp(number * 1_000_000_000));
+        }
+        all.record(&acknack(2, 101, 0, 0));
+        all.record(&acknack(1, 41, 3, 0b101 << 29));
+        let [hangs, keeps_up] = &facts(&all, 101, 110)[..] else {
+            panic!("two readers")
+        };
+        assert_eq!((hangs.acknowledged, hangs.missing), (40, 2));
+        assert_eq!((hangs.lag_samples, hangs.lag_seconds), (60, Some(69.0)));
+        assert_eq!((keeps_up.acknowledged, keeps_up.missing), (100, 0));
+        assert_eq!((keeps_up.lag_samples, keeps_up.lag_seconds), (0, Some(0.0)));
+    }
+
+    #[test]
+    fn an_hour_of_silence_is_told_in_bounded_memory() {
+        let mut all = Acknowledgements::default();
+        all.record(&acknack(1, 1, 0, 0));
+        for number in 1..=360_000 {
+            all.wrote(number, Timestamp(number * 10_000_000));
+        }
+        assert!(all.times.len() <= TIMES);
+        all.record(&acknack(1, 180_001, 0, 0));
+        let lag = facts(&all, 360_001, 3600)
+            .first()
+            .and_then(|each| each.lag_seconds);
+        assert!(
+            lag.is_some_and(|lag| (1800.0..3700.0).contains(&lag)),
+            "{lag:?}"
+        );
+    }
+
+    #[test]
+    fn an_acknack_that_is_seen_leaving_and_arriving_is_one() {
+        let mut all = Acknowledgements::default();
+        let leaving = Record {
+            flags: flag::OUTGOING,
+            ..acknack(1, 5, 1, 1 << 31)
+        };
+        all.record(&leaving);
+        all.record(&acknack(1, 5, 1, 1 << 31));
+        let [reader] = &facts(&all, 6, 1)[..] else {
+            panic!("one reader")
+        };
+        assert_eq!((reader.acknacks, reader.requested), (1, 1));
+        all.retain(|_| false);
+        assert!(all.readers.is_empty() && all.times.capacity() == 0);
+    }
+}

@@ -1,0 +1,575 @@
+//! What one receiver got of one writer's samples, or what left for one destination.
+//!
+//! A delivery begins with what the receiver saw first; its losses are gaps below the highest number
+//! that it saw or that a HEARTBEAT told it, and samples that left this host for where it listens. So
+//! who joins late or leaves loses nothing. Every loss has one cause; it never goes back on a cause.
+//! What leaves has no losses: what was not sent is nobody's.
+
+use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+
+use super::cancelled::Cancelled;
+use super::cause::LossCause;
+use super::deaths::{Deaths, REASSEMBLY};
+use super::journal::{DeliveryLoss, Journal};
+use super::reception::{Decision, Outcome, Reception, Whole};
+use super::samples::Budget;
+use super::snapshot::{Breakdown, Delivered, Direction};
+use super::way::Way;
+use super::writer::settle_window;
+
+/// Largest UDP payload that fits one Ethernet frame over IPv4: a larger datagram may die in IP
+/// reassembly.
+const ONE_FRAME: u16 = 1472;
+/// Numbers that were missed while nobody listened are excused one by one up to here; beyond, the
+/// delivery begins anew.
+const EXCUSED: u64 = 512;
+/// What left this host and did not arrive is lost if nothing arrives for this long.
+const SILENCE: i64 = 5_000_000_000;
+/// Of what left in that time, what left in the last second may be under way still.
+const UNDER_WAY: u64 = 1_000_000_000;
+/// Numbers that may be told to exist beyond the highest one seen.
+const MAX_AHEAD: u64 = 4096;
+
+/// Who gets the samples.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Receiver {
+    /// A participant, by whatever ways.
+    Participant(GuidPrefix),
+    /// Whoever is at the end of this way.
+    Way(Way),
+}
+
+/// What is counted of all deliveries of a writer.
+#[derive(Clone, Debug, Default)]
+pub struct Totals {
+    /// At receivers.
+    pub received: Delivered,
+    /// On their way out.
+    pub sent: Delivered,
+    /// Where the time went.
+    pub breakdown: Option<Box<Breakdown>>,
+    /// Whether anything arrived, or left.
+    pub seen: [bool; 2],
+}
+
+/// What a record changes besides the delivery itself.
+#[derive(Debug)]
+pub struct Scene<'a> {
+    /// The time of the record, or of the look at the clock.
+    pub now: Timestamp,
+    /// Whose samples.
+    pub writer: Guid,
+    /// It retransmits.
+    pub reliable: bool,
+    /// Memory for fragmented samples.
+    pub budget: &'a mut Budget,
+    /// Where losses are told.
+    pub journal: &'a mut Journal,
+    /// Sums over all deliveries of the writer.
+    pub totals: &'a mut Totals,
+}
+
+/// One delivery.
+#[derive(Debug)]
+pub struct Delivery {
+    receiver: Receiver,
+    /// By which way new samples come.
+    main: Way,
+    reception: Reception,
+    tally: Delivered,
+    cancelled: Cancelled,
+    deaths: Deaths,
+    first_seen: Timestamp,
+    last_seen: Timestamp,
+    /// When a reader appeared for which it is, after what it saw last.
+    opened: Timestamp,
+    /// Since when something has left for here that has not arrived.
+    waiting: Option<Timestamp>,
+    /// What left since then was taken for lost.
+    told: bool,
+    /// Its datagrams may need IP reassembly on this host.
+    reassembled: bool,
+}
+
+impl Delivery {
+    /// Nothing seen yet.
+    #[must_use]
+    pub fn new(receiver: Receiver, main: Way, now: Timestamp) -> Self {
+        Self {
+            receiver,
+            main,
+            reception: Reception::default(),
+            tally: Delivered::default(),
+            cancelled: Cancelled::default(),
+            deaths: Deaths::default(),
+            first_seen: now,
+            last_seen: now,
+            opened: Timestamp(0),
+            waiting: None,
+            told: false,
+            reassembled: false,
+        }
+    }
+
+    /// Who gets the samples.
+    #[must_use]
+    pub const fn receiver(&self) -> Receiver {
+        self.receiver
+    }
+
+    /// The receiver is known better.
+    pub const fn identify(&mut self, prefix: GuidPrefix) {
+        self.receiver = Receiver::Participant(prefix);
+    }
+
+    /// By which way new samples come.
+    #[must_use]
+    pub const fn main(&self) -> Way {
+        self.main
+    }
+
+    /// New samples come another way.
+    pub const fn move_to(&mut self, way: Way) {
+        self.main = way;
+    }
+
+    /// Leaving or arriving.
+    #[must_use]
+    pub const fn direction(&self) -> Direction {
+        self.main.direction
+    }
+
+    /// What became of the samples.
+    #[must_use]
+    pub const fn tally(&self) -> &Delivered {
+        &self.tally
+    }
+
+    /// First and last record.
+    #[must_use]
+    pub const fn seen(&self) -> (Timestamp, Timestamp) {
+        (self.first_seen, self.last_seen)
+    }
+
+    /// One past the highest number known to exist.
+    #[must_use]
+    pub const fn next(&self) -> u64 {
+        self.reception.sequence().next()
+    }
+
+    /// Whether this sample is known to exist, but has not come.
+    #[must_use]
+    pub fn misses(&self, number: u64) -> bool {
+        let sequence = self.reception.sequence();
+        sequence.started()
+            && number >= sequence.first()
+            && number < sequence.next()
+            && !sequence.has(number)
+    }
+
+    /// Whether this sample came.
+    #[must_use]
+    pub fn has(&self, number: u64) -> bool {
+        self.reception.sequence().has(number)
+    }
+
+    /// This sample came another way that may be the same receiver's.
+    pub fn know(&mut self, number: u64) {
+        self.reception.sequence_mut().know(number);
+    }
+
+    /// A reader appeared; what it saw before, if anything, was for another.
+    pub fn open(&mut self, at: Timestamp) {
+        self.opened = self.opened.max(at);
+    }
+
+    /// The last reader is gone: what it has not got since its last sample it did not want.
+    pub fn close(&mut self, budget: &mut Budget) {
+        (self.waiting, self.told) = (None, false);
+        self.reception.close(budget);
+    }
+
+    /// Takes in a DATA or DATA_FRAG; whether it brought nothing new, and what it completed.
+    pub fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+        self.touch(record);
+        (self.waiting, self.told) = (None, false);
+        if self.cancelled.is_empty() {
+            return self.take(record, scene);
+        }
+        let (mut again, mut whole) = (false, None);
+        for part in self.cancelled.delivered(record) {
+            let (came_again, completed) = self.take(&part, scene);
+            again |= came_again;
+            whole = completed.or(whole);
+        }
+        (again, whole)
+    }
+
+    /// Takes in that the socket had no room for this DATA or DATA_FRAG.
+    pub fn no_room(&mut self, record: &Record, scene: &mut Scene<'_>) {
+        self.touch(record);
+        (self.waiting, self.told) = (None, false);
+        if self.cancelled.note(record) {
+            scene.budget.evictions += 1;
+        }
+        let number = record.sequence_number;
+        let is_tail = record.kind == kind::DATA_FRAG && record.fragment_start != 1 && number > 1;
+        let sequence = self.reception.sequence_mut();
+        sequence.recognise(number, record.source_timestamp().timestamp());
+        sequence.begin(number.saturating_add(u64::from(is_tail)));
+        self.die(number, LossCause::SocketBuffer, scene);
+    }
+
+    /// Takes in that the kernel gave up on some IP fragments of this sample.
+    pub fn not_reassembled(&mut self, number: u64, scene: &mut Scene<'_>) {
+        let sequence = self.reception.sequence();
+        if !sequence.started() || number > sequence.next().saturating_add(MAX_AHEAD) {
+            return;
+        }
+        if self.deaths.resolve(number) {
+            self.tally.pending -= 1;
+            scene.totals.received.pending = scene.totals.received.pending.saturating_sub(1);
+            self.split(scene)
+                .2
+                .lose(LossCause::Reassembly, number, number);
+            return;
+        }
+        self.die(number, LossCause::Reassembly, scene);
+    }
+
+    /// Takes in a HEARTBEAT for this receiver. What it has begins here, if nothing came before.
+    pub fn heartbeat(&mut self, record: &Record, scene: &mut Scene<'_>) {
+        self.touch(record);
+        let last = record.second_sequence_number();
+        self.reception.sequence_mut().begin(last.saturating_add(1));
+        let (reception, budget, mut deciding) = self.split(scene);
+        reception.heartbeat(record, budget, &mut |decision| deciding.take(decision));
+    }
+
+    /// Takes in a GAP for this receiver.
+    pub fn gap(&mut self, record: &Record, scene: &mut Scene<'_>) {
+        self.touch(record);
+        let (reception, budget, mut deciding) = self.split(scene);
+        reception.gap(record, budget, &mut |decision| deciding.take(decision));
+    }
+
+    /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What
+    /// does not arrive while nothing else does is lost.
+    pub fn expect(
+        &mut self,
+        newest: u64,
+        left_by: impl FnOnce(Timestamp) -> Option<u64>,
+        scene: &mut Scene<'_>,
+    ) {
+        if !self.reception.sequence().started() || newest < self.next() {
+            (self.waiting, self.told) = (None, false);
+            return;
+        }
+        let since = *self.waiting.get_or_insert(scene.now);
+        if self.told || scene.now.nanoseconds_since(since) < SILENCE {
+            return;
+        }
+        self.told = true;
+        if let Some(number) = left_by(Timestamp(scene.now.0.saturating_sub(UNDER_WAY))) {
+            self.exists(number, scene);
+        }
+    }
+
+    /// Nothing more will come of what has left for here.
+    pub fn expect_no_more(&mut self, newest: u64, scene: &mut Scene<'_>) {
+        if self.reception.sequence().started() && !self.told {
+            self.exists(newest, scene);
+        }
+    }
+
+    /// Settles what has waited long enough.
+    pub fn advance(&mut self, scene: &mut Scene<'_>) {
+        let (now, window) = (scene.now, settle_window(scene.reliable));
+        let (reception, budget, mut deciding) = self.split(scene);
+        reception.advance(now, window, budget, &mut |decision| deciding.take(decision));
+        self.conclude(now, scene);
+        self.deaths.settled(self.reception.sequence().settled());
+        self.cancelled.expire(now.0);
+    }
+
+    /// Settles everything, also what is pending: nothing more will come.
+    pub fn settle(&mut self, scene: &mut Scene<'_>) {
+        let (reception, budget, mut deciding) = self.split(scene);
+        reception.settle(budget, &mut |decision| deciding.take(decision));
+        self.conclude(Timestamp(u64::MAX), scene);
+    }
+
+    /// `other` turned out to be the same receiver.
+    pub fn absorb(&mut self, other: Self, scene: &mut Scene<'_>) {
+        self.tally.add(&other.tally);
+        self.deaths.absorb(other.deaths);
+        self.first_seen = self.first_seen.min(other.first_seen);
+        self.last_seen = self.last_seen.max(other.last_seen);
+        self.opened = self.opened.max(other.opened);
+        let now = scene.now;
+        let (reception, budget, mut deciding) = self.split(scene);
+        reception.absorb(other.reception, now, budget, &mut |decision| {
+            deciding.take(decision);
+        });
+    }
+
+    fn touch(&mut self, record: &Record) {
+        self.last_seen = self.last_seen.max(Timestamp(record.time));
+        self.reassembled |= record.flags & flag::HOST != 0 && record.datagram_len > ONE_FRAME;
+    }
+
+    fn take(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+        let (number, reliable) = (record.sequence_number, scene.reliable);
+        self.begin_anew(number, scene);
+        let sequence = self.reception.sequence();
+        let is_sent = self.direction() == Direction::Sent;
+        if !is_sent && self.misses(number) && number < sequence.settled() {
+            return self.late(record, scene);
+        }
+        let (next, advanced) = (sequence.next(), sequence.last_advance());
+        let (reception, budget, mut deciding) = self.split(scene);
+        let outcome = reception.sample(record, reliable, budget, &mut |decision| {
+            deciding.take(decision);
+        });
+        let sequence = self.reception.sequence_mut();
+        if next > 0 && advanced < self.opened && sequence.next() > next {
+            sequence.excuse(next, sequence.next());
+        }
+        match outcome {
+            Outcome::Open => (false, None),
+            Outcome::Again => {
+                // One multicast may be seen on its way out by several interfaces.
+                if !is_sent || !self.main.place.is_multicast() {
+                    self.count(scene, |tally| tally.duplicates += 1);
+                }
+                (true, None)
+            }
+            Outcome::Whole(whole) => {
+                self.whole(&whole, scene);
+                (false, Some(whole))
+            }
+        }
+    }
+
+    fn whole(&mut self, whole: &Whole, scene: &mut Scene<'_>) {
+        let sequence = self.reception.sequence();
+        let is_history = whole.number < sequence.first();
+        let missed = sequence.missed_since(whole.number);
+        let death = self.deaths.forget(whole.number);
+        let recovered = (whole.recovered || death.is_some()) && !is_history;
+        if !whole.is_message {
+            return;
+        }
+        let mut waited = 0.0;
+        if recovered && self.direction() == Direction::Received {
+            let noticed = death.map(|death| death.at).or(missed);
+            let waited_for = noticed.map_or(whole.repaired_after, |noticed| {
+                scene.now.nanoseconds_since(noticed)
+            });
+            waited = seconds(waited_for);
+            let breakdown = scene.totals.breakdown.get_or_insert_default();
+            breakdown.retransmission.observe(waited);
+        }
+        self.count(scene, |tally| {
+            tally.messages += 1;
+            tally.bytes += whole.bytes;
+            tally.history += u64::from(is_history);
+            tally.recovered += u64::from(recovered);
+            tally.recovery_seconds += waited;
+        });
+    }
+
+    /// A sample that comes after it was settled as lost: too late for the counters, unless its cause
+    /// was still awaited.
+    fn late(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+        let number = record.sequence_number;
+        if record.kind == kind::DATA && self.deaths.resolve(number) {
+            self.count(scene, |tally| {
+                tally.pending = tally.pending.saturating_sub(1);
+                tally.messages += 1;
+                tally.bytes += u64::from(record.payload_len);
+                tally.recovered += 1;
+            });
+            self.know(number);
+            return (false, None);
+        }
+        if record.kind == kind::DATA {
+            self.know(number);
+        }
+        self.count(scene, |tally| tally.duplicates += 1);
+        (true, None)
+    }
+
+    /// After so many numbers that nobody here was to get, all count afresh.
+    fn begin_anew(&mut self, number: u64, scene: &mut Scene<'_>) {
+        let sequence = self.reception.sequence();
+        let is_far = number.saturating_sub(sequence.next()) > EXCUSED;
+        if sequence.started() && is_far && sequence.last_advance() < self.opened {
+            let (reception, budget, mut deciding) = self.split(scene);
+            reception.settle(budget, &mut |decision| deciding.take(decision));
+            self.reception = Reception::default();
+        }
+    }
+
+    fn die(&mut self, number: u64, cause: LossCause, scene: &mut Scene<'_>) {
+        let sequence = self.reception.sequence();
+        if sequence.has(number) || number < sequence.settled().max(sequence.first()) {
+            return;
+        }
+        let now = scene.now;
+        self.exists(number, scene);
+        if self.deaths.note(number, cause, now) {
+            scene.budget.evictions += 1;
+        }
+    }
+
+    fn exists(&mut self, number: u64, scene: &mut Scene<'_>) {
+        let now = scene.now;
+        let (reception, budget, mut deciding) = self.split(scene);
+        reception.exists(number, now, budget, &mut |decision| deciding.take(decision));
+    }
+
+    /// What was pending until `now` never reached this host.
+    fn conclude(&mut self, now: Timestamp, scene: &mut Scene<'_>) {
+        for (first, last) in self.deaths.due(now) {
+            let (_, _, mut deciding) = self.split(scene);
+            deciding.conclude(first, last);
+        }
+    }
+
+    fn count(&mut self, scene: &mut Scene<'_>, change: impl Fn(&mut Delivered)) {
+        change(&mut self.tally);
+        change(scene.totals.of(self.main.direction));
+    }
+
+    /// The reception, the memory for it, and what its decisions change.
+    const fn split<'a>(
+        &'a mut self,
+        scene: &'a mut Scene<'_>,
+    ) -> (&'a mut Reception, &'a mut Budget, Deciding<'a>) {
+        let wait = REASSEMBLY - settle_window(scene.reliable);
+        let until = if self.reassembled {
+            Some(Timestamp(scene.now.0.saturating_add(wait)))
+        } else {
+            None
+        };
+        let deciding = Deciding {
+            tally: &mut self.tally,
+            deaths: &mut self.deaths,
+            totals: &mut scene.totals.received,
+            journal: scene.journal,
+            writer: scene.writer,
+            receiver: self.receiver,
+            main: self.main,
+            at: scene.now,
+            until,
+        };
+        (&mut self.reception, scene.budget, deciding)
+    }
+}
+
+impl Totals {
+    /// Those of one direction.
+    pub const fn of(&mut self, direction: Direction) -> &mut Delivered {
+        match direction {
+            Direction::Sent => &mut self.sent,
+            Direction::Received => &mut self.received,
+        }
+    }
+
+    /// Adds all of `other`.
+    pub fn add(&mut self, other: &Self) {
+        self.received.add(&other.received);
+        self.sent.add(&other.sent);
+        for (seen, also) in self.seen.iter_mut().zip(other.seen) {
+            *seen |= also;
+        }
+        if let Some(breakdown) = &other.breakdown {
+            self.breakdown.get_or_insert_default().add(breakdown);
+        }
+    }
+}
+
+/// What decisions change.
+struct Deciding<'a> {
+    tally: &'a mut Delivered,
+    deaths: &'a mut Deaths,
+    totals: &'a mut Delivered,
+    journal: &'a mut Journal,
+    writer: Guid,
+    receiver: Receiver,
+    main: Way,
+    at: Timestamp,
+    /// A loss stays pending until then.
+    until: Option<Timestamp>,
+}
+
+impl Deciding<'_> {
+    fn take(&mut self, decision: Decision) {
+        if self.main.direction == Direction::Sent {
+            return;
+        }
+        let (first, last) = match decision {
+            Decision::Lost { first, last, .. } => (first, last),
+            Decision::Irrelevant(number) => {
+                self.deaths.forget(number);
+                self.tally.irrelevant += 1;
+                self.totals.irrelevant += 1;
+                return;
+            }
+        };
+        let mut runs = Vec::new();
+        self.deaths.explain(first, last, |first, last, cause| {
+            runs.push((first, last, cause));
+        });
+        for (first, last, cause) in runs {
+            match (cause, self.until) {
+                (Some(cause), _) => self.lose(cause, first, last),
+                (None, None) => self.lose(LossCause::BeforeHost, first, last),
+                (None, Some(until)) => {
+                    self.tally.pending += last - first + 1;
+                    self.totals.pending += last - first + 1;
+                    if let Some((first, last)) = self.deaths.wait(first, last, until) {
+                        self.conclude(first, last);
+                    }
+                }
+            }
+        }
+    }
+
+    /// What was pending died before it came to this host.
+    fn conclude(&mut self, first: u64, last: u64) {
+        let count = last - first + 1;
+        self.tally.pending = self.tally.pending.saturating_sub(count);
+        self.totals.pending = self.totals.pending.saturating_sub(count);
+        self.lose(LossCause::BeforeHost, first, last);
+    }
+
+    fn lose(&mut self, cause: LossCause, first: u64, last: u64) {
+        let count = last - first + 1;
+        self.tally.lose(cause, count);
+        self.totals.lose(cause, count);
+        self.journal.lose_delivery(DeliveryLoss {
+            at: self.at,
+            writer: self.writer,
+            participant: match self.receiver {
+                Receiver::Participant(prefix) => Some(prefix),
+                Receiver::Way(_) => None,
+            },
+            socket: self.main.socket,
+            destination: self.main.place.socket_address(),
+            cause,
+            first,
+            last,
+        });
+    }
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "nanoseconds of a delay stay exact to 104 days"
+)]
+pub(super) fn seconds(nanoseconds: i64) -> f64 {
+    nanoseconds.max(0) as f64 / 1e9
+}

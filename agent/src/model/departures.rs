@@ -1,0 +1,75 @@
+//! When samples of one writer left this host: for how long they took to leave, and to arrive where
+//! one clock sees both.
+
+use std::collections::VecDeque;
+
+use ros2probe_wire::Timestamp;
+
+use super::way::Place;
+
+/// Departures remembered: a sample is under way for a moment, to a few destinations.
+const LIMIT: usize = 64;
+
+/// The latest departures of one writer.
+#[derive(Debug, Default)]
+pub struct Departures {
+    latest: VecDeque<Departure>,
+    /// Source time of the newest sample of which something left.
+    newest: Timestamp,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Departure {
+    number: u64,
+    place: Place,
+    at: Timestamp,
+}
+
+impl Departures {
+    /// Whether nothing of the sample of this source time has left before: for this destination or
+    /// another, or as a retransmission.
+    pub fn is_first(&mut self, source: Timestamp) -> bool {
+        let is_first = source > self.newest;
+        self.newest = self.newest.max(source);
+        is_first
+    }
+
+    /// The sample has left whole for this place.
+    pub fn note(&mut self, number: u64, place: Place, at: Timestamp) {
+        if self.latest.len() >= LIMIT {
+            self.latest.pop_front();
+        }
+        self.latest.push_back(Departure { number, place, at });
+    }
+
+    /// When it left for there.
+    #[must_use]
+    pub fn find(&self, number: u64, place: Place) -> Option<Timestamp> {
+        let mut latest = self.latest.iter().rev();
+        let found = latest.find(|each| each.number == number && each.place == place);
+        found.map(|departure| departure.at)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn departures_for_several_places_are_told_apart_and_bounded() {
+        let mut departures = Departures::default();
+        let place = |port| Place {
+            port,
+            ..Place::default()
+        };
+        for number in 1..=1000 {
+            let source = Timestamp(number);
+            assert!(departures.is_first(source) && !departures.is_first(source));
+            departures.note(number, place(1), Timestamp(number));
+            departures.note(number, place(2), Timestamp(number + 5));
+        }
+        assert_eq!(departures.find(1000, place(2)), Some(Timestamp(1005)));
+        assert_eq!(departures.find(1, place(1)), None);
+        assert!(departures.latest.len() <= LIMIT);
+    }
+}

@@ -1,0 +1,294 @@
+//! Which participant receives at which socket and address.
+//!
+//! A socket belongs to the participant that sends by it, or for which something directed (INFO_DST)
+//! came to it, or whose process holds it: which processes participants live in is learned from the
+//! sockets they send by, for announced process ids are those of a container, if any. An address
+//! belongs to the participant that announces it, unless several do. A multicast group belongs to
+//! nobody: what is directed at one member reaches all. Where nothing tells, or two participants
+//! share a socket, the answer is "unknown", never a guess.
+
+use std::collections::{HashMap, VecDeque};
+
+use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::{Guid, GuidPrefix, Record};
+
+use super::discovery::Discovery;
+use super::snapshot::SocketFacts;
+use super::sockets::Sockets;
+use super::topic::{Topic, Topics};
+use super::way::{Place, Way};
+
+/// Participants remembered of one socket or process.
+const OWNERS: usize = 8;
+/// Closed sockets remembered, for those who still hold something of them.
+const CLOSED: usize = 1024;
+/// Addresses kept of one participant.
+const PLACES: usize = 16;
+
+/// All that is known of receivers.
+#[derive(Debug)]
+pub struct Receivers {
+    sockets: Sockets,
+    learned: HashMap<u64, Owners>,
+    processes: HashMap<u32, Owners>,
+    places: HashMap<Place, Holder>,
+    closed: VecDeque<u64>,
+    limit: usize,
+    generation: u64,
+}
+
+/// What the samples of a writer are seen in front of.
+#[derive(Clone, Copy, Debug)]
+pub struct Around<'a> {
+    /// Who receives where.
+    pub receivers: &'a Receivers,
+    /// Who is there.
+    pub discovery: &'a Discovery,
+    /// Who reads what.
+    pub topics: &'a Topics,
+}
+
+/// Whether a receiver has a reader of the topic.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Matched {
+    /// It has.
+    Yes,
+    /// Its announcements were seen from the first on, and there is none.
+    No,
+    /// Not all of its announcements were seen, or the receiver is not known.
+    Unknown,
+}
+
+#[derive(Debug, Default)]
+struct Owners(Vec<GuidPrefix>);
+
+#[derive(Clone, Copy, Debug)]
+struct Holder {
+    prefix: GuidPrefix,
+    previous: Option<GuidPrefix>,
+    /// Two participants announce it in turn.
+    contested: bool,
+}
+
+impl Receivers {
+    /// Nothing known; at most `limit` sockets.
+    #[must_use]
+    pub fn new(limit: usize) -> Self {
+        Self {
+            sockets: Sockets::new(limit),
+            learned: HashMap::new(),
+            processes: HashMap::new(),
+            places: HashMap::new(),
+            closed: VecDeque::new(),
+            limit,
+            generation: 1,
+        }
+    }
+
+    /// Rises with every change; who compares need not ask again.
+    #[must_use]
+    pub const fn generation(&self) -> u64 {
+        self.generation
+    }
+
+    /// Something else changed that answers depend on.
+    pub const fn changed(&mut self) {
+        self.generation += 1;
+    }
+
+    /// The sockets as they were told.
+    #[must_use]
+    pub const fn sockets(&self) -> &Sockets {
+        &self.sockets
+    }
+
+    /// Whether this socket was closed a while ago.
+    #[must_use]
+    pub fn is_closed(&self, socket: u64) -> bool {
+        socket != 0 && self.closed.contains(&socket)
+    }
+
+    /// Takes in what is known of a socket.
+    pub fn socket(&mut self, facts: SocketFacts) {
+        let (cookie, process) = (facts.cookie, facts.process_id);
+        let before = self.sockets.get(cookie).and_then(|known| known.process_id);
+        let is_new = self.sockets.put(facts);
+        if !is_new || process == before {
+            return;
+        }
+        self.closed.retain(|closed| *closed != cookie);
+        if let (Some(process), Some(owners)) = (process, self.learned.get(&cookie)) {
+            let known = self.processes.entry(process).or_default();
+            owners.0.iter().for_each(|owner| known.add(*owner));
+        }
+        self.generation += 1;
+    }
+
+    /// This socket is no more.
+    pub fn socket_closed(&mut self, cookie: u64) {
+        self.sockets.remove(cookie);
+        self.learned.remove(&cookie);
+        if self.closed.len() >= CLOSED {
+            self.closed.pop_front();
+        }
+        self.closed.push_back(cookie);
+        self.generation += 1;
+    }
+
+    /// Learns from a record whose socket it is.
+    pub fn learn(&mut self, record: &Record) {
+        if record.flags & flag::HOST == 0 || record.socket == 0 {
+            return;
+        }
+        let (sender, directed) = if record.kind == kind::ACKNACK {
+            (record.reader().prefix, record.writer().prefix)
+        } else {
+            (record.writer().prefix, record.reader().prefix)
+        };
+        let owner = if record.flags & flag::OUTGOING != 0 {
+            sender
+        } else if directed == GuidPrefix::UNKNOWN {
+            return;
+        } else {
+            directed
+        };
+        let known = self.learned.get(&record.socket);
+        if known.is_some_and(|known| known.0.contains(&owner)) {
+            return;
+        }
+        let is_arriving = record.flags & flag::OUTGOING == 0;
+        if is_arriving && Place::of(record).is_multicast() {
+            return;
+        }
+        if known.is_none() && self.learned.len() >= self.limit {
+            return;
+        }
+        self.learned.entry(record.socket).or_default().add(owner);
+        let facts = self.sockets.get(record.socket);
+        if let Some(process) = facts.and_then(|facts| facts.process_id) {
+            self.processes.entry(process).or_default().add(owner);
+        }
+        self.generation += 1;
+    }
+
+    /// A participant announces where it is reached by unicast.
+    pub fn announce(&mut self, prefix: GuidPrefix, places: impl Iterator<Item = Place>) {
+        for place in places.take(PLACES) {
+            let Some(holder) = self.places.get_mut(&place) else {
+                let holder = Holder {
+                    prefix,
+                    previous: None,
+                    contested: false,
+                };
+                self.places.insert(place, holder);
+                self.generation += 1;
+                continue;
+            };
+            if holder.prefix != prefix {
+                holder.contested |= holder.previous == Some(prefix);
+                holder.previous = Some(holder.prefix);
+                holder.prefix = prefix;
+                self.generation += 1;
+            }
+        }
+    }
+
+    /// Forgets what participants said that are no more.
+    pub fn tidy(&mut self, discovery: &Discovery) {
+        let is_there = |prefix: &GuidPrefix| discovery.participants().contains_key(prefix);
+        self.places.retain(|_, holder| is_there(&holder.prefix));
+        for owners in self.learned.values_mut() {
+            owners.0.retain(is_there);
+        }
+        self.learned.retain(|_, owners| !owners.0.is_empty());
+        for owners in self.processes.values_mut() {
+            owners.0.retain(is_there);
+        }
+        self.processes.retain(|_, owners| !owners.0.is_empty());
+    }
+
+    /// The participant that receives what comes this way.
+    #[must_use]
+    pub fn owner(&self, way: &Way, discovery: &Discovery) -> Option<GuidPrefix> {
+        let alive = |owners: &Owners| {
+            let is_there = |prefix: &&GuidPrefix| discovery.participants().contains_key(*prefix);
+            let mut alive = owners.0.iter().filter(is_there);
+            let only = alive.next().copied();
+            (only, alive.next().is_none())
+        };
+        if way.socket != 0 {
+            if let (Some(owner), is_only) =
+                self.learned.get(&way.socket).map_or((None, true), alive)
+            {
+                return is_only.then_some(owner);
+            }
+            let facts = self.sockets.get(way.socket);
+            if let Some(process) = facts.and_then(|facts| facts.process_id) {
+                let learned = self.processes.get(&process);
+                if let (Some(owner), is_only) = learned.map_or((None, true), alive) {
+                    return is_only.then_some(owner);
+                }
+                if let Some(owner) = announced_in(process, discovery) {
+                    return Some(owner);
+                }
+            }
+        }
+        let holder = self.places.get(&way.place)?;
+        let is_known = discovery.participants().contains_key(&holder.prefix);
+        (is_known && !holder.contested && !way.place.is_multicast()).then_some(holder.prefix)
+    }
+}
+
+impl Around<'_> {
+    /// Whether this participant reads the topic.
+    #[must_use]
+    pub fn matched(&self, topic: Option<&Topic>, prefix: GuidPrefix) -> Matched {
+        let Some(topic) = topic else {
+            return Matched::Unknown;
+        };
+        if readers(topic, prefix).next().is_some() {
+            return Matched::Yes;
+        }
+        match self.discovery.participants().get(&prefix) {
+            Some(participant) if participant.readers_told => Matched::No,
+            _ => Matched::Unknown,
+        }
+    }
+}
+
+/// This participant's readers of the topic, sorted but for those beside it.
+pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + '_ {
+    [&topic.readers, &topic.beside]
+        .into_iter()
+        .flat_map(move |list| {
+            let start = list.partition_point(|guid| guid.prefix < prefix);
+            let own = list.get(start..).unwrap_or_default().iter().copied();
+            own.take_while(move |guid| guid.prefix == prefix)
+                .filter(|guid| !guid.entity.is_writer())
+        })
+}
+
+/// The only participant that announces to live in this process. Fast DDS says no more than the low
+/// 16 bits.
+fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
+    let mut announced = discovery.participants().iter().filter(|(_, participant)| {
+        participant
+            .portrait
+            .process_id
+            .is_some_and(|id| id == process || id == process & 0xffff)
+    });
+    let (prefix, _) = announced.next()?;
+    announced.next().is_none().then_some(*prefix)
+}
+
+impl Owners {
+    fn add(&mut self, owner: GuidPrefix) {
+        if self.0.contains(&owner) {
+            return;
+        }
+        if self.0.len() >= OWNERS {
+            self.0.remove(0);
+        }
+        self.0.push(owner);
+    }
+}

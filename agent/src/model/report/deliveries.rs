@@ -1,0 +1,156 @@
+//! Deliveries, acknowledgements and sockets as the snapshot shows them.
+
+use std::collections::{BTreeSet, HashMap};
+
+use ros2probe_wire::{EntityId, Guid, Timestamp};
+
+use crate::model::delivery::{Delivery, Receiver, Totals};
+use crate::model::observer::Observer;
+use crate::model::receivers::readers;
+use crate::model::snapshot::{AcknowledgementFacts, DeliveryFacts, Direction, SocketFacts};
+use crate::model::topic::Topic;
+use crate::model::ways::Known;
+
+/// Nodes by their endpoints.
+type Nodes<'a> = HashMap<Guid, &'a str>;
+
+/// What became of a topic's samples, of live writers and of those that have gone.
+pub(super) fn totals(observer: &Observer, topic: &Topic) -> Totals {
+    let mut sum = topic.retired_totals.as_deref().cloned().unwrap_or_default();
+    for writer in topic.writers.iter().chain(&topic.beside) {
+        let measured = observer.profiler.get(*writer);
+        if let Some(subscribers) = measured.and_then(|measured| measured.subscribers.as_ref()) {
+            sum.add(subscribers.totals());
+        }
+    }
+    sum
+}
+
+/// Every receiver and destination of the topic's live writers.
+pub(super) fn deliveries(
+    observer: &Observer,
+    topic: &Topic,
+    nodes: &Nodes<'_>,
+) -> Vec<DeliveryFacts> {
+    let mut facts = Vec::new();
+    for writer in topic.writers.iter().chain(&topic.beside) {
+        let measured = observer.profiler.get(*writer);
+        let Some(subscribers) = measured.and_then(|measured| measured.subscribers.as_ref()) else {
+            continue;
+        };
+        let deliveries = subscribers.deliveries();
+        facts.extend(deliveries.map(|(delivery, ways)| {
+            delivery_facts(observer, topic, nodes, *writer, (delivery, &ways))
+        }));
+    }
+    facts.sort_by(|one, other| {
+        (one.writer, one.direction, one.destination, &one.subscriber).cmp(&(
+            other.writer,
+            other.direction,
+            other.destination,
+            &other.subscriber,
+        ))
+    });
+    facts
+}
+
+fn delivery_facts(
+    observer: &Observer,
+    topic: &Topic,
+    nodes: &Nodes<'_>,
+    writer: Guid,
+    (delivery, ways): (&Delivery, &[&Known]),
+) -> DeliveryFacts {
+    let main = delivery.main();
+    let owner = match delivery.receiver() {
+        Receiver::Participant(prefix) => Some(prefix),
+        Receiver::Way(_) => ways.first().and_then(|known| known.owner),
+    };
+    let mut readers: Vec<_> = owner
+        .map(|prefix| readers(topic, prefix).collect())
+        .unwrap_or_default();
+    readers.sort_unstable();
+    let nodes: BTreeSet<_> = readers
+        .iter()
+        .filter_map(|reader| nodes.get(reader).copied())
+        .collect();
+    let mut sockets: Vec<_> = ways.iter().map(|known| known.way.socket).collect();
+    sockets.retain(|socket| *socket != 0);
+    sockets.sort_unstable();
+    sockets.dedup();
+    let known = observer.receivers.sockets();
+    let socket = sockets
+        .iter()
+        .filter_map(|socket| known.get(*socket))
+        .max_by_key(|facts| (facts.process_id.is_some(), facts.cgroup.is_some()));
+    let process_id = socket.and_then(|socket| socket.process_id);
+    let (first_seen, last_seen) = delivery.seen();
+    let participant = owner.map(|prefix| Guid::new(prefix, EntityId::PARTICIPANT));
+    let subscriber = match (participant, process_id, main.socket) {
+        (Some(participant), ..) => format!("participant {participant}"),
+        (None, Some(process_id), _) => format!("process {process_id}"),
+        (None, None, 0) => String::new(),
+        (None, None, socket) => format!("socket {socket}"),
+    };
+    DeliveryFacts {
+        writer,
+        direction: delivery.direction(),
+        destination: main.place.socket_address(),
+        subscriber,
+        participant,
+        readers,
+        nodes: nodes.into_iter().map(ToOwned::to_owned).collect(),
+        sockets,
+        process_id,
+        process: socket.and_then(|socket| socket.process.clone()),
+        cgroup: socket.and_then(|socket| socket.cgroup.clone()),
+        first_seen,
+        last_seen,
+        delivered: *delivery.tally(),
+    }
+}
+
+/// Every reliable reader that acknowledges to one of the topic's live writers.
+pub(super) fn acknowledgements(
+    observer: &Observer,
+    topic: &Topic,
+    nodes: &Nodes<'_>,
+    now: Timestamp,
+) -> Vec<AcknowledgementFacts> {
+    let mut facts = Vec::new();
+    for writer in &topic.writers {
+        let Some(measured) = observer.profiler.get(*writer) else {
+            continue;
+        };
+        let Some(subscribers) = &measured.subscribers else {
+            continue;
+        };
+        let next = measured.writer.next();
+        let told = subscribers.acknowledgements(*writer, next, now);
+        facts.extend(told.map(|fact| AcknowledgementFacts {
+            node: nodes.get(&fact.reader).map(|node| (*node).to_owned()),
+            ..fact
+        }));
+    }
+    facts
+}
+
+/// The sockets by which samples of measured topics come.
+pub(super) fn sockets(observer: &Observer) -> Vec<SocketFacts> {
+    let mut cookies = BTreeSet::new();
+    for (_, measured) in observer.profiler.iter() {
+        let Some(subscribers) = &measured.subscribers else {
+            continue;
+        };
+        for (delivery, ways) in subscribers.deliveries() {
+            if delivery.direction() == Direction::Received {
+                cookies.extend(ways.iter().map(|known| known.way.socket));
+            }
+        }
+    }
+    let known = observer.receivers.sockets();
+    cookies
+        .into_iter()
+        .filter_map(|cookie| known.get(cookie).cloned())
+        .collect()
+}

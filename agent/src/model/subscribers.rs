@@ -1,0 +1,709 @@
+//! Who gets one writer's samples, and by which ways.
+//!
+//! **A delivery is a participant's.** A multicast sample and its repair by unicast come to two
+//! sockets of one participant, so losses can only be told where both are put together: all ways that
+//! are known to lead to a participant feed one delivery. A way that leads to nobody known is a
+//! delivery of its own, until more is known.
+//!
+//! Of such ways a multicast one may belong to any receiver (on a wire it belongs to all). There the
+//! rule is not to invent losses: what comes by unicast fills its gaps, what it brought is not missing
+//! at a unicast delivery, and what it knows already opens no delivery when it comes again by unicast.
+//!
+//! What is directed (INFO_DST) at a participant is for nobody else at the same socket. Where the
+//! participant is known and reads nothing of the topic, samples are unmatched and nothing is kept.
+
+use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+
+use super::acknowledgement::Acknowledgements;
+use super::delivery::{Delivery, Receiver, Scene, Totals, seconds};
+use super::departures::Departures;
+use super::journal::Journal;
+use super::receivers::{Around, Matched, readers};
+use super::reception::Whole;
+use super::samples::Budget;
+use super::snapshot::{AcknowledgementFacts, Direction};
+use super::topic::{Topic, TopicId};
+use super::way::{Place, Way};
+use super::ways::{Known, Ways};
+
+const SECOND: u64 = 1_000_000_000;
+/// A way by which nothing came for so long is forgotten, unless a reader is known at its end.
+const FORGET: u64 = 60 * SECOND;
+/// Numbers looked up in a sibling at once.
+const LOOK_BACK: u64 = 4096;
+const DATA_FLAG: u8 = 0x04;
+
+/// All receivers and destinations of one writer.
+#[derive(Debug, Default)]
+pub struct Subscribers {
+    ways: Ways,
+    deliveries: Vec<Delivery>,
+    /// Deliveries of multicast ways that lead to nobody known.
+    open: usize,
+    totals: Totals,
+    departures: Departures,
+    acknowledgements: Acknowledgements,
+    /// Of the answers in `ways`.
+    generation: u64,
+}
+
+/// Room for the deliveries of all writers.
+#[derive(Clone, Copy, Debug)]
+pub struct Room {
+    /// Deliveries.
+    pub used: usize,
+    /// Cap.
+    pub limit: usize,
+    /// Deliveries refused or given up because of it.
+    pub evictions: u64,
+    /// Somebody was refused.
+    pub wanted: bool,
+}
+
+/// What a record changes besides the deliveries of its writer, and what it is seen against.
+#[derive(Debug)]
+pub struct Stage<'a> {
+    /// The time of the record, or of the look at the clock.
+    pub now: Timestamp,
+    /// The writer.
+    pub writer: Guid,
+    /// It retransmits.
+    pub reliable: bool,
+    /// Its topic.
+    pub topic: Option<TopicId>,
+    /// Memory for fragmented samples.
+    pub budget: &'a mut Budget,
+    /// Where losses are told.
+    pub journal: &'a mut Journal,
+    /// Room for deliveries.
+    pub room: &'a mut Room,
+    /// Who is there.
+    pub around: Around<'a>,
+}
+
+impl Subscribers {
+    /// Every delivery with the ways that lead to it.
+    pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&Known>)> {
+        self.deliveries.iter().map(|delivery| {
+            let leads_there = |known: &&Known| match delivery.receiver() {
+                Receiver::Way(way) => known.way == way,
+                Receiver::Participant(prefix) => {
+                    known.way.direction == Direction::Received && known.owner == Some(prefix)
+                }
+            };
+            (delivery, self.ways.iter().filter(leads_there).collect())
+        })
+    }
+
+    /// Sums over all deliveries, also those that are no more.
+    #[must_use]
+    pub const fn totals(&self) -> &Totals {
+        &self.totals
+    }
+
+    /// Ways and readers for which there was no room.
+    #[must_use]
+    pub const fn refused(&self) -> u64 {
+        self.ways.evictions() + self.acknowledgements.refused
+    }
+
+    /// What the readers acknowledged of `writer`, whose next sample will be `next`.
+    pub fn acknowledgements(
+        &self,
+        writer: Guid,
+        next: u64,
+        now: Timestamp,
+    ) -> impl Iterator<Item = AcknowledgementFacts> + '_ {
+        self.acknowledgements.facts(writer, next, now)
+    }
+
+    /// Takes in a record of the writer, or an ACKNACK for it. Whether it brought nothing that had not
+    /// come to the same receiver before, or left for the same destination.
+    pub fn record(&mut self, record: &Record, stage: &mut Stage<'_>) -> bool {
+        self.refresh(stage);
+        let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
+        if record.kind == kind::ACKNACK {
+            let is_reader = |topic: &Topic| is_reader(topic, record.reader());
+            if stage.topic().is_some_and(is_reader) {
+                self.acknowledgements.record(record);
+            }
+            return false;
+        }
+        if record.flags & flag::NOT_REASSEMBLED != 0 {
+            if is_sample {
+                self.not_reassembled(record, stage);
+            }
+            return false;
+        }
+        let way = Way::of(record);
+        if !is_sample && (!matches!(record.kind, kind::HEARTBEAT | kind::GAP) || way.is_sent()) {
+            return false;
+        }
+        let index = self
+            .ways
+            .place(way, stage.now, &stage.around, stage.topic());
+        if let Some(known) = self.ways.get_mut(index) {
+            known.last_seen = known.last_seen.max(stage.now);
+        }
+        if way.is_sent() {
+            self.leave(index, record, stage)
+        } else {
+            self.arrive(index, record, stage)
+        }
+    }
+
+    /// The writer's newest sample is this one.
+    pub fn wrote(&mut self, number: u64, at: Timestamp) {
+        self.acknowledgements.wrote(number, at);
+    }
+
+    /// Settles what has waited long enough and forgets what has been silent for long.
+    pub fn advance(&mut self, stage: &mut Stage<'_>) {
+        self.refresh(stage);
+        let now = stage.now;
+        for delivery in &mut self.deliveries {
+            delivery.advance(&mut scene(&mut self.totals, stage));
+        }
+        self.expect(stage, false);
+        if now.0.is_multiple_of(SECOND) {
+            self.ways.retain(|known| {
+                known.matched == Matched::Yes || known.last_seen.0.saturating_add(FORGET) > now.0
+            });
+            self.drop_orphans(stage);
+        }
+    }
+
+    /// Settles everything: nothing more will come.
+    pub fn settle(&mut self, stage: &mut Stage<'_>) {
+        self.expect(stage, true);
+        for delivery in &mut self.deliveries {
+            delivery.settle(&mut scene(&mut self.totals, stage));
+        }
+    }
+
+    /// Settles everything, gives back the room and tells what was counted.
+    pub fn stop(mut self, stage: &mut Stage<'_>) -> Totals {
+        self.settle(stage);
+        stage.room.used = stage.room.used.saturating_sub(self.deliveries.len());
+        self.totals
+    }
+
+    /// When each delivery was last heard of that nobody would miss, for making room.
+    pub fn silent_since(&self) -> impl Iterator<Item = Timestamp> + '_ {
+        self.deliveries.iter().map(|delivery| delivery.seen().1)
+    }
+
+    /// Gives up the deliveries that were last heard of by then, at most `count`; how many.
+    pub fn give_up(&mut self, until: Timestamp, count: usize, stage: &mut Stage<'_>) -> usize {
+        let mut left = count;
+        self.remove(stage, |delivery| {
+            let goes = left > 0 && delivery.seen().1 <= until;
+            left -= usize::from(goes);
+            goes
+        });
+        stage.room.evictions += (count - left) as u64;
+        count - left
+    }
+
+    /// A sample on its way out.
+    fn leave(&mut self, index: usize, record: &Record, stage: &mut Stage<'_>) -> bool {
+        let Some(way) = self.ways.get(index).map(|known| known.way) else {
+            return false;
+        };
+        self.totals.seen[1] = true;
+        let source = record.source_timestamp().timestamp();
+        let begins = record.kind == kind::DATA || record.fragment_start == 1;
+        if let Some(source) = source.filter(|source| begins && self.departures.is_first(*source)) {
+            let began = record.time.saturating_sub(record.elapsed.into());
+            let delay = Timestamp(began).nanoseconds_since(source);
+            if delay >= 0 {
+                self.breakdown().send_delay.observe(seconds(delay));
+            }
+        }
+        let Some(place) = self.delivery(index, Receiver::Way(way), stage) else {
+            return false;
+        };
+        let Some(delivery) = self.deliveries.get_mut(place) else {
+            return false;
+        };
+        let (again, whole) = delivery.sample(record, &mut scene(&mut self.totals, stage));
+        if let Some(whole) = whole {
+            self.departures.note(whole.number, way.place, stage.now);
+            if !self.totals.seen[0] {
+                self.transfer(&whole, stage.now);
+            }
+        }
+        again && !way.place.is_multicast()
+    }
+
+    fn arrive(&mut self, index: usize, record: &Record, stage: &mut Stage<'_>) -> bool {
+        self.totals.seen[0] = true;
+        let Some((receiver, matched)) = self.receiver(index, record, stage) else {
+            return false;
+        };
+        let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
+        if matched == Matched::No {
+            let is_whole = record.kind == kind::DATA && record.submessage_flags & DATA_FLAG != 0
+                || record.kind == kind::DATA_FRAG && record.ends_sample();
+            if is_whole && record.flags & flag::NO_ROOM == 0 && record.status_info == 0 {
+                self.totals.received.unmatched += 1;
+            }
+            return false;
+        }
+        if is_sample {
+            self.sample(index, receiver, record, stage)
+        } else {
+            self.told(index, (receiver, matched), record, stage);
+            false
+        }
+    }
+
+    /// Who gets what came this way, and whether it reads the topic.
+    fn receiver(
+        &mut self,
+        index: usize,
+        record: &Record,
+        stage: &mut Stage<'_>,
+    ) -> Option<(Receiver, Matched)> {
+        let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
+        let (around, topic) = (stage.around, stage.topic());
+        let known = self.ways.get_mut(index)?;
+        let is_multicast = known.way.place.is_multicast();
+        if let Some(prefix) = directed.filter(|_| !is_multicast) {
+            known.tell(prefix, &around, topic);
+            let matched = if known.owner == Some(prefix) {
+                known.matched
+            } else {
+                around.matched(topic, prefix)
+            };
+            return Some((Receiver::Participant(prefix), matched));
+        }
+        match (known.owner, directed) {
+            (Some(owner), None) => Some((Receiver::Participant(owner), known.matched)),
+            (Some(owner), Some(prefix)) => {
+                (owner == prefix).then_some((Receiver::Participant(owner), known.matched))
+            }
+            (None, None) => Some((Receiver::Way(known.way), Matched::Unknown)),
+            (None, Some(_)) => {
+                if matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
+                    self.repair(record, stage);
+                }
+                None
+            }
+        }
+    }
+
+    fn sample(
+        &mut self,
+        index: usize,
+        receiver: Receiver,
+        record: &Record,
+        stage: &mut Stage<'_>,
+    ) -> bool {
+        let no_room = record.flags & flag::NO_ROOM != 0;
+        let is_open = |receiver| matches!(receiver, Receiver::Way(way) if way.is_open());
+        if self.open > 0 && !is_open(receiver) {
+            let is_known = !no_room && self.repair(record, stage);
+            if (is_known || no_room) && self.find(receiver).is_none() {
+                return false;
+            }
+        }
+        let Some(place) = self.delivery(index, receiver, stage) else {
+            return false;
+        };
+        let Some(delivery) = self.deliveries.get_mut(place) else {
+            return false;
+        };
+        let next = delivery.next();
+        if no_room {
+            delivery.no_room(record, &mut scene(&mut self.totals, stage));
+            return false;
+        }
+        let (again, whole) = delivery.sample(record, &mut scene(&mut self.totals, stage));
+        if self.open > 0 {
+            self.share(place, next, whole.map(|whole| whole.number));
+        }
+        if let Some(known) = self.ways.get_mut(index) {
+            known.has_data = true;
+        }
+        if let Some(whole) = whole {
+            self.came(index, place, &whole, stage.now);
+        }
+        again
+    }
+
+    /// A sample came whole this way.
+    fn came(&mut self, index: usize, place: usize, whole: &Whole, now: Timestamp) {
+        self.transfer(whole, now);
+        let Some(known) = self.ways.get_mut(index).filter(|_| !whole.recovered) else {
+            return;
+        };
+        let way = known.way;
+        known.brought += u64::from(whole.newest);
+        let brought = known.brought;
+        if let Some(left) = self.departures.find(whole.number, way.place)
+            && now >= left
+        {
+            let transit = now.nanoseconds_since(left);
+            self.breakdown().transit.observe(seconds(transit));
+        }
+        let Some(delivery) = self.deliveries.get_mut(place) else {
+            return;
+        };
+        if delivery.main() != way {
+            let main = self.ways.find(&delivery.main());
+            let main = main.and_then(|index| self.ways.get(index));
+            if main.is_none_or(|main| main.brought < brought) {
+                delivery.move_to(way);
+            }
+        }
+    }
+
+    /// A HEARTBEAT or GAP came this way.
+    fn told(
+        &mut self,
+        index: usize,
+        (receiver, matched): (Receiver, Matched),
+        record: &Record,
+        stage: &mut Stage<'_>,
+    ) {
+        let Some(known) = self.ways.get(index) else {
+            return;
+        };
+        let is_heartbeat = record.kind == kind::HEARTBEAT;
+        // It goes where data goes, unless a reader is known to be there.
+        let holds = known.has_data || matched == Matched::Yes;
+        let is_meant = record.reader().prefix != GuidPrefix::UNKNOWN;
+        let opens = is_heartbeat
+            && matched == Matched::Yes
+            && (is_meant || !known.way.place.is_multicast());
+        if !is_heartbeat && !known.way.place.is_multicast() && self.open > 0 {
+            for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
+                delivery.gap(record, &mut scene(&mut self.totals, stage));
+            }
+        }
+        let place = match self.find(receiver) {
+            None if opens => self.delivery(index, receiver, stage),
+            found => found,
+        };
+        let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) else {
+            return;
+        };
+        let mut scene = scene(&mut self.totals, stage);
+        if !is_heartbeat {
+            delivery.gap(record, &mut scene);
+        } else if is_meant || holds {
+            delivery.heartbeat(record, &mut scene);
+        }
+    }
+
+    fn not_reassembled(&mut self, record: &Record, stage: &mut Stage<'_>) {
+        let place = Place::of(record);
+        let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
+        for delivery in &mut self.deliveries {
+            let leads_there = |known: &Known| {
+                !known.way.is_sent()
+                    && known.way.place == place
+                    && match delivery.receiver() {
+                        Receiver::Way(way) => known.way == way,
+                        Receiver::Participant(prefix) => {
+                            known.owner == Some(prefix) && directed.is_none_or(|to| to == prefix)
+                        }
+                    }
+            };
+            if self.ways.iter().any(leads_there) {
+                let number = record.sequence_number;
+                delivery.not_reassembled(number, &mut scene(&mut self.totals, stage));
+            }
+        }
+    }
+
+    /// Fills gaps of those that may be the receiver; whether any of them knows of the sample.
+    fn repair(&mut self, record: &Record, stage: &mut Stage<'_>) -> bool {
+        let number = record.sequence_number;
+        let mut is_known = false;
+        for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
+            is_known |= delivery.next() > number;
+            if delivery.misses(number) {
+                delivery.sample(record, &mut scene(&mut self.totals, stage));
+            }
+        }
+        is_known
+    }
+
+    /// Lets deliveries that may be the same receiver's know of each other's samples.
+    fn share(&mut self, place: usize, next: u64, whole: Option<u64>) {
+        let Some(delivery) = self.deliveries.get(place) else {
+            return;
+        };
+        if is_open(delivery) {
+            let Some(number) = whole else { return };
+            for other in &mut self.deliveries {
+                if !other.main().is_sent() && !is_open(other) && other.misses(number) {
+                    other.know(number);
+                }
+            }
+            return;
+        }
+        let end = delivery.next().min(next.saturating_add(LOOK_BACK));
+        if next == 0 || end <= next + 1 {
+            return;
+        }
+        let missing = (next..end).filter(|number| delivery.misses(*number));
+        let has = |number: &u64| {
+            let mut others = self.deliveries.iter().filter(|each| is_open(each));
+            others.any(|other| other.misses(*number) || other.has(*number))
+        };
+        let known: Vec<_> = missing.filter(has).collect();
+        if let Some(delivery) = self.deliveries.get_mut(place) {
+            known.into_iter().for_each(|number| delivery.know(number));
+        }
+    }
+
+    /// Looks whether what left this host for a receiver on it has arrived.
+    fn expect(&mut self, stage: &mut Stage<'_>, no_more: bool) {
+        if !self.totals.seen[1] || !self.totals.seen[0] {
+            return;
+        }
+        for index in 0..self.deliveries.len() {
+            let Some(delivery) = self.deliveries.get(index) else {
+                return;
+            };
+            let (main, next) = (delivery.main(), delivery.next());
+            let Some(at) = self.ways.find(&main) else {
+                continue;
+            };
+            if main.is_sent() {
+                if let Some(known) = self.ways.get_mut(at).filter(|_| next > 0) {
+                    known.mark(next - 1, stage.now);
+                }
+                continue;
+            }
+            if self
+                .ways
+                .get(at)
+                .is_none_or(|known| known.matched == Matched::No)
+            {
+                continue;
+            }
+            let Some(leaving) = self.ways.leaving(main.place) else {
+                continue;
+            };
+            let left = self.find(Receiver::Way(leaving.way));
+            let Some(left) = left.and_then(|left| self.deliveries.get(left)) else {
+                continue;
+            };
+            let Some(newest) = left.next().checked_sub(1) else {
+                continue;
+            };
+            let mut scene = scene(&mut self.totals, stage);
+            let Some(delivery) = self.deliveries.get_mut(index) else {
+                return;
+            };
+            if no_more {
+                delivery.expect_no_more(newest, &mut scene);
+            } else {
+                delivery.expect(newest, |at| leaving.left_by(at), &mut scene);
+            }
+        }
+    }
+
+    fn find(&self, receiver: Receiver) -> Option<usize> {
+        self.deliveries
+            .iter()
+            .position(|delivery| delivery.receiver() == receiver)
+    }
+
+    /// The delivery of this receiver, begun if there is none and there is room.
+    fn delivery(
+        &mut self,
+        index: usize,
+        receiver: Receiver,
+        stage: &mut Stage<'_>,
+    ) -> Option<usize> {
+        let known = self.ways.get(index)?;
+        let cached = known.delivery.filter(|place| {
+            let delivery = self.deliveries.get(*place);
+            delivery.is_some_and(|delivery| delivery.receiver() == receiver)
+        });
+        if cached.is_some() {
+            return cached;
+        }
+        let way = known.way;
+        let place = match self.find(receiver) {
+            Some(place) => place,
+            None if stage.room.used >= stage.room.limit => {
+                stage.room.evictions += 1;
+                stage.room.wanted = true;
+                return None;
+            }
+            None => {
+                stage.room.used += 1;
+                self.deliveries
+                    .push(Delivery::new(receiver, way, stage.now));
+                self.count_open();
+                self.deliveries.len() - 1
+            }
+        };
+        if let Some(known) = self.ways.get_mut(index) {
+            known.delivery = Some(place);
+        }
+        Some(place)
+    }
+
+    /// Finds out anew who is where, if anything changed.
+    fn refresh(&mut self, stage: &mut Stage<'_>) {
+        let (around, topic) = (stage.around, stage.topic());
+        if self.generation == around.receivers.generation() {
+            return;
+        }
+        self.generation = around.receivers.generation();
+        let before = self.ways.iter().count();
+        self.ways
+            .retain(|known| !around.receivers.is_closed(known.way.socket));
+        let closed = before > self.ways.iter().count();
+        for known in self.ways.iter_mut() {
+            known.resolve(&around, topic);
+        }
+        self.identify(stage);
+        if closed {
+            self.drop_orphans(stage);
+        }
+        for delivery in &mut self.deliveries {
+            if let Receiver::Participant(prefix) = delivery.receiver()
+                && around.matched(topic, prefix) == Matched::No
+            {
+                delivery.close(stage.budget);
+            }
+            let appeared = match delivery.receiver() {
+                Receiver::Participant(prefix) => topic.and_then(|topic| {
+                    let known = |guid| around.discovery.endpoints().get(&guid);
+                    readers(topic, prefix)
+                        .filter_map(|guid| Some(known(guid)?.first_seen))
+                        .min()
+                }),
+                Receiver::Way(_) => topic.map(|topic| topic.reader_appeared),
+            };
+            if let Some(at) = appeared.filter(|at| *at > delivery.seen().1) {
+                delivery.open(at);
+            }
+        }
+        self.acknowledgements
+            .retain(|guid| topic.is_some_and(|topic| is_reader(topic, guid)));
+    }
+
+    /// Puts ways together that turned out to lead to one participant.
+    fn identify(&mut self, stage: &mut Stage<'_>) {
+        let mut index = 0;
+        while let Some(delivery) = self.deliveries.get(index) {
+            index += 1;
+            let Receiver::Way(way) = delivery.receiver() else {
+                continue;
+            };
+            let known = self.ways.find(&way).and_then(|at| self.ways.get(at));
+            let owner = known
+                .filter(|_| !way.is_sent())
+                .and_then(|known| known.owner);
+            let Some(owner) = owner else { continue };
+            let place = index - 1;
+            if let Some(other) = self.find(Receiver::Participant(owner)) {
+                let messages = |place: usize| {
+                    let delivery = self.deliveries.get(place);
+                    delivery.map_or(0, |delivery| delivery.tally().messages)
+                };
+                let (keeps, goes) = if messages(place) > messages(other) {
+                    (place, other)
+                } else {
+                    (other, place)
+                };
+                let gone = self.deliveries.remove(goes);
+                let keeps = keeps - usize::from(goes < keeps);
+                stage.room.used = stage.room.used.saturating_sub(1);
+                if let Some(delivery) = self.deliveries.get_mut(keeps) {
+                    delivery.identify(owner);
+                    delivery.absorb(gone, &mut scene(&mut self.totals, stage));
+                }
+                index = 0;
+            } else if let Some(delivery) = self.deliveries.get_mut(place) {
+                delivery.identify(owner);
+            }
+        }
+        self.count_open();
+    }
+
+    /// Gives up deliveries to which no way leads any more.
+    fn drop_orphans(&mut self, stage: &mut Stage<'_>) {
+        let led_to: Vec<_> = self
+            .deliveries()
+            .map(|(_, ways)| !ways.is_empty())
+            .collect();
+        for (delivery, is_led_to) in self.deliveries.iter_mut().zip(&led_to) {
+            if !is_led_to {
+                delivery.close(stage.budget);
+            }
+        }
+        let mut led_to = led_to.into_iter();
+        self.remove(stage, |_| !led_to.next().unwrap_or(false));
+    }
+
+    fn remove(&mut self, stage: &mut Stage<'_>, mut goes: impl FnMut(&Delivery) -> bool) {
+        let before = self.deliveries.len();
+        let totals = &mut self.totals;
+        self.deliveries.retain_mut(|delivery| {
+            let goes = goes(delivery);
+            if goes {
+                delivery.settle(&mut scene(totals, stage));
+            }
+            !goes
+        });
+        let gone = before - self.deliveries.len();
+        if gone > 0 {
+            stage.room.used = stage.room.used.saturating_sub(gone);
+            self.ways.iter_mut().for_each(|known| known.delivery = None);
+            self.count_open();
+        }
+    }
+
+    fn count_open(&mut self) {
+        self.open = self.deliveries.iter().filter(|each| is_open(each)).count();
+    }
+
+    fn breakdown(&mut self) -> &mut super::snapshot::Breakdown {
+        self.totals.breakdown.get_or_insert_default()
+    }
+
+    fn transfer(&mut self, whole: &Whole, now: Timestamp) {
+        if now > whole.began {
+            let transfer = now.nanoseconds_since(whole.began);
+            self.breakdown().transfer.observe(seconds(transfer));
+        }
+    }
+}
+
+impl<'a> Stage<'a> {
+    fn topic(&self) -> Option<&'a Topic> {
+        self.around.topics.get(self.topic?)
+    }
+}
+
+fn is_open(delivery: &Delivery) -> bool {
+    matches!(delivery.receiver(), Receiver::Way(way) if way.is_open())
+}
+
+fn is_reader(topic: &Topic, guid: Guid) -> bool {
+    [&topic.readers, &topic.beside]
+        .iter()
+        .any(|list| list.binary_search(&guid).is_ok())
+}
+
+fn scene<'a>(totals: &'a mut Totals, stage: &'a mut Stage<'_>) -> Scene<'a> {
+    Scene {
+        now: stage.now,
+        writer: stage.writer,
+        reliable: stage.reliable,
+        budget: stage.budget,
+        journal: stage.journal,
+        totals,
+    }
+}

@@ -1,0 +1,200 @@
+//! The ways of one writer's samples, and to whom each leads.
+//!
+//! What was found out of a way is kept until something changes that it depends on. Bounded: the way
+//! that has been silent longest makes room.
+
+use std::collections::VecDeque;
+
+use ros2probe_wire::{GuidPrefix, Timestamp};
+
+use super::receivers::{Around, Matched};
+use super::snapshot::Direction;
+use super::topic::Topic;
+use super::way::{Place, Way};
+
+/// Ways of one writer.
+const LIMIT: usize = 512;
+/// Moments at which it is known what had left, one a second.
+const MOMENTS: usize = 12;
+const SECOND: u64 = 1_000_000_000;
+
+/// All ways of one writer, sorted.
+#[derive(Debug, Default)]
+pub struct Ways {
+    ways: Vec<Known>,
+    /// The one that was used last.
+    last: usize,
+    /// Ways given up because of the cap.
+    evictions: u64,
+}
+
+/// One way.
+#[derive(Debug)]
+pub struct Known {
+    /// Which.
+    pub way: Way,
+    /// The participant at its end.
+    pub owner: Option<GuidPrefix>,
+    /// What was directed to it there, where nothing else tells.
+    told: Option<GuidPrefix>,
+    /// Whether that participant reads the topic; of a multicast that leaves, whether anybody does.
+    pub matched: Matched,
+    /// Where its delivery stands, if that was looked up.
+    pub delivery: Option<usize>,
+    /// Last record.
+    pub last_seen: Timestamp,
+    /// New samples that came this way.
+    pub brought: u64,
+    /// Samples have come this way.
+    pub has_data: bool,
+    /// What had left by when.
+    left: VecDeque<(Timestamp, u64)>,
+}
+
+impl Ways {
+    /// All of them.
+    pub fn iter(&self) -> impl Iterator<Item = &Known> {
+        self.ways.iter()
+    }
+
+    /// All of them.
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut Known> {
+        self.ways.iter_mut()
+    }
+
+    /// One of them.
+    #[must_use]
+    pub fn get(&self, index: usize) -> Option<&Known> {
+        self.ways.get(index)
+    }
+
+    /// One of them.
+    pub fn get_mut(&mut self, index: usize) -> Option<&mut Known> {
+        self.ways.get_mut(index)
+    }
+
+    /// Ways given up because of the cap.
+    #[must_use]
+    pub const fn evictions(&self) -> u64 {
+        self.evictions
+    }
+
+    /// Where this way stands.
+    #[must_use]
+    pub fn find(&self, way: &Way) -> Option<usize> {
+        if self
+            .ways
+            .get(self.last)
+            .is_some_and(|known| known.way == *way)
+        {
+            return Some(self.last);
+        }
+        self.ways.binary_search_by_key(way, |known| known.way).ok()
+    }
+
+    /// Where this way stands, known from now on.
+    pub fn place(
+        &mut self,
+        way: Way,
+        now: Timestamp,
+        around: &Around<'_>,
+        topic: Option<&Topic>,
+    ) -> usize {
+        if let Some(index) = self.find(&way) {
+            self.last = index;
+            return index;
+        }
+        if self.ways.len() >= LIMIT {
+            let silent = self.ways.iter().enumerate();
+            let oldest = silent.min_by_key(|(_, known)| known.last_seen);
+            if let Some(index) = oldest.map(|(index, _)| index) {
+                self.ways.remove(index);
+                self.evictions += 1;
+            }
+        }
+        let mut known = Known {
+            way,
+            owner: None,
+            told: None,
+            matched: Matched::Unknown,
+            delivery: None,
+            last_seen: now,
+            brought: 0,
+            has_data: false,
+            left: VecDeque::new(),
+        };
+        known.resolve(around, topic);
+        let index = self.ways.partition_point(|known| known.way < way);
+        self.ways.insert(index, known);
+        self.last = index;
+        index
+    }
+
+    /// Forgets ways.
+    pub fn retain(&mut self, keep: impl FnMut(&Known) -> bool) {
+        self.ways.retain(keep);
+    }
+
+    /// The highest number that has left for this place, and what had left by a moment.
+    #[must_use]
+    pub fn leaving(&self, place: Place) -> Option<&Known> {
+        self.find(&Way {
+            direction: Direction::Sent,
+            socket: 0,
+            place,
+        })
+        .and_then(|index| self.ways.get(index))
+    }
+}
+
+impl Known {
+    /// Finds out who is at its end.
+    pub fn resolve(&mut self, around: &Around<'_>, topic: Option<&Topic>) {
+        let is_there = |prefix: &GuidPrefix| around.discovery.participants().contains_key(prefix);
+        self.owner = around
+            .receivers
+            .owner(&self.way, around.discovery)
+            .or(self.told.filter(is_there));
+        self.delivery = None;
+        let leaves_for_all = self.way.direction == Direction::Sent && self.way.place.is_multicast();
+        self.matched = match self.owner {
+            _ if leaves_for_all => match topic {
+                Some(topic) if !topic.readers.is_empty() => Matched::Yes,
+                _ => Matched::Unknown,
+            },
+            Some(owner) => around.matched(topic, owner),
+            None => Matched::Unknown,
+        };
+    }
+
+    /// Something was directed to this participant here.
+    pub fn tell(&mut self, prefix: GuidPrefix, around: &Around<'_>, topic: Option<&Topic>) {
+        if self.owner.is_none() && self.told != Some(prefix) {
+            self.told = Some(prefix);
+            self.owner = self.told;
+            self.matched = around.matched(topic, prefix);
+        }
+    }
+
+    /// Up to this number everything has left by now.
+    pub fn mark(&mut self, number: u64, now: Timestamp) {
+        let is_due = self
+            .left
+            .back()
+            .is_none_or(|(at, last)| *last != number && at.0.saturating_add(SECOND) <= now.0);
+        if is_due {
+            if self.left.len() >= MOMENTS {
+                self.left.pop_front();
+            }
+            self.left.push_back((now, number));
+        }
+    }
+
+    /// Up to which number everything had left then.
+    #[must_use]
+    pub fn left_by(&self, at: Timestamp) -> Option<u64> {
+        let mut left = self.left.iter().rev();
+        left.find(|(moment, _)| *moment <= at)
+            .map(|(_, number)| *number)
+    }
+}
