@@ -140,11 +140,16 @@ pub(crate) fn attached(cgroup: &Path) -> Result<[u32; 2]> {
 pub(crate) fn sweep() {
     if let Ok(hierarchy) = hierarchy() {
         remove_leftovers(&hierarchy, |name| {
-            let path = hierarchy.join(name);
-            for below in fs::read_dir(&path).into_iter().flatten().flatten() {
-                let _ = fs::remove_dir(below.path());
-            }
-            let _ = fs::remove_dir(path);
+            remove(&hierarchy.join(name));
         });
     }
+}
+
+fn remove(path: &Path) {
+    for below in fs::read_dir(path).into_iter().flatten().flatten() {
+        if below.file_type().is_ok_and(|kind| kind.is_dir()) {
+            remove(&below.path());
+        }
+    }
+    let _ = fs::remove_dir(path);
 }

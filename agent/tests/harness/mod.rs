@@ -8,6 +8,7 @@
 #![allow(dead_code, reason = "each test file uses its own part of the harness")]
 
 pub(crate) mod agent;
+pub(crate) mod bpf;
 pub(crate) mod capture;
 pub(crate) mod cgroup;
 pub(crate) mod dissection;

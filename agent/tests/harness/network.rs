@@ -35,7 +35,17 @@ impl Link {
     pub(crate) fn new() -> Result<Link> {
         sweep()?;
         let subnet = next_subnet();
-        let cgroup = Cgroup::create(&name_of("link", subnet))?;
+        Link::create(subnet, Cgroup::create(&name_of("link", subnet))?)
+    }
+
+    /// As [`Link::new`], below a cgroup that somebody may be looking at already.
+    pub(crate) fn below(above: &Cgroup) -> Result<Link> {
+        sweep()?;
+        let subnet = next_subnet();
+        Link::create(subnet, above.create_below(&name_of("link", subnet))?)
+    }
+
+    fn create(subnet: u16, cgroup: Cgroup) -> Result<Link> {
         let robot = Namespace::create("robot", subnet, 1, Some(&cgroup))?;
         let monitor = Namespace::create("monitor", subnet, 2, Some(&cgroup))?;
         run(&format!(

@@ -2,6 +2,7 @@
 //! sums only. It works as the agent does, and looks at sockets of the whole machine: give it a
 //! control group.
 
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -9,13 +10,16 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow, bail, ensure};
 use ros2probe::capture::live::LiveSource;
+use ros2probe::capture::netns;
 use ros2probe::config::{Config, Watchlist};
-use ros2probe::model::journal::DeliveryLoss;
+use ros2probe::model::journal::{DeliveryLoss, Loss};
 use ros2probe::model::observer::{self, Observer};
 use ros2probe::model::reassembly::Limits;
 use ros2probe::model::snapshot::Snapshot;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::filter::Counter;
+
+use super::network::Namespace;
 
 const SLICE: Duration = Duration::from_millis(100);
 /// How long the kernel may wait for IP fragments, and some more: after that every cause is settled.
@@ -30,6 +34,7 @@ pub(crate) struct Witness {
 pub(crate) struct Testimony {
     /// Once the peers had gone and everything open was settled.
     pub(crate) end: Snapshot,
+    pub(crate) losses: Vec<Loss>,
     pub(crate) delivery_losses: Vec<DeliveryLoss>,
     /// The kernel programs' own counters.
     pub(crate) counters: Vec<(Counter, u64)>,
@@ -55,13 +60,23 @@ struct Shared {
 impl Witness {
     /// Returns once it sees all that happens.
     pub(crate) fn start(configuration: &str) -> Result<Witness> {
+        Witness::start_in(None, configuration)
+    }
+
+    /// As [`Witness::start`], on a host's network.
+    pub(crate) fn start_on(host: &Namespace, configuration: &str) -> Result<Witness> {
+        let network = PathBuf::from(format!("/run/netns/{}", host.name()));
+        Witness::start_in(Some(network), configuration)
+    }
+
+    fn start_in(network: Option<PathBuf>, configuration: &str) -> Result<Witness> {
         let config = Config::parse(configuration.as_bytes())
             .map_err(|mistakes| anyhow!("{}", mistakes.report("the witness")))?;
         let shared = Arc::new(Shared::default());
         let theirs = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name("witness".to_owned())
-            .spawn(move || watch(&config, &theirs))?;
+            .spawn(move || watch(network.as_deref(), &config, &theirs))?;
         let mut witness = Witness {
             shared,
             thread: Some(thread),
@@ -125,8 +140,12 @@ impl Drop for Witness {
     }
 }
 
-fn watch(config: &Config, shared: &Shared) -> Result<Testimony> {
-    let mut source = LiveSource::open(&config.capture, Limits::default())?;
+fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Testimony> {
+    let open = || LiveSource::open(&config.capture, Limits::default());
+    let mut source = match network {
+        Some(network) => netns::within(network, open)??,
+        None => open()?,
+    };
     let mut observer = Observer::new(observer::Settings::default());
     observer.set_watchlist(Watchlist::new(config.watches.clone())?);
     let publish = |snapshot: Snapshot| {
@@ -146,6 +165,7 @@ fn watch(config: &Config, shared: &Shared) -> Result<Testimony> {
     observer.settle();
     Ok(Testimony {
         end: observer.snapshot(end),
+        losses: observer.journal().losses().copied().collect(),
         delivery_losses: observer.journal().delivery_losses().copied().collect(),
         counters,
     })

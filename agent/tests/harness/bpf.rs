@@ -1,0 +1,186 @@
+//! The kernel's BPF programs as anybody may ask for them: which are attached to a control group,
+//! which a process holds, which still exist. And one of somebody else's.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::io;
+use std::os::fd::{AsRawFd as _, FromRawFd as _, OwnedFd};
+use std::path::Path;
+
+use anyhow::{Context as _, Result};
+
+const PROG_LOAD: libc::c_int = 5;
+const PROG_ATTACH: libc::c_int = 8;
+const PROG_GET_FD_BY_ID: libc::c_int = 13;
+const PROG_QUERY: libc::c_int = 16;
+const CGROUP_SKB: u32 = 8;
+const ALLOW_MULTI: u32 = 2;
+
+/// `BPF_CGROUP_INET_INGRESS` and `BPF_CGROUP_INET_EGRESS`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub(crate) enum Direction {
+    Ingress = 0,
+    Egress = 1,
+}
+
+/// How a stranger's program tolerates others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Manners {
+    /// As everybody should.
+    BesideOthers,
+    /// Nobody else may attach.
+    Alone,
+}
+
+/// Somebody else's program on a control group: it lets everything pass. It stays attached until the
+/// group is removed.
+pub(crate) fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) -> Result<()> {
+    // r0 = 1; exit
+    let instructions: [u64; 2] = [0x0000_0001_0000_00b7, 0x95];
+    let license = c"GPL";
+    let load = ProgramToLoad {
+        kind: CGROUP_SKB,
+        instruction_count: 2,
+        instructions: instructions.as_ptr() as u64,
+        license: license.as_ptr() as u64,
+        expected_attach_type: direction as u32,
+        ..ProgramToLoad::default()
+    };
+    let program = descriptor(bpf(PROG_LOAD, &load)?);
+    let directory = File::open(cgroup)?;
+    let attach = ProgramToAttach {
+        target: directory.as_raw_fd(),
+        program: program.as_raw_fd(),
+        attach_type: direction as u32,
+        flags: match manners {
+            Manners::BesideOthers => ALLOW_MULTI,
+            Manners::Alone => 0,
+        },
+    };
+    bpf(PROG_ATTACH, &attach)?;
+    Ok(())
+}
+
+/// How many programs are attached to a control group itself.
+pub(crate) fn attached(cgroup: &Path, direction: Direction) -> Result<u32> {
+    let directory = File::open(cgroup)?;
+    let mut query = ProgramsToFind {
+        target: directory.as_raw_fd(),
+        attach_type: direction as u32,
+        ..ProgramsToFind::default()
+    };
+    bpf_mut(PROG_QUERY, &mut query)?;
+    Ok(query.program_count)
+}
+
+/// Ids of the programs that a process holds.
+pub(crate) fn programs_of(process: u32) -> Result<BTreeSet<u32>> {
+    let mut programs = BTreeSet::new();
+    for entry in fs::read_dir(format!("/proc/{process}/fdinfo"))? {
+        // A descriptor may be closed meanwhile.
+        let text = fs::read_to_string(entry?.path()).unwrap_or_default();
+        let ids = text
+            .lines()
+            .filter_map(|line| line.strip_prefix("prog_id:"));
+        programs.extend(ids.filter_map(|id| id.trim().parse::<u32>().ok()));
+    }
+    Ok(programs)
+}
+
+/// Whether anything still holds a program.
+pub(crate) fn exists(program: u32) -> Result<bool> {
+    let by_id = ProgramById {
+        id: program,
+        ..ProgramById::default()
+    };
+    match bpf(PROG_GET_FD_BY_ID, &by_id) {
+        Ok(number) => {
+            drop(descriptor(number));
+            Ok(true)
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error).context("cannot ask for a BPF program"),
+    }
+}
+
+/// The beginnings of `union bpf_attr`; the kernel takes what is missing for zero.
+trait Attributes: Copy {}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ProgramToLoad {
+    kind: u32,
+    instruction_count: u32,
+    instructions: u64,
+    license: u64,
+    log_level: u32,
+    log_size: u32,
+    log: u64,
+    kernel_version: u32,
+    flags: u32,
+    name: [u8; 16],
+    interface: u32,
+    expected_attach_type: u32,
+}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ProgramToAttach {
+    target: i32,
+    program: i32,
+    attach_type: u32,
+    flags: u32,
+}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ProgramsToFind {
+    target: i32,
+    attach_type: u32,
+    query_flags: u32,
+    attach_flags: u32,
+    programs: u64,
+    program_count: u32,
+    padding: u32,
+}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ProgramById {
+    id: u32,
+    next: u32,
+    open_flags: u32,
+}
+
+impl Attributes for ProgramToLoad {}
+impl Attributes for ProgramToAttach {}
+impl Attributes for ProgramsToFind {}
+impl Attributes for ProgramById {}
+
+fn bpf<A: Attributes>(command: libc::c_int, attributes: &A) -> io::Result<i32> {
+    let mut attributes = *attributes;
+    bpf_mut(command, &mut attributes)
+}
+
+fn bpf_mut<A: Attributes>(command: libc::c_int, attributes: &mut A) -> io::Result<i32> {
+    // SAFETY: the attributes are plain words of the size given, laid out as `union bpf_attr` is, and
+    // what they point to outlives the call.
+    let result = unsafe {
+        libc::syscall(
+            libc::SYS_bpf,
+            command,
+            std::ptr::from_mut(attributes),
+            size_of::<A>(),
+        )
+    };
+    match i32::try_from(result) {
+        Ok(number) if number >= 0 => Ok(number),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+fn descriptor(number: i32) -> OwnedFd {
+    // SAFETY: the kernel has just opened it for this process, and nothing else knows it.
+    unsafe { OwnedFd::from_raw_fd(number) }
+}
