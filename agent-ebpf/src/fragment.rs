@@ -5,7 +5,7 @@
 //! a header cut in two, fragments out of order) it hands the rest of the datagram to user space with
 //! the walk's state, so nothing is decided twice and nothing is missed.
 
-use aya_ebpf::bindings::__sk_buff;
+use aya_ebpf::{bindings::__sk_buff, helpers::bpf_ktime_get_ns};
 use ros2probe_wire::{
     filter::Counter,
     record::{Record, flag, kind},
@@ -44,9 +44,11 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
     let Some(scratch) = scratch(slot) else {
         return 0;
     };
-    count(Counter::Fragments, 1);
-    let Some(flow) = flow(scratch) else {
-        count(Counter::FlowTableFull, 1);
+    count(slot, Counter::Fragments, 1);
+    // SAFETY: no preconditions.
+    scratch.packet.now = unsafe { bpf_ktime_get_ns() };
+    let Some(flow) = flow(slot, scratch) else {
+        count(slot, Counter::FlowTableFull, 1);
         return 0;
     };
     let (offset, len, more) = (
@@ -64,7 +66,7 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
         &mut flow.cells[1]
     };
     if *cells & mask != 0 {
-        count(Counter::FragmentsRepeated, 1);
+        count(slot, Counter::FragmentsRepeated, 1);
         return u32::from(flow.state == state::CAPTURED || flow.state == state::HANDED_OVER);
     }
     *cells |= mask;
@@ -86,7 +88,7 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
 
 /// The flow of the fragment at hand, made new when there is none or its identification is reused.
 #[inline(always)]
-fn flow(scratch: &mut Scratch) -> Option<&'static mut Flow> {
+fn flow(slot: u32, scratch: &mut Scratch) -> Option<&'static mut Flow> {
     let packet = &scratch.packet;
     let key = FlowKey {
         source: packet.source,
@@ -104,7 +106,7 @@ fn flow(scratch: &mut Scratch) -> Option<&'static mut Flow> {
         }
     }
     if packet.offset != 0 {
-        count(Counter::FragmentsWithoutFlow, 1);
+        count(slot, Counter::FragmentsWithoutFlow, 1);
     }
     // SAFETY: NEW_FLOW is never written, so it stays all zero.
     let empty = unsafe { &*NEW_FLOW.get_ptr(0)? };
@@ -135,7 +137,7 @@ fn first(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Flow)
     if result >= progress::CAPTURE {
         // Also when a header is split: user space gets the datagram from its start.
         flow.state = state::CAPTURED;
-        verdict::captured(scratch);
+        verdict::captured(slot, scratch);
         return 1;
     }
     flow.state = state::WALKING;
@@ -174,7 +176,7 @@ fn trailing(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Fl
         return 0;
     }
     hand_over(slot, scratch, flow);
-    verdict::captured(scratch);
+    verdict::captured(slot, scratch);
     1
 }
 
@@ -237,8 +239,8 @@ fn hand_over(slot: u32, scratch: &Scratch, flow: &mut Flow) {
     record.fragments = packet.source[3];
     record.sample_size = 0;
     record.status_info = 0;
-    count(Counter::HandedOver, 1);
-    verdict::write(&flow.pending);
+    count(slot, Counter::HandedOver, 1);
+    verdict::write(slot, &flow.pending);
 }
 
 /// All fragments have come.
@@ -255,6 +257,7 @@ fn finish(slot: u32, scratch: &Scratch, flow: &mut Flow) {
     let metered = flow.has_pending != 0 || flow.ahead != 0;
     if walked {
         count(
+            slot,
             if metered {
                 Counter::Metered
             } else {
@@ -266,7 +269,7 @@ fn finish(slot: u32, scratch: &Scratch, flow: &mut Flow) {
     if !metered {
         return;
     }
-    count(Counter::FragmentedComplete, 1);
+    count(slot, Counter::FragmentedComplete, 1);
     if flow.has_pending == 0 {
         // Everything was sent ahead: say that it counts now.
         complete(flow);

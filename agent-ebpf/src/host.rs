@@ -16,10 +16,10 @@ use ros2probe_wire::{filter::Counter, host::Socket};
 
 use crate::{
     maps::{
-        OUTGOING_SLOT, Recent, SLOTS, SOCKETS, Scratch, claim, count, last, recent, release,
-        scratch,
+        Recent, SOCKETS, Scratch, claim_incoming, claim_outgoing, copy, count, last, recent,
+        release, scratch, sent,
     },
-    packet::{self, hook, load},
+    packet::{self, hook},
     pieces, verdict,
 };
 
@@ -27,9 +27,9 @@ use crate::{
 /// copies of one datagram one after the other, in microseconds; a writer that repeats itself waits
 /// for an answer first.
 const COPY_NANOSECONDS: u64 = 1_000_000;
-const TCP: u32 = 6;
-const ICMPV6: u32 = 58;
-const UDP: u32 = 17;
+const TCP: u8 = 6;
+const ICMPV6: u8 = 58;
+const UDP: u8 = 17;
 
 /// One datagram; `at` is one of [`hook`].
 #[unsafe(no_mangle)]
@@ -44,28 +44,34 @@ pub extern "C" fn look(skb: *mut __sk_buff, at: u32) -> u32 {
         last.token = 0;
         last.told = 0;
     }
-    let (first, end) = if incoming {
-        (0, OUTGOING_SLOT)
+    let claimed = if incoming {
+        claim_incoming()
     } else {
-        (OUTGOING_SLOT, SLOTS)
+        claim_outgoing()
     };
-    if let Some(slot) = claim(first, end) {
+    if let Some(slot) = claimed {
         let _ = datagram(skb, slot, at);
         release(slot);
     }
     0
 }
 
-/// Most of what passes here is TCP: decided on the first words.
+/// Most of what passes here is TCP: decided on the first words, read in place.
 #[inline(always)]
 fn may_be_udp(skb: *mut __sk_buff) -> bool {
-    let Some([first, second, third]) = load::<[u32; 3]>(skb, 0) else {
-        return false;
-    };
-    match u32::from_be(first) >> 28 {
-        4 => u32::from_be(third) >> 16 & 0xff == UDP,
+    // SAFETY: the verifier rewrites reads of these fields into the addresses.
+    let (start, end) = unsafe { ((*skb).data as usize, (*skb).data_end as usize) };
+    if start + 20 > end {
+        // An IP header that is not in one piece: who knows.
+        return true;
+    }
+    let words = start as *const u8;
+    // SAFETY: these bytes lie before `end`.
+    let (version, next_ipv6, next_ipv4) = unsafe { (*words >> 4, *words.add(6), *words.add(9)) };
+    match version {
+        4 => next_ipv4 == UDP,
         // Others may be extension headers.
-        6 => !matches!(u32::from_be(second) >> 8 & 0xff, TCP | ICMPV6),
+        6 => !matches!(next_ipv6, TCP | ICMPV6),
         _ => false,
     }
 }
@@ -77,13 +83,13 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     }
     // SAFETY: the verifier rewrites reads of this field; `skb` is the program's context.
     if unsafe { (*skb).gso_segs } > 1 {
-        count(Counter::Segmented, 1);
+        count(slot, Counter::Segmented, 1);
         return None;
     }
     let scratch = scratch(slot)?;
     if scratch.packet.fragmented != 0 {
         // Made by a raw socket; what sockets receive is reassembled.
-        count(Counter::Fragments, 1);
+        count(slot, Counter::Fragments, 1);
         return None;
     }
     scratch.walk.record.datagram = 0;
@@ -110,6 +116,10 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     } else if scratch.count == 0 {
         return None;
     }
+    if scratch.met == socket {
+        return None;
+    }
+    scratch.met = socket;
     if SOCKETS.get_ptr(socket).is_none() {
         let met = Socket {
             // SAFETY: `skb` is the program's context.
@@ -138,7 +148,7 @@ pub fn identify(skb: *mut __sk_buff, slot: u32, named: &mut u32) -> (u32, u64) {
 /// Whether a copy of the datagram at hand, known by the submessage that asks for its capture, was
 /// captured just before. Never on the wire hook.
 #[inline(always)]
-pub fn captured_before(scratch: &mut Scratch) -> bool {
+pub fn captured_before(slot: u32, scratch: &mut Scratch) -> bool {
     if scratch.packet.host == 0 {
         return false;
     }
@@ -159,7 +169,46 @@ pub fn captured_before(scratch: &mut Scratch) -> bool {
         && recent.writer[0] == record.writer[0];
     if same {
         scratch.repeated = 1;
-        count(Counter::CopiesNotCaptured, 1);
+        count(slot, Counter::CopiesNotCaptured, 1);
+    }
+    same
+}
+
+/// Whether the datagram at hand is the second copy of one that was sent just before: what goes to an
+/// IPv4 multicast group of which this host may be a member passes once for loopback and once for the
+/// interface, one directly after the other.
+#[inline(always)]
+pub fn sent_before(scratch: &Scratch) -> bool {
+    let packet = &scratch.packet;
+    let [first, ..] = packet.destination[3].to_ne_bytes();
+    if packet.host == 0 || packet.outgoing == 0 || packet.ipv6 != 0 || first & 0xf0 != 0xe0 {
+        return false;
+    }
+    let (Some(sent), record) = (sent(), &scratch.records[0]) else {
+        return false;
+    };
+    if scratch.count == 0 {
+        return false;
+    }
+    let same = record.time.wrapping_sub(sent.time) < COPY_NANOSECONDS
+        && sent.socket == record.socket
+        && sent.sequence_number == record.sequence_number
+        && sent.fragment_start == record.fragment_start
+        && sent.kind == record.kind
+        // A HEARTBEAT's count.
+        && sent.stamp_seconds == record.stamp_seconds
+        && sent.datagram_len == record.datagram_len
+        && sent.destination_port == record.destination_port
+        && sent.destination[3] == record.destination[3]
+        && sent.writer[3] == record.writer[3]
+        && sent.writer[2] == record.writer[2]
+        && sent.writer[1] == record.writer[1]
+        && sent.writer[0] == record.writer[0];
+    if same {
+        // There is no third.
+        sent.time = 0;
+    } else {
+        copy(record, sent);
     }
     same
 }

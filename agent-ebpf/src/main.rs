@@ -32,7 +32,7 @@ use aya_ebpf::{
 use ros2probe_wire::filter::Counter;
 
 use crate::{
-    maps::{INTERFACES, SLOTS, claim, count, release, setting},
+    maps::{INTERFACES, claim_incoming, count, count_outside, release, setting},
     packet::hook,
 };
 
@@ -99,7 +99,7 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
         unsafe { ((*skb).pkt_type, (*skb).ifindex, (*skb).gso_segs) };
     if interface == LOOPBACK && pkt_type == PACKET_OUTGOING {
         // Loopback frames pass twice; the copy on its way in is the one that counts.
-        count(Counter::LoopbackCopies, 1);
+        count_outside(Counter::LoopbackCopies, 1);
         return Some(0);
     }
     let accepted = match INTERFACES.get_ptr(interface) {
@@ -108,10 +108,10 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
         None => setting!(NEW_INTERFACES),
     };
     if accepted == 0 {
-        count(Counter::InterfaceExcluded, 1);
+        count_outside(Counter::InterfaceExcluded, 1);
         return Some(0);
     }
-    let slot = claim(0, SLOTS)?;
+    let slot = claim_incoming()?;
     let kept = claimed(skb, segments, slot);
     release(slot);
     kept
@@ -123,7 +123,7 @@ fn claimed(skb: *mut __sk_buff, segments: u32, slot: u32) -> Option<i64> {
         return Some(0);
     }
     if segments > 1 {
-        count(Counter::Segmented, 1);
+        count(slot, Counter::Segmented, 1);
         return Some(0);
     }
     let keep = if packet::is_fragment(slot)? {
@@ -136,7 +136,7 @@ fn claimed(skb: *mut __sk_buff, segments: u32, slot: u32) -> Option<i64> {
     }
     // SAFETY: as above.
     let len = unsafe { (*skb).len };
-    count(Counter::CapturedBytes, u64::from(len));
+    count(slot, Counter::CapturedBytes, u64::from(len));
     Some(i64::from(len))
 }
 

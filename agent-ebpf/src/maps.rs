@@ -23,8 +23,8 @@ const NO_PREALLOC: u32 = 1;
 pub const RECORDS_PER_DATAGRAM: u32 = 32;
 const _: () = assert!(RECORDS_PER_DATAGRAM.is_power_of_two());
 
-/// Runs of programs that may be under way on one CPU, see [`claim`]: those for datagrams on their
-/// way in (and for frames) take the slots before [`OUTGOING_SLOT`], the others those from there on.
+/// Runs of programs that may be under way on one CPU, see [`claim_outgoing`]: those for datagrams
+/// on their way in (and for frames) take the slots before [`OUTGOING_SLOT`], the others those from there on.
 pub const SLOTS: u32 = 6;
 /// First slot for datagrams on their way out.
 pub const OUTGOING_SLOT: u32 = 2;
@@ -41,9 +41,10 @@ pub static WAKE_BYTES: u64 = 128 * 1024;
 #[unsafe(no_mangle)]
 pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
 
-/// Whether runs of the programs interrupt each other on a CPU, see [`claim`]. Set by the loader.
+/// Whether the kernel preempts what it does with bottom halves disabled (PREEMPT_RT). Set by the
+/// loader.
 #[unsafe(no_mangle)]
-pub static INTERRUPTED: u32 = 1;
+pub static PREEMPTED: u32 = 1;
 
 /// Reads a setting that the loader may have changed.
 macro_rules! setting {
@@ -87,9 +88,10 @@ pub static RUN_CPUS: LruHashMap<Stream, u32> = LruHashMap::with_max_entries(RUN_
 /// What user space reads a few times a second, or when it is half full.
 #[map]
 pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
-/// By `filter::Counter`.
+/// By slot, and one more for what has none, and `filter::Counter`.
 #[map]
-pub static COUNTERS: PerCpuArray<u64> = PerCpuArray::with_max_entries(Counter::ALL.len() as u32, 0);
+pub static COUNTERS: PerCpuArray<[u64; Counter::ALL.len()]> =
+    PerCpuArray::with_max_entries(SLOTS + 1, 0);
 /// Captured datagrams of the host hook, in [`PieceBuffer`]s cut to their length.
 #[map]
 pub static PIECES: RingBuf = RingBuf::with_byte_size(1024 * 1024, 0);
@@ -108,6 +110,9 @@ static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(SLOTS, 0);
 /// What this CPU has captured lately, by a hash of it.
 #[map]
 static RECENT: PerCpuArray<Recent> = PerCpuArray::with_max_entries(RECENT_CAPACITY, 0);
+/// The first record of what this CPU has sent last to an IPv4 multicast group.
+#[map]
+static SENT: PerCpuArray<Record> = PerCpuArray::with_max_entries(1, 0);
 /// The datagram that a socket of this host received last on this CPU.
 #[map]
 static LAST: PerCpuArray<Last> = PerCpuArray::with_max_entries(1, 0);
@@ -208,6 +213,11 @@ pub struct Scratch {
     pub unknown: u32,
     /// Host hook: a copy of the datagram was captured just before.
     pub repeated: u32,
+    /// The participant that was last heard, and when that was noted in [`PARTICIPANTS`].
+    pub heard: [u32; 3],
+    pub heard_at: u64,
+    /// Host hook: the socket that was last looked for in [`SOCKETS`].
+    pub met: u64,
     /// Host hook: datagrams that this slot has named.
     pub named: u32,
     /// Runs that hold this slot or are about to notice that they do not.
@@ -251,21 +261,30 @@ pub struct PieceBuffer {
     pub bytes: [u8; PIECE_BYTES as usize],
 }
 
-/// Takes one of the slots from `first` on before `end` for this run of a program, until
+/// Takes one of the slots for datagrams on their way out for this run of a program, until
 /// [`release`].
 ///
-/// Runs on one CPU interrupt each other: a datagram on its way out is handled by a task, which may
-/// be preempted (the kernel only keeps it on its CPU), and datagrams on their way in interrupt it.
-/// Atomics that return a value need Linux 5.12. So each adds itself to the slot's claims and looks:
-/// all see the additions in one order, since they share a CPU, and at most one sees itself alone.
-///
-/// Frames on interfaces are handled with bottom halves disabled, one after the other, except on
-/// kernels that preempt even those (PREEMPT_RT).
+/// Those datagrams are handled by tasks, which may be preempted by other tasks that send (the kernel
+/// only keeps them on their CPU). Atomics that return a value need Linux 5.12. So each run adds
+/// itself to the slot's claims and looks: all see the additions in one order, since they share a
+/// CPU, and at most one sees itself alone.
 #[inline(always)]
-pub fn claim(first: u32, end: u32) -> Option<u32> {
-    if setting!(INTERRUPTED) == 0 {
-        return Some(first);
+pub fn claim_outgoing() -> Option<u32> {
+    claim(OUTGOING_SLOT, SLOTS)
+}
+
+/// As [`claim_outgoing`], for frames and for datagrams on their way in: those are handled with
+/// bottom halves disabled, one after the other, except on kernels that preempt even that.
+#[inline(always)]
+pub fn claim_incoming() -> Option<u32> {
+    if setting!(PREEMPTED) == 0 {
+        return Some(0);
     }
+    claim(0, OUTGOING_SLOT)
+}
+
+#[inline(always)]
+fn claim(first: u32, end: u32) -> Option<u32> {
     let mut slot = first;
     while slot < end {
         if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
@@ -281,14 +300,14 @@ pub fn claim(first: u32, end: u32) -> Option<u32> {
         }
         slot += 1;
     }
-    count(Counter::Contended, 1);
+    count_outside(Counter::Contended, 1);
     None
 }
 
 /// Gives a slot back.
 #[inline(always)]
 pub fn release(slot: u32) {
-    if setting!(INTERRUPTED) == 0 {
+    if setting!(PREEMPTED) == 0 && slot < OUTGOING_SLOT {
         return;
     }
     if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
@@ -330,6 +349,13 @@ pub fn recent(hash: u32) -> Option<&'static mut Recent> {
         .map(|recent| unsafe { &mut *recent })
 }
 
+/// The first record of this CPU's last datagram to an IPv4 multicast group.
+#[inline(always)]
+pub fn sent() -> Option<&'static mut Record> {
+    // SAFETY: as for `recent`: half of one and half of another is no copy of anything.
+    SENT.get_ptr_mut(0).map(|sent| unsafe { &mut *sent })
+}
+
 /// This CPU's last datagram on its way in.
 #[inline(always)]
 pub fn last() -> Option<&'static mut Last> {
@@ -338,16 +364,23 @@ pub fn last() -> Option<&'static mut Last> {
     LAST.get_ptr_mut(0).map(|last| unsafe { &mut *last })
 }
 
-/// Adds to a counter of this CPU.
+/// Adds to a counter of this CPU and slot.
 #[inline(always)]
-pub fn count(counter: Counter, by: u64) {
-    if let Some(value) = COUNTERS.get_ptr_mut(counter as u32) {
-        if setting!(INTERRUPTED) == 0 {
-            // SAFETY: a map value pointer checked against null, and nothing comes between.
-            unsafe { *value += by }
-        } else {
-            add(value, by);
-        }
+pub fn count(slot: u32, counter: Counter, by: u64) {
+    if let Some(counters) = COUNTERS.get_ptr_mut(slot) {
+        // SAFETY: a map value pointer checked against null, of a slot that this run holds, and an
+        // index below the number of counters.
+        unsafe { *counters.cast::<u64>().add(counter as usize) += by }
+    }
+}
+
+/// Adds to a counter of this CPU where no slot is held.
+#[inline(always)]
+pub fn count_outside(counter: Counter, by: u64) {
+    if let Some(counters) = COUNTERS.get_ptr_mut(SLOTS) {
+        // SAFETY: a map value pointer checked against null, and an index below the number of
+        // counters.
+        add(unsafe { counters.cast::<u64>().add(counter as usize) }, by);
     }
 }
 

@@ -17,7 +17,7 @@ use ros2probe_wire::{
 
 use crate::{
     inside::{member, place},
-    maps::{Last, RECORDS_PER_DATAGRAM, SOCKETS, add, count, last, scratch},
+    maps::{Last, RECORDS_PER_DATAGRAM, SOCKETS, add, count_outside, last, scratch},
     verdict::write,
 };
 
@@ -46,7 +46,7 @@ pub fn refused(context: &RawTracePointContext) {
     if seen == socket {
         tell(last);
     } else {
-        count(Counter::NoRoomUnseen, 1);
+        count_outside(Counter::NoRoomUnseen, 1);
     }
 }
 
@@ -104,7 +104,7 @@ fn refusal(socket: u64) {
 #[inline(always)]
 fn tell(last: &mut Last) {
     last.socket = 0;
-    count(Counter::NoRoom, 1);
+    count_outside(Counter::NoRoom, 1);
     undelivered(last.slot, last.token, last.captured);
 }
 
@@ -115,11 +115,15 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
     let Some(scratch) = scratch(slot) else {
         return 0;
     };
+    if scratch.walk.record.datagram != token {
+        // Preempted: the slot has gone on to another datagram.
+        count_outside(Counter::NoRoomUnseen, 1);
+        return 0;
+    }
     if captured != 0 {
         let record = &mut scratch.walk.record;
         record.kind = kind::UNDELIVERED;
-        record.datagram = token;
-        write(record);
+        write(slot, record);
         return 0;
     }
     let mut index = 0;
@@ -131,7 +135,7 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
             && (record.kind == kind::DATA || record.kind == kind::DATA_FRAG)
         {
             record.flags |= flag::NO_ROOM;
-            write(record);
+            write(slot, record);
         }
         index += 1;
     }

@@ -1,9 +1,6 @@
 //! From the socket buffer to an IP payload that is UDP.
 
-use aya_ebpf::{
-    bindings::__sk_buff,
-    helpers::{bpf_ktime_get_ns, generated::bpf_skb_load_bytes},
-};
+use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
 use core::mem::MaybeUninit;
 use ros2probe_wire::{filter::Counter, walk};
 
@@ -91,8 +88,6 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     packet.host = u32::from(host);
     packet.outgoing = u32::from(outgoing);
     packet.interface = interface;
-    // SAFETY: no preconditions.
-    packet.now = unsafe { bpf_ktime_get_ns() };
     // The kernel strips the outer VLAN tag on the way in; a second one is still there.
     let start = if !host && !outgoing && (protocol == VLAN || protocol == SERVICE_VLAN) {
         4
@@ -110,7 +105,7 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     if is_udp.is_none() {
         return 0;
     }
-    count(Counter::Frames, 1);
+    count(slot, Counter::Frames, 1);
     1
 }
 

@@ -50,13 +50,13 @@ pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
             break;
         }
         if hand_over(skb, slot, base, offset) == 0 {
-            count(Counter::PiecesLost, 1);
+            count(slot, Counter::PiecesLost, 1);
             return 0;
         }
         offset += PIECE_BYTES;
         number += 1;
     }
-    count(Counter::CapturedBytes, u64::from(len));
+    count(slot, Counter::CapturedBytes, u64::from(len));
     1
 }
 

@@ -17,9 +17,9 @@ use ros2probe_wire::{
 
 use crate::{
     inside::{member, place, read},
-    maps::{INTEREST, copy, count},
+    maps::{INTEREST, copy, count_outside},
     packet::IPV4_MAPPED,
-    verdict::{spend, write},
+    verdict::{spend, write_outside},
 };
 
 const UDP: u32 = 17;
@@ -109,13 +109,13 @@ fn fragment(skb: u64) -> Option<()> {
     if this.offset != 0 {
         // Behind its first fragment, or behind another of its kind.
         if !again {
-            count(Counter::NotReassembledUnnamed, 1);
+            count_outside(Counter::NotReassembledUnnamed, 1);
         }
         return None;
     }
     let linear = (head + u64::from(tail)).wrapping_sub(this.body + 8) as u32;
     if linear > 0xffff || linear < walk::HEADER_LEN {
-        count(Counter::NotReassembledUnnamed, 1);
+        count_outside(Counter::NotReassembledUnnamed, 1);
         return None;
     }
     let [ports, lengths, magic, _version, source @ ..]: [u32; 7] = read(this.body)?;
@@ -126,7 +126,7 @@ fn fragment(skb: u64) -> Option<()> {
     if udp_len < 8 + walk::HEADER_LEN {
         return None;
     }
-    count(Counter::NotReassembled, 1);
+    count_outside(Counter::NotReassembled, 1);
     let zero = core::hint::black_box(0);
     let interface = member(skb, Layout::BufferInterface)?;
     let destination = [this.name[4], this.name[5], this.name[6], this.name[7]];
@@ -194,15 +194,15 @@ pub extern "C" fn lost(payload: u64, linear: u32) -> u32 {
         // SAFETY: a map value pointer checked against null.
         Some(verdict) if unsafe { *verdict } == Verdict::Ignore as u32 => return 1,
         Some(_) => {}
-        None if spend(Budget::Records, 1) => count(Counter::MeteredUnknown, 1),
+        None if spend(Budget::Records, 1) => count_outside(Counter::MeteredUnknown, 1),
         None => {
-            count(Counter::UnknownOverBudget, 1);
+            count_outside(Counter::UnknownOverBudget, 1);
             return 1;
         }
     }
     copy(&this.walk.record, &mut this.record);
     this.record.flags |= flag::NOT_REASSEMBLED;
-    write(&this.record);
+    write_outside(&this.record);
     1
 }
 

@@ -18,11 +18,11 @@ use crate::{
 #[inline(always)]
 pub fn give(slot: u32, record: &Record, joins: bool) {
     if record.kind != kind::DATA_FRAG {
-        write(record);
+        write(slot, record);
         return;
     }
     let Some(keys) = run_keys(slot) else {
-        write(record);
+        write(slot, record);
         return;
     };
     copy(&record.writer, &mut keys.here.stream.writer);
@@ -41,26 +41,26 @@ pub fn give(slot: u32, record: &Record, joins: bool) {
         let run = unsafe { &mut *run };
         if joins && run.extend(record) {
             if run.ends_sample() {
-                write(run);
+                write(slot, run);
                 let _ = RUNS.remove(&keys.here);
             }
             return;
         }
-        write(run);
+        write(slot, run);
         if joins && begins(record) {
             copy(record, run);
             return;
         }
         let _ = RUNS.remove(&keys.here);
     } else if joins {
-        goes_on = take_over(keys, record);
+        goes_on = take_over(slot, keys, record);
     }
     if joins && (goes_on || begins(record)) && !record.ends_sample() {
         if RUNS.insert(&keys.here, record, 0).is_ok() {
             return;
         }
     }
-    write(record);
+    write(slot, record);
 }
 
 /// A sample's first fragments, with more to come.
@@ -72,7 +72,7 @@ fn begins(record: &Record) -> bool {
 /// Writes the run that the stream has left behind on another CPU; whether `record` goes on where it
 /// ends.
 #[inline(always)]
-fn take_over(keys: &mut RunKeys, record: &Record) -> bool {
+fn take_over(slot: u32, keys: &mut RunKeys, record: &Record) -> bool {
     let Some(last) = RUN_CPUS.get_ptr_mut(&keys.here.stream) else {
         let _ = RUN_CPUS.insert(&keys.here.stream, &keys.here.cpu, 0);
         return false;
@@ -94,7 +94,7 @@ fn take_over(keys: &mut RunKeys, record: &Record) -> bool {
     // are seen twice, which counts nothing.
     let run = unsafe { &mut *run };
     let goes_on = run.is_followed_by(record);
-    write(run);
+    write(slot, run);
     let _ = RUNS.remove(&keys.elsewhere);
     goes_on
 }

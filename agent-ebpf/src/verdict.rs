@@ -1,6 +1,6 @@
 //! The three verdicts on a datagram: ignore, meter, capture.
 
-use aya_ebpf::bindings::__sk_buff;
+use aya_ebpf::{bindings::__sk_buff, helpers::bpf_ktime_get_ns};
 use ros2probe_wire::{
     filter::{Budget, Counter, UNKNOWN_CAPTURE_BYTES},
     record::{Record, Verdict, flag},
@@ -11,7 +11,7 @@ use crate::{
     host,
     maps::{
         BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, UNKNOWN, copy,
-        count, opaque, scratch, setting,
+        count, count_outside, opaque, scratch, setting,
     },
     packet::{Payload, load},
     runs,
@@ -19,6 +19,8 @@ use crate::{
 
 /// Submessages that one run of the program follows; a datagram with more is captured.
 const SUBMESSAGES: u32 = 64;
+/// How old a participant's noted time may be: leases last seconds.
+const HEARD_NANOSECONDS: u64 = 10_000_000;
 /// `BPF_RB_NO_WAKEUP`, `BPF_RB_FORCE_WAKEUP`, `BPF_RB_AVAIL_DATA`.
 pub const NO_WAKEUP: u64 = 1;
 pub const FORCE_WAKEUP: u64 = 2;
@@ -47,16 +49,22 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     }
     if scratch.walk.datagram_len + 8 > scratch.packet.len {
-        count(Counter::Malformed, 1);
+        count(slot, Counter::Malformed, 1);
         return 0;
     }
     let (base, present) = (scratch.packet.body + 8, scratch.walk.datagram_len);
     if run(skb, base, present, slot) >= progress::CAPTURE {
-        captured(scratch);
+        captured(slot, scratch);
         return 1;
+    }
+    if host::sent_before(scratch) {
+        count(slot, Counter::LoopbackCopies, 1);
+        scratch.count = 0;
+        return 0;
     }
     let records = scratch.count;
     count(
+        slot,
         if records == 0 {
             Counter::Ignored
         } else {
@@ -80,12 +88,17 @@ pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()
     if magic != MAGIC {
         return None;
     }
-    count(Counter::Messages, 1);
+    count(slot, Counter::Messages, 1);
     let udp_len = u32::from_be(lengths) >> 16;
     if udp_len < 8 + walk::HEADER_LEN {
-        count(Counter::Malformed, 1);
+        count(slot, Counter::Malformed, 1);
         return None;
     }
+    if packet.fragmented == 0 {
+        // SAFETY: no preconditions.
+        scratch.packet.now = unsafe { bpf_ktime_get_ns() };
+    }
+    let packet = &scratch.packet;
     let (now, destination, interface) = (packet.now, packet.destination, packet.interface);
     let flags = (if packet.fragmented != 0 {
         flag::FRAGMENTED
@@ -117,11 +130,26 @@ pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()
     record.unused = 0;
     record.flags = flags;
     scratch.walk.begin(source, udp_len - 8);
+    heard(scratch, source, now);
+    Some(())
+}
+
+/// Notes the time of a participant's message, if user space follows the participant. One who says
+/// much is not noted each time.
+#[inline(always)]
+fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
+    let same = scratch.heard[2] == source[2]
+        && scratch.heard[1] == source[1]
+        && scratch.heard[0] == source[0];
+    if same && now.wrapping_sub(scratch.heard_at) < HEARD_NANOSECONDS {
+        return;
+    }
     if let Some(last) = PARTICIPANTS.get_ptr_mut(source) {
         // SAFETY: a map value pointer checked against null; racing writers store the same moment.
         unsafe { *last = now }
+        scratch.heard = source;
+        scratch.heard_at = now;
     }
-    Some(())
 }
 
 /// Walks the submessages that begin before `present`; the strongest [`progress`] met.
@@ -151,11 +179,11 @@ pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u3
         Step::Passed => progress::ON,
         Step::Split => progress::SPLIT,
         Step::Malformed => {
-            count(Counter::Malformed, 1);
+            count(slot, Counter::Malformed, 1);
             progress::STOP
         }
-        Step::Endpoint => endpoint(scratch, false),
-        Step::LongGap => endpoint(scratch, true),
+        Step::Endpoint => endpoint(slot, scratch, false),
+        Step::LongGap => endpoint(slot, scratch, true),
     };
     if result == progress::CAPTURE {
         // Whoever takes over reads this submessage again.
@@ -166,10 +194,10 @@ pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u3
 
 /// Asks the interest map about the submessage at hand.
 #[inline(always)]
-fn endpoint(scratch: &mut Scratch, long_gap: bool) -> u32 {
+fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
     let (key, unknown_counts) = match walk::fate(&scratch.walk.record) {
         Fate::Ignore => return progress::ON,
-        Fate::Capture if host::captured_before(scratch) => return progress::ON,
+        Fate::Capture if host::captured_before(slot, scratch) => return progress::ON,
         Fate::Capture => return progress::CAPTURE,
         Fate::Writer => (scratch.walk.record.writer, true),
         Fate::Reader => (scratch.walk.record.reader, false),
@@ -178,14 +206,14 @@ fn endpoint(scratch: &mut Scratch, long_gap: bool) -> u32 {
         // SAFETY: a map value pointer checked against null.
         Some(verdict) => match unsafe { *verdict } {
             verdict if verdict == Verdict::Capture as u32 => {
-                if !host::captured_before(scratch) {
+                if !host::captured_before(slot, scratch) {
                     return progress::CAPTURE;
                 }
                 true
             }
             verdict => verdict == Verdict::Meter as u32,
         },
-        None if unknown_counts => match unknown(scratch, key) {
+        None if unknown_counts => match unknown(slot, scratch, key) {
             progress::CAPTURE => return progress::CAPTURE,
             admitted => admitted == progress::STOP,
         },
@@ -208,7 +236,7 @@ fn endpoint(scratch: &mut Scratch, long_gap: bool) -> u32 {
 /// A writer that user space has not classified: `CAPTURE` within its budget, then `STOP` for one
 /// record, then `ON` for nothing.
 #[inline(always)]
-fn unknown(scratch: &mut Scratch, key: [u32; 4]) -> u32 {
+fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     let len = scratch.walk.datagram_len;
     let used = match UNKNOWN.get_ptr_mut(key) {
         Some(used) => used,
@@ -222,16 +250,16 @@ fn unknown(scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     };
     // SAFETY: a map value pointer checked against null.
     let used = unsafe { &mut *used };
-    if *used < UNKNOWN_CAPTURE_BYTES && !host::captured_before(scratch) && charge(len) {
+    if *used < UNKNOWN_CAPTURE_BYTES && !host::captured_before(slot, scratch) && charge(len) {
         *used += len;
         scratch.unknown = 1;
         return progress::CAPTURE;
     }
     if spend(Budget::Records, 1) {
-        count(Counter::MeteredUnknown, 1);
+        count(slot, Counter::MeteredUnknown, 1);
         return progress::STOP;
     }
-    count(Counter::UnknownOverBudget, 1);
+    count(slot, Counter::UnknownOverBudget, 1);
     progress::ON
 }
 
@@ -259,10 +287,10 @@ pub fn spend(budget: Budget, amount: u32) -> bool {
 
 /// Counts a datagram that goes to user space.
 #[inline(always)]
-pub fn captured(scratch: &Scratch) {
-    count(Counter::Captured, 1);
+pub fn captured(slot: u32, scratch: &Scratch) {
+    count(slot, Counter::Captured, 1);
     if scratch.unknown != 0 {
-        count(Counter::CapturedUnknown, 1);
+        count(slot, Counter::CapturedUnknown, 1);
     }
 }
 
@@ -297,19 +325,26 @@ pub extern "C" fn flush_one(index: u32, flags: u32, slot: u32) -> u32 {
 
 /// Writes one record; user space is woken only when the ring runs full.
 #[inline(always)]
-pub fn write(record: &Record) {
+pub fn write(slot: u32, record: &Record) {
+    count(slot, output(record), 1);
+}
+
+/// As [`write`], where no slot is held.
+#[inline(always)]
+pub fn write_outside(record: &Record) {
+    count_outside(output(record), 1);
+}
+
+#[inline(always)]
+fn output(record: &Record) -> Counter {
     let wake = if RECORDS.query(AVAILABLE_DATA) > setting!(WAKE_BYTES) {
         FORCE_WAKEUP
     } else {
         NO_WAKEUP
     };
-    let written = RECORDS.output::<Record>(record, wake).is_ok();
-    count(
-        if written {
-            Counter::Records
-        } else {
-            Counter::RecordsLost
-        },
-        1,
-    );
+    if RECORDS.output::<Record>(record, wake).is_ok() {
+        Counter::Records
+    } else {
+        Counter::RecordsLost
+    }
 }

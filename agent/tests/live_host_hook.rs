@@ -124,20 +124,19 @@ fn shared(port: u16) -> io::Result<UdpSocket> {
         sin_addr: libc::in_addr { s_addr: 0 },
         sin_zero: [0; 8],
     };
-    // SAFETY: option and address have the sizes given.
-    let results = unsafe {
-        [
-            libc::setsockopt(
-                socket.as_raw_fd(),
-                libc::SOL_SOCKET,
-                libc::SO_REUSEADDR,
-                (&raw const on).cast(),
-                4,
-            ),
-            libc::bind(socket.as_raw_fd(), (&raw const address).cast(), 16),
-        ]
+    // SAFETY: the option has the size given.
+    let set = unsafe {
+        libc::setsockopt(
+            socket.as_raw_fd(),
+            libc::SOL_SOCKET,
+            libc::SO_REUSEADDR,
+            (&raw const on).cast(),
+            4,
+        )
     };
-    if results != [0, 0] {
+    // SAFETY: the address has the size given.
+    let bound = unsafe { libc::bind(socket.as_raw_fd(), (&raw const address).cast(), 16) };
+    if (set, bound) != (0, 0) {
         return Err(io::Error::last_os_error());
     }
     Ok(socket.into())

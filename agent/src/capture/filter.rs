@@ -100,7 +100,8 @@ pub struct Filter {
     budget: Array<MapData, i64>,
     /// Values are [`Record`]s.
     runs: HashMap<MapData, RunKey, [u64; 17]>,
-    counters: PerCpuArray<MapData, u64>,
+    /// By slot.
+    counters: PerCpuArray<MapData, [u64; Counter::ALL.len()]>,
     records: RingBuf<MapData>,
 }
 
@@ -111,7 +112,7 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
-        let mut ebpf = open(settings, preempts_everything(), &sizes, None)?;
+        let mut ebpf = open(settings, &sizes, None)?;
         let program = load_program(&mut ebpf, "wire")?;
         Self::with_maps(&mut ebpf, program, None)
     }
@@ -224,21 +225,24 @@ impl Filter {
             .map_err(failed("BUDGET", "refill"))
     }
 
-    /// All counters, summed over CPUs.
+    /// All counters, summed over CPUs and the slots of each.
     ///
     /// # Errors
     /// When the kernel refuses.
     pub fn counters(&self) -> Result<Vec<(Counter, u64)>, FilterError> {
-        Counter::ALL
-            .into_iter()
-            .map(|counter| {
-                let values = self
-                    .counters
-                    .get(&(counter as u32), 0)
-                    .map_err(failed("COUNTERS", "read"))?;
-                Ok((counter, values.iter().sum()))
-            })
-            .collect()
+        let mut sums = Counter::ALL.map(|counter| (counter, 0));
+        for slot in 0..self.counters.len() {
+            let values = self
+                .counters
+                .get(&slot, 0)
+                .map_err(failed("COUNTERS", "read"))?;
+            for counters in values.iter() {
+                for ((_, sum), value) in sums.iter_mut().zip(counters) {
+                    *sum += value;
+                }
+            }
+        }
+        Ok(sums.to_vec())
     }
 
     /// Takes out the runs of DATA_FRAGs that nobody has continued since `before`
@@ -302,16 +306,14 @@ fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error>
 /// Entries of a map that the other hook uses: an LRU map has at least some.
 const UNUSED: u32 = 64;
 
-/// Opens the object and creates its maps, of which those named have another size. `interrupted`:
-/// runs of its programs may interrupt each other on a CPU. `places`: for programs that read the
-/// kernel's structures.
+/// Opens the object and creates its maps, of which those named have another size.
+/// `places`: for programs that read the kernel's structures.
 fn open(
     settings: &FilterSettings,
-    interrupted: bool,
     sizes: &[(&'static str, u32)],
     places: Option<&Places>,
 ) -> Result<Ebpf, FilterError> {
-    let interrupted = u32::from(interrupted);
+    let preempted = u32::from(preempts_everything());
     let ring = ring_size(settings.record_ring_bytes);
     let accept = u32::from(settings.accept_new_interfaces);
     let (wake, wake_pieces) = (
@@ -321,7 +323,7 @@ fn open(
     let mut loader = EbpfLoader::new();
     loader
         .override_global("NEW_INTERFACES", &accept, true)
-        .override_global("INTERRUPTED", &interrupted, true)
+        .override_global("PREEMPTED", &preempted, true)
         .override_global("WAKE_BYTES", &wake, true)
         .override_global("WAKE_PIECE_BYTES", &wake_pieces, true)
         .map_max_entries("RECORDS", ring);
