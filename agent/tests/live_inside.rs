@@ -683,3 +683,94 @@ fn a_captured_datagram_that_found_no_room_is_told_by_its_token() {
     }
     assert_eq!(refused, missing);
 }
+
+#[test]
+fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
+    const SAMPLES: usize = 2_000;
+    let mut observed = Observed::with(&FilterSettings {
+        record_ring_bytes: 8 << 20,
+        ..FilterSettings::default()
+    });
+    let host = Namespace::alone().unwrap();
+    let receiver = observed.socket(&host, "127.0.0.1:7411");
+    let other = observed.socket(&host, "127.0.0.1:7500");
+    for socket in [&receiver, &other] {
+        set(socket, libc::SO_RCVBUF, 32 * 1024);
+    }
+    let talkers = [talker(10), talker(11)];
+    for (_, writer) in &talkers {
+        let verdict = Some(Verdict::Meter);
+        observed.filter.set_interest(*writer, verdict).unwrap();
+    }
+    let mut got = BTreeSet::new();
+    let mut sent = BTreeSet::new();
+    std::thread::scope(|scope| {
+        let path = forged::path(&host);
+        let mut senders = Vec::new();
+        for (mut talker, writer) in talkers {
+            let noise = netns::within(&path, || UdpSocket::bind("127.0.0.1:0").unwrap()).unwrap();
+            let mut sender = forged::Sender::new(&host, "127.0.0.1:0", "127.0.0.1:7411").unwrap();
+            senders.push(scope.spawn(move || {
+                let mut sent = BTreeSet::new();
+                for _ in 0..SAMPLES {
+                    noise.send_to(&[7; 500], "127.0.0.1:7500").unwrap();
+                    let message = talker.sample(1_000);
+                    sent.extend(
+                        samples(&message)
+                            .iter()
+                            .map(|(number, _)| (writer, *number)),
+                    );
+                    sender.carry(&message).unwrap();
+                }
+                sent
+            }));
+        }
+        let writers: Vec<_> = senders;
+        let mut buffer = vec![0; 65_536];
+        let mut read = || {
+            while let Ok(len) = receiver.recv(&mut buffer) {
+                walk::datagram(&buffer[..len], &Envelope::default(), None, |each| {
+                    got.insert((each.record.writer(), each.record.sequence_number));
+                });
+            }
+        };
+        receiver.set_nonblocking(true).unwrap();
+        while !writers
+            .iter()
+            .all(std::thread::ScopedJoinHandle::is_finished)
+        {
+            read();
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        std::thread::sleep(SETTLED);
+        read();
+        for writer in writers {
+            sent.extend(writer.join().unwrap());
+        }
+    });
+    assert_eq!(sent.len(), 2 * SAMPLES);
+    let missing: BTreeSet<_> = sent.difference(&got).copied().collect();
+    assert!(missing.len() > 100 && got.len() > 100, "{}", missing.len());
+    let mut refused = Vec::new();
+    let mut arrived = 0;
+    while let Some(record) = observed.filter.next_record() {
+        if record.socket != cookie(&receiver) {
+            continue;
+        }
+        if record.flags & flag::NO_ROOM == 0 {
+            arrived += 1;
+        } else {
+            refused.push((record.writer(), record.sequence_number));
+        }
+    }
+    assert_eq!(observed.counted(Counter::RecordsLost), 0);
+    assert_eq!(arrived, sent.len());
+    assert_eq!(refused.len(), missing.len());
+    assert_eq!(refused.into_iter().collect::<BTreeSet<_>>(), missing);
+    assert_eq!(observed.counted(Counter::NoRoomUnseen), 0);
+    let (errors, _) = full_buffers(&host);
+    let others = observed.owners(cookie(&other))[&cookie(&other)]
+        .drops
+        .unwrap();
+    assert_eq!(errors, missing.len() as u64 + u64::from(others));
+}
