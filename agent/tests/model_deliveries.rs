@@ -443,7 +443,9 @@ fn what_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
         if is_closed {
             host.observer.socket_closed(bob.socket);
         }
-        host.wait(20_000);
+        for _ in 0..40 {
+            host.wait(1000);
+        }
         let lost = host.losses(LossCause::BeforeHost);
         let expected: &[u64] = if is_closed { &[] } else { &[18, 19, 20] };
         assert_eq!(lost, expected, "closed: {is_closed}");
@@ -459,6 +461,27 @@ fn what_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
 }
 
 #[test]
+fn what_left_for_a_receiver_that_still_talks_is_lost_soon() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=20 {
+        host.data(bob.leaving(), number);
+        host.wait(1);
+        if number < 18 {
+            host.data(bob, number);
+        }
+        host.wait(100);
+    }
+    host.wait(3000);
+    // Bob announces himself again.
+    host.participant(BOB, bob.address);
+    for _ in 0..12 {
+        host.wait(1000);
+    }
+    assert_eq!(host.losses(LossCause::BeforeHost), [18, 19, 20]);
+}
+
+#[test]
 fn a_killed_subscriber_does_not_lose_for_ever() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
@@ -469,7 +492,7 @@ fn a_killed_subscriber_does_not_lose_for_ever() {
         }
         host.wait(100);
     }
-    // What left in the first seconds of its silence is taken for lost, no more.
+    // What left in the first moments of its silence is taken for lost, no more.
     let lost = host.deliveries()[0].delivered.lost();
     assert!((30..=60).contains(&lost), "{lost}");
 }

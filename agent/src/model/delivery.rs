@@ -24,10 +24,13 @@ const ONE_FRAME: u16 = 1472;
 /// Numbers that were missed while nobody listened are excused one by one up to here; beyond, the
 /// delivery begins anew.
 const EXCUSED: u64 = 512;
-/// What left this host and did not arrive is lost if nothing arrives for this long.
-const SILENCE: i64 = 5_000_000_000;
-/// Of what left in that time, what left in the last second may be under way still.
+/// What left this host a moment ago may be under way still.
 const UNDER_WAY: u64 = 1_000_000_000;
+/// A receiver that is silent for so long and of which nothing tells whether it lives has lost what
+/// left for it in the first moments. Whoever reads the kernel's tables notices earlier that a socket
+/// was closed.
+const SILENCE: u64 = 18_000_000_000;
+const FIRST_MOMENTS: u64 = 5_000_000_000;
 /// Numbers that may be told to exist beyond the highest one seen.
 const MAX_AHEAD: u64 = 4096;
 
@@ -254,24 +257,29 @@ impl Delivery {
         reception.gap(record, budget, &mut |decision| deciding.take(decision));
     }
 
-    /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What
-    /// does not arrive while nothing else does is lost.
+    /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What does
+    /// not arrive at a receiver that was `alive` afterwards is lost.
     pub fn expect(
         &mut self,
         newest: u64,
-        left_by: impl FnOnce(Timestamp) -> Option<u64>,
+        alive: Option<Timestamp>,
+        left_by: impl Fn(Timestamp) -> Option<u64>,
         scene: &mut Scene<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
             (self.waiting, self.told) = (None, false);
             return;
         }
-        let since = *self.waiting.get_or_insert(scene.now);
-        if self.told || scene.now.nanoseconds_since(since) < SILENCE {
-            return;
+        let since = self.waiting.get_or_insert(scene.now).0;
+        let mut until = alive.map_or(0, |alive| {
+            alive.0.min(scene.now.0.saturating_sub(UNDER_WAY))
+        });
+        if !self.told && since.saturating_add(SILENCE) <= scene.now.0 {
+            self.told = true;
+            until = until.max(since.saturating_add(FIRST_MOMENTS));
         }
-        self.told = true;
-        if let Some(number) = left_by(Timestamp(scene.now.0.saturating_sub(UNDER_WAY))) {
+        let lost = left_by(Timestamp(until)).filter(|number| *number >= self.next());
+        if let Some(number) = lost.filter(|_| until >= since) {
             self.exists(number, scene);
         }
     }

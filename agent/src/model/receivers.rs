@@ -7,7 +7,7 @@
 //! nobody: what is directed at one member reaches all. Where nothing tells, or two participants
 //! share a socket, the answer is "unknown", never a guess.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
@@ -32,7 +32,8 @@ pub struct Receivers {
     learned: HashMap<u64, Owners>,
     processes: HashMap<u32, Owners>,
     places: HashMap<Place, Holder>,
-    closed: VecDeque<u64>,
+    closed: HashSet<u64>,
+    closings: VecDeque<u64>,
     limit: usize,
     generation: u64,
 }
@@ -79,7 +80,8 @@ impl Receivers {
             learned: HashMap::new(),
             processes: HashMap::new(),
             places: HashMap::new(),
-            closed: VecDeque::new(),
+            closed: HashSet::new(),
+            closings: VecDeque::new(),
             limit,
             generation: 1,
         }
@@ -105,18 +107,18 @@ impl Receivers {
     /// Whether this socket was closed a while ago.
     #[must_use]
     pub fn is_closed(&self, socket: u64) -> bool {
-        socket != 0 && self.closed.contains(&socket)
+        self.closed.contains(&socket)
     }
 
     /// Takes in what is known of a socket.
     pub fn socket(&mut self, facts: SocketFacts) {
         let (cookie, process) = (facts.cookie, facts.process_id);
         let before = self.sockets.get(cookie).and_then(|known| known.process_id);
+        self.closed.remove(&cookie);
         let is_new = self.sockets.put(facts);
         if !is_new || process == before {
             return;
         }
-        self.closed.retain(|closed| *closed != cookie);
         if let (Some(process), Some(owners)) = (process, self.learned.get(&cookie)) {
             let known = self.processes.entry(process).or_default();
             owners.0.iter().for_each(|owner| known.add(*owner));
@@ -128,10 +130,13 @@ impl Receivers {
     pub fn socket_closed(&mut self, cookie: u64) {
         self.sockets.remove(cookie);
         self.learned.remove(&cookie);
-        if self.closed.len() >= CLOSED {
-            self.closed.pop_front();
+        if self.closings.len() >= CLOSED
+            && let Some(oldest) = self.closings.pop_front()
+        {
+            self.closed.remove(&oldest);
         }
-        self.closed.push_back(cookie);
+        self.closings.push_back(cookie);
+        self.closed.insert(cookie);
         self.generation += 1;
     }
 
@@ -139,6 +144,10 @@ impl Receivers {
     pub fn learn(&mut self, record: &Record) {
         if record.flags & flag::HOST == 0 || record.socket == 0 {
             return;
+        }
+        // Who told that it was closed may have lost sight of it only.
+        if !self.closed.is_empty() {
+            self.closed.remove(&record.socket);
         }
         let (sender, directed) = if record.kind == kind::ACKNACK {
             (record.reader().prefix, record.writer().prefix)

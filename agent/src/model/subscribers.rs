@@ -497,6 +497,13 @@ impl Subscribers {
             let Some(newest) = left.next().checked_sub(1) else {
                 continue;
             };
+            let alive = match delivery.receiver() {
+                Receiver::Participant(prefix) => {
+                    let participant = stage.around.discovery.participants().get(&prefix);
+                    participant.map(|participant| participant.last_seen)
+                }
+                Receiver::Way(_) => None,
+            };
             let mut scene = scene(&mut self.totals, stage);
             let Some(delivery) = self.deliveries.get_mut(index) else {
                 return;
@@ -504,7 +511,7 @@ impl Subscribers {
             if no_more {
                 delivery.expect_no_more(newest, &mut scene);
             } else {
-                delivery.expect(newest, |at| leaving.left_by(at), &mut scene);
+                delivery.expect(newest, alive, |at| leaving.left_by(at), &mut scene);
             }
         }
     }

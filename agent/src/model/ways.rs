@@ -15,7 +15,7 @@ use super::way::{Place, Way};
 /// Ways of one writer.
 const LIMIT: usize = 512;
 /// Moments at which it is known what had left, one a second.
-const MOMENTS: usize = 12;
+const MOMENTS: usize = 24;
 const SECOND: u64 = 1_000_000_000;
 
 /// All ways of one writer, sorted.
