@@ -5,7 +5,7 @@
 //! who joins late or leaves loses nothing. Every loss has one cause; it never goes back on a cause.
 //! What leaves has no losses: what was not sent is nobody's.
 
-use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::record::kind;
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
 use super::cancelled::Cancelled;
@@ -18,9 +18,6 @@ use super::snapshot::{Breakdown, Delivered, Direction};
 use super::way::Way;
 use super::writer::settle_window;
 
-/// Largest UDP payload that fits one Ethernet frame over IPv4: a larger datagram may die in IP
-/// reassembly.
-const ONE_FRAME: u16 = 1472;
 /// Numbers that were missed while nobody listened are excused one by one up to here; beyond, the
 /// delivery begins anew.
 const EXCUSED: u64 = 512;
@@ -65,6 +62,8 @@ pub struct Scene<'a> {
     pub writer: Guid,
     /// It retransmits.
     pub reliable: bool,
+    /// Its datagrams may need IP reassembly on this host.
+    pub reassembled: bool,
     /// Memory for fragmented samples.
     pub budget: &'a mut Budget,
     /// Where losses are told.
@@ -91,8 +90,6 @@ pub struct Delivery {
     waiting: Option<Timestamp>,
     /// What left since then was taken for lost.
     told: bool,
-    /// Its datagrams may need IP reassembly on this host.
-    reassembled: bool,
 }
 
 impl Delivery {
@@ -111,7 +108,6 @@ impl Delivery {
             opened: Timestamp(0),
             waiting: None,
             told: false,
-            reassembled: false,
         }
     }
 
@@ -257,6 +253,11 @@ impl Delivery {
         reception.gap(record, budget, &mut |decision| deciding.take(decision));
     }
 
+    /// A reader asks for these again.
+    pub fn requested(&mut self, set: impl Iterator<Item = u64>) {
+        self.reception.sequence_mut().requested(set);
+    }
+
     /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What does
     /// not arrive at a receiver that was `alive` afterwards is lost.
     pub fn expect(
@@ -324,7 +325,6 @@ impl Delivery {
 
     fn touch(&mut self, record: &Record) {
         self.last_seen = self.last_seen.max(Timestamp(record.time));
-        self.reassembled |= record.flags & flag::HOST != 0 && record.datagram_len > ONE_FRAME;
     }
 
     fn take(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
@@ -457,7 +457,7 @@ impl Delivery {
         scene: &'a mut Scene<'_>,
     ) -> (&'a mut Reception, &'a mut Budget, Deciding<'a>) {
         let wait = REASSEMBLY - settle_window(scene.reliable);
-        let until = if self.reassembled {
+        let until = if scene.reassembled {
             Some(Timestamp(scene.now.0.saturating_add(wait)))
         } else {
             None

@@ -32,6 +32,9 @@ const SECOND: u64 = 1_000_000_000;
 const FORGET: u64 = 60 * SECOND;
 /// Numbers looked up in a sibling at once.
 const LOOK_BACK: u64 = 4096;
+/// Largest UDP payload that fits one Ethernet frame over IPv4: a larger datagram may die in IP
+/// reassembly.
+const ONE_FRAME: u16 = 1472;
 const DATA_FLAG: u8 = 0x04;
 
 /// All receivers and destinations of one writer.
@@ -44,6 +47,8 @@ pub struct Subscribers {
     totals: Totals,
     departures: Departures,
     acknowledgements: Acknowledgements,
+    /// Its datagrams may need IP reassembly on this host.
+    reassembled: bool,
     /// Of the answers in `ways`.
     generation: u64,
 }
@@ -124,6 +129,7 @@ impl Subscribers {
         self.refresh(stage);
         let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
         if record.kind == kind::ACKNACK {
+            self.requested(record);
             let is_reader = |topic: &Topic| is_reader(topic, record.reader());
             if stage.topic().is_some_and(is_reader) {
                 self.acknowledgements.record(record);
@@ -136,6 +142,7 @@ impl Subscribers {
             }
             return false;
         }
+        self.reassembled |= record.flags & flag::HOST != 0 && record.datagram_len > ONE_FRAME;
         let way = Way::of(record);
         if !is_sample && (!matches!(record.kind, kind::HEARTBEAT | kind::GAP) || way.is_sent()) {
             return false;
@@ -163,7 +170,7 @@ impl Subscribers {
         self.refresh(stage);
         let now = stage.now;
         for delivery in &mut self.deliveries {
-            delivery.advance(&mut scene(&mut self.totals, stage));
+            delivery.advance(&mut scene(&mut self.totals, self.reassembled, stage));
         }
         self.expect(stage, false);
         if now.0.is_multiple_of(SECOND) {
@@ -178,7 +185,7 @@ impl Subscribers {
     pub fn settle(&mut self, stage: &mut Stage<'_>) {
         self.expect(stage, true);
         for delivery in &mut self.deliveries {
-            delivery.settle(&mut scene(&mut self.totals, stage));
+            delivery.settle(&mut scene(&mut self.totals, self.reassembled, stage));
         }
     }
 
@@ -227,7 +234,10 @@ impl Subscribers {
         let Some(delivery) = self.deliveries.get_mut(place) else {
             return false;
         };
-        let (again, whole) = delivery.sample(record, &mut scene(&mut self.totals, stage));
+        let (again, whole) = delivery.sample(
+            record,
+            &mut scene(&mut self.totals, self.reassembled, stage),
+        );
         if let Some(whole) = whole {
             self.departures.note(whole.number, way.place, stage.now);
             if !self.totals.seen[0] {
@@ -317,10 +327,16 @@ impl Subscribers {
         };
         let next = delivery.next();
         if no_room {
-            delivery.no_room(record, &mut scene(&mut self.totals, stage));
+            delivery.no_room(
+                record,
+                &mut scene(&mut self.totals, self.reassembled, stage),
+            );
             return false;
         }
-        let (again, whole) = delivery.sample(record, &mut scene(&mut self.totals, stage));
+        let (again, whole) = delivery.sample(
+            record,
+            &mut scene(&mut self.totals, self.reassembled, stage),
+        );
         if self.open > 0 {
             self.share(place, next, whole.map(|whole| whole.number));
         }
@@ -380,7 +396,10 @@ impl Subscribers {
             && (is_meant || !known.way.place.is_multicast());
         if !is_heartbeat && !known.way.place.is_multicast() && self.open > 0 {
             for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
-                delivery.gap(record, &mut scene(&mut self.totals, stage));
+                delivery.gap(
+                    record,
+                    &mut scene(&mut self.totals, self.reassembled, stage),
+                );
             }
         }
         let place = match self.find(receiver) {
@@ -390,7 +409,7 @@ impl Subscribers {
         let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) else {
             return;
         };
-        let mut scene = scene(&mut self.totals, stage);
+        let mut scene = scene(&mut self.totals, self.reassembled, stage);
         if !is_heartbeat {
             delivery.gap(record, &mut scene);
         } else if is_meant || holds {
@@ -398,7 +417,20 @@ impl Subscribers {
         }
     }
 
+    /// A reader asks for samples again: what fills its gaps from now on is a retransmission.
+    fn requested(&mut self, record: &Record) {
+        let reader = record.reader().prefix;
+        for delivery in &mut self.deliveries {
+            if is_open(delivery) || delivery.receiver() == Receiver::Participant(reader) {
+                let base = record.sequence_number;
+                let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
+                delivery.requested(set);
+            }
+        }
+    }
+
     fn not_reassembled(&mut self, record: &Record, stage: &mut Stage<'_>) {
+        self.reassembled = true;
         let place = Place::of(record);
         let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
         for delivery in &mut self.deliveries {
@@ -414,7 +446,10 @@ impl Subscribers {
             };
             if self.ways.iter().any(leads_there) {
                 let number = record.sequence_number;
-                delivery.not_reassembled(number, &mut scene(&mut self.totals, stage));
+                delivery.not_reassembled(
+                    number,
+                    &mut scene(&mut self.totals, self.reassembled, stage),
+                );
             }
         }
     }
@@ -426,7 +461,10 @@ impl Subscribers {
         for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
             is_known |= delivery.next() > number;
             if delivery.misses(number) {
-                delivery.sample(record, &mut scene(&mut self.totals, stage));
+                delivery.sample(
+                    record,
+                    &mut scene(&mut self.totals, self.reassembled, stage),
+                );
             }
         }
         is_known
@@ -504,7 +542,7 @@ impl Subscribers {
                 }
                 Receiver::Way(_) => None,
             };
-            let mut scene = scene(&mut self.totals, stage);
+            let mut scene = scene(&mut self.totals, self.reassembled, stage);
             let Some(delivery) = self.deliveries.get_mut(index) else {
                 return;
             };
@@ -629,7 +667,7 @@ impl Subscribers {
                 stage.room.used = stage.room.used.saturating_sub(1);
                 if let Some(delivery) = self.deliveries.get_mut(keeps) {
                     delivery.identify(owner);
-                    delivery.absorb(gone, &mut scene(&mut self.totals, stage));
+                    delivery.absorb(gone, &mut scene(&mut self.totals, self.reassembled, stage));
                 }
                 index = 0;
             } else if let Some(delivery) = self.deliveries.get_mut(place) {
@@ -656,11 +694,11 @@ impl Subscribers {
 
     fn remove(&mut self, stage: &mut Stage<'_>, mut goes: impl FnMut(&Delivery) -> bool) {
         let before = self.deliveries.len();
-        let totals = &mut self.totals;
+        let (totals, reassembled) = (&mut self.totals, self.reassembled);
         self.deliveries.retain_mut(|delivery| {
             let goes = goes(delivery);
             if goes {
-                delivery.settle(&mut scene(totals, stage));
+                delivery.settle(&mut scene(totals, reassembled, stage));
             }
             !goes
         });
@@ -704,11 +742,12 @@ fn is_reader(topic: &Topic, guid: Guid) -> bool {
         .any(|list| list.binary_search(&guid).is_ok())
 }
 
-fn scene<'a>(totals: &'a mut Totals, stage: &'a mut Stage<'_>) -> Scene<'a> {
+fn scene<'a>(totals: &'a mut Totals, reassembled: bool, stage: &'a mut Stage<'_>) -> Scene<'a> {
     Scene {
         now: stage.now,
         writer: stage.writer,
         reliable: stage.reliable,
+        reassembled,
         budget: stage.budget,
         journal: stage.journal,
         totals,
