@@ -46,6 +46,10 @@ pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
 #[unsafe(no_mangle)]
 pub static PREEMPTED: u32 = 1;
 
+/// Whether programs may read packets in place: at a cgroup they may. Set by the loader.
+#[unsafe(no_mangle)]
+pub static IN_PLACE: u32 = 1;
+
 /// Reads a setting that the loader may have changed.
 macro_rules! setting {
     ($name:ident) => {{

@@ -147,9 +147,9 @@ fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
     if let Some(last) = PARTICIPANTS.get_ptr_mut(source) {
         // SAFETY: a map value pointer checked against null; racing writers store the same moment.
         unsafe { *last = now }
-        scratch.heard = source;
-        scratch.heard_at = now;
     }
+    scratch.heard = source;
+    scratch.heard_at = now;
 }
 
 /// Walks the submessages that begin before `present`; the strongest [`progress`] met.

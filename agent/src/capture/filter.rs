@@ -112,7 +112,7 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
-        let mut ebpf = open(settings, &sizes, None)?;
+        let mut ebpf = open(settings, false, &sizes, None)?;
         let program = load_program(&mut ebpf, "wire")?;
         Self::with_maps(&mut ebpf, program, None)
     }
@@ -307,12 +307,14 @@ fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error>
 const UNUSED: u32 = 64;
 
 /// Opens the object and creates its maps, of which those named have another size.
-/// `places`: for programs that read the kernel's structures.
+/// `host`: for the host hook. `places`: for programs that read the kernel's structures.
 fn open(
     settings: &FilterSettings,
+    host: bool,
     sizes: &[(&'static str, u32)],
     places: Option<&Places>,
 ) -> Result<Ebpf, FilterError> {
+    let in_place = u32::from(host);
     let preempted = u32::from(preempts_everything());
     let ring = ring_size(settings.record_ring_bytes);
     let accept = u32::from(settings.accept_new_interfaces);
@@ -323,6 +325,7 @@ fn open(
     let mut loader = EbpfLoader::new();
     loader
         .override_global("NEW_INTERFACES", &accept, true)
+        .override_global("IN_PLACE", &in_place, true)
         .override_global("PREEMPTED", &preempted, true)
         .override_global("WAKE_BYTES", &wake, true)
         .override_global("WAKE_PIECE_BYTES", &wake_pieces, true)

@@ -67,7 +67,7 @@ impl Filter {
             Places::unknown("the kernel was not asked for its types".to_owned())
         };
         let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
-        let mut ebpf = open(settings, &sizes, Some(&places))?;
+        let mut ebpf = open(settings, true, &sizes, Some(&places))?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
