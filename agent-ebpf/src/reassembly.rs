@@ -1,9 +1,13 @@
-//! Datagrams that never became complete: the kernel has given up waiting for IP fragments.
+//! Datagrams that never became complete: the kernel has given up waiting for IP fragments, or had
+//! no memory left for them.
 //!
 //! Looks at every packet that the kernel throws away, and at nothing of it but the reason, unless
 //! it is a fragment's. The first fragment of such a datagram tells which samples are lost; without
 //! it nothing can be named, and the datagram is only counted. So is one whose first bytes are not
 //! in the linear part of the buffer, as some network drivers leave them.
+//!
+//! That there is no memory is no reason of its own. A first fragment that is thrown away for none
+//! counts as refused if its network namespace has used up what fragments may take.
 
 use aya_ebpf::{
     helpers::bpf_ktime_get_ns, macros::map, maps::PerCpuArray, programs::RawTracePointContext,
@@ -17,7 +21,7 @@ use ros2probe_wire::{
 
 use crate::{
     inside::{member, place, read},
-    maps::{INTEREST, copy, count_outside},
+    maps::{INTEREST, add, copy, count_outside},
     packet::IPV4_MAPPED,
     verdict::{spend, write_outside},
 };
@@ -31,7 +35,8 @@ const DESTINATION_OPTIONS: u32 = 60;
 /// Submessages of a first fragment that are looked at.
 const SUBMESSAGES: u32 = 64;
 
-/// Working memory. Fragments are thrown away with bottom halves disabled, so nobody interferes.
+/// Working memory. Fragments are thrown away with bottom halves disabled, one after the other; what
+/// turns out to be something else may be interrupted by them.
 #[map]
 static INCOMPLETE: PerCpuArray<Incomplete> = PerCpuArray::with_max_entries(1, 0);
 
@@ -49,8 +54,12 @@ struct Incomplete {
     offset: u32,
     /// The fragment header's next header, or the IPv4 protocol.
     protocol: u32,
+    /// More fragments follow.
+    more: u32,
     /// Address of the IP payload.
     body: u64,
+    /// Runs that use this or are about to notice that another does.
+    claims: u64,
 }
 
 #[inline(always)]
@@ -82,27 +91,39 @@ impl walk::Bytes for Linear {
 pub fn dropped(context: &RawTracePointContext) {
     let reason: u64 = context.arg(2);
     let reason = reason as u32;
-    if reason != place(Layout::ReasonTimeout) && reason != place(Layout::ReasonTooFar) {
+    let gave_up = reason == place(Layout::ReasonTimeout) || reason == place(Layout::ReasonTooFar);
+    if !gave_up && reason != place(Layout::ReasonNone) {
         return;
     }
     let skb: u64 = context.arg(0);
-    let _ = fragment(skb);
+    let Some(this) = incomplete() else { return };
+    let claims = &raw mut this.claims;
+    add(claims, 1);
+    // SAFETY: a field of a map value; see `maps::claim`.
+    if unsafe { core::ptr::read_volatile(claims) } == 1 {
+        let _ = fragment(skb, gave_up, this);
+    } else {
+        count_outside(Counter::Contended, 1);
+    }
+    add(claims, u64::MAX);
 }
 
 #[inline(always)]
-fn fragment(skb: u64) -> Option<()> {
+fn fragment(skb: u64, gave_up: bool, this: &mut Incomplete) -> Option<()> {
     let head: u64 = member(skb, Layout::BufferHead)?;
     let tail: u32 = member(skb, Layout::BufferTail)?;
     let network: u16 = member(skb, Layout::BufferNetworkHeader)?;
     let ip = head + u64::from(network);
     let [first]: [u8; 1] = read(ip)?;
-    let this = incomplete()?;
-    let parsed = if first >> 4 == 4 {
-        ipv4(ip, this)
-    } else {
-        ipv6(ip, this)
+    let parsed = match first >> 4 {
+        4 => ipv4(ip, this),
+        6 => ipv6(ip, this),
+        _ => None,
     };
     if parsed.is_none() || this.protocol != UDP {
+        return None;
+    }
+    if !gave_up && (this.offset != 0 || this.more == 0 || !is_full(skb, this.ipv6 != 0)?) {
         return None;
     }
     let again = is_again(this);
@@ -152,6 +173,22 @@ fn fragment(skb: u64) -> Option<()> {
         submessages += 1;
     }
     Some(())
+}
+
+/// Whether there is no memory for further fragments: the kernel's own condition, with some room for
+/// what has changed since it looked.
+#[inline(always)]
+fn is_full(skb: u64, ipv6: bool) -> Option<bool> {
+    let device: u64 = member(skb, Layout::BufferDevice)?;
+    let namespace: u64 = member(device, Layout::DeviceNamespace)?;
+    let fragments: u64 = if ipv6 {
+        member(namespace, Layout::NamespaceFragments6)?
+    } else {
+        member(namespace, Layout::NamespaceFragments4)?
+    };
+    let memory: u64 = member(fragments, Layout::FragmentsMemory)?;
+    let limit: u64 = member(fragments, Layout::FragmentsLimit)?;
+    Some(memory >= limit - (limit >> 4))
 }
 
 /// Whether the fragment at hand is of the datagram of the one before; from now on it is that one.
@@ -213,6 +250,7 @@ fn ipv4(ip: u64, this: &mut Incomplete) -> Option<()> {
     let (first, second) = (u32::from_be(first), u32::from_be(second));
     this.protocol = u32::from_be(third) >> 16 & 0xff;
     this.offset = second & 0x1fff;
+    this.more = second >> 13 & 1;
     this.ipv6 = core::hint::black_box(0);
     let zero = this.ipv6;
     this.name = [
@@ -243,6 +281,7 @@ fn ipv6(ip: u64, this: &mut Incomplete) -> Option<()> {
         if next == FRAGMENT {
             this.protocol = word >> 24;
             this.offset = word & 0xfff8;
+            this.more = word & 1;
             this.ipv6 = 1;
             this.name = [
                 header[2], header[3], header[4], header[5], header[6], header[7], header[8],

@@ -343,6 +343,57 @@ fn one_that_too_many_others_have_overtaken_is_named_when_it_is_given_up() {
 }
 
 #[test]
+fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
+    let (mut observed, link, mut talker, writer) = observed_link(12, Verdict::Meter);
+    let monitor = link.monitor.address();
+    for (family, from, to) in [
+        (
+            "ipv4/ipfrag",
+            format!("{}:0", link.robot.address()),
+            format!("{monitor}:7411"),
+        ),
+        (
+            "ipv6/ip6frag",
+            "[fd99::1]:0".to_owned(),
+            "[fd99::2]:7411".to_owned(),
+        ),
+    ] {
+        let _receiver = observed.socket(&link.monitor, &to);
+        let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
+        // The receiver's link address has to be found first.
+        sender.carry(&talker.sample(100)).unwrap();
+        std::thread::sleep(SETTLED);
+        observed.records(writer, Duration::ZERO);
+        // Half of the first datagram takes all there is, and keeps it.
+        let limit = |bytes: &str| {
+            std::fs::write(format!("/proc/sys/net/{family}_low_thresh"), "1").unwrap();
+            std::fs::write(format!("/proc/sys/net/{family}_high_thresh"), bytes).unwrap();
+        };
+        netns::within(&forged::path(&link.monitor), || limit("40000")).unwrap();
+        let some = talker.sent() + 1;
+        for _ in 0..5 {
+            sender.carry(&talker.sample(60_000)).unwrap();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let found = observed.records(writer, SETTLED);
+        let lost: Vec<_> = found
+            .iter()
+            .filter(|record| record.flags & flag::NOT_REASSEMBLED != 0)
+            .collect();
+        // The first one is waited for; the others have found no room.
+        let expected: Told = (some + 1..some + 5)
+            .map(|number| (number.into(), 0))
+            .collect();
+        assert_eq!(
+            (told(lost.iter().copied()), lost.len()),
+            (expected, 4),
+            "{family}"
+        );
+        netns::within(&forged::path(&link.monitor), || limit("4000000")).unwrap();
+    }
+}
+
+#[test]
 fn over_ipv6_it_is_named_likewise() {
     let mut observed = Observed::new();
     let link = Link::new().unwrap();

@@ -57,8 +57,8 @@ pub enum Counter {
     NoRoom,
     /// Datagrams that a socket had no room for and that the host hook had not just seen there.
     NoRoomUnseen,
-    /// RTPS datagrams that lacked IP fragments until the kernel gave up, and whose first fragment
-    /// was there.
+    /// RTPS datagrams that lacked IP fragments until the kernel gave up, or were refused for lack of
+    /// memory for fragments, and whose first fragment was there.
     NotReassembled,
     /// UDP datagrams likewise whose first fragment was not there, or not where it can be read.
     NotReassembledUnnamed,

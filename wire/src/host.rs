@@ -106,6 +106,20 @@ pub enum Layout {
     ReasonTimeout,
     /// `SKB_DROP_REASON_FRAG_TOO_FAR`.
     ReasonTooFar,
+    /// `SKB_DROP_REASON_NOT_SPECIFIED`.
+    ReasonNone,
+    /// `sk_buff.dev`.
+    BufferDevice,
+    /// `net_device.nd_net`: its network namespace.
+    DeviceNamespace,
+    /// `net.ipv4.fqdir`: all fragments over IPv4 that wait in a network namespace.
+    NamespaceFragments4,
+    /// `net.ipv6.fqdir`.
+    NamespaceFragments6,
+    /// `fqdir.mem`: bytes that they take.
+    FragmentsMemory,
+    /// `fqdir.high_thresh`: bytes that they may take.
+    FragmentsLimit,
     /// `sock.__sk_common.skc_cookie`.
     SocketCookie,
     /// `sock.sk_drops`.

@@ -91,6 +91,11 @@ impl Talker {
         self.endpoint(SUBSCRIPTIONS_WRITER, reader, dds_topic, dds_type, number)
     }
 
+    /// Number of the last sample.
+    pub(crate) fn sent(&self) -> u32 {
+        self.sent
+    }
+
     /// The next sample, `size` bytes with its encapsulation header.
     pub(crate) fn sample(&mut self, size: usize) -> Vec<u8> {
         self.sent += 1;
