@@ -1,0 +1,208 @@
+//! Two robots, an agent on each, and packets lost between them: a real Prometheus that scrapes both
+//! subtracts what arrived from what was sent and finds exactly what was lost on the way.
+//!
+//! The judges are what the publisher and the subscriber log and the count of dropped datagrams.
+
+mod harness;
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Result, ensure};
+use harness::agent::{Agent, ON_THE_WIRE, at_the_sockets_of};
+use harness::loss::Loss;
+use harness::network::Namespace;
+use harness::peer::{Peer, Role, Stack, Stream};
+use harness::prometheus::Prometheus;
+use harness::switch::Switched;
+
+/// Ten seconds.
+const SAMPLES: u64 = 2_000;
+const PER_MILLE: u16 = 200;
+
+#[derive(Clone, Copy)]
+enum Source {
+    Host,
+    Wire,
+}
+
+/// How one writer's samples fared from one robot to the other.
+struct Journey {
+    published: u64,
+    received: u64,
+    dropped: u64,
+    /// The rules' answers.
+    difference: f64,
+    ratio: f64,
+    before_host: f64,
+}
+
+#[test]
+fn fast_dds_samples_lost_between_two_hosts_are_the_difference_on_the_wire() -> Result<()> {
+    best_effort(Source::Wire, Stack::Fast)
+}
+
+#[test]
+fn cyclone_dds_samples_lost_between_two_hosts_are_the_difference_on_the_wire() -> Result<()> {
+    best_effort(Source::Wire, Stack::Cyclone)
+}
+
+#[test]
+fn rust_dds_samples_lost_between_two_hosts_are_the_difference_on_the_wire() -> Result<()> {
+    best_effort(Source::Wire, Stack::Rust)
+}
+
+#[test]
+fn fast_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -> Result<()> {
+    best_effort(Source::Host, Stack::Fast)
+}
+
+#[test]
+fn cyclone_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -> Result<()> {
+    best_effort(Source::Host, Stack::Cyclone)
+}
+
+#[test]
+fn rust_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -> Result<()> {
+    best_effort(Source::Host, Stack::Rust)
+}
+
+#[test]
+fn what_was_sent_again_is_not_lost_between_two_hosts_on_the_wire() -> Result<()> {
+    reliable(Source::Wire)
+}
+
+#[test]
+fn what_was_sent_again_is_not_lost_between_two_hosts_at_the_sockets() -> Result<()> {
+    reliable(Source::Host)
+}
+
+fn best_effort(source: Source, stack: Stack) -> Result<()> {
+    let seen = Journey::of(source, stack, &stream())?;
+    let lost = seen.published - seen.received;
+    ensure!(seen.published == SAMPLES, "{} published", seen.published);
+    ensure!(
+        lost == seen.dropped && lost > SAMPLES / 10,
+        "{lost} lost, {} dropped",
+        seen.dropped
+    );
+    ensure!(
+        seen.difference == lost as f64,
+        "{} by the rule, {lost} lost",
+        seen.difference
+    );
+    // What the receiver's agent notices by itself ends with the last sample that came.
+    ensure!(
+        seen.before_host <= lost as f64 && seen.before_host >= lost as f64 - 20.0,
+        "{} of {lost} noticed by the receiver",
+        seen.before_host
+    );
+    // A rate begins with the second scrape of either counter: a second of ten may be left out.
+    let part = lost as f64 / seen.published as f64;
+    ensure!(
+        (seen.ratio - part).abs() < 0.1,
+        "{} by the rule, {part} lost",
+        seen.ratio
+    );
+    Ok(())
+}
+
+fn reliable(source: Source) -> Result<()> {
+    let stream = Stream {
+        reliable: true,
+        ..stream()
+    };
+    let seen = Journey::of(source, Stack::Cyclone, &stream)?;
+    ensure!(seen.dropped > SAMPLES / 10, "{} dropped", seen.dropped);
+    ensure!(seen.received == SAMPLES, "{} received", seen.received);
+    ensure!(seen.difference == 0.0, "{} by the rule", seen.difference);
+    ensure!(
+        seen.before_host == 0.0,
+        "{} by the receiver",
+        seen.before_host
+    );
+    Ok(())
+}
+
+/// The publisher stays until it has been asked about.
+fn stream() -> Stream {
+    Stream {
+        linger: 60.0,
+        ..Stream::small(SAMPLES)
+    }
+}
+
+impl Journey {
+    fn of(source: Source, stack: Stack, stream: &Stream) -> Result<Journey> {
+        let Switched { link, switch } = Switched::new()?;
+        let directory = tempfile::tempdir()?;
+        let robot = start(&link.robot, source, stream, directory.path())?;
+        let monitor = start(&link.monitor, source, stream, directory.path())?;
+        let targets = [&link.robot, &link.monitor].map(|host| format!("{}:17400", host.address()));
+        let rules = Path::new(env!("CARGO_MANIFEST_DIR")).join("../dashboards/rules");
+        let rules: [PathBuf; 1] = [rules.join("ros2probe.rules.yaml")];
+        let prometheus = Prometheus::start(&link.monitor, &targets, &rules)?;
+
+        let mut subscriber = Peer::start(
+            &link.monitor,
+            stack,
+            Role::Subscriber,
+            stream,
+            &["/listener"],
+        )?;
+        let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, stream, &["/talker"])?;
+        subscriber.wait_matched()?;
+        publisher.wait_matched()?;
+        prometheus.wait_for("sum(up)", 2.0)?;
+        let loss = Loss::of_samples(&switch, &link.monitor, stream, PER_MILLE)?;
+        publisher.go()?;
+        publisher.wait_sent(Duration::from_secs(60))?;
+        // Settled, scraped and evaluated, while publisher and subscriber are still there.
+        std::thread::sleep(Duration::from_secs(7));
+
+        let labels = format!("topic=\"{}\"", stream.topic);
+        let rule = |name: &str| {
+            let series = format!("subscriber:ros2_between_hosts_lost_messages:{name}{{{labels}}}");
+            let several = prometheus.series(&series)?;
+            ensure!(several == 1, "{several} series of {series}");
+            prometheus.query(&series)
+        };
+        let published: BTreeSet<u64> = publisher.log()?.sequences("pub").into_iter().collect();
+        let received: BTreeSet<u64> = subscriber.log()?.sequences("sub").into_iter().collect();
+        let journey = Journey {
+            published: published.len() as u64,
+            received: received.len() as u64,
+            dropped: loss.counts()?.dropped,
+            difference: rule("difference")?,
+            ratio: rule("ratio_rate5m")?,
+            before_host: prometheus.query(&format!(
+                "sum(ros2_subscriber_lost_messages_total{{{labels},cause=\"before_host\"}})"
+            ))?,
+        };
+        drop((robot, monitor));
+        Ok(journey)
+    }
+}
+
+fn start<'a>(
+    host: &'a Namespace,
+    source: Source,
+    stream: &Stream,
+    directory: &Path,
+) -> Result<Agent<'a>> {
+    let source = match source {
+        // Both robots are one machine here: each agent keeps to its own.
+        Source::Host => at_the_sockets_of(host),
+        Source::Wire => ON_THE_WIRE.to_owned(),
+    };
+    let configuration = directory.join(format!("{}.yaml", host.name()));
+    let text = format!(
+        "watch: [{{topic: {}, per_subscriber: true}}]\n\
+         {source}\
+         metrics: {{listen: '0.0.0.0:17400'}}\n",
+        stream.topic
+    );
+    std::fs::write(&configuration, text)?;
+    Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)
+}
