@@ -67,7 +67,7 @@ pub(in crate::surface) const TOPIC_DELIVERY_UNMATCHED: Metric = Metric::counter(
 pub(in crate::surface) const TOPIC_LAG: Metric = Metric::gauge(
     "ros2_topic_acknowledgement_lag_messages",
     TOPIC,
-    "Messages that the slowest reliable reader has not acknowledged.",
+    "Messages that the slowest reliable reader has not acknowledged; some writers ask for it seldom while nothing is missing.",
 );
 pub(in crate::surface) const TOPIC_LAG_SECONDS: Metric = Metric::gauge(
     "ros2_topic_acknowledgement_lag_seconds",
