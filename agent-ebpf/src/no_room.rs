@@ -12,18 +12,19 @@ use aya_ebpf::{helpers::bpf_ktime_get_ns, programs::RawTracePointContext};
 use ros2probe_wire::{
     filter::Counter,
     host::Layout,
-    record::{flag, kind},
+    record::{Record, flag, kind},
 };
 
 use crate::{
-    inside::{member, place},
+    inside::{member, place, read},
     maps::{Last, RECORDS_PER_DATAGRAM, SOCKETS, add, count_outside, last, scratch},
     verdict::write,
 };
 
 /// A packet that is thrown away later than this after the hook has seen it has been in the socket's
-/// buffer, or is another one in the same place.
-const AT_ONCE_NANOSECONDS: u64 = 2_000_000;
+/// buffer, or is another one in the same place: so where it cannot be compared, and where it can.
+const AT_ONCE_NANOSECONDS: u64 = 200_000;
+const COMPARED_NANOSECONDS: u64 = 10_000_000;
 
 /// `udp_fail_queue_rcv_skb(rc, sk)`.
 #[inline(always)]
@@ -64,7 +65,8 @@ pub fn freed(context: &RawTracePointContext) {
     }
 }
 
-/// `kfree_skb(skb, location)`. That it is thrown away at once is all that there is to know.
+/// `kfree_skb(skb, location)`. That it is thrown away at once is all that there is to know, unless
+/// the kernel's types are known.
 #[inline(always)]
 pub fn unexplained(context: &RawTracePointContext) {
     let buffer: u64 = context.arg(0);
@@ -72,11 +74,31 @@ pub fn unexplained(context: &RawTracePointContext) {
     let Some(scratch) = scratch(last.slot) else {
         return;
     };
+    let record = &scratch.walk.record;
+    let mut limit = AT_ONCE_NANOSECONDS;
+    if place(Layout::BufferTransportHeader) != Layout::ABSENT {
+        if is_of(buffer, record).is_none() {
+            return;
+        }
+        limit = COMPARED_NANOSECONDS;
+    }
     // SAFETY: no preconditions.
-    let age = unsafe { bpf_ktime_get_ns() }.wrapping_sub(scratch.walk.record.time);
-    if age < AT_ONCE_NANOSECONDS {
+    let age = unsafe { bpf_ktime_get_ns() }.wrapping_sub(record.time);
+    if age < limit {
         end(last);
     }
+}
+
+/// Something if the packet's UDP header is that of the record's datagram.
+#[inline(always)]
+fn is_of(buffer: u64, record: &Record) -> Option<()> {
+    let head: u64 = member(buffer, Layout::BufferHead)?;
+    let transport: u16 = member(buffer, Layout::BufferTransportHeader)?;
+    let [source, destination, len, _]: [u16; 4] = read(head + u64::from(transport))?;
+    let same = u16::from_be(source) == record.source_port
+        && u16::from_be(destination) == record.destination_port
+        && u16::from_be(len) == record.datagram_len.wrapping_add(8);
+    same.then_some(())
 }
 
 /// The hook's last datagram, if this is it and nothing has been told of its end.

@@ -96,6 +96,8 @@ pub enum Layout {
     BufferTail,
     /// `sk_buff.network_header`: bytes from the head to the IP header.
     BufferNetworkHeader,
+    /// `sk_buff.transport_header`: bytes from the head to the UDP header.
+    BufferTransportHeader,
     /// `sk_buff.skb_iif`: the interface it came in on.
     BufferInterface,
     /// `SKB_DROP_REASON_SOCKET_RCVBUFF`.

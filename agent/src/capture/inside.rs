@@ -45,6 +45,7 @@ const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::BufferHead, "sk_buff", "head"),
     (Layout::BufferTail, "sk_buff", "tail"),
     (Layout::BufferNetworkHeader, "sk_buff", "network_header"),
+    (Layout::BufferTransportHeader, "sk_buff", "transport_header"),
     (Layout::BufferInterface, "sk_buff", "skb_iif"),
     (
         Layout::ReasonBufferFull,
