@@ -16,7 +16,7 @@ use ros2probe::capture::pcap::PcapReader;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::reassembly::Limits;
-use ros2probe_wire::record::{guid_words, kind};
+use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
 const START: u64 = 1_795_143_000_000_000_000;
@@ -112,6 +112,65 @@ fn samples(criterion: &mut Criterion) {
     group.finish();
 }
 
+/// Records of the host hook: what one writer sends to four receivers.
+fn deliveries(criterion: &mut Criterion) {
+    let mut group = criterion.benchmark_group("deliveries");
+    group.throughput(Throughput::Elements(1));
+    let at = |number: u64, socket: u64| Record {
+        kind: kind::DATA,
+        submessage_flags: 5,
+        writer: guid_words(guid(7)),
+        time: START + number * 100_000 + socket,
+        sequence_number: number,
+        payload_len: 324,
+        source_timestamp: 1_795_143_000 << 32,
+        destination: [
+            0,
+            0,
+            u32::from_be(0xffff),
+            u32::from_ne_bytes([10, 0, 0, 2]),
+        ],
+        destination_port: u16::try_from(7411 + socket).unwrap(),
+        flags: flag::HOST,
+        socket,
+        ..Record::default()
+    };
+    for (name, lost) in [
+        ("record to four receivers", u64::MAX),
+        ("record to four receivers that lose a tenth", 10),
+    ] {
+        let mut world = observer(100);
+        let mut count = 0;
+        group.bench_function(name, |bencher| {
+            bencher.iter(|| {
+                count += 1;
+                let (number, socket) = (count / 4 + 1, count % 4 + 1);
+                let record = at(number, socket);
+                if (number + socket) % lost != 0 {
+                    world.record(black_box(&record));
+                }
+                if count % 4000 == 0 {
+                    world.advance(Timestamp(record.time));
+                }
+            });
+        });
+    }
+    let mut world = observer(100);
+    let mut count = 0;
+    group.bench_function("record that leaves and arrives", |bencher| {
+        bencher.iter(|| {
+            count += 1;
+            let (number, leaves) = (count / 2 + 1, count % 2 == 0);
+            let mut record = at(number, 1);
+            if leaves {
+                record.flags |= flag::OUTGOING;
+            }
+            world.record(black_box(&record));
+        });
+    });
+    group.finish();
+}
+
 fn discovery(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("discovery");
     let envelope = forge::multicast(START, 0);
@@ -175,5 +234,12 @@ fn captures(criterion: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, samples, discovery, housekeeping, captures);
+criterion_group!(
+    benches,
+    samples,
+    deliveries,
+    discovery,
+    housekeeping,
+    captures
+);
 criterion_main!(benches);

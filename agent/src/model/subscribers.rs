@@ -476,7 +476,9 @@ impl Subscribers {
             return;
         };
         if is_open(delivery) {
-            let Some(number) = whole else { return };
+            let Some(number) = whole.filter(|_| self.open < self.deliveries.len()) else {
+                return;
+            };
             for other in &mut self.deliveries {
                 if !other.main().is_sent() && !is_open(other) && other.misses(number) {
                     other.know(number);
