@@ -648,6 +648,55 @@ fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
     assert_eq!(sockets[0].unidentified_drops, 3);
 }
 
+#[test]
+fn a_best_effort_reader_of_a_reliable_writer_is_sent_nothing_again() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    host.subscribe_with(BOB, 2, false);
+    host.wait(10);
+    for number in 1..=100 {
+        if number % 10 != 0 {
+            host.data(bob, number);
+        }
+        // All others have acknowledged all: the writer has nothing before this any more.
+        host.heartbeat(bob, number, number);
+        host.wait(10);
+    }
+    host.wait(2000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!(
+        (facts.lost(), facts.irrelevant, facts.recovered),
+        (10, 0, 0)
+    );
+}
+
+#[test]
+fn heartbeats_alone_lose_nothing_until_the_reader_asks() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    // All samples go by shared memory.
+    for number in 1..=100 {
+        host.heartbeat(bob.directed(BOB), 1, number);
+        host.wait(100);
+    }
+    host.wait(12_000);
+    assert_eq!(host.deliveries()[0].delivered.lost(), 0);
+    // All samples are larger than what gets through, and the reader asks for them.
+    for number in 101..=120 {
+        host.heartbeat(bob.directed(BOB), 1, number);
+        let acknack = Record {
+            reader: guid_words(Guid::new(BOB, READER)),
+            stamp_seconds: 1,
+            stamp_nanoseconds: 1 << 31,
+            ..host.record(bob.leaving(), kind::ACKNACK, 101)
+        };
+        host.put(acknack);
+        host.wait(100);
+    }
+    host.wait(12_000);
+    assert!((118..=120).contains(&host.deliveries()[0].delivered.lost()));
+}
+
 /// What becomes of one sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Fate {

@@ -90,6 +90,10 @@ pub struct Delivery {
     waiting: Option<Timestamp>,
     /// What left since then was taken for lost.
     told: bool,
+    /// All its readers are best effort: nothing is sent to them again, nothing is said to them.
+    best_effort: bool,
+    /// Samples come here over the network, or should: not all by shared memory.
+    proven: bool,
 }
 
 impl Delivery {
@@ -108,6 +112,8 @@ impl Delivery {
             opened: Timestamp(0),
             waiting: None,
             told: false,
+            best_effort: false,
+            proven: false,
         }
     }
 
@@ -183,6 +189,11 @@ impl Delivery {
         self.opened = self.opened.max(at);
     }
 
+    /// Whether none of its readers is reliable.
+    pub const fn learn(&mut self, best_effort: bool) {
+        self.best_effort = best_effort;
+    }
+
     /// The last reader is gone: what it has not got since its last sample it did not want.
     pub fn close(&mut self, budget: &mut Budget) {
         (self.waiting, self.told) = (None, false);
@@ -192,7 +203,7 @@ impl Delivery {
     /// Takes in a DATA or DATA_FRAG; whether it brought nothing new, and what it completed.
     pub fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
         self.touch(record);
-        (self.waiting, self.told) = (None, false);
+        (self.waiting, self.told, self.proven) = (None, false, true);
         if self.cancelled.is_empty() {
             return self.take(record, scene);
         }
@@ -208,7 +219,7 @@ impl Delivery {
     /// Takes in that the socket had no room for this DATA or DATA_FRAG.
     pub fn no_room(&mut self, record: &Record, scene: &mut Scene<'_>) {
         self.touch(record);
-        (self.waiting, self.told) = (None, false);
+        (self.waiting, self.told, self.proven) = (None, false, true);
         if self.cancelled.note(record) {
             scene.budget.evictions += 1;
         }
@@ -222,6 +233,7 @@ impl Delivery {
 
     /// Takes in that the kernel gave up on some IP fragments of this sample.
     pub fn not_reassembled(&mut self, number: u64, scene: &mut Scene<'_>) {
+        self.proven = true;
         let sequence = self.reception.sequence();
         if !sequence.started() || number > sequence.next().saturating_add(MAX_AHEAD) {
             return;
@@ -237,13 +249,27 @@ impl Delivery {
         self.die(number, LossCause::Reassembly, scene);
     }
 
-    /// Takes in a HEARTBEAT for this receiver. What it has begins here, if nothing came before.
+    /// Takes in a HEARTBEAT for this receiver. What it has begins here, if nothing came before; but
+    /// as long as nothing comes and nothing is asked for, its samples may go by shared memory.
     pub fn heartbeat(&mut self, record: &Record, scene: &mut Scene<'_>) {
         self.touch(record);
         let last = record.second_sequence_number();
         self.reception.sequence_mut().begin(last.saturating_add(1));
+        if !self.proven {
+            return;
+        }
+        // A best-effort reader does not hear what the writer will not send again: it is lost.
+        let sequence_number = if self.best_effort {
+            1
+        } else {
+            record.sequence_number
+        };
+        let record = Record {
+            sequence_number,
+            ..*record
+        };
         let (reception, budget, mut deciding) = self.split(scene);
-        reception.heartbeat(record, budget, &mut |decision| deciding.take(decision));
+        reception.heartbeat(&record, budget, &mut |decision| deciding.take(decision));
     }
 
     /// Takes in a GAP for this receiver.
@@ -253,9 +279,14 @@ impl Delivery {
         reception.gap(record, budget, &mut |decision| deciding.take(decision));
     }
 
-    /// A reader asks for these again.
-    pub fn requested(&mut self, set: impl Iterator<Item = u64>) {
-        self.reception.sequence_mut().requested(set);
+    /// Takes in an ACKNACK: a reader asks for samples again.
+    pub fn requested(&mut self, record: &Record) {
+        let base = record.sequence_number;
+        let set = || record.bitmap().map(|bit| base.saturating_add(bit.into()));
+        let sequence = self.reception.sequence_mut();
+        let first = sequence.first();
+        self.proven |= sequence.started() && set().any(|number| number >= first);
+        sequence.requested(set());
     }
 
     /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What does
@@ -294,7 +325,7 @@ impl Delivery {
 
     /// Settles what has waited long enough.
     pub fn advance(&mut self, scene: &mut Scene<'_>) {
-        let (now, window) = (scene.now, settle_window(scene.reliable));
+        let (now, window) = (scene.now, settle_window(self.is_reliable(scene)));
         let (reception, budget, mut deciding) = self.split(scene);
         reception.advance(now, window, budget, &mut |decision| deciding.take(decision));
         self.conclude(now, scene);
@@ -323,12 +354,16 @@ impl Delivery {
         });
     }
 
+    const fn is_reliable(&self, scene: &Scene<'_>) -> bool {
+        scene.reliable && !self.best_effort
+    }
+
     fn touch(&mut self, record: &Record) {
         self.last_seen = self.last_seen.max(Timestamp(record.time));
     }
 
     fn take(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
-        let (number, reliable) = (record.sequence_number, scene.reliable);
+        let (number, reliable) = (record.sequence_number, self.is_reliable(scene));
         self.begin_anew(number, scene);
         let sequence = self.reception.sequence();
         let is_sent = self.direction() == Direction::Sent;
@@ -456,7 +491,7 @@ impl Delivery {
         &'a mut self,
         scene: &'a mut Scene<'_>,
     ) -> (&'a mut Reception, &'a mut Budget, Deciding<'a>) {
-        let wait = REASSEMBLY - settle_window(scene.reliable);
+        let wait = REASSEMBLY - settle_window(self.is_reliable(scene));
         let until = if scene.reassembled {
             Some(Timestamp(scene.now.0.saturating_add(wait)))
         } else {

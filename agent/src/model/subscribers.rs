@@ -12,6 +12,7 @@
 //! What is directed (INFO_DST) at a participant is for nobody else at the same socket. Where the
 //! participant is known and reads nothing of the topic, samples are unmatched and nothing is kept.
 
+use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
@@ -422,9 +423,7 @@ impl Subscribers {
         let reader = record.reader().prefix;
         for delivery in &mut self.deliveries {
             if is_open(delivery) || delivery.receiver() == Receiver::Participant(reader) {
-                let base = record.sequence_number;
-                let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
-                delivery.requested(set);
+                delivery.requested(record);
             }
         }
     }
@@ -587,8 +586,9 @@ impl Subscribers {
             }
             None => {
                 stage.room.used += 1;
-                self.deliveries
-                    .push(Delivery::new(receiver, way, stage.now));
+                let mut delivery = Delivery::new(receiver, way, stage.now);
+                delivery.learn(is_best_effort(receiver, stage));
+                self.deliveries.push(delivery);
                 self.count_open();
                 self.deliveries.len() - 1
             }
@@ -623,6 +623,7 @@ impl Subscribers {
             {
                 delivery.close(stage.budget);
             }
+            delivery.learn(is_best_effort(delivery.receiver(), stage));
             let appeared = match delivery.receiver() {
                 Receiver::Participant(prefix) => topic.and_then(|topic| {
                     let known = |guid| around.discovery.endpoints().get(&guid);
@@ -736,6 +737,17 @@ impl<'a> Stage<'a> {
 
 fn is_open(delivery: &Delivery) -> bool {
     matches!(delivery.receiver(), Receiver::Way(way) if way.is_open())
+}
+
+/// Whether readers are known there and none of them is reliable.
+fn is_best_effort(receiver: Receiver, stage: &Stage<'_>) -> bool {
+    let (Receiver::Participant(prefix), Some(topic)) = (receiver, stage.topic()) else {
+        return false;
+    };
+    let endpoints = stage.around.discovery.endpoints();
+    let known = readers(topic, prefix).filter_map(|guid| endpoints.get(&guid));
+    let mut known = known.map(|endpoint| endpoint.qos.reliability == Reliability::RELIABLE);
+    known.next() == Some(false) && !known.any(|is_reliable| is_reliable)
 }
 
 fn is_reader(topic: &Topic, guid: Guid) -> bool {

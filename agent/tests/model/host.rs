@@ -122,7 +122,13 @@ impl Host {
 
     /// Announces a reader; `number` is that of the announcement.
     pub fn subscribe(&mut self, prefix: GuidPrefix, number: u64) {
-        let payload = forge::endpoint(Guid::new(prefix, READER), "rt/chatter", STRING, true);
+        self.subscribe_with(prefix, number, true);
+    }
+
+    /// Likewise, with this reliability.
+    pub fn subscribe_with(&mut self, prefix: GuidPrefix, number: u64, reliable: bool) {
+        let guid = Guid::new(prefix, READER);
+        let payload = forge::endpoint(guid, "rt/chatter", STRING, reliable);
         self.announce(Message::from(prefix).data(SEDP_READERS, number, &payload));
     }
 
