@@ -20,6 +20,8 @@ use harness::switch::Switched;
 /// Ten seconds.
 const SAMPLES: u64 = 2_000;
 const PER_MILLE: u16 = 200;
+/// Of some 450 that a point cloud takes.
+const FRAMES_PER_MILLE: u16 = 1;
 
 #[derive(Clone, Copy)]
 enum Source {
@@ -36,6 +38,7 @@ struct Journey {
     difference: f64,
     ratio: f64,
     before_host: f64,
+    socket_buffer: f64,
 }
 
 #[test]
@@ -70,12 +73,22 @@ fn rust_dds_samples_lost_between_two_hosts_are_the_difference_at_the_sockets() -
 
 #[test]
 fn what_was_sent_again_is_not_lost_between_two_hosts_on_the_wire() -> Result<()> {
-    reliable(Source::Wire)
+    reliable(Source::Wire, Stack::Cyclone)
 }
 
 #[test]
 fn what_was_sent_again_is_not_lost_between_two_hosts_at_the_sockets() -> Result<()> {
-    reliable(Source::Host)
+    reliable(Source::Host, Stack::Fast)
+}
+
+#[test]
+fn fast_dds_point_clouds_that_lose_a_frame_between_two_hosts_are_the_difference() -> Result<()> {
+    point_clouds(Stack::Fast)
+}
+
+#[test]
+fn cyclone_dds_point_clouds_that_lose_a_frame_between_two_hosts_are_the_difference() -> Result<()> {
+    point_clouds(Stack::Cyclone)
 }
 
 fn best_effort(source: Source, stack: Stack) -> Result<()> {
@@ -108,19 +121,40 @@ fn best_effort(source: Source, stack: Stack) -> Result<()> {
     Ok(())
 }
 
-fn reliable(source: Source) -> Result<()> {
+fn reliable(source: Source, stack: Stack) -> Result<()> {
     let stream = Stream {
         reliable: true,
         ..stream()
     };
-    let seen = Journey::of(source, Stack::Cyclone, &stream)?;
+    let seen = Journey::of(source, stack, &stream)?;
     ensure!(seen.dropped > SAMPLES / 10, "{} dropped", seen.dropped);
-    ensure!(seen.received == SAMPLES, "{} received", seen.received);
-    ensure!(seen.difference == 0.0, "{} by the rule", seen.difference);
+    // A few are overwritten in the writer's history before they could be sent again.
+    let lost = seen.published - seen.received;
+    ensure!(lost < SAMPLES / 50, "{lost} lost");
     ensure!(
-        seen.before_host == 0.0,
-        "{} by the receiver",
+        seen.difference == lost as f64 && seen.before_host <= lost as f64,
+        "{} by the rule, {} by the receiver, {lost} lost",
+        seen.difference,
         seen.before_host
+    );
+    Ok(())
+}
+
+/// Each is hundreds of frames; what loses one of them is lost, in the reassembly of the receiver's
+/// kernel or library. What a full socket buffer swallowed had come.
+fn point_clouds(stack: Stack) -> Result<()> {
+    let stream = Stream {
+        linger: 60.0,
+        ..Stream::point_cloud(644_000, 200)
+    };
+    let seen = Journey::of(Source::Host, stack, &stream)?;
+    let lost = seen.published - seen.received;
+    ensure!(seen.dropped > 20, "{} dropped", seen.dropped);
+    ensure!(
+        seen.difference + seen.socket_buffer == lost as f64 && seen.difference > 10.0,
+        "{} by the rule, {} in the socket buffer, {lost} lost",
+        seen.difference,
+        seen.socket_buffer
     );
     Ok(())
 }
@@ -155,7 +189,12 @@ impl Journey {
         subscriber.wait_matched()?;
         publisher.wait_matched()?;
         prometheus.wait_for("sum(up)", 2.0)?;
-        let loss = Loss::of_samples(&switch, &link.monitor, stream, PER_MILLE)?;
+        let loss = if stream.size > 1_000 {
+            let frames = format!("ip daddr {} ip length > 1000", link.monitor.address());
+            Loss::of(&switch, &frames, FRAMES_PER_MILLE)?
+        } else {
+            Loss::of_samples(&switch, &link.monitor, stream, PER_MILLE)?
+        };
         publisher.go()?;
         publisher.wait_sent(Duration::from_secs(60))?;
         // Settled, scraped and evaluated, while publisher and subscriber are still there.
@@ -168,6 +207,12 @@ impl Journey {
             ensure!(several == 1, "{several} series of {series}");
             prometheus.query(&series)
         };
+        let cause = |cause: &str| {
+            let cause = format!("{labels},cause=\"{cause}\"");
+            prometheus.query(&format!(
+                "sum(ros2_subscriber_lost_messages_total{{{cause}}})"
+            ))
+        };
         let published: BTreeSet<u64> = publisher.log()?.sequences("pub").into_iter().collect();
         let received: BTreeSet<u64> = subscriber.log()?.sequences("sub").into_iter().collect();
         let journey = Journey {
@@ -176,9 +221,8 @@ impl Journey {
             dropped: loss.counts()?.dropped,
             difference: rule("difference")?,
             ratio: rule("ratio_rate5m")?,
-            before_host: prometheus.query(&format!(
-                "sum(ros2_subscriber_lost_messages_total{{{labels},cause=\"before_host\"}})"
-            ))?,
+            before_host: cause("before_host")?,
+            socket_buffer: cause("socket_buffer")?,
         };
         drop((robot, monitor));
         Ok(journey)
