@@ -16,8 +16,8 @@ use ros2probe_wire::{filter::Counter, host::Socket};
 
 use crate::{
     maps::{
-        Recent, SOCKETS, Scratch, claim_incoming, claim_outgoing, copy, count, last, recent,
-        release, scratch, sent,
+        Recent, SOCKETS, Scratch, claim_incoming, claim_outgoing, count, last, recent, release,
+        scratch,
     },
     packet::{self, hook},
     pieces, verdict,
@@ -170,45 +170,6 @@ pub fn captured_before(slot: u32, scratch: &mut Scratch) -> bool {
     if same {
         scratch.repeated = 1;
         count(slot, Counter::CopiesNotCaptured, 1);
-    }
-    same
-}
-
-/// Whether the datagram at hand is the second copy of one that was sent just before: what goes to an
-/// IPv4 multicast group of which this host may be a member passes once for loopback and once for the
-/// interface, one directly after the other.
-#[inline(always)]
-pub fn sent_before(scratch: &Scratch) -> bool {
-    let packet = &scratch.packet;
-    let [first, ..] = packet.destination[3].to_ne_bytes();
-    if packet.host == 0 || packet.outgoing == 0 || packet.ipv6 != 0 || first & 0xf0 != 0xe0 {
-        return false;
-    }
-    let (Some(sent), record) = (sent(), &scratch.records[0]) else {
-        return false;
-    };
-    if scratch.count == 0 {
-        return false;
-    }
-    let same = record.time.wrapping_sub(sent.time) < COPY_NANOSECONDS
-        && sent.socket == record.socket
-        && sent.sequence_number == record.sequence_number
-        && sent.fragment_start == record.fragment_start
-        && sent.kind == record.kind
-        // A HEARTBEAT's count.
-        && sent.stamp_seconds == record.stamp_seconds
-        && sent.datagram_len == record.datagram_len
-        && sent.destination_port == record.destination_port
-        && sent.destination[3] == record.destination[3]
-        && sent.writer[3] == record.writer[3]
-        && sent.writer[2] == record.writer[2]
-        && sent.writer[1] == record.writer[1]
-        && sent.writer[0] == record.writer[0];
-    if same {
-        // There is no third.
-        sent.time = 0;
-    } else {
-        copy(record, sent);
     }
     same
 }

@@ -114,9 +114,6 @@ static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(SLOTS, 0);
 /// What this CPU has captured lately, by a hash of it.
 #[map]
 static RECENT: PerCpuArray<Recent> = PerCpuArray::with_max_entries(RECENT_CAPACITY, 0);
-/// The first record of what this CPU has sent last to an IPv4 multicast group.
-#[map]
-static SENT: PerCpuArray<Record> = PerCpuArray::with_max_entries(1, 0);
 /// The datagram that a socket of this host received last on this CPU.
 #[map]
 static LAST: PerCpuArray<Last> = PerCpuArray::with_max_entries(1, 0);
@@ -351,13 +348,6 @@ pub fn recent(hash: u32) -> Option<&'static mut Recent> {
     RECENT
         .get_ptr_mut(hash & (RECENT_CAPACITY - 1))
         .map(|recent| unsafe { &mut *recent })
-}
-
-/// The first record of this CPU's last datagram to an IPv4 multicast group.
-#[inline(always)]
-pub fn sent() -> Option<&'static mut Record> {
-    // SAFETY: as for `recent`: half of one and half of another is no copy of anything.
-    SENT.get_ptr_mut(0).map(|sent| unsafe { &mut *sent })
 }
 
 /// This CPU's last datagram on its way in.

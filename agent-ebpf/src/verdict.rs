@@ -57,11 +57,6 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
         captured(slot, scratch);
         return 1;
     }
-    if host::sent_before(scratch) {
-        count(slot, Counter::LoopbackCopies, 1);
-        scratch.count = 0;
-        return 0;
-    }
     let records = scratch.count;
     count(
         slot,
