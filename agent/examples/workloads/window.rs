@@ -8,7 +8,6 @@ use anyhow::{Context as _, Result};
 use crate::harness::agent::{Agent, Scrape};
 use crate::harness::network::{INTERFACE, Link, Namespace};
 use crate::harness::peer::{Peer, Role, Stack, Stream};
-use crate::harness::process::Process;
 use crate::harness::run;
 use crate::harness::usage::{Usage, machine_idle, softirq_cpu};
 
@@ -17,13 +16,17 @@ const WARM_UP: Duration = Duration::from_secs(3);
 /// Between two looks at the observer's memory.
 const SAMPLING: Duration = Duration::from_secs(1);
 /// CPU times are told for this long.
-const UNIT_SECONDS: f64 = 20.0;
+pub(crate) const UNIT_SECONDS: f64 = 20.0;
 
 /// Who watches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Observer {
     Nobody,
-    Agent,
+    /// The agent with the host hook.
+    Host,
+    /// The agent with packet sockets.
+    Wire,
+    /// One more subscriber to everything, Cyclone DDS in C++.
     Subscriber,
 }
 
@@ -37,7 +40,7 @@ pub(crate) struct Window {
     pub(crate) cpu: f64,
     /// The most memory of the observer seen in the window.
     pub(crate) pss: u64,
-    /// Samples written, from the publisher's first to its last.
+    /// Samples written, from the publishers' first to their last.
     pub(crate) sent: u64,
     /// What the agent says at the end.
     pub(crate) told: Option<Told>,
@@ -54,53 +57,86 @@ pub(crate) struct Told {
 }
 
 impl Observer {
-    pub(crate) const ALL: [Observer; 3] = [Observer::Nobody, Observer::Agent, Observer::Subscriber];
+    pub(crate) const ALL: [Observer; 4] = [
+        Observer::Nobody,
+        Observer::Host,
+        Observer::Wire,
+        Observer::Subscriber,
+    ];
+
+    /// The agent's configuration, if it is the agent.
+    fn configuration(self) -> Option<String> {
+        let source = match self {
+            Observer::Host => "host",
+            Observer::Wire => "wire",
+            Observer::Nobody | Observer::Subscriber => return None,
+        };
+        Some(format!(
+            "watch:\n  - /**\ncapture:\n  source: {source}\nlog: warn\n"
+        ))
+    }
 }
 
 impl Window {
     pub(crate) fn measure(
         stack: Stack,
-        stream: &Stream,
+        streams: &[Stream],
         observer: Observer,
         program: &Path,
         length: Duration,
     ) -> Result<Window> {
         let link = Link::new()?;
-        let unlogged = Stream {
-            logged: false,
-            ..stream.clone()
-        };
         let directory = tempfile::tempdir().context("cannot create a directory")?;
         let configuration = directory.path().join("ros2probe.yaml");
-        let cgroup = link.robot.cgroup().display();
-        let text = format!("watch: [/**]\nlog: warn\ncapture: {{cgroup: {cgroup}}}\n");
-        std::fs::write(&configuration, text).context("cannot write a configuration")?;
-
-        let agent = (observer == Observer::Agent)
-            .then(|| Agent::start(&link.robot, program, &configuration))
-            .transpose()?;
-        let subscriber =
-            |stack, node| Peer::start(&link.monitor, stack, Role::Subscriber, &unlogged, &[node]);
-        let second = (observer == Observer::Subscriber)
-            .then(|| subscriber(Stack::Cyclone, "/observer"))
-            .transpose()?;
-        let mut listener = subscriber(stack, "/listener")?;
-        let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, stream, &["/lidar"])?;
-        publisher.wait_matched()?;
-        listener.wait_matched()?;
-        publisher.go()?;
+        let agent = match observer.configuration() {
+            Some(text) => {
+                std::fs::write(&configuration, text).context("cannot write a configuration")?;
+                Some(Agent::start(&link.robot, program, &configuration)?)
+            }
+            None => None,
+        };
+        let subscribers = |stack, node: &str| -> Result<Vec<Peer>> {
+            let each = streams.iter().enumerate().map(|(number, stream)| {
+                let unlogged = Stream {
+                    logged: false,
+                    ..stream.clone()
+                };
+                let node = format!("/{node}{number}");
+                Peer::start(&link.monitor, stack, Role::Subscriber, &unlogged, &[&node])
+            });
+            each.collect()
+        };
+        let observers = if observer == Observer::Subscriber {
+            subscribers(Stack::Cyclone, "observer")?
+        } else {
+            Vec::new()
+        };
+        let mut listeners = subscribers(stack, "listener")?;
+        let publishers = streams.iter().enumerate().map(|(number, stream)| {
+            let node = format!("/sensor{number}");
+            Peer::start(&link.robot, stack, Role::Publisher, stream, &[&node])
+        });
+        let mut publishers: Vec<Peer> = publishers.collect::<Result<_>>()?;
+        for peer in publishers.iter_mut().chain(&mut listeners) {
+            peer.wait_matched()?;
+        }
+        for publisher in &mut publishers {
+            publisher.go()?;
+        }
         std::thread::sleep(WARM_UP);
 
-        let watching = match (&agent, &second) {
-            (Some(agent), _) => Some(&agent.process),
-            (None, Some(second)) => Some(&second.process),
-            (None, None) => None,
-        };
-        let parts = [&publisher.process, &listener.process];
-        let spent = Spent::during(length, watching, &parts)?;
+        let processes =
+            |peers: &[Peer]| -> Vec<u32> { peers.iter().map(|peer| peer.process.pid()).collect() };
+        let mut watching = processes(&observers);
+        watching.extend(agent.as_ref().map(|agent| agent.process.pid()));
+        let parts = [processes(&publishers), processes(&listeners)].concat();
+        let spent = Spent::during(length, &watching, &parts)?;
 
-        publisher.process.terminate()?;
-        let sent = publisher.log()?.sequences("pub").len() as u64;
+        let mut sent = 0;
+        for publisher in &mut publishers {
+            publisher.process.terminate()?;
+            sent += publisher.log()?.sequences("pub").len() as u64;
+        }
         let traffic = bytes_sent(&link.robot)?;
         let scrape = agent.as_ref().map(Agent::settled_scrape).transpose()?;
         Ok(Window {
@@ -110,17 +146,21 @@ impl Window {
             cpu: spent.cpu,
             pss: spent.pss,
             sent,
-            told: scrape.map(|scrape| Told::of(&scrape, stream, traffic)),
+            told: scrape.map(|scrape| Told::of(&scrape, streams, traffic)),
         })
     }
 }
 
 impl Told {
-    fn of(scrape: &Scrape, stream: &Stream, traffic: f64) -> Told {
-        let topic = [("topic", stream.topic.as_str())];
+    fn of(scrape: &Scrape, streams: &[Stream], traffic: f64) -> Told {
+        let sum = |name: &str| -> f64 {
+            let each = streams.iter().map(|stream| stream.topic.as_str());
+            each.map(|topic| scrape.sum(name, &[("topic", topic)]))
+                .sum()
+        };
         Told {
-            counted: scrape.sum("ros2_topic_messages_total", &topic),
-            lost: scrape.sum("ros2_topic_lost_messages_total", &topic),
+            counted: sum("ros2_topic_messages_total"),
+            lost: sum("ros2_topic_lost_messages_total"),
             dropped: scrape.sum("ros2probe_capture_dropped_packets_total", &[])
                 + scrape.sum("ros2probe_records_dropped_total", &[]),
             copied: scrape.sum("ros2probe_capture_copied_bytes_total", &[]) / traffic,
@@ -136,11 +176,16 @@ struct Spent {
 }
 
 impl Spent {
-    fn during(length: Duration, watching: Option<&Process>, parts: &[&Process]) -> Result<Spent> {
-        let look = || watching.map(|process| Usage::of(process.pid())).transpose();
+    fn during(length: Duration, watching: &[u32], parts: &[u32]) -> Result<Spent> {
+        let look = || {
+            watching.iter().try_fold((Duration::ZERO, 0), |sum, pid| {
+                let usage = Usage::of(*pid)?;
+                anyhow::Ok((sum.0 + usage.cpu, sum.1 + usage.pss))
+            })
+        };
         let rest = || {
             parts.iter().try_fold(softirq_cpu()?, |sum, part| {
-                anyhow::Ok(sum + Usage::of(part.pid())?.cpu)
+                anyhow::Ok(sum + Usage::of(*part)?.cpu)
             })
         };
         let cpus = std::thread::available_parallelism().context("cannot count CPUs")?;
@@ -151,15 +196,13 @@ impl Spent {
         while let Some(left) = length.checked_sub(began.elapsed()) {
             std::thread::sleep(left.min(SAMPLING));
             last = look()?;
-            pss = last.map_or(0, |usage| usage.pss).max(pss);
+            pss = last.1.max(pss);
         }
         let elapsed = began.elapsed().as_secs_f64();
         let unit = UNIT_SECONDS / elapsed;
         let idle = machine_idle()?.saturating_sub(idle).as_secs_f64();
         let rest = rest()?.saturating_sub(rest_before);
-        let cpu = last
-            .zip(first)
-            .map_or(Duration::ZERO, |(last, first)| last.since(&first).cpu);
+        let cpu = last.0.saturating_sub(first.0);
         Ok(Spent {
             machine: (elapsed * cpus.get() as f64 - idle).max(0.0) * unit,
             workload: (rest + cpu).as_secs_f64() * unit,
