@@ -5,16 +5,21 @@
 //! who joins late or leaves loses nothing. Every loss has one cause; it never goes back on a cause.
 //! What leaves has no losses: what was not sent is nobody's.
 
+mod deciding;
+
 use ros2probe_wire::record::kind;
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+
+use deciding::Deciding;
+pub use deciding::Totals;
 
 use super::cancelled::Cancelled;
 use super::cause::LossCause;
 use super::deaths::{Deaths, REASSEMBLY};
-use super::journal::{DeliveryLoss, Journal};
-use super::reception::{Decision, Outcome, Reception, Whole};
+use super::journal::Journal;
+use super::reception::{Outcome, Reception, Whole};
 use super::samples::Budget;
-use super::snapshot::{Breakdown, Delivered, Direction};
+use super::snapshot::{Delivered, Direction};
 use super::way::Way;
 use super::writer::settle_window;
 
@@ -38,19 +43,6 @@ pub enum Receiver {
     Participant(GuidPrefix),
     /// Whoever is at the end of this way.
     Way(Way),
-}
-
-/// What is counted of all deliveries of a writer.
-#[derive(Clone, Debug, Default)]
-pub struct Totals {
-    /// At receivers.
-    pub received: Delivered,
-    /// On their way out.
-    pub sent: Delivered,
-    /// Where the time went.
-    pub breakdown: Option<Box<Breakdown>>,
-    /// Whether anything arrived, or left.
-    pub seen: [bool; 2],
 }
 
 /// What a record changes besides the delivery itself.
@@ -509,103 +501,6 @@ impl Delivery {
             until,
         };
         (&mut self.reception, scene.budget, deciding)
-    }
-}
-
-impl Totals {
-    /// Those of one direction.
-    pub const fn of(&mut self, direction: Direction) -> &mut Delivered {
-        match direction {
-            Direction::Sent => &mut self.sent,
-            Direction::Received => &mut self.received,
-        }
-    }
-
-    /// Adds all of `other`.
-    pub fn add(&mut self, other: &Self) {
-        self.received.add(&other.received);
-        self.sent.add(&other.sent);
-        for (seen, also) in self.seen.iter_mut().zip(other.seen) {
-            *seen |= also;
-        }
-        if let Some(breakdown) = &other.breakdown {
-            self.breakdown.get_or_insert_default().add(breakdown);
-        }
-    }
-}
-
-/// What decisions change.
-struct Deciding<'a> {
-    tally: &'a mut Delivered,
-    deaths: &'a mut Deaths,
-    totals: &'a mut Delivered,
-    journal: &'a mut Journal,
-    writer: Guid,
-    receiver: Receiver,
-    main: Way,
-    at: Timestamp,
-    /// A loss stays pending until then.
-    until: Option<Timestamp>,
-}
-
-impl Deciding<'_> {
-    fn take(&mut self, decision: Decision) {
-        if self.main.direction == Direction::Sent {
-            return;
-        }
-        let (first, last) = match decision {
-            Decision::Lost { first, last, .. } => (first, last),
-            Decision::Irrelevant(number) => {
-                self.deaths.forget(number);
-                self.tally.irrelevant += 1;
-                self.totals.irrelevant += 1;
-                return;
-            }
-        };
-        let mut runs = Vec::new();
-        self.deaths.explain(first, last, |first, last, cause| {
-            runs.push((first, last, cause));
-        });
-        for (first, last, cause) in runs {
-            match (cause, self.until) {
-                (Some(cause), _) => self.lose(cause, first, last),
-                (None, None) => self.lose(LossCause::BeforeHost, first, last),
-                (None, Some(until)) => {
-                    self.tally.pending += last - first + 1;
-                    self.totals.pending += last - first + 1;
-                    if let Some((first, last)) = self.deaths.wait(first, last, until) {
-                        self.conclude(first, last);
-                    }
-                }
-            }
-        }
-    }
-
-    /// What was pending died before it came to this host.
-    fn conclude(&mut self, first: u64, last: u64) {
-        let count = last - first + 1;
-        self.tally.pending = self.tally.pending.saturating_sub(count);
-        self.totals.pending = self.totals.pending.saturating_sub(count);
-        self.lose(LossCause::BeforeHost, first, last);
-    }
-
-    fn lose(&mut self, cause: LossCause, first: u64, last: u64) {
-        let count = last - first + 1;
-        self.tally.lose(cause, count);
-        self.totals.lose(cause, count);
-        self.journal.lose_delivery(DeliveryLoss {
-            at: self.at,
-            writer: self.writer,
-            participant: match self.receiver {
-                Receiver::Participant(prefix) => Some(prefix),
-                Receiver::Way(_) => None,
-            },
-            socket: self.main.socket,
-            destination: self.main.place.socket_address(),
-            cause,
-            first,
-            last,
-        });
     }
 }
 

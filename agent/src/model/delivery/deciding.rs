@@ -1,0 +1,121 @@
+//! What the decisions about a delivery's samples change: counters, causes, the journal.
+
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::Receiver;
+use crate::model::cause::LossCause;
+use crate::model::deaths::Deaths;
+use crate::model::journal::{DeliveryLoss, Journal};
+use crate::model::reception::Decision;
+use crate::model::snapshot::{Breakdown, Delivered, Direction};
+use crate::model::way::Way;
+
+/// What is counted of all deliveries of a writer.
+#[derive(Clone, Debug, Default)]
+pub struct Totals {
+    /// At receivers.
+    pub received: Delivered,
+    /// On their way out.
+    pub sent: Delivered,
+    /// Where the time went.
+    pub breakdown: Option<Box<Breakdown>>,
+    /// Whether anything arrived, or left.
+    pub seen: [bool; 2],
+}
+
+impl Totals {
+    /// Those of one direction.
+    pub const fn of(&mut self, direction: Direction) -> &mut Delivered {
+        match direction {
+            Direction::Sent => &mut self.sent,
+            Direction::Received => &mut self.received,
+        }
+    }
+
+    /// Adds all of `other`.
+    pub fn add(&mut self, other: &Self) {
+        self.received.add(&other.received);
+        self.sent.add(&other.sent);
+        for (seen, also) in self.seen.iter_mut().zip(other.seen) {
+            *seen |= also;
+        }
+        if let Some(breakdown) = &other.breakdown {
+            self.breakdown.get_or_insert_default().add(breakdown);
+        }
+    }
+}
+
+/// What decisions change.
+pub(super) struct Deciding<'a> {
+    pub(super) tally: &'a mut Delivered,
+    pub(super) deaths: &'a mut Deaths,
+    pub(super) totals: &'a mut Delivered,
+    pub(super) journal: &'a mut Journal,
+    pub(super) writer: Guid,
+    pub(super) receiver: Receiver,
+    pub(super) main: Way,
+    pub(super) at: Timestamp,
+    /// A loss stays pending until then.
+    pub(super) until: Option<Timestamp>,
+}
+
+impl Deciding<'_> {
+    pub(super) fn take(&mut self, decision: Decision) {
+        if self.main.direction == Direction::Sent {
+            return;
+        }
+        let (first, last) = match decision {
+            Decision::Lost { first, last, .. } => (first, last),
+            Decision::Irrelevant(number) => {
+                self.deaths.forget(number);
+                self.tally.irrelevant += 1;
+                self.totals.irrelevant += 1;
+                return;
+            }
+        };
+        let mut runs = Vec::new();
+        self.deaths.explain(first, last, |first, last, cause| {
+            runs.push((first, last, cause));
+        });
+        for (first, last, cause) in runs {
+            match (cause, self.until) {
+                (Some(cause), _) => self.lose(cause, first, last),
+                (None, None) => self.lose(LossCause::BeforeHost, first, last),
+                (None, Some(until)) => {
+                    self.tally.pending += last - first + 1;
+                    self.totals.pending += last - first + 1;
+                    if let Some((first, last)) = self.deaths.wait(first, last, until) {
+                        self.conclude(first, last);
+                    }
+                }
+            }
+        }
+    }
+
+    /// What was pending died before it came to this host.
+    pub(super) fn conclude(&mut self, first: u64, last: u64) {
+        let count = last - first + 1;
+        self.tally.pending = self.tally.pending.saturating_sub(count);
+        self.totals.pending = self.totals.pending.saturating_sub(count);
+        self.lose(LossCause::BeforeHost, first, last);
+    }
+
+    pub(super) fn lose(&mut self, cause: LossCause, first: u64, last: u64) {
+        let count = last - first + 1;
+        self.tally.lose(cause, count);
+        self.totals.lose(cause, count);
+        self.journal.lose_delivery(DeliveryLoss {
+            at: self.at,
+            writer: self.writer,
+            participant: match self.receiver {
+                Receiver::Participant(prefix) => Some(prefix),
+                Receiver::Way(_) => None,
+            },
+            socket: self.main.socket,
+            destination: self.main.place.socket_address(),
+            cause,
+            first,
+            last,
+        });
+    }
+}
