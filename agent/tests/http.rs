@@ -118,6 +118,36 @@ fn a_reload_takes_over_what_is_right_and_keeps_what_was_when_it_is_wrong() {
     assert!(agent.wait().success());
 }
 
+#[test]
+fn series_of_deliveries_come_with_a_reload_that_asks_for_them() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("config.yaml");
+    std::fs::write(&path, "watch: [/chatter]\n").unwrap();
+    // 10 Hz for 3 s, at a third of the pace.
+    let mut agent = LocalAgent::start(&["--config", path.to_str().unwrap(), "--speed", "0.3"]);
+    let topic = "{domain_id=\"0\",topic=\"/chatter\"}";
+    let delivered = format!("ros2_topic_delivered_messages_total{topic}");
+    agent.wait_for_metric(&delivered, |count| count > 3.0);
+    assert!(
+        !agent
+            .get("/metrics")
+            .body
+            .contains("ros2_subscriber_received_messages_total{")
+    );
+
+    std::fs::write(&path, "watch: [{topic: /chatter, per_subscriber: true}]\n").unwrap();
+    agent.signal("-HUP");
+    agent.wait_for_log("the configuration was reloaded");
+    let page = agent.get("/metrics").body;
+    let sum = metric(&page, &delivered).unwrap();
+    let each = page.lines().filter_map(|line| {
+        let labels = line.strip_prefix("ros2_subscriber_received_messages_total{")?;
+        labels.rsplit_once(' ')?.1.parse::<f64>().ok()
+    });
+    assert_eq!(each.sum::<f64>(), sum, "{page}");
+    assert_eq!(promtool(&page), "");
+}
+
 /// A Prometheus of its own, killed with its value.
 struct Prometheus {
     child: Child,

@@ -25,7 +25,7 @@ pub(in crate::surface) const READY: Metric = Metric::gauge(
 pub(in crate::surface) const CAPTURE_PACKETS: Metric = Metric::counter(
     "ros2probe_capture_packets_total",
     &["interface"],
-    "Packets that the filter let through to user space.",
+    "Packets that the filter let through to user space; `sockets` are datagrams captured at the host's sockets.",
 );
 pub(in crate::surface) const CAPTURE_DROPPED: Metric = Metric::counter(
     "ros2probe_capture_dropped_packets_total",
