@@ -629,6 +629,29 @@ fn who_is_silent_and_unknown_is_forgotten() {
 }
 
 #[test]
+fn what_a_participant_sends_to_an_address_of_its_own_by_mistake_tells_nothing_of_its_socket() {
+    // RustDDS announces 127.0.0.1 to other hosts too: an ACKNACK for Alice comes back to Bob.
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let stray = Record {
+        reader: guid_words(Guid::new(BOB, READER)),
+        ..host.record(bob, kind::ACKNACK, 1)
+    };
+    host.put(stray);
+    host.owner(bob, BOB);
+    let group = bob.multicast(101);
+    host.owner(group, BOB);
+    for number in 1..=10 {
+        host.data(group, number);
+        host.wait(10);
+    }
+    let deliveries = host.deliveries();
+    assert_eq!(deliveries.len(), 1);
+    assert_eq!(deliveries[0].participant.unwrap().prefix, BOB);
+    assert_eq!(deliveries[0].readers, [Guid::new(BOB, READER)]);
+}
+
+#[test]
 fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);

@@ -1,8 +1,10 @@
 //! Which participant receives at which socket and address.
 //!
-//! A socket belongs to the participant that sends by it, or for which something directed (INFO_DST)
-//! came to it, or whose process holds it: which processes participants live in is learned from the
-//! sockets they send by, for announced process ids are those of a container, if any. An address
+//! A socket belongs to the participant that sends by it, or whose process holds it, or for which
+//! something directed (INFO_DST) came to it. Which processes participants live in is learned from
+//! the sockets they send by, for announced process ids are those of a container, if any. What is
+//! directed tells least: RustDDS announces loopback addresses to other hosts, so what their
+//! participants send there for one of this host they send to themselves. An address
 //! belongs to the participant that announces it, unless several do. A multicast group belongs to
 //! nobody: what is directed at one member reaches all. Where nothing tells, or two participants
 //! share a socket, the answer is "unknown", never a guess.
@@ -29,7 +31,7 @@ const PLACES: usize = 16;
 #[derive(Debug)]
 pub struct Receivers {
     sockets: Sockets,
-    learned: HashMap<u64, Owners>,
+    learned: HashMap<u64, Learned>,
     processes: HashMap<u32, Owners>,
     places: HashMap<Place, Holder>,
     closed: HashSet<u64>,
@@ -58,6 +60,15 @@ pub enum Matched {
     No,
     /// Not all of its announcements were seen, or the receiver is not known.
     Unknown,
+}
+
+/// To whom a socket may belong.
+#[derive(Debug, Default)]
+struct Learned {
+    /// They send by it.
+    senders: Owners,
+    /// Something directed to them came to it.
+    addressed: Owners,
 }
 
 #[derive(Debug, Default)]
@@ -119,9 +130,10 @@ impl Receivers {
         if !is_new || process == before {
             return;
         }
-        if let (Some(process), Some(owners)) = (process, self.learned.get(&cookie)) {
+        if let (Some(process), Some(learned)) = (process, self.learned.get(&cookie)) {
             let known = self.processes.entry(process).or_default();
-            owners.0.iter().for_each(|owner| known.add(*owner));
+            let senders = learned.senders.0.iter();
+            senders.for_each(|owner| known.add(*owner));
         }
         self.generation += 1;
     }
@@ -154,28 +166,34 @@ impl Receivers {
         } else {
             (record.writer().prefix, record.reader().prefix)
         };
-        let owner = if record.flags & flag::OUTGOING != 0 {
-            sender
-        } else if directed == GuidPrefix::UNKNOWN {
-            return;
-        } else {
-            directed
-        };
-        let known = self.learned.get(&record.socket);
-        if known.is_some_and(|known| known.0.contains(&owner)) {
+        let is_sent = record.flags & flag::OUTGOING != 0;
+        if !is_sent && (directed == GuidPrefix::UNKNOWN || Place::of(record).is_multicast()) {
             return;
         }
-        let is_arriving = record.flags & flag::OUTGOING == 0;
-        if is_arriving && Place::of(record).is_multicast() {
+        let owner = if is_sent { sender } else { directed };
+        let known = self.learned.get(&record.socket);
+        let list = known.map(|known| {
+            if is_sent {
+                &known.senders
+            } else {
+                &known.addressed
+            }
+        });
+        if list.is_some_and(|list| list.0.contains(&owner)) {
             return;
         }
         if known.is_none() && self.learned.len() >= self.limit {
             return;
         }
-        self.learned.entry(record.socket).or_default().add(owner);
-        let facts = self.sockets.get(record.socket);
-        if let Some(process) = facts.and_then(|facts| facts.process_id) {
-            self.processes.entry(process).or_default().add(owner);
+        let known = self.learned.entry(record.socket).or_default();
+        if is_sent {
+            known.senders.add(owner);
+            let facts = self.sockets.get(record.socket);
+            if let Some(process) = facts.and_then(|facts| facts.process_id) {
+                self.processes.entry(process).or_default().add(owner);
+            }
+        } else {
+            known.addressed.add(owner);
         }
         self.generation += 1;
     }
@@ -206,10 +224,12 @@ impl Receivers {
     pub fn tidy(&mut self, discovery: &Discovery) {
         let is_there = |prefix: &GuidPrefix| discovery.participants().contains_key(prefix);
         self.places.retain(|_, holder| is_there(&holder.prefix));
-        for owners in self.learned.values_mut() {
-            owners.0.retain(is_there);
+        for learned in self.learned.values_mut() {
+            learned.senders.0.retain(is_there);
+            learned.addressed.0.retain(is_there);
         }
-        self.learned.retain(|_, owners| !owners.0.is_empty());
+        self.learned
+            .retain(|_, learned| !learned.senders.0.is_empty() || !learned.addressed.0.is_empty());
         for owners in self.processes.values_mut() {
             owners.0.retain(is_there);
         }
@@ -219,27 +239,34 @@ impl Receivers {
     /// The participant that receives what comes this way.
     #[must_use]
     pub fn owner(&self, way: &Way, discovery: &Discovery) -> Option<GuidPrefix> {
-        let alive = |owners: &Owners| {
-            let is_there = |prefix: &&GuidPrefix| discovery.participants().contains_key(*prefix);
-            let mut alive = owners.0.iter().filter(is_there);
-            let only = alive.next().copied();
-            (only, alive.next().is_none())
-        };
         if way.socket != 0 {
-            if let (Some(owner), is_only) =
-                self.learned.get(&way.socket).map_or((None, true), alive)
-            {
-                return is_only.then_some(owner);
-            }
-            let facts = self.sockets.get(way.socket);
-            if let Some(process) = facts.and_then(|facts| facts.process_id) {
-                let learned = self.processes.get(&process);
-                if let (Some(owner), is_only) = learned.map_or((None, true), alive) {
-                    return is_only.then_some(owner);
+            let learned = self.learned.get(&way.socket);
+            let process = self.sockets.get(way.socket);
+            let process = process.and_then(|facts| facts.process_id);
+            let lists = [
+                learned.map(|learned| &learned.senders),
+                process.and_then(|process| self.processes.get(&process)),
+                learned.map(|learned| &learned.addressed),
+            ];
+            // Each list is asked only about those that the ones before leave open.
+            let mut open: Vec<GuidPrefix> = Vec::new();
+            for owners in lists.into_iter().flatten() {
+                let alive = |owner: &&GuidPrefix| discovery.participants().contains_key(*owner);
+                let alive: Vec<_> = owners.0.iter().filter(alive).copied().collect();
+                let is_open = |owner: &GuidPrefix| open.is_empty() || open.contains(owner);
+                let left: Vec<_> = alive.into_iter().filter(is_open).collect();
+                if !left.is_empty() {
+                    open = left;
                 }
-                if let Some(owner) = announced_in(process, discovery) {
+                if let [owner] = open[..] {
                     return Some(owner);
                 }
+            }
+            if !open.is_empty() {
+                return None;
+            }
+            if let Some(owner) = process.and_then(|process| announced_in(process, discovery)) {
+                return Some(owner);
             }
         }
         let holder = self.places.get(&way.place)?;

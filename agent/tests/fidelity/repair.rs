@@ -1,0 +1,172 @@
+//! A reliable stream, seen only where it is received: what is lost on the link comes again, and
+//! what comes no more is known although nothing follows it.
+
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe::model::cause::LossCause;
+use ros2probe::model::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
+
+use crate::experiment::{DISCOVERY, Truth, is, reported, sums};
+use crate::harness::loss::{Loss, Part};
+use crate::harness::network::Link;
+use crate::harness::peer::{Peer, Role, Stack, Stream};
+use crate::harness::witness::Witness;
+
+const PATIENCE: Duration = Duration::from_secs(30);
+/// Samples of which some are dropped, of ten seconds of them.
+const WOUNDED: u64 = 100;
+const SAMPLES: u64 = 300;
+/// One in so many datagrams with samples is dropped.
+const NTH: u64 = 5;
+
+/// What the agent on the receiving side knew.
+pub(crate) struct Repair {
+    sent: Truth,
+    received: Truth,
+    /// When everything had been repaired.
+    repaired: Delivered,
+    dropped: u64,
+    /// When the tail was missing.
+    waiting: AcknowledgementFacts,
+    /// Once the writer was gone.
+    lost: Vec<(u64, LossCause)>,
+}
+
+impl Repair {
+    pub(crate) fn of(stack: Stack) -> Result<Repair> {
+        let link = Link::new()?;
+        let mut witness = Witness::start(&format!(
+            "watch: [/**]\ncapture: {{source: host, cgroup: {}}}\n",
+            link.monitor.cgroup().display()
+        ))?;
+        let stream = Stream {
+            reliable: true,
+            depth: 1000,
+            rate: 30.0,
+            linger: 60.0,
+            ..Stream::small(SAMPLES)
+        };
+        let host = &link.monitor;
+        let mut subscriber = Peer::start(host, stack, Role::Subscriber, &stream, &["/listener"])?;
+        let host = &link.robot;
+        let mut publisher = Peer::start(host, stack, Role::Publisher, &stream, &["/talker"])?;
+        publisher.wait_matched()?;
+        subscriber.wait_matched()?;
+        witness.wait_for("the endpoints", PATIENCE, |seen| {
+            let mut topics = seen.topics.iter();
+            let topic = topics.find(|topic| topic.name == stream.topic)?;
+            let known = (topic.publishers.len(), topic.subscriptions.len());
+            (known == (1, 1)).then_some(())
+        })?;
+
+        // Also of those that go again, alone or several at once. A HEARTBEAT is shorter.
+        let samples = format!("udp length 380-65535 udp dport != {{ {DISCOVERY} }}");
+        let loss = Loss::of_datagrams(&link.robot, &samples, NTH, Part::Whole)?;
+        publisher.go()?;
+        wait_until(|| Ok(publisher.log()?.sequences("pub").len() as u64 >= WOUNDED))?;
+        let dropped = loss.counts()?.dropped;
+        drop(loss);
+        // Fast DDS asks again within three seconds.
+        wait_until(|| Ok(subscriber.log()?.sequences("sub").len() as u64 > WOUNDED))?;
+        let _all = Loss::of_datagrams(&link.robot, &samples, 1, Part::Whole)?;
+        let (sent, reader) = (
+            Truth::of(&publisher, "pub")?,
+            Truth::of(&subscriber, "sub")?.guid,
+        );
+        publisher.wait_sent(PATIENCE)?;
+        let sent = Truth {
+            numbers: publisher.log()?.writer_numbers("pub")?,
+            ..sent
+        };
+        let newest = *sent.numbers.last().context("nothing was sent")?;
+        let waiting = witness.wait_for("what is missing", PATIENCE, |seen| {
+            let facts = acknowledgement(seen, &sent.guid, &reader)?;
+            (facts.acknowledged + facts.lag_samples == newest && facts.missing > 0).then_some(facts)
+        })?;
+        let repaired = witness.latest().context("no snapshot")?;
+        println!("DBG sockets {:?}", repaired.sockets);
+        for delivery in repaired.topics.iter().flat_map(|topic| &topic.deliveries) {
+            println!("DBG {delivery:?}");
+        }
+        let repaired = sums(&repaired, &sent.guid, &reader);
+        let received = Truth::of(&subscriber, "sub")?;
+        publisher.process.signal("KILL")?;
+        publisher.process.wait(PATIENCE)?;
+        // In its time: while the reader is there, what the writer said it has is awaited.
+        let testimony = witness.finish()?;
+        testimony.ensure_complete()?;
+        for delivery in testimony.end.topics.iter().flat_map(|topic| &topic.deliveries) {
+            println!("DBG end {delivery:?}");
+        }
+        for topic in &testimony.end.topics { println!("DBG end {} {:?}", topic.name, topic.received); }
+        let lost = reported(&testimony.delivery_losses, &sent.guid, &received.guid)?;
+        Ok(Repair {
+            sent,
+            received,
+            repaired,
+            dropped,
+            waiting,
+            lost: lost.into_iter().collect(),
+        })
+    }
+
+    pub(crate) fn ensure_told(&self) -> Result<()> {
+        let Repair {
+            sent,
+            received,
+            repaired,
+            dropped,
+            waiting,
+            lost,
+        } = self;
+        println!(
+            "{} sent, {dropped} datagrams dropped, {} received; {repaired:?}; {waiting:?}; {} lost",
+            sent.numbers.len(),
+            received.numbers.len(),
+            lost.len()
+        );
+        let missing = received.missing(&sent.numbers);
+        ensure!(!missing.is_empty() && *dropped > 0);
+        ensure!(
+            repaired.messages == received.numbers.len() as u64,
+            "{repaired:?}"
+        );
+        ensure!(
+            repaired.recovered > 0 && repaired.lost() == 0,
+            "{repaired:?}"
+        );
+        ensure!(repaired.recovery_seconds > 0.0, "{repaired:?}");
+        // The reader acknowledges all before the first that it misses.
+        let first = *missing.first().context("nothing is missing")?;
+        ensure!(
+            waiting.acknowledged == first - 1,
+            "{waiting:?}, {first} is missing"
+        );
+        let expected: Vec<_> = missing
+            .iter()
+            .map(|each| (*each, LossCause::BeforeHost))
+            .collect();
+        ensure!(*lost == expected, "{lost:?} are lost, not {missing:?}");
+        Ok(())
+    }
+}
+
+fn acknowledgement(seen: &Snapshot, writer: &str, reader: &str) -> Option<AcknowledgementFacts> {
+    let mut facts = seen.topics.iter().flat_map(|topic| &topic.acknowledgements);
+    facts
+        .find(|each| is(each.writer, writer) && is(each.reader, reader))
+        .cloned()
+}
+
+fn wait_until(what: impl Fn() -> Result<bool>) -> Result<()> {
+    let deadline = std::time::Instant::now() + PATIENCE;
+    while !what()? {
+        ensure!(
+            std::time::Instant::now() < deadline,
+            "not within {PATIENCE:?}"
+        );
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    Ok(())
+}
