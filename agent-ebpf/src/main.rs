@@ -92,6 +92,13 @@ pub fn not_reassembled(context: RawTracePointContext) -> u32 {
     0
 }
 
+/// As [`not_reassembled`], where the kernel tells no reason.
+#[raw_tracepoint]
+pub fn not_reassembled_unexplained(context: RawTracePointContext) -> u32 {
+    reassembly::unexplained(&context);
+    0
+}
+
 #[inline(always)]
 fn frame(skb: *mut __sk_buff) -> Option<i64> {
     // SAFETY: the verifier rewrites reads of these fields; `skb` is the program's context.

@@ -7,7 +7,8 @@
 //! in the linear part of the buffer, as some network drivers leave them.
 //!
 //! That there is no memory is no reason of its own. A first fragment that is thrown away for none
-//! counts as refused if its network namespace has used up what fragments may take.
+//! counts as refused if its network namespace has used up what fragments may take. Before Linux 6.2
+//! giving up is no reason of its own either: there a first fragment that is thrown away is enough.
 
 use aya_ebpf::{
     helpers::bpf_ktime_get_ns, macros::map, maps::PerCpuArray, programs::RawTracePointContext,
@@ -86,22 +87,48 @@ impl walk::Bytes for Linear {
     }
 }
 
+/// What is known of why a packet is thrown away.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Why {
+    /// The kernel has given up waiting.
+    GaveUp,
+    /// Some other reason, or none.
+    Other,
+    /// The kernel does not tell.
+    Unknown,
+}
+
 /// `kfree_skb(skb, location, reason)`.
 #[inline(always)]
 pub fn dropped(context: &RawTracePointContext) {
     let reason: u64 = context.arg(2);
     let reason = reason as u32;
-    let gave_up = reason == place(Layout::ReasonTimeout) || reason == place(Layout::ReasonTooFar);
-    if !gave_up && reason != place(Layout::ReasonNone) {
+    let why = if reason == place(Layout::ReasonTimeout) || reason == place(Layout::ReasonTooFar) {
+        Why::GaveUp
+    } else if reason != place(Layout::ReasonNone) {
         return;
-    }
-    let skb: u64 = context.arg(0);
+    } else if place(Layout::ReasonTimeout) == Layout::ABSENT {
+        Why::Unknown
+    } else {
+        Why::Other
+    };
+    look(context.arg(0), why);
+}
+
+/// `kfree_skb(skb, location)`.
+#[inline(always)]
+pub fn unexplained(context: &RawTracePointContext) {
+    look(context.arg(0), Why::Unknown);
+}
+
+#[inline(always)]
+fn look(skb: u64, why: Why) {
     let Some(this) = incomplete() else { return };
     let claims = &raw mut this.claims;
     add(claims, 1);
     // SAFETY: a field of a map value; see `maps::claim`.
     if unsafe { core::ptr::read_volatile(claims) } == 1 {
-        let _ = fragment(skb, gave_up, this);
+        let _ = fragment(skb, why, this);
     } else {
         count_outside(Counter::Contended, 1);
     }
@@ -109,7 +136,7 @@ pub fn dropped(context: &RawTracePointContext) {
 }
 
 #[inline(always)]
-fn fragment(skb: u64, gave_up: bool, this: &mut Incomplete) -> Option<()> {
+fn fragment(skb: u64, why: Why, this: &mut Incomplete) -> Option<()> {
     let head: u64 = member(skb, Layout::BufferHead)?;
     let tail: u32 = member(skb, Layout::BufferTail)?;
     let network: u16 = member(skb, Layout::BufferNetworkHeader)?;
@@ -123,7 +150,11 @@ fn fragment(skb: u64, gave_up: bool, this: &mut Incomplete) -> Option<()> {
     if parsed.is_none() || this.protocol != UDP {
         return None;
     }
-    if !gave_up && (this.offset != 0 || this.more == 0 || !is_full(skb, this.ipv6 != 0)?) {
+    // Of a datagram that became complete, the first fragment does not look like one any more.
+    if why != Why::GaveUp && (this.offset != 0 || this.more == 0) {
+        return None;
+    }
+    if why == Why::Other && !is_full(skb, this.ipv6 != 0)? {
         return None;
     }
     let again = is_again(this);

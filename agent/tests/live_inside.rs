@@ -394,48 +394,61 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
 }
 
 #[test]
-fn over_ipv6_it_is_named_likewise() {
-    let mut observed = Observed::new();
-    let link = Link::new().unwrap();
+fn over_ipv6_and_multicast_it_is_named_likewise() {
+    let group = Ipv4Addr::new(239, 255, 0, 8);
+    let (mut observed, link, mut talker, writer) = observed_link(3, Verdict::Meter);
     hurry(&link.monitor);
-    for (host, address) in [(&link.robot, "fd99::1"), (&link.monitor, "fd99::2")] {
-        let name = host.name();
-        run(&format!(
-            "ip -n {name} addr add {address}/64 dev {INTERFACE} nodad"
-        ))
+    let member = observed.socket(&link.monitor, &format!("{group}:7411"));
+    member
+        .join_multicast_v4(&group, &link.monitor.address())
         .unwrap();
-    }
-    let (mut talker, writer) = talker(3);
-    observed
-        .filter
-        .set_interest(writer, Some(Verdict::Meter))
-        .unwrap();
-    let mut sender = forged::Sender::new(&link.robot, "[fd99::1]:0", "[fd99::2]:7411").unwrap();
-    // The receiver's link address has to be found first.
-    sender.carry(&talker.sample(100)).unwrap();
-    std::thread::sleep(SETTLED);
-    let lossy = Loss::of(
-        &link.robot,
-        "meta protocol ip6 frag more-fragments 0 frag frag-off > 0",
-        1000,
-    )
-    .unwrap();
-    for _ in 2..=4 {
+    let last_v6 = "meta protocol ip6 frag more-fragments 0 frag frag-off > 0";
+    let last_v4 = "ip frag-off & 0x2000 == 0 ip frag-off & 0x1fff != 0";
+    let ways = [
+        (
+            "[fd99::1]:0".to_owned(),
+            "[fd99::2]:7411".to_owned(),
+            last_v6,
+            flag::IPV6,
+        ),
+        (
+            format!("{}:0", link.robot.address()),
+            format!("{group}:7411"),
+            last_v4,
+            0,
+        ),
+    ];
+    for (from, to, last_fragment, family) in ways {
+        let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
+        // The receiver's link address has to be found first.
+        sender.carry(&talker.sample(100)).unwrap();
+        std::thread::sleep(SETTLED);
+        observed.records(writer, Duration::ZERO);
+        let lossy = Loss::of(&link.robot, last_fragment, 1000).unwrap();
+        let before = talker.sent();
+        for _ in 0..3 {
+            sender.carry(&talker.sample(60_000)).unwrap();
+        }
+        drop(lossy);
         sender.carry(&talker.sample(60_000)).unwrap();
-    }
-    drop(lossy);
-    sender.carry(&talker.sample(60_000)).unwrap();
-    let found = observed.records(writer, GIVEN_UP);
-    let mut numbers: Vec<_> = found.iter().map(|record| record.sequence_number).collect();
-    numbers.sort_unstable();
-    assert_eq!(numbers, [2, 3, 4]);
-    for record in found {
-        let flags = flag::FRAGMENTED | flag::NOT_REASSEMBLED | flag::IPV6;
-        assert_eq!(record.flags & !flag::STAMP, flags);
-        let destination: [u8; 16] = zerocopy::transmute!(record.destination);
-        let expected: std::net::Ipv6Addr = "fd99::2".parse().unwrap();
-        assert_eq!(destination, expected.octets());
-        assert_eq!(record.payload_len, 60_000);
+        let mut found = observed.records(writer, GIVEN_UP);
+        found.retain(|record| record.flags & flag::NOT_REASSEMBLED != 0);
+        let expected: Told = (before + 1..before + 4)
+            .map(|number| (number.into(), 0))
+            .collect();
+        assert_eq!((told(&found), found.len()), (expected, 3), "{to}");
+        for record in found {
+            let flags = flag::FRAGMENTED | flag::NOT_REASSEMBLED | family;
+            assert_eq!(record.flags & !flag::STAMP, flags);
+            let destination: [u8; 16] = zerocopy::transmute!(record.destination);
+            let to: SocketAddr = to.parse().unwrap();
+            let expected = match to.ip() {
+                IpAddr::V4(address) => address.to_ipv6_mapped(),
+                IpAddr::V6(address) => address,
+            };
+            assert_eq!(destination, expected.octets());
+            assert_eq!(record.payload_len, 60_000);
+        }
     }
 }
 

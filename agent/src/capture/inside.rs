@@ -34,7 +34,7 @@ pub struct Places {
     unknown: Option<String>,
 }
 
-/// The enumeration of reasons why a packet is thrown away: Linux 5.17; what is asked of it: 6.2.
+/// The enumeration of reasons why a packet is thrown away: Linux 5.17; those about fragments: 6.2.
 const REASONS: &str = "skb_drop_reason";
 
 /// From this release on the kernel tells of datagrams over IPv6 that a socket had no room for.
@@ -218,13 +218,17 @@ fn release() -> Option<(u32, u32)> {
 
 fn reassembly_losses(ebpf: &mut Ebpf, places: &Places) -> Result<RawTracePointLink, String> {
     places.need(&[
-        Layout::ReasonTimeout,
         Layout::BufferHead,
         Layout::BufferTail,
         Layout::BufferNetworkHeader,
         Layout::BufferInterface,
     ])?;
-    tracepoint(ebpf, "not_reassembled", "kfree_skb")
+    let program = if places.need(&[Layout::ReasonNone]).is_ok() {
+        "not_reassembled"
+    } else {
+        "not_reassembled_unexplained"
+    };
+    tracepoint(ebpf, program, "kfree_skb")
 }
 
 fn owners(ebpf: &mut Ebpf, places: &Places) -> Result<Owners, String> {
