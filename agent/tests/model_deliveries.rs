@@ -426,6 +426,11 @@ fn what_arrives_where_nobody_reads_is_unmatched_and_takes_no_room() {
     let snapshot = host.snapshot();
     let tables = snapshot.tables.iter().map(|row| (row.table, row.size));
     assert!(tables.into_iter().any(|row| row == ("deliveries", 1)));
+    host.unsubscribe(BOB, 2);
+    (11..=13).for_each(|number| host.data(bob, number));
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.messages, facts.unmatched), (10, 3));
+    assert_eq!(host.topic().received.unwrap().unmatched, 13);
 }
 
 #[test]

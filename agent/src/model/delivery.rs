@@ -192,6 +192,12 @@ impl Delivery {
         self.reception.close(budget);
     }
 
+    /// A sample came, and no reader is there for it.
+    pub const fn ignore(&mut self, totals: &mut Totals) {
+        self.tally.unmatched += 1;
+        totals.received.unmatched += 1;
+    }
+
     /// Takes in a DATA or DATA_FRAG; whether it brought nothing new, and what it completed.
     pub fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
         self.touch(record);

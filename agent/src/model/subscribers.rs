@@ -210,7 +210,11 @@ impl Subscribers {
             let is_whole = record.kind == kind::DATA && record.submessage_flags & DATA_FLAG != 0
                 || record.kind == kind::DATA_FRAG && record.ends_sample();
             if is_whole && record.flags & flag::NO_ROOM == 0 && record.status_info == 0 {
-                self.totals.received.unmatched += 1;
+                let place = self.find(receiver);
+                match place.and_then(|place| self.deliveries.get_mut(place)) {
+                    Some(delivery) => delivery.ignore(&mut self.totals),
+                    None => self.totals.received.unmatched += 1,
+                }
             }
             return false;
         }

@@ -13,7 +13,7 @@ use crate::model::histogram::Histogram;
 /// delivery's first sight; what is still awaited is not in it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Delivered {
-    /// Samples that came (or left) whole, each once, with or without a reader.
+    /// Samples that came (or left) whole, each once.
     pub messages: u64,
     /// Their payload bytes, encapsulation included.
     pub bytes: u64,
@@ -23,7 +23,8 @@ pub struct Delivered {
     pub recovered: u64,
     /// Seconds from noticing the gap to its filling, summed over `recovered`.
     pub recovery_seconds: f64,
-    /// Of `messages`: samples that arrived where no reader of the topic is known.
+    /// Samples that arrived where it is known that no reader of the topic is: undelivered, and not
+    /// in `messages`.
     pub unmatched: u64,
     /// Samples and fragments that came again; copies of one multicast on its way out do not count.
     pub duplicates: u64,

@@ -62,7 +62,7 @@ pub(in crate::surface) const TOPIC_DELIVERY_IRRELEVANT: Metric = Metric::counter
 pub(in crate::surface) const TOPIC_DELIVERY_UNMATCHED: Metric = Metric::counter(
     "ros2_topic_delivery_unmatched_messages_total",
     TOPIC,
-    "Delivered messages that arrived where no reader of the topic is known.",
+    "Messages that arrived where no reader of the topic is: delivered to nobody.",
 );
 pub(in crate::surface) const TOPIC_LAG: Metric = Metric::gauge(
     "ros2_topic_acknowledgement_lag_messages",
@@ -177,7 +177,7 @@ pub(in crate::surface) const SUBSCRIBER_IRRELEVANT: Metric = Metric::counter(
 pub(in crate::surface) const SUBSCRIBER_UNMATCHED: Metric = Metric::counter(
     "ros2_subscriber_unmatched_messages_total",
     SUBSCRIBER,
-    "Received messages without a known reader of the topic.",
+    "Messages that arrived while no reader of the topic was there: not among the received ones.",
 )
 .experimental();
 pub(in crate::surface) const READER_LAG: Metric = Metric::gauge(
