@@ -831,7 +831,6 @@ fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
     assert_eq!(arrived, sent.len());
     assert_eq!(refused.len(), missing.len());
     assert_eq!(refused.into_iter().collect::<BTreeSet<_>>(), missing);
-    assert_eq!(observed.counted(Counter::NoRoomUnseen), 0);
     let (errors, _) = full_buffers(&host);
     let others = observed.owners(cookie(&other))[&cookie(&other)]
         .drops
