@@ -650,10 +650,15 @@ fn what_a_participant_sends_to_an_address_of_its_own_by_mistake_tells_nothing_of
         host.data(group, number);
         host.wait(10);
     }
+    // Samples for a reader on another host come there as well.
+    host.participant(CAROL, "127.0.0.1:7411".parse().unwrap());
+    host.subscribe(CAROL, 1);
+    (5..=8).for_each(|number| host.data(bob.directed(CAROL), number));
     let deliveries = host.deliveries();
     assert_eq!(deliveries.len(), 1);
     assert_eq!(deliveries[0].participant.unwrap().prefix, BOB);
     assert_eq!(deliveries[0].readers, [Guid::new(BOB, READER)]);
+    assert_eq!(deliveries[0].delivered.duplicates, 0);
 }
 
 #[test]

@@ -238,6 +238,10 @@ impl Subscribers {
         let known = self.ways.get_mut(index)?;
         let is_multicast = known.way.place.is_multicast();
         if let Some(prefix) = directed.filter(|_| !is_multicast) {
+            if known.way.socket != 0 && known.owner.is_some_and(|owner| owner != prefix) {
+                // Whoever lives here passes it over.
+                return None;
+            }
             known.tell(prefix, &around, topic);
             let matched = if known.owner == Some(prefix) {
                 known.matched
