@@ -102,8 +102,16 @@ fn start<'a>(
     let watch = "watch: [{topic: /imu, per_subscriber: true}]\n";
     std::fs::write(file("ros2probe.yaml"), format!("{watch}{capture}"))?;
     let only = format!("-all,{capabilities}");
+    let groups = harness::cgroup::hierarchy()?;
+    let groups = groups.display();
+    // As ProtectControlGroups=yes and ProtectProc=invisible of the unit would have it.
+    let sandbox = format!(
+        "mount --bind {groups} {groups} && mount -o remount,bind,ro {groups} && \
+         mount -t proc -o hidepid=invisible proc /proc"
+    );
     let script = format!(
-        "#!/bin/sh\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
+        "#!/bin/sh\nset -e\n[ \"$1\" = inside ] || exec unshare --mount \"$0\" inside \"$@\"\nshift\n\
+         {sandbox}\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
          --ambient-caps {only} --bounding-set {only} {} \"$@\"\n",
         file("rp").display()
     );
