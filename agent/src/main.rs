@@ -56,7 +56,7 @@ fn run(options: cli::Run) -> Result<()> {
     }
     let log = Log::start(config.log);
     let source = open(&options, &config)?;
-    source.announce();
+    source.announce(&config.capture);
     let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
     let watchlist = Watchlist::new(config.watches.clone()).context("the watchlist is unusable")?;
     let server = config

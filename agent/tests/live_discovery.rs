@@ -14,7 +14,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
-use harness::agent::{Agent, ON_THE_WIRE, Scrape};
+use harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
 use tempfile::TempDir;
@@ -202,16 +202,20 @@ fn nodes_that_stop_are_gone_at_once_and_killed_ones_when_their_lease_ends() -> R
     Ok(())
 }
 
+/// On the wire of one host, and at the sockets of the other.
 fn all_nodes_are_there_each_time(stack: Stack) -> Result<()> {
     let link = Link::new()?;
-    let watcher = Watcher::start(&link.monitor)?;
+    let watchers = [
+        Watcher::start(&link.monitor)?,
+        Watcher::start_looking(&link.robot, &at_the_sockets_of(&link.robot))?,
+    ];
     for start in 0..STARTS {
         let began = Instant::now();
         let mut robot = Robot::new(&link, stack, start);
         robot.launch(NODES)?;
-        robot.wait_shown(&watcher)?;
+        robot.wait_shown(&watchers)?;
         eprintln!("{stack:?} {start}: shown after {:?}", began.elapsed());
-        robot.stop(&watcher)?;
+        robot.stop(&watchers)?;
     }
     Ok(())
 }
@@ -222,11 +226,14 @@ fn late_agent_shows_all_nodes_each_time(stack: Stack) -> Result<()> {
         let began = Instant::now();
         let mut robot = Robot::new(&link, stack, start);
         robot.launch(NODES / 2)?;
-        let watcher = Watcher::start(&link.monitor)?;
+        let watchers = [
+            Watcher::start(&link.monitor)?,
+            Watcher::start_looking(&link.robot, &at_the_sockets_of(&link.robot))?,
+        ];
         robot.launch(NODES / 2)?;
-        robot.wait_shown(&watcher)?;
+        robot.wait_shown(&watchers)?;
         eprintln!("{stack:?} {start}: shown after {:?}", began.elapsed());
-        robot.stop(&watcher)?;
+        robot.stop(&watchers)?;
     }
     Ok(())
 }
@@ -275,7 +282,7 @@ impl<'a> Robot<'a> {
         format!("/start_{}/node_{number}", self.start)
     }
 
-    fn wait_shown(&self, watcher: &Watcher<'_>) -> Result<()> {
+    fn wait_shown(&self, watchers: &[Watcher<'_>]) -> Result<()> {
         let names: BTreeSet<_> = (0..NODES).map(|number| self.name(number)).collect();
         let shown = |page: &Scrape| {
             let topic = [("topic", "/imu")];
@@ -285,20 +292,34 @@ impl<'a> Robot<'a> {
                 && page.sum("ros2_participants", &[]) == NODES as f64
         };
         let what = format!("all of start {}", self.start);
-        watcher.wait(shown, PATIENCE, &what)
+        watchers
+            .iter()
+            .try_for_each(|watcher| watcher.wait(shown, PATIENCE, &what))
     }
 
     /// Ends all nodes in order and sees them go.
-    fn stop(mut self, watcher: &Watcher<'_>) -> Result<()> {
-        for (number, peer) in self.peers.iter_mut().enumerate() {
-            // The Rust peer cannot end while it waits for the start.
-            if number % 2 == 0 {
-                peer.go()?;
+    fn stop(mut self, watchers: &[Watcher<'_>]) -> Result<()> {
+        // The monitor's first: at the robot's sockets nobody hears who goes when all have gone there.
+        for on_monitor in [1, 0] {
+            let peers = self.peers.iter_mut().enumerate();
+            let there = peers.filter(|(number, _)| number / 2 % 2 == on_monitor);
+            let mut ending = Vec::new();
+            for (number, peer) in there {
+                // The Rust peer cannot end while it waits for the start.
+                if number % 2 == 0 {
+                    peer.go()?;
+                }
+                peer.process.signal("TERM")?;
+                ending.push(peer);
             }
-            peer.process.signal("TERM")?;
+            for peer in ending {
+                peer.process.wait(PATIENCE)?;
+            }
         }
         let nobody = |page: &Scrape| page.sum("ros2_participants", &[]) == 0.0;
-        watcher.wait(nobody, LEAVE, "nobody")
+        watchers
+            .iter()
+            .try_for_each(|watcher| watcher.wait(nobody, LEAVE, "nobody"))
     }
 }
 
@@ -310,9 +331,13 @@ struct Watcher<'a> {
 
 impl<'a> Watcher<'a> {
     fn start(host: &'a Namespace) -> Result<Watcher<'a>> {
+        Self::start_looking(host, ON_THE_WIRE)
+    }
+
+    fn start_looking(host: &'a Namespace, capture: &str) -> Result<Watcher<'a>> {
         let directory = tempfile::tempdir()?;
         let file = directory.path().join("ros2probe.yaml");
-        std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{ON_THE_WIRE}"))?;
+        std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{capture}"))?;
         let agent = Agent::start(host, Path::new(env!("CARGO_BIN_EXE_rp")), &file)?;
         Ok(Watcher {
             agent,

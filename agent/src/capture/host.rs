@@ -18,7 +18,7 @@ use super::hierarchy::{self, Cgroup, HierarchyError};
 use super::inside::Abilities;
 use super::order::{Next, Order};
 use super::sockets::Sockets;
-use super::system::{self, Clocks};
+use super::system::Clocks;
 use super::whole::Wholes;
 use crate::model::observer::Observer;
 
@@ -93,7 +93,6 @@ impl HostTap {
             Some(path) => hierarchy::mount_point().unwrap_or_else(|_| path.clone()),
             None => cgroup.path().to_path_buf(),
         };
-        system::give_back_memory();
         Ok(Self {
             sockets: Sockets::new(hierarchy),
             cgroup,

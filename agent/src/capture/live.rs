@@ -18,7 +18,7 @@ use super::filter::{Filter, FilterError};
 use super::host::{self, HostError, HostSettings, HostTap};
 use super::interfaces::Selection;
 use super::netns::{self, NetnsError};
-use super::system::{Clocks, wait};
+use super::system::{Clocks, give_back_memory, wait};
 use super::wire::{self, TapError, WireSettings, WireTap};
 use crate::config::{CaptureSettings, SourceChoice};
 use crate::model::observer::Observer;
@@ -112,6 +112,7 @@ impl LiveSource {
                 open_wires(settings, limits, mirrors)?
             }
         };
+        give_back_memory();
         let clocks = Clocks::read();
         let mut source = Self {
             host,

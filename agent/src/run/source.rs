@@ -13,6 +13,7 @@ use super::RunError;
 use super::replay::Replay;
 use crate::capture::host::HostTap;
 use crate::capture::live::LiveSource;
+use crate::config::CaptureSettings;
 use crate::model::observer::Observer;
 use crate::surface::{Ability, AgentFacts, InterfaceFacts, SourceKind};
 
@@ -35,10 +36,13 @@ impl Source {
     }
 
     /// Says in the log what this looks at, what it can tell and what it cannot.
-    pub fn announce(&self) {
+    pub fn announce(&self, settings: &CaptureSettings) {
         let Self::Live(live) = self else { return };
         if let Some(reason) = live.without_host() {
             tracing::warn!("host hook not used: {reason}; using packet sockets");
+        }
+        if !live.is_on_the_wire() && !settings.network_namespaces.is_empty() {
+            tracing::info!("capture.network_namespaces is not needed: all sockets are seen");
         }
         for (ability, able) in inside(live).into_iter().flatten() {
             if let Err(reason) = able {
