@@ -349,6 +349,37 @@ fn a_wire_tells_receivers_apart_by_destination_and_invents_no_losses_for_repairs
 }
 
 #[test]
+fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    let elsewhere = host.reader(CAROL, 7413).wire();
+    host.owner(group, BOB);
+    for number in 1..=100 {
+        // The mirror is first, and shows what Bob and Carol get.
+        host.data(group.wire(), number);
+        host.data(group, number);
+        if number % 10 == 0 {
+            host.data(elsewhere.directed(CAROL), number - 5);
+        }
+        host.wait(10);
+    }
+    host.wait(12_000);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("Bob alone: {:#?}", host.deliveries())
+    };
+    assert_eq!(delivery.participant.unwrap().prefix, BOB);
+    let facts = delivery.delivered;
+    assert_eq!(
+        (facts.messages, facts.lost(), facts.duplicates),
+        (100, 0, 0)
+    );
+    let union = host.measurement();
+    // The very first came before it was known that a socket receives it.
+    assert_eq!((union.messages, union.lost, union.duplicates), (100, 0, 10));
+}
+
+#[test]
 fn a_loss_whose_fragments_the_kernel_gives_up_later_is_told_with_its_final_cause() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);

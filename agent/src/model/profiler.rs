@@ -14,7 +14,7 @@ use super::journal::Journal;
 use super::receivers::Around;
 use super::samples::Budget;
 use super::snapshot::Measurement;
-use super::subscribers::{Room, Stage, Subscribers};
+use super::subscribers::{Room, Sight, Stage, Subscribers};
 use super::topic::TopicId;
 use super::writer::{Scene, Traits, Writer};
 
@@ -168,7 +168,7 @@ impl Profiler {
             Some(_) => &mut self.budget,
             None => &mut self.strangers_budget,
         };
-        let mut came_again = false;
+        let mut sight = Sight::New;
         if measured.topic.is_some() {
             let mut stage = Stage {
                 now,
@@ -181,9 +181,9 @@ impl Profiler {
                 around,
             };
             let subscribers = measured.subscribers.get_or_insert_default();
-            came_again = subscribers.record(record, &mut stage);
+            sight = subscribers.record(record, &mut stage);
         }
-        if record.flags & UNDELIVERED != 0 {
+        if record.flags & UNDELIVERED != 0 || sight == Sight::Covered {
             return true;
         }
         let next = measured.writer.next();
@@ -196,7 +196,7 @@ impl Profiler {
                 journal,
             },
         );
-        if came_again && record.flags & flag::HOST != 0 {
+        if sight == Sight::Again && record.flags & flag::HOST != 0 {
             measured.writer.came_again();
         }
         if let Some(subscribers) = &mut measured.subscribers

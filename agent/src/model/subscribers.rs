@@ -50,8 +50,22 @@ pub struct Subscribers {
     acknowledgements: Acknowledgements,
     /// Its datagrams may need IP reassembly on this host.
     reassembled: bool,
+    /// Some ways are seen at sockets.
+    at_socket: bool,
     /// Of the answers in `ways`.
     generation: u64,
+}
+
+/// What a record was to the deliveries.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Sight {
+    /// It may have brought something.
+    New,
+    /// It brought nothing that had not come to the same receiver before, or left for the same
+    /// destination.
+    Again,
+    /// On a wire, of what is seen at sockets anyway.
+    Covered,
 }
 
 /// Room for the deliveries of all writers.
@@ -124,9 +138,8 @@ impl Subscribers {
         self.acknowledgements.facts(writer, next, now)
     }
 
-    /// Takes in a record of the writer, or an ACKNACK for it. Whether it brought nothing that had not
-    /// come to the same receiver before, or left for the same destination.
-    pub fn record(&mut self, record: &Record, stage: &mut Stage<'_>) -> bool {
+    /// Takes in a record of the writer, or an ACKNACK for it.
+    pub fn record(&mut self, record: &Record, stage: &mut Stage<'_>) -> Sight {
         self.refresh(stage);
         let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
         if record.kind == kind::ACKNACK {
@@ -135,30 +148,39 @@ impl Subscribers {
             if stage.topic().is_some_and(is_reader) {
                 self.acknowledgements.record(record);
             }
-            return false;
+            return Sight::New;
         }
         if record.flags & flag::NOT_REASSEMBLED != 0 {
             if is_sample {
                 self.not_reassembled(record, stage);
             }
-            return false;
+            return Sight::New;
         }
         self.reassembled |= record.flags & flag::HOST != 0 && record.datagram_len > ONE_FRAME;
         let way = Way::of(record);
         if !is_sample && (!matches!(record.kind, kind::HEARTBEAT | kind::GAP) || way.is_sent()) {
-            return false;
+            return Sight::New;
         }
-        let index = self
-            .ways
-            .place(way, stage.now, &stage.around, stage.topic());
+        let is_host = record.flags & flag::HOST != 0;
+        if !is_host && self.at_socket && self.ways.is_at_socket(way.place) {
+            return Sight::Covered;
+        }
+        let topic = stage.topic();
+        let mut index = self.ways.place(way, stage.now, &stage.around, topic);
         if let Some(known) = self.ways.get_mut(index) {
             known.last_seen = known.last_seen.max(stage.now);
+            if is_host && !known.at_socket {
+                known.at_socket = true;
+                self.uncover(way, stage);
+                index = self.ways.find(&way).unwrap_or(index);
+            }
         }
-        if way.is_sent() {
+        let came_again = if way.is_sent() {
             self.leave(index, record, stage)
         } else {
             self.arrive(index, record, stage)
-        }
+        };
+        if came_again { Sight::Again } else { Sight::New }
     }
 
     /// The writer's newest sample is this one.
@@ -273,6 +295,10 @@ impl Subscribers {
         stage: &mut Stage<'_>,
     ) -> bool {
         let no_room = record.flags & flag::NO_ROOM != 0;
+        let way = self.ways.get(index).map(|known| known.way);
+        if way.is_some_and(|way| self.is_repair_elsewhere(way, receiver, record)) {
+            return false;
+        }
         let is_open = |receiver| matches!(receiver, Receiver::Way(way) if way.is_open());
         if self.open > 0 && !is_open(receiver) {
             let is_known = !no_room && self.repair(record, stage);
@@ -351,6 +377,19 @@ impl Subscribers {
             }
         }
         is_known
+    }
+
+    /// On a wire, by unicast, to somebody of whom nothing else is known, of a sample that has come to
+    /// a socket of this host as multicast: a repair for another host that got the multicast too.
+    fn is_repair_elsewhere(&self, way: Way, receiver: Receiver, record: &Record) -> bool {
+        let is_at_socket = |way: Way| way.is_open() && way.socket != 0;
+        way.socket == 0
+            && self.at_socket
+            && !way.place.is_multicast()
+            && self.find(receiver).is_none()
+            && self.deliveries.iter().any(|delivery| {
+                is_at_socket(delivery.main()) && delivery.next() > record.sequence_number
+            })
     }
 
     /// Lets deliveries that may be the same receiver's know of each other's samples.

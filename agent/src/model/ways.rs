@@ -45,6 +45,8 @@ pub struct Known {
     pub last_seen: Timestamp,
     /// New samples that came this way.
     pub brought: u64,
+    /// It is seen at a socket, not on a wire.
+    pub at_socket: bool,
     /// Samples have come this way.
     pub has_data: bool,
     /// What had left by when.
@@ -120,6 +122,7 @@ impl Ways {
             delivery: None,
             last_seen: now,
             brought: 0,
+            at_socket: false,
             has_data: false,
             left: VecDeque::new(),
         };
@@ -128,6 +131,13 @@ impl Ways {
         self.ways.insert(index, known);
         self.last = index;
         index
+    }
+
+    /// Whether what is sent to this place is seen at sockets.
+    #[must_use]
+    pub fn is_at_socket(&self, place: Place) -> bool {
+        let mut ways = self.ways.iter();
+        ways.any(|known| known.at_socket && known.way.place == place)
     }
 
     /// Forgets ways.

@@ -6,6 +6,7 @@ use ros2probe_wire::qos::Reliability;
 use super::{Stage, Subscribers, is_reader, scene};
 use crate::model::delivery::{Delivery, Receiver, Totals};
 use crate::model::receivers::{Matched, readers};
+use crate::model::way::Way;
 
 const SECOND: u64 = 1_000_000_000;
 /// A way by which nothing came for so long is forgotten, unless a reader is known at its end.
@@ -112,6 +113,18 @@ impl Subscribers {
             } else {
                 delivery.expect(newest, alive, |at| leaving.left_by(at), &mut scene);
             }
+        }
+    }
+
+    /// What came this way so far was seen on a wire; from now on it is seen at a socket.
+    pub(super) fn uncover(&mut self, way: Way, stage: &mut Stage<'_>) {
+        self.at_socket = true;
+        let place = way.place;
+        let before = self.ways.iter().count();
+        self.ways
+            .retain(|known| known.at_socket || known.way.place != place);
+        if self.ways.iter().count() < before {
+            self.drop_orphans(stage);
         }
     }
 
