@@ -103,6 +103,34 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
 }
 
 #[test]
+fn who_receives_is_named_by_process_and_control_group() -> Result<()> {
+    let host = Namespace::alone()?;
+    let configuration = format!(
+        "watch: [{{topic: /imu, per_subscriber: true}}]\n{}",
+        at_the_sockets_of(&host)
+    );
+    let observed = Observed::start(&host, &configuration)?;
+    let stream = Stream {
+        linger: 20.0,
+        ..Stream::small(2000)
+    };
+    let (mut publisher, subscriber) = pair(&host, &host, Stack::Cyclone, &stream)?;
+    publisher.go()?;
+    let cgroup = host.cgroup().file_name().context("no name")?;
+    let cgroup = format!("/{}", cgroup.display());
+    let process_id = subscriber.process.pid().to_string();
+    let expected = [
+        ("topic", "/imu"),
+        ("ros_node", "/listener"),
+        ("process", "cyclonedds"),
+        ("pid", &process_id),
+        ("cgroup", &cgroup),
+    ];
+    observed.wait(|page| page.value("ros2_subscriber_info", &expected) == Some(1.0))?;
+    Ok(())
+}
+
+#[test]
 fn left_to_itself_the_agent_looks_at_the_sockets_and_says_so() -> Result<()> {
     let host = Namespace::alone()?;
     let cgroup = host.cgroup().display();
