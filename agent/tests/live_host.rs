@@ -75,6 +75,10 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
         let robot = Observed::start(&link.robot, &at_the_sockets_of(&link.robot))?;
         let monitor = Observed::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
         let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
+        // Of a writer that is not known yet less than a point cloud is looked at.
+        for observed in [&robot, &monitor] {
+            observed.wait(|page| publishers(page, &stream.topic) == Some(1.0))?;
+        }
         publisher.go()?;
         publisher.wait_sent(PATIENCE)?;
         for observed in [&robot, &monitor] {
@@ -388,7 +392,11 @@ fn count(page: &Scrape, what: &str, topic: &str) -> u64 {
 
 /// The topic's publisher came and went.
 fn gone(page: &Scrape, topic: &str) -> bool {
-    page.value("ros2_topic_publishers", &[("topic", topic)]) == Some(0.0)
+    publishers(page, topic) == Some(0.0)
+}
+
+fn publishers(page: &Scrape, topic: &str) -> Option<f64> {
+    page.value("ros2_topic_publishers", &[("topic", topic)])
 }
 
 fn nothing_was_dropped(page: &Scrape) -> Result<()> {
