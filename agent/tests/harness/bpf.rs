@@ -88,6 +88,22 @@ pub(crate) fn programs_of(process: u32) -> Result<BTreeSet<u32>> {
     Ok(programs)
 }
 
+/// How often the kernel left out running one of this process's programs because it was running on
+/// that CPU already.
+pub(crate) fn skipped_runs() -> Result<u64> {
+    let mut skipped = 0;
+    for entry in fs::read_dir("/proc/self/fdinfo")? {
+        let text = fs::read_to_string(entry?.path()).unwrap_or_default();
+        let misses = text
+            .lines()
+            .filter_map(|line| line.strip_prefix("recursion_misses:"));
+        skipped += misses
+            .filter_map(|count| count.trim().parse::<u64>().ok())
+            .sum::<u64>();
+    }
+    Ok(skipped)
+}
+
 /// Whether anything still holds a program.
 pub(crate) fn exists(program: u32) -> Result<bool> {
     let by_id = ProgramById {

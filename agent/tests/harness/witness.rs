@@ -19,6 +19,7 @@ use ros2probe::model::snapshot::Snapshot;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::filter::Counter;
 
+use super::bpf;
 use super::network::Namespace;
 
 const SLICE: Duration = Duration::from_millis(100);
@@ -38,6 +39,8 @@ pub(crate) struct Testimony {
     pub(crate) delivery_losses: Vec<DeliveryLoss>,
     /// The kernel programs' own counters.
     pub(crate) counters: Vec<(Counter, u64)>,
+    /// Runs of those that the kernel left out.
+    pub(crate) skipped_runs: u64,
 }
 
 impl Testimony {
@@ -160,6 +163,7 @@ fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Tes
     }
     source.drain(&mut observer);
     let counters = source.counters()?;
+    let skipped_runs = bpf::skipped_runs()?;
     let end = Timestamp(source.clock().0.saturating_add(UNTIL_ALL_IS_SETTLED));
     observer.advance(end);
     observer.settle();
@@ -168,5 +172,6 @@ fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Tes
         losses: observer.journal().losses().copied().collect(),
         delivery_losses: observer.journal().delivery_losses().copied().collect(),
         counters,
+        skipped_runs,
     })
 }

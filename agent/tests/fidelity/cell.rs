@@ -1,0 +1,104 @@
+//! One stretch of a stream as one subscriber met it, and what the agent says of it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+
+use ros2probe::model::cause::LossCause;
+
+/// Writer's sequence numbers throughout.
+#[derive(Debug)]
+pub(crate) struct Cell {
+    /// Stack, size, trouble, subscriber.
+    pub(crate) name: String,
+    pub(crate) sent: BTreeSet<u64>,
+    /// Those of `sent` that the subscriber was not given.
+    pub(crate) lost: BTreeSet<u64>,
+    /// Those that the agent calls lost, with the cause it gives.
+    pub(crate) reported: BTreeMap<u64, LossCause>,
+    /// Causes that the trouble can have had.
+    pub(crate) possible: BTreeSet<LossCause>,
+    /// Sent while the trouble began or ended: may have died of what was before or after.
+    pub(crate) between: BTreeSet<u64>,
+    /// Whether the trouble cannot fail to cost samples.
+    pub(crate) must_lose: bool,
+}
+
+impl Cell {
+    fn found(&self) -> usize {
+        let reported = self.reported.keys();
+        reported.filter(|number| self.lost.contains(number)).count()
+    }
+
+    /// Share of the lost samples that the agent names.
+    fn recall(&self) -> f64 {
+        share(self.found(), self.lost.len())
+    }
+
+    /// Share of the samples that the agent names which were lost.
+    fn precision(&self) -> f64 {
+        share(self.found(), self.reported.len())
+    }
+
+    /// What is not as it must be.
+    pub(crate) fn faults(&self) -> Vec<String> {
+        let named: BTreeSet<u64> = self.reported.keys().copied().collect();
+        let mut faults = Vec::new();
+        let mut fault = |what: &str, numbers: Vec<u64>| {
+            if !numbers.is_empty() {
+                faults.push(format!("{}: {what} {numbers:?}", self.name));
+            }
+        };
+        fault(
+            "not reported",
+            self.lost.difference(&named).copied().collect(),
+        );
+        fault("not lost", named.difference(&self.lost).copied().collect());
+        for cause in LossCause::ALL {
+            let wrong = self.reported.iter().filter(|(number, reported)| {
+                **reported == cause
+                    && !self.possible.contains(&cause)
+                    && !self.between.contains(number)
+            });
+            let wrong = wrong.map(|(number, _)| *number).collect();
+            fault(&format!("cannot be of {}", cause.label()), wrong);
+        }
+        if self.must_lose && self.lost.is_empty() {
+            faults.push(format!("{}: lost nothing", self.name));
+        }
+        faults
+    }
+}
+
+impl fmt::Display for Cell {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{:60} {:5} sent {:4} lost {:4} reported  recall {:.3} precision {:.3} ",
+            self.name,
+            self.sent.len(),
+            self.lost.len(),
+            self.reported.len(),
+            self.recall(),
+            self.precision()
+        )?;
+        for cause in LossCause::ALL {
+            let count = self
+                .reported
+                .values()
+                .filter(|each| **each == cause)
+                .count();
+            if count > 0 {
+                write!(f, " {} {count}", cause.label())?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Of nothing all were found.
+fn share(part: usize, whole: usize) -> f64 {
+    match whole {
+        0 => 1.0,
+        _ => part as f64 / whole as f64,
+    }
+}
