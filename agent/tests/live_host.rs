@@ -1,6 +1,12 @@
 //! `rp run` at the sockets of a host: real participants are seen whole, the source is chosen as
 //! documented, containers that start later are seen, and nothing stays behind. Needs root.
 
+#![expect(
+    clippy::indexing_slicing,
+    reason = "test code says what must hold by failing"
+)]
+
+mod forged;
 mod harness;
 
 use std::fs::Permissions;
@@ -9,6 +15,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
+use forged::{Sender, Talker, introduce, talk};
 use harness::agent::{Agent, Scrape, at_the_sockets_of};
 use harness::cgroup;
 use harness::network::{Link, Namespace};
@@ -75,6 +82,10 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
         let robot = Observed::start(&link.robot, &at_the_sockets_of(&link.robot))?;
         let monitor = Observed::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
         let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
+        // Of a writer that is not known yet less than a point cloud is looked at.
+        for observed in [&robot, &monitor] {
+            observed.wait(|page| publishers(page, &stream.topic) == Some(1.0))?;
+        }
         publisher.go()?;
         publisher.wait_sent(PATIENCE)?;
         for observed in [&robot, &monitor] {
@@ -100,6 +111,76 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
         }
     }
     Ok(())
+}
+
+#[test]
+fn who_receives_is_named_by_process_and_control_group() -> Result<()> {
+    let host = Namespace::alone()?;
+    let configuration = format!(
+        "watch: [{{topic: /imu, per_subscriber: true}}]\n{}",
+        at_the_sockets_of(&host)
+    );
+    let observed = Observed::start(&host, &configuration)?;
+    let stream = Stream {
+        linger: 20.0,
+        ..Stream::small(2000)
+    };
+    let (mut publisher, subscriber) = pair(&host, &host, Stack::Cyclone, &stream)?;
+    publisher.go()?;
+    let cgroup = host.cgroup().file_name().context("no name")?;
+    let cgroup = format!("/{}", cgroup.display());
+    let process_id = subscriber.process.pid().to_string();
+    let expected = [
+        ("topic", "/imu"),
+        ("ros_node", "/listener"),
+        ("process", "cyclonedds"),
+        ("pid", &process_id),
+        ("cgroup", &cgroup),
+    ];
+    observed.wait(|page| page.value("ros2_subscriber_info", &expected) == Some(1.0))?;
+    Ok(())
+}
+
+#[test]
+fn a_mirrored_interface_shows_what_no_socket_receives_and_counts_nothing_twice() -> Result<()> {
+    let link = Link::new()?;
+    let cgroup = link.monitor.cgroup().display();
+    let configuration =
+        format!("capture: {{source: host, cgroup: {cgroup}, mirror_interfaces: [eth*]}}\n");
+    let observed = Observed::start(&link.monitor, &configuration)?;
+    // To a port that nobody has, as what a mirror port or a gateway passes on.
+    let mut sender = Sender::between(&link.robot, &link.monitor)?;
+    let mut talker = Talker::new(1, "/forwarded");
+    introduce(&talker, &mut sender)?;
+    talk(&mut talker, &mut sender, [320; 200])?;
+    let stream = Stream {
+        topic: "/received".to_owned(),
+        ..Stream::small(400)
+    };
+    let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Cyclone, &stream)?;
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    let page = observed.wait(|page| gone(page, "/received"))?;
+    assert_eq!(count(&page, "messages", "/forwarded"), 200);
+    assert_eq!(count(&page, "messages", "/received"), 400);
+    assert_eq!(
+        page.sum(
+            "ros2_topic_delivered_messages_total",
+            &[("topic", "/received")]
+        ),
+        400.0,
+        "{}",
+        page.0
+    );
+    let forwarded = [("ability", "forwarded")];
+    assert_eq!(page.sum("ros2probe_capture_ability", &forwarded), 1.0);
+    assert!(
+        page.sum("ros2probe_capture_packets_total", &[("interface", "eth0")]) > 0.0
+            && page.sum("ros2probe_capture_packets_total", &[("interface", "lo")]) == 0.0,
+        "{}",
+        page.0
+    );
+    nothing_was_dropped(&page)
 }
 
 #[test]
@@ -360,7 +441,11 @@ fn count(page: &Scrape, what: &str, topic: &str) -> u64 {
 
 /// The topic's publisher came and went.
 fn gone(page: &Scrape, topic: &str) -> bool {
-    page.value("ros2_topic_publishers", &[("topic", topic)]) == Some(0.0)
+    publishers(page, topic) == Some(0.0)
+}
+
+fn publishers(page: &Scrape, topic: &str) -> Option<f64> {
+    page.value("ros2_topic_publishers", &[("topic", topic)])
 }
 
 fn nothing_was_dropped(page: &Scrape) -> Result<()> {

@@ -32,7 +32,7 @@ const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
 /// How long news from the host hook is gathered: a node that starts announces its endpoints one by
 /// one, and each round costs.
-const GATHER: Duration = Duration::from_millis(20);
+const GATHER: Duration = Duration::from_millis(10);
 const SECOND: u64 = 1_000_000_000;
 const TENTH: u64 = SECOND / 10;
 
