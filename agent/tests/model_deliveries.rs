@@ -13,6 +13,8 @@ mod forge;
 mod host;
 
 use host::{BOB, CAROL, GROUP, Host, READER, Seen};
+use std::net::SocketAddrV4;
+
 use proptest::prelude::*;
 use ros2probe::model::cause::LossCause;
 
@@ -644,6 +646,61 @@ fn a_full_table_refuses_counts_and_makes_room_when_somebody_is_silent() {
         .map(|each| each.delivered.messages)
         .sum();
     assert!(host.topic().received.unwrap().messages > sum);
+}
+
+#[test]
+fn an_address_that_two_announce_in_turn_is_nobodys() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411).wire();
+    host.reader(CAROL, 7411);
+    host.data(bob, 1);
+    let owner = |host: &Host| host.deliveries()[0].participant.map(|guid| guid.prefix);
+    assert_eq!(owner(&host), Some(CAROL));
+    // Bob lives: containers have the same addresses.
+    host.participant(BOB, bob.address);
+    host.participant(CAROL, bob.address);
+    host.data(bob, 2);
+    host.wait(100);
+    let deliveries = host.deliveries();
+    assert!(
+        deliveries.iter().any(|each| each.participant.is_none()),
+        "{deliveries:#?}"
+    );
+    assert!(deliveries.iter().all(|each| each.delivered.lost() == 0));
+}
+
+#[test]
+fn a_storm_of_forged_destinations_stays_bounded_and_real_receivers_are_counted() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411).wire();
+    for number in 1..=200 {
+        host.data(bob, number);
+        for forged in 0..100 {
+            let address = u32::from_be_bytes([10, 1, 0, 0]) + (number as u32) * 100 + forged;
+            let nowhere = Seen {
+                address: SocketAddrV4::new(address.into(), 7411),
+                ..bob
+            };
+            host.data(nowhere, number);
+        }
+        host.wait(50);
+    }
+    let tables = host.snapshot().tables;
+    let row = tables.iter().find(|row| row.table == "deliveries").unwrap();
+    assert!(row.size <= 2000 && row.evictions > 10_000, "{row:?}");
+    let deliveries = host.deliveries();
+    let of_bob = deliveries
+        .iter()
+        .find(|each| each.participant.is_some())
+        .unwrap();
+    assert_eq!(
+        (of_bob.delivered.messages, of_bob.delivered.lost()),
+        (200, 0)
+    );
+    for _ in 0..70 {
+        host.wait(1000);
+    }
+    assert_eq!(host.deliveries().len(), 1);
 }
 
 #[test]

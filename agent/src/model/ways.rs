@@ -208,3 +208,34 @@ impl Known {
             .map(|(_, number)| *number)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_had_left_by_a_moment_is_remembered_for_a_while() {
+        let mut known = Known {
+            way: Way {
+                direction: Direction::Sent,
+                socket: 0,
+                place: Place::default(),
+            },
+            owner: None,
+            told: None,
+            matched: Matched::Unknown,
+            delivery: None,
+            last_seen: Timestamp(0),
+            brought: 0,
+            at_socket: true,
+            has_data: true,
+            left: VecDeque::new(),
+        };
+        let at = |tenths: u64| Timestamp((1000 + tenths) * SECOND / 10);
+        (0..1000).for_each(|tenths| known.mark(tenths * 3, at(tenths)));
+        assert_eq!(known.left_by(at(500)), None);
+        assert_eq!(known.left_by(at(905)), Some(2700));
+        assert_eq!(known.left_by(at(2000)), Some(2970));
+        assert!(known.left.len() <= MOMENTS);
+    }
+}
