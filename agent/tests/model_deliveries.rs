@@ -301,6 +301,43 @@ fn ways_are_put_together_when_their_socket_is_known_late() {
 }
 
 #[test]
+fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    let large = |host: &mut Host, seen: Seen, number| {
+        let record = host.record(seen, kind::DATA, number);
+        host.put(Record {
+            datagram_len: 60_000,
+            ..record
+        });
+    };
+    // By unicast what the multicast brings after all, and the other way round.
+    (1..=5).for_each(|number| large(&mut host, bob, number));
+    (9..=20).for_each(|number| large(&mut host, bob, number));
+    host.wait(11_000);
+    assert_eq!(host.topic().received.unwrap().pending, 3);
+    for number in [6, 8, 20, 22] {
+        large(&mut host, group, number);
+    }
+    host.wait(11_000);
+    host.owner(group, BOB);
+    host.wait(100);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("one receiver: {:#?}", host.deliveries())
+    };
+    assert_eq!(
+        delivery.delivered.pending,
+        host.topic().received.unwrap().pending
+    );
+    for _ in 0..50 {
+        host.wait(1000);
+    }
+    assert_eq!(host.topic().received.unwrap().pending, 0);
+    assert_eq!(host.losses(LossCause::BeforeHost), [7, 21]);
+}
+
+#[test]
 fn a_wire_tells_receivers_apart_by_destination_and_invents_no_losses_for_repairs() {
     let mut host = Host::new();
     let (bob, carol) = (

@@ -7,6 +7,8 @@
 
 mod deciding;
 
+use std::collections::BTreeSet;
+
 use ros2probe_wire::record::kind;
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
@@ -33,6 +35,8 @@ const UNDER_WAY: u64 = 1_000_000_000;
 /// was closed.
 const SILENCE: u64 = 18_000_000_000;
 const FIRST_MOMENTS: u64 = 5_000_000_000;
+/// Samples that are lost in one go and wait for their cause when two deliveries become one.
+const LONG_RUN: u64 = 256;
 /// Numbers that may be told to exist beyond the highest one seen.
 const MAX_AHEAD: u64 = 4096;
 
@@ -339,17 +343,42 @@ impl Delivery {
     }
 
     /// `other` turned out to be the same receiver.
-    pub fn absorb(&mut self, other: Self, scene: &mut Scene<'_>) {
+    pub fn absorb(&mut self, mut other: Self, scene: &mut Scene<'_>) {
+        let mut runs = self.deaths.due(Timestamp(u64::MAX));
+        runs.extend(other.deaths.due(Timestamp(u64::MAX)));
+        // So many at once are no matter of single fragments, nor of single repairs.
+        let (long, short): (Vec<_>, Vec<_>) = runs
+            .into_iter()
+            .partition(|(first, last)| last - first > LONG_RUN);
+        let pending: BTreeSet<u64> = short
+            .into_iter()
+            .flat_map(|(first, last)| first..=last)
+            .filter(|number| !self.has(*number) && !other.has(*number))
+            .collect();
         self.tally.add(&other.tally);
+        let total = &mut scene.totals.received.pending;
+        *total = total.saturating_sub(std::mem::take(&mut self.tally.pending));
         self.deaths.absorb(other.deaths);
         self.first_seen = self.first_seen.min(other.first_seen);
         self.last_seen = self.last_seen.max(other.last_seen);
         self.opened = self.opened.max(other.opened);
+        self.proven |= other.proven;
         let now = scene.now;
+        let settled = other.reception.sequence().settled();
         let (reception, budget, mut deciding) = self.split(scene);
+        for (first, last) in long {
+            deciding.lose(LossCause::BeforeHost, first, last);
+        }
+        for number in pending {
+            deciding.wait(number, number);
+        }
         reception.absorb(other.reception, now, budget, &mut |decision| {
             deciding.take(decision);
         });
+        // What was decided there is not decided again.
+        let sequence = self.reception.sequence_mut();
+        let settled = settled.min(sequence.next());
+        (sequence.settled()..settled).for_each(|number| sequence.know(number));
     }
 
     const fn is_reliable(&self, scene: &Scene<'_>) -> bool {

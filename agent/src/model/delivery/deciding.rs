@@ -78,17 +78,23 @@ impl Deciding<'_> {
             runs.push((first, last, cause));
         });
         for (first, last, cause) in runs {
-            match (cause, self.until) {
-                (Some(cause), _) => self.lose(cause, first, last),
-                (None, None) => self.lose(LossCause::BeforeHost, first, last),
-                (None, Some(until)) => {
-                    self.tally.pending += last - first + 1;
-                    self.totals.pending += last - first + 1;
-                    if let Some((first, last)) = self.deaths.wait(first, last, until) {
-                        self.conclude(first, last);
-                    }
-                }
+            match cause {
+                Some(cause) => self.lose(cause, first, last),
+                None => self.wait(first, last),
             }
+        }
+    }
+
+    /// Nothing is known yet of where these died.
+    pub(super) fn wait(&mut self, first: u64, last: u64) {
+        let Some(until) = self.until else {
+            self.lose(LossCause::BeforeHost, first, last);
+            return;
+        };
+        self.tally.pending += last - first + 1;
+        self.totals.pending += last - first + 1;
+        if let Some((first, last)) = self.deaths.wait(first, last, until) {
+            self.conclude(first, last);
         }
     }
 
