@@ -320,6 +320,7 @@ fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
     for number in [6, 8, 20, 22] {
         large(&mut host, group, number);
     }
+    assert_eq!(host.topic().received.unwrap().pending, 1);
     host.wait(11_000);
     host.owner(group, BOB);
     host.wait(100);

@@ -176,8 +176,12 @@ impl Delivery {
     }
 
     /// This sample came another way that may be the same receiver's.
-    pub fn know(&mut self, number: u64) {
+    pub fn know(&mut self, number: u64, totals: &mut Totals) {
         self.reception.sequence_mut().know(number);
+        if self.deaths.resolve(number) {
+            self.tally.pending = self.tally.pending.saturating_sub(1);
+            totals.received.pending = totals.received.pending.saturating_sub(1);
+        }
     }
 
     /// A reader appeared; what it saw before, if anything, was for another.
@@ -461,11 +465,11 @@ impl Delivery {
                 tally.bytes += u64::from(record.payload_len);
                 tally.recovered += 1;
             });
-            self.know(number);
+            self.reception.sequence_mut().know(number);
             return (false, None);
         }
         if record.kind == kind::DATA {
-            self.know(number);
+            self.reception.sequence_mut().know(number);
         }
         self.count(scene, |tally| tally.duplicates += 1);
         (true, None)

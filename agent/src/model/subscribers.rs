@@ -403,7 +403,7 @@ impl Subscribers {
             };
             for other in &mut self.deliveries {
                 if !other.main().is_sent() && !is_open(other) && other.misses(number) {
-                    other.know(number);
+                    other.know(number, &mut self.totals);
                 }
             }
             return;
@@ -419,7 +419,10 @@ impl Subscribers {
         };
         let known: Vec<_> = missing.filter(has).collect();
         if let Some(delivery) = self.deliveries.get_mut(place) {
-            known.into_iter().for_each(|number| delivery.know(number));
+            let totals = &mut self.totals;
+            known
+                .into_iter()
+                .for_each(|number| delivery.know(number, totals));
         }
     }
 
