@@ -13,7 +13,7 @@ mod forge;
 mod host;
 
 use host::{BOB, CAROL, GROUP, Host, READER, Seen};
-use std::net::SocketAddrV4;
+use std::net::{Ipv4Addr, SocketAddrV4};
 
 use proptest::prelude::*;
 use ros2probe::model::cause::LossCause;
@@ -21,7 +21,7 @@ use ros2probe::model::cause::LossCause;
 use ros2probe::model::observer::Settings;
 use ros2probe::model::snapshot::{Direction, SocketFacts};
 use ros2probe_wire::record::{flag, guid_words, kind};
-use ros2probe_wire::{Guid, Record};
+use ros2probe_wire::{Guid, GuidPrefix, Record};
 
 #[test]
 fn every_cause_is_counted_for_itself_and_all_add_up() {
@@ -795,6 +795,7 @@ fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
     host.observer.socket(SocketFacts {
         cookie: bob.socket,
         process_id: Some(42),
+        own_process_id: Some(42),
         process: Some("planner".to_owned()),
         cgroup: Some("/robot".to_owned()),
         unidentified_drops: 3,
@@ -805,6 +806,41 @@ fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
     let sockets = host.snapshot().sockets;
     assert_eq!(sockets.len(), 1);
     assert_eq!(sockets[0].unidentified_drops, 3);
+}
+
+#[test]
+fn a_container_is_recognised_by_the_number_that_its_process_has_inside() {
+    let mut host = Host::new();
+    let fast_dds = |process: u8| GuidPrefix([1, 0x0f, 1, 2, process, 0, 3, 3, 3, 3, 3, 3]);
+    for (process, port) in [(7, 7411), (9, 7413)] {
+        host.reader(fast_dds(process), port);
+    }
+    let group = SocketAddrV4::new(Ipv4Addr::new(239, 255, 0, 1), 7401);
+    for (process, socket) in [(9_u8, 1001), (7, 1002)] {
+        host.observer.socket(SocketFacts {
+            cookie: socket,
+            process_id: Some(40_000 + u32::from(process)),
+            own_process_id: Some(process.into()),
+            ..SocketFacts::default()
+        });
+        let seen = Seen {
+            socket,
+            address: group,
+            directed: None,
+            flags: flag::HOST,
+        };
+        host.data(seen, 1);
+    }
+    let mut found: Vec<_> = host
+        .deliveries()
+        .iter()
+        .map(|each| (each.participant.unwrap().prefix, each.process_id))
+        .collect();
+    found.sort();
+    assert_eq!(
+        found,
+        [(fast_dds(7), Some(40_007)), (fast_dds(9), Some(40_009))]
+    );
 }
 
 #[test]

@@ -241,8 +241,8 @@ impl Receivers {
     pub fn owner(&self, way: &Way, discovery: &Discovery) -> Option<GuidPrefix> {
         if way.socket != 0 {
             let learned = self.learned.get(&way.socket);
-            let process = self.sockets.get(way.socket);
-            let process = process.and_then(|facts| facts.process_id);
+            let facts = self.sockets.get(way.socket);
+            let process = facts.and_then(|facts| facts.process_id);
             let lists = [
                 learned.map(|learned| &learned.senders),
                 process.and_then(|process| self.processes.get(&process)),
@@ -265,7 +265,8 @@ impl Receivers {
             if !open.is_empty() {
                 return None;
             }
-            if let Some(owner) = process.and_then(|process| announced_in(process, discovery)) {
+            let announced = facts.and_then(|facts| facts.own_process_id);
+            if let Some(owner) = announced.and_then(|process| announced_in(process, discovery)) {
                 return Some(owner);
             }
         }
@@ -304,7 +305,7 @@ pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> 
         })
 }
 
-/// The only participant that announces to live in this process. Fast DDS says no more than the low
+/// The only participant that announces to live in this process, by its own number. Fast DDS says no more than the low
 /// 16 bits.
 fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
     let mut announced = discovery.participants().iter().filter(|(_, participant)| {

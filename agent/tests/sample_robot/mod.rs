@@ -40,6 +40,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         sockets: vec![SocketFacts {
             cookie: 77,
             process_id: Some(42),
+            own_process_id: Some(7),
             process: Some("mapper".to_owned()),
             cgroup: Some("/robot.slice".to_owned()),
             unidentified_drops: 5,

@@ -205,6 +205,9 @@ pub struct SocketFacts {
     pub cookie: u64,
     /// Process that holds it.
     pub process_id: Option<u32>,
+    /// The same process as it knows itself: in a container another number, which is the one that
+    /// participants announce.
+    pub own_process_id: Option<u32>,
     /// Its name.
     pub process: Option<String>,
     /// Control group, as a path below the root.
