@@ -4,8 +4,7 @@
 //! A best-effort stream of each stack and size passes through stretches, in each of which one thing
 //! is wrong: nothing; every n-th datagram dropped on the link, behind the publisher's socket; all IP
 //! fragments but the first of such datagrams; a subscriber that is stopped again and again, so that
-//! its receive buffer overflows. The place of death follows from that. A sample that was sent while
-//! one stretch gave way to the next may have died of either.
+//! its receive buffer overflows. The publisher waits in between, so the place of death follows.
 //!
 //! The log tells what the application was given, which is what its socket was given only where the
 //! middleware itself drops nothing. So readers' histories hold more than can pile up during a stop

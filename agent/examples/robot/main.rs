@@ -67,6 +67,9 @@ struct Options {
     /// Once matched, wait for a line on standard input before sending
     #[arg(long)]
     hold: bool,
+    /// After so many samples, and so many more, wait for a line again; 0 means never
+    #[arg(long, default_value_t = 0)]
+    stretch: u64,
     /// Seconds to stay after the last sample was sent
     #[arg(long, default_value_t = 1.0)]
     linger: f64,
@@ -263,7 +266,8 @@ async fn publish(
     let (count, size) = (options.count, options.size);
     let logging = log.clone();
     let writer = publisher.clone();
-    let sending = periodic(options.rate, stop, move |sequence| {
+    let (rate, stretch) = (options.rate, options.stretch);
+    let send = move |sequence| {
         if count > 0 && sequence >= count {
             return false;
         }
@@ -274,8 +278,24 @@ async fn publish(
         logging
             .write(&json!({"ev": event, "t": began, "done": done, "seq": sequence, "len": size}));
         true
-    });
-    tokio::task::spawn_blocking(move || join([sending])).await??;
+    };
+    match stretch {
+        0 => {
+            let sending = periodic(rate, stop, send);
+            tokio::task::spawn_blocking(move || join([sending])).await??;
+        }
+        _ => {
+            for first in (0..count).step_by(usize::try_from(stretch)?) {
+                if first > 0 {
+                    wait_for_line().await?;
+                }
+                let send = send.clone();
+                let next = move |index| index < stretch && send(first + index);
+                let sending = periodic(rate, stop, next);
+                tokio::task::spawn_blocking(move || join([sending])).await??;
+            }
+        }
+    }
     log.write(&json!({"ev": "stop", "t": unix_ns()}));
     println!("done");
     let leave = Instant::now() + Duration::from_secs_f64(options.linger.max(0.0));
@@ -377,15 +397,19 @@ impl Options {
             tokio::time::sleep(Duration::from_millis(500)).await;
             return Ok(());
         }
-        tokio::task::spawn_blocking(|| {
-            let mut line = String::new();
-            match std::io::stdin().lock().read_line(&mut line) {
-                Ok(read) if read > 0 => Ok(()),
-                _ => Err(anyhow!("standard input ended before the start")),
-            }
-        })
-        .await?
+        wait_for_line().await
     }
+}
+
+async fn wait_for_line() -> Result<()> {
+    tokio::task::spawn_blocking(|| {
+        let mut line = String::new();
+        match std::io::stdin().lock().read_line(&mut line) {
+            Ok(read) if read > 0 => Ok(()),
+            _ => Err(anyhow!("standard input ended before the start")),
+        }
+    })
+    .await?
 }
 
 /// The event log: one JSON object per line, written at once so that a killed process leaves it whole.

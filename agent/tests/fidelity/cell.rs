@@ -17,8 +17,6 @@ pub(crate) struct Cell {
     pub(crate) reported: BTreeMap<u64, LossCause>,
     /// Causes that the trouble can have had.
     pub(crate) possible: BTreeSet<LossCause>,
-    /// Sent while the trouble began or ended: may have died of what was before or after.
-    pub(crate) between: BTreeSet<u64>,
     /// Whether the trouble cannot fail to cost samples.
     pub(crate) must_lose: bool,
 }
@@ -54,11 +52,10 @@ impl Cell {
         );
         fault("not lost", named.difference(&self.lost).copied().collect());
         for cause in LossCause::ALL {
-            let wrong = self.reported.iter().filter(|(number, reported)| {
-                **reported == cause
-                    && !self.possible.contains(&cause)
-                    && !self.between.contains(number)
-            });
+            let wrong = self
+                .reported
+                .iter()
+                .filter(|(_, reported)| **reported == cause && !self.possible.contains(&cause));
             let wrong = wrong.map(|(number, _)| *number).collect();
             fault(&format!("cannot be of {}", cause.label()), wrong);
         }

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe::model::cause::LossCause;
@@ -12,7 +12,6 @@ use ros2probe_wire::{EntityId, Guid};
 
 use crate::cell::Cell;
 use crate::harness::agent::{Agent, Scrape};
-use crate::harness::event_log::EventLog;
 use crate::harness::loss::{Loss, Part};
 use crate::harness::network::Link;
 use crate::harness::peer::{Peer, Role, Stack, Stream};
@@ -24,8 +23,9 @@ use crate::harness::witness::Witness;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Ports of the first participants of domain 0 that carry no samples.
 pub(crate) const DISCOVERY: &str = "7400, 7410, 7412, 7414, 7416";
-/// RustDDS sends somewhat later than it says.
-const MARGIN: u64 = 50_000_000;
+/// RustDDS sends somewhat later than it says, and announcements never cease.
+const QUIET: Duration = Duration::from_millis(150);
+const ANNOUNCEMENTS: u64 = 10;
 /// How long the kernel of the subscribers' host waits for IP fragments, and somewhat more.
 const REASSEMBLY: Duration = Duration::from_millis(1500);
 
@@ -61,8 +61,6 @@ pub(crate) struct Experiment {
 /// What was true while a trouble lasted.
 struct Span {
     trouble: Trouble,
-    began: u64,
-    ended: u64,
     overflown: bool,
 }
 
@@ -99,7 +97,7 @@ impl Size {
         }
     }
 
-    /// Datagrams that make a sample. One in a few more than that misses each sample once at most.
+    /// Datagrams that make a sample.
     const fn datagrams(self, stack: Stack) -> u64 {
         match (self, stack) {
             (Size::B320, _) => 1,
@@ -163,10 +161,9 @@ impl Experiment {
             (known == (1, self.subscribers)).then_some(())
         })?;
 
-        peers.publisher.go()?;
         let mut spans = Vec::new();
         for (trouble, due) in self.troubles.iter().zip(1..) {
-            spans.push(self.span(*trouble, due * self.size.samples(), &link, &peers)?);
+            spans.push(self.span(*trouble, due * self.size.samples(), &link, &mut peers)?);
         }
         peers.publisher.wait_sent(PATIENCE)?;
         std::thread::sleep(REASSEMBLY);
@@ -187,15 +184,15 @@ impl Experiment {
                 agrees.then_some(())
             })?;
         }
+        let seen = witness.latest().context("no snapshot")?;
         let page = agent.as_ref().map(Agent::settled_scrape).transpose()?;
-        let log = peers.publisher.log()?;
         peers.terminate()?;
         let testimony = witness.finish()?;
         testimony.ensure_complete()?;
 
         let mut cells = Vec::new();
         for (subscriber, truth) in received.iter().enumerate() {
-            let losses = reported(&testimony.delivery_losses, &sent.guid, &truth.guid)?;
+            let losses = reported(&testimony.delivery_losses, &seen, &sent.guid, &truth.guid)?;
             if let Some(page) = &page {
                 truth.ensure_on(page, &losses)?;
             }
@@ -219,7 +216,6 @@ impl Experiment {
                         .map(|(at, why)| (*at, *why))
                         .collect(),
                     possible,
-                    between: span.not_inside(&log),
                     must_lose: strikes,
                 });
             }
@@ -265,6 +261,7 @@ impl Experiment {
         enter.extend(["env", unicast].map(str::to_owned));
         let stream = Stream {
             peers: self.subscribers,
+            stretch: self.size.samples(),
             ..stream
         };
         let role = Role::Publisher;
@@ -278,28 +275,23 @@ impl Experiment {
         })
     }
 
-    /// One trouble until so many samples have been sent in all.
-    fn span(&self, trouble: Trouble, due: u64, link: &Link, peers: &Peers) -> Result<Span> {
-        let host = peers
-            .subscribers
-            .first()
-            .context("no subscriber")?
-            .process
-            .pid();
+    /// One trouble while the next stretch is sent, until there are so many samples in all.
+    fn span(&self, trouble: Trouble, due: u64, link: &Link, peers: &mut Peers) -> Result<Span> {
+        let subscriber = peers.subscribers.first().context("no subscriber")?;
+        let host = subscriber.process.pid();
         let overflows = || Snmp::of(host)?.receive_buffer_errors();
         let before = overflows()?;
         let _loss = self.loss(trouble, link, peers)?;
-        let began = unix_nanoseconds();
+        peers.publisher.go()?;
         while (peers.publisher.log()?.sequences("pub").len() as u64) < due {
             match trouble {
                 Trouble::Stops => self.stop(peers)?,
-                _ => std::thread::sleep(Duration::from_millis(5)),
+                _ => std::thread::sleep(QUIET),
             }
         }
+        peers.wait_quiet()?;
         Ok(Span {
             trouble,
-            began,
-            ended: unix_nanoseconds(),
             overflown: overflows()? > before,
         })
     }
@@ -336,7 +328,11 @@ impl Experiment {
             format!("udp dport {{ {} }}", ports.join(", "))
         });
         let datagrams = format!("udp length {length} udp dport != {{ {DISCOVERY} }} {to}");
-        let nth = 100 / per_cent * self.size.datagrams(self.stack) + 1;
+        // Each time another datagram of a sample.
+        let nth = match self.size.datagrams(self.stack) {
+            1 => 100 / per_cent,
+            several => 100 * several / per_cent - 1,
+        };
         Loss::of_datagrams(&link.robot, &datagrams, nth, part).map(Some)
     }
 }
@@ -360,6 +356,20 @@ impl Peers {
             ports.retain(|port| !others.contains(port));
         }
         Ok(ports.iter().map(u16::to_string).collect())
+    }
+
+    /// Waits until all that the publisher has to send is on its way.
+    fn wait_quiet(&self) -> Result<()> {
+        let sent = || Snmp::of(self.publisher.process.pid())?.sent();
+        let mut before = sent()?;
+        loop {
+            std::thread::sleep(QUIET);
+            let now = sent()?;
+            if now < before + ANNOUNCEMENTS {
+                return Ok(());
+            }
+            before = now;
+        }
     }
 
     fn terminate(&mut self) -> Result<()> {
@@ -424,16 +434,6 @@ impl Truth {
     }
 }
 
-impl Span {
-    /// Samples that were not sent for sure while the trouble was there from beginning to end.
-    fn not_inside(&self, log: &EventLog) -> BTreeSet<u64> {
-        let outside = log.0.iter().filter(|event| {
-            event.ev == "pub" && (event.t < self.began || event.t + MARGIN > self.ended)
-        });
-        outside.filter_map(|event| Some(event.seq? + 1)).collect()
-    }
-}
-
 /// Of one reader.
 pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
     let mut sums = Delivered::default();
@@ -446,18 +446,25 @@ pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
     sums
 }
 
-/// Lost numbers of one reader with their cause, each named once.
+/// Lost numbers of one reader with their cause, each named once. A loss that was settled before it
+/// was known whose socket it was is his whose it turned out to be.
 pub(crate) fn reported(
     losses: &[DeliveryLoss],
+    seen: &Snapshot,
     writer: &str,
     reader: &str,
 ) -> Result<BTreeMap<u64, LossCause>> {
+    let deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
+    let of_reader = deliveries.filter(|each| each.readers.iter().any(|guid| is(*guid, reader)));
+    let sockets: BTreeSet<u64> = of_reader.flat_map(|each| each.sockets.clone()).collect();
+    let is_prefix = |prefix| {
+        let participant = Guid::new(prefix, EntityId::PARTICIPANT).to_string();
+        participant.get(..24) == reader.get(..24)
+    };
     let mut reported = BTreeMap::new();
     for loss in losses {
-        let participant = loss.participant.context("a loss of nobody")?;
-        let participant = Guid::new(participant, EntityId::PARTICIPANT).to_string();
-        let of_reader = participant.get(..24) == reader.get(..24);
-        if of_reader && is(loss.writer, writer) {
+        let socket = sockets.contains(&loss.socket);
+        if loss.participant.map_or(socket, is_prefix) && is(loss.writer, writer) {
             for number in loss.first..=loss.last {
                 let before = reported.insert(number, loss.cause);
                 ensure!(before.is_none(), "{number} was lost twice: {loss:?}");
@@ -470,11 +477,4 @@ pub(crate) fn reported(
 /// A log writes GUIDs without the point.
 pub(crate) fn is(guid: Guid, logged: &str) -> bool {
     guid.to_string().replace('.', "") == logged
-}
-
-fn unix_nanoseconds() -> u64 {
-    let now = SystemTime::now()
-        .duration_since(UNIX_EPOCH)
-        .unwrap_or_default();
-    u64::try_from(now.as_nanos()).unwrap_or(u64::MAX)
 }

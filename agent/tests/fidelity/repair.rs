@@ -95,15 +95,20 @@ impl Repair {
             let facts = acknowledgement(seen, &sent.guid, &reader)?;
             (facts.acknowledged + facts.lag_samples == newest && facts.missing > 0).then_some(facts)
         })?;
-        let repaired = witness.latest().context("no snapshot")?;
-        let repaired = sums(&repaired, &sent.guid, &reader);
+        let seen = witness.latest().context("no snapshot")?;
+        let repaired = sums(&seen, &sent.guid, &reader);
         let received = Truth::of(&subscriber, "sub")?;
         publisher.process.signal("KILL")?;
         publisher.process.wait(PATIENCE)?;
         // In its time: while the reader is there, what the writer said it has is awaited.
         let testimony = witness.finish()?;
         testimony.ensure_complete()?;
-        let lost = reported(&testimony.delivery_losses, &sent.guid, &received.guid)?;
+        let lost = reported(
+            &testimony.delivery_losses,
+            &seen,
+            &sent.guid,
+            &received.guid,
+        )?;
         Ok(Repair {
             sent,
             received,

@@ -41,6 +41,8 @@ pub(crate) struct Stream {
     pub(crate) logged: bool,
     /// Seconds for which a publisher stays after its last sample, unless it is terminated.
     pub(crate) linger: f64,
+    /// After so many samples, and so many more, a publisher waits for [`Peer::go`]; 0 = never.
+    pub(crate) stretch: u64,
     /// How many of the other role a peer waits for.
     pub(crate) peers: usize,
     /// Bytes of each of the peers' receive buffers, as far as net.core.rmem_max goes.
@@ -83,6 +85,7 @@ impl Stream {
             domain: 0,
             logged: true,
             linger: 1.0,
+            stretch: 0,
             peers: 1,
             receive_buffer: 4 << 20,
         }
@@ -158,6 +161,7 @@ impl Peer {
         }
         if role == Role::Publisher {
             option("--count", stream.count.to_string());
+            option("--stretch", stream.stretch.to_string());
             option("--linger", stream.linger.to_string());
         }
         for node in nodes {

@@ -22,14 +22,9 @@ impl Snmp {
         self.value("Udp:", "InErrors")
     }
 
-    /// Datagrams that were delivered.
-    pub(crate) fn received(&self) -> Result<u64> {
-        self.value("Udp:", "InDatagrams")
-    }
-
-    /// How often the kernel gave up waiting for IP fragments.
-    pub(crate) fn reassembly_failures(&self) -> Result<u64> {
-        self.value("Ip:", "ReasmFails")
+    /// Datagrams that were sent.
+    pub(crate) fn sent(&self) -> Result<u64> {
+        self.value("Udp:", "OutDatagrams")
     }
 
     fn value(&self, protocol: &str, name: &str) -> Result<u64> {

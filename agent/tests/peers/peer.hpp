@@ -69,13 +69,16 @@ struct Options {
   std::string log;
   int peers = 1;
   bool hold = false;
+  // After so many samples, and so many more, a publisher holds again; 0 means never.
+  uint64_t stretch = 0;
   double linger = 1.0;
   // Of each socket, as far as net.core.rmem_max goes: room for bursts of point cloud fragments.
   uint32_t receive_buffer = 4 << 20;
 
   static Options parse(int argc, char** argv) {
     enum { kRole = 1, kTopic, kSize, kRate, kCount, kReliable, kBestEffort, kTransientLocal, kDepth,
-           kDomain, kGidSize, kNode, kLog, kPeers, kHold, kLinger, kReceiveBuffer, kHelp };
+           kDomain, kGidSize, kNode, kLog, kPeers, kHold, kStretch, kLinger,
+           kReceiveBuffer, kHelp };
     static const option names[] = {
         {"role", 1, nullptr, kRole},           {"topic", 1, nullptr, kTopic},
         {"size", 1, nullptr, kSize},           {"rate", 1, nullptr, kRate},
@@ -87,6 +90,7 @@ struct Options {
         {"log", 1, nullptr, kLog},             {"peers", 1, nullptr, kPeers},
         {"hold", 0, nullptr, kHold},           {"linger", 1, nullptr, kLinger},
         {"receive-buffer", 1, nullptr, kReceiveBuffer},
+        {"stretch", 1, nullptr, kStretch},
         {"help", 0, nullptr, kHelp},           {nullptr, 0, nullptr, 0}};
     Options options;
     bool role_given = false;
@@ -111,6 +115,7 @@ struct Options {
         case kLog: options.log = optarg; break;
         case kPeers: options.peers = atoi(optarg); break;
         case kHold: options.hold = true; break;
+        case kStretch: options.stretch = strtoull(optarg, nullptr, 10); break;
         case kLinger: options.linger = strtod(optarg, nullptr); break;
         case kReceiveBuffer:
           options.receive_buffer = static_cast<uint32_t>(strtoul(optarg, nullptr, 10));
@@ -119,7 +124,7 @@ struct Options {
           fail("usage: --role pub|sub [--topic /t] [--size BYTES] [--rate HZ] [--count N]\n"
                "  [--reliable|--best-effort] [--transient-local] [--depth N] [--domain D]\n"
                "  [--gid-size 24|16] [--node /ns/name]... [--log FILE] [--peers N] [--hold]\n"
-               "  [--linger SECONDS] [--receive-buffer BYTES]");
+               "  [--stretch SAMPLES] [--linger SECONDS] [--receive-buffer BYTES]");
       }
     }
     if (!role_given) fail("--role pub|sub is missing");
@@ -219,14 +224,8 @@ inline void say(const char* line) {
   fflush(stdout);
 }
 
-// Waits until `matched` reports enough peers, then for the start.
-inline void wait_for_start(const Options& options, const std::function<int()>& matched) {
-  while (!stopped && matched() < options.peers) usleep(10000);
-  say("matched");
-  if (!options.hold) {
-    sleep_until_or_stop(unix_ns() + 500000000);
-    return;
-  }
+// Waits for a line on standard input, or for a signal.
+inline void wait_for_line() {
   pollfd input{0, POLLIN, 0};
   while (!stopped && poll(&input, 1, 50) <= 0) {
   }
@@ -237,12 +236,29 @@ inline void wait_for_start(const Options& options, const std::function<int()>& m
   } while (byte != '\n');
 }
 
+// Waits until `matched` reports enough peers, then for the start.
+inline void wait_for_start(const Options& options, const std::function<int()>& matched) {
+  while (!stopped && matched() < options.peers) usleep(10000);
+  say("matched");
+  if (options.hold) {
+    wait_for_line();
+  } else {
+    sleep_until_or_stop(unix_ns() + 500000000);
+  }
+}
+
 // Calls `write(sequence, stamp)` at the rate asked for, against absolute deadlines.
 inline void send_all(const Options& options, Log& log,
                      const std::function<bool(uint64_t, int64_t)>& write) {
   int64_t start = unix_ns();
+  uint64_t first = 0;
   for (uint64_t seq = 0; !stopped && (options.count == 0 || seq < options.count); seq++) {
-    sleep_until_or_stop(start + static_cast<int64_t>(seq * 1e9 / options.rate));
+    if (options.stretch > 0 && seq == first + options.stretch) {
+      wait_for_line();
+      start = unix_ns();
+      first = seq;
+    }
+    sleep_until_or_stop(start + static_cast<int64_t>((seq - first) * 1e9 / options.rate));
     if (stopped) break;
     int64_t began = unix_ns();
     bool accepted = write(seq, began);
