@@ -14,16 +14,15 @@ mod program_run;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
-use std::io::{self, BufRead as _, BufReader};
+use std::io;
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 use std::os::fd::{AsRawFd as _, FromRawFd as _, OwnedFd};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
-use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 use harness::cgroup::Cgroup;
 use harness::network::{Link, Namespace};
 use harness::{PREFIX, run};
@@ -452,61 +451,28 @@ fn other_programs_keep_their_places_and_everything_is_delivered() -> Result<()> 
     assert_eq!(records_of(&mut ours), 2 * sent);
 
     drop(ours);
-    assert_eq!(attached(&path)?, [2, 2]);
+    wait_attached(&path, [2, 2])?;
     assert_eq!(delivered(&sender, &receiver)?, sent);
     assert_eq!(other.records().len(), 2 * sent);
 
     drop(third);
     let Observed { cgroup, filter } = other;
     drop(filter);
-    assert_eq!(attached(cgroup.path())?, [0, 0]);
+    wait_attached(cgroup.path(), [0, 0])?;
     assert_eq!(delivered(&sender, &receiver)?, sent);
     Ok(())
 }
 
-fn records_of(filter: &mut Filter) -> usize {
-    std::iter::from_fn(|| filter.next_record()).count()
-}
-
-#[test]
-fn a_killed_process_leaves_nothing_attached() -> Result<()> {
-    let name = format!("{PREFIX}-{}-killed", std::process::id());
-    let cgroup = Cgroup::create(&name)?;
-    let mut child = Command::new(std::env::current_exe()?)
-        .args(["--exact", "--ignored", "--nocapture", ATTACHES_AND_WAITS])
-        .env("ROS2PROBE_TEST_CGROUP", cgroup.path())
-        .stdout(Stdio::piped())
-        .spawn()?;
-    let output = BufReader::new(child.stdout.take().unwrap());
-    let attached_there = output
-        .lines()
-        .map_while(Result::ok)
-        .any(|line| line.ends_with("attached"));
-    let before = attached(cgroup.path());
-    child.kill()?;
-    child.wait()?;
-    assert!(attached_there, "the child could not attach");
-    assert_eq!(before?, [1, 1]);
-    // Links go with the last descriptor, which the kernel puts away a little later.
+/// Links go with their last descriptor, which the kernel puts away a little later.
+fn wait_attached(cgroup: &Path, programs: [usize; 2]) -> Result<()> {
     let deadline = Instant::now() + Duration::from_secs(5);
-    while attached(cgroup.path())? != [0, 0] {
-        assert!(Instant::now() < deadline, "programs stay behind");
+    while attached(cgroup)? != programs {
+        ensure!(Instant::now() < deadline, "programs stay behind");
         std::thread::sleep(Duration::from_millis(10));
     }
     Ok(())
 }
 
-const ATTACHES_AND_WAITS: &str = "attaches_and_waits_to_be_killed";
-
-/// The other process of `a_killed_process_leaves_nothing_attached`.
-#[test]
-#[ignore = "waits for ever: another test starts it"]
-fn attaches_and_waits_to_be_killed() -> Result<()> {
-    let path = std::env::var_os("ROS2PROBE_TEST_CGROUP").context("no cgroup is given")?;
-    let mut filter = Filter::load_host(&FilterSettings::default())?;
-    filter.attach(&File::open(path)?)?;
-    println!("attached");
-    loop {
-        std::thread::park();
-    }
+fn records_of(filter: &mut Filter) -> usize {
+    std::iter::from_fn(|| filter.next_record()).count()
 }

@@ -81,7 +81,7 @@ pub struct FilterSettings {
 impl Default for FilterSettings {
     fn default() -> Self {
         Self {
-            record_ring_bytes: 512 * 1024,
+            record_ring_bytes: 1024 * 1024,
             piece_ring_bytes: 1024 * 1024,
             accept_new_interfaces: true,
             kernel_types: true,

@@ -267,7 +267,7 @@ mod defaults {
     pub(super) const UNKNOWN_WRITERS: usize = 256;
     pub(super) const REASSEMBLY_BYTES: usize = 4 << 20;
     pub(super) const RING_BYTES: usize = 4 << 20;
-    pub(super) const RECORD_RING_BYTES: usize = 512 << 10;
+    pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
     pub(super) const LISTEN: &str = "127.0.0.1:17400";
 
     pub(super) const fn topic_grace_s() -> u64 {
