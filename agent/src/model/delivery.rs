@@ -113,6 +113,11 @@ impl Delivery {
         }
     }
 
+    /// Samples in fragments that begin before this may lack some that nobody lost.
+    pub const fn doubt(&mut self, until: Timestamp) {
+        self.reception.doubt(until);
+    }
+
     /// Who gets the samples.
     #[must_use]
     pub const fn receiver(&self) -> Receiver {

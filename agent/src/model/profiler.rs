@@ -26,6 +26,9 @@ const FORGET: u64 = 30 * SECOND;
 const DOUBTFUL: u64 = 3 * SECOND;
 /// Messages after which a stranger is somebody.
 const SOMEBODY: u64 = 10;
+/// How long the kernel may take to be told of a writer: a round of the capture thread on a busy
+/// machine. Until then it hands over as much as of a stranger, which a point cloud exceeds.
+const TELLING: u64 = SECOND / 5;
 /// Strangers may use this part of the memory for fragmented samples.
 const STRANGERS_SHARE: usize = 4;
 /// Deliveries that make room for new ones: silent for so long, so many at once.
@@ -50,6 +53,8 @@ pub struct Measured {
     /// A stranger that has been one for long enough.
     pub metered: bool,
     opened: Timestamp,
+    /// From here on the kernel hands over all of its fragments.
+    sure_from: Timestamp,
 }
 
 /// All measured writers.
@@ -180,7 +185,9 @@ impl Profiler {
                 room: &mut self.room,
                 around,
             };
-            let subscribers = measured.subscribers.get_or_insert_default();
+            let subscribers = measured
+                .subscribers
+                .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
             sight = subscribers.record(record, &mut stage);
         }
         if record.flags & UNDELIVERED != 0 || sight == Sight::Covered {
@@ -251,12 +258,14 @@ impl Profiler {
                     .writer
                     .transfer(&mut self.strangers_budget, &mut self.budget);
                 self.strangers -= 1;
+                known.doubt(now);
             }
             known.topic = Some(topic);
             return;
         }
         let mut measured = Measured::new(Writer::new(guid, traits), Some(topic), now);
         measured.opened = opened;
+        measured.doubt(now);
         self.writers.insert(guid, measured);
     }
 
@@ -460,6 +469,13 @@ impl Measured {
             last_seen: now,
             metered: false,
             opened: Timestamp(0),
+            sure_from: Timestamp(0),
         }
+    }
+
+    /// It is metered once the kernel has been told.
+    const fn doubt(&mut self, now: Timestamp) {
+        self.sure_from = Timestamp(now.0.saturating_add(TELLING));
+        self.writer.doubt(self.sure_from);
     }
 }

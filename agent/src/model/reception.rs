@@ -95,6 +95,12 @@ impl Reception {
         self.samples.transfer(from, to);
     }
 
+    /// Samples in fragments that begin before this are no loss when they stay incomplete: the kernel
+    /// did not know the writer yet, and what it hands over of strangers is limited.
+    pub const fn doubt(&mut self, until: Timestamp) {
+        self.samples.doubt(until);
+    }
+
     /// Takes in a DATA or DATA_FRAG of a writer that retransmits, or does not.
     pub fn sample(
         &mut self,
@@ -298,6 +304,10 @@ impl Reception {
 
 fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Decision {
     let (first, last) = match settled {
+        Settled::Lost(number) | Settled::Irrelevant(number) if samples.is_doubtful(number) => {
+            samples.forget(number, budget);
+            return Decision::Irrelevant(number);
+        }
         Settled::Lost(number) => (number, number),
         Settled::LostRun(start, end) => (start, end.saturating_sub(1)),
         // A sample of which fragments came was sent: no excuse holds.

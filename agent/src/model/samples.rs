@@ -45,6 +45,10 @@ impl Budget {
 #[derive(Debug, Default)]
 pub struct Samples {
     partial: Vec<Partial>,
+    /// Of samples that begin earlier, fragments may have been left out.
+    sure_from: Timestamp,
+    /// The last one that did.
+    last_doubtful: u64,
 }
 
 /// One unfinished sample.
@@ -156,6 +160,17 @@ impl Samples {
         self.place(number).is_some()
     }
 
+    /// Of samples that begin before this, the kernel may have left fragments out.
+    pub const fn doubt(&mut self, until: Timestamp) {
+        self.sure_from = until;
+    }
+
+    /// Whether this one is under way and may lack fragments that nobody lost.
+    #[must_use]
+    pub fn is_doubtful(&self, number: u64) -> bool {
+        number <= self.last_doubtful && self.is_partial(number)
+    }
+
     /// The oldest sample that still gets fragments: it and what follows is not decided yet.
     #[must_use]
     pub fn growing(&self, now: Timestamp, window: u64) -> Option<u64> {
@@ -214,6 +229,10 @@ impl Samples {
             self.evict(record.sequence_number, budget);
         }
         budget.samples += 1;
+        let began = Timestamp(now.0.saturating_sub(record.elapsed.into()));
+        if began < self.sure_from {
+            self.last_doubtful = self.last_doubtful.max(record.sequence_number);
+        }
         self.partial.push(Partial {
             number: record.sequence_number,
             size: record.sample_size,
@@ -224,7 +243,7 @@ impl Samples {
             latest: now,
             facts: Facts {
                 size: record.sample_size,
-                began: Timestamp(now.0.saturating_sub(record.elapsed.into())),
+                began,
                 ..Facts::default()
             },
         });

@@ -54,6 +54,8 @@ pub struct Subscribers {
     at_socket: bool,
     /// Of the answers in `ways`.
     generation: u64,
+    /// See [`Delivery::doubt`].
+    sure_from: Timestamp,
 }
 
 /// What a record was to the deliveries.
@@ -103,6 +105,15 @@ pub struct Stage<'a> {
 }
 
 impl Subscribers {
+    /// None yet, of a writer that the kernel meters from `sure_from` on.
+    #[must_use]
+    pub fn new(sure_from: Timestamp) -> Self {
+        Self {
+            sure_from,
+            ..Self::default()
+        }
+    }
+
     /// Every delivery with the ways that lead to it.
     pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&Known>)> {
         self.deliveries.iter().map(|delivery| {
@@ -459,6 +470,7 @@ impl Subscribers {
                 stage.room.used += 1;
                 let mut delivery = Delivery::new(receiver, way, stage.now);
                 delivery.learn(is_best_effort(receiver, stage));
+                delivery.doubt(self.sure_from);
                 self.deliveries.push(delivery);
                 self.count_open();
                 self.deliveries.len() - 1

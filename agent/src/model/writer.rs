@@ -98,6 +98,11 @@ impl Writer {
         self.reception.transfer(from, to);
     }
 
+    /// Samples in fragments that begin before this may lack some that nobody lost.
+    pub const fn doubt(&mut self, until: Timestamp) {
+        self.reception.doubt(until);
+    }
+
     /// What discovery and its HEARTBEATs said.
     #[must_use]
     pub const fn traits(&self) -> Traits {

@@ -143,6 +143,22 @@ fn an_incomplete_sample_is_lost_although_its_number_was_seen() {
 }
 
 #[test]
+fn a_sample_that_began_before_the_kernel_was_told_of_its_writer_is_no_loss_when_fragments_lack() {
+    let mut bench = Bench::new(Traits::default());
+    bench.writer.doubt(Timestamp(bench.now + 200 * MILLISECOND));
+    bench.fragments(1, 1..=4).fragments(1, 8..=10).wait(300);
+    bench.fragments(2, 1..=9).fragments(3, 1..=10).wait(5000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost, facts.incomplete), (1, 1, 1));
+    assert_eq!(facts.irrelevant, 1);
+    assert_eq!(
+        bench.journal.losses().next().map(|loss| loss.first),
+        Some(2)
+    );
+    assert_eq!((bench.budget.bytes, bench.budget.samples), (0, 0));
+}
+
+#[test]
 fn the_last_incomplete_sample_is_lost_too() {
     let mut bench = Bench::new(Traits::default());
     bench.fragments(1, 1..=10).fragments(2, 2..=10).wait(5000);
