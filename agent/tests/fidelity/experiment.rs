@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::time::Duration;
 
-use anyhow::{Context as _, Result, ensure};
+use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe::model::cause::LossCause;
 use ros2probe::model::journal::DeliveryLoss;
 use ros2probe::model::snapshot::{Delivered, Direction, Snapshot};
@@ -23,8 +23,13 @@ use crate::harness::witness::Witness;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Ports of the first participants of domain 0 that carry no samples.
 pub(crate) const DISCOVERY: &str = "7400, 7410, 7412, 7414, 7416";
+/// RustDDS sends 2125 datagrams a sample, to its own socket too: on a busy machine none has room.
+const RECORD_RING: u32 = 16 << 20;
+/// Gaps of best-effort streams are settled sooner.
+const SETTLED: Duration = Duration::from_secs(20);
 /// RustDDS sends somewhat later than it says, and announcements never cease.
-const QUIET: Duration = Duration::from_millis(150);
+const QUIET: Duration = Duration::from_millis(400);
+const PAUSE: Duration = Duration::from_millis(20);
 const ANNOUNCEMENTS: u64 = 10;
 /// How long the kernel of the subscribers' host waits for IP fragments, and somewhat more.
 const REASSEMBLY: Duration = Duration::from_millis(1500);
@@ -148,7 +153,8 @@ impl Experiment {
             link.monitor.name()
         ))?;
         let mut witness = Witness::start(&format!(
-            "watch: [/**]\ncapture: {{source: host, cgroup: {}}}\n",
+            "watch: [/**]\n\
+             capture: {{source: host, record_ring_bytes: {RECORD_RING}, cgroup: {}}}\n",
             link.cgroup().display()
         ))?;
         let directory = tempfile::tempdir()?;
@@ -175,14 +181,23 @@ impl Experiment {
             "not all was sent"
         );
         // The sums first, while the peers are there; the lists settle once they have gone.
+        let mut doubts = Vec::new();
         for truth in &received {
-            witness.wait_for("what the log says", PATIENCE, |seen| {
+            let missing = truth.missing(&sent.numbers).len() as u64;
+            let logged = (truth.numbers.len() as u64, missing);
+            let told = |seen: &Snapshot| {
                 let sums = sums(seen, &sent.guid, &truth.guid);
-                let missing = truth.missing(&sent.numbers).len();
-                let agrees =
-                    (sums.messages, sums.lost()) == (truth.numbers.len() as u64, missing as u64);
-                agrees.then_some(())
-            })?;
+                (sums.messages, sums.lost())
+            };
+            let agrees = |seen: &Snapshot| (told(seen) == logged).then_some(());
+            let agreed = witness.wait_for("what the log says", SETTLED, agrees);
+            let seen = witness.latest().context("no snapshot")?;
+            if agreed.is_err() {
+                doubts.push(format!(
+                    "received and lost {:?}, not {logged:?}",
+                    told(&seen)
+                ));
+            }
         }
         let seen = witness.latest().context("no snapshot")?;
         let page = agent.as_ref().map(Agent::settled_scrape).transpose()?;
@@ -221,6 +236,10 @@ impl Experiment {
             }
             let beyond: Vec<_> = losses.range(self.samples() + 1..).collect();
             ensure!(beyond.is_empty(), "never sent: {beyond:?}");
+        }
+        if !doubts.is_empty() {
+            cells.iter().for_each(|cell| println!("{cell}"));
+            bail!("{}", doubts.join("; "));
         }
         Ok(cells)
     }
@@ -286,7 +305,7 @@ impl Experiment {
         while (peers.publisher.log()?.sequences("pub").len() as u64) < due {
             match trouble {
                 Trouble::Stops => self.stop(peers)?,
-                _ => std::thread::sleep(QUIET),
+                _ => std::thread::sleep(PAUSE),
             }
         }
         peers.wait_quiet()?;
@@ -358,14 +377,19 @@ impl Peers {
         Ok(ports.iter().map(u16::to_string).collect())
     }
 
-    /// Waits until all that the publisher has to send is on its way.
+    /// Waits until all that was sent is on its way, and received what can be.
     fn wait_quiet(&self) -> Result<()> {
-        let sent = || Snmp::of(self.publisher.process.pid())?.sent();
-        let mut before = sent()?;
+        let state = || {
+            let logs = self.subscribers.iter().map(|peer| Ok(peer.log()?.0.len()));
+            let received: Vec<usize> = logs.collect::<Result<_>>()?;
+            let sent = Snmp::of(self.publisher.process.pid())?.sent()?;
+            anyhow::Ok((sent, received))
+        };
+        let mut before = state()?;
         loop {
             std::thread::sleep(QUIET);
-            let now = sent()?;
-            if now < before + ANNOUNCEMENTS {
+            let now = state()?;
+            if now.1 == before.1 && now.0 < before.0 + ANNOUNCEMENTS {
                 return Ok(());
             }
             before = now;
