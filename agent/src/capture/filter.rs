@@ -43,7 +43,10 @@ pub enum FilterError {
     #[error("the kernel refuses the filter program")]
     Program(#[source] ProgramError),
     /// The kernel refuses to attach a program to the cgroup.
-    #[error("attaching the host hook to the cgroup needs CAP_NET_ADMIN")]
+    #[error(
+        "attaching the host hook to the cgroup needs CAP_NET_ADMIN, and no program there that \
+         tolerates no other"
+    )]
     AttachNotPermitted(#[source] io::Error),
     /// The cgroup takes no program.
     #[error("the host hook does not attach to the cgroup")]

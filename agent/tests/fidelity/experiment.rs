@@ -204,6 +204,9 @@ impl Experiment {
         peers.terminate()?;
         let testimony = witness.finish()?;
         testimony.ensure_complete()?;
+        if testimony.skipped_runs > 0 {
+            println!("the kernel left out {} runs", testimony.skipped_runs);
+        }
 
         let mut cells = Vec::new();
         for (subscriber, truth) in received.iter().enumerate() {
