@@ -64,16 +64,15 @@ impl Observer {
         Observer::Subscriber,
     ];
 
-    /// The agent's configuration, if it is the agent.
-    fn configuration(self) -> Option<String> {
-        let source = match self {
-            Observer::Host => "host",
-            Observer::Wire => "wire",
+    /// The agent's configuration, if it is the agent. With the host hook it sees both hosts, as it
+    /// does where all nodes live on one, and what else runs on the machine it does not see.
+    fn configuration(self, link: &Link) -> Option<String> {
+        let capture = match self {
+            Observer::Host => format!("source: host, cgroup: {}", link.cgroup().display()),
+            Observer::Wire => "source: wire".to_owned(),
             Observer::Nobody | Observer::Subscriber => return None,
         };
-        Some(format!(
-            "watch:\n  - /**\ncapture:\n  source: {source}\nlog: warn\n"
-        ))
+        Some(format!("watch: [/**]\ncapture: {{{capture}}}\nlog: warn\n"))
     }
 }
 
@@ -88,7 +87,7 @@ impl Window {
         let link = Link::new()?;
         let directory = tempfile::tempdir().context("cannot create a directory")?;
         let configuration = directory.path().join("ros2probe.yaml");
-        let agent = match observer.configuration() {
+        let agent = match observer.configuration(&link) {
             Some(text) => {
                 std::fs::write(&configuration, text).context("cannot write a configuration")?;
                 Some(Agent::start(&link.robot, program, &configuration)?)

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::error::Error;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::record::Verdict;
@@ -161,9 +161,11 @@ impl LiveSource {
         let rings = bell.is_some().into();
         let bell = bell.into_iter();
         let descriptors: Vec<_> = bell.chain(sockets).chain(interfaces).collect();
+        let began = Instant::now();
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
-        if self.host.is_some() && ready.is_some_and(|first| first >= rings) {
-            // News seldom comes alone.
+        let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
+        if self.host.is_some() && woken {
+            // News seldom comes alone. What nobody was woken for has had its time.
             std::thread::sleep(GATHER);
         }
         let clocks = Clocks::read();

@@ -40,6 +40,8 @@ struct Known {
     /// What it had dropped before it was known, named or not.
     dropped_before: Option<u64>,
     questions: u8,
+    /// As it was when it was told.
+    no_room: u64,
     told: Option<SocketFacts>,
 }
 
@@ -64,13 +66,19 @@ impl Sockets {
         self.looked = now;
         let met: BTreeMap<u64, Socket> = filter.sockets().collect();
         self.forget(&met, observer);
-        if let Some(owners) = self.owners(filter.inside(), &met, now) {
+        let owners = self.owners(filter.inside(), &met, now);
+        let asked = owners.is_some();
+        if let Some(owners) = owners {
             self.take_in(owners, &met, observer);
         }
         let groups: BTreeSet<u64> = met.values().map(|socket| socket.cgroup).collect();
         self.groups.refresh(&groups);
         for (cookie, socket) in &met {
             let known = self.known.entry(*cookie).or_default();
+            if !asked && known.told.is_some() && known.no_room == socket.no_room {
+                continue;
+            }
+            known.no_room = socket.no_room;
             let facts = known.facts(*cookie, socket, &self.groups);
             if known.told.as_ref() != Some(&facts) {
                 known.told = Some(facts.clone());

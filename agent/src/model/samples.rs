@@ -275,12 +275,16 @@ impl Partial {
             self.bitmap.resize(words, 0);
         }
         let mut new = 0;
-        for bit in start..end {
+        let mut bit = start;
+        while bit < end {
+            let next = (bit / 64 + 1) * 64;
+            let upper = if next > end { next - end } else { 0 };
+            let mask = (u64::MAX << (bit % 64)) & (u64::MAX >> upper);
             if let Some(word) = self.bitmap.get_mut(bit as usize / 64) {
-                let mask = 1 << (bit % 64);
-                new += u32::from(*word & mask == 0);
+                new += (mask & !*word).count_ones();
                 *word |= mask;
             }
+            bit = next;
         }
         new
     }
@@ -289,6 +293,42 @@ impl Partial {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn ranges_are_marked_as_their_numbers_one_by_one_are() {
+        for (start, end) in [
+            (0, 1),
+            (0, 64),
+            (63, 65),
+            (5, 5),
+            (70, 200),
+            (127, 128),
+            (0, 300),
+        ] {
+            let partial = || Partial {
+                number: 1,
+                size: 0,
+                fragment_size: 0,
+                seen: 0,
+                bitmap: Vec::new(),
+                tail: None,
+                latest: Timestamp(0),
+                facts: Facts::default(),
+            };
+            let (mut range, mut single) = (partial(), partial());
+            for seen in [3, 64, 130] {
+                range.mark(seen, seen + 1);
+                single.mark(seen, seen + 1);
+            }
+            let new: u32 = (start..end).map(|bit| single.mark(bit, bit + 1)).sum();
+            assert_eq!(range.mark(start, end), new, "{start}..{end}");
+            range.bitmap.resize(8, 0);
+            single.bitmap.resize(8, 0);
+            assert_eq!(range.bitmap, single.bitmap, "{start}..{end}");
+            let marked: u32 = range.bitmap.iter().map(|word| word.count_ones()).sum();
+            assert_eq!(marked, new + 3, "{start}..{end}");
+        }
+    }
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
         Record {
