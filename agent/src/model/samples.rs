@@ -278,7 +278,7 @@ impl Partial {
         let mut bit = start;
         while bit < end {
             let next = (bit / 64 + 1) * 64;
-            let upper = if next > end { next - end } else { 0 };
+            let upper = next.saturating_sub(end);
             let mask = (u64::MAX << (bit % 64)) & (u64::MAX >> upper);
             if let Some(word) = self.bitmap.get_mut(bit as usize / 64) {
                 new += (mask & !*word).count_ones();
