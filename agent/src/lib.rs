@@ -8,4 +8,5 @@ pub mod config;
 pub mod model;
 pub mod privilege;
 pub mod run;
+pub mod state;
 pub mod surface;

@@ -2,6 +2,7 @@
 
 mod cli;
 mod logging;
+mod memory;
 mod supervise;
 
 use std::path::{Path, PathBuf};
@@ -19,6 +20,7 @@ use ros2probe::model::reassembly::Limits;
 use ros2probe::privilege::{self, Missing};
 use ros2probe::run::replay::Replay;
 use ros2probe::run::{Run, Source};
+use ros2probe::state::Keeper;
 use ros2probe::surface::http::Server;
 use ros2probe::surface::{Board, Exposition, Format, Settings};
 use tokio_util::sync::CancellationToken;
@@ -64,6 +66,11 @@ fn run(options: cli::Run) -> Result<()> {
         .listen
         .map(|address| Server::bind(address, Arc::clone(&board)));
     let server = server.transpose()?;
+    let state = match &source {
+        Source::Live(_) => memory::open(&config.state_directory),
+        Source::Replay(_) => None,
+    };
+    let known = state.as_ref().and_then(memory::load);
     privilege::give_up()?;
     if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {
         tracing::info!(%address, watches = config.watches.len(), "serving metrics");
@@ -78,7 +85,12 @@ fn run(options: cli::Run) -> Result<()> {
     };
     let mut observer = Observer::new(settings);
     observer.set_watchlist(watchlist);
-    let run = Run::new(source, observer, Arc::clone(&board), inbox, stop.clone());
+    if let (Some(known), Source::Live(live)) = (known, &source) {
+        observer.restore(&known, live.clock());
+    }
+    let keeper = state.map(Keeper::start).transpose();
+    let keeper = keeper.context("cannot start the thread that keeps state")?;
+    let run = Run::new(source, observer, Arc::clone(&board), inbox, stop.clone()).keeping(keeper);
     if options.report && server.is_none() {
         let ended = run.run();
         print!("{}", Exposition::new(board).render(Format::Classic)?);

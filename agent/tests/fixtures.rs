@@ -109,11 +109,11 @@ fn participants(name: &str, facts: &Facts, replayed: &Replayed) {
         let property = |key| theirs.property_list.get(key).map(String::as_str);
         if let Some(process) = property("__Pid") {
             assert_eq!(
-                ours.process_id.map(|id| id.to_string()).as_deref(),
+                ours.process.id.map(|id| id.to_string()).as_deref(),
                 Some(process)
             );
-            assert_eq!(ours.host.as_deref(), property("__Hostname"));
-            assert_eq!(ours.process_name.as_deref(), property("__ProcessName"));
+            assert_eq!(ours.process.host.as_deref(), property("__Hostname"));
+            assert_eq!(ours.process.name.as_deref(), property("__ProcessName"));
         }
         assert!((ours.first_seen.seconds() - theirs.first_seen).abs() < ROUNDING);
     }

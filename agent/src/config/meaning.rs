@@ -12,7 +12,7 @@ use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{CaptureShape, ConfigShape, MetricsShape, WatchEntryShape, WatchShape};
 use super::watch::{Expectations, Watch, check_pattern};
-use super::{CaptureSettings, Config, Limits, MetricsSettings, SourceChoice};
+use super::{CaptureSettings, Config, Limits, MetricsSettings, SourceChoice, StateChoice};
 
 /// A watchlist that long should be globs.
 const MAX_WATCHES: usize = 1_000;
@@ -91,6 +91,7 @@ impl Reader {
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(&shape.metrics.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
+            state_directory: state(&shape.state_directory),
             log: shape.log,
         }
     }
@@ -230,6 +231,9 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         "capture.network_namespaces[]" if !text.starts_with('/') => {
             Err("must be an absolute path, as in `/run/netns/robot`".to_owned())
         }
+        "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/var/lib/ros2probe`, `auto` or `off`".to_owned())
+        }
         "metrics.listen" if text != "off" && text.parse::<SocketAddr>().is_err() => Err(format!(
             "is `{text}`, must be an IP address and port, as in `127.0.0.1:17400` or \
              `[::1]:17400`, or `off`"
@@ -247,6 +251,14 @@ fn without_indices(key: &str) -> String {
         shown
     };
     key.chars().filter(|c| shown(*c)).collect()
+}
+
+fn state(text: &str) -> StateChoice {
+    match text {
+        "auto" => StateChoice::Auto,
+        "off" => StateChoice::Off,
+        path => StateChoice::At(PathBuf::from(path)),
+    }
 }
 
 fn metrics(shape: &MetricsShape) -> MetricsSettings {

@@ -37,6 +37,8 @@ pub struct Config {
     pub metrics: MetricsSettings,
     /// How long a topic without endpoints is still reported.
     pub topic_grace: Duration,
+    /// Where what discovery knows is kept for the next start.
+    pub state_directory: StateChoice,
     /// Least severe level that is logged.
     pub log: Level,
 }
@@ -88,6 +90,19 @@ pub enum SourceChoice {
     Host,
     /// Frames on the interfaces.
     Wire,
+}
+
+/// Where state is kept.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum StateChoice {
+    /// Where the service manager says (`$STATE_DIRECTORY`), else the default place if it can be
+    /// used.
+    #[default]
+    Auto,
+    /// Nowhere.
+    Off,
+    /// Here.
+    At(PathBuf),
 }
 
 /// The metrics surface.
@@ -187,6 +202,10 @@ impl Config {
             ("capture", self.capture != new.capture),
             ("metrics.listen", self.metrics.listen != new.metrics.listen),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
+            (
+                "state_directory",
+                self.state_directory != new.state_directory,
+            ),
         ]
         .into_iter()
         .filter_map(|(key, changed)| changed.then_some(key))
@@ -228,6 +247,7 @@ impl Default for Config {
                 per_writer: false,
             },
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
+            state_directory: StateChoice::default(),
             log: Level::default(),
         }
     }
@@ -272,5 +292,9 @@ mod defaults {
 
     pub(super) const fn topic_grace_s() -> u64 {
         600
+    }
+
+    pub(super) fn state_directory() -> String {
+        "auto".to_owned()
     }
 }

@@ -26,6 +26,11 @@ pub(super) struct ConfigShape {
     #[schemars(range(min = 0, max = 604_800))]
     #[serde(default = "defaults::topic_grace_s")]
     pub(super) topic_grace_s: u64,
+    /// Where the agent keeps what discovery knows, so that a restart on a running robot loses no
+    /// name: an absolute path to a directory, `off`, or `auto`: `$STATE_DIRECTORY` as the service
+    /// manager sets it, else /var/lib/ros2probe if it is there and can be written.
+    #[serde(default = "defaults::state_directory")]
+    pub(super) state_directory: String,
     /// Least severe log level that is written to standard error. Applied on reload.
     #[serde(default)]
     pub(super) log: Level,

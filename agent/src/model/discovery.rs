@@ -7,6 +7,7 @@
 
 mod facts;
 mod graveyard;
+mod memory;
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
@@ -16,8 +17,9 @@ use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
 use facts::domain;
-pub use facts::{DomainSource, Endpoint, Node, Origin, Participant, Portrait};
+pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, Portrait};
 use graveyard::Graveyard;
+pub use memory::{Memory, hexadecimal};
 
 use super::churn::{Churn, Entity, Event};
 use super::journal::{DiscoveryEvent, Journal};
@@ -95,6 +97,7 @@ pub struct Discovery {
     pub churn: Churn,
     evictions: Evictions,
     search_after: Timestamp,
+    revision: u64,
 }
 
 /// Entries refused or given up because of a cap.
@@ -124,7 +127,14 @@ impl Discovery {
             churn: Churn::default(),
             evictions: Evictions::default(),
             search_after: Timestamp(0),
+            revision: 0,
         }
+    }
+
+    /// Rises with every change of what [`Self::memory`] says.
+    #[must_use]
+    pub const fn revision(&self) -> u64 {
+        self.revision
     }
 
     /// Everybody.
@@ -165,7 +175,7 @@ impl Discovery {
     /// Something of this participant was seen: its lease begins anew.
     pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp) {
         if let Some(participant) = self.participants.get_mut(&prefix) {
-            participant.last_seen = participant.last_seen.max(at);
+            participant.seen(at);
         }
     }
 
@@ -183,7 +193,12 @@ impl Discovery {
         let (domain_id, source) = domain(announcement.domain_id, origin);
         let portrait = Portrait::of(announcement);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
-            participant.last_seen = participant.last_seen.max(origin.at);
+            participant.seen(origin.at);
+            let addresses = Addresses::of(announcement);
+            if participant.addresses != addresses {
+                participant.addresses = addresses;
+                self.revision += 1;
+            }
             if participant.portrait != portrait {
                 participant.portrait = portrait;
                 let domain_id = participant.domain_id;
@@ -208,6 +223,8 @@ impl Discovery {
             guid.prefix,
             Participant {
                 portrait,
+                addresses: Addresses::of(announcement),
+                restored: None,
                 domain_id,
                 first_seen: origin.at,
                 last_seen: origin.at,
@@ -353,8 +370,11 @@ impl Discovery {
             .participants
             .iter()
             .filter_map(|(prefix, participant)| {
-                let Duration::Finite(lease) = participant.portrait.lease else {
-                    return None;
+                let lease = match participant.portrait.lease {
+                    Duration::Finite(lease) => lease,
+                    // Who went while nobody looked is not believed in for ever.
+                    Duration::Infinite if participant.restored.is_some() => FORSAKEN,
+                    Duration::Infinite => return None,
                 };
                 let end = participant.last_seen.0.saturating_add(lease);
                 (end <= now.0).then_some((end, *prefix))
@@ -597,6 +617,7 @@ impl Discovery {
             return;
         }
         participant.domain_source = source;
+        self.revision += 1;
         if participant.domain_id == domain_id {
             return;
         }
@@ -634,6 +655,7 @@ impl Discovery {
             return false;
         };
         self.evictions.participants += 1;
+        self.revision += 1;
         self.remove(prefix, now, None, &mut Journal::default());
         self.participants.len() < self.caps.participants
             && self.endpoints.len() < self.caps.endpoints
@@ -650,6 +672,7 @@ impl Discovery {
         at: Timestamp,
         journal: &mut Journal,
     ) {
+        self.revision += 1;
         self.churn.count(domain_id, entity, event);
         journal.note(DiscoveryEvent {
             at,

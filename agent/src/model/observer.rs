@@ -18,7 +18,7 @@ use ros2probe_wire::{
     Cursor, Endianness, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError,
 };
 
-use super::discovery::{Caps, Change, Discovery, Endpoint, Origin};
+use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin};
 use super::expectation::Evidence;
 use super::header::begins_with_header;
 use super::interest::Interest;
@@ -238,6 +238,30 @@ impl Observer {
     /// This socket was closed.
     pub fn socket_closed(&mut self, cookie: u64) {
         self.receivers.socket_closed(cookie);
+    }
+
+    /// Takes over what was known before the start, until one lease from `now` on at most.
+    pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
+        self.discovery.restore(memory, now);
+        for (prefix, participant) in self.discovery.participants() {
+            let addresses = &participant.addresses;
+            let places = addresses.default.iter().chain(&addresses.metatraffic);
+            self.receivers
+                .announce(*prefix, places.copied().map(Place::from));
+        }
+        self.follow_up(now);
+    }
+
+    /// What is known of who is there, to be kept for the next start.
+    #[must_use]
+    pub fn memory(&self) -> Memory {
+        self.discovery.memory()
+    }
+
+    /// Rises with every change of what [`Self::memory`] says.
+    #[must_use]
+    pub const fn memory_revision(&self) -> u64 {
+        self.discovery.revision()
     }
 
     /// What the kernel filter has to be told since the last call; `None` = remove the entry.
@@ -681,7 +705,8 @@ const INLINE_QOS_FLAG: u8 = 0x02;
 const DATA_FLAG: u8 = 0x04;
 const KEY_FLAG: u8 = 0x08;
 
-fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
+/// What a DATA submessage carries.
+pub(crate) fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
     match found.record.submessage_flags & (DATA_FLAG | KEY_FLAG) {
         0 => Payload::None,
         KEY_FLAG => Payload::Key(found.payload),
@@ -690,7 +715,7 @@ fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
 }
 
 /// Inline QoS of a DATA submessage: behind `octetsToInlineQos`, which counts from its own end.
-fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireError> {
+pub(crate) fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireError> {
     let flags = found.record.submessage_flags;
     if flags & INLINE_QOS_FLAG == 0 {
         return Ok(InlineQos::default());

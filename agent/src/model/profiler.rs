@@ -52,6 +52,8 @@ pub struct Measured {
     pub last_seen: Timestamp,
     /// A stranger that has been one for long enough.
     pub metered: bool,
+    /// Of a stranger, the cookie of the socket it sends by; 0 = unknown.
+    pub sent_from: u64,
     opened: Timestamp,
     /// From here on the kernel hands over all of its fragments.
     sure_from: Timestamp,
@@ -168,6 +170,10 @@ impl Profiler {
         if measured.topic.is_none() && !measured.metered {
             // The kernel filter's budget for strangers may leave samples out: no gap is a loss.
             measured.opened = now;
+        }
+        const LEFT: u16 = flag::HOST | flag::OUTGOING;
+        if measured.topic.is_none() && record.flags & LEFT == LEFT {
+            measured.sent_from = record.socket;
         }
         let budget = match measured.topic {
             Some(_) => &mut self.budget,
@@ -468,6 +474,7 @@ impl Measured {
             first_seen: now,
             last_seen: now,
             metered: false,
+            sent_from: 0,
             opened: Timestamp(0),
             sure_from: Timestamp(0),
         }

@@ -115,6 +115,26 @@ impl Receivers {
         &self.sockets
     }
 
+    /// Who holds the socket by which each participant sends, as far as that is known.
+    #[must_use]
+    pub fn holders(&self) -> HashMap<GuidPrefix, &SocketFacts> {
+        let mut holders: HashMap<GuidPrefix, &SocketFacts> = HashMap::new();
+        for (cookie, learned) in &self.learned {
+            let Some(facts) = self.sockets.get(*cookie) else {
+                continue;
+            };
+            for sender in &learned.senders.0 {
+                // Of several sockets always the same one.
+                let holder = holders.entry(*sender).or_insert(facts);
+                let better = |facts: &SocketFacts| (facts.process_id.is_none(), facts.cookie);
+                if better(facts) < better(holder) {
+                    *holder = facts;
+                }
+            }
+        }
+        holders
+    }
+
     /// Whether this socket was closed a while ago.
     #[must_use]
     pub fn is_closed(&self, socket: u64) -> bool {

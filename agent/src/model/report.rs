@@ -7,13 +7,15 @@ use std::collections::{BTreeSet, HashMap};
 
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::HistoryKind;
+use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{Duration, EntityId, Guid, Timestamp};
 
-use super::discovery::{Discovery, Endpoint};
+use super::discovery::{Discovery, Endpoint, Portrait};
 use super::observer::Observer;
 use super::snapshot::{
-    DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Snapshot,
-    TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+    DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts,
+    Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
+    WatchedTopicFacts,
 };
 use super::topic::{Topic, Watched};
 
@@ -21,7 +23,7 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
     let nodes = nodes_of_endpoints(&observer.discovery);
     Snapshot {
         at: now,
-        participants: participants(&observer.discovery),
+        participants: participants(observer),
         nodes: node_facts(&observer.discovery),
         topics: observer
             .topics
@@ -40,8 +42,10 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
     }
 }
 
-fn participants(discovery: &Discovery) -> Vec<ParticipantFacts> {
-    let mut facts: Vec<_> = discovery
+fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
+    let holders = observer.receivers.holders();
+    let mut facts: Vec<_> = observer
+        .discovery
         .participants()
         .iter()
         .map(|(prefix, participant)| {
@@ -51,13 +55,13 @@ fn participants(discovery: &Discovery) -> Vec<ParticipantFacts> {
                 domain_id: participant.domain_id,
                 vendor: portrait.vendor.to_string(),
                 enclave: portrait.enclave.as_deref().map(Into::into),
-                host: portrait.host.as_deref().map(Into::into),
-                process_id: portrait.process_id,
-                process_name: portrait.process_name.as_deref().map(Into::into),
+                process: process(Some(portrait), holders.get(prefix).copied()),
                 first_seen: participant.first_seen,
                 last_seen: participant.last_seen,
                 lease_nanoseconds: nanoseconds(portrait.lease),
                 secured: portrait.secured,
+                restored: participant.restored.is_some(),
+                addresses: participant.addresses.clone(),
             }
         })
         .collect();
@@ -214,9 +218,12 @@ fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFact
     let mut facts: Vec<_> = strangers
         .map(|(guid, measured)| {
             let participant = observer.discovery.participants().get(&guid.prefix);
+            let portrait = participant.map(|participant| &participant.portrait);
+            let holder = observer.receivers.sockets().get(measured.sent_from);
             UnknownWriterFacts {
                 guid: *guid,
-                vendor: participant.map(|known| known.portrait.vendor.to_string()),
+                vendor: vendor(*guid, portrait),
+                process: process(portrait, holder),
                 first_seen: measured.first_seen,
                 measurement: measured.writer.measurement(now),
             }
@@ -224,6 +231,34 @@ fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFact
         .collect();
     facts.sort_unstable_by_key(|fact| fact.guid);
     facts
+}
+
+/// What a participant says of where it lives, and who holds the socket it sends by.
+fn process(portrait: Option<&Portrait>, holder: Option<&SocketFacts>) -> ProcessFacts {
+    let said = |text: fn(&Portrait) -> &Option<Box<str>>| {
+        portrait
+            .and_then(|portrait| text(portrait).as_deref())
+            .map(str::to_owned)
+    };
+    let held = |text: fn(&SocketFacts) -> &Option<String>| holder.and_then(|it| text(it).clone());
+    let id = holder.and_then(|holder| holder.process_id);
+    ProcessFacts {
+        host: said(|portrait| &portrait.host),
+        id: id.or_else(|| portrait.and_then(|portrait| portrait.process_id)),
+        name: said(|portrait| &portrait.process_name).or_else(|| held(|holder| &holder.process)),
+        cgroup: held(|holder| &holder.cgroup),
+    }
+}
+
+/// The vendor in words; without an announcement the GUID tells where it begins with a known one's
+/// mark (RTPS 2.5, 9.3.1.5). Cyclone DDS's begin with anything.
+fn vendor(guid: Guid, portrait: Option<&Portrait>) -> String {
+    let [first, second, ..] = guid.prefix.0;
+    let marked = VendorId([first, second]);
+    match portrait {
+        Some(portrait) => portrait.vendor.to_string(),
+        None => marked.name().unwrap_or_default().to_owned(),
+    }
 }
 
 fn watches(observer: &Observer) -> Vec<WatchFacts> {

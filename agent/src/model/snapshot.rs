@@ -11,6 +11,7 @@ pub use delivery::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts,
 };
 
+use super::discovery::Addresses;
 use super::histogram::Histogram;
 
 /// All facts at `at`. Lists are sorted by their identity.
@@ -55,12 +56,8 @@ pub struct ParticipantFacts {
     pub vendor: String,
     /// ROS enclave; `None` means it is no ROS participant.
     pub enclave: Option<String>,
-    /// Host name when announced.
-    pub host: Option<String>,
-    /// Process id when announced or encoded in the GUID.
-    pub process_id: Option<u32>,
-    /// Process name when announced.
-    pub process_name: Option<String>,
+    /// Where it lives.
+    pub process: ProcessFacts,
     /// When its first announcement was seen.
     pub first_seen: Timestamp,
     /// When anything of it was last seen.
@@ -69,6 +66,24 @@ pub struct ParticipantFacts {
     pub lease_nanoseconds: Option<u64>,
     /// Announces security: its user data may be encrypted.
     pub secured: bool,
+    /// Known from before the agent's start and not heard since.
+    pub restored: bool,
+    /// Where its discovery endpoints and its other ones are reached over UDP.
+    pub addresses: Addresses,
+}
+
+/// Where something lives, as far as it is announced or its socket's holder is known.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ProcessFacts {
+    /// Host name when announced.
+    pub host: Option<String>,
+    /// Process id: of the socket's holder, else as announced, perhaps in a container's count, or its
+    /// low 16 bits where the GUID holds those.
+    pub id: Option<u32>,
+    /// Process name: as announced, else that of the socket's holder.
+    pub name: Option<String>,
+    /// Control group of the socket, as a path below the root: which container.
+    pub cgroup: Option<String>,
 }
 
 /// One ROS node.
@@ -216,8 +231,10 @@ impl Measurement {
 pub struct UnknownWriterFacts {
     /// GUID.
     pub guid: Guid,
-    /// Vendor of the participant, if its SPDP was seen.
-    pub vendor: Option<String>,
+    /// Vendor: its participant's, else the one whose mark its GUID bears, else empty.
+    pub vendor: String,
+    /// Where it lives.
+    pub process: ProcessFacts,
     /// First record.
     pub first_seen: Timestamp,
     /// Measured like any writer.

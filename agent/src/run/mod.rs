@@ -17,6 +17,7 @@ use crate::capture::pcap::PcapError;
 use crate::config::Watchlist;
 use crate::model::observer::Observer;
 use crate::model::snapshot::Snapshot;
+use crate::state::Keeper;
 use crate::surface::Board;
 pub use source::Source;
 
@@ -54,6 +55,7 @@ pub struct Run {
     board: Arc<Board>,
     orders: Receiver<Order>,
     stop: CancellationToken,
+    keeper: Option<Keeper>,
 }
 
 impl Run {
@@ -73,7 +75,14 @@ impl Run {
             board,
             orders,
             stop,
+            keeper: None,
         }
+    }
+
+    /// Keeps what discovery knows for the next start.
+    #[must_use]
+    pub fn keeping(self, keeper: Option<Keeper>) -> Self {
+        Self { keeper, ..self }
     }
 
     /// Works until told to stop or until the capture ends; the last state stays on the board.
@@ -81,6 +90,14 @@ impl Run {
     /// # Errors
     /// When the source fails for good.
     pub fn run(mut self) -> Result<(), RunError> {
+        let ended = self.work();
+        if let Some(keeper) = self.keeper.take() {
+            keeper.finish(self.observer.memory());
+        }
+        ended
+    }
+
+    fn work(&mut self) -> Result<(), RunError> {
         self.publish();
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
@@ -138,7 +155,14 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             follow(live, &mut self.followed, &snapshot);
         }
-        let facts = self.source.facts();
+        let mut facts = self.source.facts();
+        if let Some(keeper) = &mut self.keeper {
+            let (revision, now) = (self.observer.memory_revision(), Instant::now());
+            if keeper.wants(revision, now) {
+                keeper.keep(self.observer.memory(), revision, now);
+            }
+            facts.state = Some(keeper.facts());
+        }
         self.board.publish(snapshot, facts);
     }
 }

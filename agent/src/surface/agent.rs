@@ -115,6 +115,25 @@ pub(super) fn model(
     page.single(&metric::DELIVERIES_HIDDEN, hidden_deliveries)
 }
 
+/// What is kept for the next start, and what came from the last one.
+pub(super) fn kept(page: &mut Page<'_>, state: &State) -> fmt::Result {
+    let kept = state.agent.state;
+    page.family(&metric::STATE_WRITES, |family| {
+        let counts = kept.map_or([None, None], |kept| {
+            [
+                Some(("written", kept.writes)),
+                Some(("failed", kept.failures)),
+            ]
+        });
+        let mut counts = counts.into_iter().flatten();
+        counts.try_for_each(|(outcome, count)| family.sample(&[Label::Text(outcome)], count))
+    })?;
+    let snapshot = state.snapshot.iter();
+    let participants = snapshot.flat_map(|snapshot| &snapshot.participants);
+    let restored = participants.filter(|participant| participant.restored);
+    page.single(&metric::RESTORED, restored.count())
+}
+
 /// The surface itself.
 pub(super) fn surface(
     page: &mut Page<'_>,

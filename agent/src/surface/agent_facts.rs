@@ -3,6 +3,8 @@
 
 use std::time::Instant;
 
+use crate::state::StateFacts;
+
 /// One moment of the agent.
 #[derive(Clone, Debug)]
 pub struct AgentFacts {
@@ -37,6 +39,8 @@ pub struct AgentFacts {
     pub reassembly_bytes: u64,
     /// Changes of interest for which the kernel filter had no room.
     pub refused_updates: u64,
+    /// What became of the state for the next start; `None` = none is kept.
+    pub state: Option<StateFacts>,
 }
 
 /// Where packets come from.
@@ -100,6 +104,7 @@ impl AgentFacts {
             incomplete_datagrams: 0,
             reassembly_bytes: 0,
             refused_updates: 0,
+            state: None,
         }
     }
 }

@@ -158,6 +158,19 @@ pub(super) const NODE_INFO: Metric = Metric::info(
     &["domain_id", "ros_node", "participant", "vendor", "host"],
     "ROS nodes and where they run.",
 );
+pub(super) const PARTICIPANT_INFO: Metric = Metric::info(
+    "ros2_participant_info",
+    &[
+        "domain_id",
+        "participant",
+        "vendor",
+        "host",
+        "process",
+        "pid",
+        "cgroup",
+    ],
+    "Participants and the process each lives in: as it says, or who holds the socket it sends by.",
+);
 pub(super) const TOPICS: Metric = Metric::gauge(
     "ros2_topics",
     &["domain_id", "kind"],
@@ -177,6 +190,19 @@ pub(super) const UNKNOWN_WRITER_MESSAGES: Metric = Metric::counter(
     "ros2_unknown_writer_messages_total",
     UNKNOWN,
     "Messages of unknown writers, for the first 32 of them.",
+)
+.experimental();
+pub(super) const UNKNOWN_WRITER_RATE: Metric = Metric::gauge(
+    "ros2_unknown_writer_rate_hertz",
+    UNKNOWN,
+    "Messages a second of unknown writers over the agent's last window, for people.",
+)
+.unit("hertz")
+.experimental();
+pub(super) const UNKNOWN_WRITER_INFO: Metric = Metric::info(
+    "ros2_unknown_writer_info",
+    &["writer", "vendor", "host", "process", "pid", "cgroup"],
+    "Who an unknown writer is: what its participant says, and who holds the socket it sends by.",
 )
 .experimental();
 
@@ -311,10 +337,13 @@ pub const CATALOGUE: &[Metric] = &[
     SECURED_PARTICIPANTS,
     NODES,
     NODE_INFO,
+    PARTICIPANT_INFO,
     TOPICS,
     DISCOVERY_EVENTS,
     UNKNOWN_WRITERS,
     UNKNOWN_WRITER_MESSAGES,
+    UNKNOWN_WRITER_RATE,
+    UNKNOWN_WRITER_INFO,
     TOPIC_INFO,
     TOPIC_PUBLISHERS,
     TOPIC_SUBSCRIPTIONS,
@@ -395,6 +424,8 @@ pub const CATALOGUE: &[Metric] = &[
     SCRAPE_DURATION,
     RELOAD_SUCCESSFUL,
     RELOAD_TIMESTAMP,
+    STATE_WRITES,
+    RESTORED,
     PROCESS_CPU,
     PROCESS_RESIDENT,
     PROCESS_VIRTUAL,

@@ -138,6 +138,7 @@ impl Collector for Scrape {
         agent::capture(&mut page, &state)?;
         agent::model(&mut page, &state, &rows, deliveries.hidden)?;
         agent::surface(&mut page, &state, self.board.reload(), last_scrape, now)?;
+        agent::kept(&mut page, &state)?;
         agent::process(&mut page)
     }
 }

@@ -10,7 +10,7 @@ use super::page::{Family, Label, Number, Page};
 use crate::config::Watch;
 use crate::model::histogram::Histogram;
 use crate::model::snapshot::{
-    EndpointFacts, Measurement, Snapshot, TopicFacts, WatchFacts, WatchState,
+    EndpointFacts, Measurement, ProcessFacts, Snapshot, TopicFacts, WatchFacts, WatchState,
 };
 
 /// Unknown writers with series of their own.
@@ -153,6 +153,20 @@ pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
         per_domain(family, &domains, |counts| counts.2)
     })?;
     page.family(&metric::NODE_INFO, |family| nodes(family, snapshot))?;
+    page.family(&metric::PARTICIPANT_INFO, |family| {
+        snapshot.participants.iter().try_for_each(|participant| {
+            let [host, process, pid, cgroup] = place(&participant.process);
+            family.info(&[
+                Label::Number(participant.domain_id.into()),
+                Label::Guid(participant.guid),
+                Label::Text(&participant.vendor),
+                host,
+                process,
+                pid,
+                cgroup,
+            ])
+        })
+    })?;
     page.family(&metric::TOPICS, |family| {
         let mut kinds: BTreeMap<(u32, &str), usize> = BTreeMap::new();
         for topic in snapshot.topics.iter().filter(|topic| !topic.vanished) {
@@ -176,17 +190,38 @@ pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
         })
     })?;
     page.single(&metric::UNKNOWN_WRITERS, snapshot.unknown_writers.len())?;
+    let unknown = || snapshot.unknown_writers.iter().take(MAX_UNKNOWN_WRITERS);
     page.family(&metric::UNKNOWN_WRITER_MESSAGES, |family| {
-        snapshot
-            .unknown_writers
-            .iter()
-            .take(MAX_UNKNOWN_WRITERS)
-            .try_for_each(|writer| {
-                let vendor = writer.vendor.as_deref().unwrap_or_default();
-                let labels = [Label::Guid(writer.guid), Label::Text(vendor)];
-                family.sample(&labels, writer.measurement.messages)
-            })
+        unknown().try_for_each(|writer| {
+            let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
+            family.sample(&labels, writer.measurement.messages)
+        })
+    })?;
+    page.family(&metric::UNKNOWN_WRITER_RATE, |family| {
+        unknown().try_for_each(|writer| {
+            let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
+            family.sample(&labels, writer.measurement.rate_hz)
+        })
+    })?;
+    page.family(&metric::UNKNOWN_WRITER_INFO, |family| {
+        unknown().try_for_each(|writer| {
+            let [host, process, pid, cgroup] = place(&writer.process);
+            let (guid, vendor) = (Label::Guid(writer.guid), Label::Text(&writer.vendor));
+            family.info(&[guid, vendor, host, process, pid, cgroup])
+        })
     })
+}
+
+/// Host, process, process id and control group, each empty where it is not known.
+fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
+    [
+        Label::Text(process.host.as_deref().unwrap_or_default()),
+        Label::Text(process.name.as_deref().unwrap_or_default()),
+        process
+            .id
+            .map_or(Label::Text(""), |id| Label::Number(id.into())),
+        Label::Text(process.cgroup.as_deref().unwrap_or_default()),
+    ]
 }
 
 fn per_domain(
@@ -213,7 +248,7 @@ fn nodes(family: &mut Family<'_>, snapshot: &Snapshot) -> fmt::Result {
         }
         let participant = participants.get(&node.participant);
         let vendor = participant.map_or("", |participant| participant.vendor.as_str());
-        let host = participant.and_then(|participant| participant.host.as_deref());
+        let host = participant.and_then(|participant| participant.process.host.as_deref());
         family.info(&[
             Label::Number(node.domain_id.into()),
             Label::Text(&node.name),

@@ -3,12 +3,15 @@
 use std::net::Ipv4Addr;
 use std::time::{Duration, Instant};
 
+use ros2probe::model::discovery::Addresses;
 use ros2probe::model::histogram::Histogram;
 use ros2probe::model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
-    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Snapshot, SocketFacts,
-    TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, Snapshot,
+    SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
+    WatchedTopicFacts,
 };
+use ros2probe::state::StateFacts;
 use ros2probe::surface::{AgentFacts, InterfaceFacts, SourceKind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -29,13 +32,13 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             domain_id: 0,
             vendor: "eProsima Fast DDS".to_owned(),
             enclave: Some("/".to_owned()),
-            host: Some("robot".to_owned()),
-            process_id: Some(42),
-            process_name: None,
+            process: process(),
             first_seen: Timestamp(1),
             last_seen: Timestamp(2),
             lease_nanoseconds: Some(20_000_000_000),
             secured: false,
+            restored: false,
+            addresses: Addresses::default(),
         }],
         sockets: vec![SocketFacts {
             cookie: 77,
@@ -60,7 +63,8 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         topics,
         unknown_writers: vec![UnknownWriterFacts {
             guid,
-            vendor: None,
+            vendor: String::new(),
+            process: process(),
             first_seen: Timestamp(3),
             measurement: measurement(),
         }],
@@ -87,6 +91,15 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
     }
 }
 
+fn process() -> ProcessFacts {
+    ProcessFacts {
+        host: Some("robot".to_owned()),
+        id: Some(42),
+        name: Some("mapper".to_owned()),
+        cgroup: Some("/robot.slice".to_owned()),
+    }
+}
+
 /// An agent in the midst of it.
 pub fn agent() -> AgentFacts {
     AgentFacts {
@@ -97,6 +110,10 @@ pub fn agent() -> AgentFacts {
         }],
         filter_events: vec![("ignore", 7), ("meter", 8), ("capture", 9)],
         copied_bytes: 12_345,
+        state: Some(StateFacts {
+            writes: 3,
+            failures: 0,
+        }),
         ..AgentFacts::new(SourceKind::Wire, Instant::now())
     }
 }

@@ -1,19 +1,24 @@
 //! What is kept of participants, endpoints and nodes, and where a participant's domain is read from.
 
 use std::collections::BTreeSet;
+use std::net::SocketAddr;
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
 use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::qos::Qos;
-use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::rtps::{Locator, VendorId};
 use ros2probe_wire::{Duration, Guid, GuidPrefix, Timestamp};
+use serde::{Deserialize, Serialize};
 
 /// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
-const MAX_DOMAIN: u32 = 232;
+pub(super) const MAX_DOMAIN: u32 = 232;
+/// Addresses kept of one participant and kind.
+const ADDRESSES: usize = 16;
 
 /// How sure a participant's domain is, least first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum DomainSource {
     /// Nothing told.
     Assumed,
@@ -59,11 +64,24 @@ pub struct Portrait {
     pub secured: bool,
 }
 
+/// Where a participant is reached over UDP by unicast.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Addresses {
+    /// Its discovery endpoints.
+    pub metatraffic: Box<[SocketAddr]>,
+    /// Its other endpoints.
+    pub default: Box<[SocketAddr]>,
+}
+
 /// One participant.
 #[derive(Debug)]
 pub struct Participant {
     /// What it says.
     pub portrait: Portrait,
+    /// Where it is reached.
+    pub addresses: Addresses,
+    /// Known from before the agent's start, restored then, and not heard since.
+    pub restored: Option<Timestamp>,
     /// Its domain.
     pub domain_id: u32,
     /// First announcement.
@@ -123,6 +141,29 @@ impl Portrait {
             lease: announcement.lease,
             secured: announcement.is_secured,
         }
+    }
+}
+
+impl Addresses {
+    pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
+        let udp = |locators: &[Locator]| {
+            let addresses = locators.iter().filter_map(Locator::udp);
+            addresses.take(ADDRESSES).collect()
+        };
+        Self {
+            metatraffic: udp(&announcement.metatraffic_unicast),
+            default: udp(&announcement.default_unicast),
+        }
+    }
+}
+
+impl Participant {
+    /// A sign of life.
+    pub(super) fn seen(&mut self, at: Timestamp) {
+        if self.restored.is_some_and(|restored| at > restored) {
+            self.restored = None;
+        }
+        self.last_seen = self.last_seen.max(at);
     }
 }
 

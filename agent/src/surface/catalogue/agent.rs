@@ -146,6 +146,17 @@ pub(in crate::surface) const RELOAD_TIMESTAMP: Metric = Metric::gauge(
 )
 .unit("seconds");
 
+pub(in crate::surface) const STATE_WRITES: Metric = Metric::counter(
+    "ros2probe_state_writes_total",
+    &["outcome"],
+    "Times that what discovery knows was written to the state directory, or could not be; absent where no state is kept.",
+);
+pub(in crate::surface) const RESTORED: Metric = Metric::gauge(
+    "ros2probe_restored_participants",
+    &[],
+    "Participants known from before the agent's start and not heard since; they go when their lease ends.",
+);
+
 // The process, under the names every exporter uses.
 pub(in crate::surface) const PROCESS_CPU: Metric = Metric::counter(
     "process_cpu_seconds_total",

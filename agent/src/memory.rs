@@ -1,0 +1,56 @@
+//! Where state is kept, as the configuration or the service manager says, and what was found there.
+//! Whatever is wrong with it is said in the log: an agent without memory still observes.
+
+use std::path::Path;
+
+use anyhow::anyhow;
+use ros2probe::config::StateChoice;
+use ros2probe::model::discovery::Memory;
+use ros2probe::state::{Loaded, StateDirectory};
+
+/// Where the package and the service manager put it.
+const DEFAULT: &str = "/var/lib/ros2probe";
+/// Set by the service manager.
+const VARIABLE: &str = "STATE_DIRECTORY";
+
+/// The directory to use; `None` = none.
+pub(crate) fn open(choice: &StateChoice) -> Option<StateDirectory> {
+    let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
+    let opened = match (choice, named) {
+        (StateChoice::Off, _) => return None,
+        (StateChoice::At(path), _) => StateDirectory::open(path),
+        (StateChoice::Auto, Some(path)) => StateDirectory::open(Path::new(&path)),
+        (StateChoice::Auto, None) if !Path::new(DEFAULT).exists() => return None,
+        (StateChoice::Auto, None) => StateDirectory::open(Path::new(DEFAULT)),
+    };
+    match opened {
+        Ok(directory) => Some(directory),
+        Err(error) => {
+            let reason = format!("{:#}", anyhow!(error));
+            tracing::warn!(reason, "no state is kept: a restart loses names");
+            None
+        }
+    }
+}
+
+/// What the last agent knew.
+pub(crate) fn load(directory: &StateDirectory) -> Option<Memory> {
+    let path = directory.path().display();
+    match directory.load() {
+        Loaded::Known(memory) => {
+            let participants = memory.participants.len();
+            tracing::info!(%path, participants, "known from before, until confirmed");
+            Some(memory)
+        }
+        Loaded::Nothing => None,
+        Loaded::AnotherBoot => {
+            tracing::info!(%path, "the state is of another boot and not used");
+            None
+        }
+        Loaded::Unusable { reason, aside } => {
+            let aside = aside.map(|aside| aside.display().to_string());
+            tracing::warn!(%path, reason, aside, "the state cannot be used");
+            None
+        }
+    }
+}

@@ -1,0 +1,352 @@
+//! What discovery knew, as plain data that outlives the agent.
+//!
+//! Most of discovery is said once; an agent that is started anew on a running robot would know
+//! GUIDs without names. What is taken over from before is believed for one lease: whoever is heard
+//! by then stays, with all that was known of it. Bytes and files are somebody else's business; but
+//! what comes back from there is checked like anything that comes from outside.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use ros2probe_wire::discovery::{Role, TypeHash};
+use ros2probe_wire::names::{DdsTopic, RosType};
+use ros2probe_wire::qos::{
+    Durability, History, HistoryKind, Liveliness, Ownership, Qos, Reliability,
+};
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
+use serde::{Deserialize, Serialize};
+
+use super::facts::{Addresses, DomainSource, Endpoint, MAX_DOMAIN, Node, Participant, Portrait};
+use super::{Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT};
+
+/// Everybody that was there.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Memory {
+    /// Sorted by GUID prefix.
+    pub participants: Vec<Remembered>,
+}
+
+/// One participant with all it had. GUIDs and vendors are hexadecimal digits.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Remembered {
+    prefix: String,
+    vendor: String,
+    domain_id: u32,
+    domain_source: DomainSource,
+    enclave: Option<String>,
+    host: Option<String>,
+    process_name: Option<String>,
+    process_id: Option<u32>,
+    /// Nanoseconds; `None` = infinite, here and below.
+    lease: Option<u64>,
+    secured: bool,
+    addresses: Addresses,
+    nodes: Vec<RememberedNode>,
+    /// Writer and number of the sample that told the nodes.
+    nodes_from: Option<(String, u64)>,
+    endpoints: Vec<RememberedEndpoint>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct RememberedNode {
+    name: String,
+    writers: Vec<String>,
+    readers: Vec<String>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct RememberedEndpoint {
+    guid: String,
+    topic: String,
+    message_type: String,
+    type_hash: Option<String>,
+    reliability: u32,
+    durability: u32,
+    history: Option<(u32, i32)>,
+    deadline: Option<u64>,
+    lifespan: Option<u64>,
+    liveliness: u32,
+    liveliness_lease: Option<u64>,
+    ownership: u32,
+    minimum_separation: Option<u64>,
+    partitions: Vec<String>,
+}
+
+impl Discovery {
+    /// All that is worth keeping.
+    #[must_use]
+    pub fn memory(&self) -> Memory {
+        let mut participants: Vec<_> = self.participants.iter().collect();
+        participants.sort_unstable_by_key(|(prefix, _)| **prefix);
+        let remember = |(prefix, participant): (&GuidPrefix, &Participant)| {
+            let endpoints = participant.endpoints.iter();
+            let endpoints = endpoints.filter_map(|guid| {
+                let endpoint = self.endpoints.get(guid)?;
+                Some(RememberedEndpoint::of(*guid, endpoint))
+            });
+            Remembered::of(*prefix, participant, endpoints.collect())
+        };
+        Memory {
+            participants: participants.into_iter().map(remember).collect(),
+        }
+    }
+
+    /// Takes over what was known before the start, for one lease. What cannot be is left out; whom
+    /// discovery has met already knows better. No event: nothing happened to anybody.
+    pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
+        for remembered in &memory.participants {
+            let Some((prefix, mut participant)) = remembered.participant(now) else {
+                continue;
+            };
+            if self.participants.contains_key(&prefix) {
+                continue;
+            }
+            if self.participants.len() >= self.caps.participants {
+                self.evictions.participants += 1;
+                continue;
+            }
+            let room = self.caps.nodes.saturating_sub(self.node_count);
+            self.evictions.nodes += participant.nodes.len().saturating_sub(room) as u64;
+            participant.nodes.truncate(room);
+            self.node_count += participant.nodes.len();
+            for endpoint in remembered.endpoints.iter().take(PER_PARTICIPANT) {
+                let domain_id = participant.domain_id;
+                let Some((guid, endpoint)) = endpoint.endpoint(prefix, domain_id, now) else {
+                    continue;
+                };
+                if self.endpoints.len() >= self.caps.endpoints {
+                    self.evictions.endpoints += 1;
+                    continue;
+                }
+                if participant.endpoints.insert(guid) {
+                    self.endpoints.insert(guid, endpoint);
+                    self.changes.push(Change::Appeared(guid));
+                }
+            }
+            self.participants.insert(prefix, participant);
+        }
+    }
+}
+
+impl Remembered {
+    fn of(
+        prefix: GuidPrefix,
+        participant: &Participant,
+        endpoints: Vec<RememberedEndpoint>,
+    ) -> Self {
+        let portrait = &participant.portrait;
+        let text = |text: &Option<Box<str>>| text.as_deref().map(str::to_owned);
+        let [first, second] = portrait.vendor.0;
+        Self {
+            prefix: prefix.to_string(),
+            vendor: format!("{first:02x}{second:02x}"),
+            domain_id: participant.domain_id,
+            domain_source: participant.domain_source,
+            enclave: text(&portrait.enclave),
+            host: text(&portrait.host),
+            process_name: text(&portrait.process_name),
+            process_id: portrait.process_id,
+            lease: nanoseconds(portrait.lease),
+            secured: portrait.secured,
+            addresses: participant.addresses.clone(),
+            nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
+            nodes_from: participant
+                .nodes_from
+                .map(|(writer, number)| (digits(writer), number)),
+            endpoints,
+        }
+    }
+
+    fn participant(&self, now: Timestamp) -> Option<(GuidPrefix, Participant)> {
+        let prefix = GuidPrefix(hexadecimal(&self.prefix)?);
+        let texts = [&self.enclave, &self.host, &self.process_name];
+        let all_plain = texts.into_iter().flatten().all(|text| is_plain(text));
+        if self.domain_id > MAX_DOMAIN || !all_plain {
+            return None;
+        }
+        let text = |text: &Option<String>| text.as_deref().map(Into::into);
+        let nodes_from = self.nodes_from.as_ref();
+        let participant = Participant {
+            portrait: Portrait {
+                vendor: VendorId(hexadecimal(&self.vendor)?),
+                enclave: text(&self.enclave),
+                host: text(&self.host),
+                process_name: text(&self.process_name),
+                process_id: self.process_id,
+                lease: duration(self.lease),
+                secured: self.secured,
+            },
+            addresses: self.addresses.clone(),
+            restored: Some(now),
+            domain_id: self.domain_id,
+            first_seen: now,
+            last_seen: now,
+            endpoints: BTreeSet::new(),
+            nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
+            // Readers may have come while nobody looked.
+            readers_told: false,
+            domain_source: self.domain_source,
+            nodes_from: nodes_from
+                .and_then(|(writer, number)| Some((guid(writer, prefix)?, *number))),
+        };
+        Some((prefix, participant))
+    }
+}
+
+impl RememberedNode {
+    fn of(node: &Node) -> Self {
+        let all = |guids: &[Guid]| guids.iter().map(|guid| digits(*guid)).collect();
+        Self {
+            name: node.name.as_ref().to_owned(),
+            writers: all(&node.writers),
+            readers: all(&node.readers),
+        }
+    }
+
+    fn node(&self) -> Option<Node> {
+        let all = |texts: &[String]| -> Option<Vec<Guid>> {
+            let guids = texts
+                .iter()
+                .map(|text| hexadecimal(text).map(Guid::from_bytes));
+            guids.collect()
+        };
+        is_plain(&self.name).then_some(())?;
+        Some(Node {
+            name: self.name.as_str().into(),
+            writers: all(&self.writers)?,
+            readers: all(&self.readers)?,
+        })
+    }
+}
+
+impl RememberedEndpoint {
+    fn of(guid: Guid, endpoint: &Endpoint) -> Self {
+        let qos = &endpoint.qos;
+        Self {
+            guid: digits(guid),
+            topic: endpoint.topic.as_ref().to_owned(),
+            message_type: endpoint.message_type.as_ref().to_owned(),
+            type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
+            reliability: qos.reliability.0,
+            durability: qos.durability.0,
+            history: qos.history.map(|history| (history.kind.0, history.depth)),
+            deadline: nanoseconds(qos.deadline),
+            lifespan: nanoseconds(qos.lifespan),
+            liveliness: qos.liveliness.0,
+            liveliness_lease: nanoseconds(qos.liveliness_lease),
+            ownership: qos.ownership.0,
+            minimum_separation: nanoseconds(qos.minimum_separation),
+            partitions: qos.partitions.iter().map(ToString::to_string).collect(),
+        }
+    }
+
+    fn endpoint(
+        &self,
+        prefix: GuidPrefix,
+        domain_id: u32,
+        now: Timestamp,
+    ) -> Option<(Guid, Endpoint)> {
+        let guid = guid(&self.guid, prefix)?;
+        let role = match guid.entity {
+            entity if entity.is_writer() => Role::Writer,
+            entity if entity.is_reader() => Role::Reader,
+            _ => return None,
+        };
+        let topic = DdsTopic::parse(&self.topic).ok()?;
+        let message_type = RosType::parse(&self.message_type).ok()?;
+        let names = [topic.as_str(), message_type.as_str()];
+        let fits = names.iter().all(|name| name.len() <= MAX_NAME_LEN);
+        if !fits || !self.partitions.iter().all(|name| is_plain(name)) {
+            return None;
+        }
+        let history = |(kind, depth)| History {
+            kind: HistoryKind(kind),
+            depth,
+        };
+        let endpoint = Endpoint {
+            role,
+            domain_id,
+            topic: Arc::from(topic.as_str()),
+            message_type: Arc::from(message_type.as_str()),
+            type_hash: self.type_hash.as_deref().and_then(TypeHash::parse),
+            qos: Qos {
+                reliability: Reliability(self.reliability),
+                durability: Durability(self.durability),
+                history: self.history.map(history),
+                deadline: duration(self.deadline),
+                lifespan: duration(self.lifespan),
+                liveliness: Liveliness(self.liveliness),
+                liveliness_lease: duration(self.liveliness_lease),
+                ownership: Ownership(self.ownership),
+                minimum_separation: duration(self.minimum_separation),
+                partitions: self
+                    .partitions
+                    .iter()
+                    .map(|name| name.as_str().into())
+                    .collect(),
+            },
+            first_seen: now,
+        };
+        Some((guid, endpoint))
+    }
+}
+
+fn digits(guid: Guid) -> String {
+    format!("{}{}", guid.prefix, guid.entity)
+}
+
+/// A GUID of this participant.
+fn guid(text: &str, prefix: GuidPrefix) -> Option<Guid> {
+    let guid = Guid::from_bytes(hexadecimal(text)?);
+    (guid.prefix == prefix && guid.entity != EntityId::PARTICIPANT).then_some(guid)
+}
+
+/// `N` bytes from exactly as many pairs of hexadecimal digits.
+#[must_use]
+pub fn hexadecimal<const N: usize>(text: &str) -> Option<[u8; N]> {
+    let (pairs, []) = text.as_bytes().as_chunks::<2>() else {
+        return None;
+    };
+    let pairs: &[[u8; 2]; N] = pairs.try_into().ok()?;
+    let digit = |digit: u8| {
+        char::from(digit)
+            .to_digit(16)
+            .and_then(|it| u8::try_from(it).ok())
+    };
+    let mut bytes = [0; N];
+    for (byte, [high, low]) in bytes.iter_mut().zip(pairs) {
+        *byte = digit(*high)? << 4 | digit(*low)?;
+    }
+    Some(bytes)
+}
+
+/// As names on the wire have to be; the empty one is the root enclave's in some releases.
+fn is_plain(text: &str) -> bool {
+    text.is_empty() || text.len() <= MAX_NAME_LEN && DdsTopic::parse(text).is_ok()
+}
+
+const fn nanoseconds(duration: Duration) -> Option<u64> {
+    match duration {
+        Duration::Finite(nanoseconds) => Some(nanoseconds),
+        Duration::Infinite => None,
+    }
+}
+
+fn duration(nanoseconds: Option<u64>) -> Duration {
+    nanoseconds.map_or(Duration::Infinite, Duration::Finite)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_whole_pairs_of_digits_are_bytes() {
+        assert_eq!(hexadecimal("010f"), Some([1, 15]));
+        assert_eq!(hexadecimal("FFa0"), Some([255, 160]));
+        for wrong in ["", "01", "010", "010f00", "01g0", "+1+1", "01 f"] {
+            assert_eq!(hexadecimal::<2>(wrong), None, "{wrong:?}");
+        }
+    }
+}

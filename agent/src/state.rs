@@ -1,0 +1,407 @@
+//! The state directory: what discovery knew, on disk for the next start.
+//!
+//! One JSON file, replaced as a whole (new file, fsync, rename, fsync of the directory), so that a
+//! power cut leaves the old or the new one. Writing happens on a thread of its own; the capture
+//! hands over and never waits. Nothing here ends the agent: a file that cannot be read is kept
+//! aside, a disk that is full is counted and said once. One agent to a directory.
+
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{self, BufWriter, Read as _, Write as _};
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use crate::model::discovery::Memory;
+
+/// The form that is written; one that is read with another number is none of ours.
+const VERSION: u32 = 1;
+const FILE: &str = "discovery.json";
+const NEW_FILE: &str = "discovery.json.new";
+/// A larger file was not written by this.
+const MAX_BYTES: u64 = 64 << 20;
+/// How often at most the file is written.
+const PERIOD: Duration = Duration::from_secs(3);
+const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
+
+/// Where state is kept, to this process alone.
+#[derive(Debug)]
+pub struct StateDirectory {
+    path: PathBuf,
+    /// Holds the lock, and is what a rename is made durable by.
+    directory: File,
+}
+
+/// Why no state is kept.
+#[derive(Debug, thiserror::Error)]
+pub enum StateError {
+    /// It cannot be used.
+    #[error("cannot use the state directory {}", path.display())]
+    Unusable {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// Another agent uses it.
+    #[error("the state directory {} is in use by another agent", path.display())]
+    InUse {
+        /// Which.
+        path: PathBuf,
+    },
+}
+
+/// What was found at the start.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Loaded {
+    /// No file.
+    Nothing,
+    /// Of another boot of this host: whoever used these GUIDs then is gone or on another host, and
+    /// process ids, which Fast DDS makes GUIDs of, come again.
+    AnotherBoot,
+    /// Everybody that was there.
+    Known(Memory),
+    /// It cannot be used, for this reason, and now lies there.
+    Unusable {
+        /// Why.
+        reason: String,
+        /// Where it lies, if it could be moved.
+        aside: Option<PathBuf>,
+    },
+}
+
+/// What can be read of a file of any version.
+#[derive(Deserialize)]
+struct Version {
+    version: u32,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Document {
+    version: u32,
+    /// The kernel's name of the boot it was written in.
+    boot: String,
+    #[serde(flatten)]
+    memory: Memory,
+}
+
+/// The thread that writes, and what it has done.
+#[derive(Debug)]
+pub struct Keeper {
+    inbox: SyncSender<Memory>,
+    thread: JoinHandle<()>,
+    done: Arc<Done>,
+    /// The revision that was handed over last, and when.
+    handed: Option<(u64, Instant)>,
+}
+
+#[derive(Debug, Default)]
+struct Done {
+    writes: AtomicU64,
+    failures: AtomicU64,
+}
+
+/// How often state was written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StateFacts {
+    /// Written.
+    pub writes: u64,
+    /// Not written.
+    pub failures: u64,
+}
+
+impl StateDirectory {
+    /// Opens a directory that exists, for this process alone.
+    ///
+    /// # Errors
+    /// It does not exist, cannot be written, or another agent uses it.
+    pub fn open(path: &Path) -> Result<Self, StateError> {
+        let unusable = |source| StateError::Unusable {
+            path: path.to_path_buf(),
+            source,
+        };
+        let directory = File::open(path).map_err(unusable)?;
+        match directory.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let path = path.to_path_buf();
+                return Err(StateError::InUse { path });
+            }
+            Err(TryLockError::Error(error)) => return Err(unusable(error)),
+        }
+        let probe = path.join(NEW_FILE);
+        let written = new_file(&probe).and_then(|_| fs::remove_file(&probe));
+        written.map_err(unusable)?;
+        Ok(Self {
+            path: path.to_path_buf(),
+            directory,
+        })
+    }
+
+    /// Where it is.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Reads what the last agent left. What is no state is moved aside.
+    #[must_use]
+    pub fn load(&self) -> Loaded {
+        let path = self.path.join(FILE);
+        let mut bytes = Vec::new();
+        let read =
+            File::open(&path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
+        match read {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Loaded::Nothing,
+            Err(error) => return self.set_aside(error.to_string()),
+            Ok(_) if bytes.len() as u64 > MAX_BYTES => {
+                return self.set_aside(format!("it is larger than {MAX_BYTES} bytes"));
+            }
+            Ok(_) => {}
+        }
+        match serde_json::from_slice::<Version>(&bytes) {
+            Ok(Version { version: VERSION }) => {}
+            Ok(Version { version }) => {
+                let reason = format!("it is of version {version}, this agent reads {VERSION}");
+                return self.set_aside(reason);
+            }
+            Err(error) => return self.set_aside(error.to_string()),
+        }
+        match serde_json::from_slice::<Document>(&bytes) {
+            Ok(document) if document.boot != boot() => Loaded::AnotherBoot,
+            Ok(document) => Loaded::Known(document.memory),
+            Err(error) => self.set_aside(error.to_string()),
+        }
+    }
+
+    fn set_aside(&self, reason: String) -> Loaded {
+        let aside = self.path.join(format!("{FILE}.corrupt"));
+        let moved = fs::rename(self.path.join(FILE), &aside);
+        Loaded::Unusable {
+            reason,
+            aside: moved.is_ok().then_some(aside),
+        }
+    }
+
+    fn write(&self, memory: Memory) -> io::Result<()> {
+        let new = self.path.join(NEW_FILE);
+        let written = write_new(&new, memory).and_then(|()| {
+            fs::rename(&new, self.path.join(FILE))?;
+            self.directory.sync_all()
+        });
+        if written.is_err() {
+            // Half a file helps nobody, least of all on a full disk.
+            let _ = fs::remove_file(&new);
+        }
+        written
+    }
+}
+
+fn new_file(path: &Path) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    let options = options.write(true).create(true).truncate(true).mode(0o600);
+    options.open(path)
+}
+
+fn write_new(path: &Path, memory: Memory) -> io::Result<()> {
+    let mut file = BufWriter::new(new_file(path)?);
+    let document = Document {
+        version: VERSION,
+        boot: boot(),
+        memory,
+    };
+    serde_json::to_writer(&mut file, &document)?;
+    file.write_all(b"\n")?;
+    let file = file.into_inner().map_err(io::IntoInnerError::into_error)?;
+    file.sync_all()
+}
+
+/// Which boot this is; empty where the kernel does not tell.
+fn boot() -> String {
+    let boot = fs::read_to_string(BOOT_ID).unwrap_or_default();
+    boot.trim().to_owned()
+}
+
+impl Keeper {
+    /// Starts the thread.
+    ///
+    /// # Errors
+    /// No thread is to be had.
+    pub fn start(directory: StateDirectory) -> io::Result<Self> {
+        let (inbox, outbox) = sync_channel(1);
+        let done = Arc::<Done>::default();
+        let own = Arc::clone(&done);
+        let thread = std::thread::Builder::new()
+            .name("state".to_owned())
+            .spawn(move || keep(&directory, &outbox, &own))?;
+        Ok(Self {
+            inbox,
+            thread,
+            done,
+            handed: None,
+        })
+    }
+
+    /// Whether it is time to hand over what is known at `revision`.
+    #[must_use]
+    pub fn wants(&self, revision: u64, now: Instant) -> bool {
+        self.handed.is_none_or(|(handed, at)| {
+            handed != revision && now.saturating_duration_since(at) >= PERIOD
+        })
+    }
+
+    /// Hands over; returns at once. While the disk keeps the thread busy, a later one will do.
+    pub fn keep(&mut self, memory: Memory, revision: u64, now: Instant) {
+        match self.inbox.try_send(memory) {
+            Ok(()) => self.handed = Some((revision, now)),
+            Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) => {}
+        }
+    }
+
+    /// Writes the last state and waits until it is on disk.
+    pub fn finish(self, memory: Memory) {
+        let Self { inbox, thread, .. } = self;
+        // The thread ends with its inbox alone; if it has panicked, that is in the log.
+        let _ = inbox.send(memory);
+        drop(inbox);
+        let _ = thread.join();
+    }
+
+    /// What the thread has done.
+    #[must_use]
+    pub fn facts(&self) -> StateFacts {
+        StateFacts {
+            writes: self.done.writes.load(Ordering::Relaxed),
+            failures: self.done.failures.load(Ordering::Relaxed),
+        }
+    }
+}
+
+fn keep(directory: &StateDirectory, inbox: &Receiver<Memory>, done: &Done) {
+    let mut failing = false;
+    while let Ok(memory) = inbox.recv() {
+        match directory.write(memory) {
+            Ok(()) => {
+                done.writes.fetch_add(1, Ordering::Relaxed);
+                if failing {
+                    tracing::info!(path = %directory.path.display(), "state is written again");
+                }
+                failing = false;
+            }
+            Err(error) => {
+                done.failures.fetch_add(1, Ordering::Relaxed);
+                if !failing {
+                    let path = directory.path.display();
+                    tracing::error!(%path, %error, "state cannot be written: names would be lost with a restart");
+                }
+                failing = true;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn directory() -> (tempfile::TempDir, StateDirectory) {
+        let place = tempfile::tempdir().unwrap();
+        let directory = StateDirectory::open(place.path()).unwrap();
+        (place, directory)
+    }
+
+    fn unusable(directory: &StateDirectory) -> String {
+        match directory.load() {
+            Loaded::Unusable { reason, aside } => {
+                assert!(aside.unwrap().ends_with("discovery.json.corrupt"));
+                reason
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read_again_and_nothing_else_is_left() {
+        let (place, directory) = directory();
+        assert_eq!(directory.load(), Loaded::Nothing);
+        directory.write(Memory::default()).unwrap();
+        assert_eq!(directory.load(), Loaded::Known(Memory::default()));
+        let names: Vec<_> = fs::read_dir(place.path())
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name())
+            .collect();
+        assert_eq!(names, [FILE]);
+    }
+
+    #[test]
+    fn a_file_that_is_no_state_is_kept_aside_and_a_new_one_begun() {
+        let (place, directory) = directory();
+        let file = place.path().join(FILE);
+        directory.write(Memory::default()).unwrap();
+        let whole = fs::read(&file).unwrap();
+        for length in 0..whole.len() - 2 {
+            fs::write(&file, &whole[..length]).unwrap();
+            unusable(&directory);
+            assert_eq!(directory.load(), Loaded::Nothing, "cut at {length}");
+        }
+        for garbage in [&b"\0\xff\x7f"[..], b"[]", b"{}", b"{\"version\":\"1\"}"] {
+            fs::write(&file, garbage).unwrap();
+            unusable(&directory);
+        }
+        fs::write(&file, r#"{"version": 2, "boot": {}, "clouds": []}"#).unwrap();
+        assert_eq!(
+            unusable(&directory),
+            "it is of version 2, this agent reads 1"
+        );
+        let aside = fs::read_to_string(place.path().join("discovery.json.corrupt")).unwrap();
+        assert!(aside.contains("clouds"));
+        directory.write(Memory::default()).unwrap();
+        assert_eq!(directory.load(), Loaded::Known(Memory::default()));
+    }
+
+    #[test]
+    fn who_was_there_before_the_host_was_started_is_not_there() {
+        let (place, directory) = directory();
+        let file = place.path().join(FILE);
+        fs::write(&file, r#"{"version":1,"boot":"other","participants":[]}"#).unwrap();
+        assert_eq!(directory.load(), Loaded::AnotherBoot);
+    }
+
+    #[test]
+    fn two_agents_do_not_share_a_directory() {
+        let (place, directory) = directory();
+        let second = StateDirectory::open(place.path());
+        assert!(matches!(second, Err(StateError::InUse { .. })));
+        drop(directory);
+        StateDirectory::open(place.path()).unwrap();
+    }
+
+    #[test]
+    fn a_disk_that_cannot_be_written_costs_a_counter_and_nothing_else() {
+        let (place, directory) = directory();
+        // Nobody can write a file where a directory is.
+        let obstacle = place.path().join(NEW_FILE);
+        fs::create_dir(&obstacle).unwrap();
+        let mut keeper = Keeper::start(directory).unwrap();
+        let start = Instant::now();
+        assert!(keeper.wants(0, start));
+        keeper.keep(Memory::default(), 0, start);
+        while keeper.facts().failures == 0 {
+            assert!(start.elapsed() < Duration::from_secs(10));
+            std::thread::yield_now();
+        }
+        fs::remove_dir(obstacle).unwrap();
+        assert!(!keeper.wants(0, start + 2 * PERIOD), "nothing has changed");
+        assert!(!keeper.wants(1, start + PERIOD / 2), "it is too soon");
+        assert!(keeper.wants(1, start + PERIOD));
+        assert_eq!(keeper.facts().writes, 0);
+        keeper.finish(Memory::default());
+        let directory = StateDirectory::open(place.path()).unwrap();
+        assert_eq!(directory.load(), Loaded::Known(Memory::default()));
+    }
+}
