@@ -5,6 +5,7 @@
 
 pub mod capture;
 pub mod config;
+pub mod discover;
 pub mod model;
 pub mod privilege;
 pub mod run;

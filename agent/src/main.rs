@@ -1,5 +1,6 @@
 //! `rp`: the agent and its tools.
 
+mod ask;
 mod cli;
 mod logging;
 mod memory;
@@ -37,6 +38,7 @@ fn main() -> ExitCode {
     let done = match Arguments::parse().command {
         Command::Run(options) => run(options),
         Command::CheckConfig { file } => check_config(&file),
+        Command::Discover(options) => ask::discover(&options),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -118,7 +120,7 @@ fn run(options: cli::Run) -> Result<()> {
 }
 
 /// The configuration and the file it came from. Without `--config` a missing file is no mistake.
-fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>)> {
+pub(crate) fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>)> {
     let default = Path::new(DEFAULT_CONFIG);
     match file {
         None if !default.exists() => Ok((Config::default(), None)),

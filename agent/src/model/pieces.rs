@@ -42,6 +42,16 @@ impl Pieces {
         self.place(record).is_some()
     }
 
+    /// Which fragments of this sample have not come, if some have; fragments count from 1.
+    pub fn missing(&self, writer: Guid, number: u64) -> impl Iterator<Item = u32> + '_ {
+        let mut samples = self.samples.iter();
+        let sample = samples.find(|each| (each.writer, each.number) == (writer, number));
+        sample.into_iter().flat_map(|sample| {
+            let total = sample.size.div_ceil(sample.fragment_size);
+            (1..=total).filter(|fragment| !sample.fragments.contains_key(fragment))
+        })
+    }
+
     /// Samples given up.
     #[must_use]
     pub const fn evictions(&self) -> u64 {

@@ -1,0 +1,406 @@
+//! The few RTPS messages that `rp discover` sends, byte for byte (RTPS 2.5, 8.3 and 9.4).
+//!
+//! The only encoder in the product. It can announce a bare participant, one reader of
+//! `ros_discovery_info`, ask for samples, and say goodbye; nothing else, and in nobody else's name.
+
+use std::net::SocketAddrV4;
+
+use ros2probe_wire::parameters::ParameterId;
+use ros2probe_wire::qos::{Durability, Reliability};
+use ros2probe_wire::rtps::{LocatorKind, SubmessageId, VendorId};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+/// Believed to be unassigned; both vendors take it for a stranger's and use no extensions.
+pub const VENDOR: VendorId = VendorId([0x01, 0x7f]);
+/// The reader of `ros_discovery_info`: a user's, without key.
+pub const NODES_READER: EntityId = EntityId([0x00, 0x00, 0x0a, 0x04]);
+/// Reader of SEDP publication announcements.
+pub const PUBLICATIONS_READER: EntityId = EntityId([0x00, 0x00, 0x03, 0xc7]);
+/// Reader of SEDP subscription announcements.
+pub const SUBSCRIPTIONS_READER: EntityId = EntityId([0x00, 0x00, 0x04, 0xc7]);
+const SPDP_READER: EntityId = EntityId([0x00, 0x01, 0x00, 0xc7]);
+
+/// Where the discovery of every domain meets (RTPS 2.5, 9.6.1.4).
+const MULTICAST: [u8; 4] = [239, 255, 0, 1];
+/// SPDP writer, SEDP publications reader, SEDP subscriptions writer and reader. Fast DDS takes a
+/// goodbye only from whoever has the first.
+const BUILTIN_ENDPOINTS: u32 = 0x39;
+/// Should the goodbye be lost.
+const LEASE_SECONDS: u32 = 3;
+/// Numbers that one ACKNACK can ask for (RTPS 2.5, 9.4.2.6).
+pub const MOST_NUMBERS: u64 = 256;
+
+/// Flags of submessages (RTPS 2.5, 9.4.5).
+const LITTLE_ENDIAN: u8 = 0x01;
+const INLINE_QOS: u8 = 0x02;
+const DATA: u8 = 0x04;
+const FINAL: u8 = 0x02;
+const PL_CDR_LE: [u8; 4] = [0x00, 0x03, 0x00, 0x00];
+/// Disposed and unregistered; STATUS_INFO is big-endian always (RTPS 2.5, 9.6.4.9).
+const GONE: [u8; 4] = [0, 0, 0, 3];
+
+/// Who speaks: a participant of a moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Speaker {
+    /// Its GUID prefix.
+    pub prefix: GuidPrefix,
+    /// Its one socket.
+    pub address: SocketAddrV4,
+    /// Its domain.
+    pub domain_id: u16,
+}
+
+/// A message under construction.
+#[derive(Debug)]
+pub struct Message(Vec<u8>);
+
+impl Message {
+    /// From the speaker to this participant alone.
+    #[must_use]
+    pub fn new(speaker: Speaker, target: GuidPrefix) -> Self {
+        let header = [&b"RTPS\x02\x03"[..], &VENDOR.0, &speaker.prefix.0];
+        Self(header.concat()).submessage(SubmessageId::INFO_DST, 0, &[&target.0])
+    }
+
+    /// SPDP: here I am. Without user data it is no ROS participant, so that no node list and no
+    /// graph shows it. Cyclone DDS forgets the address after the goodbye only if there is a
+    /// multicast locator.
+    #[must_use]
+    pub fn announce(self, speaker: Speaker) -> Self {
+        let own = Guid::new(speaker.prefix, EntityId::PARTICIPANT);
+        let unicast = locator(*speaker.address.ip(), speaker.address.port());
+        // 7400 + 250 d (RTPS 2.5, 9.6.1.1); beyond domain 232 there are no ports.
+        let port = speaker.domain_id.saturating_mul(250).saturating_add(7400);
+        let multicast = locator(MULTICAST.into(), port);
+        let payload = Parameters::default()
+            .add(ParameterId::PROTOCOL_VERSION, &[2, 3, 0, 0])
+            .add(ParameterId::VENDORID, &[VENDOR.0[0], VENDOR.0[1], 0, 0])
+            .add(ParameterId::PARTICIPANT_GUID, &own.to_bytes())
+            .add(
+                ParameterId::PARTICIPANT_LEASE_DURATION,
+                &[LEASE_SECONDS.to_le_bytes(), [0; 4]].concat(),
+            )
+            .add(ParameterId::METATRAFFIC_UNICAST_LOCATOR, &unicast)
+            .add(ParameterId::DEFAULT_UNICAST_LOCATOR, &unicast)
+            .add(ParameterId::METATRAFFIC_MULTICAST_LOCATOR, &multicast)
+            .add(
+                ParameterId::BUILTIN_ENDPOINT_SET,
+                &BUILTIN_ENDPOINTS.to_le_bytes(),
+            )
+            .end();
+        self.data(SPDP_READER, EntityId::SPDP_WRITER, 1, &payload)
+    }
+
+    /// SPDP: here I was.
+    #[must_use]
+    pub fn goodbye(self, speaker: Speaker) -> Self {
+        let own = Guid::new(speaker.prefix, EntityId::PARTICIPANT);
+        let inline_qos = Parameters::default()
+            .add(ParameterId::KEY_HASH, &own.to_bytes())
+            .add(ParameterId::STATUS_INFO, &GONE)
+            .end();
+        let head = data_head(SPDP_READER, EntityId::SPDP_WRITER, 2);
+        self.submessage(SubmessageId::DATA, INLINE_QOS, &[&head, &inline_qos])
+    }
+
+    /// SEDP: I read `ros_discovery_info`, and that is all I have.
+    #[must_use]
+    pub fn read_nodes(self, speaker: Speaker) -> Self {
+        let own = Guid::new(speaker.prefix, EntityId::PARTICIPANT);
+        let reader = Guid::new(speaker.prefix, NODES_READER);
+        let payload = Parameters::default()
+            .add(ParameterId::ENDPOINT_GUID, &reader.to_bytes())
+            .add(ParameterId::PARTICIPANT_GUID, &own.to_bytes())
+            .add(ParameterId::TOPIC_NAME, &text(b"ros_discovery_info"))
+            .add(
+                ParameterId::TYPE_NAME,
+                &text(b"rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"),
+            )
+            .add(
+                ParameterId::RELIABILITY,
+                &[Reliability::RELIABLE.0.to_le_bytes(), [0; 4], [0; 4]].concat(),
+            )
+            .add(
+                ParameterId::DURABILITY,
+                &Durability::TRANSIENT_LOCAL.0.to_le_bytes(),
+            )
+            .end();
+        let (reader, writer) = (SUBSCRIPTIONS_READER, EntityId::SEDP_SUBSCRIPTIONS_WRITER);
+        let numbers = [number(1), number(1)].concat();
+        let heartbeat = [&reader.0[..], &writer.0, &numbers, &1u32.to_le_bytes()];
+        self.data(reader, writer, 1, &payload).submessage(
+            SubmessageId::HEARTBEAT,
+            FINAL,
+            &heartbeat,
+        )
+    }
+
+    /// ACKNACK: of this writer, everything before `base` is here and these numbers are missing. At
+    /// most [`MOST_NUMBERS`] from `base` on can be asked for; others are left out.
+    #[must_use]
+    pub fn ask(
+        self,
+        reader: EntityId,
+        writer: EntityId,
+        base: u64,
+        missing: impl IntoIterator<Item = u64>,
+        count: u32,
+    ) -> Self {
+        let set = bitmap(base, missing);
+        let count = count.to_le_bytes();
+        let body = [&reader.0[..], &writer.0, &number(base), &set, &count];
+        self.submessage(SubmessageId::ACKNACK, FINAL, &body)
+    }
+
+    /// NACK_FRAG: of this sample, these fragments are missing (RTPS 2.5, 9.4.5.14). Asked for a
+    /// sample, Cyclone DDS repeats its first fragment and waits for this.
+    #[must_use]
+    pub fn ask_fragments(
+        self,
+        reader: EntityId,
+        writer: EntityId,
+        sample: u64,
+        missing: impl IntoIterator<Item = u32>,
+        count: u32,
+    ) -> Self {
+        let mut missing = missing.into_iter().map(u64::from).peekable();
+        let base = missing.peek().copied().unwrap_or(1);
+        let set = bitmap(base, missing);
+        let base = u32::try_from(base).unwrap_or(1).to_le_bytes();
+        let count = count.to_le_bytes();
+        let body = [
+            &reader.0[..],
+            &writer.0,
+            &number(sample),
+            &base,
+            &set,
+            &count,
+        ];
+        self.submessage(SubmessageId::NACK_FRAG, 0, &body)
+    }
+
+    /// As it is sent.
+    #[must_use]
+    pub fn bytes(self) -> Vec<u8> {
+        self.0
+    }
+
+    fn data(self, reader: EntityId, writer: EntityId, number: u32, payload: &[u8]) -> Self {
+        let head = data_head(reader, writer, number);
+        self.submessage(SubmessageId::DATA, DATA, &[&head, &PL_CDR_LE, payload])
+    }
+
+    fn submessage(mut self, id: SubmessageId, flags: u8, body: &[&[u8]]) -> Self {
+        let body = body.concat();
+        // Bodies here are some hundred bytes at most.
+        let length = u16::try_from(body.len()).unwrap_or(0);
+        self.0.extend_from_slice(&[id.0, flags | LITTLE_ENDIAN]);
+        self.0.extend_from_slice(&length.to_le_bytes());
+        self.0.extend_from_slice(&body);
+        self
+    }
+}
+
+/// What begins a DATA submessage (RTPS 2.5, 9.4.5.4).
+fn data_head(reader: EntityId, writer: EntityId, sequence_number: u32) -> Vec<u8> {
+    // extraFlags, octetsToInlineQos.
+    let fixed = [0, 0, 16, 0];
+    let number = number(sequence_number.into());
+    [&fixed[..], &reader.0, &writer.0, &number].concat()
+}
+
+/// numBits and bitmap of a set of numbers from `base` on (RTPS 2.5, 9.4.2.6).
+fn bitmap(base: u64, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
+    let mut words = [0u32; 8];
+    let mut bits = 0u32;
+    for number in numbers {
+        let offset = number.checked_sub(base);
+        let Some(offset) = offset.and_then(|offset| u32::try_from(offset).ok()) else {
+            continue;
+        };
+        if let Some(word) = words.get_mut((offset / 32) as usize) {
+            *word |= 1 << (31 - offset % 32);
+            bits = bits.max(offset + 1);
+        }
+    }
+    let used = words.iter().take(bits.div_ceil(32) as usize);
+    let words = std::iter::once(&bits).chain(used);
+    words.flat_map(|word| word.to_le_bytes()).collect()
+}
+
+/// A sequence number: high word, low word (RTPS 2.5, 9.3.2.5).
+fn number(number: u64) -> [u8; 8] {
+    number.rotate_left(32).to_le_bytes()
+}
+
+fn locator(address: std::net::Ipv4Addr, port: u16) -> Vec<u8> {
+    let kind = LocatorKind::UDP_V4.0.to_le_bytes();
+    let port = u32::from(port).to_le_bytes();
+    [&kind[..], &port, &[0; 12], &address.octets()].concat()
+}
+
+/// A CDR string.
+fn text(text: &[u8]) -> Vec<u8> {
+    let length = u32::try_from(text.len() + 1).unwrap_or(0);
+    [&length.to_le_bytes()[..], text, &[0]].concat()
+}
+
+/// A parameter list (RTPS 2.5, 9.4.2.11).
+#[derive(Default)]
+struct Parameters(Vec<u8>);
+
+impl Parameters {
+    fn add(mut self, id: ParameterId, value: &[u8]) -> Self {
+        let padded = value.len().next_multiple_of(4);
+        let length = u16::try_from(padded).unwrap_or(0);
+        self.0.extend_from_slice(&id.0.to_le_bytes());
+        self.0.extend_from_slice(&length.to_le_bytes());
+        self.0.extend_from_slice(value);
+        self.0.resize(self.0.len() + padded - value.len(), 0);
+        self
+    }
+
+    fn end(self) -> Vec<u8> {
+        self.add(ParameterId::SENTINEL, &[]).0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use ros2probe_wire::discovery::{self, Discovery, Role};
+    use ros2probe_wire::record::kind;
+    use ros2probe_wire::rtps::{self, Body, InlineQos, Payload};
+    use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
+    use ros2probe_wire::{Duration, Record};
+
+    use super::*;
+
+    const TARGET: GuidPrefix = GuidPrefix([9; 12]);
+    const SPEAKER: Speaker = Speaker {
+        prefix: GuidPrefix(*b"\x01\x7fabcdefghij"),
+        address: SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 7), 40_123),
+        domain_id: 3,
+    };
+
+    fn message() -> Message {
+        Message::new(SPEAKER, TARGET)
+    }
+
+    fn walked(bytes: &[u8]) -> Vec<Found<'_>> {
+        let mut found = Vec::new();
+        let outcome = walk::datagram(bytes, &Envelope::default(), None, |it| found.push(it));
+        assert_eq!(outcome, Outcome::Complete);
+        found
+    }
+
+    #[test]
+    fn the_announcement_is_the_one_that_was_measured_and_can_be_read() {
+        let bytes = message().announce(SPEAKER).bytes();
+        assert_eq!(bytes.len(), 208);
+        let found = walked(&bytes);
+        let record = found[0].record;
+        assert_eq!(
+            record.writer(),
+            Guid::new(SPEAKER.prefix, EntityId::SPDP_WRITER)
+        );
+        assert_eq!(record.reader(), Guid::new(TARGET, SPDP_READER));
+        assert_eq!((found.len(), record.sequence_number), (1, 1));
+        let payload = Payload::Data(found[0].payload);
+        let told = discovery::participant(VENDOR, payload, &InlineQos::default()).unwrap();
+        let Discovery::Alive(told) = told else {
+            panic!("{told:?}")
+        };
+        assert_eq!(told.guid, Guid::new(SPEAKER.prefix, EntityId::PARTICIPANT));
+        assert_eq!(
+            (told.vendor, told.lease),
+            (VENDOR, Duration::Finite(3_000_000_000))
+        );
+        assert_eq!((told.enclave, told.builtin_endpoints.0), (None, 0x39));
+        let udp = |locators: &[ros2probe_wire::rtps::Locator]| {
+            let all = locators.iter().map(|it| it.udp().unwrap().to_string());
+            all.collect::<Vec<_>>()
+        };
+        assert_eq!(udp(&told.metatraffic_unicast), ["10.0.0.7:40123"]);
+        assert_eq!(udp(&told.default_unicast), ["10.0.0.7:40123"]);
+        assert_eq!(udp(&told.metatraffic_multicast), ["239.255.0.1:8150"]);
+        assert!(told.default_multicast.is_empty());
+    }
+
+    #[test]
+    fn the_goodbye_names_the_participant_by_its_key_hash() {
+        let bytes = message().goodbye(SPEAKER).bytes();
+        let found = walked(&bytes);
+        assert_eq!(found[0].record.sequence_number, 2);
+        assert_eq!(
+            (found[0].record.status_info, found[0].payload.len()),
+            (3, 0)
+        );
+        let own = Guid::new(SPEAKER.prefix, EntityId::PARTICIPANT).to_bytes();
+        assert!(bytes.windows(16).any(|window| window == own));
+    }
+
+    #[test]
+    fn the_reader_is_one_that_a_ros_writer_matches() {
+        let bytes = message().read_nodes(SPEAKER).bytes();
+        let found = walked(&bytes);
+        let payload = Payload::Data(found[0].payload);
+        let told = discovery::endpoint(Role::Reader, VENDOR, payload, &InlineQos::default());
+        let Discovery::Alive(told) = told.unwrap() else {
+            panic!("not alive")
+        };
+        assert_eq!(told.guid, Guid::new(SPEAKER.prefix, NODES_READER));
+        assert_eq!(told.topic.as_str(), "ros_discovery_info");
+        assert_eq!(
+            told.type_name.message().as_str(),
+            "rmw_dds_common/msg/ParticipantEntitiesInfo"
+        );
+        assert_eq!(told.qos.reliability, Reliability::RELIABLE);
+        assert_eq!(told.qos.durability, Durability::TRANSIENT_LOCAL);
+        let heartbeat = found[1].record;
+        assert_eq!(heartbeat.kind, kind::HEARTBEAT);
+        assert_eq!(heartbeat.sequence_number, 1);
+        assert_eq!(heartbeat.second_sequence_number(), 1);
+    }
+
+    #[test]
+    fn a_request_asks_for_exactly_the_missing_numbers() {
+        let asked = |base: u64, missing: &[u64]| -> (Record, Vec<u64>) {
+            let writer = EntityId::SEDP_PUBLICATIONS_WRITER;
+            let numbers = missing.iter().copied();
+            let bytes = message()
+                .ask(PUBLICATIONS_READER, writer, base, numbers, 7)
+                .bytes();
+            let record = walked(&bytes)[0].record;
+            let bits = record.bitmap();
+            (record, bits.map(|bit| base + u64::from(bit)).collect())
+        };
+        for missing in [vec![1], vec![1, 2, 3, 33, 64, 65, 150], vec![(1 << 32) + 5]] {
+            let (record, numbers) = asked(missing[0], &missing);
+            assert_eq!(
+                (numbers, record.sequence_number),
+                (missing.clone(), missing[0])
+            );
+            assert_eq!(
+                record.writer(),
+                Guid::new(TARGET, EntityId::SEDP_PUBLICATIONS_WRITER)
+            );
+            assert_eq!(
+                record.reader(),
+                Guid::new(SPEAKER.prefix, PUBLICATIONS_READER)
+            );
+        }
+        let bytes = message()
+            .ask_fragments(NODES_READER, NODES_READER, 48, [2, 4, 33], 1)
+            .bytes();
+        let mut parsed = rtps::Message::parse(&bytes).unwrap();
+        let Body::NackFrag(nack) = parsed.nth(1).unwrap().unwrap().body else {
+            panic!("no NACK_FRAG")
+        };
+        assert_eq!((nack.sequence_number.0, nack.missing.base), (48, 2));
+        assert_eq!(nack.missing.iter().collect::<Vec<_>>(), [2, 4, 33]);
+        let (record, _) = asked(10, &(1..1000).collect::<Vec<_>>());
+        assert_eq!(record.stamp_seconds, 256, "what does not fit is left out");
+    }
+}
