@@ -4,7 +4,7 @@
 mod harness;
 
 use std::fs::Permissions;
-use std::os::unix::fs::PermissionsExt as _;
+use std::os::unix::fs::{PermissionsExt as _, chown};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -61,6 +61,9 @@ fn three_capabilities_are_enough_at_the_sockets() -> Result<()> {
     );
     let processes = page.labels_of("ros2_subscriber_info", "process");
     assert!(processes.contains("cyclonedds"), "{processes:?}");
+    let writes = |outcome| page.value("ros2probe_state_writes_total", &[("outcome", outcome)]);
+    assert!(writes("written").is_some_and(|count| count > 0.0));
+    assert_eq!(writes("failed"), Some(0.0));
     Ok(())
 }
 
@@ -102,6 +105,9 @@ fn start<'a>(
     let watch = "watch: [{topic: /imu, per_subscriber: true}]\n";
     std::fs::write(file("ros2probe.yaml"), format!("{watch}{capture}"))?;
     let only = format!("-all,{capabilities}");
+    // As StateDirectory=ros2probe of the unit would have it.
+    std::fs::create_dir(file("state"))?;
+    chown(file("state"), Some(65534), Some(65534))?;
     let groups = harness::cgroup::hierarchy()?;
     let groups = groups.display();
     // As ProtectControlGroups=yes and ProtectProc=invisible of the unit would have it.
@@ -111,8 +117,9 @@ fn start<'a>(
     );
     let script = format!(
         "#!/bin/sh\nset -e\n[ \"$1\" = inside ] || exec unshare --mount \"$0\" inside \"$@\"\nshift\n\
-         {sandbox}\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
+         {sandbox}\nexport STATE_DIRECTORY={}\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
          --ambient-caps {only} --bounding-set {only} {} \"$@\"\n",
+        file("state").display(),
         file("rp").display()
     );
     std::fs::write(file("start"), script)?;

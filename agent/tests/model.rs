@@ -12,7 +12,7 @@ mod forge;
 use forge::{Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe::config::{Expectations, Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::snapshot::{Measurement, Snapshot, TopicFacts, WatchState};
+use ros2probe::model::snapshot::{Measurement, Snapshot, SocketFacts, TopicFacts, WatchState};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
@@ -627,6 +627,55 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
     world.stream(alice(WRITER), 401..=500);
     assert_eq!(world.measurement("/chatter").messages, 500);
     assert!(world.observer.interest_changes().is_empty());
+}
+
+#[test]
+fn an_unknown_writer_is_told_by_the_holder_of_its_socket_by_its_guid_and_by_its_participant() {
+    const FAST: GuidPrefix = GuidPrefix(*b"\x01\x0fsome-robot");
+    let mut world = World::new(&[]);
+    let holder = SocketFacts {
+        cookie: 77,
+        process_id: Some(4242),
+        process: Some("lidar_driver".to_owned()),
+        cgroup: Some("/robot.slice".to_owned()),
+        ..SocketFacts::default()
+    };
+    world.observer.socket(holder);
+    let send = |world: &mut World, number| {
+        for (prefix, socket) in [(FAST, 77), (ALICE, 78), (BOB, 77)] {
+            let envelope = Envelope {
+                host: true,
+                outgoing: true,
+                socket,
+                ..forge::multicast(world.now, 0)
+            };
+            let sample = Message::from(prefix).data(WRITER, number, &[0, 1, 0, 0]);
+            world.observer.datagram(&envelope, &sample.bytes(), None);
+        }
+        world.wait(10);
+    };
+    (1..=400).for_each(|number| send(&mut world, number));
+    world.spdp(BOB, 10);
+    send(&mut world, 401);
+    let told = |prefix: GuidPrefix| {
+        let snapshot = world.snapshot();
+        let writers = snapshot.unknown_writers.into_iter();
+        let mut writers = writers.filter(|writer| writer.guid == Guid::new(prefix, WRITER));
+        let writer = writers.next().unwrap();
+        (writer.vendor, writer.process.id, writer.process.name)
+    };
+    let lidar = Some("lidar_driver".to_owned());
+    assert_eq!(
+        told(FAST),
+        ("eProsima Fast DDS".to_owned(), Some(4242), lidar.clone())
+    );
+    assert_eq!(told(BOB).0, "Eclipse Cyclone DDS");
+    assert_eq!((told(BOB).1, told(BOB).2), (Some(4242), lidar));
+    assert_eq!((told(ALICE).1, told(ALICE).2), (None, None));
+    let participant = world.snapshot().participants.remove(0);
+    assert_eq!(participant.guid.prefix, BOB);
+    assert_eq!(participant.process.id, Some(4242));
+    assert_eq!(participant.process.cgroup.as_deref(), Some("/robot.slice"));
 }
 
 #[test]
