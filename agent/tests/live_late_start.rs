@@ -48,6 +48,68 @@ fn a_running_cyclone_dds_robot_that_is_asked_tells_all_names() -> Result<()> {
     asked(Stack::Cyclone)
 }
 
+#[test]
+fn a_full_disk_costs_one_line_in_the_log_and_the_state_alone() -> Result<()> {
+    let scene = Scene::new()?;
+    let state = scene.file("state");
+    let _disk = Disk::mount(&state)?;
+    fs::write(state.join("something-else"), [7; 44 << 10])?;
+    let log = scene.file("log");
+    let program = env!("CARGO_BIN_EXE_rp");
+    let agent = Agent::start_logging(&scene.place, program, &scene.configuration()?, &log)?;
+    let _robot = scene.robot(Stack::Cyclone)?;
+    let written = |outcome: &'static str, least: f64| {
+        let labels = [("outcome", outcome)];
+        move |page: &Scrape| {
+            let count = page.value("ros2probe_state_writes_total", &labels);
+            count.is_some_and(|count| count >= least)
+        }
+    };
+    // That of nobody still fits.
+    wait(&agent, written("failed", 1.0), PATIENCE, "a failure")?;
+    let known = |page: &Scrape| nodes(page).len() == NODES.len() && has_names(page);
+    let page = wait(&agent, known, PATIENCE, "all names")?;
+    let before = page.value("ros2probe_state_writes_total", &[("outcome", "written")]);
+    let lines = fs::read_to_string(&log)?;
+    assert_eq!(
+        lines.matches("state cannot be written").count(),
+        1,
+        "{lines}"
+    );
+    fs::remove_file(state.join("something-else"))?;
+    // With the next change.
+    let stream = Stream::small(1);
+    let host = &scene.link.robot;
+    let _more = Peer::start(host, Stack::Cyclone, Role::Subscriber, &stream, &["/more"])?;
+    let again = written("written", before.unwrap_or(0.0) + 1.0);
+    wait(&agent, again, PATIENCE, "a state that is written again")?;
+    let state = fs::read_to_string(state.join("discovery.json"))?;
+    assert!(
+        state.contains("/talker") && state.contains("/more"),
+        "{state}"
+    );
+    Ok(())
+}
+
+/// A very small disk.
+struct Disk(PathBuf);
+
+impl Disk {
+    fn mount(place: &Path) -> Result<Disk> {
+        harness::run(&format!(
+            "mount -t tmpfs -o size=48k tmpfs {}",
+            place.display()
+        ))?;
+        Ok(Disk(place.to_path_buf()))
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let _ = harness::run(&format!("umount -l {}", self.0.display()));
+    }
+}
+
 fn restarted_on_a_running_robot(stack: Stack) -> Result<()> {
     let scene = Scene::new()?;
     let agent = scene.agent()?;
@@ -164,6 +226,12 @@ fn asked(stack: Stack) -> Result<()> {
     assert_eq!(count(&recording, &ours)?, sent.iter().sum::<usize>());
     let to_nobody_else = format!("{ours} and not dst host {}", scene.link.robot.address());
     assert_eq!(count(&recording, &to_nobody_else)?, 0);
+    let refusals = format!("icmp and host {monitor}");
+    assert_eq!(
+        count(&recording, &refusals)?,
+        0,
+        "a port was closed too early"
+    );
     let conversations = ports(&recording, &ours)?;
     assert_eq!(conversations.len(), 2);
     for port in conversations {
@@ -242,6 +310,8 @@ impl Scene {
         let stream = Stream {
             rate: 100.0,
             reliable: true,
+            // Whatever the domain.
+            domain: if stack == Stack::Fast { 3 } else { 0 },
             ..Stream::small(100_000)
         };
         let host = &self.link.robot;

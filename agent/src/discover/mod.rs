@@ -21,6 +21,8 @@ use crate::model::snapshot::ParticipantFacts;
 
 /// How often the session is told the time while nothing comes.
 const SLICE: Duration = Duration::from_millis(5);
+/// After the goodbye, what is still under way is let in: a closed port would make the kernel answer.
+const LINGER: Duration = Duration::from_millis(50);
 /// Largest UDP payload.
 const DATAGRAM: usize = 65_507;
 
@@ -135,31 +137,46 @@ pub fn speaker(target: &Target, domain_id: u32) -> Result<(Speaker, UdpSocket), 
 /// When the network refuses; then, too, goodbye was tried.
 pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, DiscoverError> {
     let began = Instant::now();
+    // The session's time begins with 1: 0 is before everything.
+    let now = || {
+        let elapsed = u64::try_from(began.elapsed().as_nanos()).unwrap_or(u64::MAX);
+        Timestamp(elapsed.saturating_add(1))
+    };
     let mut buffer = vec![0; DATAGRAM];
     while !session.is_over() {
-        // The session's time begins with 1: 0 is before everything.
-        let elapsed = u64::try_from(began.elapsed().as_nanos()).unwrap_or(u64::MAX);
-        let now = Timestamp(elapsed.saturating_add(1));
-        let outgoing = session.advance(now);
-        if let Err(error) = send(socket, &outgoing) {
+        let outgoing = session.advance(now());
+        let round =
+            send(socket, &outgoing).and_then(|()| listen(session, socket, &mut buffer, now));
+        if let Err(error) = round {
             let _ = send(socket, &session.hang_up());
             return Err(error);
         }
-        if session.is_over() {
-            break;
-        }
-        match socket.recv_from(&mut buffer) {
-            Ok((length, _)) => session.datagram(now, buffer.get(..length).unwrap_or_default()),
-            // Refused: an earlier packet met a closed port. The session notices by itself.
-            Err(error) if is_passing(&error) => {}
-            Err(source) => {
-                let target = session.target().metatraffic;
-                let _ = send(socket, &session.hang_up());
-                return Err(DiscoverError::Talk { target, source });
-            }
+    }
+    let took = began.elapsed();
+    let end = Instant::now() + LINGER;
+    while Instant::now() < end {
+        listen(session, socket, &mut buffer, now)?;
+    }
+    Ok(took)
+}
+
+/// Waits a moment for a datagram.
+fn listen(
+    session: &mut Session,
+    socket: &UdpSocket,
+    buffer: &mut [u8],
+    now: impl Fn() -> Timestamp,
+) -> Result<(), DiscoverError> {
+    match socket.recv_from(buffer) {
+        Ok((length, _)) => session.datagram(now(), buffer.get(..length).unwrap_or_default()),
+        // Refused: an earlier packet met a closed port. The session notices by itself.
+        Err(error) if is_passing(&error) => {}
+        Err(source) => {
+            let target = session.target().metatraffic;
+            return Err(DiscoverError::Talk { target, source });
         }
     }
-    Ok(began.elapsed())
+    Ok(())
 }
 
 fn is_passing(error: &io::Error) -> bool {

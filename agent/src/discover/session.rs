@@ -34,7 +34,7 @@ const GATHER: u64 = 20 * MILLISECOND;
 /// What was asked for comes within this, or it is asked for again.
 const PATIENCE: u64 = 300 * MILLISECOND;
 /// How long the node list may take after everything else.
-const NODES_PATIENCE: u64 = 1_000 * MILLISECOND;
+const NODES_PATIENCE: u64 = 500 * MILLISECOND;
 /// The whole conversation.
 const LIMIT: u64 = 3_000 * MILLISECOND;
 /// Announcements of one kind believed to exist, whatever a HEARTBEAT says.
