@@ -31,10 +31,13 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     privilege::give_up()?;
     let participants = listen(live, options)?;
     let seconds = options.listen;
+    let heard = match participants.len() {
+        1 => "1 participant".to_owned(),
+        count => format!("{count} participants"),
+    };
     writeln!(
         out,
-        "{} participants heard in {seconds} s of listening; nothing was sent",
-        participants.len()
+        "{heard} heard in up to {seconds} s of listening; nothing was sent"
     )?;
     let mut targets = Vec::new();
     for participant in &participants {
@@ -129,9 +132,10 @@ fn describe(participant: &ParticipantFacts) -> String {
 fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
     let (speaker, socket) = speaker(target, domain_id)?;
     let mut session = Session::new(speaker, *target, !options.no_nodes);
+    let will = if options.dry_run { "would" } else { "will" };
     writeln!(
         out,
-        "\n{}: will send at most {MOST_PACKETS} packets, from {}, normally these:",
+        "\n{}: {will} send at most {MOST_PACKETS} packets, from {}, normally these:",
         target.prefix, speaker.address
     )?;
     for packet in session.plan() {

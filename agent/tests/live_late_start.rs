@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result};
 use harness::agent::{Agent, Scrape};
 use harness::capture::{Capture, SETTLE};
-use harness::network::{Link, Namespace};
+use harness::network::{INTERFACE, Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
 use tempfile::TempDir;
 
@@ -184,8 +184,24 @@ fn asked(stack: Stack) -> Result<()> {
     assert!(nodes(&page).is_empty() && !has_names(&page));
 
     let recording = Capture::start(&scene.link.monitor, &scene.file("dry.pcap"))?;
-    let output = scene.discover(&["--all", "--dry-run"])?;
-    assert!(output.status.success(), "{output:?}");
+    let output = scene.discover(&["--all", "--dry-run", "--interface", INTERFACE])?;
+    let said = String::from_utf8(output.stdout)?;
+    assert!(
+        output.status.success() && said.starts_with("2 participants"),
+        "{said}"
+    );
+    let guids = page.labels_of("ros2_participant_info", "participant");
+    let one = guids.first().context("no participant")?;
+    let output = scene.discover(&["--participant", one, "--dry-run", "--no-nodes"])?;
+    let said = String::from_utf8(output.stdout)?;
+    assert!(
+        output.status.success() && said.starts_with("1 participant "),
+        "{said}"
+    );
+    let plan = ["introduction", "request", "goodbye"];
+    let planned = said.lines().filter(|line| line.contains(", at most "));
+    let planned = planned.map(|line| line.trim().split(',').next().unwrap_or_default());
+    assert_eq!(planned.collect::<Vec<_>>(), plan, "{said}");
     std::thread::sleep(SETTLE);
     let monitor = scene.link.monitor.address();
     let ours = format!("udp and src host {monitor}");
