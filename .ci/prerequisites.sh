@@ -123,7 +123,7 @@ ebpf() {
     fi
 }
 
-network_tools=(iproute2 nftables ethtool util-linux curl ca-certificates tcpdump)
+network_tools=(iproute2 nftables ethtool util-linux procps curl ca-certificates tcpdump)
 
 for need; do
     case $need in

@@ -29,12 +29,13 @@ use std::process::Command;
 use anyhow::{Context as _, Result, bail};
 
 /// Tools the harness runs, with the Debian or Ubuntu package that has each.
-const TOOLS: [(&str, &str); 7] = [
+const TOOLS: [(&str, &str); 8] = [
     ("ip", "iproute2"),
     ("nft", "nftables"),
     ("ethtool", "ethtool"),
     ("nsenter", "util-linux"),
     ("setpriv", "util-linux"),
+    ("sysctl", "procps"),
     ("curl", "curl"),
     ("tcpdump", "tcpdump"),
 ];
