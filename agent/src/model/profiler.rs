@@ -66,11 +66,25 @@ pub struct Profiler {
     strangers: usize,
     stranger_limit: usize,
     stranger_evictions: u64,
+    shared: Shared,
+    search_after: Timestamp,
+}
+
+/// What all writers draw on.
+#[derive(Debug)]
+struct Shared {
     budget: Budget,
     strangers_budget: Budget,
     deliveries_budget: Budget,
     room: Room,
-    search_after: Timestamp,
+}
+
+/// Whose samples something is about.
+#[derive(Clone, Copy)]
+struct Subject {
+    writer: Guid,
+    reliable: bool,
+    topic: Option<TopicId>,
 }
 
 /// What had been counted of a writer that is measured no more.
@@ -102,14 +116,16 @@ impl Profiler {
             strangers: 0,
             stranger_limit,
             stranger_evictions: 0,
-            budget: Budget::new(sample_bytes),
-            strangers_budget: Budget::new(sample_bytes / STRANGERS_SHARE),
-            deliveries_budget: Budget::new(sample_bytes),
-            room: Room {
-                used: 0,
-                limit: deliveries,
-                evictions: 0,
-                wanted: false,
+            shared: Shared {
+                budget: Budget::new(sample_bytes),
+                strangers_budget: Budget::new(sample_bytes / STRANGERS_SHARE),
+                deliveries_budget: Budget::new(sample_bytes),
+                room: Room {
+                    used: 0,
+                    limit: deliveries,
+                    evictions: 0,
+                    wanted: false,
+                },
             },
             search_after: Timestamp(0),
         }
@@ -142,16 +158,16 @@ impl Profiler {
     #[must_use]
     pub const fn budgets(&self) -> [&Budget; 3] {
         [
-            &self.budget,
-            &self.strangers_budget,
-            &self.deliveries_budget,
+            &self.shared.budget,
+            &self.shared.strangers_budget,
+            &self.shared.deliveries_budget,
         ]
     }
 
     /// Room for deliveries.
     #[must_use]
     pub const fn room(&self) -> &Room {
-        &self.room
+        &self.shared.room
     }
 
     /// Takes in a record of a measured writer; `false` if it is of another.
@@ -175,22 +191,10 @@ impl Profiler {
         if measured.topic.is_none() && record.flags & LEFT == LEFT {
             measured.sent_from = record.socket;
         }
-        let budget = match measured.topic {
-            Some(_) => &mut self.budget,
-            None => &mut self.strangers_budget,
-        };
+        let subject = measured.subject(guid);
         let mut sight = Sight::New;
         if measured.topic.is_some() {
-            let mut stage = Stage {
-                now,
-                writer: guid,
-                reliable: measured.writer.traits().reliable,
-                topic: measured.topic,
-                budget: &mut self.deliveries_budget,
-                journal,
-                room: &mut self.room,
-                around,
-            };
+            let mut stage = self.shared.stage(subject, now, journal, around);
             let subscribers = measured
                 .subscribers
                 .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
@@ -203,11 +207,7 @@ impl Profiler {
         measured.writer.record(
             record,
             measured.opened,
-            &mut Scene {
-                now,
-                budget,
-                journal,
-            },
+            &mut self.shared.scene(subject, now, journal),
         );
         if sight == Sight::Again && record.flags & flag::HOST != 0 {
             measured.writer.came_again();
@@ -262,7 +262,7 @@ impl Profiler {
                 // Its unfinished samples are paid for by the other budget from now on.
                 known
                     .writer
-                    .transfer(&mut self.strangers_budget, &mut self.budget);
+                    .transfer(&mut self.shared.strangers_budget, &mut self.shared.budget);
                 self.strangers -= 1;
                 known.doubt(now);
             }
@@ -298,32 +298,17 @@ impl Profiler {
         around: Around<'_>,
     ) -> Option<Retired> {
         let mut measured = self.writers.remove(&guid)?;
-        let budget = match measured.topic {
-            Some(_) => &mut self.budget,
-            None => &mut self.strangers_budget,
-        };
-        measured.writer.settle(&mut Scene {
-            now,
-            budget,
-            journal,
-        });
+        let subject = measured.subject(guid);
+        measured
+            .writer
+            .settle(&mut self.shared.scene(subject, now, journal));
         self.strangers -= usize::from(measured.topic.is_none());
-        let (topic, reliable) = (measured.topic, measured.writer.traits().reliable);
         let subscribers = measured.subscribers.take();
         let totals = subscribers.map(|subscribers| {
-            subscribers.stop(&mut Stage {
-                now,
-                writer: guid,
-                reliable,
-                topic,
-                budget: &mut self.deliveries_budget,
-                journal,
-                room: &mut self.room,
-                around,
-            })
+            subscribers.stop(&mut self.shared.stage(subject, now, journal, around))
         });
         Some(Retired {
-            topic: topic?,
+            topic: subject.topic?,
             measurement: measured.writer.measurement(now),
             totals,
         })
@@ -338,27 +323,13 @@ impl Profiler {
     ) -> Strangers {
         let mut strangers = Strangers::default();
         for (guid, measured) in &mut self.writers {
-            let budget = match measured.topic {
-                Some(_) => &mut self.budget,
-                None => &mut self.strangers_budget,
-            };
-            measured.writer.advance(&mut Scene {
-                now,
-                budget,
-                journal,
-            });
+            let subject = measured.subject(*guid);
+            measured
+                .writer
+                .advance(&mut self.shared.scene(subject, now, journal));
             if measured.topic.is_some() {
                 if let Some(subscribers) = &mut measured.subscribers {
-                    subscribers.advance(&mut Stage {
-                        now,
-                        writer: *guid,
-                        reliable: measured.writer.traits().reliable,
-                        topic: measured.topic,
-                        budget: &mut self.deliveries_budget,
-                        journal,
-                        room: &mut self.room,
-                        around,
-                    });
+                    subscribers.advance(&mut self.shared.stage(subject, now, journal, around));
                 }
                 continue;
             }
@@ -374,7 +345,7 @@ impl Profiler {
         for guid in &strangers.forgotten {
             self.stop(*guid, now, journal, around);
         }
-        if std::mem::take(&mut self.room.wanted) {
+        if std::mem::take(&mut self.shared.room.wanted) {
             self.give_up_silent(now, journal, around);
         }
         strangers
@@ -388,26 +359,12 @@ impl Profiler {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
-            let budget = match measured.topic {
-                Some(_) => &mut self.budget,
-                None => &mut self.strangers_budget,
-            };
-            measured.writer.settle(&mut Scene {
-                now,
-                budget,
-                journal,
-            });
+            let subject = measured.subject(guid);
+            measured
+                .writer
+                .settle(&mut self.shared.scene(subject, now, journal));
             if let Some(subscribers) = &mut measured.subscribers {
-                subscribers.settle(&mut Stage {
-                    now,
-                    writer: guid,
-                    reliable: measured.writer.traits().reliable,
-                    topic: measured.topic,
-                    budget: &mut self.deliveries_budget,
-                    journal,
-                    room: &mut self.room,
-                    around,
-                });
+                subscribers.settle(&mut self.shared.stage(subject, now, journal, around));
             }
             // Who sent twice and was not announced until the end is a stranger.
             measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
@@ -428,17 +385,9 @@ impl Profiler {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
+            let subject = measured.subject(guid);
             if let Some(subscribers) = &mut measured.subscribers {
-                let mut stage = Stage {
-                    now,
-                    writer: guid,
-                    reliable: measured.writer.traits().reliable,
-                    topic: measured.topic,
-                    budget: &mut self.deliveries_budget,
-                    journal,
-                    room: &mut self.room,
-                    around,
-                };
+                let mut stage = self.shared.stage(subject, now, journal, around);
                 subscribers.give_up(at, 1, &mut stage);
             }
         }
@@ -465,7 +414,53 @@ impl Profiler {
     }
 }
 
+impl Shared {
+    fn scene<'a>(
+        &'a mut self,
+        subject: Subject,
+        now: Timestamp,
+        journal: &'a mut Journal,
+    ) -> Scene<'a> {
+        let budget = match subject.topic {
+            Some(_) => &mut self.budget,
+            None => &mut self.strangers_budget,
+        };
+        Scene {
+            now,
+            budget,
+            journal,
+        }
+    }
+
+    fn stage<'a>(
+        &'a mut self,
+        subject: Subject,
+        now: Timestamp,
+        journal: &'a mut Journal,
+        around: Around<'a>,
+    ) -> Stage<'a> {
+        Stage {
+            now,
+            writer: subject.writer,
+            reliable: subject.reliable,
+            topic: subject.topic,
+            budget: &mut self.deliveries_budget,
+            journal,
+            room: &mut self.room,
+            around,
+        }
+    }
+}
+
 impl Measured {
+    fn subject(&self, writer: Guid) -> Subject {
+        Subject {
+            writer,
+            reliable: self.writer.traits().reliable,
+            topic: self.topic,
+        }
+    }
+
     fn new(writer: Writer, topic: Option<TopicId>, now: Timestamp) -> Self {
         Self {
             writer: Box::new(writer),
