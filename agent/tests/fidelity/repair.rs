@@ -91,9 +91,14 @@ impl Repair {
             ..sent
         };
         let newest = *sent.numbers.last().context("nothing was sent")?;
+        // The HEARTBEAT that tells of the tail is seen some milliseconds before the ACKNACK it is
+        // answered with. Until that comes the last request stands, though all of that was received.
         let waiting = witness.wait_for("what is missing", PATIENCE, |seen| {
             let facts = acknowledgement(seen, &sent.guid, &reader)?;
-            (facts.acknowledged + facts.lag_samples == newest && facts.missing > 0).then_some(facts)
+            let received = Truth::of(&subscriber, "sub").ok()?;
+            let first = *received.missing(&sent.numbers).first()?;
+            let told = facts.acknowledged == first - 1 && facts.missing > 0;
+            (told && facts.acknowledged + facts.lag_samples == newest).then_some(facts)
         })?;
         let seen = witness.latest().context("no snapshot")?;
         let repaired = sums(&seen, &sent.guid, &reader);
