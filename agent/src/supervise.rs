@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, anyhow};
 use ros2probe::config::{Config, Watch, Watchlist};
 use ros2probe::run::{Order, Run, RunError};
+use ros2probe::surface::events::Sight;
 use ros2probe::surface::http::Server;
 use ros2probe::surface::{Board, Settings};
 use sd_notify::NotifyState;
@@ -123,8 +124,8 @@ impl Supervisor {
         match Config::load(file) {
             Ok(config) => self.take_over(config),
             Err(error) => {
-                self.board.reload_failed();
                 let error = format!("{:#}", anyhow!(error));
+                self.board.reload_failed(&error);
                 for line in error.lines() {
                     tracing::error!(error = line, "the configuration was not reloaded");
                 }
@@ -141,7 +142,7 @@ impl Supervisor {
         let watchlist = match Watchlist::new(config.watches.clone()) {
             Ok(watchlist) => watchlist,
             Err(error) => {
-                self.board.reload_failed();
+                self.board.reload_failed(&error.to_string());
                 tracing::error!(%error, "the configuration was not reloaded");
                 return;
             }
@@ -209,6 +210,7 @@ struct Watchdog {
     period: Option<Duration>,
     fed: Option<Instant>,
     ready: bool,
+    sight: Sight,
 }
 
 impl Watchdog {
@@ -219,6 +221,7 @@ impl Watchdog {
             period,
             fed: None,
             ready: false,
+            sight: Sight::default(),
         }
     }
 
@@ -226,7 +229,11 @@ impl Watchdog {
     /// become ready.
     fn look(&mut self, board: &Board) -> bool {
         let now = Instant::now();
-        if board.state().ready(now).is_err() {
+        let ready = board.state().ready(now);
+        if let Some(event) = self.sight.look(&ready, now) {
+            board.events().tell(event);
+        }
+        if ready.is_err() {
             return false;
         }
         let first = !self.ready;

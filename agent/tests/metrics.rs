@@ -15,6 +15,7 @@ use ros2probe::model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
+use ros2probe::surface::events;
 use ros2probe::surface::{Ability, AgentFacts, Board, Exposition, Format, Settings, SourceKind};
 
 fn settings() -> Settings {
@@ -80,20 +81,27 @@ fn the_page_shows_the_whole_catalogue_and_nothing_else() {
 }
 
 #[test]
-fn the_readme_s_table_is_the_catalogue() {
+fn the_readme_s_tables_are_those_of_the_sources() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../README.md");
-    let readme = std::fs::read_to_string(&path).unwrap();
-    let (before, rest) = readme.split_once("catalogue.rs -->\n").unwrap();
-    let (table, after) = rest.split_once("<!-- metrics: end").unwrap();
+    let mut readme = std::fs::read_to_string(&path).unwrap();
+    let hint = "run `UPDATE_README=1 cargo test -p ros2probe --test metrics` and commit";
+    for (begin, end, wanted) in [
+        ("catalogue.rs -->\n", "<!-- metrics: end", markdown()),
+        (
+            "events/table.rs -->\n",
+            "<!-- events: end",
+            events::markdown(),
+        ),
+    ] {
+        let (before, rest) = readme.split_once(begin).unwrap();
+        let (table, after) = rest.split_once(end).unwrap();
+        if std::env::var_os("UPDATE_README").is_none() {
+            assert_eq!(table, wanted, "{hint}");
+        }
+        readme = format!("{before}{begin}{wanted}{end}{after}");
+    }
     if std::env::var_os("UPDATE_README").is_some() {
-        let readme = format!(
-            "{before}catalogue.rs -->\n{}<!-- metrics: end{after}",
-            markdown()
-        );
         std::fs::write(path, readme).unwrap();
-    } else {
-        let hint = "run `UPDATE_README=1 cargo test -p ros2probe --test metrics` and commit";
-        assert_eq!(table, markdown(), "{hint}");
     }
 }
 

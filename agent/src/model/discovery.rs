@@ -8,6 +8,7 @@
 mod facts;
 mod graveyard;
 mod memory;
+mod subject;
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
@@ -20,8 +21,9 @@ use facts::domain;
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, Portrait};
 use graveyard::Graveyard;
 pub use memory::{Memory, hexadecimal};
+use subject::Subject;
 
-use super::churn::{Churn, Entity, Event};
+use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
 
 const SECOND: u64 = 1_000_000_000;
@@ -202,15 +204,9 @@ impl Discovery {
             if participant.portrait != portrait {
                 participant.portrait = portrait;
                 let domain_id = participant.domain_id;
-                self.note(
-                    domain_id,
-                    Entity::Participant,
-                    Event::Changed,
-                    guid,
-                    &Arc::default(),
-                    origin.at,
-                    journal,
-                );
+                let portrait = Portrait::of(announcement);
+                let subject = Subject::participant(domain_id, guid, &portrait);
+                self.note(&subject, Event::Changed, origin.at, journal);
             }
             self.move_to(guid.prefix, domain_id, source);
             return;
@@ -222,7 +218,7 @@ impl Discovery {
         self.participants.insert(
             guid.prefix,
             Participant {
-                portrait,
+                portrait: portrait.clone(),
                 addresses: Addresses::of(announcement),
                 restored: None,
                 domain_id,
@@ -235,15 +231,8 @@ impl Discovery {
                 nodes_from: None,
             },
         );
-        self.note(
-            domain_id,
-            Entity::Participant,
-            Event::Appeared,
-            guid,
-            &Arc::default(),
-            origin.at,
-            journal,
-        );
+        let subject = Subject::participant(domain_id, guid, &portrait);
+        self.note(&subject, Event::Appeared, origin.at, journal);
         self.adopt_pending(guid.prefix, origin.at, journal);
     }
 
@@ -402,7 +391,6 @@ impl Discovery {
             return;
         };
         let domain_id = participant.domain_id;
-        let entity = Entity::of(announcement.role);
         if let Some(known) = self.endpoints.get_mut(&guid) {
             if *known.topic == *announcement.topic.as_str() {
                 let before = (
@@ -417,9 +405,9 @@ impl Discovery {
                     && before.1 == known.qos
                     && before.2 == known.message_type;
                 if !unchanged {
-                    let topic = Arc::clone(&known.topic);
+                    let subject = Subject::endpoint(guid, known);
                     self.changes.push(Change::Changed(guid));
-                    self.note(domain_id, entity, Event::Changed, guid, &topic, at, journal);
+                    self.note(&subject, Event::Changed, at, journal);
                 }
                 return;
             }
@@ -444,21 +432,13 @@ impl Discovery {
             qos: announcement.qos,
             first_seen: at,
         };
-        let topic = Arc::clone(&endpoint.topic);
+        let subject = Subject::endpoint(guid, &endpoint);
         self.endpoints.insert(guid, endpoint);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.insert(guid);
         }
         self.changes.push(Change::Appeared(guid));
-        self.note(
-            domain_id,
-            entity,
-            Event::Appeared,
-            guid,
-            &topic,
-            at,
-            journal,
-        );
+        self.note(&subject, Event::Appeared, at, journal);
     }
 
     /// What waited for this participant.
@@ -513,26 +493,12 @@ impl Discovery {
         let before: Vec<_> = before.into_iter().map(|node| node.name).collect();
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         for name in difference(&before, &after) {
-            self.note(
-                domain_id,
-                Entity::Node,
-                Event::Disposed,
-                guid,
-                &name,
-                at,
-                journal,
-            );
+            let subject = Subject::node(domain_id, guid, &name);
+            self.note(&subject, Event::Disposed, at, journal);
         }
         for name in difference(&after, &before) {
-            self.note(
-                domain_id,
-                Entity::Node,
-                Event::Appeared,
-                guid,
-                &name,
-                at,
-                journal,
-            );
+            let subject = Subject::node(domain_id, guid, &name);
+            self.note(&subject, Event::Appeared, at, journal);
         }
     }
 
@@ -553,15 +519,8 @@ impl Discovery {
         let domain_id = participant.domain_id;
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         if let Some(event) = event {
-            self.note(
-                domain_id,
-                Entity::Participant,
-                event,
-                guid,
-                &Arc::default(),
-                at,
-                journal,
-            );
+            let subject = Subject::participant(domain_id, guid, &participant.portrait);
+            self.note(&subject, event, at, journal);
         }
         let cascade = event.map(|_| Event::Cascaded);
         for endpoint in participant.endpoints {
@@ -570,15 +529,8 @@ impl Discovery {
         self.node_count = self.node_count.saturating_sub(participant.nodes.len());
         if let Some(event) = cascade {
             for node in participant.nodes {
-                self.note(
-                    domain_id,
-                    Entity::Node,
-                    event,
-                    guid,
-                    &node.name,
-                    at,
-                    journal,
-                );
+                let subject = Subject::node(domain_id, guid, &node.name);
+                self.note(&subject, event, at, journal);
             }
         }
     }
@@ -594,16 +546,7 @@ impl Discovery {
             return;
         };
         if let Some(event) = event {
-            let entity = Entity::of(endpoint.role);
-            self.note(
-                endpoint.domain_id,
-                entity,
-                event,
-                guid,
-                &endpoint.topic,
-                at,
-                journal,
-            );
+            self.note(&Subject::endpoint(guid, &endpoint), event, at, journal);
         }
         self.changes.push(Change::Gone(guid, Box::new(endpoint)));
     }
@@ -661,27 +604,18 @@ impl Discovery {
             && self.endpoints.len() < self.caps.endpoints
     }
 
-    #[expect(clippy::too_many_arguments, reason = "an event has that many sides")]
-    fn note(
-        &mut self,
-        domain_id: u32,
-        entity: Entity,
-        event: Event,
-        guid: Guid,
-        name: &Arc<str>,
-        at: Timestamp,
-        journal: &mut Journal,
-    ) {
+    fn note(&mut self, subject: &Subject<'_>, event: Event, at: Timestamp, journal: &mut Journal) {
         self.revision += 1;
-        self.churn.count(domain_id, entity, event);
+        self.churn.count(subject.domain_id, subject.entity(), event);
         journal.note(DiscoveryEvent {
             at,
-            domain_id,
-            entity: entity.label(),
+            domain_id: subject.domain_id,
+            entity: subject.entity().label(),
             event: event.label(),
-            guid,
-            name: Arc::clone(name),
+            guid: subject.guid,
+            name: subject.name(),
         });
+        journal.events.push(at, subject.happened(event));
     }
 }
 

@@ -47,6 +47,8 @@ pub struct Evidence<'a> {
 /// How one topic stands with one entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Judgement {
+    /// Nothing was judged yet.
+    fresh: bool,
     state: WatchState,
     violated: bool,
     broken: u8,
@@ -57,6 +59,7 @@ pub struct Judgement {
 impl Default for Judgement {
     fn default() -> Self {
         Self {
+            fresh: true,
             state: WatchState::Ok,
             violated: false,
             broken: 0,
@@ -83,8 +86,14 @@ impl Judgement {
             .collect()
     }
 
-    /// Judges once more.
-    pub fn judge(&mut self, expectations: &Expectations, evidence: &Evidence<'_>) {
+    /// Judges once more. When the state is another one than before, gives that; at the first look,
+    /// which has none before, a state that is not the good one counts as a change.
+    pub fn judge(
+        &mut self,
+        expectations: &Expectations,
+        evidence: &Evidence<'_>,
+    ) -> Option<Option<WatchState>> {
+        let before = (!self.fresh).then_some(self.state);
         let broken = broken(expectations, evidence);
         let silent = broken & MAX_SILENCE != 0;
         if broken & !MAX_SILENCE == 0 {
@@ -116,6 +125,8 @@ impl Judgement {
             WatchState::Violated => {}
             _ => self.broken = 0,
         }
+        self.fresh = false;
+        (before.unwrap_or(WatchState::Ok) != self.state).then_some(before)
     }
 }
 

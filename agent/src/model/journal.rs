@@ -7,6 +7,7 @@ use std::sync::Arc;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::cause::LossCause;
+use super::event::Events;
 
 /// Entries kept of discovery events and of writers' losses each.
 const LIMIT: usize = 1024;
@@ -72,6 +73,8 @@ pub struct Journal {
     discovery: VecDeque<DiscoveryEvent>,
     losses: VecDeque<Loss>,
     delivery_losses: VecDeque<DeliveryLoss>,
+    /// What waits to be told.
+    pub events: Events,
 }
 
 impl Journal {
@@ -100,6 +103,7 @@ impl Journal {
 
     /// Adds a loss, to the last entry when it continues that one.
     pub fn lose(&mut self, loss: Loss) {
+        self.events.lose(&loss);
         if let Some(last) = self.losses.back_mut()
             && last.writer == loss.writer
             && last.last.checked_add(1) == Some(loss.first)

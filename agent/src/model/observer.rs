@@ -19,6 +19,7 @@ use ros2probe_wire::{
 };
 
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin};
+use super::event::{EventKind, Taken, bounded, bounded_shared};
 use super::expectation::Evidence;
 use super::header::begins_with_header;
 use super::interest::Interest;
@@ -27,7 +28,8 @@ use super::pieces::Pieces;
 use super::profiler::Profiler;
 use super::rate::Slot;
 use super::receivers::{Around, Receivers};
-use super::snapshot::{Snapshot, SocketFacts};
+use super::snapshot::{Snapshot, SocketFacts, WatchState};
+use super::standing::Standing;
 use super::topic::{Naming, TopicId, Topics, Watched};
 use super::way::Place;
 use super::writer::Traits;
@@ -154,6 +156,7 @@ impl Observer {
 
     /// Watches these from now on. What was counted of a topic that is no more watched stays.
     pub fn set_watchlist(&mut self, watchlist: Watchlist) {
+        let standing = Standing::new(&self.topics, &self.watchlist);
         self.watchlist = watchlist;
         // First give places back, then hand them out.
         for pass in [Watched::Yes, Watched::No] {
@@ -164,6 +167,7 @@ impl Observer {
                 }
             }
         }
+        standing.restore(&mut self.topics, &self.watchlist);
     }
 
     /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`
@@ -228,6 +232,7 @@ impl Observer {
     pub fn settle(&mut self) {
         let around = around!(self);
         self.profiler.settle(self.clock, &mut self.journal, around);
+        self.tell_losses();
     }
 
     /// Says what is known of a socket, again whenever that changes.
@@ -273,6 +278,11 @@ impl Observer {
     #[must_use]
     pub const fn journal(&self) -> &Journal {
         &self.journal
+    }
+
+    /// What happened since the last call.
+    pub fn take_events(&mut self) -> Taken {
+        self.journal.events.take()
     }
 
     /// All facts at this moment.
@@ -534,10 +544,26 @@ impl Observer {
     fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: Timestamp) {
         self.interest.remove(guid);
         self.retire(guid, now);
+        let (domain_id, topic) = (endpoint.domain_id, bounded_shared(&endpoint.topic));
+        self.journal.events.name(guid, domain_id, &topic);
         let id = naming(endpoint).and_then(|naming| self.topics.find(endpoint.domain_id, &naming));
         if let Some(id) = id {
             self.topics.leave(id, guid, now);
         }
+    }
+
+    /// Tells the losses of the last second.
+    fn tell_losses(&mut self) {
+        let discovery = &self.discovery;
+        self.journal.events.end_bursts(|burst| {
+            if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
+                burst.topic = Some((endpoint.domain_id, bounded_shared(&endpoint.topic)));
+            }
+            let participant = discovery.participants().get(&burst.writer.prefix);
+            let mut nodes = participant.into_iter().flat_map(|known| &known.nodes);
+            let node = nodes.find(|node| node.writers.contains(&burst.writer));
+            burst.node = node.map(|node| bounded_shared(&node.name));
+        });
     }
 
     /// Asks the watchlist about a topic and lets its endpoints follow.
@@ -612,6 +638,7 @@ impl Observer {
             self.receivers.tidy(&self.discovery);
             self.promote();
             self.judge(now);
+            self.tell_losses();
         }
     }
 
@@ -675,8 +702,30 @@ impl Observer {
             };
             let mut judgements = topic.judgements.clone();
             for (index, judgement) in &mut judgements {
-                if let Some(watch) = self.watchlist.watches().get(*index) {
-                    judgement.judge(&watch.expectations, &evidence);
+                let Some(watch) = self.watchlist.watches().get(*index) else {
+                    continue;
+                };
+                let changed = judgement.judge(&watch.expectations, &evidence);
+                let Some(from) = changed else { continue };
+                let to = judgement.state();
+                let (domain_id, name) = (topic.domain_id, &topic.naming.name);
+                let kind = EventKind::Expectation {
+                    domain_id,
+                    topic: bounded_shared(name),
+                    watch: bounded(&watch.pattern).into(),
+                    from,
+                    to,
+                    violations: judgement.violations(),
+                };
+                self.journal.events.push(now, kind);
+                if to == WatchState::Silent {
+                    let kind = EventKind::Silence {
+                        domain_id,
+                        topic: bounded_shared(name),
+                        watch: bounded(&watch.pattern).into(),
+                        last_message: evidence.last_message,
+                    };
+                    self.journal.events.push(now, kind);
                 }
             }
             if let Some(topic) = self.topics.get_mut(id) {

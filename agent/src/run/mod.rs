@@ -19,6 +19,7 @@ use crate::model::observer::Observer;
 use crate::model::snapshot::Snapshot;
 use crate::state::Keeper;
 use crate::surface::Board;
+use crate::surface::events::Drops;
 pub use source::Source;
 
 /// Longest time without looking at commands and the clock. Captured frames and a record ring that
@@ -53,6 +54,7 @@ pub struct Run {
     /// Participants whose last message the kernel filter notes.
     followed: BTreeSet<GuidPrefix>,
     board: Arc<Board>,
+    drops: Drops,
     orders: Receiver<Order>,
     stop: CancellationToken,
     keeper: Option<Keeper>,
@@ -61,7 +63,7 @@ pub struct Run {
 impl Run {
     /// Ready to run.
     #[must_use]
-    pub const fn new(
+    pub fn new(
         source: Source,
         observer: Observer,
         board: Arc<Board>,
@@ -73,6 +75,7 @@ impl Run {
             observer,
             followed: BTreeSet::new(),
             board,
+            drops: Drops::default(),
             orders,
             stop,
             keeper: None,
@@ -119,6 +122,7 @@ impl Run {
             if let Source::Live(live) = &mut self.source {
                 live.apply(&self.observer.interest_changes());
             }
+            self.board.events().add(self.observer.take_events());
             let age = published.elapsed();
             let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
             if finished || polled.is_err() || due {
@@ -133,6 +137,7 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             live.drain(&mut self.observer);
         }
+        self.board.events().add(self.observer.take_events());
         self.publish();
         Ok(())
     }
@@ -162,6 +167,9 @@ impl Run {
                 keeper.keep(self.observer.memory(), revision, now);
             }
             facts.state = Some(keeper.facts());
+        }
+        for drop in self.drops.look(&facts, Instant::now()) {
+            self.board.events().tell(drop);
         }
         self.board.publish(snapshot, facts);
     }

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::agent_facts::{Ability, InterfaceFacts};
 use super::board::{Reload, State};
 use super::catalogue as metric;
+use super::events::EventLog;
 use super::page::{Label, Page};
 use super::process::Process;
 use super::robot::Rows;
@@ -151,6 +152,20 @@ pub(super) fn surface(
         &metric::RELOAD_TIMESTAMP,
         since_epoch.unwrap_or_default().as_secs_f64(),
     )
+}
+
+/// Events, told and not told.
+pub(super) fn events(page: &mut Page<'_>, log: &EventLog) -> fmt::Result {
+    for (metric, counts) in [
+        (&metric::EVENTS, log.told()),
+        (&metric::EVENTS_DROPPED, log.dropped()),
+    ] {
+        page.family(metric, |family| {
+            let mut counts = counts.into_iter();
+            counts.try_for_each(|(label, count)| family.sample(&[Label::Text(label)], count))
+        })?;
+    }
+    Ok(())
 }
 
 /// The process; what cannot be read is left out.

@@ -14,6 +14,7 @@ use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
+use super::events::{AgentEvent, EventLog};
 use crate::config::{Config, Watch};
 use crate::model::snapshot::Snapshot;
 
@@ -26,6 +27,7 @@ pub struct Board {
     state: ArcSwap<State>,
     settings: ArcSwap<Settings>,
     reload: ArcSwap<Reload>,
+    events: Arc<EventLog>,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
     bell: Option<Bell>,
@@ -88,6 +90,8 @@ impl Board {
     #[must_use]
     pub fn new(source: SourceKind, settings: Settings) -> Self {
         let agent = AgentFacts::new(source, Instant::now());
+        let events = EventLog::new();
+        events.tell(AgentEvent::Started { source });
         let reload = Reload {
             successful: true,
             last_success: SystemTime::now(),
@@ -99,6 +103,7 @@ impl Board {
             }),
             settings: ArcSwap::from_pointee(settings),
             reload: ArcSwap::from_pointee(reload),
+            events: Arc::new(events),
             asked: AtomicBool::new(false),
             // Without one, askers wait until the capture thread looks by itself.
             bell: Bell::new().ok(),
@@ -153,6 +158,8 @@ impl Board {
 
     /// Pins new settings after a reload that worked.
     pub fn reloaded(&self, settings: Settings) {
+        let watches = settings.watches.len();
+        self.events.tell(AgentEvent::Reloaded { watches });
         self.settings.store(Arc::new(settings));
         let reload = Reload {
             successful: true,
@@ -161,8 +168,10 @@ impl Board {
         self.reload.store(Arc::new(reload));
     }
 
-    /// Notes that a reload was refused.
-    pub fn reload_failed(&self) {
+    /// Notes that a reload was refused, and why.
+    pub fn reload_failed(&self, error: &str) {
+        let error = error.to_owned();
+        self.events.tell(AgentEvent::ReloadFailed { error });
         let last_success = self.reload.load().last_success;
         self.reload.store(Arc::new(Reload {
             successful: false,
@@ -180,6 +189,12 @@ impl Board {
     #[must_use]
     pub fn settings(&self) -> Arc<Settings> {
         self.settings.load_full()
+    }
+
+    /// What happened lately.
+    #[must_use]
+    pub const fn events(&self) -> &Arc<EventLog> {
+        &self.events
     }
 
     /// How the last reload went.
@@ -319,7 +334,7 @@ mod tests {
         };
         let board = Board::new(SourceKind::Wire, settings.clone());
         let first = board.reload().last_success;
-        board.reload_failed();
+        board.reload_failed("no such file");
         assert_eq!(*board.settings(), settings);
         assert!(!board.reload().successful);
         assert_eq!(board.reload().last_success, first);

@@ -139,6 +139,7 @@ impl Collector for Scrape {
         agent::model(&mut page, &state, &rows, deliveries.hidden)?;
         agent::surface(&mut page, &state, self.board.reload(), last_scrape, now)?;
         agent::kept(&mut page, &state)?;
+        agent::events(&mut page, self.board.events())?;
         agent::process(&mut page)
     }
 }

@@ -6,6 +6,7 @@ pub mod agent_facts;
 pub mod board;
 pub mod catalogue;
 mod deliveries;
+pub mod events;
 pub mod exposition;
 pub mod http;
 mod page;
@@ -14,4 +15,5 @@ mod robot;
 
 pub use agent_facts::{Ability, AgentFacts, InterfaceFacts, SourceKind};
 pub use board::{Board, Settings, State};
+pub use events::{AgentEvent, EventLog};
 pub use exposition::{Exposition, Format};

@@ -157,6 +157,14 @@ pub(in crate::surface) const RESTORED: Metric = Metric::gauge(
     "Participants known from before the agent's start and not heard since; they go when their lease ends.",
 );
 
+pub(in crate::surface) const EVENTS: Metric =
+    Metric::counter("ros2probe_events_total", &["name"], "Events told, by name.");
+pub(in crate::surface) const EVENTS_DROPPED: Metric = Metric::counter(
+    "ros2probe_events_dropped_total",
+    &["reason"],
+    "Events only counted in a storm, or overwritten before a slow reader came to them: a stream of /events, or the sender of log records.",
+);
+
 // The process, under the names every exporter uses.
 pub(in crate::surface) const PROCESS_CPU: Metric = Metric::counter(
     "process_cpu_seconds_total",

@@ -1,0 +1,361 @@
+//! What happened, for whoever wants to be told once rather than to ask how it stands: discovery
+//! churn, bursts of lost samples, changes of expectations.
+//!
+//! Facts without words: names, severities and attributes are the surface's. What waits to be taken
+//! is bounded for each class by itself, so that a storm of one leaves room for the others; what
+//! found no room is counted. Nobody has to take anything.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::churn;
+use super::journal::Loss;
+use super::snapshot::WatchState;
+
+/// Events of one class that wait at most: those of one round of the capture thread.
+const WAITING: u16 = 512;
+/// Writers whose losses of one second are added up.
+const BURSTS: usize = 1024;
+/// Longest text kept, as of a topic's name.
+const TEXT: usize = 256;
+
+/// One thing that happened.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Event {
+    /// When, in the source's time.
+    pub at: Timestamp,
+    /// What.
+    pub kind: EventKind,
+}
+
+/// What happened.
+#[derive(Clone, Debug, PartialEq)]
+pub enum EventKind {
+    /// A participant came, changed or went.
+    Participant {
+        /// How.
+        change: churn::Event,
+        /// Its domain.
+        domain_id: u32,
+        /// Which one.
+        guid: Guid,
+        /// Its implementation.
+        vendor: VendorId,
+        /// Host name, as announced.
+        host: Option<Box<str>>,
+        /// Process name, as announced.
+        process: Option<Box<str>>,
+    },
+    /// A writer or reader came, changed or went.
+    Endpoint {
+        /// How.
+        change: churn::Event,
+        /// Its domain.
+        domain_id: u32,
+        /// Which one.
+        guid: Guid,
+        /// Writer or reader.
+        role: Role,
+        /// DDS topic.
+        topic: Arc<str>,
+        /// ROS type.
+        message_type: Arc<str>,
+    },
+    /// A node came or went.
+    Node {
+        /// How.
+        change: churn::Event,
+        /// Its domain.
+        domain_id: u32,
+        /// The participant it lives in.
+        participant: Guid,
+        /// Fully qualified name.
+        name: Arc<str>,
+    },
+    /// A writer's samples of about one second were settled as lost.
+    Loss(LossBurst),
+    /// A watched topic stands otherwise than before with its watchlist entry.
+    Expectation {
+        /// Its domain.
+        domain_id: u32,
+        /// ROS name.
+        topic: Arc<str>,
+        /// The entry's pattern.
+        watch: Box<str>,
+        /// How it stood; `None` when this is the first look.
+        from: Option<WatchState>,
+        /// How it stands.
+        to: WatchState,
+        /// Which expectations are broken.
+        violations: Vec<&'static str>,
+    },
+    /// A watched topic is published and nothing came for longer than its entry allows.
+    Silence {
+        /// Its domain.
+        domain_id: u32,
+        /// ROS name.
+        topic: Arc<str>,
+        /// The entry's pattern.
+        watch: Box<str>,
+        /// When its last message came, if any did.
+        last_message: Option<Timestamp>,
+    },
+}
+
+/// Lost samples of one writer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LossBurst {
+    /// Whose.
+    pub writer: Guid,
+    /// Domain and DDS topic, where the writer was announced.
+    pub topic: Option<(u32, Arc<str>)>,
+    /// Its node, where that is known.
+    pub node: Option<Arc<str>>,
+    /// How many.
+    pub count: u64,
+    /// First lost sequence number.
+    pub first: u64,
+    /// Last lost sequence number; between them others may have come.
+    pub last: u64,
+}
+
+/// Events that share a bound.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Class {
+    /// Participants.
+    Participant,
+    /// Endpoints.
+    Endpoint,
+    /// Nodes.
+    Node,
+    /// Losses.
+    Loss,
+    /// Expectations and silence.
+    Expectation,
+}
+
+/// What was taken.
+#[derive(Debug, Default)]
+pub struct Taken {
+    /// In the order in which it was noticed.
+    pub events: Vec<Event>,
+    /// Events that found no room, by class.
+    pub overflow: Vec<(Class, u64)>,
+}
+
+/// Events that wait to be taken, and losses that are being added up.
+#[derive(Debug, Default)]
+pub struct Events {
+    waiting: Vec<Event>,
+    classes: BTreeMap<Class, Room>,
+    bursts: BTreeMap<Guid, Burst>,
+}
+
+/// What one class has.
+#[derive(Clone, Copy, Debug, Default)]
+struct Room {
+    waiting: u16,
+    overflow: u64,
+}
+
+/// A burst that has not ended.
+#[derive(Debug)]
+struct Burst {
+    at: Timestamp,
+    told: LossBurst,
+}
+
+impl EventKind {
+    /// Its class.
+    #[must_use]
+    pub const fn class(&self) -> Class {
+        match self {
+            Self::Participant { .. } => Class::Participant,
+            Self::Endpoint { .. } => Class::Endpoint,
+            Self::Node { .. } => Class::Node,
+            Self::Loss(_) => Class::Loss,
+            Self::Expectation { .. } | Self::Silence { .. } => Class::Expectation,
+        }
+    }
+}
+
+impl Events {
+    /// Adds one, if there is room.
+    pub fn push(&mut self, at: Timestamp, kind: EventKind) {
+        let room = self.classes.entry(kind.class()).or_default();
+        if room.waiting >= WAITING {
+            room.overflow += 1;
+            return;
+        }
+        room.waiting += 1;
+        self.waiting.push(Event { at, kind });
+    }
+
+    /// Adds a loss to its writer's burst.
+    pub fn lose(&mut self, loss: &Loss) {
+        let count = loss.last.saturating_sub(loss.first).saturating_add(1);
+        if let Some(burst) = self.bursts.get_mut(&loss.writer) {
+            burst.at = burst.at.max(loss.at);
+            burst.told.count = burst.told.count.saturating_add(count);
+            burst.told.first = burst.told.first.min(loss.first);
+            burst.told.last = burst.told.last.max(loss.last);
+            return;
+        }
+        if self.bursts.len() >= BURSTS {
+            self.classes.entry(Class::Loss).or_default().overflow += 1;
+            return;
+        }
+        let told = LossBurst {
+            writer: loss.writer,
+            topic: None,
+            node: None,
+            count,
+            first: loss.first,
+            last: loss.last,
+        };
+        self.bursts.insert(loss.writer, Burst { at: loss.at, told });
+    }
+
+    /// This writer is no more: its burst, if there is one, was on this topic.
+    pub fn name(&mut self, writer: Guid, domain_id: u32, topic: &Arc<str>) {
+        if let Some(burst) = self.bursts.get_mut(&writer) {
+            burst.told.topic = Some((domain_id, Arc::clone(topic)));
+        }
+    }
+
+    /// Ends all bursts; `complete` adds what is known of their writers.
+    pub fn end_bursts(&mut self, mut complete: impl FnMut(&mut LossBurst)) {
+        for (_, Burst { at, mut told }) in std::mem::take(&mut self.bursts) {
+            complete(&mut told);
+            self.push(at, EventKind::Loss(told));
+        }
+    }
+
+    /// Everything since the last call.
+    pub fn take(&mut self) -> Taken {
+        let overflow = self
+            .classes
+            .iter()
+            .map(|(class, room)| (*class, room.overflow));
+        let taken = Taken {
+            overflow: overflow.filter(|(_, count)| *count > 0).collect(),
+            events: std::mem::take(&mut self.waiting),
+        };
+        self.classes.clear();
+        taken
+    }
+}
+
+/// The text, or as much of it as is kept.
+#[must_use]
+pub fn bounded(text: &str) -> &str {
+    text.get(..text.floor_char_boundary(TEXT))
+        .unwrap_or_default()
+}
+
+/// Likewise of a shared one.
+#[must_use]
+pub fn bounded_shared(text: &Arc<str>) -> Arc<str> {
+    if text.len() <= TEXT {
+        return Arc::clone(text);
+    }
+    bounded(text).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::{EntityId, GuidPrefix};
+
+    use super::*;
+
+    fn guid(number: u8) -> Guid {
+        Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, number, 3]))
+    }
+
+    fn loss(writer: Guid, at: u64, first: u64, last: u64) -> Loss {
+        Loss {
+            at: Timestamp(at),
+            writer,
+            first,
+            last,
+        }
+    }
+
+    fn node(name: &str) -> EventKind {
+        EventKind::Node {
+            change: churn::Event::Appeared,
+            domain_id: 0,
+            participant: guid(1),
+            name: name.into(),
+        }
+    }
+
+    #[test]
+    fn losses_of_one_writer_are_told_once_until_the_burst_ends() {
+        let mut events = Events::default();
+        events.lose(&loss(guid(1), 10, 5, 7));
+        events.lose(&loss(guid(2), 11, 1, 1));
+        events.lose(&loss(guid(1), 12, 9, 9));
+        assert!(events.take().events.is_empty());
+        events.name(guid(2), 3, &"rt/points".into());
+        events.end_bursts(|burst| {
+            if burst.topic.is_none() {
+                burst.topic = Some((0, "rt/imu".into()));
+            }
+        });
+        let told: Vec<_> = events
+            .take()
+            .events
+            .into_iter()
+            .map(|event| event.kind)
+            .collect();
+        let burst = |writer, topic: (u32, &str), count, first, last| {
+            EventKind::Loss(LossBurst {
+                writer,
+                topic: Some((topic.0, topic.1.into())),
+                node: None,
+                count,
+                first,
+                last,
+            })
+        };
+        assert_eq!(
+            told,
+            [
+                burst(guid(1), (0, "rt/imu"), 4, 5, 9),
+                burst(guid(2), (3, "rt/points"), 1, 1, 1)
+            ]
+        );
+        events.end_bursts(|_| {});
+        assert!(events.take().events.is_empty());
+    }
+
+    #[test]
+    fn a_storm_of_one_class_leaves_room_for_the_others_and_is_counted() {
+        let mut events = Events::default();
+        for number in 0..WAITING + 7 {
+            events.push(Timestamp(number.into()), node("/a"));
+        }
+        events.lose(&loss(guid(1), 10, 5, 7));
+        events.end_bursts(|_| {});
+        let taken = events.take();
+        assert_eq!(taken.events.len(), usize::from(WAITING) + 1);
+        assert_eq!(taken.overflow, [(Class::Node, 7)]);
+        events.push(Timestamp(1), node("/b"));
+        let taken = events.take();
+        assert_eq!((taken.events.len(), taken.overflow.len()), (1, 0));
+    }
+
+    #[test]
+    fn kept_texts_are_cut_between_characters() {
+        let long: Arc<str> = "\u{e9}".repeat(5_000).into();
+        assert_eq!(bounded(&long).len(), TEXT);
+        assert_eq!(bounded_shared(&long).len(), TEXT);
+        let short: Arc<str> = "/points".into();
+        assert!(Arc::ptr_eq(&short, &bounded_shared(&short)));
+    }
+}

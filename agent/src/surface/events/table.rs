@@ -1,0 +1,311 @@
+//! Every event the agent tells, once: name, severity, attributes, help. The streams, the log records
+//! of OpenTelemetry, the README's table and the tests work from it; nothing else spells a name.
+//!
+//! Attributes bear the names of the metrics' labels, so that events and series can be joined.
+
+use crate::surface::catalogue::Stability;
+
+/// One kind of event.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Definition {
+    /// Its name, for ever the same structure.
+    pub name: &'static str,
+    /// How bad it is.
+    pub severity: Severity,
+    /// How bad where it tells of something that is over or was meant to be.
+    pub relief: Severity,
+    /// Attributes, in order; those that are not known are left out.
+    pub attributes: &'static [&'static str],
+    /// One sentence.
+    pub help: &'static str,
+    /// Whether name and attributes may still change.
+    pub stability: Stability,
+}
+
+/// Severities of OpenTelemetry's logs, as far as they are used.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Severity {
+    /// What happens on a healthy robot.
+    Info,
+    /// Somebody should know.
+    Warn,
+    /// The agent does not see all.
+    Error,
+}
+
+impl Severity {
+    /// `SeverityText`.
+    #[must_use]
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::Info => "INFO",
+            Self::Warn => "WARN",
+            Self::Error => "ERROR",
+        }
+    }
+
+    /// `SeverityNumber`.
+    #[must_use]
+    pub const fn number(self) -> u8 {
+        match self {
+            Self::Info => 9,
+            Self::Warn => 13,
+            Self::Error => 17,
+        }
+    }
+}
+
+impl Definition {
+    const fn new(
+        name: &'static str,
+        severity: Severity,
+        attributes: &'static [&'static str],
+        help: &'static str,
+    ) -> Self {
+        Self {
+            name,
+            severity,
+            relief: severity,
+            attributes,
+            help,
+            stability: Stability::Stable,
+        }
+    }
+
+    const fn relief(self, relief: Severity) -> Self {
+        Self { relief, ..self }
+    }
+}
+
+const PARTICIPANT: &[&str] = &["domain_id", "participant", "vendor", "host", "process"];
+const PARTICIPANT_GONE: &[&str] = &[
+    "domain_id",
+    "participant",
+    "vendor",
+    "host",
+    "process",
+    "cause",
+];
+const ENDPOINT: &[&str] = &[
+    "domain_id",
+    "topic",
+    "kind",
+    "role",
+    "endpoint",
+    "message_type",
+];
+const ENDPOINT_GONE: &[&str] = &[
+    "domain_id",
+    "topic",
+    "kind",
+    "role",
+    "endpoint",
+    "message_type",
+    "cause",
+];
+
+pub(super) const PARTICIPANT_DISCOVERED: Definition = Definition::new(
+    "ros2.participant.discovered",
+    Severity::Info,
+    PARTICIPANT,
+    "A participant announced itself for the first time, or again after it was gone.",
+);
+pub(super) const PARTICIPANT_CHANGED: Definition = Definition::new(
+    "ros2.participant.changed",
+    Severity::Info,
+    PARTICIPANT,
+    "A participant announced itself with other properties.",
+);
+pub(super) const PARTICIPANT_LOST: Definition = Definition::new(
+    "ros2.participant.lost",
+    Severity::Warn,
+    PARTICIPANT_GONE,
+    "A participant went: its lease expired, or (INFO) it said goodbye, cause disposed.",
+)
+.relief(Severity::Info);
+pub(super) const ENDPOINT_DISCOVERED: Definition = Definition::new(
+    "ros2.endpoint.discovered",
+    Severity::Info,
+    ENDPOINT,
+    "A writer or reader was announced.",
+);
+pub(super) const ENDPOINT_CHANGED: Definition = Definition::new(
+    "ros2.endpoint.changed",
+    Severity::Info,
+    ENDPOINT,
+    "A writer or reader was announced with another type or quality of service.",
+);
+pub(super) const ENDPOINT_LOST: Definition = Definition::new(
+    "ros2.endpoint.lost",
+    Severity::Info,
+    ENDPOINT_GONE,
+    "A writer or reader went: it was disposed of, or cascaded with its participant.",
+);
+pub(super) const NODE_DISCOVERED: Definition = Definition::new(
+    "ros2.node.discovered",
+    Severity::Info,
+    &["domain_id", "ros_node", "participant"],
+    "A ROS node appeared.",
+);
+pub(super) const NODE_LOST: Definition = Definition::new(
+    "ros2.node.lost",
+    Severity::Info,
+    &["domain_id", "ros_node", "participant", "cause"],
+    "A ROS node went: it was disposed of, or cascaded with its participant.",
+);
+pub(super) const MESSAGE_LOST: Definition = Definition::new(
+    "ros2.message.lost",
+    Severity::Warn,
+    &[
+        "domain_id",
+        "topic",
+        "writer",
+        "ros_node",
+        "count",
+        "first_sequence_number",
+        "last_sequence_number",
+    ],
+    "Messages of a measured writer were settled as lost; one event for all of a second.",
+);
+pub(super) const EXPECTATION_CHANGED: Definition = Definition::new(
+    "ros2.topic.expectation_changed",
+    Severity::Warn,
+    &["domain_id", "topic", "watch", "from", "to", "violations"],
+    "A watched topic stands otherwise than before with its expectations; INFO when it is ok now.",
+)
+.relief(Severity::Info);
+pub(super) const TOPIC_SILENT: Definition = Definition::new(
+    "ros2.topic.silent",
+    Severity::Warn,
+    &["domain_id", "topic", "watch", "last_message_seconds_ago"],
+    "A watched topic has publishers, but nothing came for longer than max_silence_s.",
+);
+
+pub(super) const STARTED: Definition = Definition::new(
+    "ros2probe.agent.started",
+    Severity::Info,
+    &["version", "source"],
+    "The agent started: ids begin anew.",
+);
+pub(super) const CAPTURE_DROPPED: Definition = Definition::new(
+    "ros2probe.capture.dropped",
+    Severity::Error,
+    &["what", "count"],
+    "The agent lost packets, records or datagrams for want of room, or could not look at them: what it tells is a lower bound.",
+);
+pub(super) const CAPTURE_BLIND: Definition = Definition::new(
+    "ros2probe.capture.blind",
+    Severity::Error,
+    &["reason"],
+    "The agent does not see the robot any more, as /readyz answers.",
+);
+pub(super) const CAPTURE_SEEING: Definition = Definition::new(
+    "ros2probe.capture.seeing",
+    Severity::Info,
+    &["blind_seconds"],
+    "The agent sees the robot again.",
+);
+pub(super) const CONFIG_RELOADED: Definition = Definition::new(
+    "ros2probe.config.reloaded",
+    Severity::Info,
+    &["watches"],
+    "A configuration was taken over.",
+);
+pub(super) const CONFIG_REFUSED: Definition = Definition::new(
+    "ros2probe.config.reload_failed",
+    Severity::Error,
+    &["error"],
+    "A configuration was refused; the one before stays in force.",
+);
+pub(super) const WATCH_ADDED: Definition = Definition::new(
+    "ros2probe.watch.added",
+    Severity::Info,
+    &["watch", "watch_domain_id"],
+    "Somebody asked through the API for a topic to be watched.",
+);
+pub(super) const WATCH_REMOVED: Definition = Definition::new(
+    "ros2probe.watch.removed",
+    Severity::Info,
+    &["watch", "watch_domain_id"],
+    "Somebody ended a watch through the API.",
+);
+pub(super) const SUPPRESSED: Definition = Definition::new(
+    "ros2probe.events.suppressed",
+    Severity::Warn,
+    &["event", "count"],
+    "So many events of one name, or of a group of names, came in a second that the rest of them is only counted.",
+);
+
+/// All of them.
+pub const EVENTS: &[Definition] = &[
+    PARTICIPANT_DISCOVERED,
+    PARTICIPANT_CHANGED,
+    PARTICIPANT_LOST,
+    ENDPOINT_DISCOVERED,
+    ENDPOINT_CHANGED,
+    ENDPOINT_LOST,
+    NODE_DISCOVERED,
+    NODE_LOST,
+    MESSAGE_LOST,
+    EXPECTATION_CHANGED,
+    TOPIC_SILENT,
+    STARTED,
+    CAPTURE_DROPPED,
+    CAPTURE_BLIND,
+    CAPTURE_SEEING,
+    CONFIG_RELOADED,
+    CONFIG_REFUSED,
+    WATCH_ADDED,
+    WATCH_REMOVED,
+    SUPPRESSED,
+];
+
+/// The table in Markdown, for the README.
+#[must_use]
+pub fn markdown() -> String {
+    let mut table =
+        "| event | severity | attributes | meaning |\n| --- | --- | --- | --- |\n".to_owned();
+    for Definition {
+        name,
+        severity,
+        relief,
+        attributes,
+        help,
+        ..
+    } in EVENTS
+    {
+        let attributes: Vec<String> = attributes.iter().map(|name| format!("`{name}`")).collect();
+        let attributes = attributes.join(", ");
+        let mut severities = severity.text().to_owned();
+        if relief != severity {
+            severities = format!("{severities} or {}", relief.text());
+        }
+        table.push_str(&format!(
+            "| `{name}` | {severities} | {attributes} | {help} |\n"
+        ));
+    }
+    table
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn names_are_unique_dotted_and_in_a_namespace_of_ours() {
+        let names: BTreeSet<&str> = EVENTS.iter().map(|event| event.name).collect();
+        assert_eq!(names.len(), EVENTS.len());
+        for event in EVENTS {
+            let mut parts = event.name.split('.');
+            assert!(matches!(parts.next(), Some("ros2" | "ros2probe")));
+            assert_eq!(parts.clone().count(), 2, "{}", event.name);
+            let plain = |c: char| c.is_ascii_lowercase() || c == '_';
+            assert!(parts.all(|part| !part.is_empty() && part.chars().all(plain)));
+            assert!(event.help.ends_with('.') && !event.help.contains(['\n', '|']));
+            let attributes: BTreeSet<_> = event.attributes.iter().collect();
+            assert_eq!(attributes.len(), event.attributes.len(), "{}", event.name);
+        }
+    }
+}
