@@ -31,7 +31,10 @@ impl ParameterId {
     pub const LIVELINESS: Self = Self(0x001b);
     pub const DURABILITY: Self = Self(0x001d);
     pub const OWNERSHIP: Self = Self(0x001f);
+    pub const PRESENTATION: Self = Self(0x0021);
     pub const DEADLINE: Self = Self(0x0023);
+    pub const DESTINATION_ORDER: Self = Self(0x0025);
+    pub const LATENCY_BUDGET: Self = Self(0x0027);
     pub const PARTITION: Self = Self(0x0029);
     pub const LIFESPAN: Self = Self(0x002b);
     pub const USER_DATA: Self = Self(0x002c);

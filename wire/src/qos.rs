@@ -70,6 +70,14 @@ kind!(
     Ownership { SHARED = 0, EXCLUSIVE = 1 }
 );
 kind!(
+    /// By whose clock samples of several writers are put in order.
+    DestinationOrder { BY_RECEPTION_TIMESTAMP = 0, BY_SOURCE_TIMESTAMP = 1 }
+);
+kind!(
+    /// How far changes belong together, narrowest first.
+    AccessScope { INSTANCE = 0, TOPIC = 1, GROUP = 2 }
+);
+kind!(
     /// How many samples are kept.
     HistoryKind { KEEP_LAST = 0, KEEP_ALL = 1 }
 );
@@ -83,13 +91,37 @@ pub struct History {
     pub depth: i32,
 }
 
+/// How changes to several instances are presented together.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct Presentation {
+    /// How far they belong together.
+    pub access_scope: AccessScope,
+    /// All or none.
+    pub is_coherent: bool,
+    /// In the order of writing.
+    pub is_ordered: bool,
+}
+
+/// How samples are encoded (XTypes 1.3, 7.6.3.1.1).
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct DataRepresentation(pub i16);
+
+#[expect(missing_docs, reason = "the names are those of XTypes")]
+impl DataRepresentation {
+    pub const XCDR1: Self = Self(0);
+    pub const XML: Self = Self(1);
+    pub const XCDR2: Self = Self(2);
+}
+
+/// Most representations kept of one endpoint; there are three.
+const MAX_REPRESENTATIONS: u32 = 8;
 /// Most partitions kept of one endpoint; ROS 2 uses none.
 const MAX_PARTITIONS: usize = 16;
 /// Longest partition name kept.
 const MAX_PARTITION_LEN: usize = 256;
 
 /// What an endpoint offers or asks for.
-#[derive(Clone, PartialEq, Eq, Debug)]
+#[derive(Clone, PartialEq, Eq, Hash, Debug)]
 pub struct Qos {
     /// Reliability.
     pub reliability: Reliability,
@@ -109,6 +141,14 @@ pub struct Qos {
     pub ownership: Ownership,
     /// Least time between two samples a reader wants to see.
     pub minimum_separation: Duration,
+    /// Delay that may be added to save work.
+    pub latency_budget: Duration,
+    /// Order of several writers' samples.
+    pub destination_order: DestinationOrder,
+    /// What is presented together.
+    pub presentation: Presentation,
+    /// A writer uses the first, a reader accepts any; empty is XCDR1.
+    pub representations: Vec<DataRepresentation>,
     /// Partitions; empty is the default one.
     pub partitions: Vec<Box<str>>,
 }
@@ -138,6 +178,14 @@ impl Qos {
             liveliness_lease: Duration::Infinite,
             ownership: Ownership::SHARED,
             minimum_separation: Duration::Finite(0),
+            latency_budget: Duration::Finite(0),
+            destination_order: DestinationOrder::BY_RECEPTION_TIMESTAMP,
+            presentation: Presentation {
+                access_scope: AccessScope::INSTANCE,
+                is_coherent: false,
+                is_ordered: false,
+            },
+            representations: Vec::new(),
             partitions: Vec::new(),
         }
     }
@@ -173,6 +221,22 @@ impl Qos {
             ParameterId::TIME_BASED_FILTER => {
                 self.minimum_separation = duration(&mut value, "PID_TIME_BASED_FILTER")?;
             }
+            ParameterId::LATENCY_BUDGET => {
+                self.latency_budget = duration(&mut value, "PID_LATENCY_BUDGET")?;
+            }
+            ParameterId::DESTINATION_ORDER => {
+                self.destination_order = DestinationOrder(value.u32("PID_DESTINATION_ORDER")?);
+            }
+            ParameterId::PRESENTATION => {
+                self.presentation = Presentation {
+                    access_scope: AccessScope(value.u32("PID_PRESENTATION")?),
+                    is_coherent: value.u8("PID_PRESENTATION")? != 0,
+                    is_ordered: value.u8("PID_PRESENTATION")? != 0,
+                };
+            }
+            ParameterId::DATA_REPRESENTATION => {
+                self.representations = representations(&mut value)?;
+            }
             ParameterId::PARTITION => self.partitions = partitions(&mut value)?,
             _ => return Ok(false),
         }
@@ -197,6 +261,17 @@ fn partitions(value: &mut Cursor<'_>) -> Result<Vec<Box<str>>, WireError> {
         partitions.push(text::name(value, "PID_PARTITION", MAX_PARTITION_LEN)?.into());
     }
     Ok(partitions)
+}
+
+/// The first ones: what is beyond the limit says nothing new.
+fn representations(value: &mut Cursor<'_>) -> Result<Vec<DataRepresentation>, WireError> {
+    let count = value.u32("PID_DATA_REPRESENTATION")?;
+    let mut representations = Vec::new();
+    for _ in 0..count.min(MAX_REPRESENTATIONS) {
+        let kind = value.u16("PID_DATA_REPRESENTATION")?.cast_signed();
+        representations.push(DataRepresentation(kind));
+    }
+    Ok(representations)
 }
 
 #[cfg(test)]
@@ -244,6 +319,42 @@ mod tests {
         apply(&mut qos, ParameterId::LIVELINESS, &value).unwrap();
         assert_eq!(qos.liveliness, Liveliness::MANUAL_BY_TOPIC);
         assert_eq!(qos.liveliness_lease, Duration::Finite(1_500_000_000));
+    }
+
+    #[test]
+    fn presentation_order_and_representation_are_read() {
+        let mut qos = Qos::defaults(Role::Writer, VendorId::CYCLONE);
+        apply(&mut qos, ParameterId::PRESENTATION, &[1, 0, 0, 0, 0, 1, 0, 0]).unwrap();
+        let Presentation {
+            access_scope,
+            is_coherent,
+            is_ordered,
+        } = qos.presentation;
+        assert_eq!(access_scope, AccessScope::TOPIC);
+        assert_eq!((is_coherent, is_ordered), (false, true));
+        apply(&mut qos, ParameterId::DESTINATION_ORDER, &[1, 0, 0, 0]).unwrap();
+        assert_eq!(
+            qos.destination_order,
+            DestinationOrder::BY_SOURCE_TIMESTAMP
+        );
+        apply(&mut qos, ParameterId::LATENCY_BUDGET, &[1, 0, 0, 0, 0, 0, 0, 0]).unwrap();
+        assert_eq!(qos.latency_budget, Duration::Finite(1_000_000_000));
+    }
+
+    #[test]
+    fn representations_are_bounded() {
+        let mut qos = Qos::defaults(Role::Reader, VendorId::CYCLONE);
+        let value = [2, 0, 0, 0, 2, 0, 0, 0];
+        apply(&mut qos, ParameterId::DATA_REPRESENTATION, &value).unwrap();
+        assert_eq!(
+            qos.representations,
+            [DataRepresentation::XCDR2, DataRepresentation::XCDR1]
+        );
+        let mut many = [0xff; 4 + 2 * 20];
+        apply(&mut qos, ParameterId::DATA_REPRESENTATION, &many).unwrap();
+        assert_eq!(qos.representations, [DataRepresentation(-1); 8]);
+        many[..4].copy_from_slice(&[3, 0, 0, 0]);
+        assert!(apply(&mut qos, ParameterId::DATA_REPRESENTATION, &many[..8]).is_err());
     }
 
     #[test]

@@ -8,6 +8,7 @@ pub mod churn;
 pub mod deaths;
 pub mod delivery;
 pub mod departures;
+pub mod diagnosis;
 pub mod discovery;
 pub mod event;
 pub mod expectation;

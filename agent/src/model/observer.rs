@@ -18,6 +18,7 @@ use ros2probe_wire::{
     Cursor, Endianness, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError,
 };
 
+use super::diagnosis::Examiner;
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin};
 use super::event::{EventKind, Taken, bounded, bounded_shared};
 use super::expectation::Evidence;
@@ -116,6 +117,7 @@ pub struct Observer {
     pub(super) profiler: Profiler,
     pub(super) pieces: Pieces,
     pub(super) receivers: Receivers,
+    pub(super) examiner: Examiner,
     pub(super) decode_errors: BTreeMap<(&'static str, &'static str), u64>,
     pub(super) datagrams: u64,
     pub(super) records: u64,
@@ -146,6 +148,7 @@ impl Observer {
             ),
             pieces: Pieces::default(),
             receivers: Receivers::new(settings.deliveries),
+            examiner: Examiner::default(),
             decode_errors: BTreeMap::new(),
             datagrams: 0,
             records: 0,
@@ -233,6 +236,7 @@ impl Observer {
         let around = around!(self);
         self.profiler.settle(self.clock, &mut self.journal, around);
         self.tell_losses();
+        self.examine(self.clock);
     }
 
     /// Says what is known of a socket, again whenever that changes.
@@ -248,6 +252,7 @@ impl Observer {
     /// Takes over what was known before the start, until one lease from `now` on at most.
     pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
         self.discovery.restore(memory, now);
+        self.examiner.forget();
         for (prefix, participant) in self.discovery.participants() {
             let addresses = &participant.addresses;
             let places = addresses.default.iter().chain(&addresses.metatraffic);
@@ -639,7 +644,12 @@ impl Observer {
             self.promote();
             self.judge(now);
             self.tell_losses();
+            self.examine(now);
         }
+    }
+
+    fn examine(&mut self, now: Timestamp) {
+        self.examiner.examine(&self.discovery, &self.topics, now);
     }
 
     /// Gives free measuring places, and those of vanished topics, to topics that were kept out.

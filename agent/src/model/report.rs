@@ -4,6 +4,7 @@
 mod deliveries;
 
 use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
 
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::HistoryKind;
@@ -33,6 +34,7 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
         unknown_writers: unknown_writers(observer, now),
         sockets: deliveries::sockets(observer),
         watches: watches(observer),
+        diagnoses: Arc::clone(observer.examiner.current()),
         churn: observer.discovery.churn.facts(),
         decode_errors: decode_errors(observer),
         tables: tables(observer),
@@ -331,6 +333,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     let (writers, unknown, unknown_limit, unknown_evictions) = profiler.size();
     let (interest, interest_limit, interest_evictions) = observer.interest.size();
     let (sockets, sockets_limit, sockets_evictions) = observer.receivers.sockets().size();
+    let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
     let room = profiler.room();
     let refused = profiler.iter().filter_map(|(_, measured)| {
         let subscribers = measured.subscribers.as_ref()?;
@@ -380,6 +383,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
             room.evictions + refused,
         ),
         table("sockets", sockets, sockets_limit, sockets_evictions),
+        table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
     ]
 }
 

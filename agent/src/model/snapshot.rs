@@ -5,12 +5,15 @@
 
 mod delivery;
 
+use std::sync::Arc;
+
 use ros2probe_wire::{Guid, Timestamp};
 
 pub use delivery::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts,
 };
 
+use super::diagnosis::Diagnoses;
 use super::discovery::Addresses;
 use super::histogram::Histogram;
 
@@ -31,6 +34,8 @@ pub struct Snapshot {
     pub sockets: Vec<SocketFacts>,
     /// Watchlist entries, in configuration order.
     pub watches: Vec<WatchFacts>,
+    /// What is wrong with the graph; the same value as long as nothing changes.
+    pub diagnoses: Arc<Diagnoses>,
     /// Discovery churn since the start.
     pub churn: Vec<ChurnCount>,
     /// Parse failures since the start.
@@ -332,7 +337,7 @@ pub struct DecodeErrorCount {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
-    /// `reassembly`, `interest`, `deliveries`, `sockets`.
+    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`.
     pub table: &'static str,
     /// Entries (bytes for `reassembly`).
     pub size: u64,

@@ -6,9 +6,11 @@
 
 mod agent;
 mod delivery;
+mod diagnosis;
 
 pub(super) use agent::*;
 pub(super) use delivery::*;
+pub(super) use diagnosis::*;
 
 /// One metric family.
 #[derive(Debug, PartialEq, Eq)]
@@ -344,6 +346,14 @@ pub const CATALOGUE: &[Metric] = &[
     UNKNOWN_WRITER_MESSAGES,
     UNKNOWN_WRITER_RATE,
     UNKNOWN_WRITER_INFO,
+    DIAGNOSES,
+    QOS_INCOMPATIBLE_PAIRS,
+    TOPIC_CONFLICTING_TYPES,
+    TOPIC_CONFLICTING_TYPE_HASHES,
+    UNHEARD_PUBLISHERS,
+    UNFED_SUBSCRIPTIONS,
+    DUPLICATE_NODES,
+    NODE_DOMAINS,
     TOPIC_INFO,
     TOPIC_PUBLISHERS,
     TOPIC_SUBSCRIPTIONS,

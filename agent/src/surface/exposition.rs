@@ -13,6 +13,7 @@ use prometheus_client::registry::Registry;
 use super::agent;
 use super::board::Board;
 use super::deliveries::{self, Deliveries};
+use super::diagnoses;
 use super::page::Page;
 use super::robot::{self, Rows};
 use crate::model::snapshot::Snapshot;
@@ -127,6 +128,7 @@ impl Collector for Scrape {
 
         let mut page = Page::new(encoder);
         robot::graph(&mut page, snapshot)?;
+        diagnoses::diagnoses(&mut page, snapshot)?;
         let deliveries = Deliveries::new(&rows.shown);
         robot::topics(&mut page, &rows.shown, &settings)?;
         deliveries::sums(&mut page, &rows.shown, &settings)?;

@@ -6,6 +6,7 @@ pub mod agent_facts;
 pub mod board;
 pub mod catalogue;
 mod deliveries;
+mod diagnoses;
 pub mod events;
 pub mod exposition;
 pub mod http;

@@ -55,7 +55,8 @@ impl<'a> Rows<'a> {
             .filter(shown)
             .partition(|facts| facts.measurement.is_some());
         for facts in measured.into_iter().chain(others) {
-            let (domain_id, name) = (facts.domain_id, series_name(facts));
+            let name = series_name(facts.kind, &facts.name, &facts.dds_name);
+            let domain_id = facts.domain_id;
             let key = (domain_id, name.clone());
             if rows.contains_key(&key) || rows.len() >= max_topics {
                 hidden += 1;
@@ -121,11 +122,11 @@ impl<'a> Row<'a> {
 
 /// Services and other plumbing keep their DDS names: a request, its reply and a topic may share
 /// their ROS name. A DDS name that looks like a ROS name is marked.
-fn series_name(facts: &TopicFacts) -> Cow<'_, str> {
-    match facts.kind {
-        "topic" | "action_feedback" | "action_status" => Cow::Borrowed(&facts.name),
-        _ if facts.dds_name.starts_with('/') => Cow::Owned(format!("dds:{}", facts.dds_name)),
-        _ => Cow::Borrowed(&facts.dds_name),
+pub(super) fn series_name<'a>(kind: &str, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
+    match kind {
+        "topic" | "action_feedback" | "action_status" => Cow::Borrowed(name),
+        _ if dds_name.starts_with('/') => Cow::Owned(format!("dds:{dds_name}")),
+        _ => Cow::Borrowed(dds_name),
     }
 }
 

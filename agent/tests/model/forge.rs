@@ -155,12 +155,19 @@ pub fn participant_at(
 /// SEDP payload.
 pub fn endpoint(guid: Guid, topic: &str, type_name: &str, reliable: bool) -> Vec<u8> {
     let reliability = if reliable { 2u32 } else { 1 };
-    encapsulated(&[
+    let value = [&reliability.to_le_bytes()[..], &[0; 8]].concat();
+    endpoint_with(guid, topic, type_name, &[(0x1a, &value)])
+}
+
+/// SEDP payload with these parameters beside GUID, topic and type.
+pub fn endpoint_with(guid: Guid, topic: &str, type_name: &str, others: &[(u16, &[u8])]) -> Vec<u8> {
+    let mut list = vec![
         (0x5a, guid.to_bytes().to_vec()),
         (0x05, text(topic)),
         (0x07, text(type_name)),
-        (0x1a, [&reliability.to_le_bytes()[..], &[0; 8]].concat()),
-    ])
+    ];
+    list.extend(others.iter().map(|(id, value)| (*id, value.to_vec())));
+    encapsulated(&list)
 }
 
 /// `ros_discovery_info` payload: nodes by name with one writer each; gids of 16 or 24 bytes.

@@ -1,8 +1,12 @@
 //! A robot of any size as the model would describe it, with every fact filled in.
 
 use std::net::Ipv4Addr;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use ros2probe::model::diagnosis::{
+    Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
+};
 use ros2probe::model::discovery::Addresses;
 use ros2probe::model::histogram::Histogram;
 use ros2probe::model::snapshot::{
@@ -13,6 +17,7 @@ use ros2probe::model::snapshot::{
 };
 use ros2probe::state::StateFacts;
 use ros2probe::surface::{AgentFacts, InterfaceFacts, SourceKind};
+use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 /// Everything an agent knows of a robot with topics of these names, all watched by `/**`.
@@ -68,6 +73,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             first_seen: Timestamp(3),
             measurement: measurement(),
         }],
+        diagnoses: Arc::new(diagnoses()),
         churn: vec![ChurnCount {
             domain_id: 0,
             entity: "writer",
@@ -88,6 +94,68 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         datagrams: 100,
         records: 1_000,
         topics_rejected: 0,
+    }
+}
+
+/// One finding of each kind.
+fn diagnoses() -> Diagnoses {
+    let guid = |entity: [u8; 4]| Guid::new(GuidPrefix([1; 12]), EntityId(entity));
+    let (writer, reader) = (guid([0, 0, 1, 3]), guid([0, 0, 2, 4]));
+    let participant = guid([0, 0, 1, 0xc1]);
+    let topic = TopicKey {
+        domain_id: 0,
+        dds_name: "rt/points".into(),
+        name: "/points".into(),
+        kind: "topic",
+    };
+    let mut policies = Policies::default();
+    policies.insert(Policy::Reliability);
+    let list = vec![
+        Diagnosis::QosIncompatible {
+            topic: topic.clone(),
+            writer,
+            reader,
+            policies,
+        },
+        Diagnosis::TypeConflict {
+            topic: topic.clone(),
+            types: vec!["a/msg/A".into(), "b/msg/B".into()],
+        },
+        Diagnosis::TypeHashConflict {
+            topic: topic.clone(),
+            message_type: "a/msg/A".into(),
+            hashes: vec![TypeHash([1; 32]), TypeHash([2; 32])],
+        },
+        Diagnosis::DuplicateNode {
+            domain_id: 0,
+            node: "/lidar".into(),
+            participants: vec![participant; 3],
+        },
+        Diagnosis::UnheardPublisher {
+            topic: topic.clone(),
+            writer,
+            reason: Unmatched::Qos,
+        },
+        Diagnosis::UnfedSubscriber {
+            topic: topic.clone(),
+            reader,
+            reason: Unmatched::Type,
+        },
+        Diagnosis::NodeInSeveralDomains {
+            node: "/lidar".into(),
+            participant,
+            domains: vec![0, 5],
+        },
+    ];
+    let qos_pairs = vec![QosPairs {
+        topic,
+        policy: Policy::Reliability,
+        pairs: 12,
+    }];
+    Diagnoses {
+        list,
+        qos_pairs,
+        ..Diagnoses::default()
     }
 }
 

@@ -11,7 +11,8 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::{Role, TypeHash};
 use ros2probe_wire::names::{DdsTopic, RosType};
 use ros2probe_wire::qos::{
-    Durability, History, HistoryKind, Liveliness, Ownership, Qos, Reliability,
+    AccessScope, DataRepresentation, DestinationOrder, Durability, History, HistoryKind,
+    Liveliness, Ownership, Presentation, Qos, Reliability,
 };
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
@@ -71,7 +72,23 @@ struct RememberedEndpoint {
     ownership: u32,
     minimum_separation: Option<u64>,
     partitions: Vec<String>,
+    /// What follows is what only matching asks for; earlier agents did not keep it.
+    #[serde(default)]
+    matching: Matching,
 }
+
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Matching {
+    latency_budget: Option<u64>,
+    destination_order: u32,
+    access_scope: u32,
+    coherent: bool,
+    ordered: bool,
+    representations: Vec<i16>,
+}
+
+/// Most data representations taken back of one endpoint.
+const MAX_REPRESENTATIONS: usize = 8;
 
 impl Discovery {
     /// All that is worth keeping.
@@ -238,6 +255,7 @@ impl RememberedEndpoint {
             ownership: qos.ownership.0,
             minimum_separation: nanoseconds(qos.minimum_separation),
             partitions: qos.partitions.iter().map(ToString::to_string).collect(),
+            matching: Matching::of(qos),
         }
     }
 
@@ -285,10 +303,52 @@ impl RememberedEndpoint {
                     .iter()
                     .map(|name| name.as_str().into())
                     .collect(),
+                latency_budget: duration(self.matching.latency_budget),
+                destination_order: DestinationOrder(self.matching.destination_order),
+                presentation: self.matching.presentation(),
+                representations: self.matching.representations(),
             },
             first_seen: now,
         };
         Some((guid, endpoint))
+    }
+}
+
+impl Matching {
+    fn of(qos: &Qos) -> Self {
+        let Presentation {
+            access_scope,
+            is_coherent: coherent,
+            is_ordered: ordered,
+        } = qos.presentation;
+        Self {
+            latency_budget: nanoseconds(qos.latency_budget),
+            destination_order: qos.destination_order.0,
+            access_scope: access_scope.0,
+            coherent,
+            ordered,
+            representations: qos.representations.iter().map(|each| each.0).collect(),
+        }
+    }
+
+    fn presentation(&self) -> Presentation {
+        Presentation {
+            access_scope: AccessScope(self.access_scope),
+            is_coherent: self.coherent,
+            is_ordered: self.ordered,
+        }
+    }
+
+    fn representations(&self) -> Vec<DataRepresentation> {
+        let kept = self.representations.iter().take(MAX_REPRESENTATIONS);
+        kept.copied().map(DataRepresentation).collect()
+    }
+}
+
+impl Default for Matching {
+    /// What nearly all endpoints have.
+    fn default() -> Self {
+        Self::of(&Qos::defaults(Role::Writer, VendorId::EPROSIMA))
     }
 }
 

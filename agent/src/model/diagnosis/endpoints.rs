@@ -1,0 +1,254 @@
+//! One topic: do its writers and readers understand each other, and has each one somebody?
+
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+
+use ros2probe_wire::Guid;
+use ros2probe_wire::discovery::{Role, TypeHash};
+use ros2probe_wire::rtps::VendorId;
+
+use super::examiner::{Findings, half_known};
+use super::matching::{self, Offer, Policies, Policy, Verdict};
+use super::{Diagnosis, QosPairs, TopicKey, Unmatched};
+use crate::model::discovery::{Discovery, Endpoint};
+use crate::model::topic::Topic;
+
+/// Incompatible pairs listed of one topic.
+const PAIRS_PER_TOPIC: usize = 32;
+/// Types and hashes named in one finding.
+const MAX_NAMED: usize = 16;
+
+/// Looks at topics, with what it has to know of the whole.
+#[derive(Debug)]
+pub(super) struct Lookout<'a> {
+    discovery: &'a Discovery,
+    half_known: BTreeSet<u32>,
+}
+
+/// An endpoint without a counterpart: a finding once it lasts.
+#[derive(Debug)]
+pub(super) struct Lonely {
+    pub(super) guid: Guid,
+    pub(super) diagnosis: Diagnosis,
+}
+
+/// Endpoints of one role for which every verdict is the same.
+#[derive(Debug)]
+struct Group<'a> {
+    message_type: &'a Arc<str>,
+    offer: Offer<'a>,
+    members: Vec<Guid>,
+    /// Why they have no counterpart; `None` once they have, or may have.
+    unmatched: Option<Unmatched>,
+}
+
+impl<'a> Lookout<'a> {
+    pub(super) fn new(discovery: &'a Discovery) -> Self {
+        let half_known = half_known(discovery);
+        Self {
+            discovery,
+            half_known,
+        }
+    }
+
+    /// Adds what is found; gives who is alone.
+    pub(super) fn examine(&self, topic: &Topic, findings: &mut Findings) -> Vec<Lonely> {
+        let naming = &topic.naming;
+        let key = || TopicKey {
+            domain_id: topic.domain_id,
+            dds_name: Arc::clone(&naming.dds_name),
+            name: Arc::clone(&naming.name),
+            kind: naming.kind,
+        };
+        let mut writers = self.groups(&topic.writers);
+        let mut readers = self.groups(&topic.readers);
+        self.types(topic, &key, findings);
+        compare(&mut writers, &mut readers, &key, findings);
+        if !is_about_hearing(topic) || self.half_known.contains(&topic.domain_id) {
+            return Vec::new();
+        }
+        let groups = writers.iter().map(|group| (Role::Writer, group));
+        let groups = groups.chain(readers.iter().map(|group| (Role::Reader, group)));
+        let mut lonely = Vec::new();
+        for (role, group) in groups {
+            let Some(reason) = group.unmatched else {
+                continue;
+            };
+            for guid in &group.members {
+                let topic = key();
+                let diagnosis = match role {
+                    Role::Writer => Diagnosis::UnheardPublisher {
+                        topic,
+                        writer: *guid,
+                        reason,
+                    },
+                    Role::Reader => Diagnosis::UnfedSubscriber {
+                        topic,
+                        reader: *guid,
+                        reason,
+                    },
+                };
+                lonely.push(Lonely {
+                    guid: *guid,
+                    diagnosis,
+                });
+            }
+        }
+        lonely
+    }
+
+    fn endpoint(&self, guid: Guid) -> Option<(&'a Endpoint, VendorId)> {
+        let endpoint = self.discovery.endpoints().get(&guid)?;
+        let participant = self.discovery.participants().get(&guid.prefix)?;
+        Some((endpoint, participant.portrait.vendor))
+    }
+
+    fn groups(&self, guids: &[Guid]) -> Vec<Group<'a>> {
+        let mut groups: Vec<Group<'a>> = Vec::new();
+        let mut places: HashMap<_, usize> = HashMap::new();
+        for guid in guids {
+            let Some((endpoint, vendor)) = self.endpoint(*guid) else {
+                continue;
+            };
+            let qos = &endpoint.qos;
+            let (message_type, offer) = (&endpoint.message_type, Offer { qos, vendor });
+            match places.entry((message_type, offer)) {
+                Entry::Occupied(place) => {
+                    if let Some(group) = groups.get_mut(*place.get()) {
+                        group.members.push(*guid);
+                    }
+                }
+                Entry::Vacant(place) => {
+                    place.insert(groups.len());
+                    groups.push(Group {
+                        message_type,
+                        offer,
+                        members: vec![*guid],
+                        unmatched: Some(Unmatched::Nobody),
+                    });
+                }
+            }
+        }
+        groups
+    }
+
+    /// Are there several types, or several definitions of one?
+    fn types(&self, topic: &Topic, key: &impl Fn() -> TopicKey, findings: &mut Findings) {
+        let mut types: BTreeMap<&Arc<str>, BTreeSet<TypeHash>> = BTreeMap::new();
+        for guid in topic.writers.iter().chain(&topic.readers) {
+            if let Some((endpoint, _)) = self.endpoint(*guid) {
+                let hashes = types.entry(&endpoint.message_type).or_default();
+                hashes.extend(endpoint.type_hash);
+            }
+        }
+        if types.len() > 1 {
+            findings.add(Diagnosis::TypeConflict {
+                topic: key(),
+                types: types.keys().take(MAX_NAMED).copied().cloned().collect(),
+            });
+        }
+        for (message_type, hashes) in types.into_iter().filter(|(_, hashes)| hashes.len() > 1) {
+            findings.add(Diagnosis::TypeHashConflict {
+                topic: key(),
+                message_type: Arc::clone(message_type),
+                hashes: hashes.into_iter().take(MAX_NAMED).collect(),
+            });
+        }
+    }
+}
+
+/// Every kind of writer against every kind of reader.
+fn compare<'a>(
+    writers: &mut [Group<'a>],
+    readers: &mut [Group<'a>],
+    key: &impl Fn() -> TopicKey,
+    findings: &mut Findings,
+) {
+    findings.turn();
+    let mut counts = [0_u64; Policy::ALL.len()];
+    let mut listed = 0;
+    let mut open = writers.len() as u64 * readers.len() as u64;
+    'all: for writer in &mut *writers {
+        for reader in &mut *readers {
+            if !findings.spend(matching::effort(writer.offer.qos, reader.offer.qos)) {
+                break 'all;
+            }
+            open -= 1;
+            let hindrance = if writer.message_type != reader.message_type {
+                Some(Unmatched::Type)
+            } else {
+                match matching::verdict(writer.offer, reader.offer) {
+                    Verdict::Match => None,
+                    Verdict::Partition => Some(Unmatched::Partition),
+                    Verdict::Incompatible(policies) => {
+                        let pairs = writer.members.len() as u64 * reader.members.len() as u64;
+                        for (count, policy) in counts.iter_mut().zip(Policy::ALL) {
+                            *count += pairs * u64::from(policies.contains(policy));
+                        }
+                        let room = PAIRS_PER_TOPIC - listed;
+                        let new = list(writer, reader, policies, room, key, findings);
+                        findings.leave_out(pairs - new as u64);
+                        listed += new;
+                        Some(Unmatched::Qos)
+                    }
+                }
+            };
+            for unmatched in [&mut writer.unmatched, &mut reader.unmatched] {
+                *unmatched = unmatched.and_then(|before| Some(before.min(hindrance?)));
+            }
+        }
+    }
+    if open > 0 {
+        // Whoever was not looked at may well have somebody.
+        let groups = writers.iter_mut().chain(readers);
+        groups.for_each(|group| group.unmatched = None);
+        findings.unexamined += open;
+    }
+    for (policy, pairs) in Policy::ALL.into_iter().zip(counts) {
+        if pairs > 0 {
+            findings.qos_pairs.push(QosPairs {
+                topic: key(),
+                policy,
+                pairs,
+            });
+        }
+    }
+}
+
+/// Names pairs of these two kinds, as far as there is room; gives how many.
+fn list(
+    writers: &Group<'_>,
+    readers: &Group<'_>,
+    policies: Policies,
+    room: usize,
+    key: &impl Fn() -> TopicKey,
+    findings: &mut Findings,
+) -> usize {
+    let pairs = writers.members.iter().flat_map(|writer| {
+        let readers = readers.members.iter();
+        readers.map(move |reader| (*writer, *reader))
+    });
+    let mut count = 0;
+    for (writer, reader) in pairs.take(room) {
+        count += 1;
+        findings.add(Diagnosis::QosIncompatible {
+            topic: key(),
+            writer,
+            reader,
+            policies,
+        });
+    }
+    count
+}
+
+/// Whether somebody should listen and somebody should speak. Not so where every node has an end as
+/// a matter of course, of which most lead nowhere: `/rosout`, `/parameter_events`, a lifecycle
+/// node's `transition_event`, hidden topics, and the topics of services and actions.
+fn is_about_hearing(topic: &Topic) -> bool {
+    let naming = &topic.naming;
+    naming.kind == "topic"
+        && !naming.hidden
+        && !matches!(&*naming.name, "/rosout" | "/parameter_events")
+        && !naming.name.ends_with("/transition_event")
+}

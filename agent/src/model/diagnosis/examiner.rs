@@ -1,0 +1,172 @@
+//! When to look, and what is kept of it.
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::endpoints::{Lonely, Lookout};
+use super::{Diagnoses, Diagnosis, QosPairs, nodes};
+use crate::model::discovery::Discovery;
+use crate::model::topic::Topics;
+
+const SECOND: u64 = 1_000_000_000;
+/// How long an endpoint is alone before that is a finding: nodes start one after another.
+pub(super) const PATIENCE: u64 = 5 * SECOND;
+/// Most findings kept of each kind.
+pub(super) const PER_KIND: usize = 256;
+/// Most series of incompatible pairs.
+const MAX_QOS_PAIRS: usize = 1024;
+/// Steps that one look may take, some ten nanoseconds each, and how many for one topic.
+const STEPS: usize = 500_000;
+const STEPS_PER_TOPIC: usize = 50_000;
+
+/// Finds what is wrong whenever something has changed.
+#[derive(Debug, Default)]
+pub struct Examiner {
+    /// Discovery's revision at the last look.
+    revision: Option<u64>,
+    /// When patience ends with somebody who is alone.
+    due: Option<Timestamp>,
+    /// Since when who is alone.
+    alone: HashMap<Guid, Timestamp>,
+    current: Arc<Diagnoses>,
+    left_out: u64,
+}
+
+/// Collects findings within the caps.
+#[derive(Debug)]
+pub(super) struct Findings {
+    list: Vec<Diagnosis>,
+    counts: [usize; Diagnosis::KINDS.len()],
+    pub(super) qos_pairs: Vec<QosPairs>,
+    left_out: u64,
+    pub(super) unexamined: u64,
+    /// Steps that may still be taken, and how many for this topic.
+    steps: usize,
+    steps_here: usize,
+}
+
+impl Examiner {
+    /// The findings of the last look.
+    #[must_use]
+    pub const fn current(&self) -> &Arc<Diagnoses> {
+        &self.current
+    }
+
+    /// How many findings there are, the cap, and how many had no room so far.
+    #[must_use]
+    pub fn size(&self) -> (usize, usize, u64) {
+        let limit = PER_KIND * Diagnosis::KINDS.len();
+        (self.current.list.len(), limit, self.left_out)
+    }
+
+    /// Looks again the next time, whatever discovery says of itself.
+    pub fn forget(&mut self) {
+        self.revision = None;
+    }
+
+    /// Looks, unless nothing has changed since the last time.
+    pub fn examine(&mut self, discovery: &Discovery, topics: &Topics, now: Timestamp) {
+        let is_due = self.due.is_some_and(|due| due <= now);
+        if self.revision == Some(discovery.revision()) && !is_due {
+            return;
+        }
+        self.revision = Some(discovery.revision());
+        let mut findings = Findings::new();
+        let lookout = Lookout::new(discovery);
+        let mut alone = HashMap::new();
+        let mut due = None;
+        for (_, topic) in topics.iter() {
+            for lonely in lookout.examine(topic, &mut findings) {
+                let Lonely { guid, diagnosis } = lonely;
+                let since = self.alone.get(&guid).copied().unwrap_or(now);
+                alone.insert(guid, since);
+                let end = Timestamp(since.0.saturating_add(PATIENCE));
+                if end <= now {
+                    findings.add(diagnosis);
+                } else {
+                    due = Some(due.map_or(end, |due: Timestamp| due.min(end)));
+                }
+            }
+        }
+        nodes::examine(discovery, &mut findings);
+        (self.alone, self.due) = (alone, due);
+        let found = findings.finish();
+        let more = found.left_out.saturating_sub(self.current.left_out);
+        self.left_out += more;
+        if *self.current != found {
+            self.current = Arc::new(found);
+        }
+    }
+}
+
+impl Findings {
+    fn new() -> Self {
+        Self {
+            list: Vec::new(),
+            counts: [0; Diagnosis::KINDS.len()],
+            qos_pairs: Vec::new(),
+            left_out: 0,
+            unexamined: 0,
+            steps: STEPS,
+            steps_here: 0,
+        }
+    }
+
+    /// One more, if its kind has room.
+    pub(super) fn add(&mut self, diagnosis: Diagnosis) {
+        let kinds = Diagnosis::KINDS.iter().zip(&mut self.counts);
+        let mut own = kinds.filter(|(kind, _)| **kind == diagnosis.kind());
+        match own.next() {
+            Some((_, count)) if *count < PER_KIND => {
+                *count += 1;
+                self.list.push(diagnosis);
+            }
+            _ => self.left_out += 1,
+        }
+    }
+
+    /// As many more of which only the number is known.
+    pub(super) const fn leave_out(&mut self, count: u64) {
+        self.left_out += count;
+    }
+
+    /// Another topic is looked at.
+    pub(super) const fn turn(&mut self) {
+        self.steps_here = STEPS_PER_TOPIC;
+    }
+
+    /// Whether so many steps may still be taken; takes them.
+    pub(super) const fn spend(&mut self, steps: usize) -> bool {
+        let may = steps <= self.steps && steps <= self.steps_here;
+        if may {
+            self.steps -= steps;
+            self.steps_here -= steps;
+        }
+        may
+    }
+
+    fn finish(mut self) -> Diagnoses {
+        self.list.sort_unstable();
+        self.list.dedup();
+        let more = self.qos_pairs.len().saturating_sub(MAX_QOS_PAIRS);
+        self.qos_pairs.truncate(MAX_QOS_PAIRS);
+        Diagnoses {
+            list: self.list,
+            qos_pairs: self.qos_pairs,
+            left_out: self.left_out + more as u64,
+            unexamined: self.unexamined,
+        }
+    }
+}
+
+/// Domains of which it is known that not everything is known: a ROS participant lives there of
+/// which no endpoint was announced in the agent's hearing, although each has some.
+pub(super) fn half_known(discovery: &Discovery) -> BTreeSet<u32> {
+    let participants = discovery.participants().values();
+    let silent = participants.filter(|participant| {
+        participant.portrait.enclave.is_some() && participant.endpoints.is_empty()
+    });
+    silent.map(|participant| participant.domain_id).collect()
+}

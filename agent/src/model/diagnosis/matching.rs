@@ -1,0 +1,535 @@
+//! Whether a writer and a reader of one topic understand each other: the request/offered rules of
+//! DDS (DDS 1.4, 2.2.3; XTypes 1.3, 7.6.3.1.1), one by one, from what both announced.
+//!
+//! Says what the participants themselves decide, not what would be reasonable: a value that the
+//! specification does not know is nobody's fault, and what an implementation does not check keeps
+//! nobody apart.
+
+use std::fmt;
+use std::str::Chars;
+
+use ros2probe_wire::Duration;
+use ros2probe_wire::qos::{DataRepresentation, Presentation, Qos};
+use ros2probe_wire::rtps::VendorId;
+
+/// A policy that a writer offers and a reader requests.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Policy {
+    /// The reader wants all samples, the writer does not repeat lost ones.
+    Reliability,
+    /// The reader wants samples from before its time, the writer does not keep them as long.
+    Durability,
+    /// The reader wants samples more often than the writer promises.
+    Deadline,
+    /// The writer may delay samples longer than the reader allows.
+    LatencyBudget,
+    /// The writer says it is alive in a weaker way than the reader wants, or less often.
+    Liveliness,
+    /// One wants an owner for each instance, the other shares.
+    Ownership,
+    /// The reader wants the writers' order, the writer does not offer it.
+    DestinationOrder,
+    /// The reader wants changes together that the writer does not keep together.
+    Presentation,
+    /// The reader does not read the encoding that the writer uses.
+    DataRepresentation,
+}
+
+/// Policies in which a writer and a reader differ.
+#[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Policies(u16);
+
+/// How a writer and a reader stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// They talk.
+    Match,
+    /// They do not, on purpose: no partition is common to both.
+    Partition,
+    /// They do not: these policies are in the way.
+    Incompatible(Policies),
+}
+
+/// What matching asks of one endpoint.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Offer<'a> {
+    /// Quality of service.
+    pub qos: &'a Qos,
+    /// Implementation, for not all check all policies.
+    pub vendor: VendorId,
+}
+
+impl Policy {
+    /// All of them.
+    pub const ALL: [Self; 9] = [
+        Self::Reliability,
+        Self::Durability,
+        Self::Deadline,
+        Self::LatencyBudget,
+        Self::Liveliness,
+        Self::Ownership,
+        Self::DestinationOrder,
+        Self::Presentation,
+        Self::DataRepresentation,
+    ];
+
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Reliability => "reliability",
+            Self::Durability => "durability",
+            Self::Deadline => "deadline",
+            Self::LatencyBudget => "latency_budget",
+            Self::Liveliness => "liveliness",
+            Self::Ownership => "ownership",
+            Self::DestinationOrder => "destination_order",
+            Self::Presentation => "presentation",
+            Self::DataRepresentation => "data_representation",
+        }
+    }
+
+    /// Fast DDS announces these three and lets nothing depend on them.
+    const fn is_checked_by_fast_dds(self) -> bool {
+        !matches!(
+            self,
+            Self::LatencyBudget | Self::DestinationOrder | Self::Presentation
+        )
+    }
+
+    fn is_satisfied(self, offered: &Qos, requested: &Qos) -> bool {
+        /// At least as much, as far as both values have a meaning.
+        fn at_least(offered: (u32, Option<&str>), requested: (u32, Option<&str>)) -> bool {
+            offered.1.is_none() || requested.1.is_none() || offered.0 >= requested.0
+        }
+        macro_rules! at_least {
+            ($policy:ident) => {{
+                let (offered, requested) = (offered.$policy, requested.$policy);
+                at_least((offered.0, offered.name()), (requested.0, requested.name()))
+            }};
+        }
+        match self {
+            Self::Reliability => at_least!(reliability),
+            Self::Durability => at_least!(durability),
+            Self::Deadline => within(offered.deadline, requested.deadline),
+            Self::LatencyBudget => within(offered.latency_budget, requested.latency_budget),
+            Self::Liveliness => {
+                at_least!(liveliness)
+                    && within(offered.liveliness_lease, requested.liveliness_lease)
+            }
+            Self::Ownership => {
+                let kinds = [offered.ownership, requested.ownership];
+                kinds.iter().any(|kind| kind.name().is_none())
+                    || offered.ownership == requested.ownership
+            }
+            Self::DestinationOrder => at_least!(destination_order),
+            Self::Presentation => presents(offered.presentation, requested.presentation),
+            Self::DataRepresentation => {
+                let first = offered.representations.first().copied();
+                let used = first.unwrap_or(DataRepresentation::XCDR1);
+                let read = &requested.representations;
+                read.contains(&used) || read.is_empty() && used == DataRepresentation::XCDR1
+            }
+        }
+    }
+}
+
+impl Policies {
+    /// One more.
+    pub const fn insert(&mut self, policy: Policy) {
+        self.0 |= 1 << policy as u16;
+    }
+
+    /// Whether it is one of them.
+    #[must_use]
+    pub const fn contains(self, policy: Policy) -> bool {
+        self.0 & (1 << policy as u16) != 0
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub const fn is_empty(self) -> bool {
+        self.0 == 0
+    }
+
+    /// In the order of [`Policy::ALL`].
+    pub fn iter(self) -> impl Iterator<Item = Policy> {
+        let all = Policy::ALL.into_iter();
+        all.filter(move |policy| self.contains(*policy))
+    }
+}
+
+impl fmt::Debug for Policies {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_set().entries(self.iter()).finish()
+    }
+}
+
+/// Whether samples of this writer go to this reader of its topic and type.
+#[must_use]
+pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
+    let both = [offered.vendor, requested.vendor];
+    let all_fast = both.iter().all(|vendor| *vendor == VendorId::EPROSIMA);
+    let mut policies = Policies::default();
+    for policy in Policy::ALL {
+        let is_checked = !all_fast || policy.is_checked_by_fast_dds();
+        if is_checked && !policy.is_satisfied(offered.qos, requested.qos) {
+            policies.insert(policy);
+        }
+    }
+    if !have_common_partition(offered.qos, requested.qos) {
+        // Apart on purpose: whether they would understand each other is nobody's question.
+        Verdict::Partition
+    } else if policies.is_empty() {
+        Verdict::Match
+    } else {
+        Verdict::Incompatible(policies)
+    }
+}
+
+/// Upper bound of the steps that [`verdict`] takes for these two.
+#[must_use]
+pub fn effort(offered: &Qos, requested: &Qos) -> usize {
+    let length = |qos: &Qos| -> usize { qos.partitions.iter().map(|name| name.len() + 1).sum() };
+    1 + length(offered) * length(requested)
+}
+
+/// Not longer. Implementations convert between nanoseconds and 2^-32 s each in their own way: one
+/// nanosecond is no difference.
+fn within(offered: Duration, requested: Duration) -> bool {
+    match (offered, requested) {
+        (_, Duration::Infinite) => true,
+        (Duration::Infinite, Duration::Finite(_)) => false,
+        (Duration::Finite(offered), Duration::Finite(requested)) => {
+            offered <= requested.saturating_add(1)
+        }
+    }
+}
+
+fn presents(offered: Presentation, requested: Presentation) -> bool {
+    let scopes = [offered.access_scope, requested.access_scope];
+    let is_wide_enough = scopes.iter().any(|scope| scope.name().is_none())
+        || offered.access_scope >= requested.access_scope;
+    is_wide_enough
+        && (offered.is_coherent || !requested.is_coherent)
+        && (offered.is_ordered || !requested.is_ordered)
+}
+
+/// DDS 1.4, 2.2.3.13: a name that is equal, or that matches the other side's pattern; two patterns
+/// never match. No partition at all is the one with the empty name.
+fn have_common_partition(one: &Qos, other: &Qos) -> bool {
+    fn names(qos: &Qos) -> impl Iterator<Item = &str> {
+        let default = qos.partitions.is_empty().then_some("");
+        qos.partitions.iter().map(AsRef::as_ref).chain(default)
+    }
+    names(one).any(|one| names(other).any(|other| meet(one, other) || meet(other, one)))
+}
+
+/// Whether a name, which is no pattern, matches a name or a pattern of `*` and `?`.
+fn meet(pattern: &str, name: &str) -> bool {
+    let is_pattern = |text: &str| text.contains(['*', '?']);
+    if is_pattern(name) || !is_pattern(pattern) {
+        return pattern == name && !is_pattern(name);
+    }
+    let (mut pattern, mut name) = (pattern.chars(), name.chars());
+    // Behind the last star: the pattern, and the name from where it may swallow one more.
+    let mut retry: Option<(Chars<'_>, Chars<'_>)> = None;
+    loop {
+        let mut next = pattern.clone();
+        match (next.next(), name.clone().next()) {
+            (Some('*'), _) => {
+                pattern = next;
+                retry = Some((pattern.clone(), name.clone()));
+                continue;
+            }
+            (Some(wanted), Some(found)) if wanted == '?' || wanted == found => {
+                pattern = next;
+                name.next();
+                continue;
+            }
+            (None, None) => return true,
+            _ => {}
+        }
+        let Some((behind, from)) = &mut retry else {
+            return false;
+        };
+        if from.next().is_none() {
+            return false;
+        }
+        (pattern, name) = (behind.clone(), from.clone());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use ros2probe_wire::qos::{
+        AccessScope, DestinationOrder, Durability, Liveliness, Ownership, Reliability, Role,
+    };
+
+    use super::*;
+
+    /// Makes a reader ask for more, or a writer offer it.
+    type Demand = fn(&mut Qos);
+
+    const CYCLONE: VendorId = VendorId::CYCLONE;
+    const FAST: VendorId = VendorId::EPROSIMA;
+
+    fn qos(role: Role) -> Qos {
+        Qos::defaults(role, CYCLONE)
+    }
+
+    fn judge(offered: &Qos, requested: &Qos, vendors: [VendorId; 2]) -> Verdict {
+        let [writer, reader] = vendors;
+        let offered = Offer {
+            qos: offered,
+            vendor: writer,
+        };
+        let requested = Offer {
+            qos: requested,
+            vendor: reader,
+        };
+        verdict(offered, requested)
+    }
+
+    fn policies(offered: &Qos, requested: &Qos) -> Vec<Policy> {
+        match judge(offered, requested, [CYCLONE; 2]) {
+            Verdict::Match => Vec::new(),
+            Verdict::Incompatible(policies) => policies.iter().collect(),
+            Verdict::Partition => panic!("{offered:?} and {requested:?} are apart"),
+        }
+    }
+
+    #[test]
+    fn defaults_match() {
+        assert_eq!(policies(&qos(Role::Writer), &qos(Role::Reader)), []);
+    }
+
+    /// Each policy broken alone, and the same pair the other way round, which holds for all but
+    /// the one that has to be equal.
+    #[test]
+    fn each_policy_is_named() {
+        let weak = qos(Role::Writer);
+        let breaking: [(Policy, Demand); 10] = [
+            (Policy::Durability, |qos| {
+                qos.durability = Durability::TRANSIENT_LOCAL;
+            }),
+            (Policy::Deadline, |qos| {
+                qos.deadline = Duration::Finite(5_000_000);
+            }),
+            (Policy::Liveliness, |qos| {
+                qos.liveliness = Liveliness::MANUAL_BY_TOPIC;
+            }),
+            (Policy::Liveliness, |qos| {
+                qos.liveliness_lease = Duration::Finite(1);
+            }),
+            (Policy::DestinationOrder, |qos| {
+                qos.destination_order = DestinationOrder::BY_SOURCE_TIMESTAMP;
+            }),
+            (Policy::Presentation, |qos| {
+                qos.presentation.access_scope = AccessScope::GROUP;
+            }),
+            (Policy::Presentation, |qos| {
+                qos.presentation.is_coherent = true;
+            }),
+            (Policy::Presentation, |qos| {
+                qos.presentation.is_ordered = true;
+            }),
+            (Policy::Ownership, |qos| {
+                qos.ownership = Ownership::EXCLUSIVE;
+            }),
+            (Policy::DataRepresentation, |qos| {
+                qos.representations = vec![DataRepresentation::XCDR2];
+            }),
+        ];
+        for (policy, demand) in breaking {
+            let mut strong = weak.clone();
+            demand(&mut strong);
+            assert_eq!(policies(&weak, &strong), [policy]);
+            let is_symmetric = matches!(policy, Policy::Ownership | Policy::DataRepresentation);
+            let reversed = policies(&strong, &weak);
+            assert_eq!(reversed.is_empty(), !is_symmetric, "{policy:?}");
+        }
+        let mut late = weak.clone();
+        late.latency_budget = Duration::Finite(1_000);
+        assert_eq!(policies(&late, &weak), [Policy::LatencyBudget]);
+        let mut best_effort = weak.clone();
+        best_effort.reliability = Reliability::BEST_EFFORT;
+        assert_eq!(policies(&best_effort, &weak), [Policy::Reliability]);
+        assert_eq!(policies(&weak, &best_effort), []);
+    }
+
+    #[test]
+    fn several_policies_are_all_named() {
+        let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
+        writer.reliability = Reliability::BEST_EFFORT;
+        reader.reliability = Reliability::RELIABLE;
+        reader.durability = Durability::TRANSIENT_LOCAL;
+        let expected = [Policy::Reliability, Policy::Durability];
+        assert_eq!(policies(&writer, &reader), expected);
+    }
+
+    #[test]
+    fn fast_dds_lets_three_policies_pass_among_its_own() {
+        let (writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
+        reader.presentation.is_ordered = true;
+        reader.destination_order = DestinationOrder::BY_SOURCE_TIMESTAMP;
+        assert_eq!(judge(&writer, &reader, [FAST; 2]), Verdict::Match);
+        let mixed = judge(&writer, &reader, [FAST, CYCLONE]);
+        assert!(matches!(mixed, Verdict::Incompatible(_)));
+        reader.reliability = Reliability::RELIABLE;
+        let mut writer = writer;
+        writer.reliability = Reliability::BEST_EFFORT;
+        let fast = judge(&writer, &reader, [FAST; 2]);
+        let Verdict::Incompatible(policies) = fast else {
+            panic!("{fast:?}");
+        };
+        assert_eq!(policies.iter().collect::<Vec<_>>(), [Policy::Reliability]);
+    }
+
+    #[test]
+    fn unknown_values_are_nobodys_fault() {
+        let (writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
+        reader.durability = Durability(9);
+        reader.ownership = Ownership(7);
+        reader.presentation.access_scope = AccessScope(3);
+        assert_eq!(policies(&writer, &reader), []);
+    }
+
+    #[test]
+    fn a_writer_uses_its_first_representation_and_a_reader_accepts_any() {
+        let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
+        writer.representations = vec![DataRepresentation::XCDR2, DataRepresentation::XCDR1];
+        assert_eq!(policies(&writer, &reader), [Policy::DataRepresentation]);
+        reader.representations = vec![DataRepresentation::XCDR1, DataRepresentation::XCDR2];
+        assert_eq!(policies(&writer, &reader), []);
+        writer.representations.clear();
+        assert_eq!(policies(&writer, &reader), []);
+    }
+
+    #[test]
+    fn a_nanosecond_of_rounding_is_no_difference() {
+        let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
+        writer.deadline = Duration::Finite(100_000_001);
+        reader.deadline = Duration::Finite(100_000_000);
+        assert_eq!(policies(&writer, &reader), []);
+        writer.deadline = Duration::Finite(100_000_002);
+        assert_eq!(policies(&writer, &reader), [Policy::Deadline]);
+    }
+
+    #[test]
+    fn partitions_meet_by_name_or_by_one_sides_pattern() {
+        let within = |names: &[&str]| {
+            let mut qos = qos(Role::Writer);
+            qos.partitions = names.iter().map(|name| (*name).into()).collect();
+            qos
+        };
+        for (one, other, expected) in [
+            (&["a"][..], &["a"][..], true),
+            (&["a"], &["b"], false),
+            (&["a", "b"], &["c", "b"], true),
+            (&[], &[""], true),
+            (&[], &["*"], true),
+            (&[], &["a"], false),
+            (&["robot*"], &["robot1"], true),
+            (&["robot*"], &["robot?"], false),
+            (&["robot*"], &["robot*"], false),
+            (&["r?b*t"], &["robot"], true),
+            (&["r?b*t"], &["robots"], false),
+            (&["*a*b"], &["aXaXb"], true),
+        ] {
+            let (one, other) = (within(one), within(other));
+            assert_eq!(have_common_partition(&one, &other), expected, "{one:?}");
+            assert_eq!(have_common_partition(&other, &one), expected, "{one:?}");
+        }
+        let apart = judge(&within(&["a"]), &within(&["b"]), [FAST; 2]);
+        assert_eq!(apart, Verdict::Partition);
+    }
+
+    prop_compose! {
+        fn any_qos()(
+            kinds in [0_u32..4, 0..4, 0..3, 0..2, 0..2, 0..3],
+            durations in proptest::array::uniform3(proptest::option::of(0_u64..4)),
+            flags: [bool; 2],
+            representations in proptest::collection::vec(0_i16..3, 0..3),
+        ) -> Qos {
+            let [reliability, durability, liveliness, ownership, order, scope] = kinds;
+            // Steps of a microsecond: far from rounding.
+            let [deadline, budget, lease] = durations
+                .map(|it| it.map_or(Duration::Infinite, |it| Duration::Finite(it * 1_000)));
+            let mut qos = Qos::defaults(Role::Writer, CYCLONE);
+            qos.reliability = Reliability(1 + reliability % 2);
+            qos.durability = Durability(durability);
+            qos.liveliness = Liveliness(liveliness);
+            qos.ownership = Ownership(ownership);
+            qos.destination_order = DestinationOrder(order);
+            qos.presentation.access_scope = AccessScope(scope);
+            [qos.presentation.is_coherent, qos.presentation.is_ordered] = flags;
+            (qos.deadline, qos.latency_budget, qos.liveliness_lease) = (deadline, budget, lease);
+            qos.representations = representations.into_iter().map(DataRepresentation).collect();
+            qos
+        }
+    }
+
+    proptest! {
+        /// The rules as the specification's table has them, written down a second time.
+        #[test]
+        fn the_rules_are_those_of_the_specification(offered in any_qos(), requested in any_qos()) {
+            let used = *offered.representations.first().unwrap_or(&DataRepresentation::XCDR1);
+            let mut read = requested.representations.clone();
+            if read.is_empty() {
+                read.push(DataRepresentation::XCDR1);
+            }
+            let expected = [
+                offered.reliability.0 < requested.reliability.0,
+                offered.durability.0 < requested.durability.0,
+                offered.deadline > requested.deadline,
+                offered.latency_budget > requested.latency_budget,
+                offered.liveliness.0 < requested.liveliness.0
+                    || offered.liveliness_lease > requested.liveliness_lease,
+                offered.ownership.0 != requested.ownership.0,
+                offered.destination_order.0 < requested.destination_order.0,
+                offered.presentation.access_scope.0 < requested.presentation.access_scope.0
+                    || !offered.presentation.is_coherent && requested.presentation.is_coherent
+                    || !offered.presentation.is_ordered && requested.presentation.is_ordered,
+                !read.contains(&used),
+            ];
+            let broken = policies(&offered, &requested);
+            for (policy, expected) in Policy::ALL.into_iter().zip(expected) {
+                prop_assert_eq!(broken.contains(&policy), expected, "{:?}", policy);
+            }
+        }
+
+        /// Whoever offers what a third one requests of a second one, and gets it, offers it too:
+        /// "at least" is an order. Encodings and owners are no order, only equal or not.
+        #[test]
+        fn at_least_is_an_order(mut three in proptest::array::uniform3(any_qos())) {
+            for qos in &mut three {
+                qos.representations.clear();
+            }
+            let [one, two, three] = three;
+            prop_assert_eq!(policies(&one, &one), []);
+            if policies(&one, &two).is_empty() && policies(&two, &three).is_empty() {
+                prop_assert_eq!(policies(&one, &three), []);
+            }
+        }
+
+        /// Against the slow and obvious way.
+        #[test]
+        fn patterns_match_as_a_naive_matcher_says(pattern in "[ab*?]{0,7}", name in "[ab]{0,7}") {
+            fn naive(pattern: &[u8], name: &[u8]) -> bool {
+                match (pattern.split_first(), name.split_first()) {
+                    (None, None) => true,
+                    (Some((b'*', rest)), _) if naive(rest, name) => true,
+                    (Some((b'*', _)), Some((_, shorter))) => naive(pattern, shorter),
+                    (Some((wanted, rest)), Some((found, shorter))) => {
+                        (*wanted == b'?' || wanted == found) && naive(rest, shorter)
+                    }
+                    _ => false,
+                }
+            }
+            let expected = naive(pattern.as_bytes(), name.as_bytes());
+            prop_assert_eq!(meet(&pattern, &name), expected);
+        }
+    }
+}

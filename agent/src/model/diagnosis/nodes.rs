@@ -1,0 +1,121 @@
+//! Nodes: is a name taken twice, is one node in several domains?
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::IpAddr;
+use std::sync::Arc;
+
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+use super::Diagnosis;
+use super::examiner::Findings;
+use crate::model::discovery::{Discovery, Node, Participant};
+
+/// One node with whom it belongs to.
+#[derive(Clone, Copy, Debug)]
+struct Placed<'a> {
+    prefix: GuidPrefix,
+    participant: &'a Participant,
+    node: &'a Node,
+}
+
+/// Adds what is found.
+pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
+    let mut names: BTreeMap<&Arc<str>, Vec<Placed<'_>>> = BTreeMap::new();
+    for (prefix, participant) in discovery.participants() {
+        // Who was there before the agent's start and was not heard since may be its own successor.
+        if participant.restored.is_some() {
+            continue;
+        }
+        for node in participant.nodes.iter().filter(|node| !is_hidden(node)) {
+            let prefix = *prefix;
+            names.entry(&node.name).or_default().push(Placed {
+                prefix,
+                participant,
+                node,
+            });
+        }
+    }
+    for (name, nodes) in &mut names {
+        nodes.sort_by_key(|each| (each.participant.domain_id, each.prefix));
+        let domains =
+            nodes.chunk_by(|one, other| one.participant.domain_id == other.participant.domain_id);
+        for nodes in domains.filter(|nodes| nodes.len() > 1) {
+            findings.add(Diagnosis::DuplicateNode {
+                domain_id: nodes.first().map_or(0, |each| each.participant.domain_id),
+                node: Arc::clone(name),
+                participants: nodes.iter().map(Placed::guid).collect(),
+            });
+        }
+        several_domains(name, nodes, discovery, findings);
+    }
+}
+
+/// One node in several domains: its endpoints are announced there, or nodes of its name live there
+/// on the same machine. Robots whose nodes have the same names and whose domains keep them apart
+/// are a fleet as it should be.
+fn several_domains(
+    name: &Arc<str>,
+    nodes: &[Placed<'_>],
+    discovery: &Discovery,
+    findings: &mut Findings,
+) {
+    let mut machines: BTreeMap<BTreeSet<IpAddr>, (Guid, BTreeSet<u32>)> = BTreeMap::new();
+    let lonely = nodes.len() == 1;
+    for placed in nodes {
+        let mut domains = placed.domains(discovery);
+        let machine = if lonely { None } else { placed.machine() };
+        if let Some(machine) = machine {
+            let (guid, all) = machines
+                .entry(machine)
+                .or_insert_with(|| (placed.guid(), BTreeSet::new()));
+            *guid = placed.guid().min(*guid);
+            all.append(&mut domains);
+        } else if domains.len() > 1 {
+            findings.add(finding(name, placed.guid(), &domains));
+        }
+    }
+    for (guid, domains) in machines
+        .into_values()
+        .filter(|(_, domains)| domains.len() > 1)
+    {
+        findings.add(finding(name, guid, &domains));
+    }
+}
+
+fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<u32>) -> Diagnosis {
+    Diagnosis::NodeInSeveralDomains {
+        node: Arc::clone(name),
+        participant,
+        domains: domains.iter().copied().collect(),
+    }
+}
+
+impl Placed<'_> {
+    fn guid(&self) -> Guid {
+        Guid::new(self.prefix, EntityId::PARTICIPANT)
+    }
+
+    /// Domains of its participant and of the endpoints it has.
+    fn domains(&self, discovery: &Discovery) -> BTreeSet<u32> {
+        let guids = self.node.writers.iter().chain(&self.node.readers);
+        // Its own participant's are where the participant is.
+        let foreign = guids.filter(|guid| guid.prefix != self.prefix);
+        let endpoints = foreign.filter_map(|guid| discovery.endpoints().get(guid));
+        let mut domains: BTreeSet<_> = endpoints.map(|endpoint| endpoint.domain_id).collect();
+        domains.insert(self.participant.domain_id);
+        domains
+    }
+
+    /// Its machine: where it is reached. Host names tell less, for robots of a series share them.
+    fn machine(&self) -> Option<BTreeSet<IpAddr>> {
+        let addresses = &self.participant.addresses;
+        let all = addresses.default.iter().chain(&addresses.metatraffic);
+        let machine: BTreeSet<_> = all.map(std::net::SocketAddr::ip).collect();
+        (!machine.is_empty()).then_some(machine)
+    }
+}
+
+/// Nodes that `ros2 node list` hides: those of the command line, which come and go.
+fn is_hidden(node: &Node) -> bool {
+    node.name.split('/').any(|token| token.starts_with('_'))
+}

@@ -1,0 +1,44 @@
+//! What is wrong with the graph: a series lives as long as its finding.
+
+use super::{Metric, TOPIC};
+
+pub(in crate::surface) const DIAGNOSES: Metric = Metric::gauge(
+    "ros2_diagnoses",
+    &["kind"],
+    "Findings about the graph of each kind, also while there is none; /topics names them.",
+);
+pub(in crate::surface) const QOS_INCOMPATIBLE_PAIRS: Metric = Metric::gauge(
+    "ros2_qos_incompatible_pairs",
+    &["domain_id", "topic", "policy"],
+    "Publishers and subscribers of one topic that do not talk because of this policy, in pairs.",
+);
+pub(in crate::surface) const TOPIC_CONFLICTING_TYPES: Metric = Metric::gauge(
+    "ros2_topic_conflicting_types",
+    TOPIC,
+    "Types of a topic that has several: endpoints of different types do not talk.",
+);
+pub(in crate::surface) const TOPIC_CONFLICTING_TYPE_HASHES: Metric = Metric::gauge(
+    "ros2_topic_conflicting_type_hashes",
+    TOPIC,
+    "Definitions of one type on a topic that has several: its nodes misread each other.",
+);
+pub(in crate::surface) const UNHEARD_PUBLISHERS: Metric = Metric::gauge(
+    "ros2_topic_unheard_publishers",
+    TOPIC,
+    "Publishers that have had no matching subscriber for 5 s; not on /rosout and the like.",
+);
+pub(in crate::surface) const UNFED_SUBSCRIPTIONS: Metric = Metric::gauge(
+    "ros2_topic_unfed_subscriptions",
+    TOPIC,
+    "Subscriptions that have had no matching publisher for 5 s; not on /rosout and the like.",
+);
+pub(in crate::surface) const DUPLICATE_NODES: Metric = Metric::gauge(
+    "ros2_duplicate_nodes",
+    &["domain_id", "ros_node"],
+    "Nodes of one name in one domain, where there are several.",
+);
+pub(in crate::surface) const NODE_DOMAINS: Metric = Metric::gauge(
+    "ros2_node_domains",
+    &["ros_node", "participant"],
+    "Domains of a node that is in several on one machine.",
+);
