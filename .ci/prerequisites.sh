@@ -2,6 +2,7 @@
 # Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
 #
 #   prerequisites.sh demo|test|ebpf|fuzz...   install what those targets need
+#   prerequisites.sh types                    install what the dashboards are type-checked with
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
 #
 # Made for Debian 12 and Ubuntu 22.04 or newer. It starts no service, adds no package source and
@@ -63,6 +64,18 @@ prometheus() {
     mkdir -p "$tools"
     (cd "$tools" && apt-get -o APT::Sandbox::User=root download -qq prometheus &&
         dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb)
+}
+
+# What the dashboards are type-checked with. Without it one test fails and says so.
+types() {
+    local directory=$tools/grafana lock=dashboards/check/package-lock.json
+    cmp -s "$lock" "$directory/package-lock.json" && [ -d "$directory/node_modules/typescript" ] && return
+    command -v npm >/dev/null || packages npm
+    say "installing @grafana/schema and typescript into target/tools/grafana"
+    mkdir -p "$directory"
+    cp dashboards/check/package.json "$lock" "$directory"
+    (cd "$directory" && npm ci --ignore-scripts --no-audit --no-fund --silent) ||
+        { rm -f "$directory/package-lock.json"; say "npm failed: the dashboards cannot be type-checked"; }
 }
 
 rust() {
@@ -136,9 +149,11 @@ for need; do
         packages "${network_tools[@]}" gcc g++ make tshark systemd \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
         prometheus
+        types
         rust
         ebpf
         ;;
+    types) types ;;
     ebpf)
         rust
         ebpf
@@ -152,6 +167,6 @@ for need; do
             cargo install cargo-fuzz --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, ebpf, fuzz" ;;
+    *) die "prerequisites.sh: $need is none of demo, test, types, ebpf, fuzz" ;;
     esac
 done

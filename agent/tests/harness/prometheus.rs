@@ -1,5 +1,6 @@
 //! A real Prometheus on a host, and what it answers.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -33,7 +34,7 @@ impl<'a> Prometheus<'a> {
         let text = format!(
             "global: {{scrape_interval: 1s, evaluation_interval: 1s}}\n\
              rule_files: {rules:?}\n\
-             scrape_configs: [{{job_name: robots, static_configs: [{{targets: {targets:?}}}]}}]\n",
+             scrape_configs: [{{job_name: ros2probe, static_configs: [{{targets: {targets:?}}}]}}]\n",
         );
         std::fs::write(&configuration, text)?;
         let arguments = [
@@ -90,12 +91,21 @@ impl<'a> Prometheus<'a> {
 
     /// How many series an expression has now.
     pub(crate) fn series(&self, expression: &str) -> Result<usize> {
-        let answer = self.ask(expression)?;
+        Ok(self.label_sets(expression)?.len())
+    }
+
+    /// The labels of each series that an expression has now.
+    pub(crate) fn label_sets(&self, expression: &str) -> Result<Vec<BTreeMap<String, String>>> {
+        let answer = self
+            .ask(expression)
+            .with_context(|| expression.to_owned())?;
         let result = answer.pointer("/data/result");
         let series = result.and_then(|result| result.as_array());
-        Ok(series
+        let labels = series
             .with_context(|| format!("{expression}: {answer}"))?
-            .len())
+            .iter()
+            .map(|series| Ok(serde_json::from_value(series["metric"].clone())?));
+        labels.collect()
     }
 
     fn ask(&self, expression: &str) -> Result<serde_json::Value> {
