@@ -62,8 +62,12 @@ pub(crate) struct Run {
     #[arg(long, value_name = "GLOB", value_parser = watch)]
     pub(crate) watch: Vec<Watch>,
     /// Address and port of the metrics listener, or `off`, instead of the configured one
-    #[arg(long, value_name = "ADDR|off", value_parser = metrics)]
+    #[arg(long, value_name = "ADDR|off", value_parser = listen)]
     pub(crate) metrics: Option<Listen>,
+    /// Address and port of the control API, or `off` (also for its unix socket), instead of the
+    /// configured one
+    #[arg(long, value_name = "ADDR|off", value_parser = listen)]
+    pub(crate) api: Option<Listen>,
 }
 
 #[derive(Debug, Args)]
@@ -108,7 +112,7 @@ pub(crate) struct Discover {
     pub(crate) config: Option<PathBuf>,
 }
 
-/// Where `--metrics` wants the listener.
+/// Where `--metrics` or `--api` wants the listener.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Listen(pub(crate) Option<SocketAddr>);
 
@@ -123,7 +127,7 @@ fn prefix(text: &str) -> Result<GuidPrefix, String> {
     prefix.ok_or_else(|| "must be 24 hexadecimal digits, as in ros2_participant_info".to_owned())
 }
 
-fn metrics(address: &str) -> Result<Listen, String> {
+fn listen(address: &str) -> Result<Listen, String> {
     if address == "off" {
         return Ok(Listen(None));
     }

@@ -11,3 +11,4 @@ pub mod privilege;
 pub mod run;
 pub mod state;
 pub mod surface;
+pub mod watches;

@@ -2,6 +2,7 @@
 
 mod ask;
 mod cli;
+mod control;
 mod logging;
 mod memory;
 mod supervise;
@@ -9,26 +10,27 @@ mod supervise;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::mpsc::sync_channel;
 
 use anyhow::{Context as _, Result};
 use clap::Parser as _;
 use ros2probe::capture::live::LiveSource;
 use ros2probe::capture::pcap::Speed;
-use ros2probe::config::{Config, ConfigError, Watchlist};
+use ros2probe::config::{Config, ConfigError};
 use ros2probe::model::observer::{self, Observer};
 use ros2probe::model::reassembly::Limits;
 use ros2probe::privilege::{self, Missing};
 use ros2probe::run::replay::Replay;
 use ros2probe::run::{Run, Source};
 use ros2probe::state::Keeper;
+use ros2probe::surface::api::{self, reload};
 use ros2probe::surface::http::Server;
 use ros2probe::surface::{Board, Exposition, Format, Settings};
+use ros2probe::watches::Watches;
 use tokio_util::sync::CancellationToken;
 
 use cli::{Arguments, Command, DEFAULT_CONFIG};
 use logging::Log;
-use supervise::{Supervisor, add_watches};
+use supervise::{Supervisor, Surfaces};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
@@ -52,22 +54,24 @@ fn main() -> ExitCode {
 /// The agent's life, in order.
 fn run(options: cli::Run) -> Result<()> {
     let (mut config, file) = configuration(options.config.as_deref())?;
-    add_watches(&mut config, &options.watch);
     if let Some(listen) = options.metrics {
         config.metrics.listen = listen.0;
     } else if options.report {
         config.metrics.listen = None;
     }
+    control::choose(&mut config.api, options.api, options.report);
     let log = Log::start(config.log);
     let source = open(&options, &config)?;
     source.announce(&config.capture);
     let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
-    let watchlist = Watchlist::new(config.watches.clone()).context("the watchlist is unusable")?;
+    let watches = Watches::new(Arc::clone(&board), config.watches.clone(), options.watch);
+    let watches = Arc::new(watches.context("the watchlist is unusable")?);
     let server = config
         .metrics
         .listen
         .map(|address| Server::bind(address, Arc::clone(&board)));
     let server = server.transpose()?;
+    let control = control::open(&config.api)?;
     let state = match &source {
         Source::Live(_) => memory::open(&config.state_directory),
         Source::Replay(_) => None,
@@ -75,25 +79,34 @@ fn run(options: cli::Run) -> Result<()> {
     let known = state.as_ref().and_then(memory::load);
     privilege::give_up()?;
     if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {
-        tracing::info!(%address, watches = config.watches.len(), "serving metrics");
+        let watches = watches.in_force().entries().len();
+        tracing::info!(%address, watches, "serving metrics");
+    }
+    for door in control.doors() {
+        tracing::info!(address = door, "serving the control API");
     }
 
     let stop = CancellationToken::new();
-    let (orders, inbox) = sync_channel(4);
     let grace = u64::try_from(config.topic_grace.as_nanos()).unwrap_or(u64::MAX);
     let settings = observer::Settings {
         topic_grace: grace,
         ..observer::Settings::default().with_limits(&config.limits)
     };
     let mut observer = Observer::new(settings);
-    observer.set_watchlist(watchlist);
     if let (Some(known), Source::Live(live)) = (known, &source) {
         observer.restore(&known, live.clock());
     }
     let keeper = state.map(Keeper::start).transpose();
     let keeper = keeper.context("cannot start the thread that keeps state")?;
-    let run = Run::new(source, observer, Arc::clone(&board), inbox, stop.clone()).keeping(keeper);
-    if options.report && server.is_none() {
+    let run = Run::new(
+        source,
+        observer,
+        Arc::clone(&board),
+        Arc::clone(&watches),
+        stop.clone(),
+    );
+    let run = run.keeping(keeper);
+    if options.report && server.is_none() && control.is_empty() {
         let ended = run.run();
         print!("{}", Exposition::new(board).render(Format::Classic)?);
         return Ok(ended?);
@@ -102,17 +115,28 @@ fn run(options: cli::Run) -> Result<()> {
         .enable_all()
         .build();
     let runtime = runtime.context("cannot start the runtime of the metrics listener")?;
-    let extra = options.watch;
+    let (reloader, reloads) = reload::channel();
+    let context = api::Context {
+        board: Arc::clone(&board),
+        watches: Arc::clone(&watches),
+        reloader,
+        stop: stop.clone(),
+    };
     let supervisor = Supervisor {
         board: Arc::clone(&board),
         config,
         file,
-        extra,
-        orders,
+        watches,
+        reloads,
         stop,
         log,
     };
-    runtime.block_on(supervisor.run(run, server, options.report))?;
+    let surfaces = Surfaces {
+        metrics: server,
+        control,
+        context,
+    };
+    runtime.block_on(supervisor.run(run, surfaces, options.report))?;
     if options.report {
         print!("{}", Exposition::new(board).render(Format::Classic)?);
     }

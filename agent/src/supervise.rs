@@ -3,19 +3,22 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::mpsc::SyncSender;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow};
-use ros2probe::config::{Config, Watch, Watchlist};
-use ros2probe::run::{Order, Run, RunError};
+use ros2probe::config::{Config, ConfigError};
+use ros2probe::run::{Run, RunError};
+use ros2probe::surface::api;
+use ros2probe::surface::api::reload::{NotReloaded, Reloaded, Reloads};
 use ros2probe::surface::events::Sight;
 use ros2probe::surface::http::Server;
 use ros2probe::surface::{Board, Settings};
+use ros2probe::watches::Watches;
 use sd_notify::NotifyState;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
+use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
 
@@ -31,13 +34,19 @@ const DRAIN: Duration = Duration::from_secs(3);
 pub(crate) struct Supervisor {
     pub(crate) board: Arc<Board>,
     pub(crate) config: Config,
-    /// Where the configuration came from; read again on SIGHUP.
+    /// Where the configuration came from; read again on SIGHUP and when a client asks.
     pub(crate) file: Option<PathBuf>,
-    /// From the command line: they stay through reloads.
-    pub(crate) extra: Vec<Watch>,
-    pub(crate) orders: SyncSender<Order>,
+    pub(crate) watches: Arc<Watches>,
+    pub(crate) reloads: Reloads,
     pub(crate) stop: CancellationToken,
     pub(crate) log: Log,
+}
+
+/// What is served, bound and not answered yet.
+pub(crate) struct Surfaces {
+    pub(crate) metrics: Option<Server>,
+    pub(crate) control: api::Server,
+    pub(crate) context: api::Context,
 }
 
 /// Signals that are listened to from before the working thread starts.
@@ -56,10 +65,15 @@ struct Worker {
 impl Supervisor {
     /// Runs everything until a signal or a failure, or with `once` until the capture ends, and says
     /// in the log how it ended.
-    pub(crate) async fn run(mut self, run: Run, server: Option<Server>, once: bool) -> Result<()> {
+    pub(crate) async fn run(mut self, run: Run, surfaces: Surfaces, once: bool) -> Result<()> {
         let mut signals = Signals::listen().context("cannot listen to signals")?;
         let mut worker = Worker::start(run).context("cannot start the working thread")?;
-        let serving = server.map(|server| tokio::spawn(server.serve(self.stop.clone())));
+        let mut serving = JoinSet::new();
+        if let Some(metrics) = surfaces.metrics {
+            serving.spawn(metrics.serve(self.stop.clone()));
+        }
+        surfaces.control.serve(&surfaces.context, &mut serving)?;
+        drop(surfaces.context);
         let mut watchdog = Watchdog::new();
         let mut tick = ticks(STARTING_TICK);
         let mut working = true;
@@ -68,7 +82,17 @@ impl Supervisor {
             tokio::select! {
                 _ = signals.terminate.recv() => break Ok("SIGTERM"),
                 _ = signals.interrupt.recv() => break Ok("SIGINT"),
-                _ = signals.hangup.recv() => self.reload(),
+                _ = signals.hangup.recv() => {
+                    let _ = self.reload();
+                }
+                Some(answer) = self.reloads.next() => {
+                    // Who asked may have gone.
+                    let _ = answer.send(self.reload());
+                }
+                Some(ended) = serving.join_next() => {
+                    let ended = ended.map_err(anyhow::Error::from).and_then(|served| Ok(served?));
+                    break Err(ended.err().unwrap_or_else(|| anyhow!("a listener ended")));
+                }
                 ended = &mut worker.ended, if working => {
                     working = false;
                     match ended {
@@ -95,9 +119,7 @@ impl Supervisor {
             if working {
                 let _ = (&mut worker.ended).await;
             }
-            if let Some(serving) = serving {
-                let _ = serving.await;
-            }
+            while serving.join_next().await.is_some() {}
         });
         let drained = drained.await.is_ok();
         if drained && worker.thread.join().is_err() {
@@ -113,56 +135,48 @@ impl Supervisor {
     }
 
     /// Reads the configuration again; a mistake changes nothing.
-    fn reload(&mut self) {
+    fn reload(&mut self) -> Result<Reloaded, NotReloaded> {
         let Some(file) = &self.file else {
             tracing::warn!("nothing to reload: the agent was started without a configuration file");
-            return;
+            return Err(NotReloaded::NoFile);
         };
         if let Ok(now) = NotifyState::monotonic_usec_now() {
             let _ = sd_notify::notify(&[NotifyState::Reloading, now]);
         }
-        match Config::load(file) {
-            Ok(config) => self.take_over(config),
-            Err(error) => {
-                let error = format!("{:#}", anyhow!(error));
-                self.board.reload_failed(&error);
-                for line in error.lines() {
-                    tracing::error!(error = line, "the configuration was not reloaded");
-                }
-            }
-        }
+        let done = Config::load(file)
+            .map_err(|error| mistakes(&error))
+            .and_then(|config| self.take_over(&config));
         let _ = sd_notify::notify(&[NotifyState::Ready]);
+        done.map_err(|mistakes| {
+            self.board.reload_failed(&mistakes.join("\n"));
+            for line in &mistakes {
+                tracing::error!(error = line, "the configuration was not reloaded");
+            }
+            NotReloaded::Mistakes(mistakes)
+        })
     }
 
-    fn take_over(&mut self, mut config: Config) {
-        for key in self.config.needs_restart(&config) {
+    fn take_over(&mut self, config: &Config) -> Result<Reloaded, Vec<String>> {
+        let configured = self.watches.configure(config.watches.clone());
+        configured.map_err(|error| vec![error.to_string()])?;
+        let needs_restart = self.config.needs_restart(config);
+        for key in &needs_restart {
             tracing::warn!(key, "the change takes effect after a restart");
         }
-        add_watches(&mut config, &self.extra);
-        let watchlist = match Watchlist::new(config.watches.clone()) {
-            Ok(watchlist) => watchlist,
-            Err(error) => {
-                self.board.reload_failed(&error.to_string());
-                tracing::error!(%error, "the configuration was not reloaded");
-                return;
-            }
-        };
-        // Full or gone: the thread is stuck or has ended, and /readyz says so.
-        if self.orders.try_send(Order::Watch(watchlist)).is_err() {
-            tracing::warn!("the watchlist was not handed over: nothing is captured any more");
-        }
         self.log.set(config.log);
-        let settings = Settings::new(&config);
-        // The cap of the tables is the one the agent was started with.
-        let max_topics = self.config.limits.topics;
+        let in_force = self.watches.in_force();
         self.board.reloaded(Settings {
-            max_topics,
-            ..settings
+            watches: in_force.watchlist().watches().to_vec(),
+            // The cap of the tables is the one the agent was started with.
+            max_topics: self.config.limits.topics,
+            ..Settings::new(config)
         });
-        tracing::info!(
-            watches = config.watches.len(),
-            "the configuration was reloaded"
-        );
+        let watches = in_force.entries().len();
+        tracing::info!(watches, "the configuration was reloaded");
+        Ok(Reloaded {
+            watches,
+            needs_restart,
+        })
     }
 }
 
@@ -172,15 +186,15 @@ fn ticks(period: Duration) -> Interval {
     ticks
 }
 
-/// Adds the command line's watches to the configured ones.
-pub(crate) fn add_watches(config: &mut Config, extra: &[Watch]) {
-    for watch in extra {
-        let same =
-            |other: &Watch| other.pattern == watch.pattern && other.domain_id == watch.domain_id;
-        if !config.watches.iter().any(same) {
-            config.watches.push(watch.clone());
-        }
+/// One line each.
+fn mistakes(error: &ConfigError) -> Vec<String> {
+    let mut text = error.to_string();
+    let mut cause = std::error::Error::source(error);
+    while let Some(error) = cause {
+        text = format!("{text}: {error}");
+        cause = error.source();
     }
+    text.lines().map(str::to_owned).collect()
 }
 
 impl Signals {

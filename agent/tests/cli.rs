@@ -104,6 +104,16 @@ fn a_busy_port_is_named_with_the_key_that_moves_it() {
         1,
         &[&address, "metrics.listen", "--metrics", "in use"],
     );
+    let output = run(&[
+        "run",
+        "--replay",
+        capture.to_str().unwrap(),
+        "--metrics",
+        "off",
+        "--api",
+        &address,
+    ]);
+    fails_with(&output, 1, &[&address, "api.listen", "--api", "in use"]);
 }
 
 #[test]

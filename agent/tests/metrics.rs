@@ -24,11 +24,11 @@ fn settings() -> Settings {
         ..Expectations::default()
     };
     Settings {
-        watches: vec![Watch {
+        watches: vec![Arc::new(Watch {
             expectations,
             per_subscriber: true,
             ..Watch::named("/**").unwrap()
-        }],
+        })],
         histograms: true,
         per_writer: true,
         max_topics: 1_000,
@@ -253,7 +253,7 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
     assert_eq!(sample(&asked, &drops), Some("5"));
 
     let mut plain = settings();
-    plain.watches[0].per_subscriber = false;
+    Arc::make_mut(&mut plain.watches[0]).per_subscriber = false;
     let plain = page(snapshot, plain, Format::Classic);
     for (name, cause, value) in sums {
         let series = series(name, topic, cause);
@@ -504,7 +504,7 @@ fn a_page_of_a_thousand_measured_topics_stays_below_16_kb_a_topic() {
         per_writer: false,
         ..settings()
     };
-    settings.watches[0].per_subscriber = false;
+    Arc::make_mut(&mut settings.watches[0]).per_subscriber = false;
     let all = page(snapshot.clone(), settings.clone(), Format::Classic).len();
     assert!(all < 16_000_000, "{all} bytes");
     let lean = page(

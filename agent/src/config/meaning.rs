@@ -10,9 +10,14 @@ use globset::Glob;
 use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
-use super::shape::{CaptureShape, ConfigShape, MetricsShape, WatchEntryShape, WatchShape};
+use super::shape::{
+    ApiShape, CaptureShape, ConfigShape, MetricsShape, WatchEntryShape, WatchShape,
+};
 use super::watch::{Expectations, Watch, check_pattern};
-use super::{CaptureSettings, Config, Limits, MetricsSettings, SourceChoice, StateChoice};
+use super::{
+    ApiSettings, CaptureSettings, Config, Limits, MetricsSettings, SocketChoice, SourceChoice,
+    StateChoice,
+};
 
 /// A watchlist that long should be globs.
 const MAX_WATCHES: usize = 1_000;
@@ -90,6 +95,7 @@ impl Reader {
             },
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(&shape.metrics.unwrap_or_default()),
+            api: self.api(shape.api.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             state_directory: state(&shape.state_directory),
             log: shape.log,
@@ -148,6 +154,29 @@ impl Reader {
                 max_silence_s: entry.max_silence_s,
             },
             per_subscriber: entry.per_subscriber,
+        }
+    }
+
+    /// Who can reach an address beyond this host has to prove that he may change what is watched.
+    fn api(&mut self, shape: ApiShape) -> ApiSettings {
+        let listen: Option<SocketAddr> = shape.listen.parse().ok();
+        let open = listen.filter(|address| !address.ip().is_loopback());
+        if let (Some(address), None) = (open, &shape.token_file) {
+            let message = format!(
+                "is {address}, which others can reach: that needs `token_file` too, or use \
+                 127.0.0.1"
+            );
+            self.wrong("api.listen", message);
+        }
+        ApiSettings {
+            // Text that is no address is `off`: everything else was refused before.
+            listen,
+            socket: match shape.socket.as_str() {
+                "auto" => SocketChoice::Auto,
+                "off" => SocketChoice::Off,
+                path => SocketChoice::At(PathBuf::from(path)),
+            },
+            token_file: shape.token_file.map(PathBuf::from),
         }
     }
 
@@ -234,10 +263,21 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
             Err("must be an absolute path, as in `/var/lib/ros2probe`, `auto` or `off`".to_owned())
         }
-        "metrics.listen" if text != "off" && text.parse::<SocketAddr>().is_err() => Err(format!(
-            "is `{text}`, must be an IP address and port, as in `127.0.0.1:17400` or \
-             `[::1]:17400`, or `off`"
-        )),
+        "api.socket" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
+            "must be an absolute path, as in `/run/ros2probe/api.sock`, `auto` or `off`".to_owned(),
+        ),
+        "api.token_file" if !text.starts_with('/') => Err(
+            "must be an absolute path, as in `/run/credentials/ros2probe.service/token`".to_owned(),
+        ),
+        key @ ("metrics.listen" | "api.listen")
+            if text != "off" && text.parse::<SocketAddr>().is_err() =>
+        {
+            let port = if key == "api.listen" { 17401 } else { 17400 };
+            Err(format!(
+                "is `{text}`, must be an IP address and port, as in `127.0.0.1:{port}` or \
+                 `[::1]:{port}`, or `off`"
+            ))
+        }
         _ => Ok(()),
     }
 }

@@ -35,6 +35,8 @@ pub struct Config {
     pub capture: CaptureSettings,
     /// The metrics surface.
     pub metrics: MetricsSettings,
+    /// The control API.
+    pub api: ApiSettings,
     /// How long a topic without endpoints is still reported.
     pub topic_grace: Duration,
     /// Where what discovery knows is kept for the next start.
@@ -114,6 +116,30 @@ pub struct MetricsSettings {
     pub histograms: bool,
     /// Series per writer.
     pub per_writer: bool,
+}
+
+/// The control API.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ApiSettings {
+    /// Where to listen; `None` = nowhere.
+    pub listen: Option<SocketAddr>,
+    /// Which unix socket to listen on besides.
+    pub socket: SocketChoice,
+    /// Holds the bearer token that clients on the network address must send.
+    pub token_file: Option<PathBuf>,
+}
+
+/// Which unix socket.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum SocketChoice {
+    /// Where the service manager says (`$RUNTIME_DIRECTORY`), else the default place if its
+    /// directory is there.
+    #[default]
+    Auto,
+    /// None.
+    Off,
+    /// This one.
+    At(PathBuf),
 }
 
 /// How much is logged.
@@ -201,6 +227,7 @@ impl Config {
             ("limits", self.limits != new.limits),
             ("capture", self.capture != new.capture),
             ("metrics.listen", self.metrics.listen != new.metrics.listen),
+            ("api", self.api != new.api),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             (
                 "state_directory",
@@ -246,6 +273,11 @@ impl Default for Config {
                 histograms: true,
                 per_writer: false,
             },
+            api: ApiSettings {
+                listen: defaults::API.parse().ok(),
+                socket: SocketChoice::default(),
+                token_file: None,
+            },
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             state_directory: StateChoice::default(),
             log: Level::default(),
@@ -289,6 +321,7 @@ mod defaults {
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
     pub(super) const LISTEN: &str = "127.0.0.1:17400";
+    pub(super) const API: &str = "127.0.0.1:17401";
 
     pub(super) const fn topic_grace_s() -> u64 {
         600

@@ -22,6 +22,8 @@ pub(super) struct ConfigShape {
     pub(super) capture: Option<CaptureShape>,
     /// The metrics listener and what it shows.
     pub(super) metrics: Option<MetricsShape>,
+    /// The control API: watches that are added and removed while the agent runs.
+    pub(super) api: Option<ApiShape>,
     /// How long a topic without endpoints is still reported, in seconds.
     #[schemars(range(min = 0, max = 604_800))]
     #[serde(default = "defaults::topic_grace_s")]
@@ -148,6 +150,33 @@ pub(super) struct MetricsShape {
     pub(super) histograms: bool,
     /// Series per writer of watched topics, besides those per topic. Applied on reload.
     pub(super) per_writer: bool,
+}
+
+/// The control API.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct ApiShape {
+    /// IP address and port to listen on, or `off`. Any address but a loopback one needs
+    /// `token_file`.
+    pub(super) listen: String,
+    /// Unix socket to listen on besides, for members of its group: a path, `off`, or `auto`:
+    /// api.sock in `$RUNTIME_DIRECTORY` as the service manager sets it, else in /run/ros2probe if
+    /// that is there.
+    pub(super) socket: String,
+    /// File with the bearer token that clients of `listen` must send, as the service manager's
+    /// LoadCredential= provides it.
+    pub(super) token_file: Option<String>,
+}
+
+impl Default for ApiShape {
+    fn default() -> Self {
+        Self {
+            listen: defaults::API.to_owned(),
+            socket: "auto".to_owned(),
+            token_file: None,
+        }
+    }
 }
 
 impl Default for LimitsShape {

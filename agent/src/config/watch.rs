@@ -1,6 +1,9 @@
 //! What to watch and what to expect of it: plain data, already checked, and the matcher that tells
 //! which entries cover a topic.
 
+use std::collections::HashMap;
+use std::sync::Arc;
+
 use globset::{GlobBuilder, GlobSet, GlobSetBuilder};
 
 /// One watchlist entry.
@@ -92,7 +95,43 @@ impl Expectations {
             ("max_silence_s", self.max_silence_s.is_some()),
         ]
     }
+
+    /// Says whether this can be expected of a topic, where no schema has looked at it.
+    ///
+    /// # Errors
+    /// The first mistake.
+    pub fn check(&self) -> Result<(), String> {
+        let values = [
+            self.min_rate_hz,
+            self.max_rate_hz,
+            self.max_loss_ratio,
+            self.max_latency_ms,
+            self.max_silence_s,
+        ];
+        for ((key, low, high), value) in RANGES.into_iter().zip(values) {
+            if let Some(value) = value.filter(|value| !(low..=high).contains(value)) {
+                return Err(format!(
+                    "{key} is {value}, must be between {low} and {high}"
+                ));
+            }
+        }
+        match (self.min_rate_hz, self.max_rate_hz) {
+            (Some(low), Some(high)) if low > high => Err(format!(
+                "max_rate_hz is {high}, below min_rate_hz, which is {low}"
+            )),
+            _ => Ok(()),
+        }
+    }
 }
+
+/// Ranges of what may be expected, as the configuration's schema has them.
+const RANGES: [(&str, f64, f64); 5] = [
+    ("min_rate_hz", 0.0, 1_000_000.0),
+    ("max_rate_hz", 0.0, 1_000_000.0),
+    ("max_loss_ratio", 0.0, 1.0),
+    ("max_latency_ms", 0.0, 3_600_000.0),
+    ("max_silence_s", 0.001, 604_800.0),
+];
 
 /// Says whether `pattern` can be a ROS topic name or a glob over such names.
 ///
@@ -126,11 +165,23 @@ pub fn check_pattern(pattern: &str) -> Result<(), PatternError> {
     Ok(())
 }
 
-/// A watchlist, ready to be asked.
+/// A watchlist, ready to be asked. Making the next one out of it costs a pointer for each entry
+/// and a look at its name; globs are compiled again only when other ones are watched.
 #[derive(Clone, Debug, Default)]
 pub struct Watchlist {
-    watches: Vec<Watch>,
-    globs: GlobSet,
+    watches: Vec<Arc<Watch>>,
+    /// Places in `watches` of the entries with this pattern, which are for different domains.
+    patterns: HashMap<String, Vec<usize>>,
+    globs: Arc<Globs>,
+    /// Places in `watches` of the globs.
+    glob_places: Vec<usize>,
+}
+
+/// Patterns that are no plain names, in watchlist order.
+#[derive(Debug, Default)]
+struct Globs {
+    patterns: Vec<String>,
+    set: GlobSet,
 }
 
 impl Watchlist {
@@ -139,33 +190,85 @@ impl Watchlist {
     /// # Errors
     /// When a pattern is no glob; patterns that passed [`check_pattern`] always are.
     pub fn new(watches: Vec<Watch>) -> Result<Self, globset::Error> {
-        let mut globs = GlobSetBuilder::new();
-        for watch in &watches {
-            globs.add(
-                GlobBuilder::new(&watch.pattern)
-                    .literal_separator(true)
-                    .build()?,
-            );
+        Self::default().followed_by(watches.into_iter().map(Arc::new).collect())
+    }
+
+    /// The watchlist of `watches`, made with what this one has prepared already.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn followed_by(&self, watches: Vec<Arc<Watch>>) -> Result<Self, globset::Error> {
+        let mut patterns: HashMap<String, Vec<usize>> = HashMap::with_capacity(watches.len());
+        let mut glob_places = Vec::new();
+        let mut globs = Vec::new();
+        for (place, watch) in watches.iter().enumerate() {
+            patterns
+                .entry(watch.pattern.clone())
+                .or_default()
+                .push(place);
+            if !watch.is_literal() {
+                glob_places.push(place);
+                globs.push(watch.pattern.as_str());
+            }
         }
-        let globs = globs.build()?;
-        Ok(Self { watches, globs })
+        let globs = if self.globs.patterns == globs {
+            Arc::clone(&self.globs)
+        } else {
+            Arc::new(Globs::new(&globs)?)
+        };
+        Ok(Self {
+            watches,
+            patterns,
+            globs,
+            glob_places,
+        })
     }
 
     /// The entries, in configuration order.
     #[must_use]
-    pub fn watches(&self) -> &[Watch] {
+    pub fn watches(&self) -> &[Arc<Watch>] {
         &self.watches
     }
 
     /// The entries that cover this topic, as indices into [`Self::watches`].
     #[must_use]
     pub fn matching(&self, domain_id: u32, topic: &str) -> Vec<usize> {
-        let mut matching = self.globs.matches(topic);
-        matching.retain(|index| {
-            let wanted = self.watches.get(*index).and_then(|watch| watch.domain_id);
+        let globs = self.globs.set.matches(topic).into_iter();
+        let globs = globs.filter_map(|glob| self.glob_places.get(glob).copied());
+        // A hostile topic may be called as a glob is written: then the glob has decided.
+        let named = self.patterns.get(topic).into_iter().flatten().copied();
+        let named =
+            named.filter(|place| self.watches.get(*place).is_some_and(|it| it.is_literal()));
+        let mut matching: Vec<usize> = globs.chain(named).collect();
+        matching.retain(|place| {
+            let wanted = self.watches.get(*place).and_then(|watch| watch.domain_id);
             wanted.is_none_or(|wanted| wanted == domain_id)
         });
+        matching.sort_unstable();
         matching
+    }
+
+    /// Where the entry with this pattern for this domain stands.
+    #[must_use]
+    pub fn position(&self, pattern: &str, domain_id: Option<u32>) -> Option<usize> {
+        let mut places = self.patterns.get(pattern)?.iter().copied();
+        places.find(|place| {
+            let watch = self.watches.get(*place);
+            watch.is_some_and(|watch| watch.domain_id == domain_id)
+        })
+    }
+}
+
+impl Globs {
+    fn new(patterns: &[&str]) -> Result<Self, globset::Error> {
+        let mut set = GlobSetBuilder::new();
+        for pattern in patterns {
+            set.add(GlobBuilder::new(pattern).literal_separator(true).build()?);
+        }
+        Ok(Self {
+            patterns: patterns.iter().map(|&pattern| pattern.to_owned()).collect(),
+            set: set.build()?,
+        })
     }
 }
 
@@ -190,6 +293,27 @@ mod tests {
         assert_eq!(list.matching(0, "/camera/left/up/image_raw"), [1, 3]);
         assert_eq!(list.matching(0, "/points"), [1, 2]);
         assert_eq!(list.matching(0, "/points2"), [1]);
+    }
+
+    #[test]
+    fn the_next_watchlist_matches_as_one_made_anew() {
+        let first = watchlist(&["/a", "/**", "/b", "/c/*"]);
+        let watches: Vec<_> = ["/b", "/c/d", "/**", "/e", "/c/*"]
+            .map(|name| Arc::new(Watch::named(name).unwrap()))
+            .into();
+        let next = first.followed_by(watches).unwrap();
+        assert!(Arc::ptr_eq(&first.globs, &next.globs));
+        for (topic, places) in [
+            ("/a", &[2][..]),
+            ("/b", &[0, 2]),
+            ("/c/d", &[1, 2, 4]),
+            ("/**", &[2]),
+        ] {
+            assert_eq!(next.matching(0, topic), places, "{topic}");
+        }
+        assert_eq!(next.position("/e", None), Some(3));
+        assert_eq!(next.position("/e", Some(0)), None);
+        assert_eq!(next.position("/a", None), None);
     }
 
     #[test]

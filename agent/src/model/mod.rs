@@ -28,7 +28,6 @@ pub mod samples;
 pub mod sequence;
 pub mod snapshot;
 pub mod sockets;
-mod standing;
 pub mod subscribers;
 pub mod topic;
 pub mod way;

@@ -30,11 +30,10 @@ use super::profiler::Profiler;
 use super::rate::Slot;
 use super::receivers::{Around, Receivers};
 use super::snapshot::{Snapshot, SocketFacts, WatchState};
-use super::standing::Standing;
 use super::topic::{Naming, TopicId, Topics, Watched};
 use super::way::Place;
 use super::writer::Traits;
-use crate::config::{Limits, Watchlist};
+use crate::config::{Limits, Watch, Watchlist};
 
 const SECOND: u64 = 1_000_000_000;
 /// How often leases, windows and gaps are looked at.
@@ -110,7 +109,7 @@ macro_rules! around {
 #[derive(Debug)]
 pub struct Observer {
     pub(super) settings: Settings,
-    pub(super) watchlist: Watchlist,
+    pub(super) watchlist: Arc<Watchlist>,
     pub(super) discovery: Discovery,
     pub(super) topics: Topics,
     pub(super) interest: Interest,
@@ -137,7 +136,7 @@ impl Observer {
         };
         Self {
             settings,
-            watchlist: Watchlist::default(),
+            watchlist: Arc::default(),
             discovery: Discovery::new(caps),
             topics: Topics::default(),
             interest: Interest::new(settings.interest),
@@ -157,10 +156,17 @@ impl Observer {
         }
     }
 
-    /// Watches these from now on. What was counted of a topic that is no more watched stays.
-    pub fn set_watchlist(&mut self, watchlist: Watchlist) {
-        let standing = Standing::new(&self.topics, &self.watchlist);
-        self.watchlist = watchlist;
+    /// Watches these from now on. What was counted of a topic that is no more watched stays, and so
+    /// does how a topic stands with an entry that is in the new list as it was.
+    pub fn set_watchlist(&mut self, watchlist: impl Into<Arc<Watchlist>>) {
+        let before = std::mem::replace(&mut self.watchlist, watchlist.into());
+        let moved = |watch: &Arc<Watch>| {
+            let place = self.watchlist.position(&watch.pattern, watch.domain_id)?;
+            let after = self.watchlist.watches().get(place)?;
+            (after.expectations == watch.expectations).then_some(place)
+        };
+        let moved: Vec<_> = before.watches().iter().map(moved).collect();
+        self.topics.renumber(&moved);
         // First give places back, then hand them out.
         for pass in [Watched::Yes, Watched::No] {
             for id in self.topics.ids() {
@@ -170,7 +176,6 @@ impl Observer {
                 }
             }
         }
-        standing.restore(&mut self.topics, &self.watchlist);
     }
 
     /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`

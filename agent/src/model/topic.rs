@@ -295,6 +295,17 @@ impl Topics {
         }
     }
 
+    /// Watchlist entries stand elsewhere from now on: `moved` has the new place for each old one.
+    pub fn renumber(&mut self, moved: &[Option<usize>]) {
+        for topic in self.topics.values_mut() {
+            topic.judgements.retain_mut(|(watch, _)| {
+                let place = moved.get(*watch).copied().flatten();
+                *watch = place.unwrap_or(*watch);
+                place.is_some()
+            });
+        }
+    }
+
     /// Asks the watchlist about one topic, within the cap.
     pub fn consult(&mut self, id: TopicId, watchlist: &Watchlist, cap: usize, now: Timestamp) {
         let Some(topic) = self.topics.get(&id) else {
@@ -327,10 +338,14 @@ impl Topics {
             };
         }
         topic.judgements = match after {
-            Watched::Yes => covering
-                .into_iter()
-                .map(|watch| (watch, Judgement::default()))
-                .collect(),
+            Watched::Yes => {
+                let before = std::mem::take(&mut topic.judgements);
+                let judged = |watch| {
+                    let known = before.iter().find(|(other, _)| *other == watch);
+                    known.copied().unwrap_or((watch, Judgement::default()))
+                };
+                covering.into_iter().map(judged).collect()
+            }
             _ => Vec::new(),
         };
     }

@@ -6,7 +6,6 @@ mod source;
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
 
 use ros2probe_wire::GuidPrefix;
@@ -14,12 +13,12 @@ use tokio_util::sync::CancellationToken;
 
 use crate::capture::live::{CaptureError, LiveSource};
 use crate::capture::pcap::PcapError;
-use crate::config::Watchlist;
 use crate::model::observer::Observer;
 use crate::model::snapshot::Snapshot;
 use crate::state::Keeper;
 use crate::surface::Board;
 use crate::surface::events::Drops;
+use crate::watches::Watches;
 pub use source::Source;
 
 /// Longest time without looking at commands and the clock. Captured frames and a record ring that
@@ -28,13 +27,6 @@ const SLICE: Duration = Duration::from_millis(250);
 /// How often surfaces get a new snapshot unasked, and how often at most when they ask.
 const PUBLISH: Duration = Duration::from_secs(1);
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);
-
-/// What the agent is told while it runs.
-#[derive(Debug)]
-pub enum Order {
-    /// Measure these topics from now on.
-    Watch(Watchlist),
-}
 
 /// Why the working thread ended although nobody asked it to.
 #[derive(Debug, thiserror::Error)]
@@ -55,7 +47,7 @@ pub struct Run {
     followed: BTreeSet<GuidPrefix>,
     board: Arc<Board>,
     drops: Drops,
-    orders: Receiver<Order>,
+    watches: Arc<Watches>,
     stop: CancellationToken,
     keeper: Option<Keeper>,
 }
@@ -67,7 +59,7 @@ impl Run {
         source: Source,
         observer: Observer,
         board: Arc<Board>,
-        orders: Receiver<Order>,
+        watches: Arc<Watches>,
         stop: CancellationToken,
     ) -> Self {
         Self {
@@ -76,7 +68,7 @@ impl Run {
             followed: BTreeSet::new(),
             board,
             drops: Drops::default(),
-            orders,
+            watches,
             stop,
             keeper: None,
         }
@@ -101,10 +93,10 @@ impl Run {
     }
 
     fn work(&mut self) -> Result<(), RunError> {
+        self.take_watches();
         self.publish();
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
-            self.take_orders();
             let slice = if self.board.is_asked() {
                 PUBLISH_ASKED
             } else {
@@ -113,15 +105,14 @@ impl Run {
             let bell = self.board.bell();
             let polled = self.source.poll(slice, bell, &mut self.observer);
             self.board.hear();
+            self.take_watches();
             let finished = self.source.is_finished();
             if finished {
                 self.observer.settle();
             } else {
                 self.observer.advance(self.source.clock());
             }
-            if let Source::Live(live) = &mut self.source {
-                live.apply(&self.observer.interest_changes());
-            }
+            self.tell_interest();
             self.board.events().add(self.observer.take_events());
             let age = published.elapsed();
             let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
@@ -142,13 +133,17 @@ impl Run {
         Ok(())
     }
 
-    fn take_orders(&mut self) {
-        loop {
-            match self.orders.try_recv() {
-                Ok(Order::Watch(watchlist)) => self.observer.set_watchlist(watchlist),
-                // Without a supervisor there are no more orders; its token says when to stop.
-                Err(TryRecvError::Empty | TryRecvError::Disconnected) => return,
-            }
+    /// Watches what is asked for since the last look. The kernel knows it before the next packets.
+    fn take_watches(&mut self) {
+        if let Some(watchlist) = self.watches.take_news() {
+            self.observer.set_watchlist(watchlist);
+            self.tell_interest();
+        }
+    }
+
+    fn tell_interest(&mut self) {
+        if let Source::Live(live) = &mut self.source {
+            live.apply(&self.observer.interest_changes());
         }
     }
 

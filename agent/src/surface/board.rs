@@ -54,7 +54,7 @@ pub struct State {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Settings {
     /// Expectations are shown as configured.
-    pub watches: Vec<Watch>,
+    pub watches: Vec<Arc<Watch>>,
     /// Histograms of watched topics.
     pub histograms: bool,
     /// Series per writer.
@@ -77,7 +77,7 @@ impl Settings {
     #[must_use]
     pub fn new(config: &Config) -> Self {
         Self {
-            watches: config.watches.clone(),
+            watches: config.watches.iter().cloned().map(Arc::new).collect(),
             histograms: config.metrics.histograms,
             per_writer: config.metrics.per_writer,
             max_topics: config.limits.topics,
@@ -140,6 +140,14 @@ impl Board {
         }
     }
 
+    /// Wakes the capture thread.
+    pub fn ring(&self) {
+        if let Some(bell) = &self.bell {
+            // A full pipe has been rung often enough.
+            let _ = (&bell.ringer).write(&[1]);
+        }
+    }
+
     /// Asks for a newer state and waits for it, but no longer than `patience`: counters that a
     /// scrape reads should be those of its moment, or rates over short windows would be off.
     pub async fn refresh(&self, patience: Duration) {
@@ -148,12 +156,17 @@ impl Board {
             return;
         }
         self.asked.store(true, Ordering::Relaxed);
-        if let Some(bell) = &self.bell {
-            // A full pipe has been rung often enough.
-            let _ = (&bell.ringer).write(&[1]);
-        }
+        self.ring();
         // Late or not: what is on the board is shown, with its age.
         let _ = tokio::time::timeout(patience, news).await;
+    }
+
+    /// Other watches are in force from now on.
+    pub fn watch(&self, watches: &[Arc<Watch>]) {
+        self.settings.rcu(|settings| Settings {
+            watches: watches.to_vec(),
+            ..(**settings).clone()
+        });
     }
 
     /// Pins new settings after a reload that worked.

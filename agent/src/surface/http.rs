@@ -2,9 +2,7 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
 use axum::Router;
@@ -13,19 +11,15 @@ use axum::http::header::{ACCEPT, CACHE_CONTROL, CONTENT_TYPE};
 use axum::http::{HeaderMap, Method, StatusCode};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tokio::time::{Sleep, sleep};
+use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
 use super::board::Board;
+use super::bounded::Bounded;
 use super::exposition::{Exposition, Format};
 
 /// More scrapers than any robot has.
 const MAX_CONNECTIONS: usize = 32;
-/// A connection to which nothing was answered for so long is closed.
-const IDLE: Duration = Duration::from_secs(75);
 
 const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 <p>Watches the ROS 2 robot on this host from copies of its traffic.
@@ -85,10 +79,7 @@ impl Server {
     /// # Errors
     /// When the runtime cannot take the socket over.
     pub async fn serve(self, stop: CancellationToken) -> io::Result<()> {
-        let listener = Bounded {
-            listener: TcpListener::from_std(self.listener)?,
-            permits: Arc::new(Semaphore::new(MAX_CONNECTIONS)),
-        };
+        let listener = Bounded::new(TcpListener::from_std(self.listener)?, MAX_CONNECTIONS);
         let stopped = async move { stop.cancelled().await };
         axum::serve(listener, router(self.board))
             .with_graceful_shutdown(stopped)
@@ -141,90 +132,5 @@ async fn readyz(Extract(pages): Extract<Pages>) -> Response {
     match pages.board.state().ready(Instant::now()) {
         Ok(()) => "ready\n".into_response(),
         Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, reason + "\n").into_response(),
-    }
-}
-
-/// A listener with a limited number of connections; further ones wait in the kernel's queue.
-struct Bounded {
-    listener: TcpListener,
-    permits: Arc<Semaphore>,
-}
-
-/// A connection that ends when nothing was answered on it for [`IDLE`]: requests that trickle in
-/// and readers that do not read cannot hold it.
-struct Connection {
-    stream: TcpStream,
-    deadline: Pin<Box<Sleep>>,
-    _permit: Option<OwnedSemaphorePermit>,
-}
-
-impl axum::serve::Listener for Bounded {
-    type Io = Connection;
-    type Addr = SocketAddr;
-
-    async fn accept(&mut self) -> (Connection, SocketAddr) {
-        // The semaphore is never closed.
-        let permit = Arc::clone(&self.permits).acquire_owned().await.ok();
-        let (stream, address) = axum::serve::Listener::accept(&mut self.listener).await;
-        (
-            Connection {
-                stream,
-                deadline: Box::pin(sleep(IDLE)),
-                _permit: permit,
-            },
-            address,
-        )
-    }
-
-    fn local_addr(&self) -> io::Result<SocketAddr> {
-        self.listener.local_addr()
-    }
-}
-
-impl Connection {
-    /// `pending`, unless the time is over.
-    fn overdue<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
-        self.deadline
-            .as_mut()
-            .poll(context)
-            .map(|()| Err(io::Error::new(io::ErrorKind::TimedOut, "idle for too long")))
-    }
-}
-
-impl AsyncRead for Connection {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        match Pin::new(&mut self.stream).poll_read(context, buffer) {
-            Poll::Pending => self.overdue(context),
-            ready => ready,
-        }
-    }
-}
-
-impl AsyncWrite for Connection {
-    fn poll_write(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        bytes: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        match Pin::new(&mut self.stream).poll_write(context, bytes) {
-            Poll::Pending => self.overdue(context),
-            ready => {
-                let next = tokio::time::Instant::now() + IDLE;
-                self.deadline.as_mut().reset(next);
-                ready
-            }
-        }
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(context)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
     }
 }

@@ -1,9 +1,11 @@
-//! What people and machines read: metrics and health over HTTP, from immutable snapshots. Nothing
-//! here ever makes the capture wait.
+//! What people and machines read and write: metrics, health and the control API over HTTP, from
+//! immutable snapshots. Nothing here ever makes the capture wait.
 
 mod agent;
 pub mod agent_facts;
+pub mod api;
 pub mod board;
+mod bounded;
 pub mod catalogue;
 mod deliveries;
 mod diagnoses;

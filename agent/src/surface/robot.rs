@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
+use std::sync::Arc;
 
 use super::board::Settings;
 use super::catalogue::{self as metric, Metric};
@@ -440,7 +441,7 @@ fn each_writer(family: &mut Family<'_>, row: &Row<'_>, value: Count) -> fmt::Res
 pub(super) fn watches(
     page: &mut Page<'_>,
     snapshot: &Snapshot,
-    configured: &[Watch],
+    configured: &[Arc<Watch>],
 ) -> fmt::Result {
     page.family(&metric::WATCH_STATE, |family| {
         for watch in &snapshot.watches {
@@ -483,10 +484,10 @@ pub(super) fn watches(
 }
 
 /// The entry of the configuration that is in force for what the model calls `watch`.
-fn configured<'c>(watch: &WatchFacts, configured: &'c [Watch]) -> Option<&'c Watch> {
+fn configured<'c>(watch: &WatchFacts, configured: &'c [Arc<Watch>]) -> Option<&'c Watch> {
     let same =
         |other: &&Watch| (&other.pattern, other.domain_id) == (&watch.pattern, watch.domain_id);
-    configured.iter().find(same)
+    configured.iter().map(|watch| &**watch).find(same)
 }
 
 /// `/points`, or `/points@5` when it is for one domain; `@` is in no ROS name.

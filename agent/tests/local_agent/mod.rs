@@ -1,7 +1,7 @@
 //! The real binary on a free port of this host, replaying a capture: no privilege, no namespaces.
 #![allow(dead_code, reason = "each test file uses its own part")]
 
-use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::io::{BufRead as _, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -32,7 +32,10 @@ pub struct LocalAgent {
     child: Child,
     log: Receiver<String>,
     seen: Vec<String>,
+    /// The metrics listener's.
     pub address: SocketAddr,
+    /// The control API's.
+    pub api: SocketAddr,
 }
 
 /// An HTTP answer.
@@ -43,7 +46,7 @@ pub struct Answer {
 }
 
 impl LocalAgent {
-    /// Starts `rp run` on the capture, with further arguments, and waits for its listener.
+    /// Starts `rp run` on the capture, with further arguments, and waits for its listeners.
     pub fn start(arguments: &[&str]) -> Self {
         Self::start_as(&mut rp(), arguments)
     }
@@ -51,7 +54,8 @@ impl LocalAgent {
     /// As [`Self::start`], with an environment of its own.
     pub fn start_as(command: &mut Command, arguments: &[&str]) -> Self {
         let mut child = command
-            .args(["run", "--metrics", "127.0.0.1:0", "--replay"])
+            .args(["run", "--metrics", "127.0.0.1:0", "--api", "127.0.0.1:0"])
+            .arg("--replay")
             .arg(capture())
             .args(arguments)
             .stdout(Stdio::null())
@@ -72,14 +76,18 @@ impl LocalAgent {
             log,
             seen: Vec::new(),
             address,
+            api: address,
         };
-        let line = agent.wait_for_log("serving metrics");
-        let address = line
-            .split("address=")
-            .nth(1)
-            .and_then(|rest| rest.split(' ').next());
-        agent.address = address.unwrap().parse().unwrap();
+        agent.address = agent.wait_for_address("serving metrics");
+        agent.api = agent.wait_for_address("serving the control API");
         agent
+    }
+
+    fn wait_for_address(&mut self, text: &str) -> SocketAddr {
+        let line = self.wait_for_log(text);
+        let address = line.split("address=").nth(1);
+        let address = address.and_then(|rest| rest.split(' ').next());
+        address.unwrap().trim_matches('"').parse().unwrap()
     }
 
     /// The next line of the log that contains `text`.
@@ -157,11 +165,15 @@ impl Drop for LocalAgent {
 
 /// One request on its own connection.
 pub fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> Answer {
-    let mut stream = TcpStream::connect(address).unwrap();
+    let stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    let request = format!(
-        "{method} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n{headers}\r\n"
-    );
+    let head = format!("{method} {path} HTTP/1.1\r\nHost: {address}\r\n{headers}");
+    exchange(stream, &head, "")
+}
+
+/// Sends a request of this head, without its last line, and this body; reads the answer.
+pub fn exchange(mut stream: impl Read + Write, head: &str, body: &str) -> Answer {
+    let request = format!("{head}Connection: close\r\n\r\n{body}");
     stream.write_all(request.as_bytes()).unwrap();
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();

@@ -1,0 +1,66 @@
+//! The control API: REST over a loopback address and a unix socket, described by its OpenAPI
+//! document. It reads snapshots and changes what is watched; it never makes the capture wait.
+//!
+//! A module for each noun gives its routes; what every request has to pass is in `security`.
+
+mod health;
+mod openapi;
+mod parameters;
+pub mod problem;
+pub mod reload;
+mod security;
+mod server;
+mod watch;
+
+use std::sync::Arc;
+
+use axum::Router;
+use axum::http::Method;
+use axum::middleware;
+use tokio_util::sync::CancellationToken;
+use utoipa_axum::router::OpenApiRouter;
+
+use super::board::Board;
+use crate::watches::Watches;
+pub use openapi::document;
+use problem::{Code, Problem};
+use reload::Reloader;
+use security::Door;
+pub use server::{OpenError, Server};
+
+/// What the routes work on.
+#[derive(Clone)]
+pub struct Context {
+    /// The latest snapshot.
+    pub board: Arc<Board>,
+    /// What is watched.
+    pub watches: Arc<Watches>,
+    /// Has the configuration read again.
+    pub reloader: Reloader,
+    /// Ends streams when the agent ends.
+    pub stop: CancellationToken,
+}
+
+/// The routes of all nouns and what the document says of them.
+fn nouns() -> OpenApiRouter<Context> {
+    OpenApiRouter::with_openapi(openapi::head())
+        .merge(watch::routes())
+        .merge(health::routes())
+        .merge(reload::routes())
+        .merge(openapi::routes())
+}
+
+/// What answers behind `door`.
+fn router(context: &Context, door: Arc<Door>) -> Router {
+    let (router, _) = nouns().split_for_parts();
+    router
+        .fallback(async || Problem::new(Code::NotFound, "the paths are listed in /openapi.json"))
+        .method_not_allowed_fallback(async |method: Method| {
+            Problem::new(
+                Code::MethodNotAllowed,
+                format!("{method} is not possible here"),
+            )
+        })
+        .layer(middleware::from_fn_with_state(door, security::guard))
+        .with_state(context.clone())
+}

@@ -1,0 +1,106 @@
+//! The OpenAPI document: made of what the routes say of themselves, completed with what holds for
+//! all of them. It is checked in as `config/openapi.json`; a test compares.
+
+use std::sync::LazyLock;
+
+use axum::http::header::CONTENT_TYPE;
+use axum::response::IntoResponse;
+use utoipa::OpenApi;
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
+use utoipa::openapi::{ContentBuilder, PathItem, Ref, RefOr, ResponseBuilder, SecurityRequirement};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::problem::{MEDIA_TYPE, ProblemBody};
+use super::{Context, nouns};
+
+/// Answers that any request may get, whatever it asks for.
+const COMMON: [(&str, &str); 6] = [
+    ("400", "The request cannot be read."),
+    ("401", "The listener wants a bearer token."),
+    ("403", "Sent to a foreign name, or by a foreign web page."),
+    ("413", "The body is too large."),
+    ("429", "Too many requests."),
+    ("503", "The agent is about to end."),
+];
+
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "ros2probe",
+        description = "Control API of the ros2probe agent on one robot: what is watched, and what is known.",
+        license(name = "Apache-2.0 OR MIT", identifier = "Apache-2.0 OR MIT")
+    ),
+    components(schemas(ProblemBody)),
+    tags(
+        (name = "watch", description = "What is measured, changed while the agent runs."),
+        (name = "agent", description = "The agent itself."),
+    )
+)]
+struct Head;
+
+/// What the document begins with.
+pub(super) fn head() -> utoipa::openapi::OpenApi {
+    Head::openapi()
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(openapi))
+}
+
+/// The whole document.
+#[must_use]
+pub fn document() -> utoipa::openapi::OpenApi {
+    let mut document = nouns().into_openapi();
+    let paths = std::mem::take(&mut document.paths.paths);
+    for (path, mut item) in paths {
+        operations(&mut item).for_each(complete);
+        // The router's mark for a parameter that may hold slashes.
+        document.paths.paths.insert(path.replace("{*", "{"), item);
+    }
+    let scheme = SecurityScheme::Http(Http::new(HttpAuthScheme::Bearer));
+    let components = document.components.get_or_insert_default();
+    components.add_security_scheme("token", scheme);
+    let none = SecurityRequirement::default();
+    let token = SecurityRequirement::new("token", [] as [&str; 0]);
+    document.security = Some(vec![none, token]);
+    document
+}
+
+fn operations(item: &mut PathItem) -> impl Iterator<Item = &mut Operation> {
+    let all = [
+        &mut item.get,
+        &mut item.post,
+        &mut item.put,
+        &mut item.delete,
+    ];
+    all.into_iter().flatten()
+}
+
+fn complete(operation: &mut Operation) {
+    for (status, description) in COMMON {
+        let problem = ContentBuilder::new().schema(Some(Ref::from_schema_name("Problem")));
+        let response = ResponseBuilder::new()
+            .description(description)
+            .content(MEDIA_TYPE, problem.build())
+            .build();
+        let responses = &mut operation.responses.responses;
+        responses
+            .entry(status.to_owned())
+            .or_insert(RefOr::T(response));
+    }
+}
+
+/// This document
+#[utoipa::path(
+    get,
+    path = "/openapi.json",
+    tag = "agent",
+    responses((status = 200, description = "OpenAPI 3.1.", body = Object))
+)]
+async fn openapi() -> impl IntoResponse {
+    static TEXT: LazyLock<String> =
+        LazyLock::new(|| document().to_pretty_json().unwrap_or_default());
+    ([(CONTENT_TYPE, "application/json")], TEXT.as_str())
+}

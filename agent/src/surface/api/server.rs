@@ -1,0 +1,321 @@
+//! The API's listeners: bound before privileges are given up, answered until the agent ends.
+//!
+//! Each has its own limit of connections and of requests. Who may use the unix socket is decided by
+//! the mode and group of its file, which goes when the agent ends.
+
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io;
+use std::net::{SocketAddr, TcpListener};
+use std::os::unix::fs::{FileTypeExt as _, OpenOptionsExt as _, PermissionsExt as _};
+use std::os::unix::net::UnixListener;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use axum::serve::Listener;
+use tokio::task::JoinSet;
+
+use super::security::{Door, Kind, Token, TokenError};
+use super::{Context, router};
+use crate::surface::bounded::Bounded;
+
+/// More clients than any robot has; some of them hold streams of events.
+const MAX_CONNECTIONS: usize = 64;
+/// Owner and group.
+const SOCKET_MODE: u32 = 0o660;
+/// The group that may use the socket of an agent that was started by root.
+const GROUP: &str = "ros2probe";
+
+/// Why the API cannot be served.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// The token cannot be had.
+    #[error(transparent)]
+    Token(#[from] TokenError),
+    /// Everybody could change what is watched.
+    #[error(
+        "{address} can be reached from elsewhere: serving the control API there needs \
+         `api.token_file`"
+    )]
+    Unprotected {
+        /// Where.
+        address: SocketAddr,
+    },
+    /// The address is taken or not this host's.
+    #[error("cannot listen on {address}: change `api.listen` in the configuration or pass `--api`")]
+    Address {
+        /// Where.
+        address: SocketAddr,
+        /// Why not.
+        source: io::Error,
+    },
+    /// Another agent answers there.
+    #[error("another agent serves the socket {}: change `api.socket`", path.display())]
+    InUse {
+        /// Where.
+        path: PathBuf,
+    },
+    /// Something is there that is not to be replaced.
+    #[error("{} is there and is no socket: change `api.socket`", path.display())]
+    NoSocket {
+        /// Where.
+        path: PathBuf,
+    },
+    /// The directory is missing or not to be written.
+    #[error("cannot serve the socket {}: change `api.socket`", path.display())]
+    Socket {
+        /// Where.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+}
+
+/// Bound listeners that nobody answers yet.
+#[derive(Debug, Default)]
+pub struct Server {
+    token: Option<Token>,
+    addresses: Vec<TcpListener>,
+    sockets: Vec<Socket>,
+}
+
+/// A unix socket and the file it is found by.
+#[derive(Debug)]
+struct Socket {
+    listener: UnixListener,
+    file: SocketFile,
+}
+
+/// Removes the socket's file with its value.
+#[derive(Debug)]
+struct SocketFile {
+    path: PathBuf,
+    /// Keeps other agents from taking the socket for a stale one.
+    _lock: File,
+}
+
+impl Server {
+    /// Nothing bound yet; clients on the network need the token in this file.
+    ///
+    /// # Errors
+    /// The file holds no token.
+    pub fn new(token: Option<&Path>) -> Result<Self, OpenError> {
+        Ok(Self {
+            token: token.map(Token::load).transpose()?,
+            ..Self::default()
+        })
+    }
+
+    /// Listens on an address. Without a token only on loopback.
+    ///
+    /// # Errors
+    /// The address needs a token, is taken, or not this host's.
+    pub fn bind(&mut self, address: SocketAddr) -> Result<(), OpenError> {
+        if !address.ip().is_loopback() && self.token.is_none() {
+            return Err(OpenError::Unprotected { address });
+        }
+        let bind = || {
+            let listener = TcpListener::bind(address)?;
+            listener.set_nonblocking(true)?;
+            Ok(listener)
+        };
+        let listener = bind().map_err(|source| OpenError::Address { address, source })?;
+        self.addresses.push(listener);
+        Ok(())
+    }
+
+    /// Listens on a unix socket; a stale file of an agent that was killed is replaced.
+    ///
+    /// # Errors
+    /// Another agent serves it, something else is there, or the directory cannot be used.
+    pub fn bind_socket(&mut self, path: &Path) -> Result<(), OpenError> {
+        let failed = |source| OpenError::Socket {
+            path: path.to_path_buf(),
+            source,
+        };
+        let lock = lock(path)?;
+        match fs::symlink_metadata(path) {
+            Ok(metadata) if metadata.file_type().is_socket() => {
+                fs::remove_file(path).map_err(failed)?;
+            }
+            Ok(_) => {
+                let path = path.to_path_buf();
+                return Err(OpenError::NoSocket { path });
+            }
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(failed(error)),
+        }
+        let bind = || {
+            let listener = UnixListener::bind(path)?;
+            let file = SocketFile {
+                path: path.to_path_buf(),
+                _lock: lock,
+            };
+            give_to_group(path);
+            fs::set_permissions(path, fs::Permissions::from_mode(SOCKET_MODE))?;
+            listener.set_nonblocking(true)?;
+            Ok(Socket { listener, file })
+        };
+        self.sockets.push(bind().map_err(failed)?);
+        Ok(())
+    }
+
+    /// Nothing is bound.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.addresses.is_empty() && self.sockets.is_empty()
+    }
+
+    /// Where it listens, with the port the kernel chose when it was 0.
+    pub fn doors(&self) -> impl Iterator<Item = String> {
+        let addresses = self.addresses.iter().map(TcpListener::local_addr);
+        let sockets = self.sockets.iter();
+        let sockets = sockets.map(|socket| format!("unix:{}", socket.file.path.display()));
+        let addresses = addresses.filter_map(Result::ok).map(|it| it.to_string());
+        addresses.chain(sockets)
+    }
+
+    /// Answers on all of them until `context` says stop, then finishes the answers that have begun.
+    ///
+    /// # Errors
+    /// When the runtime cannot take a listener over.
+    pub fn serve(self, context: &Context, tasks: &mut JoinSet<io::Result<()>>) -> io::Result<()> {
+        for listener in self.addresses {
+            let is_local = listener.local_addr()?.ip().is_loopback();
+            let kind = match self.token.clone() {
+                Some(token) if !is_local => Kind::Network(token),
+                token => Kind::Loopback(token),
+            };
+            let listener = tokio::net::TcpListener::from_std(listener)?;
+            tasks.spawn(serve(listener, kind, context.clone()));
+        }
+        for Socket { listener, file } in self.sockets {
+            let listener = tokio::net::UnixListener::from_std(listener)?;
+            let serving = serve(listener, Kind::Socket, context.clone());
+            tasks.spawn(async move {
+                let served = serving.await;
+                drop(file);
+                served
+            });
+        }
+        Ok(())
+    }
+}
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        // What cannot be removed is stale for the next agent, which replaces it.
+        let _ = fs::remove_file(&self.path);
+    }
+}
+
+async fn serve<L>(listener: L, kind: Kind, context: Context) -> io::Result<()>
+where
+    L: Listener,
+    L::Addr: std::fmt::Debug,
+    L::Io: Unpin,
+{
+    let router = router(&context, Arc::new(Door::new(kind)));
+    let stop = context.stop.clone();
+    axum::serve(Bounded::new(listener, MAX_CONNECTIONS), router)
+        .with_graceful_shutdown(async move { stop.cancelled().await })
+        .await
+}
+
+/// The lock lies beside the socket and outlives the agent: a file that is removed would be a lock
+/// for one and none for the other.
+fn lock(path: &Path) -> Result<File, OpenError> {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".lock");
+    let mut options = OpenOptions::new();
+    let options = options.write(true).create(true).truncate(false).mode(0o600);
+    let failed = |source| OpenError::Socket {
+        path: path.to_path_buf(),
+        source,
+    };
+    let file = options.open(&name).map_err(failed)?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => Err(OpenError::InUse {
+            path: path.to_path_buf(),
+        }),
+        Err(TryLockError::Error(source)) => Err(failed(source)),
+    }
+}
+
+/// An agent that runs as root lets the group in where there is one; started by the service manager
+/// it has that group anyway. Where this is not possible, the socket stays the agent's own.
+fn give_to_group(path: &Path) {
+    let groups = fs::read_to_string("/etc/group").unwrap_or_default();
+    let group = groups.lines().find_map(|line| {
+        let mut fields = line.split(':');
+        let is_ours = fields.next() == Some(GROUP);
+        fields.nth(1)?.parse().ok().filter(|_| is_ours)
+    });
+    if let Some(group) = group {
+        let _ = std::os::unix::fs::chown(path, None, Some(group));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn one_line(error: &OpenError) -> String {
+        let text = format!("{:#}", anyhow::anyhow!(error.to_string()));
+        assert!(!text.contains('\n'), "{text}");
+        text
+    }
+
+    #[test]
+    fn an_address_beyond_this_host_needs_a_token() {
+        let mut server = Server::new(None).unwrap();
+        let error = server.bind(([0, 0, 0, 0], 0).into()).unwrap_err();
+        assert!(one_line(&error).contains("needs `api.token_file`"));
+        assert!(server.is_empty());
+
+        let directory = tempfile::tempdir().unwrap();
+        let token = directory.path().join("token");
+        fs::write(&token, "0123456789abcdef\n").unwrap();
+        let mut server = Server::new(Some(&token)).unwrap();
+        server.bind(([0, 0, 0, 0], 0).into()).unwrap();
+        assert_eq!(server.doors().count(), 1);
+    }
+
+    #[test]
+    fn a_busy_port_is_said_in_one_line() {
+        let other = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = other.local_addr().unwrap();
+        let error = Server::new(None).unwrap().bind(address).unwrap_err();
+        assert!(one_line(&error).contains("`api.listen`"));
+    }
+
+    #[test]
+    fn a_stale_socket_is_replaced_and_one_in_use_or_another_file_is_not() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("api.sock");
+        // Left by an agent that was killed.
+        drop(UnixListener::bind(&path).unwrap());
+        let mut server = Server::new(None).unwrap();
+        server.bind_socket(&path).unwrap();
+        let mode = fs::metadata(&path).unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, SOCKET_MODE);
+
+        let error = Server::new(None).unwrap().bind_socket(&path).unwrap_err();
+        assert!(one_line(&error).contains("another agent serves the socket"));
+        assert!(std::os::unix::net::UnixStream::connect(&path).is_ok());
+
+        drop(server);
+        assert!(!path.exists());
+        fs::write(&path, "").unwrap();
+        let error = Server::new(None).unwrap().bind_socket(&path).unwrap_err();
+        assert!(one_line(&error).contains("is no socket"));
+        assert!(path.exists());
+
+        let missing = directory.path().join("missing/api.sock");
+        let error = Server::new(None)
+            .unwrap()
+            .bind_socket(&missing)
+            .unwrap_err();
+        assert!(one_line(&error).contains("missing/api.sock"));
+    }
+}

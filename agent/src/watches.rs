@@ -1,0 +1,302 @@
+//! All that is watched: what the configuration lists, what the command line adds, and what clients
+//! add and remove while the agent runs.
+//!
+//! One entry for each pattern and domain; the configuration's comes first. The capture thread is
+//! handed the merged list in a slot that holds the latest one and is woken; nobody waits for it.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use arc_swap::{ArcSwap, ArcSwapOption};
+
+use crate::config::{Watch, Watchlist};
+use crate::surface::Board;
+
+/// Watches that clients may add; a longer list should be globs.
+pub const MAX_ADDED: usize = 1_000;
+
+/// Who asked for a watch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// The configuration file.
+    Config,
+    /// `--watch`.
+    CommandLine,
+    /// A client of the API.
+    Api,
+}
+
+/// One watch in force.
+#[derive(Clone, Debug)]
+pub struct Entry {
+    /// What is watched.
+    pub watch: Arc<Watch>,
+    /// On whose behalf.
+    pub origin: Origin,
+}
+
+/// What is in force, immutable.
+#[derive(Clone, Debug, Default)]
+pub struct InForce {
+    entries: Vec<Entry>,
+    watchlist: Arc<Watchlist>,
+}
+
+/// What became of a watch that was asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Done {
+    /// It was not there before.
+    Added,
+    /// It was there, with other settings.
+    Replaced,
+    /// It was there just so.
+    Unchanged,
+}
+
+/// Why the list of watches stays as it is.
+#[derive(Debug, thiserror::Error)]
+pub enum Refused {
+    /// Listed by the configuration or the command line, which a client does not overrule.
+    #[error("it is given by {}", by.phrase())]
+    Given {
+        /// Which of them.
+        by: Origin,
+    },
+    /// A client added it with other settings.
+    #[error("it is watched already, with other settings")]
+    Different,
+    /// No such watch.
+    #[error("it is not watched")]
+    Unknown,
+    /// There are [`MAX_ADDED`] already.
+    #[error("{MAX_ADDED} watches were added already, use globs")]
+    Full,
+    /// The patterns cannot be matched together.
+    #[error("the patterns cannot be matched")]
+    Pattern(#[from] globset::Error),
+}
+
+/// All watches.
+#[derive(Debug)]
+pub struct Watches {
+    lists: Mutex<Lists>,
+    in_force: ArcSwap<InForce>,
+    /// For the capture thread: the latest list it has not taken yet.
+    news: ArcSwapOption<Watchlist>,
+    board: Arc<Board>,
+}
+
+#[derive(Clone, Debug, Default)]
+struct Lists {
+    configured: Vec<Arc<Watch>>,
+    command_line: Vec<Arc<Watch>>,
+    added: Vec<Arc<Watch>>,
+}
+
+impl Origin {
+    /// As clients see it.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Config => "config",
+            Self::CommandLine => "command_line",
+            Self::Api => "api",
+        }
+    }
+
+    /// As in a sentence.
+    #[must_use]
+    pub const fn phrase(self) -> &'static str {
+        match self {
+            Self::Config => "the configuration file",
+            Self::CommandLine => "the command line",
+            Self::Api => "a client of the API",
+        }
+    }
+}
+
+impl InForce {
+    /// Each watch: of the configuration, of the command line, of clients in the order they came.
+    #[must_use]
+    pub fn entries(&self) -> &[Entry] {
+        &self.entries
+    }
+
+    /// The watches alone.
+    #[must_use]
+    pub fn watchlist(&self) -> &Watchlist {
+        &self.watchlist
+    }
+
+    /// The watch with this pattern for this domain.
+    #[must_use]
+    pub fn find(&self, pattern: &str, domain_id: Option<u32>) -> Option<&Entry> {
+        let place = self.watchlist.position(pattern, domain_id)?;
+        self.entries.get(place)
+    }
+}
+
+impl Watches {
+    /// What the configuration and the command line list.
+    ///
+    /// # Errors
+    /// When patterns cannot be matched together.
+    pub fn new(
+        board: Arc<Board>,
+        configured: Vec<Watch>,
+        command_line: Vec<Watch>,
+    ) -> Result<Self, globset::Error> {
+        let watches = Self {
+            lists: Mutex::default(),
+            in_force: ArcSwap::default(),
+            news: ArcSwapOption::default(),
+            board,
+        };
+        let lists = Lists {
+            configured: configured.into_iter().map(Arc::new).collect(),
+            command_line: command_line.into_iter().map(Arc::new).collect(),
+            added: Vec::new(),
+        };
+        watches.change(|old| {
+            *old = lists;
+            Ok::<_, globset::Error>(())
+        })?;
+        Ok(watches)
+    }
+
+    /// The configuration lists these now; what else is watched stays.
+    ///
+    /// # Errors
+    /// When patterns cannot be matched together; then nothing changes.
+    pub fn configure(&self, watches: Vec<Watch>) -> Result<(), globset::Error> {
+        self.change(|lists| {
+            lists.configured = watches.into_iter().map(Arc::new).collect();
+            Ok(())
+        })
+    }
+
+    /// Watches this too, unless it is watched already.
+    ///
+    /// # Errors
+    /// It is watched with other settings, or there is no room.
+    pub fn add(&self, watch: Watch) -> Result<Done, Refused> {
+        self.put(watch, false)
+    }
+
+    /// Watches this too, in place of what a client has asked for before.
+    ///
+    /// # Errors
+    /// The configuration lists it with other settings, or there is no room.
+    pub fn replace(&self, watch: Watch) -> Result<Done, Refused> {
+        self.put(watch, true)
+    }
+
+    /// Watches what a client has added no longer.
+    ///
+    /// # Errors
+    /// There is no such watch, or it is not a client's.
+    pub fn remove(&self, pattern: &str, domain_id: Option<u32>) -> Result<(), Refused> {
+        let found = self.in_force().find(pattern, domain_id).cloned();
+        match found {
+            None => return Err(Refused::Unknown),
+            Some(Entry { origin, .. }) if origin != Origin::Api => {
+                return Err(Refused::Given { by: origin });
+            }
+            Some(_) => {}
+        }
+        self.change(|lists| {
+            let before = lists.added.len();
+            lists
+                .added
+                .retain(|watch| !is_for(watch, pattern, domain_id));
+            if lists.added.len() == before {
+                return Err(Refused::Unknown);
+            }
+            Ok(())
+        })
+    }
+
+    /// What is in force.
+    #[must_use]
+    pub fn in_force(&self) -> Arc<InForce> {
+        self.in_force.load_full()
+    }
+
+    /// For the capture thread: what to watch from now on, when that has changed since the last call.
+    #[must_use]
+    pub fn take_news(&self) -> Option<Arc<Watchlist>> {
+        self.news.swap(None)
+    }
+
+    fn put(&self, watch: Watch, replace: bool) -> Result<Done, Refused> {
+        let in_force = self.in_force();
+        let old = in_force.find(&watch.pattern, watch.domain_id);
+        let done = match old {
+            Some(old) if *old.watch == watch => return Ok(Done::Unchanged),
+            Some(old) if old.origin != Origin::Api => {
+                return Err(Refused::Given { by: old.origin });
+            }
+            Some(_) if !replace => return Err(Refused::Different),
+            Some(_) => Done::Replaced,
+            None => Done::Added,
+        };
+        let watch = Arc::new(watch);
+        self.change(|lists| {
+            let same = |other: &&mut Arc<Watch>| is_for(other, &watch.pattern, watch.domain_id);
+            if let Some(old) = lists.added.iter_mut().find(same) {
+                *old = Arc::clone(&watch);
+            } else if lists.added.len() < MAX_ADDED {
+                lists.added.push(Arc::clone(&watch));
+            } else {
+                return Err(Refused::Full);
+            }
+            Ok(())
+        })?;
+        Ok(done)
+    }
+
+    /// Changes the lists, merges them and hands the outcome to whom it concerns; on an error
+    /// nothing changes.
+    fn change<E: From<globset::Error>>(
+        &self,
+        change: impl FnOnce(&mut Lists) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let mut lists = self.lists.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut new = lists.clone();
+        change(&mut new)?;
+        let merged = InForce::merge(&new, &self.in_force().watchlist)?;
+        *lists = new;
+        self.news.store(Some(Arc::clone(&merged.watchlist)));
+        self.board.watch(merged.watchlist.watches());
+        self.in_force.store(Arc::new(merged));
+        drop(lists);
+        self.board.ring();
+        Ok(())
+    }
+}
+
+impl InForce {
+    fn merge(lists: &Lists, before: &Watchlist) -> Result<Self, globset::Error> {
+        let origins = [
+            (Origin::Config, &lists.configured),
+            (Origin::CommandLine, &lists.command_line),
+            (Origin::Api, &lists.added),
+        ];
+        let mut taken = std::collections::HashSet::new();
+        let mut entries = Vec::new();
+        for (origin, watches) in origins {
+            for watch in watches {
+                if taken.insert((watch.pattern.as_str(), watch.domain_id)) {
+                    let watch = Arc::clone(watch);
+                    entries.push(Entry { watch, origin });
+                }
+            }
+        }
+        let watches = entries.iter().map(|entry| Arc::clone(&entry.watch));
+        let watchlist = Arc::new(before.followed_by(watches.collect())?);
+        Ok(Self { entries, watchlist })
+    }
+}
+
+fn is_for(watch: &Watch, pattern: &str, domain_id: Option<u32>) -> bool {
+    watch.pattern == pattern && watch.domain_id == domain_id
+}
