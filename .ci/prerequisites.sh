@@ -68,12 +68,12 @@ prometheus() {
 
 # What the dashboards are type-checked with. Without it one test fails and says so.
 types() {
-    local directory=$tools/grafana lock=dashboards/check/package-lock.json
+    local directory=$tools/grafana lock=agent/tests/dashboard/types/package-lock.json
     cmp -s "$lock" "$directory/package-lock.json" && [ -d "$directory/node_modules/typescript" ] && return
     command -v npm >/dev/null || packages npm
     say "installing @grafana/schema and typescript into target/tools/grafana"
     mkdir -p "$directory"
-    cp dashboards/check/package.json "$lock" "$directory"
+    cp agent/tests/dashboard/types/package.json "$lock" "$directory"
     (cd "$directory" && npm ci --ignore-scripts --no-audit --no-fund --silent) ||
         { rm -f "$directory/package-lock.json"; say "npm failed: the dashboards cannot be type-checked"; }
 }

@@ -253,7 +253,7 @@ fn table_of_panels() -> Result<String> {
     Ok(table + "\n")
 }
 
-/// What the TypeScript compiler says of dashboards beside `dashboards/check/dashboard.ts`.
+/// What the TypeScript compiler says of dashboards beside `agent/tests/dashboard/types/dashboard.ts`.
 fn type_check(files: &[(String, String)]) -> Result<String> {
     const MISSING: &str = "the TypeScript compiler is missing: run `.ci/prerequisites.sh types`, \
                            which needs npm (`apt-get install npm`)";
@@ -263,7 +263,7 @@ fn type_check(files: &[(String, String)]) -> Result<String> {
     let compiler = compiler.canonicalize()?;
     // Below what npm installed, where the compiler looks for Grafana's types.
     let directory = tempfile::tempdir_in(&tools)?;
-    let sources = dashboard::directory().join("check");
+    let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/dashboard/types");
     for file in ["dashboard.ts", "tsconfig.json"] {
         std::fs::copy(sources.join(file), directory.path().join(file))?;
     }

@@ -19,7 +19,7 @@ use harness::prometheus::Prometheus;
 use serde_yaml::Value;
 
 /// Panels' queries without an answer on these robots, and why that is right.
-const RIGHTLY_EMPTY: [(&str, &str); 5] = [
+const RIGHTLY_EMPTY: [(&str, &str); 9] = [
     (
         "robot: Where latency arises B",
         "nothing is sent and received by sockets of one host",
@@ -32,17 +32,25 @@ const RIGHTLY_EMPTY: [(&str, &str); 5] = [
         "robot: Dropped by the agent E",
         "packet rings are of the source `wire`",
     ),
+    ("robot: Who does not talk to whom B", "a topic has one type"),
+    (
+        "robot: Who does not talk to whom C",
+        "a type has one definition",
+    ),
+    ("robot: Names in conflict A", "names are taken once"),
+    ("robot: Names in conflict B", "all nodes are in one domain"),
     ("robot: Unreadable packets A", "everything can be read"),
     ("robot: Drops of unknown content A", "no socket overflows"),
 ];
 
 /// Alerts whose condition holds here. The others are about agents and links that fail.
-const TRUE_ALERTS: [&str; 5] = [
+const TRUE_ALERTS: [&str; 6] = [
     "Ros2TopicSilent",
     "Ros2TopicNotPublished",
     "Ros2TopicRateBelowContract",
     "Ros2TopicRateAboveContract",
     "Ros2TopicLatencyAboveContract",
+    "Ros2QosIncompatible",
 ];
 
 /// Labels that may be empty, which to Prometheus is the same as absent.
@@ -73,17 +81,21 @@ fn every_panel_and_every_rule_has_data_of_two_robots() -> Result<()> {
     ] {
         roles.push(Process::start(&host.inside(), robot()?, ["--role", role])?);
     }
-    // A publisher that is never let go.
+    // A publisher that is never let go, and a subscriber that asks for more than it offers.
     let quiet = Stream {
         topic: "/quiet".to_owned(),
         ..Stream::small(1)
+    };
+    let demanding = Stream {
+        reliable: true,
+        ..quiet.clone()
     };
     let listener = &["/listener"];
     let subscriber = Peer::start(
         &link.monitor,
         Stack::Rust,
         Role::Subscriber,
-        &quiet,
+        &demanding,
         listener,
     )?;
     let publisher = Peer::start(

@@ -324,7 +324,12 @@ mod tests {
     #[test]
     fn presentation_order_and_representation_are_read() {
         let mut qos = Qos::defaults(Role::Writer, VendorId::CYCLONE);
-        apply(&mut qos, ParameterId::PRESENTATION, &[1, 0, 0, 0, 0, 1, 0, 0]).unwrap();
+        apply(
+            &mut qos,
+            ParameterId::PRESENTATION,
+            &[1, 0, 0, 0, 0, 1, 0, 0],
+        )
+        .unwrap();
         let Presentation {
             access_scope,
             is_coherent,
@@ -333,11 +338,13 @@ mod tests {
         assert_eq!(access_scope, AccessScope::TOPIC);
         assert_eq!((is_coherent, is_ordered), (false, true));
         apply(&mut qos, ParameterId::DESTINATION_ORDER, &[1, 0, 0, 0]).unwrap();
-        assert_eq!(
-            qos.destination_order,
-            DestinationOrder::BY_SOURCE_TIMESTAMP
-        );
-        apply(&mut qos, ParameterId::LATENCY_BUDGET, &[1, 0, 0, 0, 0, 0, 0, 0]).unwrap();
+        assert_eq!(qos.destination_order, DestinationOrder::BY_SOURCE_TIMESTAMP);
+        apply(
+            &mut qos,
+            ParameterId::LATENCY_BUDGET,
+            &[1, 0, 0, 0, 0, 0, 0, 0],
+        )
+        .unwrap();
         assert_eq!(qos.latency_budget, Duration::Finite(1_000_000_000));
     }
 
