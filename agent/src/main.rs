@@ -24,6 +24,7 @@ use ros2probe::run::{Run, Source};
 use ros2probe::state::Keeper;
 use ros2probe::surface::api::{self, reload};
 use ros2probe::surface::http::Server;
+use ros2probe::surface::otlp::{self, Exporter, Host, SettingsError};
 use ros2probe::surface::{Board, Exposition, Format, Settings};
 use ros2probe::watches::Watches;
 use tokio_util::sync::CancellationToken;
@@ -72,6 +73,11 @@ fn run(options: cli::Run) -> Result<()> {
         .map(|address| Server::bind(address, Arc::clone(&board)));
     let server = server.transpose()?;
     let control = control::open(&config.api)?;
+    let export = otlp::Settings::resolve(
+        &config.otlp,
+        &|name| std::env::var(name).ok(),
+        &Host::read(),
+    )?;
     let state = match &source {
         Source::Live(_) => memory::open(&config.state_directory),
         Source::Replay(_) => None,
@@ -122,6 +128,8 @@ fn run(options: cli::Run) -> Result<()> {
         reloader,
         stop: stop.clone(),
     };
+    let exporter = export.map(|settings| Exporter::start(settings, &board));
+    let exporter = exporter.transpose()?;
     let supervisor = Supervisor {
         board: Arc::clone(&board),
         config,
@@ -130,6 +138,7 @@ fn run(options: cli::Run) -> Result<()> {
         reloads,
         stop,
         log,
+        exporter,
     };
     let surfaces = Surfaces {
         metrics: server,
@@ -196,7 +205,7 @@ fn message(error: &anyhow::Error) -> String {
 fn exit_code(error: &anyhow::Error) -> ExitCode {
     if error.is::<Missing>() {
         ExitCode::from(NO_PERMISSION)
-    } else if error.is::<ConfigError>() {
+    } else if error.is::<ConfigError>() || error.is::<SettingsError>() {
         ExitCode::from(BAD_CONFIG)
     } else {
         ExitCode::FAILURE

@@ -13,6 +13,7 @@ use ros2probe::surface::api;
 use ros2probe::surface::api::reload::{NotReloaded, Reloaded, Reloads};
 use ros2probe::surface::events::Sight;
 use ros2probe::surface::http::Server;
+use ros2probe::surface::otlp::Exporter;
 use ros2probe::surface::{Board, Settings};
 use ros2probe::watches::Watches;
 use sd_notify::NotifyState;
@@ -40,6 +41,8 @@ pub(crate) struct Supervisor {
     pub(crate) reloads: Reloads,
     pub(crate) stop: CancellationToken,
     pub(crate) log: Log,
+    /// Pushes what is on the board, where something is to be pushed.
+    pub(crate) exporter: Option<Exporter>,
 }
 
 /// What is served, bound and not answered yet.
@@ -124,6 +127,10 @@ impl Supervisor {
         let drained = drained.await.is_ok();
         if drained && worker.thread.join().is_err() {
             tracing::error!("the working thread died while ending");
+        }
+        // After the working thread, whose last state it exports.
+        if let Some(exporter) = self.exporter.take() {
+            exporter.finish().await;
         }
         match outcome {
             Ok(reason) => {

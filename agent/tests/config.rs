@@ -75,9 +75,10 @@ fn the_defaults_in_the_comments_are_the_defaults() {
         "record_ring_bytes",
         "exclude",
         "per_writer",
+        "compression",
         "topic_grace_s",
     ] {
-        let active = |line: &str| line.trim_start().starts_with(&format!("{key}: "));
+        let active = |line: &str| line.trim_start().starts_with(&format!("{key}:"));
         assert!(yaml.lines().any(active), "{key} is not in\n{yaml}");
     }
     let config = Config::parse(yaml.as_bytes()).unwrap_or_else(|error| {
@@ -102,6 +103,7 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
         uncommented(&shipped("ros2probe.yaml")),
         "watch:\nlimits: {topics: 5}\n".to_owned(),
         "watch: [/a, {topic: /b, domain: 3, max_silence_s: 1.5}]\nlog: warn\n".to_owned(),
+        "otlp: {endpoint: 'http://collector', headers: {a: b}, compression: gzip}\n".to_owned(),
     ];
     for yaml in good {
         assert!(
@@ -123,6 +125,9 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
         "capture: {source: socket}",
         "watch: [{topic: /a, per_subscriber: 1}]",
         "topic_grace_s: -1",
+        "otlp: {headers: {a: 1}}",
+        "otlp: {compression: zstd}",
+        "otlp: {interval_s: 0}",
     ] {
         assert!(
             !validator.is_valid(&serde_yaml::from_str(yaml).unwrap()),

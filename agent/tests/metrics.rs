@@ -16,6 +16,7 @@ use ros2probe::model::snapshot::{
 };
 use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe::surface::events;
+use ros2probe::surface::otlp::Signal;
 use ros2probe::surface::{Ability, AgentFacts, Board, Exposition, Format, Settings, SourceKind};
 
 fn settings() -> Settings {
@@ -38,6 +39,7 @@ fn settings() -> Settings {
 fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
     let board = Arc::new(Board::new(SourceKind::Wire, settings));
     board.publish(snapshot, sample_robot::agent());
+    board.exports().enable(Signal::Metrics);
     Exposition::new(board).render(format).unwrap()
 }
 

@@ -74,7 +74,12 @@ fn check_map(
     };
     for (key, value) in entries {
         let path = key_path(path, &key.name);
-        match properties.and_then(|all| all.get(&key.name)) {
+        let own = properties.and_then(|all| all.get(&key.name));
+        // A map of names that the operator chooses.
+        let any = schema
+            .get("additionalProperties")
+            .filter(|any| any.is_object());
+        match own.or(any) {
             Some(schema) => check(value, &path, schema, root, found),
             None => found.add(key.position, &path, unknown_key(&key.name, known())),
         }

@@ -11,13 +11,14 @@ use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
-    ApiShape, CaptureShape, ConfigShape, MetricsShape, WatchEntryShape, WatchShape,
+    ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, WatchEntryShape, WatchShape,
 };
 use super::watch::{Expectations, Watch, check_pattern};
 use super::{
-    ApiSettings, CaptureSettings, Config, Limits, MetricsSettings, SocketChoice, SourceChoice,
-    StateChoice,
+    ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
+    SocketChoice, SourceChoice, StateChoice,
 };
+use crate::surface::otlp::endpoint;
 
 /// A watchlist that long should be globs.
 const MAX_WATCHES: usize = 1_000;
@@ -96,6 +97,7 @@ impl Reader {
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(&shape.metrics.unwrap_or_default()),
             api: self.api(shape.api.unwrap_or_default()),
+            otlp: otlp(shape.otlp.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             state_directory: state(&shape.state_directory),
             log: shape.log,
@@ -278,6 +280,12 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
                  `[::1]:{port}`, or `off`"
             ))
         }
+        "otlp.endpoint" if text != "off" && endpoint(text).is_none() => Err(
+            "must be an URL of a gRPC receiver, as in `http://collector:4317`, or `off`".to_owned(),
+        ),
+        "otlp.headers_file" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/etc/ros2probe/otlp.headers`".to_owned())
+        }
         _ => Ok(()),
     }
 }
@@ -307,6 +315,26 @@ fn metrics(shape: &MetricsShape) -> MetricsSettings {
         listen: shape.listen.parse().ok(),
         histograms: shape.histograms,
         per_writer: shape.per_writer,
+    }
+}
+
+fn otlp(shape: OtlpShape) -> OtlpSettings {
+    OtlpSettings {
+        endpoint: match shape.endpoint.as_deref() {
+            None => Endpoint::Environment,
+            Some("off") => Endpoint::Off,
+            Some(endpoint) => Endpoint::At(endpoint.to_owned()),
+        },
+        interval: shape.interval_s.map(Duration::from_secs),
+        timeout: shape.timeout_s.map(Duration::from_secs),
+        headers: shape.headers.unwrap_or_default(),
+        headers_file: shape.headers_file.map(PathBuf::from),
+        compression: shape.compression,
+        metrics: shape.metrics,
+        events: shape.events,
+        traces: shape.traces,
+        robot: shape.robot,
+        attributes: shape.attributes.unwrap_or_default(),
     }
 }
 
@@ -452,6 +480,29 @@ capture:
         ] {
             assert_eq!(report(good), "", "{good}");
         }
+    }
+
+    #[test]
+    fn an_otlp_section_is_checked_down_to_the_names_an_operator_chooses() {
+        let source = "\
+otlp:
+  endpoint: collector:4317
+  headers: {a: b, c: 3}
+  headers_file: secret
+  compression: zip
+  attributes: {site: roof, floor: [2]}
+";
+        assert_eq!(
+            report(source),
+            "f:2:13: otlp.endpoint: must be an URL of a gRPC receiver, as in \
+             `http://collector:4317`, or `off`\n\
+             f:3:22: otlp.headers.c: is `3`, must be text\n\
+             f:4:17: otlp.headers_file: must be an absolute path, as in \
+             `/etc/ros2probe/otlp.headers`\n\
+             f:5:16: otlp.compression: is the text `zip`, must be one of none, gzip\n\
+             f:6:35: otlp.attributes.floor: is a list, must be text"
+        );
+        assert_eq!(report("otlp: {endpoint: 'off', headers: }"), "");
     }
 
     #[test]

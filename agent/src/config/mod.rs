@@ -9,6 +9,7 @@ mod mistake;
 mod shape;
 pub mod watch;
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{self, Read as _};
 use std::net::SocketAddr;
@@ -37,6 +38,8 @@ pub struct Config {
     pub metrics: MetricsSettings,
     /// The control API.
     pub api: ApiSettings,
+    /// What is pushed to an OpenTelemetry receiver.
+    pub otlp: OtlpSettings,
     /// How long a topic without endpoints is still reported.
     pub topic_grace: Duration,
     /// Where what discovery knows is kept for the next start.
@@ -142,6 +145,55 @@ pub enum SocketChoice {
     At(PathBuf),
 }
 
+/// What is pushed to an OpenTelemetry receiver; `None` = the standard variable decides, or a default.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct OtlpSettings {
+    /// Where to.
+    pub endpoint: Endpoint,
+    /// How often metrics are.
+    pub interval: Option<Duration>,
+    /// How long an answer may take.
+    pub timeout: Option<Duration>,
+    /// Sent with each request.
+    pub headers: BTreeMap<String, String>,
+    /// A file with further ones.
+    pub headers_file: Option<PathBuf>,
+    /// Whether requests are compressed.
+    pub compression: Option<Compression>,
+    /// Whether metrics are exported.
+    pub metrics: Option<bool>,
+    /// Whether events are exported.
+    pub events: Option<bool>,
+    /// Whether spans of the watches that ask for them are exported.
+    pub traces: Option<bool>,
+    /// What the robot is called.
+    pub robot: Option<String>,
+    /// Further attributes of the resource.
+    pub attributes: BTreeMap<String, String>,
+}
+
+/// Where an OpenTelemetry receiver is.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Endpoint {
+    /// Where the standard variables say; nowhere when they are silent.
+    #[default]
+    Environment,
+    /// Nowhere.
+    Off,
+    /// Here.
+    At(String),
+}
+
+/// How requests are compressed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Compression {
+    /// Not at all.
+    None,
+    /// A fifth of the size or less, for some processor time.
+    Gzip,
+}
+
 /// How much is logged.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
@@ -228,6 +280,7 @@ impl Config {
             ("capture", self.capture != new.capture),
             ("metrics.listen", self.metrics.listen != new.metrics.listen),
             ("api", self.api != new.api),
+            ("otlp", self.otlp != new.otlp),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             (
                 "state_directory",
@@ -278,6 +331,7 @@ impl Default for Config {
                 socket: SocketChoice::default(),
                 token_file: None,
             },
+            otlp: OtlpSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             state_directory: StateChoice::default(),
             log: Level::default(),

@@ -3,10 +3,12 @@
 //! Sections may be left empty (`watch:` with everything below it commented out). Ranges written
 //! here are enforced while reading; what needs more than one value is checked in `meaning`.
 
+use std::collections::BTreeMap;
+
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::{Level, SourceChoice, defaults};
+use super::{Compression, Level, SourceChoice, defaults};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
@@ -24,6 +26,9 @@ pub(super) struct ConfigShape {
     pub(super) metrics: Option<MetricsShape>,
     /// The control API: watches that are added and removed while the agent runs.
     pub(super) api: Option<ApiShape>,
+    /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. What is not
+    /// written here the standard `OTEL_*` variables decide.
+    pub(super) otlp: Option<OtlpShape>,
     /// How long a topic without endpoints is still reported, in seconds.
     #[schemars(range(min = 0, max = 604_800))]
     #[serde(default = "defaults::topic_grace_s")]
@@ -177,6 +182,39 @@ impl Default for ApiShape {
             token_file: None,
         }
     }
+}
+
+/// Push to an OpenTelemetry receiver.
+#[derive(Debug, Default, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct OtlpShape {
+    /// URL of the receiver, as `http://collector:4317`, or `off`. When left out,
+    /// `OTEL_EXPORTER_OTLP_ENDPOINT` decides (and those of single signals); nothing is exported
+    /// when it is not set either.
+    pub(super) endpoint: Option<String>,
+    /// How often metrics are exported, in seconds; 15 when nobody says.
+    #[schemars(range(min = 1, max = 3_600))]
+    pub(super) interval_s: Option<u64>,
+    /// How long the receiver may take to answer, in seconds; 10 when nobody says.
+    #[schemars(range(min = 1, max = 300))]
+    pub(super) timeout_s: Option<u64>,
+    /// Sent with each request: names and values. Secrets belong into headers_file.
+    pub(super) headers: Option<BTreeMap<String, String>>,
+    /// A file with one `name: value` a line, by absolute path.
+    pub(super) headers_file: Option<String>,
+    /// `none`, or `gzip` for slow links.
+    pub(super) compression: Option<Compression>,
+    /// Whether metrics are exported.
+    pub(super) metrics: Option<bool>,
+    /// Whether events are exported, as log records.
+    pub(super) events: Option<bool>,
+    /// Whether spans are exported, of the watches with `trace`.
+    pub(super) traces: Option<bool>,
+    /// What this robot is called: the attribute `robot.name` of all that is exported.
+    pub(super) robot: Option<String>,
+    /// Further attributes of the resource, names and values.
+    pub(super) attributes: Option<BTreeMap<String, String>>,
 }
 
 impl Default for LimitsShape {

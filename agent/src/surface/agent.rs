@@ -8,6 +8,7 @@ use super::agent_facts::{Ability, InterfaceFacts};
 use super::board::{Reload, State};
 use super::catalogue as metric;
 use super::events::EventLog;
+use super::otlp::{Exports, Outcome, Reason};
 use super::page::{Label, Page};
 use super::process::Process;
 use super::robot::Rows;
@@ -166,6 +167,28 @@ pub(super) fn events(page: &mut Page<'_>, log: &EventLog) -> fmt::Result {
         })?;
     }
     Ok(())
+}
+
+/// What became of what was to be exported; nothing where nothing is.
+pub(super) fn exports(page: &mut Page<'_>, exports: &Exports) -> fmt::Result {
+    page.family(&metric::OTLP_EXPORTS, |family| {
+        for signal in exports.signals() {
+            for outcome in Outcome::ALL {
+                let labels = [Label::Text(signal.label()), Label::Text(outcome.label())];
+                family.sample(&labels, exports.requests(signal, outcome))?;
+            }
+        }
+        Ok(())
+    })?;
+    page.family(&metric::OTLP_DROPPED, |family| {
+        for signal in exports.signals() {
+            for reason in Reason::ALL {
+                let labels = [Label::Text(signal.label()), Label::Text(reason.label())];
+                family.sample(&labels, exports.dropped(signal, reason))?;
+            }
+        }
+        Ok(())
+    })
 }
 
 /// The process; what cannot be read is left out.

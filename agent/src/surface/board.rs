@@ -15,6 +15,7 @@ use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
 use super::events::{AgentEvent, EventLog};
+use super::otlp::Exports;
 use crate::config::{Config, Watch};
 use crate::model::snapshot::Snapshot;
 
@@ -28,6 +29,7 @@ pub struct Board {
     settings: ArcSwap<Settings>,
     reload: ArcSwap<Reload>,
     events: Arc<EventLog>,
+    exports: Exports,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
     bell: Option<Bell>,
@@ -104,6 +106,7 @@ impl Board {
             settings: ArcSwap::from_pointee(settings),
             reload: ArcSwap::from_pointee(reload),
             events: Arc::new(events),
+            exports: Exports::default(),
             asked: AtomicBool::new(false),
             // Without one, askers wait until the capture thread looks by itself.
             bell: Bell::new().ok(),
@@ -208,6 +211,12 @@ impl Board {
     #[must_use]
     pub const fn events(&self) -> &Arc<EventLog> {
         &self.events
+    }
+
+    /// What became of what was to be exported.
+    #[must_use]
+    pub const fn exports(&self) -> &Exports {
+        &self.exports
     }
 
     /// How the last reload went.

@@ -10,13 +10,9 @@ use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, text};
 use prometheus_client::registry::Registry;
 
-use super::agent;
 use super::board::Board;
-use super::deliveries::{self, Deliveries};
-use super::diagnoses;
 use super::page::Page;
-use super::robot::{self, Rows};
-use crate::model::snapshot::Snapshot;
+use super::walk::walk;
 
 /// The two text formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -119,30 +115,8 @@ struct Scrape {
 
 impl Collector for Scrape {
     fn encode(&self, encoder: DescriptorEncoder<'_>) -> fmt::Result {
-        let (state, settings) = (self.board.state(), self.board.settings());
-        let nothing = Snapshot::default();
-        let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
-        let rows = Rows::new(snapshot, &settings);
-        let now = Instant::now();
         let last_scrape = Duration::from_nanos(self.last_scrape.load(Ordering::Relaxed));
-
-        let mut page = Page::new(encoder);
-        robot::graph(&mut page, snapshot)?;
-        diagnoses::diagnoses(&mut page, snapshot)?;
-        let deliveries = Deliveries::new(&rows.shown);
-        robot::topics(&mut page, &rows.shown, &settings)?;
-        deliveries::sums(&mut page, &rows.shown, &settings)?;
-        robot::writers(&mut page, &rows.shown, &settings)?;
-        deliveries.write(&mut page)?;
-        deliveries::sockets(&mut page, &snapshot.sockets)?;
-        robot::watches(&mut page, snapshot, &settings.watches)?;
-        agent::identity(&mut page, &state, now)?;
-        agent::capture(&mut page, &state)?;
-        agent::model(&mut page, &state, &rows, deliveries.hidden)?;
-        agent::surface(&mut page, &state, self.board.reload(), last_scrape, now)?;
-        agent::kept(&mut page, &state)?;
-        agent::events(&mut page, self.board.events())?;
-        agent::process(&mut page)
+        walk(&mut Page::Text(encoder), &self.board, last_scrape)
     }
 }
 

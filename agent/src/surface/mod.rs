@@ -12,9 +12,11 @@ mod diagnoses;
 pub mod events;
 pub mod exposition;
 pub mod http;
+pub mod otlp;
 mod page;
 mod process;
 mod robot;
+mod walk;
 
 pub use agent_facts::{Ability, AgentFacts, InterfaceFacts, SourceKind};
 pub use board::{Board, Settings, State};

@@ -1,5 +1,7 @@
-//! Writing families and samples through prometheus-client, straight from facts, in the
-//! catalogue's order. No registry types are kept: what is gone from the facts is gone from the page.
+//! Families and samples, straight from facts, in the catalogue's order, as text through
+//! prometheus-client or as OTLP data points: who writes them cannot tell which.
+//!
+//! Nothing is kept between two pages: what is gone from the facts is gone from the page.
 
 use std::collections::hash_map::DefaultHasher;
 use std::fmt::{self, Write as _};
@@ -15,6 +17,7 @@ use prometheus_client::registry::Unit;
 use ros2probe_wire::Guid;
 
 use super::catalogue::{Kind, Metric};
+use super::otlp::points::Points;
 use crate::model::histogram::Histogram;
 
 /// Longer label values are cut. ROS allows 255 characters; what is longer is hostile.
@@ -36,26 +39,39 @@ pub(super) enum Number {
     Real(f64),
 }
 
-/// One scrape being written.
-pub(super) struct Page<'a>(DescriptorEncoder<'a>);
+/// One scrape or one export being written.
+pub(super) enum Page<'a> {
+    Text(DescriptorEncoder<'a>),
+    Points(&'a mut Points),
+}
 
 /// One family being written; its samples follow one another.
 pub(super) struct Family<'a> {
     metric: &'static Metric,
-    encoder: MetricEncoder<'a>,
+    sink: Sink<'a>,
 }
 
-impl<'a> Page<'a> {
-    pub(super) fn new(encoder: DescriptorEncoder<'a>) -> Self {
-        Self(encoder)
-    }
+/// Where a family's samples go.
+enum Sink<'a> {
+    Text(MetricEncoder<'a>),
+    Points(&'a mut Points),
+}
 
+impl Page<'_> {
     /// Begins a family; `samples` writes what it holds.
     pub(super) fn family(
         &mut self,
         metric: &'static Metric,
         samples: impl FnOnce(&mut Family<'_>) -> fmt::Result,
     ) -> fmt::Result {
+        let encoder = match self {
+            Self::Text(encoder) => encoder,
+            Self::Points(points) => {
+                points.open(metric);
+                let sink = Sink::Points(points);
+                return samples(&mut Family { metric, sink });
+            }
+        };
         let kind = match metric.kind {
             Kind::Counter => MetricType::Counter,
             Kind::Gauge => MetricType::Gauge,
@@ -65,10 +81,11 @@ impl<'a> Page<'a> {
         // prometheus-client appends the unit only where it ends the name.
         let stem = metric.stem();
         let unit = metric.unit.map(|unit| Unit::Other(unit.to_owned()));
-        let encoder = self
-            .0
-            .encode_descriptor(stem, metric.help, unit.as_ref(), kind)?;
-        samples(&mut Family { metric, encoder })
+        let sink = encoder.encode_descriptor(stem, metric.help, unit.as_ref(), kind)?;
+        samples(&mut Family {
+            metric,
+            sink: Sink::Text(sink),
+        })
     }
 
     /// A family with one sample and no labels.
@@ -84,20 +101,26 @@ impl<'a> Page<'a> {
 impl Family<'_> {
     /// One counter, gauge or info sample; an info's value is ignored.
     pub(super) fn sample(&mut self, labels: &[Label<'_>], value: impl Into<Number>) -> fmt::Result {
-        let value = value.into();
-        let labels = self.labels(labels);
-        let kind = self.metric.kind;
-        if kind == Kind::Info {
-            return self.encoder.encode_info(&labels);
+        let (metric, value) = (self.metric, value.into());
+        let encoder = match &mut self.sink {
+            Sink::Text(encoder) => encoder,
+            Sink::Points(points) => {
+                points.number(labels, value);
+                return Ok(());
+            }
+        };
+        let labels = Labels::new(metric, labels);
+        if metric.kind == Kind::Info {
+            return encoder.encode_info(&labels);
         }
-        let write = |encoder: &mut MetricEncoder<'_>| match kind {
+        let write = |encoder: &mut MetricEncoder<'_>| match metric.kind {
             Kind::Counter => encoder.encode_counter::<NoLabelSet, _, f64>(&value, None),
             _ => encoder.encode_gauge(&value),
         };
         if labels.names.is_empty() {
-            return write(&mut self.encoder);
+            return write(encoder);
         }
-        write(&mut self.encoder.encode_family(&labels)?)
+        write(&mut encoder.encode_family(&labels)?)
     }
 
     /// One info sample.
@@ -107,23 +130,17 @@ impl Family<'_> {
 
     /// One histogram.
     pub(super) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
+        let encoder = match &mut self.sink {
+            Sink::Text(encoder) => encoder,
+            Sink::Points(points) => {
+                points.histogram(labels, values);
+                return Ok(());
+            }
+        };
         let buckets: Vec<(f64, u64)> = values.buckets().collect();
-        let labels = self.labels(labels);
-        let mut encoder = self.encoder.encode_family(&labels)?;
+        let labels = Labels::new(self.metric, labels);
+        let mut encoder = encoder.encode_family(&labels)?;
         encoder.encode_histogram::<NoLabelSet>(values.sum(), values.count(), &buckets, None)
-    }
-
-    fn labels<'l>(&self, values: &'l [Label<'l>]) -> Labels<'l> {
-        debug_assert_eq!(
-            self.metric.labels.len(),
-            values.len(),
-            "{}",
-            self.metric.name
-        );
-        Labels {
-            names: self.metric.labels,
-            values,
-        }
     }
 }
 
@@ -132,6 +149,14 @@ impl Family<'_> {
 struct Labels<'a> {
     names: &'static [&'static str],
     values: &'a [Label<'a>],
+}
+
+impl<'a> Labels<'a> {
+    fn new(metric: &'static Metric, values: &'a [Label<'a>]) -> Self {
+        let names = metric.labels;
+        debug_assert_eq!(names.len(), values.len(), "{}", metric.name);
+        Self { names, values }
+    }
 }
 
 impl EncodeLabelSet for Labels<'_> {
@@ -160,7 +185,7 @@ impl Label<'_> {
 
 /// Text up to the cap. What is longer keeps its beginning and a hash of the whole, so that two long
 /// names do not become one series.
-fn write_capped(out: &mut impl fmt::Write, text: &str) -> fmt::Result {
+pub(super) fn write_capped(out: &mut impl fmt::Write, text: &str) -> fmt::Result {
     if text.len() <= MAX_LABEL_BYTES {
         return out.write_str(text);
     }

@@ -156,6 +156,16 @@ pub(in crate::surface) const RESTORED: Metric = Metric::gauge(
     &[],
     "Participants known from before the agent's start and not heard since; they go when their lease ends.",
 );
+pub(in crate::surface) const OTLP_EXPORTS: Metric = Metric::counter(
+    "ros2probe_otlp_exports_total",
+    &["signal", "outcome"],
+    "Requests to the OTLP endpoint: delivered, partial (taken in part), retried or failed; absent where nothing is exported.",
+);
+pub(in crate::surface) const OTLP_DROPPED: Metric = Metric::counter(
+    "ros2probe_otlp_dropped_total",
+    &["signal", "reason"],
+    "Data points, log records and spans that were not delivered: overflow (no room here), superseded (by newer points while the endpoint was away), refused, rejected (in part) or shutdown.",
+);
 
 pub(in crate::surface) const EVENTS: Metric =
     Metric::counter("ros2probe_events_total", &["name"], "Events told, by name.");

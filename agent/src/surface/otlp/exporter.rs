@@ -1,0 +1,118 @@
+//! The thread on which everything is exported, with a runtime of its own.
+
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::{Duration, SystemTime};
+
+use tokio::runtime::{Builder, Runtime};
+use tokio::sync::oneshot;
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+
+use super::client::Client;
+use super::exports::Signal;
+use super::metrics::Collector;
+use super::outlet::Outlet;
+use super::settings::{Settings, SettingsError, Target};
+use crate::surface::board::Board;
+
+/// Ending takes no longer, whatever the receiver does.
+const ENDING: Duration = Duration::from_secs(2);
+
+/// The running thread.
+pub struct Exporter {
+    thread: JoinHandle<()>,
+    stop: CancellationToken,
+    ended: oneshot::Receiver<()>,
+}
+
+/// Why there is none.
+#[derive(Debug, thiserror::Error)]
+pub enum StartError {
+    /// What is asked for cannot be done.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// The system has no thread for it.
+    #[error("cannot start the thread that exports")]
+    Thread(#[source] std::io::Error),
+}
+
+impl Exporter {
+    /// Exports what is on the board from now on.
+    ///
+    /// # Errors
+    /// When a connection cannot be set up; that the receiver is not there is no error.
+    pub fn start(settings: Settings, board: &Arc<Board>) -> Result<Self, StartError> {
+        // Threads that block look names up, one for each signal at most.
+        let mut runtime = Builder::new_current_thread();
+        let runtime = runtime.max_blocking_threads(3).enable_all().build();
+        let runtime = runtime.map_err(StartError::Thread)?;
+        let stop = CancellationToken::new();
+        let jobs = Jobs::new(settings, board, &stop, &runtime)?;
+        let (tell, ended) = oneshot::channel();
+        let thread = std::thread::Builder::new()
+            .name("otlp".to_owned())
+            .spawn(move || {
+                runtime.block_on(jobs.run());
+                // A name that is being looked up must not hold the end up.
+                runtime.shutdown_background();
+                let _ = tell.send(());
+            })
+            .map_err(StartError::Thread)?;
+        Ok(Self {
+            thread,
+            stop,
+            ended,
+        })
+    }
+
+    /// Exports what there is a last time and ends, within two seconds.
+    pub async fn finish(self) {
+        self.stop.cancel();
+        if timeout(ENDING, self.ended).await.is_err() {
+            tracing::warn!("the last export did not end in time");
+        } else if self.thread.join().is_err() {
+            tracing::error!("the exporting thread died");
+        }
+    }
+}
+
+/// What the thread does.
+struct Jobs {
+    metrics: Option<(Collector, Outlet, Duration)>,
+}
+
+impl Jobs {
+    fn new(
+        settings: Settings,
+        board: &Arc<Board>,
+        stop: &CancellationToken,
+        runtime: &Runtime,
+    ) -> Result<Self, SettingsError> {
+        // Connections belong to the runtime from their beginning.
+        let _inside = runtime.enter();
+        let outlet = |signal: Signal, target: Option<Target>| {
+            let client = target.map(|target| Client::new(signal, target, Arc::clone(board)));
+            Ok(client
+                .transpose()?
+                .map(|client| Outlet::new(client, stop.clone())))
+        };
+        let metrics = outlet(Signal::Metrics, settings.metrics)?;
+        let collector = || {
+            Collector::new(
+                Arc::clone(board),
+                settings.resource.clone(),
+                SystemTime::now(),
+            )
+        };
+        Ok(Self {
+            metrics: metrics.map(|outlet| (collector(), outlet, settings.interval)),
+        })
+    }
+
+    async fn run(self) {
+        if let Some((collector, outlet, interval)) = self.metrics {
+            collector.run(outlet, interval).await;
+        }
+    }
+}

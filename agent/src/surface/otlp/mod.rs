@@ -1,0 +1,21 @@
+//! OTLP: metrics, events and traces pushed to a receiver, on a thread of their own.
+//!
+//! The receiver may be absent, slow or come back: memory stays bounded, what is not delivered is
+//! counted, and the capture never waits.
+
+mod client;
+mod exporter;
+mod exports;
+mod identity;
+mod metrics;
+mod naming;
+mod outlet;
+pub(super) mod points;
+mod resource;
+mod settings;
+mod starts;
+
+pub use exporter::{Exporter, StartError};
+pub use exports::{Exports, Outcome, Reason, Signal};
+pub use resource::Host;
+pub use settings::{Settings, SettingsError, endpoint};

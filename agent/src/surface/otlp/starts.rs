@@ -1,0 +1,134 @@
+//! Since when each cumulative series counts, which OTLP wants with every point.
+//!
+//! A series that is new since the last collection, or that began again, counts since that
+//! collection; the first ones since the agent's start. Bounded: what has no room counts since the
+//! agent's start, too.
+
+use std::collections::HashMap;
+use std::collections::hash_map::RandomState;
+use std::hash::{BuildHasher as _, Hash as _, Hasher as _};
+
+use crate::surface::catalogue::Metric;
+use crate::surface::page::Label;
+
+/// Series remembered.
+const MAX_SERIES: usize = 200_000;
+
+/// The series of the last collection.
+#[derive(Debug)]
+pub(super) struct Starts {
+    hashes: RandomState,
+    series: HashMap<u64, Series>,
+    agent: u64,
+    /// When the last collection was, and the one that goes on.
+    previous: u64,
+    now: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Series {
+    start: u64,
+    seen: u64,
+    value: f64,
+}
+
+impl Starts {
+    /// Of an agent that started then, in Unix nanoseconds.
+    pub(super) fn new(agent: u64) -> Self {
+        Self {
+            hashes: RandomState::new(),
+            series: HashMap::new(),
+            agent,
+            previous: agent,
+            now: agent,
+        }
+    }
+
+    /// A collection begins.
+    pub(super) fn begin(&mut self, now: u64) {
+        self.now = now;
+    }
+
+    /// It ends: what it did not hold is forgotten.
+    pub(super) fn end(&mut self) {
+        let now = self.now;
+        self.series.retain(|_, series| series.seen == now);
+        self.previous = now;
+    }
+
+    /// Since when the series counts of which this is the value now.
+    pub(super) fn start(&mut self, metric: &Metric, labels: &[Label<'_>], value: f64) -> u64 {
+        let (previous, now) = (self.previous, self.now);
+        let key = self.key(metric, labels);
+        if self.series.len() >= MAX_SERIES && !self.series.contains_key(&key) {
+            return self.agent;
+        }
+        let series = self.series.entry(key).or_insert(Series {
+            start: previous,
+            seen: now,
+            value,
+        });
+        if value < series.value {
+            series.start = previous;
+        }
+        (series.seen, series.value) = (now, value);
+        series.start
+    }
+
+    fn key(&self, metric: &Metric, labels: &[Label<'_>]) -> u64 {
+        let mut hasher = self.hashes.build_hasher();
+        metric.name.hash(&mut hasher);
+        for label in labels {
+            match label {
+                Label::Text(text) => text.hash(&mut hasher),
+                Label::Number(number) => number.hash(&mut hasher),
+                Label::Guid(guid) => guid.hash(&mut hasher),
+                Label::Address(address) => address.hash(&mut hasher),
+            }
+        }
+        hasher.finish()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::catalogue::CATALOGUE;
+
+    #[test]
+    fn a_series_counts_since_it_was_not_there_or_began_again() {
+        let [metric, other] = CATALOGUE.first_chunk().unwrap();
+        let mut starts = Starts::new(100);
+        let points = [Label::Number(0), Label::Text("/points")];
+        let imu = [Label::Number(0), Label::Text("/imu")];
+        starts.begin(200);
+        assert_eq!(starts.start(metric, &points, 5.0), 100, "the first");
+        starts.end();
+        starts.begin(300);
+        assert_eq!(starts.start(metric, &points, 7.0), 100);
+        assert_eq!(starts.start(metric, &imu, 1.0), 200, "new");
+        assert_eq!(starts.start(other, &points, 1.0), 200, "another metric");
+        starts.end();
+        starts.begin(400);
+        assert_eq!(starts.start(metric, &points, 3.0), 300, "began again");
+        starts.end();
+        starts.begin(500);
+        assert_eq!(starts.start(metric, &imu, 9.0), 400, "gone and back");
+        starts.end();
+        assert_eq!(starts.series.len(), 1);
+    }
+
+    #[test]
+    fn a_flood_of_series_is_not_remembered() {
+        let [metric, ..] = CATALOGUE else { panic!() };
+        let mut starts = Starts::new(100);
+        starts.begin(200);
+        starts.end();
+        starts.begin(300);
+        for index in 0..MAX_SERIES as u64 {
+            assert_eq!(starts.start(metric, &[Label::Number(index)], 1.0), 200);
+        }
+        assert_eq!(starts.start(metric, &[Label::Text("late")], 1.0), 100);
+        assert_eq!(starts.series.len(), MAX_SERIES);
+    }
+}
