@@ -89,6 +89,12 @@ impl Kernel {
         }
     }
 
+    pub fn forget_interest(&mut self, interest: &BTreeMap<Guid, Verdict>) {
+        for guid in interest.keys() {
+            self.filter.set_interest(*guid, None).unwrap();
+        }
+    }
+
     pub fn set_unknown_budget(&mut self, bytes: u32, records: u32) {
         for (budget, amount) in [(Budget::CaptureBytes, bytes), (Budget::Records, records)] {
             self.filter.set_unknown_budget(budget, amount).unwrap();
