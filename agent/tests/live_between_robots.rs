@@ -7,7 +7,7 @@ mod harness;
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 use harness::agent::{Agent, ON_THE_WIRE, at_the_sockets_of};
@@ -17,8 +17,12 @@ use harness::peer::{Peer, Role, Stack, Stream};
 use harness::prometheus::Prometheus;
 use harness::switch::Switched;
 
-/// Ten seconds.
-const SAMPLES: u64 = 2_000;
+/// Six seconds.
+const SAMPLES: u64 = 1_200;
+/// How long repairs, scrapes and rules may take on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(40);
+/// Gaps are settled after a second; scrapes and rules take another one each.
+const STILL: Duration = Duration::from_millis(3500);
 const PER_MILLE: u16 = 200;
 /// Of some 450 that a point cloud takes.
 const FRAMES_PER_MILLE: u16 = 1;
@@ -30,6 +34,7 @@ enum Source {
 }
 
 /// How one writer's samples fared from one robot to the other.
+#[derive(Clone, Copy, Debug, PartialEq)]
 struct Journey {
     published: u64,
     received: u64,
@@ -93,7 +98,7 @@ fn cyclone_dds_point_clouds_that_lose_a_frame_between_two_hosts_are_the_differen
 
 fn best_effort(source: Source, stack: Stack) -> Result<()> {
     let seen = Journey::of(source, stack, &stream())?;
-    let lost = seen.published - seen.received;
+    let lost = seen.lost();
     ensure!(seen.published == SAMPLES, "{} published", seen.published);
     ensure!(
         lost == seen.dropped && lost > SAMPLES / 10,
@@ -111,7 +116,7 @@ fn best_effort(source: Source, stack: Stack) -> Result<()> {
         "{} of {lost} noticed by the receiver",
         seen.before_host
     );
-    // A rate begins with the second scrape of either counter: a second of ten may be left out.
+    // A rate begins with the second scrape of either counter: a second of six may be left out.
     let part = lost as f64 / seen.published as f64;
     ensure!(
         (seen.ratio - part).abs() < 0.1,
@@ -129,8 +134,8 @@ fn reliable(source: Source, stack: Stack) -> Result<()> {
     let seen = Journey::of(source, stack, &stream)?;
     ensure!(seen.dropped > SAMPLES / 10, "{} dropped", seen.dropped);
     // A few are overwritten in the writer's history before they could be sent again.
-    let lost = seen.published - seen.received;
-    ensure!(lost < SAMPLES / 50, "{lost} lost");
+    let lost = seen.lost();
+    ensure!(lost < seen.dropped / 2, "{lost} lost");
     ensure!(
         seen.difference == lost as f64 && seen.before_host <= lost as f64,
         "{} by the rule, {} by the receiver, {lost} lost",
@@ -145,16 +150,16 @@ fn reliable(source: Source, stack: Stack) -> Result<()> {
 fn point_clouds(stack: Stack) -> Result<()> {
     let stream = Stream {
         linger: 60.0,
-        ..Stream::point_cloud(644_000, 200)
+        ..Stream::point_cloud(644_000, 120)
     };
     let seen = Journey::of(Source::Host, stack, &stream)?;
-    let lost = seen.published - seen.received;
-    ensure!(seen.dropped > 20, "{} dropped", seen.dropped);
+    ensure!(seen.dropped > 10, "{} dropped", seen.dropped);
     ensure!(
-        seen.difference + seen.socket_buffer == lost as f64 && seen.difference > 10.0,
-        "{} by the rule, {} in the socket buffer, {lost} lost",
+        seen.is_explained() && seen.difference > 5.0,
+        "{} by the rule, {} in the socket buffer, {} lost",
         seen.difference,
-        seen.socket_buffer
+        seen.socket_buffer,
+        seen.lost()
     );
     Ok(())
 }
@@ -198,14 +203,43 @@ impl Journey {
         publisher.go()?;
         publisher.wait_sent(Duration::from_secs(60))?;
         // Settled, scraped and evaluated, while publisher and subscriber are still there.
-        std::thread::sleep(Duration::from_secs(7));
+        let deadline = Instant::now() + PATIENCE;
+        let (mut before, mut since) = (None, Instant::now());
+        let mut journey = loop {
+            let numbers = Journey::ask(&prometheus, &publisher, &subscriber, stream)?;
+            // The ratio goes on with the clock.
+            let counted = Journey {
+                ratio: 0.0,
+                ..numbers
+            };
+            if before.replace(counted) != Some(counted) {
+                since = Instant::now();
+            }
+            let is_still = since.elapsed() >= STILL;
+            if is_still && numbers.is_explained() || Instant::now() > deadline {
+                break numbers;
+            }
+            std::thread::sleep(Duration::from_millis(500));
+        };
+        journey.dropped = loss.counts()?.dropped;
+        drop((robot, monitor));
+        Ok(journey)
+    }
 
+    /// As it is now; nothing is known of what was dropped.
+    fn ask(
+        prometheus: &Prometheus<'_>,
+        publisher: &Peer,
+        subscriber: &Peer,
+        stream: &Stream,
+    ) -> Result<Journey> {
         let labels = format!("topic=\"{}\"", stream.topic);
         let rule = |name: &str| {
             let series = format!("subscriber:ros2_between_hosts_lost_messages:{name}{{{labels}}}");
+            let value = prometheus.query(&series)?;
             let several = prometheus.series(&series)?;
             ensure!(several == 1, "{several} series of {series}");
-            prometheus.query(&series)
+            Ok(value)
         };
         let cause = |cause: &str| {
             let cause = format!("{labels},cause=\"{cause}\"");
@@ -215,17 +249,23 @@ impl Journey {
         };
         let published: BTreeSet<u64> = publisher.log()?.sequences("pub").into_iter().collect();
         let received: BTreeSet<u64> = subscriber.log()?.sequences("sub").into_iter().collect();
-        let journey = Journey {
+        Ok(Journey {
             published: published.len() as u64,
             received: received.len() as u64,
-            dropped: loss.counts()?.dropped,
+            dropped: 0,
             difference: rule("difference")?,
             ratio: rule("ratio_rate5m")?,
             before_host: cause("before_host")?,
             socket_buffer: cause("socket_buffer")?,
-        };
-        drop((robot, monitor));
-        Ok(journey)
+        })
+    }
+
+    fn lost(&self) -> u64 {
+        self.published - self.received
+    }
+
+    fn is_explained(&self) -> bool {
+        self.difference + self.socket_buffer == self.lost() as f64
     }
 }
 

@@ -347,7 +347,7 @@ impl<'a> Observer<'a> {
 
     /// Waits until the agent has seen the writer go.
     fn finish(self, topic: &str, writer: &str) -> Result<End> {
-        let deadline = Instant::now() + Duration::from_secs(10);
+        let deadline = Instant::now() + Duration::from_secs(30);
         let scrape = loop {
             let scrape = self.agent.scrape()?;
             if scrape.value("ros2_topic_publishers", &[("topic", topic)]) == Some(0.0) {
@@ -480,7 +480,7 @@ fn writer_of(log: &EventLog, topic: &str) -> Result<String> {
 
 /// A reliable subscriber gets everything, in time.
 fn wait_received(subscriber: &Peer, count: u64) -> Result<()> {
-    let deadline = Instant::now() + Duration::from_secs(20);
+    let deadline = Instant::now() + Duration::from_secs(60);
     loop {
         let received = subscriber.log()?.sequences("sub").len() as u64;
         if received >= count {

@@ -23,7 +23,7 @@ use harness::peer::{Peer, Role, Stack, Stream, robot};
 use harness::process::Process;
 use tempfile::TempDir;
 
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 #[test]
 fn the_demo_robot_is_seen_whole_at_its_sockets() -> Result<()> {
@@ -323,9 +323,9 @@ fn two_agents_at_once_see_the_same_and_one_that_is_killed_takes_its_programs_alo
         nothing_was_dropped(&page)?;
     }
     second.agent.process.signal("KILL")?;
-    second.agent.process.wait(Duration::from_secs(5))?;
+    second.agent.process.wait(PATIENCE)?;
     // The kernel lets go of a dead process's descriptors in its own time.
-    let deadline = Instant::now() + Duration::from_secs(5);
+    let deadline = Instant::now() + PATIENCE;
     while cgroup::attached(link.robot.cgroup())? != [1, 1] {
         ensure!(Instant::now() < deadline, "a program stays");
         std::thread::sleep(Duration::from_millis(20));

@@ -31,7 +31,7 @@ use harness::usage::Usage;
 
 /// A port that nothing on the robot listens to: the storm is for the agent alone.
 const NOBODY: u16 = 7399;
-const STORM: Duration = Duration::from_secs(10);
+const STORM: Duration = Duration::from_secs(6);
 /// What a storm may add to the agent's memory: with every table full it stays well within the
 /// unit's `MemoryMax`, kernel maps included.
 const GROWTH: u64 = 56 << 20;
@@ -130,7 +130,7 @@ fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()>
     let mut talker = Talker::new(1, "/unprivileged");
     introduce(&talker, &mut sender)?;
     talk(&mut talker, &mut sender, [320; 500])?;
-    let page = agent.settled_scrape()?;
+    let page = agent.settled_scrape("/unprivileged", 500)?;
     let counted = page.sum("ros2_topic_messages_total", &[("topic", "/unprivileged")]);
     assert_eq!(counted, 500.0, "{}", page.0);
     // Once the writer is classified the filter meters it: it was told so without privilege.
@@ -171,10 +171,10 @@ fn weather(link: &Link, recovery: Duration, storm: impl FnOnce() -> Result<Storm
         largest = largest.max(Usage::of(agent.process.pid())?.pss);
         std::thread::sleep(Duration::from_millis(300));
     }
-    publisher.wait_sent(Duration::from_secs(20))?;
+    publisher.wait_sent(Duration::from_secs(60))?;
     let cpu = Usage::of(agent.process.pid())?.since(&before).cpu;
     let sent = storm.end()?;
-    let page = agent.settled_scrape()?;
+    let page = agent.settled_scrape("/real", stream.count)?;
     largest = largest.max(Usage::of(agent.process.pid())?.pss);
     well_formed(&page);
     let growth = largest.saturating_sub(before.pss);
@@ -189,8 +189,16 @@ fn weather(link: &Link, recovery: Duration, storm: impl FnOnce() -> Result<Storm
     assert!(growth < GROWTH, "{growth} bytes more");
     assert!(oldest < 5.0, "a page was {oldest} s old");
     let real = |name| page.sum(name, &[("topic", "/real")]);
-    assert_eq!(real("ros2_topic_messages_total"), stream.count as f64);
-    assert_eq!(real("ros2_topic_lost_messages_total"), 0.0);
+    // What an agent that was kept from the CPU could not take in, it says.
+    let unseen = page.sum("ros2probe_capture_dropped_packets_total", &[])
+        + page.sum("ros2probe_records_dropped_total", &[]);
+    let missing = stream.count as f64 - real("ros2_topic_messages_total");
+    assert!((0.0..=unseen).contains(&missing), "{missing} of {unseen}");
+    assert!(
+        (0.0..=missing).contains(&real("ros2_topic_lost_messages_total")),
+        "{}",
+        page.0
+    );
 
     // It is over: who comes now is seen, and what it sends is counted.
     let stream = Stream {
@@ -219,8 +227,8 @@ fn weather(link: &Link, recovery: Duration, storm: impl FnOnce() -> Result<Storm
     }
     eprintln!("newcomers are seen after {:?}", came.elapsed());
     publisher.go()?;
-    publisher.wait_sent(Duration::from_secs(20))?;
-    let page = agent.settled_scrape()?;
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let page = agent.settled_scrape("/after", 200)?;
     let after = page.sum("ros2_topic_messages_total", &[("topic", "/after")]);
     assert_eq!(after, 200.0, "{}", page.0);
     let log = std::fs::read_to_string(&log).context("the agent's log")?;

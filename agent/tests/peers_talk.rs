@@ -86,7 +86,7 @@ impl Exchange {
         publisher.wait_matched()?;
         let loss = Loss::of_samples(&link.robot, &link.monitor, &stream, per_mille)?;
         publisher.go()?;
-        publisher.wait_sent(Duration::from_secs(20))?;
+        publisher.wait_sent(Duration::from_secs(60))?;
         std::thread::sleep(Duration::from_millis(300));
         let counts = loss.counts()?;
         // A busy RustDDS writer packs several samples into a datagram; those are never dropped.

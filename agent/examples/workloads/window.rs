@@ -137,7 +137,11 @@ impl Window {
             sent += publisher.log()?.sequences("pub").len() as u64;
         }
         let traffic = bytes_sent(&link.robot)?;
-        let scrape = agent.as_ref().map(Agent::settled_scrape).transpose()?;
+        let pages = agent.iter().flat_map(|agent| {
+            let topics = streams.iter().map(|stream| &stream.topic);
+            topics.map(|topic| agent.settled_scrape(topic, 0))
+        });
+        let scrape = pages.collect::<Result<Vec<_>>>()?.pop();
         Ok(Window {
             observer,
             machine: spent.machine,

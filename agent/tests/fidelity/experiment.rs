@@ -20,13 +20,13 @@ use crate::harness::snmp::Snmp;
 use crate::harness::witness::Witness;
 
 /// Of the whole stream, with all pauses.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_secs(90);
 /// Ports of the first participants of domain 0 that carry no samples.
 pub(crate) const DISCOVERY: &str = "7400, 7410, 7412, 7414, 7416";
 /// RustDDS sends 2125 datagrams a sample, to its own socket too: on a busy machine none has room.
 const RECORD_RING: u32 = 16 << 20;
 /// Gaps of best-effort streams are settled sooner.
-const SETTLED: Duration = Duration::from_secs(20);
+const SETTLED: Duration = Duration::from_secs(60);
 /// RustDDS sends somewhat later than it says, and announcements never cease.
 const QUIET: Duration = Duration::from_millis(400);
 const PAUSE: Duration = Duration::from_millis(20);
@@ -200,7 +200,9 @@ impl Experiment {
             }
         }
         let seen = witness.latest().context("no snapshot")?;
-        let page = agent.as_ref().map(Agent::settled_scrape).transpose()?;
+        let topic = self.size.stream().topic;
+        let page = agent.as_ref().map(|agent| agent.settled_scrape(&topic, 0));
+        let page = page.transpose()?;
         peers.terminate()?;
         let testimony = witness.finish()?;
         testimony.ensure_complete()?;

@@ -13,7 +13,7 @@ use crate::harness::network::Link;
 use crate::harness::peer::{Peer, Role, Stack, Stream};
 use crate::harness::witness::Witness;
 
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(60);
 /// Samples of which some are dropped, of seven seconds of them.
 const WOUNDED: u64 = 100;
 const SAMPLES: u64 = 220;

@@ -25,7 +25,7 @@ const PARTICIPANT: [u8; 4] = [0, 0, 1, 0xc1];
 /// Of `ros_discovery_info`; user topics follow.
 const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];
 pub(crate) const SAMPLES_WRITER: [u8; 4] = [0, 0, 2, 3];
-pub(crate) const FINITE_LEASE_SECONDS: u32 = 20;
+pub(crate) const FINITE_LEASE_SECONDS: u32 = 12;
 
 /// A participant with one node and one writer that only ever sends.
 pub(crate) struct Talker {

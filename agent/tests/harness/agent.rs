@@ -18,6 +18,15 @@ pub(crate) const METRICS: &str = "http://127.0.0.1:17400";
 /// What a test of packet sockets adds to its configuration.
 pub(crate) const ON_THE_WIRE: &str = "capture: {source: wire}\n";
 
+/// How long the page may take to show what has been sent, on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// How long the kernel may take to verify the programs there.
+const START: Duration = Duration::from_secs(60);
+/// A gap of a best-effort stream is settled a second after it opened, and some more.
+const STILL: Duration = Duration::from_millis(1800);
+/// The page of an agent that had its turn on the CPU.
+const FRESH: f64 = 0.4;
+
 /// `rp run` on a host.
 pub(crate) struct Agent<'a> {
     pub(crate) process: Process,
@@ -67,7 +76,7 @@ impl<'a> Agent<'a> {
         ];
         let process = Process::start_with(&host.on_network(), program, arguments, errors)?;
         let mut agent = Agent { process, host };
-        agent.wait_ready(Duration::from_secs(10))?;
+        agent.wait_ready(START)?;
         Ok(agent)
     }
 
@@ -89,10 +98,51 @@ impl<'a> Agent<'a> {
         Ok(Scrape(self.request("/metrics")?))
     }
 
-    /// A scrape after the agent has had time to take over what the kernel still held.
-    pub(crate) fn settled_scrape(&self) -> Result<Scrape> {
-        std::thread::sleep(Duration::from_millis(3500));
-        self.scrape()
+    /// A scrape that shows what was asked for.
+    pub(crate) fn scrape_until(
+        &self,
+        what: &str,
+        shows: impl Fn(&Scrape) -> bool,
+    ) -> Result<Scrape> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let page = self.scrape()?;
+            if shows(&page) {
+                return Ok(page);
+            }
+            if Instant::now() > deadline {
+                bail!("not {what} within {PATIENCE:?}: {}", page.0);
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// A scrape once the agent has counted so many messages of a topic, or had time to, and nothing
+    /// it counts of that topic changes any more.
+    pub(crate) fn settled_scrape(&self, topic: &str, messages: u64) -> Result<Scrape> {
+        let label = [("topic", topic)];
+        let deadline = Instant::now() + PATIENCE;
+        let (mut before, mut since) = (Vec::new(), Instant::now());
+        loop {
+            let page = self.scrape()?;
+            let now = page.counters(topic);
+            let is_fresh = page.sum("ros2probe_snapshot_age_seconds", &[]) < FRESH;
+            if now != before || !is_fresh {
+                (before, since) = (now, Instant::now());
+            }
+            let all = page.sum("ros2_topic_messages_total", &label) >= messages as f64;
+            let in_time = Instant::now() < deadline;
+            if since.elapsed() >= STILL && (all || !in_time) {
+                return Ok(page);
+            }
+            if Instant::now() > deadline + STILL {
+                bail!(
+                    "what is counted of {topic} does not stand still: {}",
+                    page.0
+                );
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
     }
 
     /// GETs a path from inside the host; anything but success is an error.
@@ -142,6 +192,16 @@ impl Scrape {
         lines.collect::<Vec<_>>().join("; ")
     }
 
+    /// What counts messages of a topic, with the values.
+    fn counters(&self, topic: &str) -> Vec<String> {
+        let topic = format!("topic=\"{topic}\"");
+        let counters = self.0.lines().filter(|line| {
+            let name = line.split_once('{').map_or("", |(name, _)| name);
+            name.ends_with("_messages_total") && line.contains(&topic)
+        });
+        counters.map(str::to_owned).collect()
+    }
+
     fn samples(&self, name: &str, labels: &[(&str, &str)]) -> impl Iterator<Item = f64> {
         let wanted: Vec<String> = labels
             .iter()
@@ -178,7 +238,7 @@ pub(crate) fn get(host: &Namespace, url: &str) -> Result<String> {
             "--show-error",
             "--fail",
             "--max-time",
-            "5",
+            "20",
             url,
         ])
         .output()

@@ -35,7 +35,7 @@ impl Capture {
             path: path.to_owned(),
             said,
         };
-        let deadline = Instant::now() + Duration::from_secs(10);
+        let deadline = Instant::now() + Duration::from_secs(30);
         while !capture.said()?.contains("listening on") {
             if Instant::now() > deadline {
                 bail!("tcpdump does not begin: {}", capture.said()?);
@@ -51,7 +51,7 @@ impl Capture {
         self.process.signal("INT")?;
         let status = self
             .process
-            .wait(Duration::from_secs(10))
+            .wait(Duration::from_secs(30))
             .context("tcpdump")?;
         let said = self.said()?;
         if !status.success() {

@@ -11,7 +11,7 @@ use super::network::Namespace;
 use super::process::Process;
 
 /// How long discovery may take on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(60);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Stack {

@@ -142,13 +142,13 @@ impl Process {
         }
     }
 
-    /// Asks the program to end in order, and fails if it does not within five seconds.
+    /// Asks the program to end in order, and fails if it does not in time.
     pub(crate) fn terminate(&mut self) -> Result<ExitStatus> {
         if let Some(status) = self.child.try_wait()? {
             return Ok(status);
         }
         self.signal("TERM")?;
-        self.wait(Duration::from_secs(5))
+        self.wait(Duration::from_secs(30))
     }
 }
 

@@ -14,7 +14,7 @@ use super::process::Process;
 pub(crate) const INSTALL: &str = "run `make prerequisites` or `apt-get install prometheus`";
 const SERVER: &str = "127.0.0.1:9090";
 /// How long a query may have no answer.
-const PATIENCE: Duration = Duration::from_secs(20);
+const PATIENCE: Duration = Duration::from_secs(40);
 
 pub(crate) struct Prometheus<'a> {
     host: &'a Namespace,

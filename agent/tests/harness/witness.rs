@@ -84,7 +84,7 @@ impl Witness {
             shared,
             thread: Some(thread),
         };
-        let deadline = Instant::now() + Duration::from_secs(20);
+        let deadline = Instant::now() + Duration::from_secs(60);
         while witness.latest().is_none() {
             if witness.thread.as_ref().is_none_or(JoinHandle::is_finished) {
                 witness.finish()?;
