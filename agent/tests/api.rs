@@ -1,5 +1,10 @@
 //! The control API of the real binary, on free ports of this host.
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test may panic"
+)]
 
 mod local_agent;
 
