@@ -78,6 +78,17 @@ types() {
         { rm -f "$directory/package-lock.json"; say "npm failed: the dashboards cannot be type-checked"; }
 }
 
+# The OpenTelemetry receiver that the tests send to; it is linked against this very libpython.
+rotel() {
+    local place=$tools/rotel
+    compgen -G "$place/lib/python3*/site-packages/rotel-0.0.1a15.dist-info" >/dev/null && return
+    packages python3-venv libpython3.11
+    say "installing rotel 0.0.1a15 from PyPI into target/tools/rotel"
+    rm -rf "$place"
+    python3 -m venv "$place"
+    "$place/bin/pip" install --quiet --disable-pip-version-check rotel==0.0.1a15
+}
+
 rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version

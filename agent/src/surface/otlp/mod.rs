@@ -14,6 +14,8 @@ pub(super) mod points;
 mod resource;
 mod settings;
 mod starts;
+#[cfg(test)]
+mod tests;
 
 pub use exporter::{Exporter, StartError};
 pub use exports::{Exports, Outcome, Reason, Signal};

@@ -1,0 +1,195 @@
+//! A real OpenTelemetry receiver gets what the page shows, and the agent does not mind when it goes.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test may panic"
+)]
+
+mod local_agent;
+mod rotel;
+
+use std::collections::BTreeMap;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use local_agent::{LocalAgent, metric};
+use ros2probe::surface::catalogue::{CATALOGUE, Kind};
+use rotel::{Export, Rotel, exports};
+
+/// What changes from one look to the next.
+fn changes(name: &str) -> bool {
+    name.starts_with("process_")
+        || name.starts_with("ros2probe_otlp_")
+        || matches!(
+            name,
+            "ros2probe_snapshot_age_seconds" | "ros2probe_scrape_duration_seconds"
+        )
+}
+
+/// The page's series, without histograms' buckets and what changes.
+fn page_series(page: &str) -> BTreeMap<String, f64> {
+    let lines = page.lines().filter(|line| !line.starts_with('#'));
+    let series = lines.filter_map(|line| {
+        let (series, value) = line.rsplit_once(' ')?;
+        Some((series.to_owned(), value.parse().ok()?))
+    });
+    series
+        .filter(|(series, _)| !changes(series.split('{').next().unwrap()))
+        .filter(|(series, _)| !series.contains("_bucket{"))
+        .collect()
+}
+
+/// The same of what was exported.
+fn exported_series(export: &[Export]) -> BTreeMap<String, f64> {
+    let names: BTreeMap<String, _> = CATALOGUE
+        .iter()
+        .map(|metric| (metric.otlp_name(), metric))
+        .collect();
+    let mut series = BTreeMap::new();
+    for item in export.iter().flat_map(|export| &export.items) {
+        let name = &item.fields["Name"];
+        let metric = names
+            .get(name)
+            .unwrap_or_else(|| panic!("{name} is in no catalogue"));
+        assert_eq!(
+            item.fields.get("Unit").map_or("", String::as_str),
+            metric.ucum(),
+            "{name}"
+        );
+        let kind = match metric.kind {
+            Kind::Counter => "Sum",
+            Kind::Gauge | Kind::Info => "Gauge",
+            Kind::Histogram => "Histogram",
+        };
+        assert_eq!(item.fields["DataType"], kind, "{name}");
+        if changes(metric.name) {
+            continue;
+        }
+        let label = |label: &&str| {
+            let value = item.attributes.get(*label).map_or("", String::as_str);
+            format!("{label}=\"{value}\"")
+        };
+        let labels: Vec<String> = metric.labels.iter().map(label).collect();
+        let labels = match labels.as_slice() {
+            [] => String::new(),
+            labels => format!("{{{}}}", labels.join(",")),
+        };
+        let mut add = |suffix: &str, field: &str| {
+            let value = item.fields[field].parse().unwrap();
+            series.insert(format!("{}{suffix}{labels}", metric.name), value);
+        };
+        if metric.kind == Kind::Histogram {
+            add("_count", "Count");
+            add("_sum", "Sum");
+            let count: u64 = item.fields["Count"].parse().unwrap();
+            assert_eq!(item.buckets.iter().sum::<u64>(), count, "{name}");
+        } else {
+            add("", "Value");
+        }
+    }
+    series
+}
+
+#[test]
+fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = format!(
+        "watch: [{{topic: /**, per_subscriber: true}}]\nmetrics: {{per_writer: true}}\n\
+         otlp: {{endpoint: 'http://{}', interval_s: 1, robot: marvin, attributes: {{site: hall 2}}}}\n",
+        receiver.address
+    );
+    std::fs::write(&configuration, yaml).unwrap();
+    let mut agent = LocalAgent::start(&[
+        "--config",
+        configuration.to_str().unwrap(),
+        "--speed",
+        "max",
+    ]);
+    agent.wait_for_log("the capture has ended");
+    let page = page_series(&agent.get("/metrics").body);
+    assert!(page.len() > 200, "{}", page.len());
+
+    // The requests of one second tell the final state; each begins with the same metric.
+    let complete = |text: &str| text.matches("-> Name: process.start_time").count();
+    let seen = complete(&receiver.text());
+    let text = receiver.wait_for("another export is complete", |text| {
+        complete(text) >= seen + 2
+    });
+    let all = exports(&text);
+    let first = |export: &Export| {
+        let item = export.items.first();
+        item.is_some_and(|item| item.fields["Name"] == "ros2.participants")
+    };
+    let ends: Vec<usize> = (0..all.len()).filter(|index| first(&all[*index])).collect();
+    let [.., begin, end] = ends[..] else {
+        panic!("{} exports", all.len())
+    };
+    let exported = exported_series(&all[begin..end]);
+    let (missing, more): (Vec<_>, Vec<_>) = (
+        page.iter()
+            .filter(|each| exported.get(each.0) != Some(each.1))
+            .collect(),
+        exported
+            .iter()
+            .filter(|each| page.get(each.0) != Some(each.1))
+            .collect(),
+    );
+    assert!(
+        missing.is_empty() && more.is_empty(),
+        "page: {missing:#?}\nexported: {more:#?}"
+    );
+    let resource = &all[begin].resource;
+    for (key, value) in [
+        ("service.name", "ros2probe"),
+        ("service.version", env!("CARGO_PKG_VERSION")),
+        ("robot.name", "marvin"),
+        ("site", "hall 2"),
+    ] {
+        assert_eq!(
+            resource.get(key).map(String::as_str),
+            Some(value),
+            "{resource:?}"
+        );
+    }
+    assert!(resource.contains_key("service.instance.id") && resource.contains_key("host.name"));
+
+    let counter = |name: &str, outcome: &str| {
+        format!("ros2probe_otlp_{name}{{signal=\"metrics\",{outcome}}}")
+    };
+    agent.wait_for_metric(
+        &counter("exports_total", "outcome=\"delivered\""),
+        |count| count > 2.0,
+    );
+    let resident = || metric(&agent.get("/metrics").body, "process_resident_memory_bytes").unwrap();
+    let before = resident();
+    let address = receiver.address;
+    drop(receiver);
+    let dropped = counter("dropped_total", "reason=\"superseded\"");
+    agent.wait_for_metric(&dropped, |points| points > 3.0 * page.len() as f64 / 2.0);
+    let mut receiver = Rotel::start(
+        &mut Command::new(Rotel::binary()),
+        directory.path(),
+        Some(address),
+    );
+    receiver.wait_for("it gets all again", |text| complete(text) >= 1);
+    let grown = resident() - before;
+    assert!(grown < 4e6, "{grown} bytes more");
+    assert_eq!(
+        page_series(&agent.get("/metrics").body),
+        page,
+        "the capture noticed nothing"
+    );
+
+    drop(receiver);
+    agent.signal("-TERM");
+    let begun = Instant::now();
+    assert!(agent.wait().success());
+    assert!(
+        begun.elapsed() < Duration::from_secs(4),
+        "{:?}",
+        begun.elapsed()
+    );
+}
