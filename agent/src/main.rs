@@ -21,7 +21,7 @@ use ros2probe::model::reassembly::Limits;
 use ros2probe::privilege::{self, Missing};
 use ros2probe::run::replay::Replay;
 use ros2probe::run::{Run, Source};
-use ros2probe::state::Keeper;
+use ros2probe::state::{Keeper, StateDirectory};
 use ros2probe::surface::api::{self, reload};
 use ros2probe::surface::http::Server;
 use ros2probe::surface::otlp::{self, Exporter, Host, SettingsError};
@@ -55,6 +55,7 @@ fn main() -> ExitCode {
 /// The agent's life, in order.
 fn run(options: cli::Run) -> Result<()> {
     let (mut config, file) = configuration(options.config.as_deref())?;
+    let configured = config.clone();
     if let Some(listen) = options.metrics {
         config.metrics.listen = listen.0;
     } else if options.report {
@@ -82,7 +83,12 @@ fn run(options: cli::Run) -> Result<()> {
         Source::Live(_) => memory::open(&config.state_directory),
         Source::Replay(_) => None,
     };
-    let known = state.as_ref().and_then(memory::load);
+    let known = state.as_deref().and_then(memory::load);
+    if let Some(state) = &state
+        && let Err(error) = watches.restore(memory::load_watches(state))
+    {
+        tracing::warn!(%error, "the watches that were added cannot be used");
+    }
     privilege::give_up()?;
     if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {
         let watches = watches.in_force().entries().len();
@@ -102,8 +108,12 @@ fn run(options: cli::Run) -> Result<()> {
     if let (Some(known), Source::Live(live)) = (known, &source) {
         observer.restore(&known, live.clock());
     }
-    let keeper = state.map(Keeper::start).transpose();
-    let keeper = keeper.context("cannot start the thread that keeps state")?;
+    let keep = |directory: Arc<StateDirectory>| {
+        watches.keep_in(Arc::clone(&directory))?;
+        Keeper::start(directory)
+    };
+    let keeper = state.map(keep).transpose();
+    let keeper = keeper.context("cannot start the threads that keep state")?;
     let run = Run::new(
         source,
         observer,
@@ -132,9 +142,9 @@ fn run(options: cli::Run) -> Result<()> {
     let exporter = exporter.transpose()?;
     let supervisor = Supervisor {
         board: Arc::clone(&board),
-        config,
+        config: configured,
         file,
-        watches,
+        watches: Arc::clone(&watches),
         reloads,
         stop,
         log,
@@ -145,7 +155,9 @@ fn run(options: cli::Run) -> Result<()> {
         control,
         context,
     };
-    runtime.block_on(supervisor.run(run, surfaces, options.report))?;
+    let ended = runtime.block_on(supervisor.run(run, surfaces, options.report));
+    watches.finish();
+    ended?;
     if options.report {
         print!("{}", Exposition::new(board).render(Format::Classic)?);
     }

@@ -2,11 +2,13 @@
 //! Whatever is wrong with it is said in the log: an agent without memory still observes.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use anyhow::anyhow;
-use ros2probe::config::StateChoice;
+use ros2probe::config::{StateChoice, Watch};
 use ros2probe::model::discovery::Memory;
 use ros2probe::state::{Loaded, StateDirectory};
+use ros2probe::watches::{self, Kept};
 
 /// Where the package and the service manager put it.
 const DEFAULT: &str = "/var/lib/ros2probe";
@@ -14,7 +16,7 @@ const DEFAULT: &str = "/var/lib/ros2probe";
 const VARIABLE: &str = "STATE_DIRECTORY";
 
 /// The directory to use; `None` = none.
-pub(crate) fn open(choice: &StateChoice) -> Option<StateDirectory> {
+pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
     let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
     let opened = match (choice, named) {
         (StateChoice::Off, _) => return None,
@@ -24,10 +26,13 @@ pub(crate) fn open(choice: &StateChoice) -> Option<StateDirectory> {
         (StateChoice::Auto, None) => StateDirectory::open(Path::new(DEFAULT)),
     };
     match opened {
-        Ok(directory) => Some(directory),
+        Ok(directory) => Some(Arc::new(directory)),
         Err(error) => {
             let reason = format!("{:#}", anyhow!(error));
-            tracing::warn!(reason, "no state is kept: a restart loses names");
+            tracing::warn!(
+                reason,
+                "no state is kept: a restart loses names and added watches"
+            );
             None
         }
     }
@@ -51,6 +56,23 @@ pub(crate) fn load(directory: &StateDirectory) -> Option<Memory> {
             let aside = aside.map(|aside| aside.display().to_string());
             tracing::warn!(%path, reason, aside, "the state cannot be used");
             None
+        }
+    }
+}
+
+/// What clients of the last agent watched.
+pub(crate) fn load_watches(directory: &StateDirectory) -> Vec<Watch> {
+    let path = directory.path().display();
+    match watches::load(directory) {
+        Kept::Nothing => Vec::new(),
+        Kept::These(watches) => {
+            tracing::info!(%path, watches = watches.len(), "watched again, as clients had asked");
+            watches
+        }
+        Kept::Unusable { reason, aside } => {
+            let aside = aside.map(|aside| aside.display().to_string());
+            tracing::warn!(%path, reason, aside, "the watches that were added cannot be used");
+            Vec::new()
         }
     }
 }

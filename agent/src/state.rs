@@ -1,6 +1,7 @@
-//! The state directory: what discovery knew, on disk for the next start.
+//! The state directory: what discovery knew, on disk for the next start. What clients watch lies
+//! beside it (`watches`).
 //!
-//! One JSON file, replaced as a whole (new file, fsync, rename, fsync of the directory), so that a
+//! JSON files, each replaced as a whole (new file, fsync, rename, fsync of the directory), so that a
 //! power cut leaves the old or the new one. Writing happens on a thread of its own; the capture
 //! hands over and never waits. Nothing here ends the agent: a file that cannot be read is kept
 //! aside, a disk that is full is counted and said once. One agent to a directory.
@@ -15,6 +16,7 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::model::discovery::Memory;
@@ -22,6 +24,7 @@ use crate::model::discovery::Memory;
 /// The form that is written; one that is read with another number is none of ours.
 const VERSION: u32 = 1;
 const FILE: &str = "discovery.json";
+/// What a file is called while it is written.
 const NEW_FILE: &str = "discovery.json.new";
 /// A larger file was not written by this.
 const MAX_BYTES: u64 = 64 << 20;
@@ -66,6 +69,22 @@ pub enum Loaded {
     AnotherBoot,
     /// Everybody that was there.
     Known(Memory),
+    /// It cannot be used, for this reason, and now lies there.
+    Unusable {
+        /// Why.
+        reason: String,
+        /// Where it lies, if it could be moved.
+        aside: Option<PathBuf>,
+    },
+}
+
+/// What was found in one file.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Found<T> {
+    /// No file.
+    Nothing,
+    /// A document.
+    This(T),
     /// It cannot be used, for this reason, and now lies there.
     Unusable {
         /// Why.
@@ -152,46 +171,57 @@ impl StateDirectory {
     /// Reads what the last agent left. What is no state is moved aside.
     #[must_use]
     pub fn load(&self) -> Loaded {
-        let path = self.path.join(FILE);
+        match self.read::<Document>(FILE, VERSION) {
+            Found::Nothing => Loaded::Nothing,
+            Found::This(document) if document.boot != boot() => Loaded::AnotherBoot,
+            Found::This(document) => Loaded::Known(document.memory),
+            Found::Unusable { reason, aside } => Loaded::Unusable { reason, aside },
+        }
+    }
+
+    /// Reads a document of this version. What is none is moved aside.
+    pub(crate) fn read<T: DeserializeOwned>(&self, file: &str, version: u32) -> Found<T> {
+        let path = self.path.join(file);
         let mut bytes = Vec::new();
         let read =
             File::open(&path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
         match read {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Loaded::Nothing,
-            Err(error) => return self.set_aside(error.to_string()),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Found::Nothing,
+            Err(error) => return self.set_aside(file, error.to_string()),
             Ok(_) if bytes.len() as u64 > MAX_BYTES => {
-                return self.set_aside(format!("it is larger than {MAX_BYTES} bytes"));
+                return self.set_aside(file, format!("it is larger than {MAX_BYTES} bytes"));
             }
             Ok(_) => {}
         }
         match serde_json::from_slice::<Version>(&bytes) {
-            Ok(Version { version: VERSION }) => {}
-            Ok(Version { version }) => {
-                let reason = format!("it is of version {version}, this agent reads {VERSION}");
-                return self.set_aside(reason);
+            Ok(found) if found.version == version => {}
+            Ok(Version { version: other }) => {
+                let reason = format!("it is of version {other}, this agent reads {version}");
+                return self.set_aside(file, reason);
             }
-            Err(error) => return self.set_aside(error.to_string()),
+            Err(error) => return self.set_aside(file, error.to_string()),
         }
-        match serde_json::from_slice::<Document>(&bytes) {
-            Ok(document) if document.boot != boot() => Loaded::AnotherBoot,
-            Ok(document) => Loaded::Known(document.memory),
-            Err(error) => self.set_aside(error.to_string()),
+        match serde_json::from_slice(&bytes) {
+            Ok(document) => Found::This(document),
+            Err(error) => self.set_aside(file, error.to_string()),
         }
     }
 
-    fn set_aside(&self, reason: String) -> Loaded {
-        let aside = self.path.join(format!("{FILE}.corrupt"));
-        let moved = fs::rename(self.path.join(FILE), &aside);
-        Loaded::Unusable {
+    /// Keeps a file that cannot be used out of the way.
+    pub(crate) fn set_aside<T>(&self, file: &str, reason: String) -> Found<T> {
+        let aside = self.path.join(format!("{file}.corrupt"));
+        let moved = fs::rename(self.path.join(file), &aside);
+        Found::Unusable {
             reason,
             aside: moved.is_ok().then_some(aside),
         }
     }
 
-    fn write(&self, memory: Memory) -> io::Result<()> {
-        let new = self.path.join(NEW_FILE);
-        let written = write_new(&new, memory).and_then(|()| {
-            fs::rename(&new, self.path.join(FILE))?;
+    /// Replaces a file as a whole.
+    pub(crate) fn replace(&self, file: &str, document: &impl Serialize) -> io::Result<()> {
+        let new = self.path.join(format!("{file}.new"));
+        let written = write_new(&new, document).and_then(|()| {
+            fs::rename(&new, self.path.join(file))?;
             self.directory.sync_all()
         });
         if written.is_err() {
@@ -199,6 +229,15 @@ impl StateDirectory {
             let _ = fs::remove_file(&new);
         }
         written
+    }
+
+    fn write(&self, memory: Memory) -> io::Result<()> {
+        let document = Document {
+            version: VERSION,
+            boot: boot(),
+            memory,
+        };
+        self.replace(FILE, &document)
     }
 }
 
@@ -208,14 +247,9 @@ fn new_file(path: &Path) -> io::Result<File> {
     options.open(path)
 }
 
-fn write_new(path: &Path, memory: Memory) -> io::Result<()> {
+fn write_new(path: &Path, document: &impl Serialize) -> io::Result<()> {
     let mut file = BufWriter::new(new_file(path)?);
-    let document = Document {
-        version: VERSION,
-        boot: boot(),
-        memory,
-    };
-    serde_json::to_writer(&mut file, &document)?;
+    serde_json::to_writer(&mut file, document)?;
     file.write_all(b"\n")?;
     let file = file.into_inner().map_err(io::IntoInnerError::into_error)?;
     file.sync_all()
@@ -232,7 +266,7 @@ impl Keeper {
     ///
     /// # Errors
     /// No thread is to be had.
-    pub fn start(directory: StateDirectory) -> io::Result<Self> {
+    pub fn start(directory: Arc<StateDirectory>) -> io::Result<Self> {
         let (inbox, outbox) = sync_channel(1);
         let done = Arc::<Done>::default();
         let own = Arc::clone(&done);
@@ -387,7 +421,7 @@ mod tests {
         // Nobody can write a file where a directory is.
         let obstacle = place.path().join(NEW_FILE);
         fs::create_dir(&obstacle).unwrap();
-        let mut keeper = Keeper::start(directory).unwrap();
+        let mut keeper = Keeper::start(Arc::new(directory)).unwrap();
         let start = Instant::now();
         assert!(keeper.wants(0, start));
         keeper.keep(Memory::default(), 0, start);

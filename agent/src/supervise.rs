@@ -34,6 +34,7 @@ const DRAIN: Duration = Duration::from_secs(3);
 /// The agent around its working thread.
 pub(crate) struct Supervisor {
     pub(crate) board: Arc<Board>,
+    /// As it was read at the start, before the command line changed it.
     pub(crate) config: Config,
     /// Where the configuration came from; read again on SIGHUP and when a client asks.
     pub(crate) file: Option<PathBuf>,

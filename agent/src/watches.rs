@@ -4,12 +4,19 @@
 //! One entry for each pattern and domain; the configuration's comes first. The capture thread is
 //! handed the merged list in a slot that holds the latest one and is woken; nobody waits for it.
 
-use std::sync::{Arc, Mutex, PoisonError};
+mod kept;
+
+use std::collections::HashSet;
+use std::io;
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use arc_swap::{ArcSwap, ArcSwapOption};
 
 use crate::config::{Watch, Watchlist};
+use crate::state::StateDirectory;
 use crate::surface::Board;
+use kept::Keeper;
+pub use kept::{Kept, load};
 
 /// Watches that clients may add; a longer list should be globs.
 pub const MAX_ADDED: usize = 1_000;
@@ -83,6 +90,7 @@ pub struct Watches {
     /// For the capture thread: the latest list it has not taken yet.
     news: ArcSwapOption<Watchlist>,
     board: Arc<Board>,
+    keeper: OnceLock<Keeper>,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -150,6 +158,7 @@ impl Watches {
             in_force: ArcSwap::default(),
             news: ArcSwapOption::default(),
             board,
+            keeper: OnceLock::new(),
         };
         let lists = Lists {
             configured: configured.into_iter().map(Arc::new).collect(),
@@ -161,6 +170,41 @@ impl Watches {
             Ok::<_, globset::Error>(())
         })?;
         Ok(watches)
+    }
+
+    /// Watches again what clients had added before the last agent ended.
+    ///
+    /// # Errors
+    /// When patterns cannot be matched together; then nothing changes.
+    pub fn restore(&self, watches: Vec<Watch>) -> Result<(), globset::Error> {
+        self.change(|lists| {
+            lists.added = watches.into_iter().map(Arc::new).collect();
+            Ok(())
+        })
+    }
+
+    /// Keeps what clients add from now on in this directory.
+    ///
+    /// # Errors
+    /// No thread is to be had for it.
+    pub fn keep_in(&self, directory: Arc<StateDirectory>) -> io::Result<()> {
+        let keeper = Keeper::start(directory)?;
+        // Only the first one would ever be asked for.
+        let _ = self.keeper.set(keeper);
+        Ok(())
+    }
+
+    /// Whether what clients add outlives the agent: kept somewhere, and the last write worked.
+    #[must_use]
+    pub fn is_kept(&self) -> bool {
+        self.keeper.get().is_some_and(Keeper::works)
+    }
+
+    /// Waits until what clients have added is on disk, when the agent ends.
+    pub fn finish(&self) {
+        if let Some(keeper) = self.keeper.get() {
+            keeper.finish();
+        }
     }
 
     /// The configuration lists these now; what else is watched stays.
@@ -264,6 +308,11 @@ impl Watches {
         let mut new = lists.clone();
         change(&mut new)?;
         let merged = InForce::merge(&new, &self.in_force().watchlist)?;
+        if new.added != lists.added
+            && let Some(keeper) = self.keeper.get()
+        {
+            keeper.keep(new.added.clone());
+        }
         *lists = new;
         self.news.store(Some(Arc::clone(&merged.watchlist)));
         self.board.watch(merged.watchlist.watches());
@@ -281,7 +330,7 @@ impl InForce {
             (Origin::CommandLine, &lists.command_line),
             (Origin::Api, &lists.added),
         ];
-        let mut taken = std::collections::HashSet::new();
+        let mut taken = HashSet::new();
         let mut entries = Vec::new();
         for (origin, watches) in origins {
             for watch in watches {

@@ -131,3 +131,222 @@ fn a_watch_is_added_shown_replaced_and_removed() {
     let gone = ask(&agent, "DELETE", encoded, "", "");
     assert_eq!(problem(&gone), (404, "no-such-watch".to_owned()));
 }
+
+/// Topics and origins of what is watched.
+fn listed(agent: &LocalAgent) -> Vec<(String, String)> {
+    let list: Value = serde_json::from_str(&ask(agent, "GET", "/watch", "", "").body).unwrap();
+    let watches = list["watches"].as_array().unwrap().iter();
+    let text = |watch: &Value, key: &str| watch[key].as_str().unwrap().to_owned();
+    let pair = |watch| (text(watch, "topic"), text(watch, "origin"));
+    watches.map(pair).collect()
+}
+
+#[test]
+fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_added() {
+    let directory = tempfile::tempdir().unwrap();
+    let config = directory.path().join("config.yaml");
+    let write = |text: &str| std::fs::write(&config, text).unwrap();
+    write("watch: [/a]");
+    let mut agent = LocalAgent::start(&["--config", config.to_str().unwrap(), "--watch", "/b"]);
+    agent.wait_for_log("ready");
+    let entry = |topic: &str, origin: &str| (topic.to_owned(), origin.to_owned());
+
+    for topic in ["c", "d", "e/**"] {
+        let path = format!("/watch/{topic}");
+        assert_eq!(ask(&agent, "POST", &path, "", "").status, 201);
+    }
+    assert_eq!(ask(&agent, "DELETE", "/watch/d", "", "").status, 204);
+    for (topic, by) in [("a", "configuration file"), ("b", "command line")] {
+        let given = ask(&agent, "DELETE", &format!("/watch/{topic}"), "", "");
+        assert_eq!(problem(&given), (409, "watch-given".to_owned()));
+        assert!(given.body.contains(by), "{}", given.body);
+    }
+    assert_eq!(ask(&agent, "POST", "/watch/a", "", "").status, 200);
+    let json = "Content-Type: application/json\r\n";
+    let other = ask(
+        &agent,
+        "PUT",
+        "/watch/a",
+        json,
+        "{\"per_subscriber\": true}",
+    );
+    assert_eq!(problem(&other), (409, "watch-given".to_owned()));
+
+    // What the configuration lists later is its own for as long as it does.
+    write("watch: [/a, /c]");
+    let reloaded = ask(&agent, "POST", "/-/reload", "", "");
+    assert_eq!(reloaded.status, 200, "{}", reloaded.body);
+    assert!(reloaded.body.contains("\"watches\":4"), "{}", reloaded.body);
+    assert_eq!(listed(&agent)[1], entry("/c", "config"));
+
+    write("watch: [/a, c]");
+    let wrong = ask(&agent, "POST", "/-/reload", "", "");
+    assert_eq!(problem(&wrong), (422, "invalid-configuration".to_owned()));
+    let body: Value = serde_json::from_str(&wrong.body).unwrap();
+    let mistake = body["mistakes"][0].as_str().unwrap();
+    let place = "config.yaml:1:13: watch[1]: must begin with a slash";
+    assert!(mistake.contains(place), "{mistake}");
+
+    write("watch: [/a]\nlimits: {topics: 7}\n");
+    let reloaded = ask(&agent, "POST", "/-/reload", "", "");
+    assert!(reloaded.body.contains("[\"limits\"]"), "{}", reloaded.body);
+    let all = [
+        entry("/a", "config"),
+        entry("/b", "command_line"),
+        entry("/c", "api"),
+        entry("/e/**", "api"),
+    ];
+    assert_eq!(listed(&agent), all);
+
+    let health: Value = serde_json::from_str(&ask(&agent, "GET", "/health", "", "").body).unwrap();
+    assert_eq!(health["ready"], true);
+    assert_eq!(health["watches"], 4);
+    assert_eq!(health["watches_kept"], false);
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+}
+
+#[test]
+fn what_cannot_be_is_answered_with_a_problem_that_says_why() {
+    let mut agent = LocalAgent::start(&["--speed", "max"]);
+    agent.wait_for_log("ready");
+    let json = "Content-Type: application/json\r\n";
+    let form = "Content-Type: application/x-www-form-urlencoded\r\n";
+    for (method, path, headers, body, status, code, says) in [
+        ("GET", "/watches", "", "", 404, "not-found", "/openapi.json"),
+        ("GET", "/watch/", "", "", 404, "not-found", ""),
+        (
+            "PATCH",
+            "/watch/a",
+            "",
+            "",
+            405,
+            "method-not-allowed",
+            "PATCH",
+        ),
+        ("POST", "/watch/2d", "", "", 422, "invalid-request", "digit"),
+        ("POST", "/watch/a/", "", "", 422, "invalid-request", "token"),
+        (
+            "POST",
+            "/watch/a%20b",
+            "",
+            "",
+            422,
+            "invalid-request",
+            "letters",
+        ),
+        (
+            "POST",
+            "/watch/a%ff",
+            "",
+            "",
+            400,
+            "malformed-request",
+            "UTF-8",
+        ),
+        (
+            "POST",
+            "/watch/a?domain=5",
+            "",
+            "",
+            400,
+            "malformed-request",
+            "domain",
+        ),
+        (
+            "POST",
+            "/watch/a?domain_id=300",
+            "",
+            "",
+            422,
+            "invalid-request",
+            "232",
+        ),
+        (
+            "POST",
+            "/watch/a",
+            "",
+            "{}",
+            415,
+            "unsupported-media-type",
+            "application/json",
+        ),
+        (
+            "POST",
+            "/watch/a",
+            form,
+            "{}",
+            415,
+            "unsupported-media-type",
+            "application/json",
+        ),
+        (
+            "POST",
+            "/watch/a",
+            json,
+            "{",
+            400,
+            "malformed-request",
+            "EOF",
+        ),
+        ("POST", "/watch/a", json, "[]", 422, "invalid-request", ""),
+        (
+            "POST",
+            "/watch/a",
+            json,
+            "{\"max_loss\": 1}",
+            422,
+            "invalid-request",
+            "max_loss_ratio",
+        ),
+        (
+            "POST",
+            "/watch/a",
+            json,
+            "{\"max_loss_ratio\": 2}",
+            422,
+            "invalid-request",
+            "1",
+        ),
+        (
+            "PUT",
+            "/watch/a",
+            json,
+            "{\"domain_id\": 233}",
+            422,
+            "invalid-request",
+            "232",
+        ),
+        (
+            "PUT",
+            "/watch/a?domain_id=1",
+            json,
+            "{\"domain_id\": 2}",
+            422,
+            "invalid-request",
+            "query",
+        ),
+        (
+            "POST",
+            "/-/reload",
+            "",
+            "",
+            409,
+            "nothing-to-reload",
+            "without a configuration file",
+        ),
+    ] {
+        let answer = ask(&agent, method, path, headers, body);
+        let case = format!("{method} {path} {body}: {}", answer.body);
+        assert_eq!(problem(&answer), (status, code.to_owned()), "{case}");
+        assert!(answer.body.contains(says), "{case}");
+    }
+    let refused = ask(&agent, "PATCH", "/watch/a", "", "");
+    assert!(refused.headers.contains("allow: "), "{}", refused.headers);
+    // What has no body may say what it likes about it; a name may come whole.
+    assert_eq!(ask(&agent, "POST", "/watch/%2Fa", form, "").status, 201);
+    assert_eq!(ask(&agent, "GET", "/watch/a", "", "").status, 200);
+    let document: Value =
+        serde_json::from_str(&ask(&agent, "GET", "/openapi.json", "", "").body).unwrap();
+    assert_eq!(document["openapi"], "3.1.0");
+}

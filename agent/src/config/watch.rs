@@ -124,6 +124,9 @@ impl Expectations {
     }
 }
 
+/// The highest domain id for which RTPS has ports.
+pub const MAX_DOMAIN: u32 = 232;
+
 /// Ranges of what may be expected, as the configuration's schema has them.
 const RANGES: [(&str, f64, f64); 5] = [
     ("min_rate_hz", 0.0, 1_000_000.0),

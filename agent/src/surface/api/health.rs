@@ -26,6 +26,8 @@ pub(super) struct Health {
     source: &'static str,
     /// Watches in force, of every origin.
     watches: usize,
+    /// Watches that clients add outlive the agent: there is a state directory that can be written.
+    watches_kept: bool,
     /// Packets lost because a ring was full: above 0, counts are lower bounds.
     dropped_packets: u64,
 }
@@ -51,6 +53,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         version: env!("CARGO_PKG_VERSION"),
         source: state.agent.source.label(),
         watches: context.watches.in_force().entries().len(),
+        watches_kept: context.watches.is_kept(),
         dropped_packets: interfaces.filter_map(|interface| interface.dropped).sum(),
     })
 }

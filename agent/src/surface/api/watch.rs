@@ -13,6 +13,7 @@ use axum::extract::{DefaultBodyLimit, FromRequest, Request, State};
 use axum::http::header::{CONTENT_TYPE, LOCATION};
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
+use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
@@ -22,7 +23,7 @@ use super::Context;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::{MAX_BODY, too_large};
-use crate::config::watch::{Expectations, Watch, check_pattern};
+use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern};
 use crate::model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
 use crate::surface::board::State as BoardState;
 use crate::watches::{Done, Entry, Origin, Refused};
@@ -326,7 +327,7 @@ struct TopicParameter {
     /// ROS name or glob without its leading slash; slashes within need not be encoded.
     #[param(
         max_length = 254,
-        pattern = r"^((\*\*|\*|(\*?[A-Za-z_]|\*[0-9])(\*?[A-Za-z0-9_])*\*?)(/|$))+$",
+        pattern = r"^(\*\*|\*|(\*?[A-Za-z_]|\*[0-9])(\*?[A-Za-z0-9_])*\*?)(/(\*\*|\*|(\*?[A-Za-z_]|\*[0-9])(\*?[A-Za-z0-9_])*\*?))*$",
         example = "camera/front/image_raw"
     )]
     topic: String,
@@ -353,14 +354,21 @@ impl<S: Send + Sync> FromRequest<S> for Settings {
             let detail = "send the body with `Content-Type: application/json`, or none";
             return Err(Problem::new(Code::UnsupportedMediaType, detail));
         }
-        serde_json::from_slice(&body).map(Self).map_err(|error| {
+        let problem = |error: serde_json::Error| {
             let code = if error.is_data() {
                 Code::InvalidRequest
             } else {
                 Code::MalformedRequest
             };
             Problem::new(code, format!("the body: {error}"))
-        })
+        };
+        // serde would take a list for an object.
+        if !body.trim_ascii_start().starts_with(b"{") {
+            serde_json::from_slice::<IgnoredAny>(&body).map_err(problem)?;
+            let detail = "the body must be a JSON object";
+            return Err(Problem::new(Code::InvalidRequest, detail));
+        }
+        serde_json::from_slice(&body).map(Self).map_err(problem)
     }
 }
 
@@ -384,9 +392,9 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         }
         (one, other) => one.or(other),
     };
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > 232) {
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
         return invalid(format!(
-            "domain_id is {domain_id}, must be between 0 and 232"
+            "domain_id is {domain_id}, must be between 0 and {MAX_DOMAIN}"
         ));
     }
     let expectations = Expectations {
