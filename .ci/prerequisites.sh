@@ -89,6 +89,17 @@ rotel() {
     "$place/bin/pip" install --quiet --disable-pip-version-check rotel==0.0.1a15
 }
 
+# Throws requests at the control API; in a place of its own, from the Python package index.
+schemathesis() {
+    local place=$tools/schemathesis version=4.32.5
+    [ "$("$place/bin/st" --version 2>/dev/null)" = "st, version $version" ] && return
+    packages python3 python3-venv
+    say "installing schemathesis $version into target/tools (a Python environment of its own)"
+    rm -rf "$place"
+    python3 -m venv "$place"
+    "$place/bin/pip" install --quiet --disable-pip-version-check "schemathesis==$version"
+}
+
 rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
@@ -160,6 +171,7 @@ for need; do
         packages "${network_tools[@]}" gcc g++ make tshark systemd \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
         prometheus
+        schemathesis
         types
         rust
         ebpf

@@ -9,10 +9,13 @@
 mod local_agent;
 
 use std::net::TcpStream;
+use std::os::unix::fs::PermissionsExt as _;
+use std::os::unix::net::UnixStream;
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
-use local_agent::{Answer, LocalAgent, PATIENCE, exchange};
+use local_agent::{Answer, LocalAgent, PATIENCE, capture, exchange, rp};
 use serde_json::Value;
 
 /// A request with headers (each line ended) and a body.
@@ -349,4 +352,141 @@ fn what_cannot_be_is_answered_with_a_problem_that_says_why() {
     let document: Value =
         serde_json::from_str(&ask(&agent, "GET", "/openapi.json", "", "").body).unwrap();
     assert_eq!(document["openapi"], "3.1.0");
+}
+
+/// The program of a Python package in a place of its own.
+fn schemathesis() -> Command {
+    let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
+    let program = target.join("tools/schemathesis/bin/st");
+    assert!(
+        program.exists(),
+        "{} is missing: run `.ci/prerequisites.sh test`",
+        program.display()
+    );
+    Command::new(program)
+}
+
+#[test]
+fn no_request_that_can_be_thought_of_gets_an_answer_that_is_not_documented() {
+    let directory = tempfile::tempdir().unwrap();
+    let config = directory.path().join("config.yaml");
+    std::fs::write(&config, "watch: [/chatter, /listed]\n").unwrap();
+    let mut agent = LocalAgent::start(&["--config", config.to_str().unwrap(), "--speed", "max"]);
+    agent.wait_for_log("ready");
+    let document = format!("http://{}/openapi.json", agent.api);
+    // A stream does not end: how it is answered is tested elsewhere.
+    let output = schemathesis()
+        .arg("--config-file")
+        .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/schemathesis.toml"))
+        .args(["run", &document])
+        .args(["--checks", "all", "--seed", "1", "--max-examples", "10"])
+        .args(["--no-color", "--exclude-path", "/events"])
+        .current_dir(directory.path())
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{said}\n{}", agent.log());
+    assert_eq!(ask(&agent, "GET", "/health", "", "").status, 200);
+}
+
+/// Starts `rp run` with this `api:` section and gives what it says instead of running.
+fn refused(section: &str) -> String {
+    let directory = tempfile::tempdir().unwrap();
+    let config = directory.path().join("config.yaml");
+    std::fs::write(&config, format!("api: {section}\n")).unwrap();
+    let output = rp()
+        .args(["run", "--metrics", "off", "--replay"])
+        .args([
+            capture().to_str().unwrap(),
+            "--config",
+            config.to_str().unwrap(),
+        ])
+        .output()
+        .unwrap();
+    assert!(!output.status.success(), "{section}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    let said = said.lines().filter(|line| !line.contains(" INFO "));
+    let said: Vec<&str> = said.collect();
+    assert_eq!(said.len(), 1, "{said:?}");
+    said[0].to_owned()
+}
+
+#[test]
+fn the_agent_does_not_start_where_the_api_would_be_open_to_everybody_or_cannot_be() {
+    let open = refused("{listen: '0.0.0.0:17401'}");
+    assert!(
+        open.contains("config.yaml:1:15: api.listen: is 0.0.0.0:17401"),
+        "{open}"
+    );
+    assert!(open.contains("needs `token_file`"), "{open}");
+    let missing = refused("{listen: 'off', token_file: /nowhere/token}");
+    assert!(missing.contains("/nowhere/token"), "{missing}");
+    let missing = refused("{listen: 'off', socket: /nowhere/api.sock}");
+    assert!(
+        missing.contains("cannot serve the socket /nowhere/api.sock"),
+        "{missing}"
+    );
+}
+
+#[test]
+fn a_token_a_foreign_name_and_a_foreign_page_are_told_apart() {
+    let directory = tempfile::tempdir().unwrap();
+    let (config, token) = (
+        directory.path().join("config.yaml"),
+        directory.path().join("token"),
+    );
+    std::fs::write(&token, "0123456789abcdef\n").unwrap();
+    let socket = directory.path().join("api.sock");
+    let api = format!(
+        "{{token_file: {}, socket: {}}}",
+        token.display(),
+        socket.display()
+    );
+    std::fs::write(&config, format!("api: {api}\n")).unwrap();
+    let mut agent = LocalAgent::start(&["--config", config.to_str().unwrap()]);
+    agent.wait_for_log("ready");
+    let local = format!("Host: {}\r\n", agent.api);
+    let right = "Authorization: Bearer 0123456789abcdef\r\n";
+    let wrong = "Authorization: Bearer 0123456789abcdee\r\n";
+    let code = |headers: &str, body: &str| {
+        let stream = TcpStream::connect(agent.api).unwrap();
+        let head = format!("POST /watch/a HTTP/1.1\r\n{headers}");
+        let answer = exchange(stream, &head, body);
+        if answer.status == 401 {
+            assert!(answer.headers.contains("www-authenticate: bearer"));
+        }
+        problem(&answer)
+    };
+    let case = |status, code: &str| (status, code.to_owned());
+    assert_eq!(code(&local, ""), case(401, "unauthorized"));
+    assert_eq!(
+        code(&format!("{local}{wrong}"), ""),
+        case(401, "unauthorized")
+    );
+    assert_eq!(code(&format!("{local}{right}"), ""), case(201, ""));
+    let rebound = format!("Host: evil.example\r\n{right}");
+    assert_eq!(code(&rebound, ""), case(403, "foreign-host"));
+    let page = format!("{local}{right}Origin: http://evil.example\r\n");
+    assert_eq!(code(&page, ""), case(403, "foreign-origin"));
+    let long = "x".repeat(20_000);
+    let said = format!("{local}{right}Content-Length: 20000\r\n");
+    assert_eq!(code(&said, &long), case(413, "body-too-large"));
+    let chunked = format!("{local}{right}Transfer-Encoding: chunked\r\n");
+    let chunks = format!("4e20\r\n{long}\r\n0\r\n\r\n");
+    assert_eq!(code(&chunked, &chunks), case(413, "body-too-large"));
+
+    // Who may open the file needs no token; the metrics listener changes nothing for anybody.
+    let mode = std::fs::metadata(&socket).unwrap().permissions().mode();
+    assert_eq!(mode & 0o777, 0o660);
+    let stream = UnixStream::connect(&socket).unwrap();
+    let answer = exchange(stream, "GET /watch/a HTTP/1.1\r\nHost: rp\r\n", "");
+    assert_eq!(answer.status, 200);
+    let answer = agent.request("POST", "/watch/b", right);
+    assert_eq!(answer.status, 404);
+
+    // A connection on which nothing is asked does not hold up the end.
+    let _idle = TcpStream::connect(agent.api).unwrap();
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+    assert!(!socket.exists());
 }

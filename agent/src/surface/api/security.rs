@@ -383,6 +383,12 @@ mod tests {
         assert_eq!(drawn, 1000);
         let later = start + Duration::from_millis(10);
         assert_eq!((0..100).filter(|_| bucket.draw(later)).count(), 5);
+        let door = Door::new(Kind::Socket);
+        let refused = |_: &u32| door.let_in(&HeaderMap::new(), start).is_err();
+        assert_eq!((0..2000).filter(refused).count(), 1000);
+        let again = door.let_in(&HeaderMap::new(), start).unwrap_err();
+        assert_eq!(again.code(), Code::TooManyRequests);
+
         let rested = start + Duration::from_secs(3600);
         assert_eq!((0..2000).filter(|_| bucket.draw(rested)).count(), 1000);
     }

@@ -239,7 +239,7 @@ async fn show(
     path = "/watch/{*topic}",
     tag = "watch",
     params(TopicParameter, Domain),
-    request_body = Option<WatchRequest>,
+    request_body = WatchRequest,
     responses(
         (status = 200, description = "It is watched just so already.", body = WatchView),
         (status = 201, description = "It is watched from now on.", body = WatchView,
@@ -269,7 +269,7 @@ async fn add(
     path = "/watch/{*topic}",
     tag = "watch",
     params(TopicParameter, Domain),
-    request_body = Option<WatchRequest>,
+    request_body = WatchRequest,
     responses(
         (status = 200, description = "It is watched just so.", body = WatchView),
         (status = 201, description = "It is watched from now on.", body = WatchView,
