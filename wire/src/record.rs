@@ -59,6 +59,9 @@ pub mod flag {
     /// when it does (`net.ipv4.ipfrag_time`, 30 s), for what its first fragment shows. DATA and
     /// DATA_FRAG only; `socket` is 0.
     pub const NOT_REASSEMBLED: u16 = 1 << 8;
+    /// Read from shared memory between processes of this host: a sampled view, in which what is
+    /// missing may have been sent all the same. Never written by the kernel filter.
+    pub const SHM: u16 = 1 << 9;
 }
 
 /// One submessage of one writer or reader. 136 bytes.

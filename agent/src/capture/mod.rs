@@ -14,6 +14,7 @@ pub mod order;
 pub mod owners;
 pub mod pcap;
 pub mod ring;
+pub mod shm;
 pub mod sockets;
 pub mod system;
 pub mod whole;

@@ -24,6 +24,7 @@ pub mod reassembly;
 pub mod receivers;
 pub mod reception;
 mod report;
+pub mod sampled;
 pub mod samples;
 pub mod sequence;
 pub mod snapshot;

@@ -11,7 +11,7 @@ use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::parameters::ParameterList;
 use ros2probe_wire::qos::{Durability, Reliability};
-use ros2probe_wire::record::{Handover, Verdict, kind};
+use ros2probe_wire::record::{Handover, Verdict, flag, kind};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
 use ros2probe_wire::{
@@ -182,6 +182,19 @@ impl Observer {
     /// the kernel filter has reported what lies before its offset.
     pub fn datagram(&mut self, envelope: &Envelope, payload: &[u8], handover: Option<&Handover>) {
         self.walk(envelope, payload, handover, Self::count);
+    }
+
+    /// Takes in a message that was read in shared memory, where others may have been missed.
+    pub fn shared_memory(&mut self, envelope: &Envelope, payload: &[u8]) {
+        self.walk(envelope, payload, None, |observer, record| {
+            let flags = record.flags | flag::SHM;
+            observer.count(&Record { flags, ..*record });
+        });
+    }
+
+    /// So much time passed between two looks at shared memory that nobody can tell what happened.
+    pub fn shared_memory_uncertain(&mut self, now: Timestamp) {
+        self.profiler.uncertain(now);
     }
 
     /// Takes in what a datagram announces. What is to be counted is left to `later`, which puts it

@@ -193,7 +193,8 @@ impl Profiler {
         }
         let subject = measured.subject(guid);
         let mut sight = Sight::New;
-        if measured.topic.is_some() {
+        // What is announced in shared memory is read by whom it concerns or not: nobody sees that.
+        if measured.topic.is_some() && record.flags & flag::SHM == 0 {
             let mut stage = self.shared.stage(subject, now, journal, around);
             let subscribers = measured
                 .subscribers
@@ -218,6 +219,13 @@ impl Profiler {
             subscribers.wrote(measured.writer.next() - 1, now);
         }
         true
+    }
+
+    /// The tap on shared memory cannot tell what passed before `now`.
+    pub fn uncertain(&mut self, now: Timestamp) {
+        for measured in self.writers.values_mut() {
+            measured.writer.uncertain(now);
+        }
     }
 
     /// Takes in a record of a writer nobody announced.

@@ -171,6 +171,18 @@ impl Reception {
         });
     }
 
+    /// Another view takes over: samples of which a part came are its, and no losses. How many.
+    pub fn abandon(&mut self) -> u64 {
+        let mut partial = 0;
+        for number in self.sequence.settled()..self.sequence.next() {
+            if self.samples.is_partial(number) && !self.sequence.has(number) {
+                self.sequence.know(number);
+                partial += 1;
+            }
+        }
+        partial
+    }
+
     /// Nobody is there any more for what has not come since the last sample that came.
     pub fn close(&mut self, budget: &mut Budget) {
         let sequence = &mut self.sequence;
@@ -231,8 +243,7 @@ impl Reception {
         Outcome::Whole(Whole {
             number,
             bytes: record.payload_len.into(),
-            // A key alone is a disposal.
-            is_message: record.submessage_flags & DATA_FLAG != 0 && record.status_info == 0,
+            is_message: is_message(record),
             recovered,
             newest,
             source: record.source_timestamp(),
@@ -300,6 +311,11 @@ impl Reception {
             repaired_after: facts.repaired_after,
         })
     }
+}
+
+/// Whether a DATA is no disposal: a key alone is one.
+pub const fn is_message(record: &Record) -> bool {
+    record.submessage_flags & DATA_FLAG != 0 && record.status_info == 0
 }
 
 fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Decision {

@@ -209,6 +209,20 @@ pub struct Measurement {
     pub header_latency: Histogram,
     /// Samples whose time lay after their capture time (clocks apart); not in the histograms.
     pub negative_latency: u64,
+    /// Present when some of this was read from shared memory, which is a sampled view: messages are
+    /// then counted by the span of their numbers, and times are those of the samples that were seen.
+    pub sampled: Option<SampledFacts>,
+}
+
+/// How much a sampled view saw.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SampledFacts {
+    /// Samples of which at least a part was seen.
+    pub seen: u64,
+    /// Samples that there were, by their sequence numbers.
+    pub span: u64,
+    /// How often so much time passed between two looks that something may have gone unnoticed.
+    pub uncertain: u64,
 }
 
 impl Measurement {
@@ -228,6 +242,12 @@ impl Measurement {
         self.source_latency.merge(&other.source_latency);
         self.header_latency.merge(&other.header_latency);
         self.negative_latency += other.negative_latency;
+        if let Some(other) = &other.sampled {
+            let sampled = self.sampled.get_or_insert_default();
+            sampled.seen += other.seen;
+            sampled.span += other.span;
+            sampled.uncertain += other.uncertain;
+        }
     }
 }
 

@@ -11,7 +11,8 @@ use super::header::stamp_time;
 use super::histogram::Histogram;
 use super::journal::{Journal, Loss};
 use super::rate::{SECONDS, Slot, Window};
-use super::reception::{Decision, Outcome, Reception};
+use super::reception::{Decision, Outcome, Reception, is_message};
+use super::sampled::{News, Sampled};
 use super::samples::Budget;
 use super::snapshot::Measurement;
 
@@ -56,6 +57,8 @@ pub struct Writer {
     header_latency: Histogram,
     last_message: Option<Timestamp>,
     negative_latency: u64,
+    /// Of a writer that was seen in shared memory.
+    sampled: Option<Box<Sampled>>,
 }
 
 /// The counters that settling changes.
@@ -85,6 +88,7 @@ impl Writer {
             header_latency: Histogram::default(),
             last_message: None,
             negative_latency: 0,
+            sampled: None,
         }
     }
 
@@ -132,9 +136,20 @@ impl Writer {
         self.last_message
     }
 
+    /// The tap on shared memory cannot tell what passed before `now`.
+    pub fn uncertain(&mut self, now: Timestamp) {
+        if let Some(sampled) = self.sampled.as_mut().filter(|each| each.is_current(now)) {
+            sampled.uncertain();
+        }
+    }
+
     /// Takes in a record of this writer. `opened` is when last a way for its samples was opened
     /// that this host sees: what is missing before it went elsewhere.
     pub fn record(&mut self, record: &Record, opened: Timestamp, scene: &mut Scene<'_>) {
+        if record.flags & flag::SHM != 0 || self.is_sampled(record_time(record)) {
+            self.sampled_record(record);
+            return;
+        }
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
         match record.kind {
@@ -212,6 +227,7 @@ impl Writer {
             source_latency: self.source_latency,
             header_latency: self.header_latency,
             negative_latency: self.negative_latency,
+            sampled: self.sampled.as_ref().map(|sampled| sampled.facts()),
         }
     }
 
@@ -254,6 +270,76 @@ impl Writer {
                 self.delays(whole.number, whole.newest, whole.source, whole.stamp, now);
             }
             Outcome::Whole(_) => {}
+        }
+    }
+
+    fn is_sampled(&self, now: Timestamp) -> bool {
+        let sampled = self.sampled.as_ref();
+        sampled.is_some_and(|sampled| sampled.is_current(now))
+    }
+
+    /// Takes in a record of a view in which what is missing may have been sent all the same.
+    fn sampled_record(&mut self, record: &Record) {
+        let now = record_time(record);
+        if self.sampled.is_none() || !self.is_sampled(now) {
+            self.tally.messages += self.reception.abandon();
+        }
+        let sampled = self
+            .sampled
+            .get_or_insert_with(|| Box::new(Sampled::new(now)));
+        if record.flags & flag::SHM != 0 {
+            sampled.touch(now);
+        }
+        let sequence = self.reception.sequence_mut();
+        let number = record.sequence_number;
+        let told = match record.kind {
+            kind::DATA | kind::DATA_FRAG => {
+                let ends = record.kind == kind::DATA || record.ends_sample();
+                let source = record.source_timestamp().timestamp();
+                let news = sampled.sample(number, source, ends, now, sequence);
+                self.sampled_sample(record, &news, now);
+                return;
+            }
+            kind::HEARTBEAT => {
+                self.traits.reliable = true;
+                sampled.exist(record.second_sequence_number(), now, sequence)
+            }
+            kind::GAP => {
+                let end = record.second_sequence_number();
+                sampled.skip(number, end, now, sequence)
+            }
+            _ => 0,
+        };
+        self.tally.messages += told;
+        self.tally.window.current(now).messages += told;
+    }
+
+    fn sampled_sample(&mut self, record: &Record, news: &News, now: Timestamp) {
+        let (bytes, is_message) = match record.kind {
+            kind::DATA => (record.payload_len, is_message(record)),
+            _ => (record.sample_size, record.status_info == 0),
+        };
+        // Those that were not seen are taken for as large as the next one that was.
+        let messages = news.samples - u64::from(!is_message && news.samples > 0);
+        let bytes = messages.saturating_mul(bytes.into());
+        self.tally.messages += messages;
+        self.tally.bytes = self.tally.bytes.saturating_add(bytes);
+        let slot = self.tally.window.current(now);
+        slot.messages += messages;
+        slot.bytes = slot.bytes.saturating_add(bytes);
+        if messages > 0 {
+            self.last_message = self.last_message.max(Some(now));
+        }
+        let Some(sampled) = &mut self.sampled else {
+            return;
+        };
+        let stamp = sampled.stamp(record.sequence_number, record.header_stamp());
+        if let Some(interval) = news.interval {
+            self.interarrival.observe(seconds(interval));
+        }
+        if news.arrived && is_message {
+            let source = record.source_timestamp();
+            self.delays(record.sequence_number, true, source, stamp, now);
         }
     }
 

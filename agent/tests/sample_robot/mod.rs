@@ -11,8 +11,8 @@ use ros2probe::model::discovery::Addresses;
 use ros2probe::model::histogram::Histogram;
 use ros2probe::model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
-    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, Snapshot,
-    SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
+    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
+    Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
     WatchedTopicFacts,
 };
 use ros2probe::state::StateFacts;
@@ -318,5 +318,10 @@ fn measurement() -> Measurement {
         source_latency: histogram,
         header_latency: histogram,
         negative_latency: 0,
+        sampled: Some(SampledFacts {
+            seen: 123_000,
+            span: 123_456,
+            uncertain: 1,
+        }),
     }
 }

@@ -1,0 +1,98 @@
+//! One place in a port's ring: which buffer of which segment holds a message.
+//!
+//! Layout: MultiProducerConsumerRingBuffer's cell with a BufferDescriptor, Fast DDS 2.3 to 3.6
+//! (constant 5 of its shared-memory ABI), 20 bytes: reference counter, segment id, offset of the
+//! buffer's node in the segment, validity id.
+
+use std::fmt;
+
+/// Names a segment; in hexadecimal it ends the file's name.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct SegmentId(pub [u8; 8]);
+
+/// Which message a cell means.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Default, Debug)]
+pub struct Descriptor {
+    /// Where it lies.
+    pub segment: SegmentId,
+    /// Offset of its buffer's node in there.
+    pub node: u32,
+    /// Which use of the buffer is meant.
+    pub validity: u32,
+}
+
+/// A cell as it was read.
+#[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
+pub struct Cell {
+    /// Listeners that have not taken it yet; 0 also while it is being filled.
+    pub references: u32,
+    /// The message.
+    pub descriptor: Descriptor,
+}
+
+impl Cell {
+    /// Bytes of a cell.
+    pub const LEN: usize = 20;
+
+    /// From its bytes.
+    #[must_use]
+    pub const fn parse(bytes: [u8; Self::LEN]) -> Self {
+        let [
+            a0,
+            a1,
+            a2,
+            a3,
+            s0,
+            s1,
+            s2,
+            s3,
+            s4,
+            s5,
+            s6,
+            s7,
+            n0,
+            n1,
+            n2,
+            n3,
+            v0,
+            v1,
+            v2,
+            v3,
+        ] = bytes;
+        Self {
+            references: u32::from_le_bytes([a0, a1, a2, a3]),
+            descriptor: Descriptor {
+                segment: SegmentId([s0, s1, s2, s3, s4, s5, s6, s7]),
+                node: u32::from_le_bytes([n0, n1, n2, n3]),
+                validity: u32::from_le_bytes([v0, v1, v2, v3]),
+            },
+        }
+    }
+}
+
+impl fmt::Display for SegmentId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl fmt::Debug for SegmentId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        fmt::Display::fmt(self, f)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cell_is_four_fields_one_behind_the_other() {
+        let bytes: [u8; 20] = std::array::from_fn(|index| index as u8);
+        let cell = Cell::parse(bytes);
+        assert_eq!(cell.references, 0x0302_0100);
+        assert_eq!(cell.descriptor.segment.to_string(), "0405060708090a0b");
+        assert_eq!(cell.descriptor.node, 0x0f0e_0d0c);
+        assert_eq!(cell.descriptor.validity, 0x1312_1110);
+    }
+}

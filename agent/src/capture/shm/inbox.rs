@@ -1,0 +1,166 @@
+//! What the tap found, on its way to the working thread: bounded, and counted where it overflows.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use ros2probe_wire::record::{Record, kind};
+
+/// Records, and bytes of captured messages, that wait at most.
+const MAX_RECORDS: usize = 16_384;
+const MAX_BYTES: usize = 4 << 20;
+
+/// One thing that was found.
+#[derive(Debug)]
+pub enum Item {
+    /// A submessage of a measured writer.
+    Record(Record),
+    /// A whole message.
+    Message {
+        /// When it was read, nanoseconds since the Unix epoch.
+        time: u64,
+        /// The port that it was announced at.
+        port: u16,
+        /// The message.
+        bytes: Vec<u8>,
+    },
+    /// A ring may have gone round unnoticed before this time.
+    Uncertain(u64),
+}
+
+/// What waits.
+#[derive(Debug, Default)]
+pub struct Inbox {
+    waiting: Mutex<Waiting>,
+}
+
+#[derive(Debug, Default)]
+struct Waiting {
+    items: Vec<Item>,
+    bytes: usize,
+    refused: u64,
+}
+
+impl Inbox {
+    /// Takes over what `found` holds, and leaves it empty.
+    pub fn put(&self, found: &mut Vec<Item>) {
+        if found.is_empty() {
+            return;
+        }
+        let waiting = &mut *self.waiting();
+        for item in found.drain(..) {
+            waiting.put(item);
+        }
+    }
+
+    /// Hands over everything.
+    #[must_use]
+    pub fn take(&self) -> Vec<Item> {
+        let waiting = &mut *self.waiting();
+        waiting.bytes = 0;
+        std::mem::take(&mut waiting.items)
+    }
+
+    /// What there was no room for.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.waiting().refused
+    }
+
+    /// Nothing that is done under this lock can fail.
+    fn waiting(&self) -> MutexGuard<'_, Waiting> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Waiting {
+    fn put(&mut self, item: Item) {
+        match &item {
+            Item::Record(record) => {
+                if let Some(Item::Record(last)) = self.items.last_mut()
+                    && record.kind == kind::DATA_FRAG
+                    && (last.kind, last.writer) == (record.kind, record.writer)
+                    && last.extend(record)
+                {
+                    return;
+                }
+            }
+            Item::Message { bytes, .. } if self.bytes + bytes.len() > MAX_BYTES => {
+                self.refused += 1;
+                return;
+            }
+            Item::Message { bytes, .. } => self.bytes += bytes.len(),
+            Item::Uncertain(_) => {}
+        }
+        if self.items.len() >= MAX_RECORDS {
+            self.refused += 1;
+            return;
+        }
+        self.items.push(item);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fragment(start: u32) -> Item {
+        Item::Record(Record {
+            kind: kind::DATA_FRAG,
+            sequence_number: 1,
+            fragment_start: start,
+            fragments: 1 << 16 | 1000,
+            sample_size: 10_000,
+            payload_len: 1000,
+            ..Record::default()
+        })
+    }
+
+    #[test]
+    fn fragments_that_follow_each_other_wait_as_one() {
+        let inbox = Inbox::default();
+        let mut found = vec![fragment(1), fragment(2)];
+        inbox.put(&mut found);
+        inbox.put(&mut vec![fragment(3), fragment(5)]);
+        assert!(found.is_empty());
+        let items = inbox.take();
+        assert_eq!(items.len(), 2);
+        assert!(matches!(&items[0], Item::Record(record) if record.payload_len == 3000));
+        assert!(inbox.take().is_empty());
+    }
+
+    #[test]
+    fn samples_of_one_writer_stay_apart() {
+        let inbox = Inbox::default();
+        let sample = |number| {
+            Item::Record(Record {
+                kind: kind::DATA,
+                sequence_number: number,
+                ..Record::default()
+            })
+        };
+        inbox.put(&mut vec![sample(1), sample(1), sample(2)]);
+        assert_eq!(inbox.take().len(), 3);
+    }
+
+    #[test]
+    fn what_there_is_no_room_for_is_counted() {
+        let inbox = Inbox::default();
+        let message = || Item::Message {
+            time: 0,
+            port: 0,
+            bytes: vec![0; 1 << 20],
+        };
+        inbox.put(&mut vec![
+            message(),
+            message(),
+            message(),
+            message(),
+            message(),
+        ]);
+        assert_eq!((inbox.take().len(), inbox.refused()), (4, 1));
+        inbox.put(&mut vec![message()]);
+        assert_eq!(inbox.take().len(), 1);
+        let mut flood: Vec<_> = (0..MAX_RECORDS as u64 + 3).map(Item::Uncertain).collect();
+        inbox.put(&mut flood);
+        assert_eq!((inbox.take().len(), inbox.refused()), (MAX_RECORDS, 4));
+    }
+}

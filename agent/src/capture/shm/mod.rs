@@ -1,0 +1,189 @@
+//! Traffic between processes of one host through Fast DDS's shared memory, read and never written.
+//!
+//! A thread of its own looks at the ports (see [`tap`]), so that neither its sleeps nor a scan of
+//! processes hold up the capture, nor the capture its looks. It is a sampled view: what was
+//! overwritten before it looked it has not seen, and sequence numbers tell that there was something.
+//! It opens files for reading, takes no lock, registers nowhere and wakes nobody.
+
+pub mod cell;
+mod inbox;
+pub mod pace;
+pub mod port;
+pub mod scan;
+pub mod segment;
+pub mod source;
+pub mod tap;
+pub mod verdict;
+
+#[cfg(test)]
+mod image;
+
+use std::io;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{Guid, Timestamp};
+
+use self::inbox::{Inbox, Item};
+use self::pace::{Need, Pace};
+use self::scan::Places;
+use self::tap::{Counters, Moment, Tap};
+use super::system::{Clocks, thread_cpu};
+use crate::model::observer::Observer;
+
+/// How often the counters are put where others can read them.
+const REPORT: u64 = 200_000_000;
+
+/// The thread that looks at shared memory, from the outside.
+pub struct SharedMemory {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// What the tap says of itself.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Facts {
+    /// What it met.
+    pub counters: Counters,
+    /// CPU time of its thread, seconds.
+    pub cpu_seconds: f64,
+    /// Its looks so far.
+    pub looks: u64,
+    /// By how much it sleeps longer than it would like to, to stay within its share.
+    pub stretch: f64,
+    /// Found, and lost because nobody took it in time.
+    pub refused: u64,
+}
+
+#[derive(Default)]
+struct Shared {
+    inbox: Inbox,
+    interest: Mutex<Vec<(Guid, Option<Verdict>)>>,
+    is_told: AtomicBool,
+    facts: Mutex<Facts>,
+    stop: AtomicBool,
+}
+
+impl SharedMemory {
+    /// Starts looking, within a share of a CPU. The thread has the capabilities of the caller.
+    ///
+    /// # Errors
+    /// There can be no more threads.
+    pub fn start(places: Places, share: f64) -> io::Result<Self> {
+        let shared = Arc::<Shared>::default();
+        let thread = std::thread::Builder::new()
+            .name("shm".to_owned())
+            .stack_size(256 << 10)
+            .spawn({
+                let shared = Arc::clone(&shared);
+                move || look(&shared, places, share)
+            })?;
+        Ok(Self {
+            shared,
+            thread: Some(thread),
+        })
+    }
+
+    /// Says what has become of interest.
+    pub fn apply(&self, changes: &[(Guid, Option<Verdict>)]) {
+        if changes.is_empty() {
+            return;
+        }
+        let interest = self.shared.interest.lock();
+        let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
+        interest.extend_from_slice(changes);
+        self.shared.is_told.store(true, Ordering::Release);
+    }
+
+    /// Gives the model what was found since the last time.
+    pub fn take_in(&self, observer: &mut Observer) {
+        for item in self.shared.inbox.take() {
+            match item {
+                Item::Record(record) => observer.record(&record),
+                Item::Message { time, port, bytes } => {
+                    let envelope = Envelope {
+                        time,
+                        destination_port: port,
+                        ..Envelope::default()
+                    };
+                    observer.shared_memory(&envelope, &bytes);
+                }
+                Item::Uncertain(time) => observer.shared_memory_uncertain(Timestamp(time)),
+            }
+        }
+    }
+
+    /// What it says of itself.
+    #[must_use]
+    pub fn facts(&self) -> Facts {
+        let facts = self.shared.facts.lock();
+        Facts {
+            refused: self.shared.inbox.refused(),
+            ..*facts.unwrap_or_else(PoisonError::into_inner)
+        }
+    }
+}
+
+impl Drop for SharedMemory {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            // It can only have ended; how does not matter any more.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The thread.
+fn look(shared: &Shared, places: Places, share: f64) {
+    let mut tap = Tap::new(places);
+    let mut pace = Pace::new(share);
+    let (mut found, mut looks, mut reported) = (Vec::new(), 0, 0);
+    while !shared.stop.load(Ordering::Acquire) {
+        if shared.is_told.swap(false, Ordering::Acquire) {
+            let interest = shared.interest.lock();
+            let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
+            for (guid, verdict) in interest.drain(..) {
+                tap.judge.set(guid, verdict);
+            }
+        }
+        let clocks = Clocks::read();
+        let now = Moment {
+            monotonic: clocks.monotonic,
+            calendar: clocks.now.0,
+        };
+        let announced = tap.look(now, &mut found);
+        shared.inbox.put(&mut found);
+        looks += 1;
+        let cpu = seconds(thread_cpu());
+        if now.monotonic.saturating_sub(reported) >= REPORT {
+            reported = now.monotonic;
+            let facts = shared.facts.lock();
+            *facts.unwrap_or_else(PoisonError::into_inner) = Facts {
+                counters: tap.counters(),
+                cpu_seconds: cpu,
+                looks,
+                stretch: pace.stretch(),
+                refused: 0,
+            };
+        }
+        let need = match (tap.has_ports(), tap.judge.measures()) {
+            (false, _) => Need::Nobody,
+            (true, false) => Need::Names,
+            (true, true) => Need::Watching,
+        };
+        let monotonic = seconds(now.monotonic);
+        std::thread::sleep(pace.sleep(monotonic, cpu, announced, need));
+    }
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "nanoseconds of an uptime stay exact to 104 days, and then to the microsecond"
+)]
+fn seconds(nanoseconds: u64) -> f64 {
+    nanoseconds as f64 / 1e9
+}

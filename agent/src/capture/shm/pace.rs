@@ -1,0 +1,179 @@
+//! How long the tap sleeps between two looks.
+//!
+//! Waking up is what a look costs. So it looks again soon where there was much, slower and slower
+//! where there was nothing, and whatever it would like to do is stretched until it stays within its
+//! share of a CPU. Knows no clock but what it is told.
+
+use std::time::Duration;
+
+/// Between looks while messages come in bursts, and at most while something is measured.
+const BURST: f64 = 100e-6;
+const WATCHING: f64 = 1e-3;
+/// At most when only discovery is wanted, and when nothing came for a while.
+const NAMES: f64 = 5e-3;
+const QUIET: f64 = 10e-3;
+/// Where nobody communicates: only new ports are looked for.
+const NOBODY: f64 = 100e-3;
+/// Nothing came for so long.
+const QUIET_AFTER: f64 = 3.0;
+/// How much longer each sleep after nothing is.
+const SLOWER: f64 = 1.5;
+/// The share of the CPU is looked at this often.
+const ACCOUNT: f64 = 0.1;
+/// Sleeps get no longer than this, whatever it costs.
+const LONGEST: f64 = 50e-3;
+
+/// What the tap is there for at the moment.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Need {
+    /// There is no port.
+    Nobody,
+    /// Nothing is measured; node names and endpoints may come.
+    Names,
+    /// Something is measured.
+    Watching,
+}
+
+/// The sleeps.
+#[derive(Debug)]
+pub struct Pace {
+    /// Share of a CPU.
+    budget: f64,
+    sleep: f64,
+    stretch: f64,
+    quiet_since: f64,
+    accounted: (f64, f64),
+}
+
+impl Pace {
+    /// Within this share of a CPU, 0.015 for 1.5 %.
+    #[must_use]
+    pub const fn new(budget: f64) -> Self {
+        Self {
+            budget,
+            sleep: WATCHING,
+            stretch: 1.0,
+            quiet_since: 0.0,
+            accounted: (0.0, 0.0),
+        }
+    }
+
+    /// How long to sleep after a look at `now` that found so many messages; `cpu` is what the
+    /// thread has used so far. Both in seconds.
+    pub fn sleep(&mut self, now: f64, cpu: f64, found: usize, need: Need) -> Duration {
+        self.account(now, cpu);
+        if found > 0 {
+            self.quiet_since = now;
+        }
+        let longest = match need {
+            Need::Nobody => NOBODY,
+            _ if now - self.quiet_since > QUIET_AFTER => QUIET,
+            Need::Names => NAMES,
+            Need::Watching => WATCHING,
+        };
+        self.sleep = match found {
+            0 => (self.sleep * SLOWER).min(longest),
+            1 => (longest / 2.0).max(BURST),
+            _ => BURST,
+        };
+        let stretched = (self.sleep * self.stretch).min(LONGEST.max(longest));
+        Duration::from_secs_f64(stretched)
+    }
+
+    /// By how much sleeps are longer than they would be without a budget.
+    #[must_use]
+    pub const fn stretch(&self) -> f64 {
+        self.stretch
+    }
+
+    fn account(&mut self, now: f64, cpu: f64) {
+        let (then, used) = self.accounted;
+        let elapsed = now - then;
+        if elapsed < ACCOUNT {
+            return;
+        }
+        self.accounted = (now, cpu);
+        let share = (cpu - used) / elapsed;
+        // Waking up less often by the factor that it costs too much, but not all at once.
+        let wanted = share / self.budget;
+        let correction = wanted.clamp(0.8, 1.5);
+        self.stretch = (self.stretch * correction).clamp(1.0, LONGEST / BURST);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Runs for `seconds` with a look costing `cost`; the share of CPU over the second half, and
+    /// the looks in it.
+    fn run(
+        pace: &mut Pace,
+        seconds: f64,
+        cost: f64,
+        need: Need,
+        mut found: impl FnMut(f64) -> usize,
+    ) -> (f64, f64) {
+        let (mut now, mut cpu, mut looks, mut half) = (0.0, 0.0, 0_u32, (0.0, 0.0));
+        while now < seconds {
+            let slept = pace.sleep(now, cpu, found(now), need);
+            now += slept.as_secs_f64() + cost;
+            cpu += cost;
+            if now >= seconds / 2.0 {
+                if half.0 == 0.0 {
+                    half = (now, cpu);
+                }
+                looks += 1;
+            }
+        }
+        let elapsed = now - half.0;
+        ((cpu - half.1) / elapsed, f64::from(looks) / elapsed)
+    }
+
+    #[test]
+    fn whatever_a_look_costs_the_budget_holds() {
+        for budget in [0.005, 0.015, 0.1] {
+            for cost in [5e-6, 25e-6, 200e-6] {
+                for burst in [0, 1, 40] {
+                    let mut pace = Pace::new(budget);
+                    let (share, _) = run(&mut pace, 20.0, cost, Need::Watching, |_| burst);
+                    // A look that costs 200 us at every 50 ms is 0.4 %: less is not to be had.
+                    assert!(share <= budget * 1.1, "{budget} {cost} {burst}: {share}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn it_looks_a_thousand_times_a_second_while_it_may() {
+        let mut pace = Pace::new(0.015);
+        let busy = |now: f64| usize::from(now % 1.0 < 0.01);
+        let (_, looks) = run(&mut pace, 10.0, 5e-6, Need::Watching, busy);
+        assert!(looks > 900.0, "{looks}");
+    }
+
+    #[test]
+    fn where_little_is_needed_it_looks_seldom() {
+        let looks = |need| {
+            let mut pace = Pace::new(0.015);
+            run(&mut pace, 20.0, 5e-6, need, |_| 0).1
+        };
+        assert!((9.0..11.0).contains(&looks(Need::Nobody)));
+        assert!((90.0..110.0).contains(&looks(Need::Watching)));
+        assert!((90.0..110.0).contains(&looks(Need::Names)));
+    }
+
+    #[test]
+    fn a_burst_is_followed_closely_and_then_left_alone() {
+        let mut pace = Pace::new(0.015);
+        assert_eq!(pace.sleep(0.01, 0.0, 5, Need::Watching).as_micros(), 100);
+        let mut last = Duration::ZERO;
+        for step in 0..10 {
+            let now = 0.01 + f64::from(step) * 1e-3;
+            let slept = pace.sleep(now, 0.0, 0, Need::Watching);
+            assert!(slept >= last);
+            last = slept;
+        }
+        assert_eq!(last.as_micros(), 1000);
+    }
+}

@@ -1,0 +1,418 @@
+//! A port: the ring through which messages are announced to the participants that listen there.
+//!
+//! Reads PortNode, ring and cells of Fast DDS 2.3 to 3.6 and follows the writing end as a listener
+//! would, without being one: no reference is counted, nothing is popped. Whoever pushes moves
+//! `write_p` first, fills the cell then and sets its reference counter last; so a cell counts as
+//! filled when it is referred to or when it is not what it was a round before.
+
+use super::cell::{Cell, Descriptor};
+use super::source::Source;
+
+/// PortNode lies behind the allocator's administration, 0x100 on x86-64 and 0x110 on aarch64: it
+/// is looked for in the first page by what it says about itself.
+const FIRST: u64 = 0x40;
+const LAST: u64 = 0x1000;
+/// Fields of PortNode and of the ring's node.
+const CELLS: u64 = 12;
+const RING: u64 = 16;
+const PORT_ID: u64 = 20;
+const CAPACITY: u64 = 36;
+const TOTAL_CELLS: u64 = 8;
+/// Fast DDS has 512 cells unless it is configured otherwise; more would be our memory.
+const MAX_CAPACITY: u32 = 1 << 11;
+/// A cell that is not filled after so long will not be: its writer died.
+const UNFILLED_NANOSECONDS: u64 = 100_000_000;
+/// Attempts to read a ring that nobody moves meanwhile.
+const ATTEMPTS: usize = 3;
+/// The pace of a port is measured over this long, and forgotten by an eighth each time.
+const PACE_NANOSECONDS: u64 = 100_000_000;
+
+/// Where things lie in a port's file.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+struct Layout {
+    ring: u64,
+    cells: u64,
+    capacity: u32,
+}
+
+/// How far one port was read.
+#[derive(Debug)]
+pub struct Port {
+    layout: Layout,
+    /// Of the next cell: index, plus the capacity in every other round.
+    position: u32,
+    shadow: Vec<Descriptor>,
+    unfilled_since: Option<u64>,
+    looked: u64,
+    pace: Pace,
+    bytes: Vec<u8>,
+}
+
+/// What a look at a port found besides messages.
+#[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
+pub struct Look {
+    /// Messages announced since the last one.
+    pub pushed: u64,
+    /// Of those, overwritten before they were read.
+    pub overwritten: u64,
+    /// Announced and never filled in.
+    pub unfilled: u64,
+    /// So much time had passed that the ring may have gone round unnoticed.
+    pub is_uncertain: bool,
+}
+
+/// Messages a second at the port's busiest of late.
+#[derive(Debug, Default)]
+struct Pace {
+    since: u64,
+    count: u64,
+    peak: u64,
+}
+
+impl Port {
+    /// Finds port number `number` in its file and what still stands in its ring, the oldest first.
+    /// `None` when this is no port, or none of this layout.
+    pub fn attach<S: Source + ?Sized>(
+        source: &S,
+        number: u32,
+        now: u64,
+    ) -> Option<(Self, Vec<Descriptor>)> {
+        let layout = Layout::find(source, number)?;
+        let mut port = Self {
+            layout,
+            position: 0,
+            shadow: vec![Descriptor::default(); layout.capacity as usize],
+            unfilled_since: None,
+            looked: now,
+            pace: Pace::default(),
+            bytes: Vec::new(),
+        };
+        let mut before = port.write_position(source)?;
+        let mut cells = Vec::new();
+        for _ in 0..ATTEMPTS {
+            cells.clear();
+            port.cells(source, 0, layout.capacity, &mut cells)?;
+            let after = port.write_position(source)?;
+            port.position = before;
+            if before == after {
+                break;
+            }
+            before = after;
+        }
+        for (shadow, cell) in port.shadow.iter_mut().zip(&cells) {
+            *shadow = cell.descriptor;
+        }
+        let oldest = layout.index(port.position);
+        let (newer, older) = cells.split_at_checked(oldest as usize)?;
+        let filled = older.iter().chain(newer).map(|cell| cell.descriptor);
+        let filled = filled.filter(|descriptor| *descriptor != Descriptor::default());
+        Some((port, filled.collect()))
+    }
+
+    /// Appends what was announced since the last look. `None` when the file is no port any more.
+    pub fn look<S: Source + ?Sized>(
+        &mut self,
+        source: &S,
+        now: u64,
+        found: &mut Vec<Descriptor>,
+    ) -> Option<Look> {
+        let elapsed = now.saturating_sub(std::mem::replace(&mut self.looked, now));
+        let write = self.write_position(source)?;
+        let capacity = self.layout.capacity;
+        let mut ahead = self.layout.distance(self.position, write);
+        let mut look = Look {
+            is_uncertain: self.pace.may_lap(elapsed, capacity),
+            ..Look::default()
+        };
+        if ahead == 0 {
+            self.unfilled_since = None;
+            return Some(look);
+        }
+        if ahead > capacity {
+            let overwritten = ahead - capacity;
+            self.position = self.layout.advance(self.position, overwritten);
+            (look.overwritten, look.pushed) = (overwritten.into(), overwritten.into());
+            ahead = capacity;
+            self.unfilled_since = None;
+        }
+        // Cells may change while they are read: only what reads the same twice counts.
+        let first = self.layout.index(self.position);
+        let (mut cells, mut again) = (Vec::new(), Vec::new());
+        self.cells(source, first, ahead, &mut cells)?;
+        self.cells(source, first, ahead, &mut again)?;
+        for (cell, again) in cells.iter().zip(&again) {
+            let index = self.layout.index(self.position) as usize;
+            let shadow = self.shadow.get_mut(index)?;
+            let is_fresh = cell.references > 0 || cell.descriptor != *shadow;
+            if !is_fresh || cell.descriptor != again.descriptor {
+                let since = *self.unfilled_since.get_or_insert(now);
+                if now.saturating_sub(since) < UNFILLED_NANOSECONDS {
+                    break;
+                }
+                look.unfilled += 1;
+            } else {
+                *shadow = cell.descriptor;
+                found.push(cell.descriptor);
+            }
+            self.unfilled_since = None;
+            look.pushed += 1;
+            self.position = self.layout.advance(self.position, 1);
+        }
+        self.pace.count(look.pushed, now);
+        Some(look)
+    }
+
+    fn write_position<S: Source + ?Sized>(&self, source: &S) -> Option<u32> {
+        let word = source.word(self.layout.ring)?;
+        let (index, is_odd_round) = (word & (u32::MAX >> 1), word >> 31 == 1);
+        (index < self.layout.capacity).then(|| {
+            index
+                + if is_odd_round {
+                    self.layout.capacity
+                } else {
+                    0
+                }
+        })
+    }
+
+    /// Reads `count` cells from `first` on, round the ring's end.
+    fn cells<S: Source + ?Sized>(
+        &mut self,
+        source: &S,
+        first: u32,
+        count: u32,
+        cells: &mut Vec<Cell>,
+    ) -> Option<()> {
+        let until_end = count.min(self.layout.capacity - first);
+        for (first, count) in [(first, until_end), (0, count - until_end)] {
+            self.bytes.resize(count as usize * Cell::LEN, 0);
+            let offset = self.layout.cells + u64::from(first) * Cell::LEN as u64;
+            if !source.read(offset, &mut self.bytes) {
+                return None;
+            }
+            let (read, _) = self.bytes.as_chunks::<{ Cell::LEN }>();
+            cells.extend(read.iter().copied().map(Cell::parse));
+        }
+        Some(())
+    }
+}
+
+impl Layout {
+    fn find<S: Source + ?Sized>(source: &S, number: u32) -> Option<Self> {
+        (FIRST..LAST)
+            .step_by(8)
+            .find_map(|node| Self::at(source, node, number))
+    }
+
+    fn at<S: Source + ?Sized>(source: &S, node: u64, number: u32) -> Option<Self> {
+        if source.word(node + PORT_ID)? != number {
+            return None;
+        }
+        let capacity = source.word(node + CAPACITY)?;
+        let ring = u64::from(source.word(node + RING)?);
+        let cells = u64::from(source.word(node + CELLS)?);
+        let fits = (1..=MAX_CAPACITY).contains(&capacity)
+            && ring.is_multiple_of(4)
+            && source.word(ring + TOTAL_CELLS)? == capacity;
+        let last = cells + u64::from(capacity - fits.then_some(1)?) * Cell::LEN as u64;
+        let mut cell = [0; Cell::LEN];
+        source.read(last, &mut cell).then_some(Self {
+            ring,
+            cells,
+            capacity,
+        })
+    }
+
+    const fn index(&self, position: u32) -> u32 {
+        position % self.capacity
+    }
+
+    const fn advance(&self, position: u32, by: u32) -> u32 {
+        (position + by) % (2 * self.capacity)
+    }
+
+    /// Cells from one position to another, which is not before it.
+    const fn distance(&self, from: u32, to: u32) -> u32 {
+        (to + 2 * self.capacity - from) % (2 * self.capacity)
+    }
+}
+
+impl Pace {
+    /// Whether two rounds, which look like none, may have passed at the pace of late.
+    fn may_lap(&self, elapsed: u64, capacity: u32) -> bool {
+        let pushed = u128::from(self.peak) * u128::from(elapsed) / 1_000_000_000;
+        pushed >= 2 * u128::from(capacity)
+    }
+
+    fn count(&mut self, pushed: u64, now: u64) {
+        self.count += pushed;
+        let elapsed = now.saturating_sub(self.since);
+        if elapsed >= PACE_NANOSECONDS {
+            let pace = u128::from(self.count) * 1_000_000_000 / u128::from(elapsed);
+            let pace = u64::try_from(pace).unwrap_or(u64::MAX);
+            self.peak = pace.max(self.peak - self.peak / 8);
+            (self.since, self.count) = (now, 0);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::super::image::PortImage;
+    use super::*;
+
+    const SECOND: u64 = 1_000_000_000;
+
+    fn descriptor(number: u32) -> Descriptor {
+        Descriptor {
+            node: number,
+            validity: number,
+            ..Descriptor::default()
+        }
+    }
+
+    fn look(port: &mut Port, image: &PortImage, now: u64) -> (Vec<u32>, Look) {
+        let mut found = Vec::new();
+        let look = port.look(image.bytes(), now, &mut found).unwrap();
+        (found.iter().map(|found| found.node).collect(), look)
+    }
+
+    #[test]
+    fn what_is_pushed_is_found_once_and_in_order_round_after_round() {
+        let mut image = PortImage::new(7411, 8, 0x100);
+        let (mut port, backlog) = Port::attach(image.bytes(), 7411, 0).unwrap();
+        assert!(backlog.is_empty());
+        let (mut next, mut wanted) = (1, 1);
+        for step in 0..100 {
+            for _ in 0..step % 9 {
+                image.push(descriptor(next));
+                next += 1;
+            }
+            let (found, look) = look(&mut port, &image, step);
+            for found in found {
+                assert_eq!(found, wanted);
+                wanted += 1;
+            }
+            assert_eq!((look.overwritten, look.unfilled), (0, 0));
+            assert_eq!(wanted, next);
+        }
+    }
+
+    #[test]
+    fn the_node_is_found_where_other_architectures_have_it() {
+        for node in [0x40, 0x100, 0x110, 0x400] {
+            let image = PortImage::new(7411, 8, node);
+            assert!(Port::attach(image.bytes(), 7411, 0).is_some(), "{node:#x}");
+            assert!(Port::attach(image.bytes(), 7413, 0).is_none());
+        }
+    }
+
+    #[test]
+    fn what_stands_in_the_ring_already_comes_the_oldest_first() {
+        let mut image = PortImage::new(7411, 8, 0x100);
+        for number in 1..=11 {
+            image.push(descriptor(number));
+        }
+        let (mut port, backlog) = Port::attach(image.bytes(), 7411, 0).unwrap();
+        let backlog: Vec<_> = backlog.iter().map(|found| found.node).collect();
+        assert_eq!(backlog, [4, 5, 6, 7, 8, 9, 10, 11]);
+        image.push(descriptor(12));
+        assert_eq!(look(&mut port, &image, 1).0, [12]);
+    }
+
+    #[test]
+    fn a_listener_that_is_quicker_hides_nothing() {
+        let mut image = PortImage::new(7411, 8, 0x100);
+        let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
+        image.push(descriptor(1));
+        image.pop_all();
+        assert_eq!(look(&mut port, &image, 1).0, [1]);
+    }
+
+    #[test]
+    fn one_that_is_being_filled_is_waited_for_but_not_for_ever() {
+        let mut image = PortImage::new(7411, 8, 0x100);
+        let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
+        let begun = image.begin_push();
+        image.push(descriptor(2));
+        assert_eq!(look(&mut port, &image, 1).0, [0; 0]);
+        image.fill(begun, descriptor(1));
+        assert_eq!(look(&mut port, &image, 2).0, [1, 2]);
+        image.begin_push();
+        image.push(descriptor(4));
+        assert_eq!(look(&mut port, &image, 3).0, [0; 0]);
+        let (found, seen) = look(&mut port, &image, 3 + UNFILLED_NANOSECONDS);
+        assert_eq!((found, seen.unfilled, seen.pushed), (vec![4], 1, 2));
+    }
+
+    #[test]
+    fn the_overwritten_are_counted_and_the_rest_is_read() {
+        let mut image = PortImage::new(7411, 8, 0x100);
+        let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
+        for number in 1..=13 {
+            image.push(descriptor(number));
+        }
+        let (found, seen) = look(&mut port, &image, 1);
+        assert_eq!(found, [6, 7, 8, 9, 10, 11, 12, 13]);
+        assert_eq!((seen.overwritten, seen.pushed), (5, 13));
+    }
+
+    #[test]
+    fn a_gap_in_which_the_ring_may_have_gone_round_twice_is_uncertain() {
+        let mut image = PortImage::new(7411, 8, 0x100);
+        let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
+        for step in 1..=200 {
+            image.push(descriptor(step));
+            let (_, seen) = look(&mut port, &image, u64::from(step) * SECOND / 100);
+            assert!(!seen.is_uncertain);
+        }
+        // 100 a second: 16 take 160 ms.
+        let now = 2 * SECOND;
+        assert!(!look(&mut port, &image, now + 150_000_000).1.is_uncertain);
+        assert!(look(&mut port, &image, now + 500_000_000).1.is_uncertain);
+    }
+
+    #[test]
+    fn a_port_that_is_cut_off_or_contradicts_itself_is_none() {
+        let image = PortImage::new(7411, 8, 0x100);
+        let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
+        for end in 0..image.bytes().len() {
+            let cut = &image.bytes()[..end];
+            assert!(Port::attach(cut, 7411, 0).is_none(), "{end}");
+            let _ = port.look(cut, 1, &mut Vec::new());
+        }
+        let mut image = PortImage::new(7411, 8, 0x100);
+        image.set_write(8);
+        assert!(port.look(image.bytes(), 1, &mut Vec::new()).is_none());
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_is_written_there_reading_ends_and_stays_within_the_ring(
+            damage in proptest::collection::vec((0_usize..1200, any::<[u8; 4]>()), 0..60),
+            later in proptest::collection::vec((0_usize..1200, any::<[u8; 4]>()), 0..60),
+        ) {
+            let mut image = PortImage::new(7411, 8, 0x100);
+            image.push(descriptor(1));
+            let mut bytes = image.bytes().to_vec();
+            let change = |bytes: &mut Vec<u8>, damage: &[(usize, [u8; 4])]| {
+                for (at, word) in damage {
+                    let at = at % (bytes.len() - 4);
+                    bytes[at..at + 4].copy_from_slice(word);
+                }
+            };
+            change(&mut bytes, &damage);
+            if let Some((mut port, backlog)) = Port::attach(bytes.as_slice(), 7411, 0) {
+                prop_assert!(backlog.len() <= MAX_CAPACITY as usize);
+                for now in 1..4 {
+                    change(&mut bytes, &later);
+                    let mut found = Vec::new();
+                    let _ = port.look(bytes.as_slice(), now * SECOND, &mut found);
+                    prop_assert!(found.len() <= MAX_CAPACITY as usize);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,330 @@
+//! Which files of shared memory there are, in every mount namespace of the host.
+//!
+//! Each `/dev/shm` is listed only when it changed; processes are gone through only for those that
+//! are new. What is behind `/proc/<pid>/root` belongs to somebody else: links are not followed
+//! there.
+
+use std::collections::HashMap;
+use std::fs::{self, Metadata};
+use std::os::unix::fs::{DirEntryExt as _, MetadataExt as _};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use super::cell::SegmentId;
+
+/// Where shared memory is.
+const SHARED_MEMORY: &str = "/dev/shm";
+/// File names begin with one of these: Fast DDS 2.x, 3.x.
+const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
+/// Mount namespaces with a `/dev/shm` of their own that are looked at.
+const MAX_PLACES: usize = 64;
+/// Files of one of them.
+const MAX_FILES: usize = 2048;
+/// A directory that changed so lately may change again without its time telling.
+const COARSE: Duration = Duration::from_secs(1);
+/// A process that was met no more often than this may still be mounting what it needs; an older
+/// one is asked again at every so many rounds.
+const YOUNG: u32 = 10;
+const ROUNDS: u32 = 32;
+
+/// A directory of shared memory, by the device and inode it has.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct PlaceId {
+    device: u64,
+    inode: u64,
+}
+
+/// The ports' and segments' files of one Fast DDS generation: index of its prefix.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct Generation(u8);
+
+/// What a file is by its name.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Name {
+    /// A port.
+    Port(Generation, u32),
+    /// A segment.
+    Segment(Generation, SegmentId),
+}
+
+/// One directory of shared memory.
+#[derive(Debug)]
+pub struct Place {
+    /// Where it can be reached now.
+    pub path: PathBuf,
+    /// Files by name, with their inodes.
+    pub files: HashMap<Name, u64>,
+    changed: Option<SystemTime>,
+    seen: bool,
+}
+
+/// All of them.
+#[derive(Debug)]
+pub struct Places {
+    /// `None`: all that processes have.
+    fixed: Option<Vec<PathBuf>>,
+    /// By identity.
+    pub places: HashMap<PlaceId, Place>,
+    /// Processes gone through, with the place they have and how often they were met.
+    processes: HashMap<u32, (Option<PlaceId>, u32)>,
+    /// Places and files left out because of a cap.
+    pub left_out: u64,
+}
+
+impl Name {
+    /// From a file's name; `None` for everything that is not read.
+    #[must_use]
+    pub fn parse(name: &str) -> Option<Self> {
+        let (generation, rest) = (0_u8..)
+            .zip(PREFIXES)
+            .find_map(|(index, prefix)| Some((Generation(index), name.strip_prefix(prefix)?)))?;
+        if let Some(number) = rest.strip_prefix("port") {
+            let is_number = !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit());
+            let number = number.parse().ok().filter(|_| is_number)?;
+            return Some(Self::Port(generation, number));
+        }
+        let bytes = rest.as_bytes();
+        let mut id = [0; 8];
+        let is_id =
+            bytes.len() == 16 && bytes.iter().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+        let (pairs, _) = bytes.as_chunks::<2>();
+        for (byte, [high, low]) in id.iter_mut().zip(pairs.iter().filter(|_| is_id)) {
+            let digit = |digit: u8| char::from(digit).to_digit(16).unwrap_or(0) as u8;
+            *byte = digit(*high) << 4 | digit(*low);
+        }
+        is_id.then_some(Self::Segment(generation, SegmentId(id)))
+    }
+
+    /// The file's name.
+    #[must_use]
+    pub fn file_name(&self) -> String {
+        let prefix = |generation: &Generation| {
+            let prefix = PREFIXES.get(usize::from(generation.0));
+            prefix.copied().unwrap_or_default()
+        };
+        match self {
+            Self::Port(generation, number) => format!("{}port{number}", prefix(generation)),
+            Self::Segment(generation, id) => format!("{}{id}", prefix(generation)),
+        }
+    }
+}
+
+impl Places {
+    /// Every place that a process of this host has.
+    #[must_use]
+    pub fn of_all_processes() -> Self {
+        Self {
+            fixed: None,
+            places: HashMap::new(),
+            processes: HashMap::new(),
+            left_out: 0,
+        }
+    }
+
+    /// These alone.
+    #[must_use]
+    pub fn fixed(directories: Vec<PathBuf>) -> Self {
+        Self {
+            fixed: Some(directories),
+            ..Self::of_all_processes()
+        }
+    }
+
+    /// Looks which places there are. What no living process reaches any more is forgotten.
+    pub fn find(&mut self) {
+        for place in self.places.values_mut() {
+            place.seen = false;
+        }
+        match self.fixed.clone() {
+            Some(directories) => {
+                for directory in directories {
+                    self.reach(&directory);
+                }
+            }
+            None => {
+                self.reach(Path::new(SHARED_MEMORY));
+                self.go_through_processes();
+            }
+        }
+        self.places.retain(|_, place| place.seen);
+    }
+
+    /// Lists what changed since the last time; whether anything did.
+    pub fn list(&mut self) -> bool {
+        let mut any = false;
+        for place in self.places.values_mut() {
+            any |= place.list(&mut self.left_out);
+        }
+        any
+    }
+
+    fn go_through_processes(&mut self) {
+        let Ok(entries) = fs::read_dir("/proc") else {
+            return;
+        };
+        let before = std::mem::take(&mut self.processes);
+        for entry in entries.flatten() {
+            let Some(pid) = entry
+                .file_name()
+                .to_str()
+                .and_then(|name| name.parse().ok())
+            else {
+                continue;
+            };
+            let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
+            let is_settled = met > YOUNG && met % ROUNDS != pid % ROUNDS;
+            let place = match known.and_then(|id| self.places.get_mut(&id)) {
+                // Its path may lead through another process, which need not live any more.
+                Some(place) if is_settled && (place.seen || place.path.exists()) => {
+                    place.seen = true;
+                    known
+                }
+                None if is_settled => None,
+                _ => self.place_of(pid),
+            };
+            self.processes.insert(pid, (place, met.saturating_add(1)));
+        }
+    }
+
+    fn place_of(&mut self, pid: u32) -> Option<PlaceId> {
+        let is_directory =
+            |path: &Path| fs::symlink_metadata(path).is_ok_and(|metadata| metadata.is_dir());
+        let devices = PathBuf::from(format!("/proc/{pid}/root/dev"));
+        let within = devices.join("shm");
+        let is_plain = is_directory(&devices) && is_directory(&within);
+        is_plain.then(|| self.reach(&within)).flatten()
+    }
+
+    fn reach(&mut self, path: &Path) -> Option<PlaceId> {
+        let metadata = fs::metadata(path).ok().filter(Metadata::is_dir)?;
+        let id = PlaceId {
+            device: metadata.dev(),
+            inode: metadata.ino(),
+        };
+        if let Some(place) = self.places.get_mut(&id) {
+            if !place.seen && place.path != path && !place.path.exists() {
+                place.path = path.to_path_buf();
+            }
+            place.seen = true;
+            return Some(id);
+        }
+        if self.places.len() >= MAX_PLACES {
+            self.left_out += 1;
+            return None;
+        }
+        self.places.insert(
+            id,
+            Place {
+                path: path.to_path_buf(),
+                files: HashMap::new(),
+                changed: None,
+                seen: true,
+            },
+        );
+        Some(id)
+    }
+}
+
+impl Place {
+    fn list(&mut self, left_out: &mut u64) -> bool {
+        let changed = fs::metadata(&self.path).and_then(|metadata| metadata.modified());
+        let changed = changed.ok();
+        let settled = changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > COARSE));
+        if settled && changed == self.changed {
+            return false;
+        }
+        self.changed = changed.filter(|_| settled);
+        self.files.clear();
+        let Ok(entries) = fs::read_dir(&self.path) else {
+            return true;
+        };
+        for entry in entries.flatten() {
+            let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+            let name = entry.file_name();
+            let Some(name) = name.to_str().filter(|_| is_file).and_then(Name::parse) else {
+                continue;
+            };
+            if self.files.len() >= MAX_FILES {
+                *left_out += 1;
+                break;
+            }
+            self.files.insert(name, entry.ino());
+        }
+        true
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_ports_and_segments_are_read_and_written() {
+        for name in [
+            "fastrtps_port7411",
+            "fastdds_port7661",
+            "fastrtps_0011aabbccddeeff",
+            "fastdds_ffffffffffffffff",
+        ] {
+            assert_eq!(Name::parse(name).unwrap().file_name(), name);
+        }
+    }
+
+    #[test]
+    fn locks_semaphores_data_sharing_and_nonsense_are_left_alone() {
+        for name in [
+            "fastrtps_port7411_el",
+            "fastrtps_port7411_sl",
+            "sem.fastrtps_port7411_mutex",
+            "fastrtps_0011aabbccddeeff_el",
+            "fastrtps_0011AABBCCDDEEFF",
+            "fastrtps_0011aabbccddeef",
+            "fast_datasharing_0011aabbccddeeff",
+            "fastrtps_port",
+            "fastrtps_port+7411",
+            "fastrtps_port99999999999",
+            "fastrtps_",
+            "",
+        ] {
+            assert_eq!(Name::parse(name), None, "{name}");
+        }
+    }
+
+    #[test]
+    fn files_that_come_and_go_are_noticed_also_within_one_tick_of_the_clock() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut places = Places::fixed(vec![directory.path().to_path_buf()]);
+        places.find();
+        let port = Name::parse("fastrtps_port7411").unwrap();
+        let path = directory.path().join(port.file_name());
+        let count = |places: &Places| {
+            let files = places.places.values().map(|place| place.files.len());
+            files.sum::<usize>()
+        };
+        for _ in 0..20 {
+            fs::write(&path, "x").unwrap();
+            places.list();
+            assert_eq!(count(&places), 1);
+            fs::remove_file(&path).unwrap();
+            places.list();
+            assert_eq!(count(&places), 0);
+        }
+        drop(directory);
+        places.find();
+        assert!(places.places.is_empty());
+    }
+
+    #[test]
+    fn this_hosts_shared_memory_is_found_once_however_many_processes_have_it() {
+        let mut places = Places::of_all_processes();
+        places.find();
+        let own = places
+            .places
+            .values()
+            .filter(|place| place.path == Path::new(SHARED_MEMORY));
+        assert_eq!(own.count(), 1);
+        let number = places.places.len();
+        places.find();
+        assert_eq!(places.places.len(), number);
+    }
+}

@@ -1,0 +1,394 @@
+//! Looks at all ports, reads what they announce and hands on what is of interest.
+//!
+//! Never writes, locks or registers: the peers cannot tell that it is there. A message that several
+//! ports announce is read once. Ports that are silent are looked at less often, so that a hundred
+//! idle ones cost little. Sleeping between looks is the caller's.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+
+use ros2probe_wire::record::{Record, flag};
+
+use super::cell::{Descriptor, SegmentId};
+use super::inbox::Item;
+use super::port::Port;
+use super::scan::{Generation, Name, PlaceId, Places};
+use super::segment::{Buffer, Message, Refusal};
+use super::source::SharedFile;
+use super::verdict::{Judge, Judgement};
+
+/// Ports and segments that are open at once.
+const MAX_PORTS: usize = 512;
+const MAX_SEGMENTS: usize = 512;
+/// Messages remembered, so that one is not read again at another port.
+const REMEMBERED: usize = 8192;
+/// Messages read in one look; the rest of a flood is read in the next.
+const PER_LOOK: usize = 2048;
+/// A port that was silent for so long is looked at this often only.
+const SILENT_AFTER: u64 = 2_000_000_000;
+const SILENT_EVERY: u64 = 10_000_000;
+/// How long a segment that could not be opened is not tried again.
+const RETRY: u64 = 50_000_000;
+/// How often directories are looked at, and processes gone through.
+const LIST_EVERY: u64 = 100_000_000;
+const FIND_EVERY: u64 = 1_000_000_000;
+
+/// What is open and how far it was read.
+pub struct Tap {
+    places: Places,
+    ports: HashMap<PortKey, Open>,
+    segments: HashMap<SegmentKey, Segment>,
+    remembered: Remembered,
+    /// The rules, and what is wanted.
+    pub judge: Judge,
+    counters: Counters,
+    opened: u64,
+    listed: u64,
+    found: u64,
+    announced: Vec<Descriptor>,
+    records: Vec<Record>,
+}
+
+/// What the tap met.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Ports open now.
+    pub ports: u64,
+    /// Segments open now.
+    pub segments: u64,
+    /// Directories of shared memory.
+    pub places: u64,
+    /// Messages announced at ports, each port's for itself.
+    pub announced: u64,
+    /// Messages read, each once.
+    pub read: u64,
+    /// Of those, captured whole.
+    pub captured: u64,
+    /// Bytes of those.
+    pub captured_bytes: u64,
+    /// Announced, but overwritten in the ring or used again before they were read.
+    pub missed: u64,
+    /// Announced and never filled in: their writer died.
+    pub unfilled: u64,
+    /// In segments that could not be opened.
+    pub unreachable: u64,
+    /// Contradictory or no RTPS.
+    pub malformed: u64,
+    /// Looks that came so late that a ring may have gone round unnoticed.
+    pub uncertain: u64,
+    /// Files and places left out because of a cap.
+    pub left_out: u64,
+}
+
+type PortKey = (PlaceId, Generation, u32);
+type SegmentKey = (PlaceId, Generation, SegmentId);
+
+struct Open {
+    file: SharedFile,
+    port: Port,
+    /// When it last announced anything, and when it is looked at next.
+    busy: u64,
+    due: u64,
+}
+
+enum Segment {
+    /// With a number of its own: another file may have its name and inode later.
+    Open(SharedFile, u64),
+    /// Not to be opened, as of then.
+    Missing(u64),
+}
+
+/// The latest messages by where they lay.
+#[derive(Default)]
+struct Remembered {
+    set: HashSet<Identity>,
+    order: VecDeque<Identity>,
+}
+
+/// One use of one buffer.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+struct Identity {
+    serial: u64,
+    node: u32,
+    validity: u32,
+}
+
+/// One moment on the two clocks that matter here.
+#[derive(Clone, Copy, Debug)]
+pub struct Moment {
+    /// Nanoseconds, monotonic.
+    pub monotonic: u64,
+    /// Nanoseconds since the Unix epoch.
+    pub calendar: u64,
+}
+
+impl Tap {
+    /// Nothing open.
+    #[must_use]
+    pub fn new(places: Places) -> Self {
+        Self {
+            places,
+            ports: HashMap::new(),
+            segments: HashMap::new(),
+            remembered: Remembered::default(),
+            judge: Judge::new(),
+            counters: Counters::default(),
+            opened: 0,
+            listed: 0,
+            found: 0,
+            announced: Vec::new(),
+            records: Vec::new(),
+        }
+    }
+
+    /// Whether there is any port.
+    #[must_use]
+    pub fn has_ports(&self) -> bool {
+        !self.ports.is_empty()
+    }
+
+    /// What it met so far.
+    #[must_use]
+    pub fn counters(&self) -> Counters {
+        let open = |segment: &&Segment| matches!(segment, Segment::Open(..));
+        Counters {
+            ports: self.ports.len() as u64,
+            segments: self.segments.values().filter(open).count() as u64,
+            places: self.places.places.len() as u64,
+            left_out: self.counters.left_out + self.places.left_out,
+            ..self.counters
+        }
+    }
+
+    /// Looks everywhere once; appends what is of interest. How many messages were announced.
+    pub fn look(&mut self, now: Moment, found: &mut Vec<Item>) -> usize {
+        self.judge.refill(now.monotonic);
+        if now.monotonic.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0 {
+            self.listed = now.monotonic;
+            self.scan(now, found);
+        }
+        let mut keys: Vec<_> = self
+            .ports
+            .iter()
+            .filter(|(_, open)| open.due <= now.monotonic)
+            .map(|(key, _)| *key)
+            .collect();
+        keys.sort_unstable_by_key(|(_, _, number)| *number);
+        let mut announced = 0;
+        for key in keys {
+            announced += self.look_at(key, now, found);
+            if announced >= PER_LOOK {
+                break;
+            }
+        }
+        announced
+    }
+
+    fn look_at(&mut self, key: PortKey, now: Moment, found: &mut Vec<Item>) -> usize {
+        let Some(open) = self.ports.get_mut(&key) else {
+            return 0;
+        };
+        let mut announced = std::mem::take(&mut self.announced);
+        let look = open.port.look(&open.file, now.monotonic, &mut announced);
+        let number = announced.len();
+        match look {
+            Some(look) => {
+                if look.pushed > 0 {
+                    open.busy = now.monotonic;
+                }
+                let is_silent = now.monotonic.saturating_sub(open.busy) > SILENT_AFTER;
+                open.due = now.monotonic + if is_silent { SILENT_EVERY } else { 0 };
+                self.counters.announced += look.pushed;
+                self.counters.missed += look.overwritten;
+                self.counters.unfilled += look.unfilled;
+                if look.is_uncertain {
+                    self.counters.uncertain += 1;
+                    found.push(Item::Uncertain(now.calendar));
+                }
+            }
+            None => {
+                // Truncated or overwritten; if it is a port again, the next listing finds it.
+                self.counters.malformed += 1;
+                self.ports.remove(&key);
+            }
+        }
+        for descriptor in announced.drain(..) {
+            self.read(key, &descriptor, now, true, found);
+        }
+        self.announced = announced;
+        number
+    }
+
+    /// Reads one message. What stood in a ring before we came tells nothing of its time.
+    fn read(
+        &mut self,
+        (place, generation, port): PortKey,
+        descriptor: &Descriptor,
+        now: Moment,
+        is_timely: bool,
+        found: &mut Vec<Item>,
+    ) {
+        let key = (place, generation, descriptor.segment);
+        self.open_segment(key, now.monotonic);
+        let Some(Segment::Open(segment, serial)) = self.segments.get(&key) else {
+            self.counters.unreachable += 1;
+            return;
+        };
+        let identity = Identity {
+            serial: *serial,
+            node: descriptor.node,
+            validity: descriptor.validity,
+        };
+        if self.remembered.set.contains(&identity) {
+            return;
+        }
+        let buffer = match Buffer::find(segment, descriptor) {
+            Ok(buffer) => buffer,
+            Err(Refusal::Expired) => {
+                self.counters.missed += 1;
+                return;
+            }
+            Err(Refusal::Malformed) => {
+                self.counters.malformed += 1;
+                return;
+            }
+        };
+        let template = Record {
+            time: now.calendar,
+            destination_port: u16::try_from(port).unwrap_or(0),
+            flags: flag::SHM,
+            ..Record::default()
+        };
+        self.records.clear();
+        let message = Message::new(segment, buffer);
+        let judgement = self
+            .judge
+            .judge(&message, buffer.length, template, &mut self.records);
+        let mut bytes = Vec::new();
+        let is_whole = judgement != Judgement::Captured || buffer.read(segment, &mut bytes);
+        if !buffer.is_valid(segment) {
+            self.counters.missed += 1;
+            return;
+        }
+        self.remembered.add(identity);
+        if judgement == Judgement::Foreign || !is_whole {
+            self.counters.malformed += 1;
+            return;
+        }
+        self.counters.read += 1;
+        if judgement == Judgement::Captured {
+            self.counters.captured += 1;
+            self.counters.captured_bytes += bytes.len() as u64;
+            found.push(Item::Message {
+                time: now.calendar,
+                port: template.destination_port,
+                bytes,
+            });
+        }
+        for mut record in self.records.drain(..) {
+            if !is_timely {
+                record.source_timestamp = 0;
+                record.flags &= !flag::STAMP;
+            }
+            found.push(Item::Record(record));
+        }
+    }
+
+    fn open_segment(&mut self, key: SegmentKey, now: u64) {
+        match self.segments.get(&key) {
+            Some(Segment::Open(..)) => return,
+            Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY => return,
+            _ => {}
+        }
+        if self.segments.len() >= MAX_SEGMENTS && !self.segments.contains_key(&key) {
+            self.counters.left_out += 1;
+            return;
+        }
+        let (place, generation, id) = key;
+        let Some(place) = self.places.places.get(&place) else {
+            return;
+        };
+        let name = Name::Segment(generation, id).file_name();
+        let segment = SharedFile::open(&place.path.join(name));
+        self.opened += 1;
+        let segment = segment.map_or(Segment::Missing(now), |segment| {
+            Segment::Open(segment, self.opened)
+        });
+        self.segments.insert(key, segment);
+    }
+
+    /// Opens what is new and lets go of what is gone or is another file by now.
+    fn scan(&mut self, now: Moment, found: &mut Vec<Item>) {
+        let finds = now.monotonic.saturating_sub(self.found) >= FIND_EVERY || self.found == 0;
+        if finds {
+            self.found = now.monotonic;
+            self.places.find();
+        }
+        if !self.places.list() && !finds {
+            return;
+        }
+        let places = &self.places.places;
+        let inode = |place: &PlaceId, name| places.get(place)?.files.get(&name).copied();
+        self.ports.retain(|(place, generation, number), open| {
+            inode(place, Name::Port(*generation, *number)) == Some(open.file.inode())
+        });
+        self.segments
+            .retain(|(place, generation, id), segment| match segment {
+                Segment::Open(file, _) => {
+                    let listed = inode(place, Name::Segment(*generation, *id));
+                    listed == Some(file.inode()) && !file.is_unlinked()
+                }
+                Segment::Missing(_) => false,
+            });
+        let mut new = Vec::new();
+        for (id, place) in places {
+            for name in place.files.keys() {
+                if let Name::Port(generation, number) = name
+                    && !self.ports.contains_key(&(*id, *generation, *number))
+                {
+                    let path = place.path.join(name.file_name());
+                    new.push(((*id, *generation, *number), path));
+                }
+            }
+        }
+        for (key, path) in new {
+            if self.ports.len() >= MAX_PORTS {
+                self.counters.left_out += 1;
+                return;
+            }
+            let Ok(file) = SharedFile::open(&path) else {
+                continue;
+            };
+            let (_, _, number) = key;
+            // Not laid out yet, or not as known: it is tried again when the directory changes.
+            let Some((port, backlog)) = Port::attach(&file, number, now.monotonic) else {
+                continue;
+            };
+            let open = Open {
+                file,
+                port,
+                busy: now.monotonic,
+                due: now.monotonic,
+            };
+            self.ports.insert(key, open);
+            for descriptor in backlog {
+                self.read(key, &descriptor, now, false, found);
+            }
+        }
+    }
+}
+
+impl Remembered {
+    fn add(&mut self, identity: Identity) {
+        if self.order.len() >= REMEMBERED
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.set.remove(&oldest);
+        }
+        if self.set.insert(identity) {
+            self.order.push_back(identity);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,312 @@
+//! The tap over files that our own writer of the layout makes.
+
+use std::fs;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
+
+use proptest::prelude::*;
+use ros2probe_wire::Guid;
+use ros2probe_wire::record::{Verdict, kind};
+use tempfile::TempDir;
+
+use super::super::image::{PortImage, SegmentImage};
+use super::*;
+
+const MILLISECOND: u64 = 1_000_000;
+const SECOND: u64 = 1000 * MILLISECOND;
+
+fn writer() -> Guid {
+    let mut bytes = [9; 16];
+    bytes[12..].copy_from_slice(&[0, 0, 1, 3]);
+    Guid::from_bytes(bytes)
+}
+
+/// A message with one sample of that writer.
+fn sample(number: u32) -> Vec<u8> {
+    let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
+    bytes.extend([9; 12]);
+    bytes.extend([0x09, 1, 8, 0, 1, 0, 0, 0, 0, 0, 0, 0]);
+    bytes.extend([0x15, 0x05, 32, 0, 0, 0, 16, 0, 0, 0, 0, 0, 0, 0, 1, 3]);
+    bytes.extend([0; 4]);
+    bytes.extend(number.to_le_bytes());
+    bytes.extend([0, 1, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0]);
+    bytes
+}
+
+/// One host's shared memory, the tap on it and its clock.
+struct Host {
+    directory: TempDir,
+    tap: Tap,
+    now: u64,
+}
+
+impl Host {
+    fn new() -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let mut tap = Tap::new(Places::fixed(vec![directory.path().to_path_buf()]));
+        tap.judge.set(writer(), Some(Verdict::Meter));
+        Self {
+            directory,
+            tap,
+            now: SECOND,
+        }
+    }
+
+    fn path(&self) -> &Path {
+        self.directory.path()
+    }
+
+    fn port(&self, number: u32) -> PortImage {
+        PortImage::new(number, 16, 0x100).in_directory(self.path())
+    }
+
+    fn segment(&self, id: u8) -> SegmentImage {
+        SegmentImage::new([id; 8], 1 << 16).in_directory(self.path())
+    }
+
+    /// Lets time pass and looks; the numbers of the samples that were found.
+    fn look_after(&mut self, nanoseconds: u64) -> Vec<u64> {
+        self.now += nanoseconds;
+        let now = Moment {
+            monotonic: self.now,
+            calendar: self.now,
+        };
+        let mut found = Vec::new();
+        self.tap.look(now, &mut found);
+        let numbers = found.iter().filter_map(|item| match item {
+            Item::Record(record) if record.kind == kind::DATA => Some(record.sequence_number),
+            _ => None,
+        });
+        numbers.collect()
+    }
+
+    /// Files of this host that are open; the images' own, which are open for writing, are not
+    /// counted.
+    fn descriptors(&self) -> usize {
+        let open = fs::read_dir("/proc/self/fd").unwrap().flatten();
+        let open = open.filter(|entry| {
+            let link = fs::read_link(entry.path());
+            let mode = fs::symlink_metadata(entry.path()).map(|metadata| metadata.mode());
+            link.is_ok_and(|link| link.starts_with(self.path()))
+                && mode.is_ok_and(|mode| mode & 0o200 == 0)
+        });
+        open.count()
+    }
+}
+
+#[test]
+fn a_sample_that_several_ports_announce_is_found_once() {
+    let mut host = Host::new();
+    let (mut one, mut two, mut segment) = (host.port(7411), host.port(7413), host.segment(1));
+    host.look_after(SECOND);
+    let descriptor = segment.put(&sample(7));
+    one.push(descriptor);
+    two.push(descriptor);
+    assert_eq!(host.look_after(MILLISECOND), [7]);
+    assert_eq!(host.look_after(MILLISECOND), [0; 0]);
+    let counters = host.tap.counters();
+    assert_eq!((counters.announced, counters.read), (2, 1));
+    assert_eq!((counters.ports, counters.segments), (2, 1));
+}
+
+#[test]
+fn discovery_is_handed_on_whole_with_the_port_it_came_by() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7410), host.segment(1));
+    host.look_after(SECOND);
+    let mut message = sample(1);
+    message[44..48].copy_from_slice(&[0, 1, 0, 0xc2]);
+    port.push(segment.put(&message));
+    host.now += MILLISECOND;
+    let now = Moment {
+        monotonic: host.now,
+        calendar: 5,
+    };
+    let mut found = Vec::new();
+    host.tap.look(now, &mut found);
+    let [Item::Message { time, port, bytes }] = found.as_slice() else {
+        panic!("{found:?}");
+    };
+    assert_eq!((*time, *port, bytes), (5, 7410, &message));
+}
+
+#[test]
+fn what_stood_in_the_ring_before_is_found_without_a_time_of_its_own() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    let (old, new) = (segment.put(&sample(1)), segment.put(&sample(2)));
+    port.push(old);
+    port.push(new);
+    segment.free(old);
+    host.now += SECOND;
+    let now = Moment {
+        monotonic: host.now,
+        calendar: host.now,
+    };
+    let mut found = Vec::new();
+    host.tap.look(now, &mut found);
+    let [Item::Record(record)] = found.as_slice() else {
+        panic!("{found:?}");
+    };
+    assert_eq!((record.sequence_number, record.source_timestamp), (2, 0));
+    assert_eq!(record.header_stamp(), None);
+    assert_eq!(host.tap.counters().missed, 1);
+}
+
+#[test]
+fn a_buffer_that_was_used_again_is_missed_and_not_misread() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    host.look_after(SECOND);
+    let descriptor = segment.put(&sample(1));
+    port.push(descriptor);
+    segment.free(descriptor);
+    assert_eq!(host.look_after(MILLISECOND), [0; 0]);
+    assert_eq!(host.tap.counters().missed, 1);
+}
+
+#[test]
+fn a_restarted_participants_new_files_are_taken_and_the_old_ones_let_go() {
+    let mut host = Host::new();
+    for round in 1..=5 {
+        let (mut port, mut segment) = (host.port(7411), host.segment(1));
+        host.look_after(200 * MILLISECOND);
+        port.push(segment.put(&sample(round)));
+        assert_eq!(host.look_after(MILLISECOND), [u64::from(round)]);
+        assert_eq!(host.descriptors(), 2);
+        // Each removes what the one before it left: the same names, other files.
+        fs::remove_file(port.path(host.path())).unwrap();
+        fs::remove_file(segment.path(host.path())).unwrap();
+    }
+    host.look_after(200 * MILLISECOND);
+    assert_eq!(host.descriptors(), 0);
+    let counters = host.tap.counters();
+    assert_eq!((counters.ports, counters.segments), (0, 0));
+}
+
+#[test]
+fn a_segment_that_changes_its_owner_while_its_port_stays_is_opened_anew() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    host.look_after(SECOND);
+    port.push(segment.put(&sample(1)));
+    assert_eq!(host.look_after(MILLISECOND), [1]);
+    fs::remove_file(segment.path(host.path())).unwrap();
+    let mut segment = host.segment(1);
+    host.look_after(200 * MILLISECOND);
+    port.push(segment.put(&sample(2)));
+    // The new segment lays its first buffer where the old one did, with the same validity.
+    segment.free(segment_descriptor(&segment, 2));
+    port.push(segment.put(&sample(3)));
+    let found = host.look_after(MILLISECOND);
+    assert_eq!(found.last(), Some(&3));
+}
+
+fn segment_descriptor(_: &SegmentImage, number: u32) -> Descriptor {
+    let mut other = SegmentImage::new([1; 8], 1 << 16);
+    other.put(&sample(number))
+}
+
+#[test]
+fn a_port_that_is_truncated_under_us_is_let_go_and_found_again_when_it_is_whole() {
+    let mut host = Host::new();
+    let (port, mut segment) = (host.port(7411), host.segment(1));
+    host.look_after(SECOND);
+    fs::File::options()
+        .write(true)
+        .open(port.path(host.path()))
+        .unwrap()
+        .set_len(100)
+        .unwrap();
+    host.look_after(MILLISECOND);
+    assert_eq!(host.tap.counters().ports, 0);
+    fs::remove_file(port.path(host.path())).unwrap();
+    let mut port = host.port(7411);
+    host.look_after(200 * MILLISECOND);
+    port.push(segment.put(&sample(1)));
+    assert_eq!(host.look_after(MILLISECOND), [1]);
+    let descriptor = segment.put(&sample(2));
+    fs::File::options()
+        .write(true)
+        .open(segment.path(host.path()))
+        .unwrap()
+        .set_len(0)
+        .unwrap();
+    port.push(descriptor);
+    host.look_after(MILLISECOND);
+    assert_eq!(host.tap.counters().read, 1);
+}
+
+#[test]
+fn a_hundred_and_twenty_eight_idle_ports_are_looked_at_seldom_and_missed_by_nobody() {
+    let mut host = Host::new();
+    let mut ports: Vec<_> = (0..128).map(|index| host.port(7411 + 2 * index)).collect();
+    let mut segment = host.segment(1);
+    host.look_after(SECOND);
+    host.look_after(SILENT_AFTER + 1);
+    host.look_after(MILLISECOND);
+    let due = host.tap.ports.values();
+    let due = due.filter(|open| open.due <= host.now + MILLISECOND);
+    assert_eq!(due.count(), 0);
+    ports[77].push(segment.put(&sample(5)));
+    assert_eq!(host.look_after(SILENT_EVERY), [5]);
+    // From now on that one is looked at each time.
+    ports[77].push(segment.put(&sample(6)));
+    assert_eq!(host.look_after(MILLISECOND), [6]);
+    assert_eq!(host.tap.counters().ports, 128);
+}
+
+#[test]
+fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
+    let mut host = Host::new();
+    let file = |name: &str| host.path().join(name);
+    fs::write(file("fastrtps_port7411"), vec![0xa5; 100_000]).unwrap();
+    fs::write(file("fastrtps_port7413"), "").unwrap();
+    fs::create_dir(file("fastrtps_port7415")).unwrap();
+    std::os::unix::fs::symlink("/dev/zero", file("fastrtps_port7417")).unwrap();
+    fs::write(file("fastrtps_port7419_el"), "").unwrap();
+    let mut port = host.port(7421);
+    host.look_after(SECOND);
+    let counters = host.tap.counters();
+    assert_eq!((counters.ports, counters.places), (1, 1));
+    // It announces something that is nowhere, and something in a file that is no segment.
+    port.push(Descriptor {
+        segment: SegmentId([2; 8]),
+        node: 16,
+        validity: 1,
+    });
+    fs::write(host.path().join("fastrtps_0303030303030303"), "short").unwrap();
+    port.push(Descriptor {
+        segment: SegmentId([3; 8]),
+        node: 16,
+        validity: 1,
+    });
+    assert_eq!(host.look_after(MILLISECOND), [0; 0]);
+    let counters = host.tap.counters();
+    assert_eq!((counters.unreachable, counters.malformed), (1, 1));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn whatever_the_other_side_writes_the_tap_goes_on_and_stays_bounded(
+        damage in proptest::collection::vec((any::<bool>(), 0_usize..2000, any::<u32>()), 1..40),
+    ) {
+        use std::os::unix::fs::FileExt as _;
+        let mut host = Host::new();
+        let (mut port, mut segment) = (host.port(7411), host.segment(1));
+        host.look_after(SECOND);
+        for (number, (in_port, at, word)) in damage.into_iter().enumerate() {
+            let path = match in_port {
+                true => port.path(host.path()),
+                false => segment.path(host.path()),
+            };
+            let file = fs::File::options().write(true).open(path).unwrap();
+            file.write_all_at(&word.to_le_bytes(), at as u64).unwrap();
+            port.push(segment.put(&sample(number as u32)));
+            prop_assert!(host.look_after(MILLISECOND).len() <= 64);
+            host.look_after(200 * MILLISECOND);
+        }
+        prop_assert!(host.descriptors() <= 2);
+    }
+}

@@ -1,0 +1,306 @@
+//! The verdict on a message in shared memory: the kernel filter's rules, on the same walk.
+//!
+//! Ignored, metered as records, or captured whole; writers that nobody has classified yet are
+//! captured, then metered, each within a budget. Messages are read where the walk needs them:
+//! that of a point cloud's fragment costs its first 256 bytes.
+
+use std::collections::HashMap;
+
+use ros2probe_wire::Guid;
+use ros2probe_wire::filter::{UNKNOWN_CAPACITY, UNKNOWN_CAPTURE_BYTES};
+use ros2probe_wire::record::{Record, Verdict, guid_words};
+use ros2probe_wire::walk::{self, Bytes, Fate, MAGIC, Step, Walk};
+
+/// Submessages of one message that are followed; one with more is captured.
+const SUBMESSAGES: usize = 64;
+/// What unclassified writers may cost each second, all together: bytes captured, and records.
+const CAPTURE_PER_SECOND: i64 = 4 << 20;
+const RECORDS_PER_SECOND: i64 = 4096;
+const SECOND: u64 = 1_000_000_000;
+
+/// What is to be done with a message.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Judgement {
+    /// Nothing: none of its submessages is of interest.
+    Ignored,
+    /// The records that were appended count.
+    Metered,
+    /// User space has to see it whole.
+    Captured,
+    /// It is no RTPS message.
+    Foreign,
+}
+
+/// The rules, and what is wanted.
+#[derive(Debug)]
+pub struct Judge {
+    interest: HashMap<[u32; 4], Verdict>,
+    metered: usize,
+    /// Bytes captured of unclassified writers.
+    unknown: HashMap<[u32; 4], u32>,
+    capture_left: i64,
+    records_left: i64,
+    refilled: u64,
+}
+
+impl Judge {
+    /// Nothing classified.
+    #[must_use]
+    pub fn new() -> Self {
+        Self {
+            interest: HashMap::new(),
+            metered: 0,
+            unknown: HashMap::new(),
+            capture_left: CAPTURE_PER_SECOND,
+            records_left: RECORDS_PER_SECOND,
+            refilled: 0,
+        }
+    }
+
+    /// What is wanted of this writer or reader from now on; `None` = it is not classified.
+    pub fn set(&mut self, guid: Guid, verdict: Option<Verdict>) {
+        let key = guid_words(guid);
+        let before = match verdict {
+            Some(verdict) => self.interest.insert(key, verdict),
+            None => self.interest.remove(&key),
+        };
+        self.metered -= usize::from(before == Some(Verdict::Meter));
+        self.metered += usize::from(verdict == Some(Verdict::Meter));
+        self.unknown.remove(&key);
+    }
+
+    /// Whether anything is measured.
+    #[must_use]
+    pub const fn measures(&self) -> bool {
+        self.metered > 0
+    }
+
+    /// Gives unclassified writers what they may cost in the next second.
+    pub fn refill(&mut self, now: u64) {
+        if now.saturating_sub(self.refilled) >= SECOND {
+            self.refilled = now;
+            (self.capture_left, self.records_left) = (CAPTURE_PER_SECOND, RECORDS_PER_SECOND);
+        }
+    }
+
+    /// Judges a message of `length` bytes. Records are appended with what `template` says of the
+    /// whole message; they count when the message is metered.
+    pub fn judge<B: Bytes>(
+        &mut self,
+        message: &B,
+        length: u16,
+        template: Record,
+        records: &mut Vec<Record>,
+    ) -> Judgement {
+        let Some([magic, _version, source @ ..]) = message.words::<5>(0) else {
+            return Judgement::Foreign;
+        };
+        if magic != MAGIC {
+            return Judgement::Foreign;
+        }
+        let length = u32::from(length);
+        let mut walk = Walk {
+            record: template,
+            ..Walk::default()
+        };
+        walk.begin(source, length);
+        let first = records.len();
+        for _ in 0..SUBMESSAGES {
+            let step = walk::step(&mut walk, message, length);
+            let wanted = match step {
+                Step::Passed => continue,
+                Step::Endpoint | Step::LongGap => self.wanted(&walk.record, length),
+                Step::End | Step::Later | Step::Split | Step::Malformed => {
+                    return if records.len() > first {
+                        Judgement::Metered
+                    } else {
+                        Judgement::Ignored
+                    };
+                }
+            };
+            match wanted {
+                Verdict::Ignore => {}
+                Verdict::Meter if step != Step::LongGap => records.push(Record {
+                    flags: walk.record.flags | template.flags,
+                    ..walk.record
+                }),
+                Verdict::Meter | Verdict::Capture => {
+                    records.truncate(first);
+                    return Judgement::Captured;
+                }
+            }
+        }
+        records.truncate(first);
+        Judgement::Captured
+    }
+
+    fn wanted(&mut self, record: &Record, length: u32) -> Verdict {
+        match walk::fate(record) {
+            Fate::Ignore => Verdict::Ignore,
+            Fate::Capture => Verdict::Capture,
+            Fate::Reader => {
+                let wanted = self.interest.get(&record.reader);
+                wanted.copied().unwrap_or(Verdict::Ignore)
+            }
+            Fate::Writer => match self.interest.get(&record.writer) {
+                Some(verdict) => *verdict,
+                None => self.unknown(record.writer, length),
+            },
+        }
+    }
+
+    /// Captured within its budget, then metered within that of all.
+    fn unknown(&mut self, writer: [u32; 4], length: u32) -> Verdict {
+        let has_room = self.unknown.len() < UNKNOWN_CAPACITY as usize;
+        if (has_room || self.unknown.contains_key(&writer)) && self.capture_left > 0 {
+            let used = self.unknown.entry(writer).or_default();
+            if *used < UNKNOWN_CAPTURE_BYTES {
+                *used = used.saturating_add(length);
+                self.capture_left -= i64::from(length);
+                return Verdict::Capture;
+            }
+        }
+        if self.records_left > 0 {
+            self.records_left -= 1;
+            return Verdict::Meter;
+        }
+        Verdict::Ignore
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::record::{flag, kind};
+
+    use super::*;
+
+    const WRITER: [u8; 4] = [0, 0, 1, 3];
+
+    fn guid(entity: [u8; 4]) -> Guid {
+        let mut bytes = [9; 16];
+        bytes[12..].copy_from_slice(&entity);
+        Guid::from_bytes(bytes)
+    }
+
+    /// A message of some samples of some writers.
+    pub(super) fn message(samples: &[([u8; 4], u32)]) -> Vec<u8> {
+        let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
+        bytes.extend([9; 12]);
+        for (writer, number) in samples {
+            bytes.extend([0x15, 0x05, 32, 0, 0, 0, 16, 0, 0, 0, 0, 0]);
+            bytes.extend(writer);
+            bytes.extend([0; 4]);
+            bytes.extend(number.to_le_bytes());
+            bytes.extend([0, 1, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0]);
+        }
+        bytes
+    }
+
+    fn judge(judge: &mut Judge, message: &[u8]) -> (Judgement, Vec<Record>) {
+        let mut records = Vec::new();
+        let template = Record {
+            flags: flag::SHM,
+            ..Record::default()
+        };
+        let length = u16::try_from(message.len()).unwrap();
+        let judgement = judge.judge(&message, length, template, &mut records);
+        (judgement, records)
+    }
+
+    #[test]
+    fn every_sample_of_a_measured_writer_becomes_a_record() {
+        let mut rules = Judge::new();
+        rules.set(guid(WRITER), Some(Verdict::Meter));
+        rules.set(guid([0, 0, 2, 3]), Some(Verdict::Ignore));
+        let message = message(&[(WRITER, 7), ([0, 0, 2, 3], 1), (WRITER, 8)]);
+        let (judgement, records) = judge(&mut rules, &message);
+        assert_eq!(judgement, Judgement::Metered);
+        let numbers: Vec<_> = records.iter().map(|one| one.sequence_number).collect();
+        assert_eq!(numbers, [7, 8]);
+        assert!(records.iter().all(|record| {
+            record.kind == kind::DATA
+                && record.writer() == guid(WRITER)
+                && record.flags & flag::SHM != 0
+                && record.payload_len == 12
+        }));
+    }
+
+    #[test]
+    fn discovery_is_captured_whatever_else_there_is() {
+        let mut rules = Judge::new();
+        rules.set(guid(WRITER), Some(Verdict::Meter));
+        let message = message(&[(WRITER, 1), ([0, 1, 0, 0xc2], 1)]);
+        assert_eq!(judge(&mut rules, &message), (Judgement::Captured, vec![]));
+    }
+
+    #[test]
+    fn what_is_of_no_interest_or_no_rtps_is_left_alone() {
+        let mut rules = Judge::new();
+        rules.set(guid(WRITER), Some(Verdict::Ignore));
+        assert_eq!(
+            judge(&mut rules, &message(&[(WRITER, 1)])).0,
+            Judgement::Ignored
+        );
+        assert_eq!(judge(&mut rules, b"RTPX").0, Judgement::Foreign);
+        assert_eq!(judge(&mut rules, &[0; 100]).0, Judgement::Foreign);
+        assert_eq!(judge(&mut rules, &message(&[])).0, Judgement::Ignored);
+    }
+
+    #[test]
+    fn an_unknown_writer_is_captured_then_metered_then_nothing() {
+        let mut rules = Judge::new();
+        let message = message(&[(WRITER, 1)]);
+        let mut counts = [0; 3];
+        for _ in 0..UNKNOWN_CAPTURE_BYTES {
+            counts[match judge(&mut rules, &message).0 {
+                Judgement::Captured => 0,
+                Judgement::Metered => 1,
+                _ => 2,
+            }] += 1;
+        }
+        let [captured, metered, ignored] = counts;
+        assert_eq!(
+            captured,
+            UNKNOWN_CAPTURE_BYTES.div_ceil(message.len() as u32)
+        );
+        assert_eq!(i64::from(metered), RECORDS_PER_SECOND);
+        assert!(ignored > 0);
+        rules.refill(SECOND);
+        assert_eq!(judge(&mut rules, &message).0, Judgement::Metered);
+        rules.set(guid(WRITER), Some(Verdict::Ignore));
+        assert_eq!(judge(&mut rules, &message).0, Judgement::Ignored);
+    }
+
+    #[test]
+    fn a_flood_of_invented_writers_stays_within_the_budget() {
+        let mut rules = Judge::new();
+        let mut captured = 0;
+        for writer in 0..200_000_u32 {
+            let [_, a, b, c] = writer.to_be_bytes();
+            let message = message(&[([a, b, c, 3], 1)]);
+            if judge(&mut rules, &message).0 == Judgement::Captured {
+                captured += message.len();
+            }
+        }
+        assert!(
+            captured <= CAPTURE_PER_SECOND as usize + 65_536,
+            "{captured}"
+        );
+        assert!(rules.unknown.len() <= UNKNOWN_CAPACITY as usize);
+    }
+
+    #[test]
+    fn whether_anything_is_measured_follows_what_is_set() {
+        let mut rules = Judge::new();
+        assert!(!rules.measures());
+        for _ in 0..2 {
+            rules.set(guid(WRITER), Some(Verdict::Meter));
+        }
+        assert!(rules.measures());
+        rules.set(guid(WRITER), Some(Verdict::Capture));
+        assert!(!rules.measures());
+        rules.set(guid(WRITER), Some(Verdict::Meter));
+        rules.set(guid(WRITER), None);
+        assert!(!rules.measures());
+    }
+}

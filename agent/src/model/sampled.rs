@@ -1,0 +1,322 @@
+//! What a sampled view tells of one writer: how many samples there were, and how many of them were
+//! seen.
+//!
+//! Shared memory is looked at now and then; what was overwritten meanwhile is not seen. The sequence
+//! numbers still tell how many samples there were, so messages are counted by their span, and no
+//! number that was not seen is a loss. While a writer is seen this way, what comes of it by the
+//! network counts here too: it adds to what was seen.
+
+use ros2probe_wire::Timestamp;
+
+use super::sequence::{MAX_WINDOW, Sequence};
+use super::snapshot::SampledFacts;
+
+/// A writer that was not seen in shared memory for so long is not sampled any more.
+const HOLD: u64 = 10_000_000_000;
+/// HEARTBEAT and GAP may run ahead of what was seen by at most this.
+const MAX_AHEAD: u64 = 4096;
+
+/// State of one writer's sampled view.
+#[derive(Debug)]
+pub struct Sampled {
+    /// Last record from shared memory.
+    last: Timestamp,
+    span: u64,
+    seen: u64,
+    uncertain: u64,
+    /// Bit `i`: the number `i + 1` below the next one was seen, or needs not be.
+    sighted: u128,
+    /// The latest number that arrived whole as far as can be told, and when.
+    arrived: Option<(u64, Timestamp)>,
+    /// Where its payload begins with a header: the stamp that came with the first fragment.
+    head: Option<(u64, (i32, u32))>,
+}
+
+/// What a record changed.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct News {
+    /// Numbers that are now known to be used, the record's own included.
+    pub samples: u64,
+    /// Time since the number before it arrived, when that was seen.
+    pub interval: Option<i64>,
+    /// It is the newest one and has arrived: its delay is a delivery delay.
+    pub arrived: bool,
+}
+
+impl Sampled {
+    /// From now on.
+    #[must_use]
+    pub const fn new(now: Timestamp) -> Self {
+        Self {
+            last: now,
+            span: 0,
+            seen: 0,
+            uncertain: 0,
+            sighted: u128::MAX,
+            arrived: None,
+            head: None,
+        }
+    }
+
+    /// A record came from shared memory.
+    pub fn touch(&mut self, now: Timestamp) {
+        self.last = self.last.max(now);
+    }
+
+    /// Whether it still is seen that way.
+    #[must_use]
+    pub const fn is_current(&self, now: Timestamp) -> bool {
+        self.last.0.saturating_add(HOLD) > now.0
+    }
+
+    /// The tap cannot tell what passed before `now`.
+    pub const fn uncertain(&mut self) {
+        self.uncertain += 1;
+    }
+
+    /// So far.
+    #[must_use]
+    pub const fn facts(&self) -> SampledFacts {
+        SampledFacts {
+            seen: self.seen,
+            span: self.span,
+            uncertain: self.uncertain,
+        }
+    }
+
+    /// Takes in a sample or a fragment of one. `ends` = nothing of it follows.
+    pub fn sample(
+        &mut self,
+        number: u64,
+        source: Option<Timestamp>,
+        ends: bool,
+        now: Timestamp,
+        sequence: &mut Sequence,
+    ) -> News {
+        if number == 0 || number > u64::MAX >> 1 {
+            return News::default();
+        }
+        let before = sequence.next();
+        sequence.recognise(number, source);
+        sequence.begin(number);
+        if sequence.next() != before {
+            // It begins, perhaps anew.
+            (self.sighted, self.arrived) = (u128::MAX, None);
+        }
+        let samples = self.advance(number.saturating_add(1), now, sequence);
+        self.span += samples;
+        let below = sequence.next().saturating_sub(number).saturating_sub(1);
+        let bit = u32::try_from(below)
+            .ok()
+            .and_then(|below| 1_u128.checked_shl(below));
+        if let Some(bit) = bit.filter(|bit| self.sighted & bit == 0) {
+            self.sighted |= bit;
+            self.seen += 1;
+        }
+        let mut news = News {
+            samples,
+            ..News::default()
+        };
+        let is_later = self.arrived.is_none_or(|(arrived, _)| arrived < number);
+        if ends && below == 0 && is_later {
+            news.arrived = true;
+            news.interval = self
+                .arrived
+                .filter(|(arrived, _)| arrived.saturating_add(1) == number)
+                .map(|(_, at)| now.nanoseconds_since(at).max(0));
+            self.arrived = Some((number, now));
+        }
+        news
+    }
+
+    /// Samples up to `last` exist, as a HEARTBEAT says. How many that was not known of.
+    pub fn exist(&mut self, last: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
+        let end = last.saturating_add(1);
+        if !sequence.started() || end.saturating_sub(sequence.next()) > MAX_AHEAD {
+            return 0;
+        }
+        let samples = self.advance(end, now, sequence);
+        self.span += samples;
+        samples
+    }
+
+    /// The numbers `start..end` were never sent, as a GAP says. How many before them were that was
+    /// not known of.
+    pub fn skip(&mut self, start: u64, end: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
+        if start == 0 {
+            return 0;
+        }
+        let samples = self.exist(start - 1, now, sequence);
+        let ahead = end.saturating_sub(sequence.next());
+        if sequence.started() && start <= sequence.next() && ahead <= MAX_AHEAD {
+            let skipped = self.advance(end, now, sequence);
+            let bits = u32::try_from(skipped).unwrap_or(u32::MAX);
+            self.sighted |= 1_u128.checked_shl(bits).map_or(u128::MAX, |bit| bit - 1);
+        }
+        samples
+    }
+
+    /// Keeps the stamp of a sample that began, or gives that of one that did.
+    pub fn stamp(&mut self, number: u64, stamp: Option<(i32, u32)>) -> Option<(i32, u32)> {
+        if let Some(stamp) = stamp {
+            self.head = Some((number, stamp));
+        }
+        self.head
+            .filter(|(head, _)| *head == number)
+            .map(|(_, stamp)| stamp)
+    }
+
+    /// Everything below `end` is used, and none of it is a loss. How many numbers that is more.
+    fn advance(&mut self, end: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
+        let next = sequence.next();
+        if end <= next {
+            return 0;
+        }
+        sequence.exists(end - 1, now, &mut |_| {});
+        for number in next.max(end.saturating_sub(MAX_WINDOW))..end {
+            sequence.know(number);
+        }
+        let samples = end - next;
+        let bits = u32::try_from(samples).unwrap_or(u32::MAX);
+        self.sighted = self.sighted.checked_shl(bits).unwrap_or(0);
+        samples
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sequence::Settled;
+    use super::*;
+
+    const SECOND: u64 = 1_000_000_000;
+
+    struct View {
+        sampled: Sampled,
+        sequence: Sequence,
+        now: u64,
+    }
+
+    impl View {
+        fn new() -> Self {
+            Self {
+                sampled: Sampled::new(Timestamp(SECOND)),
+                sequence: Sequence::default(),
+                now: SECOND,
+            }
+        }
+
+        fn see(&mut self, number: u64) -> News {
+            self.part(number, true)
+        }
+
+        fn part(&mut self, number: u64, ends: bool) -> News {
+            self.now += SECOND / 100;
+            let now = Timestamp(self.now);
+            self.sampled
+                .sample(number, Some(now), ends, now, &mut self.sequence)
+        }
+
+        fn counts(&self) -> (u64, u64) {
+            let SampledFacts { seen, span, .. } = self.sampled.facts();
+            (seen, span)
+        }
+
+        fn losses(&mut self) -> Vec<Settled> {
+            let mut losses = Vec::new();
+            self.sequence
+                .settle_all(&mut |settled| losses.push(settled));
+            losses
+        }
+    }
+
+    #[test]
+    fn what_was_not_seen_was_sent_and_is_no_loss() {
+        let mut view = View::new();
+        for number in [1, 2, 5, 6, 100] {
+            view.see(number);
+        }
+        assert_eq!(view.counts(), (5, 100));
+        assert_eq!(view.losses(), []);
+    }
+
+    #[test]
+    fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
+        let mut view = View::new();
+        let news = [false, false, true, true].map(|ends| view.part(1, ends));
+        assert_eq!(news.map(|news| news.samples), [1, 0, 0, 0]);
+        assert_eq!(news.map(|news| news.arrived), [false, false, true, false]);
+        view.see(3);
+        // Late, but seen after all.
+        assert_eq!(view.see(2), News::default());
+        assert_eq!(view.see(2), News::default());
+        assert_eq!(view.counts(), (3, 3));
+    }
+
+    #[test]
+    fn an_interval_is_that_between_neighbours_that_both_were_seen() {
+        let mut view = View::new();
+        assert_eq!(view.see(1).interval, None);
+        assert_eq!(view.see(2).interval, Some(10_000_000));
+        assert_eq!(view.see(4).interval, None);
+        assert_eq!(view.see(5).interval, Some(10_000_000));
+    }
+
+    #[test]
+    fn a_heartbeat_tells_of_the_last_ones_and_a_gap_of_those_that_never_were() {
+        let mut view = View::new();
+        let now = Timestamp(view.now);
+        assert_eq!(view.sampled.exist(7, now, &mut view.sequence), 0);
+        view.see(5);
+        assert_eq!(view.sampled.exist(7, now, &mut view.sequence), 2);
+        assert_eq!(view.sampled.exist(6, now, &mut view.sequence), 0);
+        assert_eq!(view.counts(), (1, 3));
+        // 8 was sent, 9 to 11 were not.
+        assert_eq!(view.sampled.skip(9, 12, now, &mut view.sequence), 1);
+        assert_eq!(view.counts(), (1, 4));
+        assert_eq!(view.see(12).samples, 1);
+        view.see(7);
+        assert_eq!(view.counts(), (3, 5));
+        let forged = view.sampled.exist(1 << 40, now, &mut view.sequence);
+        assert_eq!((forged, view.counts()), (0, (3, 5)));
+        assert_eq!(view.losses(), []);
+    }
+
+    #[test]
+    fn a_writer_that_begins_anew_under_its_old_name_counts_from_there() {
+        let mut view = View::new();
+        view.see(1);
+        view.see(1000);
+        view.now += 60 * SECOND;
+        assert_eq!(view.see(1000 - 5).samples, 1);
+        assert_eq!(view.see(1000 - 4).samples, 1);
+        assert_eq!(view.counts(), (4, 1002));
+    }
+
+    #[test]
+    fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
+        let mut view = View::new();
+        view.see(1);
+        assert_eq!(view.see(1_000_000).samples, 999_999);
+        assert_eq!(view.losses(), []);
+        view.see(u64::MAX);
+        view.see(0);
+        assert_eq!(view.counts(), (2, 1_000_000));
+    }
+
+    #[test]
+    fn it_is_sampled_until_shared_memory_has_been_silent_for_a_while() {
+        let mut sampled = Sampled::new(Timestamp(SECOND));
+        assert!(sampled.is_current(Timestamp(10 * SECOND)));
+        assert!(!sampled.is_current(Timestamp(11 * SECOND)));
+        sampled.touch(Timestamp(5 * SECOND));
+        assert!(sampled.is_current(Timestamp(11 * SECOND)));
+    }
+
+    #[test]
+    fn the_stamp_of_a_first_fragment_is_that_of_the_sample() {
+        let mut sampled = Sampled::new(Timestamp(SECOND));
+        assert_eq!(sampled.stamp(1, Some((5, 6))), Some((5, 6)));
+        assert_eq!(sampled.stamp(1, None), Some((5, 6)));
+        assert_eq!(sampled.stamp(2, None), None);
+    }
+}
