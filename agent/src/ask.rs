@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail};
 use ros2probe::capture::live::LiveSource;
-use ros2probe::config::{CaptureSettings, SourceChoice};
+use ros2probe::config::{CaptureSettings, ShmMode, SourceChoice};
 use ros2probe::discover::session::{MOST_PACKETS, Session, Target};
 use ros2probe::discover::{converse, speaker};
 use ros2probe::model::observer::{Observer, Settings};
@@ -28,7 +28,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     let capture = capture(config.capture, options.interface.as_deref());
     privilege::check(&capture)?;
     let live = LiveSource::open(&capture, Limits::default())?;
-    privilege::give_up()?;
+    privilege::give_up(&capture)?;
     let participants = listen(live, options)?;
     let seconds = options.listen;
     let heard = match participants.len() {
@@ -72,7 +72,9 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
 }
 
 /// The configured capture, or the wire of one interface.
-fn capture(configured: CaptureSettings, interface: Option<&str>) -> CaptureSettings {
+fn capture(mut configured: CaptureSettings, interface: Option<&str>) -> CaptureSettings {
+    // Participants announce themselves on the network.
+    configured.shm.mode = ShmMode::Off;
     let Some(interface) = interface else {
         return configured;
     };

@@ -89,7 +89,7 @@ fn run(options: cli::Run) -> Result<()> {
     {
         tracing::warn!(%error, "the watches that were added cannot be used");
     }
-    privilege::give_up()?;
+    privilege::give_up(&config.capture)?;
     if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {
         let watches = watches.in_force().entries().len();
         tracing::info!(%address, watches, "serving metrics");

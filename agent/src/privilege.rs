@@ -6,7 +6,8 @@ use std::fmt;
 use caps::errors::CapsError;
 use caps::{CapSet, Capability, CapsHashSet};
 
-use crate::config::{CaptureSettings, SourceChoice};
+use crate::capture::system::allow_running_first;
+use crate::config::{CaptureSettings, ShmMode, SourceChoice};
 
 /// Attaching programs to a cgroup (`CAP_NET_ADMIN`); loading them; tracepoints, iterators and the
 /// verifier's leave to skip Spectre barriers, without which 5.15 to 6.8 refuse the filter.
@@ -89,15 +90,24 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)
 }
 
 /// Gives up every capability but `CAP_BPF`, which later changes of the filter's maps need where
-/// unprivileged BPF is disabled. Call it while the process has one thread: capabilities belong
-/// to threads, and new ones inherit them.
+/// unprivileged BPF is disabled, and two where shared memory is looked at: `CAP_SYS_PTRACE`, which
+/// opens `/proc/<pid>/root`, and so the shared memory of containers, to whoever has it anyway; and
+/// `CAP_SYS_NICE` where a limit cannot allow the thread that looks to run first. Call it while the
+/// process has one thread: capabilities belong to threads, and new ones inherit them.
 ///
 /// # Errors
 /// When the kernel refuses, which it does not for a process that gives up what it has.
-pub fn give_up() -> Result<(), DropError> {
+pub fn give_up(settings: &CaptureSettings) -> Result<(), DropError> {
+    let looks_at_memory = settings.shm.mode == ShmMode::Auto;
+    let lacks_limit = looks_at_memory && !allow_running_first();
     let keep = |set: CapsHashSet| -> CapsHashSet {
         set.into_iter()
-            .filter(|capability| *capability == Capability::CAP_BPF)
+            .filter(|capability| match capability {
+                Capability::CAP_BPF => true,
+                Capability::CAP_SYS_PTRACE => looks_at_memory,
+                Capability::CAP_SYS_NICE => lacks_limit,
+                _ => false,
+            })
             .collect()
     };
     let permitted = caps::read(None, CapSet::Permitted).map_err(DropError)?;

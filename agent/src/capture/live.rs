@@ -18,9 +18,11 @@ use super::filter::{Filter, FilterError};
 use super::host::{self, HostError, HostSettings, HostTap};
 use super::interfaces::Selection;
 use super::netns::{self, NetnsError};
+use super::shm::scan::{Places, Scope};
+use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
 use super::wire::{self, TapError, WireSettings, WireTap};
-use crate::config::{CaptureSettings, SourceChoice};
+use crate::config::{CaptureSettings, ShmMode, SourceChoice};
 use crate::model::observer::Observer;
 use crate::model::reassembly::Limits;
 
@@ -65,11 +67,20 @@ pub struct LiveSource {
     wires: Vec<WireTap>,
     /// Why the host hook is not used although it would show more.
     without_host: Option<String>,
+    shared_memory: Shm,
     /// When unclassified writers last got bytes and records to spend.
     bytes_refilled: u64,
     records_refilled: u64,
     refused_updates: u64,
     clock: Timestamp,
+}
+
+/// What looks at shared memory. Its thread begins with the first look at packets, when all
+/// privileges that are not needed are given up: threads inherit them.
+enum Shm {
+    Off,
+    Later(Scope, f64),
+    Running(SharedMemory),
 }
 
 /// What one interface delivered.
@@ -113,11 +124,19 @@ impl LiveSource {
             }
         };
         give_back_memory();
+        let shared_memory = match settings.shm.mode {
+            ShmMode::Off => Shm::Off,
+            ShmMode::Auto => {
+                let share = settings.shm.cpu_percent / 100.0;
+                Shm::Later(scope(settings, host.is_some()), share)
+            }
+        };
         let clocks = Clocks::read();
         let mut source = Self {
             host,
             wires,
             without_host,
+            shared_memory,
             bytes_refilled: 0,
             records_refilled: 0,
             refused_updates: 0,
@@ -156,6 +175,7 @@ impl LiveSource {
         bell: Option<BorrowedFd<'_>>,
         observer: &mut Observer,
     ) -> Result<(), CaptureError> {
+        self.start_shared_memory();
         let sockets = self.host.iter().flat_map(HostTap::descriptors);
         let interfaces = self.wires.iter().flat_map(WireTap::descriptors);
         let rings = bell.is_some().into();
@@ -179,6 +199,9 @@ impl LiveSource {
             wire.take_in(&clocks, observer)?;
             settle = settle.max(wire::SETTLE_NANOSECONDS);
         }
+        if let Shm::Running(shared_memory) = &self.shared_memory {
+            shared_memory.take_in(observer);
+        }
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         Ok(())
     }
@@ -192,6 +215,9 @@ impl LiveSource {
         for wire in &mut self.wires {
             wire.drain(&clocks, observer);
         }
+        if let Shm::Running(shared_memory) = &self.shared_memory {
+            shared_memory.take_in(observer);
+        }
     }
 
     /// Tells the kernel programs what has become of interest. What they have no room for stays
@@ -199,6 +225,9 @@ impl LiveSource {
     pub fn apply(&mut self, changes: &[(Guid, Option<Verdict>)]) {
         for (endpoint, verdict) in changes {
             self.tell(|filter| filter.set_interest(*endpoint, *verdict));
+        }
+        if let Shm::Running(shared_memory) = &self.shared_memory {
+            shared_memory.apply(changes);
         }
     }
 
@@ -301,6 +330,35 @@ impl LiveSource {
             .sum::<usize>()
     }
 
+    /// What the tap on shared memory says of itself, if there is one.
+    #[must_use]
+    pub fn shared_memory(&self) -> Option<shm::Facts> {
+        match &self.shared_memory {
+            Shm::Running(shared_memory) => Some(shared_memory.facts()),
+            Shm::Off | Shm::Later(..) => None,
+        }
+    }
+
+    /// Whether shared memory is, or will be, looked at.
+    #[must_use]
+    pub const fn looks_at_shared_memory(&self) -> bool {
+        !matches!(self.shared_memory, Shm::Off)
+    }
+
+    fn start_shared_memory(&mut self) {
+        let Shm::Later(scope, share) = &self.shared_memory else {
+            return;
+        };
+        let started = SharedMemory::start(Places::new(scope.clone()), *share);
+        self.shared_memory = match started {
+            Ok(running) => Shm::Running(running),
+            Err(error) => {
+                tracing::warn!(%error, "shared memory is not looked at");
+                Shm::Off
+            }
+        };
+    }
+
     fn filters(&self) -> impl Iterator<Item = &Filter> {
         let host = self.host.iter().map(HostTap::filter);
         host.chain(self.wires.iter().map(WireTap::filter))
@@ -323,6 +381,19 @@ impl LiveSource {
             self.records_refilled = monotonic;
             let (budget, amount) = (Budget::Records, UNKNOWN_RECORDS_PER_TENTH);
             self.tell(|filter| filter.set_unknown_budget(budget, amount));
+        }
+    }
+}
+
+/// Whose shared memory belongs to what is looked at otherwise.
+fn scope(settings: &CaptureSettings, host: bool) -> Scope {
+    match &settings.cgroup {
+        Some(cgroup) if host => Scope::Cgroup(cgroup.clone()),
+        _ if host => Scope::Everybody,
+        _ => {
+            let own = PathBuf::from("/proc/self/ns/net");
+            let networks = std::iter::once(own).chain(settings.network_namespaces.clone());
+            Scope::Networks(networks.collect())
         }
     }
 }

@@ -1,7 +1,12 @@
 //! The system calls that live capture needs beside its sockets: waiting, the clocks, free memory.
 
-use std::io;
-use std::os::fd::{AsRawFd as _, BorrowedFd};
+use std::ffi::CString;
+use std::fs::File;
+use std::io::{self, Read as _};
+use std::os::fd::{AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
+use std::os::unix::ffi::OsStrExt as _;
+use std::path::Path;
+use std::ptr;
 use std::time::Duration;
 
 use libc::c_int;
@@ -38,6 +43,110 @@ pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<Opt
         return Ok(None);
     }
     Ok(poll.iter().position(|descriptor| descriptor.revents != 0))
+}
+
+/// Tells when a file is created in some directories. It looks and does not touch: who creates files
+/// there cannot tell.
+#[derive(Debug)]
+pub struct DirectoryWatch {
+    events: File,
+}
+
+impl DirectoryWatch {
+    /// On no directory.
+    ///
+    /// # Errors
+    /// The kernel allows this user no more of them.
+    pub fn new() -> io::Result<Self> {
+        // SAFETY: has no preconditions.
+        let descriptor = unsafe { libc::inotify_init1(libc::IN_CLOEXEC | libc::IN_NONBLOCK) };
+        if descriptor < 0 {
+            return Err(io::Error::last_os_error());
+        }
+        // SAFETY: the kernel just gave us this descriptor, and nobody else has it.
+        let descriptor = unsafe { OwnedFd::from_raw_fd(descriptor) };
+        Ok(Self {
+            events: descriptor.into(),
+        })
+    }
+
+    /// Also on this one, while it exists. One that cannot be watched is not.
+    pub fn add(&mut self, directory: &Path) {
+        let Ok(path) = CString::new(directory.as_os_str().as_bytes()) else {
+            return;
+        };
+        let (descriptor, mask) = (self.events.as_raw_fd(), libc::IN_CREATE | libc::IN_ONLYDIR);
+        // SAFETY: `path` ends in a zero and outlives the call.
+        unsafe { libc::inotify_add_watch(descriptor, path.as_ptr(), mask) };
+    }
+
+    /// Sleeps, but no longer than until a file is created. Whether one was whose name `matters`.
+    pub fn wait(&mut self, timeout: Duration, matters: impl Fn(&str) -> bool) -> bool {
+        let mut poll = libc::pollfd {
+            fd: self.events.as_raw_fd(),
+            events: libc::POLLIN,
+            revents: 0,
+        };
+        let timeout = libc::timespec {
+            tv_sec: timeout.as_secs().try_into().unwrap_or(libc::time_t::MAX),
+            tv_nsec: timeout.subsec_nanos().into(),
+        };
+        // SAFETY: one entry and the time, both of which outlive the call; no signal mask.
+        let ready = unsafe { libc::ppoll(&raw mut poll, 1, &raw const timeout, ptr::null()) };
+        let (mut any, mut events) = (false, [0; 4096]);
+        while ready > 0
+            && let Ok(read @ 1..) = self.events.read(&mut events)
+        {
+            any |= names(events.get(..read).unwrap_or_default()).any(&matters);
+        }
+        any
+    }
+}
+
+/// The names in what inotify(7) tells: 16 bytes, the last four of them the length of a name that
+/// follows and is filled up with zeros.
+fn names(mut events: &[u8]) -> impl Iterator<Item = &str> {
+    std::iter::from_fn(move || {
+        let (head, rest) = events.split_first_chunk::<16>()?;
+        let length = u32::from_ne_bytes(*head.last_chunk()?);
+        let (name, rest) = rest.split_at_checked(usize::try_from(length).ok()?)?;
+        events = rest;
+        let name = name.split(|byte| *byte == 0).next()?;
+        Some(std::str::from_utf8(name).unwrap_or_default())
+    })
+}
+
+/// Lets threads of this process ask for [`run_first`] when privileges are given up. Whether they may
+/// then: it is ours to allow, or the service manager did.
+pub fn allow_running_first() -> bool {
+    let mut limit = libc::rlimit {
+        rlim_cur: 1,
+        rlim_max: 1,
+    };
+    // SAFETY: `limit` outlives both calls.
+    unsafe {
+        libc::setrlimit(libc::RLIMIT_RTPRIO, &raw const limit) == 0
+            || libc::getrlimit(libc::RLIMIT_RTPRIO, &raw mut limit) == 0 && limit.rlim_cur > 0
+    }
+}
+
+/// From now on, when this thread wakes it runs before ordinary ones, at the lowest real-time
+/// priority; or no longer.
+///
+/// # Errors
+/// It is not allowed to.
+pub fn run_first(first: bool) -> io::Result<()> {
+    let (policy, sched_priority) = match first {
+        true => (libc::SCHED_FIFO, 1),
+        false => (libc::SCHED_OTHER, 0),
+    };
+    let parameter = libc::sched_param { sched_priority };
+    // SAFETY: the thread is the calling one; `parameter` outlives the call.
+    match unsafe { libc::pthread_setschedparam(libc::pthread_self(), policy, &raw const parameter) }
+    {
+        0 => Ok(()),
+        error => Err(io::Error::from_raw_os_error(error)),
+    }
 }
 
 /// Gives free memory back to the system. Reading the kernel's types takes some 15 MB that nobody needs
@@ -140,6 +249,23 @@ mod tests {
         let waited = wait(&descriptors, Duration::from_secs(60)).unwrap();
         assert_eq!(waited, Some(1));
         assert!(start.elapsed() < Duration::from_secs(30));
+    }
+
+    #[test]
+    fn a_file_that_is_created_ends_the_sleep_and_is_told_once() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut watch = DirectoryWatch::new().unwrap();
+        watch.add(directory.path());
+        watch.add(Path::new("/nowhere"));
+        let short = Duration::from_micros(100);
+        assert!(!watch.wait(short, |_| true));
+        for name in ["one", "two"] {
+            std::fs::write(directory.path().join(name), "").unwrap();
+        }
+        assert!(watch.wait(Duration::from_secs(60), |name| name == "two"));
+        assert!(!watch.wait(short, |_| true));
+        std::fs::write(directory.path().join("three"), "").unwrap();
+        assert!(!watch.wait(Duration::from_secs(60), |name| name == "two"));
     }
 
     #[test]

@@ -16,7 +16,7 @@ use super::shape::{
 use super::watch::{Expectations, Watch, check_pattern};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
-    SocketChoice, SourceChoice, StateChoice,
+    ShmSettings, SocketChoice, SourceChoice, StateChoice,
 };
 use crate::surface::otlp::endpoint;
 
@@ -185,6 +185,7 @@ impl Reader {
     fn capture(&mut self, shape: CaptureShape) -> CaptureSettings {
         let interfaces = shape.interfaces.unwrap_or_default();
         let namespaces = shape.network_namespaces.unwrap_or_default();
+        let shm = shape.shm.unwrap_or_default();
         let settings = CaptureSettings {
             source: shape.source,
             cgroup: shape.cgroup.map(PathBuf::from),
@@ -194,6 +195,10 @@ impl Reader {
             network_namespaces: namespaces.into_iter().map(PathBuf::from).collect(),
             ring_bytes: shape.ring_bytes,
             record_ring_bytes: shape.record_ring_bytes,
+            shm: ShmSettings {
+                mode: shm.mode,
+                cpu_percent: shm.cpu_percent,
+            },
         };
         self.check_source(&settings);
         settings

@@ -64,7 +64,7 @@ pub struct Limits {
 }
 
 /// Where packets come from and the memory used for it.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct CaptureSettings {
     /// At the sockets of this host, or on the wire.
     pub source: SourceChoice,
@@ -82,6 +82,28 @@ pub struct CaptureSettings {
     pub ring_bytes: usize,
     /// Ring for measurement records.
     pub record_ring_bytes: usize,
+    /// What goes through shared memory.
+    pub shm: ShmSettings,
+}
+
+/// How shared memory is looked at.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ShmSettings {
+    /// Whether it is.
+    pub mode: ShmMode,
+    /// Share of one CPU that it may cost, in percent.
+    pub cpu_percent: f64,
+}
+
+/// Whether shared memory is looked at.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum ShmMode {
+    /// Where there is any.
+    #[default]
+    Auto,
+    /// Never.
+    Off,
 }
 
 /// Where the agent looks.
@@ -320,6 +342,10 @@ impl Default for Config {
                 network_namespaces: Vec::new(),
                 ring_bytes: defaults::RING_BYTES,
                 record_ring_bytes: defaults::RECORD_RING_BYTES,
+                shm: ShmSettings {
+                    mode: ShmMode::default(),
+                    cpu_percent: defaults::SHM_CPU_PERCENT,
+                },
             },
             metrics: MetricsSettings {
                 listen: defaults::LISTEN.parse().ok(),
@@ -374,6 +400,7 @@ mod defaults {
     pub(super) const REASSEMBLY_BYTES: usize = 4 << 20;
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
+    pub(super) const SHM_CPU_PERCENT: f64 = 1.5;
     pub(super) const LISTEN: &str = "127.0.0.1:17400";
     pub(super) const API: &str = "127.0.0.1:17401";
 

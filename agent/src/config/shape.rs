@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::{Compression, Level, SourceChoice, defaults};
+use super::{Compression, Level, ShmMode, SourceChoice, defaults};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
@@ -130,6 +130,21 @@ pub(super) struct CaptureShape {
     /// Ring for measurement records from the kernel filter, in bytes.
     #[schemars(range(min = 65_536, max = 1_073_741_824))]
     pub(super) record_ring_bytes: usize,
+    /// Messages between processes of one host that go through Fast DDS's shared memory.
+    pub(super) shm: Option<ShmShape>,
+}
+
+/// How shared memory is looked at: only ever read, at intervals.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct ShmShape {
+    /// `auto`: where there is any; `off`: never.
+    pub(super) mode: ShmMode,
+    /// Share of one CPU that looking may cost, in percent. With less, fewer of the messages are
+    /// seen; they are counted all the same.
+    #[schemars(range(min = 0.1, max = 100))]
+    pub(super) cpu_percent: f64,
 }
 
 /// Interface names or globs (`eth*`).
@@ -239,6 +254,16 @@ impl Default for CaptureShape {
             network_namespaces: None,
             ring_bytes: defaults::RING_BYTES,
             record_ring_bytes: defaults::RECORD_RING_BYTES,
+            shm: None,
+        }
+    }
+}
+
+impl Default for ShmShape {
+    fn default() -> Self {
+        Self {
+            mode: ShmMode::default(),
+            cpu_percent: defaults::SHM_CPU_PERCENT,
         }
     }
 }

@@ -15,6 +15,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, Role};
 use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::rtps::Locator;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
 use facts::domain;
@@ -423,6 +424,9 @@ impl Discovery {
             self.evictions.endpoints += 1;
             return;
         }
+        let unicast = &announcement.unicast;
+        let shared_memory =
+            (!unicast.is_empty()).then(|| unicast.iter().any(Locator::is_shared_memory));
         let endpoint = Endpoint {
             role: announcement.role,
             domain_id,
@@ -431,6 +435,8 @@ impl Discovery {
             type_hash: announcement.type_hash,
             qos: announcement.qos,
             first_seen: at,
+            shared_memory,
+            data_sharing: announcement.datasharing,
         };
         let subject = Subject::endpoint(guid, &endpoint);
         self.endpoints.insert(guid, endpoint);

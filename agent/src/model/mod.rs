@@ -17,6 +17,7 @@ pub mod histogram;
 pub mod interest;
 pub mod journal;
 pub mod observer;
+mod passage;
 pub mod pieces;
 pub mod profiler;
 pub mod rate;

@@ -13,6 +13,7 @@ use ros2probe_wire::{Duration, EntityId, Guid, Timestamp};
 
 use super::discovery::{Discovery, Endpoint, Portrait};
 use super::observer::Observer;
+use super::passage::passages;
 use super::snapshot::{
     DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts,
     Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
@@ -171,6 +172,11 @@ fn topic(
         deliveries: deliveries::deliveries(observer, topic, nodes),
         acknowledgements: deliveries::acknowledgements(observer, topic, nodes, now),
         vanished: topic.is_vanished(),
+        passages: passages(
+            &observer.discovery,
+            topic.writers.iter(),
+            &topic.readers.iter(),
+        ),
     }
 }
 

@@ -21,9 +21,13 @@ const MAX_AHEAD: u64 = 4096;
 pub struct Sampled {
     /// Last record from shared memory.
     last: Timestamp,
+    /// Something came by the network since shared memory fell silent.
+    left: bool,
     span: u64,
     seen: u64,
     uncertain: u64,
+    /// Messages that a HEARTBEAT told of, and whose size nothing has told yet.
+    unmeasured: u64,
     /// Bit `i`: the number `i + 1` below the next one was seen, or needs not be.
     sighted: u128,
     /// The latest number that arrived whole as far as can be told, and when.
@@ -37,6 +41,8 @@ pub struct Sampled {
 pub struct News {
     /// Numbers that are now known to be used, the record's own included.
     pub samples: u64,
+    /// Samples that may be taken for as large as this one: those, and others that were told of.
+    pub alike: u64,
     /// Time since the number before it arrived, when that was seen.
     pub interval: Option<i64>,
     /// It is the newest one and has arrived: its delay is a delivery delay.
@@ -49,9 +55,11 @@ impl Sampled {
     pub const fn new(now: Timestamp) -> Self {
         Self {
             last: now,
+            left: false,
             span: 0,
             seen: 0,
             uncertain: 0,
+            unmeasured: 0,
             sighted: u128::MAX,
             arrived: None,
             head: None,
@@ -61,12 +69,21 @@ impl Sampled {
     /// A record came from shared memory.
     pub fn touch(&mut self, now: Timestamp) {
         self.last = self.last.max(now);
+        self.left = false;
     }
 
     /// Whether it still is seen that way.
     #[must_use]
     pub const fn is_current(&self, now: Timestamp) -> bool {
         self.last.0.saturating_add(HOLD) > now.0
+    }
+
+    /// Whether a record at `now` still belongs here: while it is seen that way, and the first one
+    /// after that, for what is missing before it may have gone through shared memory.
+    pub const fn takes(&mut self, now: Timestamp) -> bool {
+        let takes = self.is_current(now) || !self.left;
+        self.left |= !self.is_current(now);
+        takes
     }
 
     /// The tap cannot tell what passed before `now`.
@@ -97,7 +114,14 @@ impl Sampled {
             return News::default();
         }
         let before = sequence.next();
-        sequence.recognise(number, source);
+        let is_told_only = self
+            .bit(number, before)
+            .is_some_and(|bit| self.sighted & bit == 0);
+        match source {
+            // It is late and not of a writer that begins anew.
+            Some(source) if is_told_only => sequence.sourced(source),
+            source => sequence.recognise(number, source),
+        }
         sequence.begin(number);
         if sequence.next() != before {
             // It begins, perhaps anew.
@@ -106,15 +130,14 @@ impl Sampled {
         let samples = self.advance(number.saturating_add(1), now, sequence);
         self.span += samples;
         let below = sequence.next().saturating_sub(number).saturating_sub(1);
-        let bit = u32::try_from(below)
-            .ok()
-            .and_then(|below| 1_u128.checked_shl(below));
+        let bit = self.bit(number, sequence.next());
         if let Some(bit) = bit.filter(|bit| self.sighted & bit == 0) {
             self.sighted |= bit;
             self.seen += 1;
         }
         let mut news = News {
             samples,
+            alike: samples.saturating_add(std::mem::take(&mut self.unmeasured)),
             ..News::default()
         };
         let is_later = self.arrived.is_none_or(|(arrived, _)| arrived < number);
@@ -137,6 +160,7 @@ impl Sampled {
         }
         let samples = self.advance(end, now, sequence);
         self.span += samples;
+        self.unmeasured += samples;
         samples
     }
 
@@ -164,6 +188,12 @@ impl Sampled {
         self.head
             .filter(|(head, _)| *head == number)
             .map(|(_, stamp)| stamp)
+    }
+
+    /// The bit of a number among those below `next`.
+    fn bit(&self, number: u64, next: u64) -> Option<u128> {
+        let below = next.checked_sub(number)?.checked_sub(1)?;
+        1_u128.checked_shl(u32::try_from(below).ok()?)
     }
 
     /// Everything below `end` is used, and none of it is a loss. How many numbers that is more.
@@ -273,7 +303,9 @@ mod tests {
         // 8 was sent, 9 to 11 were not.
         assert_eq!(view.sampled.skip(9, 12, now, &mut view.sequence), 1);
         assert_eq!(view.counts(), (1, 4));
-        assert_eq!(view.see(12).samples, 1);
+        let news = view.see(12);
+        // With 6 and 7 and 8, whose size is not known either.
+        assert_eq!((news.samples, news.alike), (1, 4));
         view.see(7);
         assert_eq!(view.counts(), (3, 5));
         let forged = view.sampled.exist(1 << 40, now, &mut view.sequence);
@@ -287,9 +319,22 @@ mod tests {
         view.see(1);
         view.see(1000);
         view.now += 60 * SECOND;
-        assert_eq!(view.see(1000 - 5).samples, 1);
-        assert_eq!(view.see(1000 - 4).samples, 1);
+        assert_eq!(view.see(1).samples, 1);
+        assert_eq!(view.see(2).samples, 1);
         assert_eq!(view.counts(), (4, 1002));
+    }
+
+    #[test]
+    fn a_sample_that_was_told_of_and_seen_late_is_no_new_beginning() {
+        let mut view = View::new();
+        view.see(1);
+        let now = Timestamp(view.now);
+        assert_eq!(view.sampled.exist(5, now, &mut view.sequence), 4);
+        view.now += SECOND;
+        for ends in [false, false, true] {
+            assert_eq!(view.part(4, ends).samples, 0);
+        }
+        assert_eq!(view.counts(), (2, 5));
     }
 
     #[test]

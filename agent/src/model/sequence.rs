@@ -169,8 +169,13 @@ impl Sequence {
             self.restart(number);
         }
         if let Some(source) = source {
-            self.newest_source = self.newest_source.max(source);
+            self.sourced(source);
         }
+    }
+
+    /// A sample was said at this time, which is later than all before or is of no matter.
+    pub fn sourced(&mut self, source: Timestamp) {
+        self.newest_source = self.newest_source.max(source);
     }
 
     /// A sample of this number exists, for some of its fragments came.

@@ -145,6 +145,56 @@ pub struct TopicFacts {
     pub acknowledgements: Vec<AcknowledgementFacts>,
     /// The last endpoint has gone; kept for the grace period.
     pub vanished: bool,
+    /// Pairs of its live writers and readers by how messages pass between them; those that there
+    /// are.
+    pub passages: Vec<PassageCount>,
+}
+
+/// How messages pass between a writer and a reader, as both announce it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Passage {
+    /// By the network, where all of them can be seen.
+    Network,
+    /// Through Fast DDS's shared memory, which is looked at now and then.
+    SharedMemory,
+    /// The reader reads the writer's history in memory: not seen.
+    DataSharing,
+    /// Within one process: not seen.
+    SameProcess,
+    /// Through Cyclone DDS's iceoryx: not seen.
+    Iceoryx,
+}
+
+/// Pairs of writer and reader.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PassageCount {
+    /// How messages pass between them.
+    pub passage: Passage,
+    /// How many pairs.
+    pub pairs: usize,
+}
+
+impl Passage {
+    /// All of them.
+    pub const ALL: [Self; 5] = [
+        Self::Network,
+        Self::SharedMemory,
+        Self::DataSharing,
+        Self::SameProcess,
+        Self::Iceoryx,
+    ];
+
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Network => "network",
+            Self::SharedMemory => "shared_memory",
+            Self::DataSharing => "data_sharing",
+            Self::SameProcess => "same_process",
+            Self::Iceoryx => "iceoryx",
+        }
+    }
 }
 
 /// One writer or reader.
@@ -248,6 +298,18 @@ impl Measurement {
             sampled.span += other.span;
             sampled.uncertain += other.uncertain;
         }
+    }
+}
+
+impl SampledFacts {
+    /// Seen of those that there were; `None` while there were none.
+    #[must_use]
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "a ratio of counts far below 2^52"
+    )]
+    pub fn coverage(&self) -> Option<f64> {
+        (self.span > 0).then(|| self.seen as f64 / self.span as f64)
     }
 }
 

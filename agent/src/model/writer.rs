@@ -146,7 +146,15 @@ impl Writer {
     /// Takes in a record of this writer. `opened` is when last a way for its samples was opened
     /// that this host sees: what is missing before it went elsewhere.
     pub fn record(&mut self, record: &Record, opened: Timestamp, scene: &mut Scene<'_>) {
-        if record.flags & flag::SHM != 0 || self.is_sampled(record_time(record)) {
+        let at = record_time(record);
+        let takes = self
+            .sampled
+            .as_mut()
+            .is_some_and(|sampled| match record.kind {
+                kind::DATA | kind::DATA_FRAG | kind::HEARTBEAT => sampled.takes(at),
+                _ => sampled.is_current(at),
+            });
+        if record.flags & flag::SHM != 0 || takes {
             self.sampled_record(record);
             return;
         }
@@ -320,8 +328,9 @@ impl Writer {
             _ => (record.sample_size, record.status_info == 0),
         };
         // Those that were not seen are taken for as large as the next one that was.
-        let messages = news.samples - u64::from(!is_message && news.samples > 0);
-        let bytes = messages.saturating_mul(bytes.into());
+        let disposals = u64::from(!is_message && news.samples > 0);
+        let messages = news.samples - disposals;
+        let bytes = (news.alike - disposals).saturating_mul(bytes.into());
         self.tally.messages += messages;
         self.tally.bytes = self.tally.bytes.saturating_add(bytes);
         let slot = self.tally.window.current(now);

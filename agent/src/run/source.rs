@@ -13,9 +13,10 @@ use super::RunError;
 use super::replay::Replay;
 use crate::capture::host::HostTap;
 use crate::capture::live::LiveSource;
+use crate::capture::shm;
 use crate::config::CaptureSettings;
 use crate::model::observer::Observer;
-use crate::surface::{Ability, AgentFacts, InterfaceFacts, SourceKind};
+use crate::surface::{Ability, AgentFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 
 /// Where packets come from.
 pub enum Source {
@@ -163,7 +164,33 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         abilities: abilities(live),
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
+        shared_memory: live.shared_memory().map(shared_memory),
         ..AgentFacts::new(kind(live), now)
+    }
+}
+
+fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
+    let counters = facts.counters;
+    SharedMemoryFacts {
+        open: vec![
+            ("port", counters.ports),
+            ("segment", counters.segments),
+            ("directory", counters.places),
+        ],
+        events: vec![
+            ("announced", counters.announced),
+            ("read", counters.read),
+            ("captured", counters.captured),
+            ("missed", counters.missed),
+            ("unfilled", counters.unfilled),
+            ("unreachable", counters.unreachable),
+            ("malformed", counters.malformed),
+            ("uncertain", counters.uncertain),
+            ("left_out", counters.left_out),
+            ("refused", facts.refused),
+        ],
+        cpu_seconds: facts.cpu_seconds,
+        looks: facts.looks,
     }
 }
 
@@ -177,6 +204,9 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     abilities.extend(inside.filter_map(|(ability, able)| able.is_ok().then_some(ability)));
     if live.host().is_some() && live.is_on_the_wire() {
         abilities.push(Ability::Forwarded);
+    }
+    if live.looks_at_shared_memory() {
+        abilities.push(Ability::SharedMemory);
     }
     abilities
 }

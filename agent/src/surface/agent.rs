@@ -4,7 +4,7 @@
 use std::fmt;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::agent_facts::{Ability, InterfaceFacts};
+use super::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
 use super::board::{Reload, State};
 use super::catalogue as metric;
 use super::events::EventLog;
@@ -63,7 +63,28 @@ pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
     page.single(&metric::PIECES_DROPPED, agent.pieces_dropped)?;
     page.single(&metric::CONTENDED, agent.contended)?;
     page.single(&metric::INCOMPLETE_DATAGRAMS, agent.incomplete_datagrams)?;
-    page.single(&metric::REASSEMBLY, agent.reassembly_bytes)
+    page.single(&metric::REASSEMBLY, agent.reassembly_bytes)?;
+    shared_memory(page, agent.shared_memory.as_ref())
+}
+
+/// The look at shared memory; nothing where there is none.
+fn shared_memory(page: &mut Page<'_>, facts: Option<&SharedMemoryFacts>) -> fmt::Result {
+    page.family(&metric::SHM_OPEN, |family| {
+        let mut open = facts.into_iter().flat_map(|facts| &facts.open);
+        open.try_for_each(|(kind, count)| family.sample(&[Label::Text(kind)], *count))
+    })?;
+    page.family(&metric::SHM_EVENTS, |family| {
+        let mut events = facts.into_iter().flat_map(|facts| &facts.events);
+        events.try_for_each(|(event, count)| family.sample(&[Label::Text(event)], *count))
+    })?;
+    page.family(&metric::SHM_LOOKS, |family| match facts {
+        Some(facts) => family.sample(&[], facts.looks),
+        None => Ok(()),
+    })?;
+    page.family(&metric::SHM_CPU, |family| match facts {
+        Some(facts) => family.sample(&[], facts.cpu_seconds),
+        None => Ok(()),
+    })
 }
 
 /// The model's tables and what it could not read.

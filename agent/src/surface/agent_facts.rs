@@ -41,6 +41,21 @@ pub struct AgentFacts {
     pub refused_updates: u64,
     /// What became of the state for the next start; `None` = none is kept.
     pub state: Option<StateFacts>,
+    /// The look at shared memory, where there is one.
+    pub shared_memory: Option<SharedMemoryFacts>,
+}
+
+/// The look at shared memory.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SharedMemoryFacts {
+    /// What is open, by kind.
+    pub open: Vec<(&'static str, u64)>,
+    /// What was met, by event, complete and in a fixed order.
+    pub events: Vec<(&'static str, u64)>,
+    /// CPU time it took.
+    pub cpu_seconds: f64,
+    /// Looks so far.
+    pub looks: u64,
 }
 
 /// Where packets come from.
@@ -71,6 +86,8 @@ pub enum Ability {
     Containers,
     /// Traffic that no local socket sends or receives.
     Forwarded,
+    /// Messages between processes of this host through shared memory, sampled.
+    SharedMemory,
 }
 
 /// Counters of one interface.
@@ -105,6 +122,7 @@ impl AgentFacts {
             reassembly_bytes: 0,
             refused_updates: 0,
             state: None,
+            shared_memory: None,
         }
     }
 }
@@ -133,7 +151,7 @@ impl SourceKind {
 
 impl Ability {
     /// All of them.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 8] = [
         Self::Subscribers,
         Self::Sent,
         Self::SocketLosses,
@@ -141,6 +159,7 @@ impl Ability {
         Self::Owners,
         Self::Containers,
         Self::Forwarded,
+        Self::SharedMemory,
     ];
 
     /// Label value.
@@ -154,6 +173,7 @@ impl Ability {
             Self::Owners => "owners",
             Self::Containers => "containers",
             Self::Forwarded => "forwarded",
+            Self::SharedMemory => "shared_memory",
         }
     }
 }

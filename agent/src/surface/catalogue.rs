@@ -300,6 +300,33 @@ pub(super) const TOPIC_NEGATIVE_LATENCY: Metric = Metric::counter(
     "Messages stamped after their capture: clocks are apart. They are in no latency histogram.",
 );
 
+pub(super) const TOPIC_SAMPLED: Metric = Metric::counter(
+    "ros2_topic_sampled_messages_total",
+    TOPIC,
+    "Of its messages, those counted by the span of their sequence numbers, because the topic is seen in shared memory: not each of them was looked at, and none of them is reported lost.",
+);
+pub(super) const TOPIC_SAMPLED_SEEN: Metric = Metric::counter(
+    "ros2_topic_sampled_seen_messages_total",
+    TOPIC,
+    "Of those, the ones that were looked at; intervals and latencies are those of these.",
+);
+pub(super) const TOPIC_SAMPLED_UNCERTAIN: Metric = Metric::counter(
+    "ros2_topic_sampled_uncertain_total",
+    TOPIC,
+    "Looks at shared memory that came so late that more may have passed than can be told.",
+);
+pub(super) const TOPIC_COVERAGE: Metric = Metric::gauge(
+    "ros2_topic_sampled_coverage_ratio",
+    TOPIC,
+    "Seen of sampled messages since the start, for people; rules divide the counters.",
+)
+.unit("ratio");
+pub(super) const TOPIC_PAIRS: Metric = Metric::gauge(
+    "ros2_topic_pairs",
+    &["domain_id", "topic", "passage"],
+    "Pairs of writer and reader by how messages pass between them, as both announce: network, shared_memory (sampled), data_sharing, same_process, iceoryx (the last three are not seen).",
+);
+
 // Writers, on request.
 pub(super) const WRITER_MESSAGES: Metric = Metric::counter(
     "ros2_writer_messages_total",
@@ -367,6 +394,11 @@ pub const CATALOGUE: &[Metric] = &[
     TOPIC_RATE,
     TOPIC_BANDWIDTH,
     TOPIC_NEGATIVE_LATENCY,
+    TOPIC_SAMPLED,
+    TOPIC_SAMPLED_SEEN,
+    TOPIC_SAMPLED_UNCERTAIN,
+    TOPIC_COVERAGE,
+    TOPIC_PAIRS,
     TOPIC_INTERARRIVAL,
     TOPIC_LATENCY,
     TOPIC_HEADER_LATENCY,
@@ -420,6 +452,10 @@ pub const CATALOGUE: &[Metric] = &[
     CONTENDED,
     INCOMPLETE_DATAGRAMS,
     REASSEMBLY,
+    SHM_OPEN,
+    SHM_EVENTS,
+    SHM_LOOKS,
+    SHM_CPU,
     DATAGRAMS,
     RECORDS,
     DECODE_ERRORS,

@@ -18,7 +18,7 @@ mod process;
 mod robot;
 mod walk;
 
-pub use agent_facts::{Ability, AgentFacts, InterfaceFacts, SourceKind};
+pub use agent_facts::{Ability, AgentFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 pub use board::{Board, Settings, State};
 pub use events::{AgentEvent, EventLog};
 pub use exposition::{Exposition, Format};

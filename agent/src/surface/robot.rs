@@ -11,7 +11,8 @@ use super::page::{Family, Label, Number, Page};
 use crate::config::Watch;
 use crate::model::histogram::Histogram;
 use crate::model::snapshot::{
-    EndpointFacts, Measurement, ProcessFacts, Snapshot, TopicFacts, WatchFacts, WatchState,
+    EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
+    WatchState,
 };
 
 /// Unknown writers with series of their own.
@@ -21,6 +22,8 @@ const MAX_JOINED: usize = 4;
 
 /// How a counter is read.
 type Count = fn(&Measurement) -> u64;
+/// How a counter of a sampled view is read.
+type SampledCount = fn(&SampledFacts) -> u64;
 /// How a histogram is read.
 type Values = fn(&Measurement) -> &Histogram;
 
@@ -313,6 +316,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
     page.family(&metric::TOPIC_NEGATIVE_LATENCY, |family| {
         measured(family, rows, |facts| Some(facts.negative_latency.into()))
     })?;
+    sampled(page, rows)?;
     let histograms: [(&Metric, Values); 3] = [
         (&metric::TOPIC_INTERARRIVAL, |measured| {
             &measured.interarrival
@@ -337,6 +341,42 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
         })?;
     }
     Ok(())
+}
+
+/// Topics of which a part was seen in shared memory, and how messages pass.
+fn sampled(page: &mut Page<'_>, rows: &[Row<'_>]) -> fmt::Result {
+    let counters: [(&Metric, SampledCount); 3] = [
+        (&metric::TOPIC_SAMPLED, |sampled| sampled.span),
+        (&metric::TOPIC_SAMPLED_SEEN, |sampled| sampled.seen),
+        (&metric::TOPIC_SAMPLED_UNCERTAIN, |sampled| {
+            sampled.uncertain
+        }),
+    ];
+    let of_rows = || {
+        let sampled = |row: &'_ Row<'_>| row.measurement().and_then(|measured| measured.sampled);
+        rows.iter()
+            .filter_map(move |row| Some((row, sampled(row)?)))
+    };
+    for (metric, value) in counters {
+        page.family(metric, |family| {
+            of_rows().try_for_each(|(row, sampled)| family.sample(&row.labels(), value(&sampled)))
+        })?;
+    }
+    page.family(&metric::TOPIC_COVERAGE, |family| {
+        let with_any = of_rows().filter_map(|(row, sampled)| Some((row, sampled.coverage()?)));
+        let mut with_any = with_any;
+        with_any.try_for_each(|(row, coverage)| family.sample(&row.labels(), coverage))
+    })?;
+    page.family(&metric::TOPIC_PAIRS, |family| {
+        for row in rows {
+            for count in row.facts.iter().flat_map(|facts| &facts.passages) {
+                let [domain_id, topic] = row.labels();
+                let passage = Label::Text(count.passage.label());
+                family.sample(&[domain_id, topic, passage], count.pairs)?;
+            }
+        }
+        Ok(())
+    })
 }
 
 /// Writers, when `settings` ask for them.

@@ -47,6 +47,10 @@ pub(crate) struct Stream {
     pub(crate) peers: usize,
     /// Bytes of each of the peers' receive buffers, as far as net.core.rmem_max goes.
     pub(crate) receive_buffer: u32,
+    /// Fast DDS: the transports that it has by itself, shared memory among them.
+    pub(crate) shares_memory: bool,
+    /// Fast DDS: readers read the history of writers of their host.
+    pub(crate) shares_history: bool,
 }
 
 pub(crate) struct Peer {
@@ -88,6 +92,8 @@ impl Stream {
             stretch: 0,
             peers: 1,
             receive_buffer: 4 << 20,
+            shares_memory: false,
+            shares_history: false,
         }
     }
 
@@ -175,6 +181,12 @@ impl Peer {
             }
             .to_owned(),
         );
+        if stream.shares_memory {
+            words.extend(["--transport", "default"].map(str::to_owned));
+        }
+        if stream.shares_history {
+            words.push("--data-sharing".to_owned());
+        }
         if stream.transient_local {
             words.push("--transient-local".to_owned());
         }

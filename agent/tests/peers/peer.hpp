@@ -74,11 +74,14 @@ struct Options {
   double linger = 1.0;
   // Of each socket, as far as net.core.rmem_max goes: room for bursts of point cloud fragments.
   uint32_t receive_buffer = 4 << 20;
+  // Of Fast DDS: the transports that it has by itself, and the sharing of histories.
+  bool default_transport = false;
+  bool data_sharing = false;
 
   static Options parse(int argc, char** argv) {
     enum { kRole = 1, kTopic, kSize, kRate, kCount, kReliable, kBestEffort, kTransientLocal, kDepth,
            kDomain, kGidSize, kNode, kLog, kPeers, kHold, kStretch, kLinger,
-           kReceiveBuffer, kHelp };
+           kReceiveBuffer, kTransport, kDataSharing, kHelp };
     static const option names[] = {
         {"role", 1, nullptr, kRole},           {"topic", 1, nullptr, kTopic},
         {"size", 1, nullptr, kSize},           {"rate", 1, nullptr, kRate},
@@ -91,6 +94,7 @@ struct Options {
         {"hold", 0, nullptr, kHold},           {"linger", 1, nullptr, kLinger},
         {"receive-buffer", 1, nullptr, kReceiveBuffer},
         {"stretch", 1, nullptr, kStretch},
+        {"transport", 1, nullptr, kTransport}, {"data-sharing", 0, nullptr, kDataSharing},
         {"help", 0, nullptr, kHelp},           {nullptr, 0, nullptr, 0}};
     Options options;
     bool role_given = false;
@@ -120,11 +124,18 @@ struct Options {
         case kReceiveBuffer:
           options.receive_buffer = static_cast<uint32_t>(strtoul(optarg, nullptr, 10));
           break;
+        case kTransport:
+          options.default_transport = strcmp(optarg, "default") == 0;
+          if (!options.default_transport && strcmp(optarg, "udp") != 0)
+            fail("--transport is default or udp");
+          break;
+        case kDataSharing: options.data_sharing = true; break;
         default:
           fail("usage: --role pub|sub [--topic /t] [--size BYTES] [--rate HZ] [--count N]\n"
                "  [--reliable|--best-effort] [--transient-local] [--depth N] [--domain D]\n"
                "  [--gid-size 24|16] [--node /ns/name]... [--log FILE] [--peers N] [--hold]\n"
-               "  [--stretch SAMPLES] [--linger SECONDS] [--receive-buffer BYTES]");
+               "  [--stretch SAMPLES] [--linger SECONDS] [--receive-buffer BYTES]\n"
+               "  [--transport default|udp] [--data-sharing]");
       }
     }
     if (!role_given) fail("--role pub|sub is missing");

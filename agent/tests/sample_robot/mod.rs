@@ -11,12 +11,12 @@ use ros2probe::model::discovery::Addresses;
 use ros2probe::model::histogram::Histogram;
 use ros2probe::model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
-    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
-    Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
-    WatchedTopicFacts,
+    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Passage, PassageCount,
+    ProcessFacts, SampledFacts, Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts,
+    WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe::state::StateFacts;
-use ros2probe::surface::{AgentFacts, InterfaceFacts, SourceKind};
+use ros2probe::surface::{AgentFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -182,6 +182,12 @@ pub fn agent() -> AgentFacts {
             writes: 3,
             failures: 0,
         }),
+        shared_memory: Some(SharedMemoryFacts {
+            open: vec![("port", 4)],
+            events: vec![("read", 7)],
+            cpu_seconds: 1.5,
+            looks: 1_000,
+        }),
         ..AgentFacts::new(SourceKind::Wire, Instant::now())
     }
 }
@@ -232,6 +238,10 @@ pub fn topic(name: &str) -> TopicFacts {
             last_seen: Timestamp(1_700_000_000_000_000_000),
         }],
         vanished: false,
+        passages: vec![PassageCount {
+            passage: Passage::SharedMemory,
+            pairs: 1,
+        }],
     }
 }
 

@@ -18,7 +18,9 @@ pub mod verdict;
 #[cfg(test)]
 mod image;
 
+use std::collections::BTreeSet;
 use std::io;
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -29,13 +31,16 @@ use ros2probe_wire::{Guid, Timestamp};
 
 use self::inbox::{Inbox, Item};
 use self::pace::{Need, Pace};
-use self::scan::Places;
+use self::scan::{Name, Places};
 use self::tap::{Counters, Moment, Tap};
-use super::system::{Clocks, thread_cpu};
+use super::system::{Clocks, DirectoryWatch, run_first, thread_cpu};
 use crate::model::observer::Observer;
 
 /// How often the counters are put where others can read them.
 const REPORT: u64 = 200_000_000;
+
+/// Close looks between two readings of the CPU time that they cost.
+const ACCOUNT_EVERY: u64 = 16;
 
 /// The thread that looks at shared memory, from the outside.
 pub struct SharedMemory {
@@ -141,7 +146,11 @@ impl Drop for SharedMemory {
 fn look(shared: &Shared, places: Places, share: f64) {
     let mut tap = Tap::new(places);
     let mut pace = Pace::new(share);
-    let (mut found, mut looks, mut reported) = (Vec::new(), 0, 0);
+    // Without it, somebody who comes is noticed at the next listing.
+    let mut watch = DirectoryWatch::new().ok();
+    let mut watched = BTreeSet::new();
+    let (mut is_first, mut may_be_first) = (false, true);
+    let (mut found, mut looks, mut reported, mut cpu) = (Vec::new(), 0, 0, 0.0);
     while !shared.stop.load(Ordering::Acquire) {
         if shared.is_told.swap(false, Ordering::Acquire) {
             let interest = shared.interest.lock();
@@ -155,10 +164,13 @@ fn look(shared: &Shared, places: Places, share: f64) {
             monotonic: clocks.monotonic,
             calendar: clocks.now.0,
         };
+        let monotonic = seconds(now.monotonic);
         let announced = tap.look(now, &mut found);
         shared.inbox.put(&mut found);
         looks += 1;
-        let cpu = seconds(thread_cpu());
+        if looks % ACCOUNT_EVERY == 0 || !pace.is_meeting(monotonic) {
+            cpu = seconds(thread_cpu());
+        }
         if now.monotonic.saturating_sub(reported) >= REPORT {
             reported = now.monotonic;
             let facts = shared.facts.lock();
@@ -175,8 +187,33 @@ fn look(shared: &Shared, places: Places, share: f64) {
             (true, false) => Need::Names,
             (true, true) => Need::Watching,
         };
-        let monotonic = seconds(now.monotonic);
-        std::thread::sleep(pace.sleep(monotonic, cpu, announced, need));
+        if tap.met() {
+            pace.news(monotonic);
+        }
+        let sleep = pace.sleep(monotonic, cpu, announced, need);
+        if may_be_first && pace.is_meeting(monotonic) != is_first {
+            is_first = !is_first;
+            tap.is_hurried = is_first;
+            if let Err(error) = run_first(is_first) {
+                (may_be_first, is_first) = (false, false);
+                tracing::info!(%error, "names said in shared memory may be missed on a busy host");
+            }
+        }
+        let Some(watch) = &mut watch else {
+            std::thread::sleep(sleep);
+            continue;
+        };
+        if tap.directory_count() != watched.len() {
+            let directories: BTreeSet<_> = tap.directories().map(Path::to_path_buf).collect();
+            for new in directories.difference(&watched) {
+                watch.add(new);
+            }
+            watched = directories;
+        }
+        if watch.wait(sleep, |name| Name::parse(name).is_some()) {
+            tap.somebody_comes();
+            pace.newcomer(monotonic);
+        }
     }
 }
 

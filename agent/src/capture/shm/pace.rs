@@ -20,6 +20,15 @@ const QUIET_AFTER: f64 = 3.0;
 const SLOWER: f64 = 1.5;
 /// The share of the CPU is looked at this often.
 const ACCOUNT: f64 = 0.1;
+/// When participants meet, each says its names once, and uses the buffer again some 50 us later.
+/// Short sleeps see more than none: who sleeps is woken before those who compute.
+const MEETING: f64 = 20e-6;
+/// How long that goes on after a participant created its files, and after anything was announced.
+const NEWCOMER: f64 = 0.4;
+const NEWS: f64 = 0.15;
+/// CPU time for it: at most so many seconds, and so much more each second.
+const CREDIT: f64 = 5.0;
+const CREDIT_PER_SECOND: f64 = 0.01;
 /// Sleeps get no longer than this, whatever it costs.
 const LONGEST: f64 = 50e-3;
 
@@ -43,6 +52,10 @@ pub struct Pace {
     stretch: f64,
     quiet_since: f64,
     accounted: (f64, f64),
+    meeting_until: f64,
+    was_close: bool,
+    /// CPU time for close looks that is left.
+    credit: f64,
 }
 
 impl Pace {
@@ -55,16 +68,45 @@ impl Pace {
             stretch: 1.0,
             quiet_since: 0.0,
             accounted: (0.0, 0.0),
+            meeting_until: 0.0,
+            was_close: false,
+            credit: CREDIT,
         }
+    }
+
+    /// Somebody comes: for a moment it looks as closely as it can, while there is credit for that.
+    pub fn newcomer(&mut self, now: f64) {
+        self.meet(now + NEWCOMER);
+    }
+
+    /// Something was announced, and more of it may follow.
+    pub fn news(&mut self, now: f64) {
+        self.meet(now + NEWS);
+    }
+
+    /// Whether it looks closely because somebody comes.
+    #[must_use]
+    pub fn is_meeting(&self, now: f64) -> bool {
+        now < self.meeting_until
     }
 
     /// How long to sleep after a look at `now` that found so many messages; `cpu` is what the
     /// thread has used so far. Both in seconds.
     pub fn sleep(&mut self, now: f64, cpu: f64, found: usize, need: Need) -> Duration {
-        self.account(now, cpu);
         if found > 0 {
             self.quiet_since = now;
         }
+        if self.was_close {
+            let (_, used) = std::mem::replace(&mut self.accounted, (now, cpu));
+            self.credit -= cpu - used;
+        }
+        self.was_close = self.is_meeting(now) && self.credit > 0.0;
+        if self.was_close {
+            self.sleep = MEETING;
+            return Duration::from_secs_f64(MEETING);
+        }
+        self.meeting_until = now;
+        self.account(now, cpu);
         let longest = match need {
             Need::Nobody => NOBODY,
             _ if now - self.quiet_since > QUIET_AFTER => QUIET,
@@ -86,6 +128,12 @@ impl Pace {
         self.stretch
     }
 
+    fn meet(&mut self, until: f64) {
+        if self.credit > 0.0 {
+            self.meeting_until = self.meeting_until.max(until);
+        }
+    }
+
     fn account(&mut self, now: f64, cpu: f64) {
         let (then, used) = self.accounted;
         let elapsed = now - then;
@@ -93,6 +141,7 @@ impl Pace {
             return;
         }
         self.accounted = (now, cpu);
+        self.credit = (self.credit + elapsed * CREDIT_PER_SECOND).min(CREDIT);
         let share = (cpu - used) / elapsed;
         // Waking up less often by the factor that it costs too much, but not all at once.
         let wanted = share / self.budget;
@@ -161,6 +210,26 @@ mod tests {
         assert!((9.0..11.0).contains(&looks(Need::Nobody)));
         assert!((90.0..110.0).contains(&looks(Need::Watching)));
         assert!((90.0..110.0).contains(&looks(Need::Names)));
+    }
+
+    #[test]
+    fn when_somebody_comes_it_looks_closely_but_not_for_ever() {
+        let mut pace = Pace::new(0.015);
+        pace.newcomer(100.0);
+        let look = |pace: &mut Pace, now, cpu| pace.sleep(now, cpu, 0, Need::Nobody).as_micros();
+        assert_eq!(look(&mut pace, 100.01, 0.0), 20);
+        assert_eq!(look(&mut pace, 100.3, 0.0), 20);
+        assert!(look(&mut pace, 100.6, 0.0) > 20);
+        // Somebody comes all the time, and close looks take a third of a CPU.
+        let (mut now, mut cpu) = (101.0, 0.0);
+        while now < 201.0 {
+            pace.newcomer(now);
+            let close = look(&mut pace, now, cpu) == 20;
+            now += 0.01;
+            cpu += if close { 0.003 } else { 0.0 };
+        }
+        // The credit, and what a hundred seconds give.
+        assert!((5.0..=6.1).contains(&cpu), "{cpu}");
     }
 
     #[test]

@@ -26,6 +26,9 @@ const COARSE: Duration = Duration::from_secs(1);
 /// one is asked again at every so many rounds.
 const YOUNG: u32 = 10;
 const ROUNDS: u32 = 32;
+/// Levels of cgroups and processes of a scope that are gone through.
+const DEPTH: usize = 8;
+const MAX_PROCESSES: usize = 8192;
 
 /// A directory of shared memory, by the device and inode it has.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
@@ -58,11 +61,25 @@ pub struct Place {
     seen: bool,
 }
 
+/// Whose shared memory is looked at.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Scope {
+    /// The agent's own, and that of every process.
+    Everybody,
+    /// That of the processes of this cgroup and those below it.
+    Cgroup(PathBuf),
+    /// The agent's own, and that of processes in these network namespaces.
+    Networks(Vec<PathBuf>),
+    /// These directories.
+    Directories(Vec<PathBuf>),
+}
+
 /// All of them.
 #[derive(Debug)]
 pub struct Places {
-    /// `None`: all that processes have.
-    fixed: Option<Vec<PathBuf>>,
+    scope: Scope,
+    /// Inodes of the network namespaces, where those are the scope.
+    networks: Vec<u64>,
     /// By identity.
     pub places: HashMap<PlaceId, Place>,
     /// Processes gone through, with the place they have and how often they were met.
@@ -110,23 +127,19 @@ impl Name {
 }
 
 impl Places {
-    /// Every place that a process of this host has.
+    /// None found yet.
     #[must_use]
-    pub fn of_all_processes() -> Self {
+    pub fn new(scope: Scope) -> Self {
+        let networks = match &scope {
+            Scope::Networks(paths) => paths.iter().filter_map(|path| inode(path)).collect(),
+            _ => Vec::new(),
+        };
         Self {
-            fixed: None,
+            scope,
+            networks,
             places: HashMap::new(),
             processes: HashMap::new(),
             left_out: 0,
-        }
-    }
-
-    /// These alone.
-    #[must_use]
-    pub fn fixed(directories: Vec<PathBuf>) -> Self {
-        Self {
-            fixed: Some(directories),
-            ..Self::of_all_processes()
         }
     }
 
@@ -135,15 +148,22 @@ impl Places {
         for place in self.places.values_mut() {
             place.seen = false;
         }
-        match self.fixed.clone() {
-            Some(directories) => {
+        match self.scope.clone() {
+            Scope::Directories(directories) => {
                 for directory in directories {
                     self.reach(&directory);
                 }
             }
-            None => {
+            Scope::Cgroup(cgroup) => {
+                let mut processes = Vec::new();
+                processes_of(&cgroup, DEPTH, &mut processes);
+                // The agent may be there, and shares nothing.
+                processes.retain(|pid| *pid != std::process::id());
+                self.go_through(processes);
+            }
+            Scope::Everybody | Scope::Networks(_) => {
                 self.reach(Path::new(SHARED_MEMORY));
-                self.go_through_processes();
+                self.go_through(all_processes());
             }
         }
         self.places.retain(|_, place| place.seen);
@@ -158,19 +178,9 @@ impl Places {
         any
     }
 
-    fn go_through_processes(&mut self) {
-        let Ok(entries) = fs::read_dir("/proc") else {
-            return;
-        };
+    fn go_through(&mut self, processes: Vec<u32>) {
         let before = std::mem::take(&mut self.processes);
-        for entry in entries.flatten() {
-            let Some(pid) = entry
-                .file_name()
-                .to_str()
-                .and_then(|name| name.parse().ok())
-            else {
-                continue;
-            };
+        for pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
             let is_settled = met > YOUNG && met % ROUNDS != pid % ROUNDS;
             let place = match known.and_then(|id| self.places.get_mut(&id)) {
@@ -187,6 +197,12 @@ impl Places {
     }
 
     fn place_of(&mut self, pid: u32) -> Option<PlaceId> {
+        if matches!(self.scope, Scope::Networks(_)) {
+            let network = inode(Path::new(&format!("/proc/{pid}/ns/net")))?;
+            if !self.networks.contains(&network) {
+                return None;
+            }
+        }
         let is_directory =
             |path: &Path| fs::symlink_metadata(path).is_ok_and(|metadata| metadata.is_dir());
         let devices = PathBuf::from(format!("/proc/{pid}/root/dev"));
@@ -254,6 +270,28 @@ impl Place {
     }
 }
 
+fn inode(path: &Path) -> Option<u64> {
+    fs::metadata(path).ok().map(|metadata| metadata.ino())
+}
+
+fn all_processes() -> Vec<u32> {
+    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let processes = entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    processes.take(MAX_PROCESSES).collect()
+}
+
+fn processes_of(cgroup: &Path, depth: usize, processes: &mut Vec<u32>) {
+    let members = fs::read_to_string(cgroup.join("cgroup.procs")).unwrap_or_default();
+    let members = members.lines().filter_map(|line| line.parse::<u32>().ok());
+    processes.extend(members.take(MAX_PROCESSES.saturating_sub(processes.len())));
+    let entries = fs::read_dir(cgroup).into_iter().flatten().flatten();
+    for entry in entries.filter(|_| depth > 0) {
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            processes_of(&entry.path(), depth - 1, processes);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -293,7 +331,7 @@ mod tests {
     #[test]
     fn files_that_come_and_go_are_noticed_also_within_one_tick_of_the_clock() {
         let directory = tempfile::tempdir().unwrap();
-        let mut places = Places::fixed(vec![directory.path().to_path_buf()]);
+        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
         places.find();
         let port = Name::parse("fastrtps_port7411").unwrap();
         let path = directory.path().join(port.file_name());
@@ -316,15 +354,21 @@ mod tests {
 
     #[test]
     fn this_hosts_shared_memory_is_found_once_however_many_processes_have_it() {
-        let mut places = Places::of_all_processes();
+        let mut places = Places::new(Scope::Everybody);
         places.find();
         let own = places
             .places
             .values()
             .filter(|place| place.path == Path::new(SHARED_MEMORY));
         assert_eq!(own.count(), 1);
-        let number = places.places.len();
+        // Of this process's network there is that one too, of a cgroup without processes nothing.
+        let network = PathBuf::from("/proc/self/ns/net");
+        let mut places = Places::new(Scope::Networks(vec![network]));
         places.find();
-        assert_eq!(places.places.len(), number);
+        let mut own = places.places.values();
+        assert!(own.any(|place| place.path == Path::new(SHARED_MEMORY)));
+        let mut places = Places::new(Scope::Cgroup(PathBuf::from("/nowhere")));
+        places.find();
+        assert!(places.places.is_empty());
     }
 }

@@ -56,7 +56,7 @@ impl Buffer {
             data: 0,
             length: 0,
         };
-        let word = |at: u64| (&bytes[..]).word(at).ok_or(Refusal::Malformed);
+        let word = |at: u64| bytes[..].word(at).ok_or(Refusal::Malformed);
         let (validity, size, data) = (word(0)?, word(SIZE)?, word(DATA)?);
         if u64::from(validity) & VALIDITY != u64::from(descriptor.validity) {
             return Err(Refusal::Expired);

@@ -5,6 +5,7 @@
 //! idle ones cost little. Sleeping between looks is the caller's.
 
 use std::collections::{HashMap, HashSet, VecDeque};
+use std::path::{Path, PathBuf};
 
 use ros2probe_wire::record::{Record, flag};
 
@@ -23,6 +24,7 @@ const MAX_SEGMENTS: usize = 512;
 const REMEMBERED: usize = 8192;
 /// Messages read in one look; the rest of a flood is read in the next.
 const PER_LOOK: usize = 2048;
+const PER_LOOK_IN_A_HURRY: usize = 64;
 /// A port that was silent for so long is looked at this often only.
 const SILENT_AFTER: u64 = 2_000_000_000;
 const SILENT_EVERY: u64 = 10_000_000;
@@ -30,19 +32,30 @@ const SILENT_EVERY: u64 = 10_000_000;
 const RETRY: u64 = 50_000_000;
 /// How often directories are looked at, and processes gone through.
 const LIST_EVERY: u64 = 100_000_000;
+/// How often a port that is not laid out yet is looked at.
+const TRY_EVERY: u64 = 1_000_000;
 const FIND_EVERY: u64 = 1_000_000_000;
+const FIND_IN_A_HURRY: u64 = 3_000_000_000;
 
 /// What is open and how far it was read.
 pub struct Tap {
     places: Places,
-    ports: HashMap<PortKey, Open>,
+    /// By number.
+    ports: Vec<Open>,
+    /// Ports that were listed and are not laid out yet.
+    unborn: Vec<(PortKey, PathBuf)>,
     segments: HashMap<SegmentKey, Segment>,
     remembered: Remembered,
     /// The rules, and what is wanted.
     pub judge: Judge,
+    /// Whether it has to be back soon: what takes long is put off.
+    pub is_hurried: bool,
     counters: Counters,
     opened: u64,
+    met: bool,
+    now: u64,
     listed: u64,
+    tried: u64,
     found: u64,
     announced: Vec<Descriptor>,
     records: Vec<Record>,
@@ -83,6 +96,7 @@ type PortKey = (PlaceId, Generation, u32);
 type SegmentKey = (PlaceId, Generation, SegmentId);
 
 struct Open {
+    key: PortKey,
     file: SharedFile,
     port: Port,
     /// When it last announced anything, and when it is looked at next.
@@ -127,17 +141,50 @@ impl Tap {
     pub fn new(places: Places) -> Self {
         Self {
             places,
-            ports: HashMap::new(),
+            ports: Vec::new(),
+            unborn: Vec::new(),
             segments: HashMap::new(),
             remembered: Remembered::default(),
-            judge: Judge::new(),
+            judge: Judge::default(),
+            is_hurried: false,
             counters: Counters::default(),
             opened: 0,
+            met: false,
+            now: 0,
             listed: 0,
+            tried: 0,
             found: 0,
             announced: Vec::new(),
             records: Vec::new(),
         }
+    }
+
+    /// Lists directories with the next look, and looks at every port however silent it was.
+    pub fn somebody_comes(&mut self) {
+        self.listed = 0;
+        for open in &mut self.ports {
+            (open.due, open.busy) = (0, open.busy.max(self.now));
+        }
+    }
+
+    /// Whether participants met since the last time that was asked: a port appeared, or an
+    /// endpoint was announced.
+    pub fn met(&mut self) -> bool {
+        std::mem::take(&mut self.met)
+    }
+
+    /// The directories that are looked at.
+    pub fn directories(&self) -> impl Iterator<Item = &Path> {
+        self.places
+            .places
+            .values()
+            .map(|place| place.path.as_path())
+    }
+
+    /// How many.
+    #[must_use]
+    pub fn directory_count(&self) -> usize {
+        self.places.places.len()
     }
 
     /// Whether there is any port.
@@ -161,32 +208,40 @@ impl Tap {
 
     /// Looks everywhere once; appends what is of interest. How many messages were announced.
     pub fn look(&mut self, now: Moment, found: &mut Vec<Item>) -> usize {
+        self.now = now.monotonic;
         self.judge.refill(now.monotonic);
         if now.monotonic.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0 {
             self.listed = now.monotonic;
             self.scan(now, found);
+        } else if !self.unborn.is_empty() && now.monotonic.saturating_sub(self.tried) >= TRY_EVERY {
+            self.attach(now, found);
         }
-        let mut keys: Vec<_> = self
-            .ports
-            .iter()
-            .filter(|(_, open)| open.due <= now.monotonic)
-            .map(|(key, _)| *key)
-            .collect();
-        keys.sort_unstable_by_key(|(_, _, number)| *number);
+        let most = if self.is_hurried {
+            PER_LOOK_IN_A_HURRY
+        } else {
+            PER_LOOK
+        };
         let mut announced = 0;
-        for key in keys {
-            announced += self.look_at(key, now, found);
-            if announced >= PER_LOOK {
-                break;
+        for index in 0..self.ports.len() {
+            if self
+                .ports
+                .get(index)
+                .is_some_and(|open| open.due <= now.monotonic)
+            {
+                announced += self.look_at(index, now, found);
+                if announced >= most {
+                    break;
+                }
             }
         }
         announced
     }
 
-    fn look_at(&mut self, key: PortKey, now: Moment, found: &mut Vec<Item>) -> usize {
-        let Some(open) = self.ports.get_mut(&key) else {
+    fn look_at(&mut self, index: usize, now: Moment, found: &mut Vec<Item>) -> usize {
+        let Some(open) = self.ports.get_mut(index) else {
             return 0;
         };
+        let key = open.key;
         let mut announced = std::mem::take(&mut self.announced);
         let look = open.port.look(&open.file, now.monotonic, &mut announced);
         let number = announced.len();
@@ -208,7 +263,7 @@ impl Tap {
             None => {
                 // Truncated or overwritten; if it is a port again, the next listing finds it.
                 self.counters.malformed += 1;
-                self.ports.remove(&key);
+                self.ports.remove(index);
             }
         }
         for descriptor in announced.drain(..) {
@@ -277,6 +332,7 @@ impl Tap {
         self.counters.read += 1;
         if judgement == Judgement::Captured {
             self.counters.captured += 1;
+            self.met |= self.judge.announces;
             self.counters.captured_bytes += bytes.len() as u64;
             found.push(Item::Message {
                 time: now.calendar,
@@ -318,7 +374,12 @@ impl Tap {
 
     /// Opens what is new and lets go of what is gone or is another file by now.
     fn scan(&mut self, now: Moment, found: &mut Vec<Item>) {
-        let finds = now.monotonic.saturating_sub(self.found) >= FIND_EVERY || self.found == 0;
+        let every = if self.is_hurried {
+            FIND_IN_A_HURRY
+        } else {
+            FIND_EVERY
+        };
+        let finds = now.monotonic.saturating_sub(self.found) >= every || self.found == 0;
         if finds {
             self.found = now.monotonic;
             self.places.find();
@@ -328,7 +389,8 @@ impl Tap {
         }
         let places = &self.places.places;
         let inode = |place: &PlaceId, name| places.get(place)?.files.get(&name).copied();
-        self.ports.retain(|(place, generation, number), open| {
+        self.ports.retain(|open| {
+            let (place, generation, number) = &open.key;
             inode(place, Name::Port(*generation, *number)) == Some(open.file.inode())
         });
         self.segments
@@ -339,18 +401,25 @@ impl Tap {
                 }
                 Segment::Missing(_) => false,
             });
-        let mut new = Vec::new();
+        let known: HashSet<_> = self.ports.iter().map(|open| open.key).collect();
+        self.unborn.clear();
         for (id, place) in places {
             for name in place.files.keys() {
                 if let Name::Port(generation, number) = name
-                    && !self.ports.contains_key(&(*id, *generation, *number))
+                    && !known.contains(&(*id, *generation, *number))
                 {
                     let path = place.path.join(name.file_name());
-                    new.push(((*id, *generation, *number), path));
+                    self.unborn.push(((*id, *generation, *number), path));
                 }
             }
         }
-        for (key, path) in new {
+        self.attach(now, found);
+    }
+
+    /// Opens ports that have come to be.
+    fn attach(&mut self, now: Moment, found: &mut Vec<Item>) {
+        self.tried = now.monotonic;
+        for (key, path) in std::mem::take(&mut self.unborn) {
             if self.ports.len() >= MAX_PORTS {
                 self.counters.left_out += 1;
                 return;
@@ -359,17 +428,21 @@ impl Tap {
                 continue;
             };
             let (_, _, number) = key;
-            // Not laid out yet, or not as known: it is tried again when the directory changes.
             let Some((port, backlog)) = Port::attach(&file, number, now.monotonic) else {
+                // Not laid out yet, or not as known.
+                self.unborn.push((key, path));
                 continue;
             };
             let open = Open {
+                key,
                 file,
                 port,
                 busy: now.monotonic,
                 due: now.monotonic,
             };
-            self.ports.insert(key, open);
+            let at = self.ports.partition_point(|open| open.key.2 <= number);
+            self.ports.insert(at, open);
+            self.met = true;
             for descriptor in backlog {
                 self.read(key, &descriptor, now, false, found);
             }

@@ -6,10 +6,10 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::Guid;
 use ros2probe_wire::filter::{UNKNOWN_CAPACITY, UNKNOWN_CAPTURE_BYTES};
-use ros2probe_wire::record::{Record, Verdict, guid_words};
+use ros2probe_wire::record::{Record, Verdict, guid_words, kind};
 use ros2probe_wire::walk::{self, Bytes, Fate, MAGIC, Step, Walk};
+use ros2probe_wire::{EntityId, Guid};
 
 /// Submessages of one message that are followed; one with more is captured.
 const SUBMESSAGES: usize = 64;
@@ -41,12 +41,13 @@ pub struct Judge {
     capture_left: i64,
     records_left: i64,
     refilled: u64,
+    /// The message that was captured last is about endpoints or nodes, and more of that may follow.
+    pub announces: bool,
 }
 
-impl Judge {
-    /// Nothing classified.
-    #[must_use]
-    pub fn new() -> Self {
+/// Nothing classified.
+impl Default for Judge {
+    fn default() -> Self {
         Self {
             interest: HashMap::new(),
             metered: 0,
@@ -54,9 +55,12 @@ impl Judge {
             capture_left: CAPTURE_PER_SECOND,
             records_left: RECORDS_PER_SECOND,
             refilled: 0,
+            announces: false,
         }
     }
+}
 
+impl Judge {
     /// What is wanted of this writer or reader from now on; `None` = it is not classified.
     pub fn set(&mut self, guid: Guid, verdict: Option<Verdict>) {
         let key = guid_words(guid);
@@ -125,6 +129,9 @@ impl Judge {
                     ..walk.record
                 }),
                 Verdict::Meter | Verdict::Capture => {
+                    let is_sample = matches!(walk.record.kind, kind::DATA | kind::DATA_FRAG);
+                    let writer = walk.record.writer().entity;
+                    self.announces = is_sample && writer != EntityId::SPDP_WRITER;
                     records.truncate(first);
                     return Judgement::Captured;
                 }
@@ -170,7 +177,7 @@ impl Judge {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_wire::record::{flag, kind};
+    use ros2probe_wire::record::flag;
 
     use super::*;
 
@@ -209,7 +216,7 @@ mod tests {
 
     #[test]
     fn every_sample_of_a_measured_writer_becomes_a_record() {
-        let mut rules = Judge::new();
+        let mut rules = Judge::default();
         rules.set(guid(WRITER), Some(Verdict::Meter));
         rules.set(guid([0, 0, 2, 3]), Some(Verdict::Ignore));
         let message = message(&[(WRITER, 7), ([0, 0, 2, 3], 1), (WRITER, 8)]);
@@ -227,15 +234,22 @@ mod tests {
 
     #[test]
     fn discovery_is_captured_whatever_else_there_is() {
-        let mut rules = Judge::new();
+        let mut rules = Judge::default();
         rules.set(guid(WRITER), Some(Verdict::Meter));
-        let message = message(&[(WRITER, 1), ([0, 1, 0, 0xc2], 1)]);
-        assert_eq!(judge(&mut rules, &message), (Judgement::Captured, vec![]));
+        let participant = message(&[(WRITER, 1), ([0, 1, 0, 0xc2], 1)]);
+        assert_eq!(
+            judge(&mut rules, &participant),
+            (Judgement::Captured, vec![])
+        );
+        assert!(!rules.announces);
+        let endpoint = message(&[(WRITER, 1), ([0, 0, 3, 0xc2], 1)]);
+        assert_eq!(judge(&mut rules, &endpoint).0, Judgement::Captured);
+        assert!(rules.announces);
     }
 
     #[test]
     fn what_is_of_no_interest_or_no_rtps_is_left_alone() {
-        let mut rules = Judge::new();
+        let mut rules = Judge::default();
         rules.set(guid(WRITER), Some(Verdict::Ignore));
         assert_eq!(
             judge(&mut rules, &message(&[(WRITER, 1)])).0,
@@ -248,7 +262,7 @@ mod tests {
 
     #[test]
     fn an_unknown_writer_is_captured_then_metered_then_nothing() {
-        let mut rules = Judge::new();
+        let mut rules = Judge::default();
         let message = message(&[(WRITER, 1)]);
         let mut counts = [0; 3];
         for _ in 0..UNKNOWN_CAPTURE_BYTES {
@@ -273,7 +287,7 @@ mod tests {
 
     #[test]
     fn a_flood_of_invented_writers_stays_within_the_budget() {
-        let mut rules = Judge::new();
+        let mut rules = Judge::default();
         let mut captured = 0;
         for writer in 0..200_000_u32 {
             let [_, a, b, c] = writer.to_be_bytes();
@@ -291,7 +305,7 @@ mod tests {
 
     #[test]
     fn whether_anything_is_measured_follows_what_is_set() {
-        let mut rules = Judge::new();
+        let mut rules = Judge::default();
         assert!(!rules.measures());
         for _ in 0..2 {
             rules.set(guid(WRITER), Some(Verdict::Meter));

@@ -62,6 +62,8 @@ pub struct Portrait {
     pub lease: Duration,
     /// Announces security.
     pub secured: bool,
+    /// Its endpoints can be reached through shared memory, unless they say otherwise.
+    pub shared_memory: bool,
 }
 
 /// Where a participant is reached over UDP by unicast.
@@ -127,6 +129,10 @@ pub struct Endpoint {
     pub qos: Qos,
     /// First announcement.
     pub first_seen: Timestamp,
+    /// Whether it can be reached through shared memory; `None` = as its participant.
+    pub shared_memory: Option<bool>,
+    /// It can share its history in memory with endpoints of its host.
+    pub data_sharing: bool,
 }
 
 impl Portrait {
@@ -140,6 +146,10 @@ impl Portrait {
             process_id: announcement.process_id().or_else(low_bits),
             lease: announcement.lease,
             secured: announcement.is_secured,
+            shared_memory: announcement
+                .default_unicast
+                .iter()
+                .any(Locator::is_shared_memory),
         }
     }
 }

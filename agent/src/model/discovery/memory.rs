@@ -42,6 +42,8 @@ pub struct Remembered {
     /// Nanoseconds; `None` = infinite, here and below.
     lease: Option<u64>,
     secured: bool,
+    #[serde(default)]
+    shared_memory: bool,
     addresses: Addresses,
     nodes: Vec<RememberedNode>,
     /// Writer and number of the sample that told the nodes.
@@ -75,6 +77,10 @@ struct RememberedEndpoint {
     /// What follows is what only matching asks for; earlier agents did not keep it.
     #[serde(default)]
     matching: Matching,
+    #[serde(default)]
+    shared_memory: Option<bool>,
+    #[serde(default)]
+    data_sharing: bool,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -166,6 +172,7 @@ impl Remembered {
             process_id: portrait.process_id,
             lease: nanoseconds(portrait.lease),
             secured: portrait.secured,
+            shared_memory: portrait.shared_memory,
             addresses: participant.addresses.clone(),
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
             nodes_from: participant
@@ -193,6 +200,7 @@ impl Remembered {
                 process_id: self.process_id,
                 lease: duration(self.lease),
                 secured: self.secured,
+                shared_memory: self.shared_memory,
             },
             addresses: self.addresses.clone(),
             restored: Some(now),
@@ -256,6 +264,8 @@ impl RememberedEndpoint {
             minimum_separation: nanoseconds(qos.minimum_separation),
             partitions: qos.partitions.iter().map(ToString::to_string).collect(),
             matching: Matching::of(qos),
+            shared_memory: endpoint.shared_memory,
+            data_sharing: endpoint.data_sharing,
         }
     }
 
@@ -309,6 +319,8 @@ impl RememberedEndpoint {
                 representations: self.matching.representations(),
             },
             first_seen: now,
+            shared_memory: self.shared_memory,
+            data_sharing: self.data_sharing,
         };
         Some((guid, endpoint))
     }

@@ -334,3 +334,68 @@ fn two_hundred_hertz_reads_two_hundred() {
 fn an_idle_writer_is_small() {
     assert!(size_of::<Writer>() <= 1400, "{}", size_of::<Writer>());
 }
+
+fn in_shared_memory(record: Record) -> Record {
+    Record {
+        flags: flag::SHM,
+        ..record
+    }
+}
+
+#[test]
+fn in_shared_memory_messages_are_the_span_of_their_numbers_and_no_gap_is_a_loss() {
+    let mut bench = Bench::new(RELIABLE);
+    for number in [1, 2, 5, 9] {
+        bench.put(in_shared_memory(data(number))).wait(10);
+    }
+    bench.wait(60_000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.bytes, facts.lost), (9, 900, 0));
+    assert_eq!((facts.irrelevant, facts.duplicates), (0, 0));
+    let sampled = facts.sampled.unwrap();
+    assert_eq!((sampled.seen, sampled.span), (4, 9));
+    // Of the intervals only that between 1 and 2 is one.
+    assert_eq!(facts.interarrival.count(), 1);
+}
+
+#[test]
+fn one_fragment_that_was_seen_is_a_message_of_its_sample_s_size() {
+    let mut bench = Bench::new(RELIABLE);
+    bench.put(in_shared_memory(fragment(1, 4)));
+    bench.put(in_shared_memory(fragment(3, 1)));
+    bench.put(in_shared_memory(fragment(3, 10)));
+    let facts = bench.wait(60_000).facts();
+    assert_eq!((facts.messages, facts.bytes), (3, 28_500));
+    assert_eq!((facts.lost, facts.incomplete), (0, 0));
+    assert_eq!(facts.sampled.unwrap().seen, 2);
+}
+
+#[test]
+fn what_comes_by_the_network_beside_shared_memory_counts_once() {
+    let mut bench = Bench::new(RELIABLE);
+    for number in 1..=10 {
+        bench.data(number);
+        if number % 2 == 0 {
+            bench.put(in_shared_memory(data(number)));
+        }
+        bench.wait(10);
+    }
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost), (10, 0));
+    // Shared memory falls silent. What is missing up to the next sample may have gone there; from
+    // then on the network's gaps are losses again.
+    bench.wait(20_000);
+    bench.data(21).data(24).wait(20_000);
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.lost), (10 + 11 + 1, 2));
+}
+
+#[test]
+fn a_sample_half_of_which_came_by_the_network_is_no_loss_of_shared_memory() {
+    let mut bench = Bench::new(RELIABLE);
+    bench.fragments(1, 1..=5);
+    bench.put(in_shared_memory(fragment(1, 9)));
+    bench.put(in_shared_memory(data(2)));
+    let facts = bench.wait(60_000).facts();
+    assert_eq!((facts.messages, facts.lost, facts.incomplete), (2, 0, 0));
+}

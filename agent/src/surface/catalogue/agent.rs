@@ -15,7 +15,7 @@ pub(in crate::surface) const SOURCE_INFO: Metric = Metric::info(
 pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
     "ros2probe_capture_ability",
     &["ability"],
-    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded.",
+    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded, shared memory.",
 );
 pub(in crate::surface) const READY: Metric = Metric::gauge(
     "ros2probe_ready",
@@ -75,6 +75,25 @@ pub(in crate::surface) const REASSEMBLY: Metric = Metric::gauge(
     "Memory held to put captured fragments together, up to limits.reassembly_bytes.",
 )
 .unit("bytes");
+pub(in crate::surface) const SHM_OPEN: Metric = Metric::gauge(
+    "ros2probe_shm_open",
+    &["kind"],
+    "Ports and segments of Fast DDS's shared memory that are open, and directories they are in.",
+);
+pub(in crate::surface) const SHM_EVENTS: Metric = Metric::counter(
+    "ros2probe_shm_events_total",
+    &["event"],
+    "What the look at shared memory met: messages announced at ports, read, captured, missed, and what went wrong.",
+)
+.experimental();
+pub(in crate::surface) const SHM_LOOKS: Metric =
+    Metric::counter("ros2probe_shm_looks_total", &[], "Looks at shared memory.");
+pub(in crate::surface) const SHM_CPU: Metric = Metric::counter(
+    "ros2probe_shm_cpu_seconds_total",
+    &[],
+    "CPU time that they took, kept to capture.shm.cpu_percent.",
+)
+.unit("seconds");
 pub(in crate::surface) const DATAGRAMS: Metric = Metric::counter(
     "ros2probe_datagrams_total",
     &[],

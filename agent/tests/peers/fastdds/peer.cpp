@@ -1,5 +1,5 @@
-// A ROS 2 publisher or subscriber on Fast DDS, announced as rmw_fastrtps does: UDPv4 only (no
-// shared memory), the enclave in the participant's user data, ros_discovery_info republished whole
+// A ROS 2 publisher or subscriber on Fast DDS, announced as rmw_fastrtps does: UDPv4 only unless
+// it is asked for the default transports, which share memory; the enclave in the participant's user data, ros_discovery_info republished whole
 // whenever an entity comes or goes. Command line and log: ../peer.hpp.
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
@@ -54,6 +54,9 @@ class SerializedType : public TopicDataType {
   std::function<uint32_t()> getSerializedSizeProvider(void* sample) override {
     return [sample] { return static_cast<uint32_t>(static_cast<Payload*>(sample)->size()); };
   }
+
+  // Histories are shared of bounded types only.
+  bool is_bounded() const override { return true; }
 
   void* createData() override { return new Payload; }
   void deleteData(void* sample) override { delete static_cast<Payload*>(sample); }
@@ -146,10 +149,12 @@ class Context {
     qos.name("/");
     const char enclave[] = "enclave=/;";
     qos.user_data().setValue(std::vector<uint8_t>(enclave, enclave + sizeof enclave));
-    auto udp = std::make_shared<UDPv4TransportDescriptor>();
-    udp->receiveBufferSize = options.receive_buffer;
-    qos.transport().use_builtin_transports = false;
-    qos.transport().user_transports.push_back(udp);
+    if (!options.default_transport) {
+      auto udp = std::make_shared<UDPv4TransportDescriptor>();
+      udp->receiveBufferSize = options.receive_buffer;
+      qos.transport().use_builtin_transports = false;
+      qos.transport().user_transports.push_back(udp);
+    }
     participant_ = factory->create_participant(options.domain, qos);
     if (!participant_) peer::fail("cannot create a participant");
     publisher_ = participant_->create_publisher(PUBLISHER_QOS_DEFAULT);
@@ -186,7 +191,7 @@ class Context {
         options_.best_effort ? BEST_EFFORT_RELIABILITY_QOS : RELIABLE_RELIABILITY_QOS;
     qos.durability().kind = durability();
     qos.history().depth = options_.depth;
-    common(qos);
+    common(qos, options_.data_sharing);
     DataWriter* writer =
         publisher_->create_datawriter(create_topic(peer::dds_topic(ros_topic), cloud_type_), qos);
     if (!writer) peer::fail("cannot create a writer");
@@ -201,7 +206,7 @@ class Context {
         options_.best_effort ? BEST_EFFORT_RELIABILITY_QOS : RELIABLE_RELIABILITY_QOS;
     qos.durability().kind = durability();
     qos.history().depth = options_.depth;
-    common(qos);
+    common(qos, options_.data_sharing);
     DataReader* reader = subscriber_->create_datareader(
         create_topic(peer::dds_topic(ros_topic), cloud_type_), qos, listener);
     if (!reader) peer::fail("cannot create a reader");
@@ -228,8 +233,8 @@ class Context {
   };
 
   template <typename Qos>
-  static void common(Qos& qos) {
-    qos.data_sharing().off();
+  void common(Qos& qos, bool data_sharing = false) const {
+    if (!data_sharing) qos.data_sharing().off();
     qos.endpoint().history_memory_policy =
         eprosima::fastrtps::rtps::PREALLOCATED_WITH_REALLOC_MEMORY_MODE;
   }

@@ -10,6 +10,7 @@ use ros2probe_wire::record::{Verdict, kind};
 use tempfile::TempDir;
 
 use super::super::image::{PortImage, SegmentImage};
+use super::super::scan::Scope;
 use super::*;
 
 const MILLISECOND: u64 = 1_000_000;
@@ -43,7 +44,9 @@ struct Host {
 impl Host {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let mut tap = Tap::new(Places::fixed(vec![directory.path().to_path_buf()]));
+        let mut tap = Tap::new(Places::new(Scope::Directories(vec![
+            directory.path().to_path_buf(),
+        ])));
         tap.judge.set(writer(), Some(Verdict::Meter));
         Self {
             directory,
@@ -245,7 +248,7 @@ fn a_hundred_and_twenty_eight_idle_ports_are_looked_at_seldom_and_missed_by_nobo
     host.look_after(SECOND);
     host.look_after(SILENT_AFTER + 1);
     host.look_after(MILLISECOND);
-    let due = host.tap.ports.values();
+    let due = host.tap.ports.iter();
     let due = due.filter(|open| open.due <= host.now + MILLISECOND);
     assert_eq!(due.count(), 0);
     ports[77].push(segment.put(&sample(5)));
@@ -287,7 +290,7 @@ fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(64))]
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
     fn whatever_the_other_side_writes_the_tap_goes_on_and_stays_bounded(
         damage in proptest::collection::vec((any::<bool>(), 0_usize..2000, any::<u32>()), 1..40),

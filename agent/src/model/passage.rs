@@ -1,0 +1,129 @@
+//! How messages pass between a writer and a reader, as far as both announce it: by the network, or
+//! by a way of their host that a network does not show.
+//!
+//! It says what they would use, not what they did: whether their QoS fits is theirs to find out.
+
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Guid, GuidPrefix};
+
+use super::discovery::{Discovery, Endpoint};
+use super::snapshot::{Passage, PassageCount};
+
+/// Pairs of one topic that are looked at; the rest is taken to be as those are.
+const MAX_PAIRS: usize = 1024;
+
+/// Pairs of these writers and readers by how messages pass between them.
+pub(super) fn passages<'a>(
+    discovery: &Discovery,
+    writers: impl Iterator<Item = &'a Guid>,
+    readers: &(impl Iterator<Item = &'a Guid> + Clone),
+) -> Vec<PassageCount> {
+    let mut counts = Passage::ALL.map(|passage| PassageCount { passage, pairs: 0 });
+    let pairs = writers.flat_map(|writer| readers.clone().map(move |reader| (*writer, *reader)));
+    for (writer, reader) in pairs.take(MAX_PAIRS) {
+        let Some(passage) = passage(discovery, writer, reader) else {
+            continue;
+        };
+        let count = counts.iter_mut().find(|count| count.passage == passage);
+        if let Some(count) = count {
+            count.pairs += 1;
+        }
+    }
+    counts.into_iter().filter(|count| count.pairs > 0).collect()
+}
+
+fn passage(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Passage> {
+    let endpoints = discovery.endpoints();
+    let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
+    if is_one_process(discovery, writer.prefix, reader.prefix) {
+        return Some(Passage::SameProcess);
+    }
+    let (vendor, other) = (
+        vendor(discovery, writer.prefix),
+        vendor(discovery, reader.prefix),
+    );
+    if vendor != other || !is_one_host(vendor, writer.prefix, reader.prefix) {
+        return Some(Passage::Network);
+    }
+    let shared_memory = |guid: Guid, endpoint: &Endpoint| {
+        let participant = discovery.participants().get(&guid.prefix);
+        let default = participant.is_some_and(|known| known.portrait.shared_memory);
+        endpoint.shared_memory.unwrap_or(default)
+    };
+    Some(if of_writer.data_sharing && of_reader.data_sharing {
+        Passage::DataSharing
+    } else if !(shared_memory(writer, of_writer) && shared_memory(reader, of_reader)) {
+        Passage::Network
+    } else if vendor == VendorId::EPROSIMA {
+        Passage::SharedMemory
+    } else {
+        Passage::Iceoryx
+    })
+}
+
+fn vendor(discovery: &Discovery, prefix: GuidPrefix) -> VendorId {
+    let participant = discovery.participants().get(&prefix);
+    let [first, second, ..] = prefix.0;
+    participant.map_or(VendorId([first, second]), |known| known.portrait.vendor)
+}
+
+/// One participant, or two of one process: Fast DDS has vendor, host and process in the first eight
+/// bytes, the process's number in the fifth and sixth and something random in the next two.
+fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> bool {
+    one == other
+        || vendor(discovery, one) == VendorId::EPROSIMA
+            && vendor(discovery, other) == VendorId::EPROSIMA
+            && one.0.first_chunk::<8>() == other.0.first_chunk::<8>()
+}
+
+/// Fast DDS has vendor and host in the first four bytes. Others do not tell: only who announces
+/// shared memory is asked about.
+fn is_one_host(vendor: VendorId, one: GuidPrefix, other: GuidPrefix) -> bool {
+    vendor != VendorId::EPROSIMA || one.0.first_chunk::<4>() == other.0.first_chunk::<4>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::discovery::Caps;
+    use super::*;
+
+    fn prefix(bytes: [u8; 12]) -> GuidPrefix {
+        GuidPrefix(bytes)
+    }
+
+    #[test]
+    fn fast_dds_tells_host_and_process_by_its_prefix_and_others_do_not() {
+        let discovery = Discovery::new(Caps {
+            participants: 1,
+            endpoints: 1,
+            nodes: 1,
+        });
+        let one = prefix([1, 15, 13, 4, 9, 9, 7, 7, 0, 0, 0, 0]);
+        let sibling = prefix([1, 15, 13, 4, 9, 9, 7, 7, 1, 0, 0, 0]);
+        let neighbour = prefix([1, 15, 13, 4, 8, 9, 7, 7, 0, 0, 0, 0]);
+        let stranger = prefix([1, 15, 14, 4, 9, 9, 7, 7, 0, 0, 0, 0]);
+        assert!(is_one_process(&discovery, one, one));
+        assert!(is_one_process(&discovery, one, sibling));
+        assert!(!is_one_process(&discovery, one, neighbour));
+        assert!(is_one_host(VendorId::EPROSIMA, one, neighbour));
+        assert!(!is_one_host(VendorId::EPROSIMA, one, stranger));
+        let (cyclone, other) = (
+            prefix([1, 16, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]),
+            prefix([1, 16, 0, 0, 1, 1, 1, 1, 2, 1, 1, 1]),
+        );
+        assert!(is_one_process(&discovery, cyclone, cyclone));
+        assert!(!is_one_process(&discovery, cyclone, other));
+    }
+
+    #[test]
+    fn endpoints_that_are_not_known_are_no_pair() {
+        let discovery = Discovery::new(Caps {
+            participants: 1,
+            endpoints: 1,
+            nodes: 1,
+        });
+        let guid = Guid::default();
+        let counts = passages(&discovery, [guid].iter(), &[guid].iter());
+        assert_eq!(counts, []);
+    }
+}
