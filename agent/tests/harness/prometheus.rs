@@ -22,6 +22,15 @@ pub(crate) struct Prometheus<'a> {
     _directory: TempDir,
 }
 
+/// What a Prometheus does.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// Keeps, evaluates and answers, and takes what others push.
+    Server,
+    /// Scrapes and pushes, and keeps only what it could not deliver.
+    Agent,
+}
+
 impl<'a> Prometheus<'a> {
     /// Scrapes these targets (`address:port`) and evaluates these files of rules each second.
     pub(crate) fn start(
@@ -29,23 +38,36 @@ impl<'a> Prometheus<'a> {
         targets: &[String],
         rules: &[PathBuf],
     ) -> Result<Prometheus<'a>> {
-        let directory = tempfile::tempdir()?;
-        let configuration = directory.path().join("prometheus.yml");
         let text = format!(
             "global: {{scrape_interval: 1s, evaluation_interval: 1s}}\n\
              rule_files: {rules:?}\n\
              scrape_configs: [{{job_name: ros2probe, static_configs: [{{targets: {targets:?}}}]}}]\n",
         );
+        Prometheus::run(host, Kind::Server, &text)
+    }
+
+    /// As a configuration says, on port 9090.
+    pub(crate) fn run(host: &'a Namespace, kind: Kind, text: &str) -> Result<Prometheus<'a>> {
+        let directory = tempfile::tempdir()?;
+        let configuration = directory.path().join("prometheus.yml");
         std::fs::write(&configuration, text)?;
-        let arguments = [
+        let data = directory.path().join("data");
+        let data = data.display();
+        let own = match kind {
+            Kind::Server => [
+                format!("--storage.tsdb.path={data}"),
+                "--web.enable-remote-write-receiver".to_owned(),
+            ],
+            Kind::Agent => [
+                format!("--storage.agent.path={data}"),
+                "--enable-feature=agent".to_owned(),
+            ],
+        };
+        let arguments = own.into_iter().chain([
             format!("--config.file={}", configuration.display()),
-            format!(
-                "--storage.tsdb.path={}",
-                directory.path().join("data").display()
-            ),
-            format!("--web.listen-address={SERVER}"),
+            "--web.listen-address=0.0.0.0:9090".to_owned(),
             "--log.level=error".to_owned(),
-        ];
+        ]);
         let process = Process::start(&host.outside(), "prometheus", arguments).context(INSTALL)?;
         Ok(Prometheus {
             host,
@@ -106,6 +128,18 @@ impl<'a> Prometheus<'a> {
             .iter()
             .map(|series| Ok(serde_json::from_value(series["metric"].clone())?));
         labels.collect()
+    }
+
+    /// The times of a series' samples: of its first, for an expression such as `up[30s]`.
+    pub(crate) fn times(&self, expression: &str) -> Result<Vec<f64>> {
+        let answer = self.ask(expression)?;
+        let samples = answer.pointer("/data/result/0/values");
+        let samples = samples.and_then(|samples| samples.as_array());
+        let samples = samples.with_context(|| format!("{expression}: {answer}"))?;
+        Ok(samples
+            .iter()
+            .filter_map(|sample| sample.get(0)?.as_f64())
+            .collect())
     }
 
     fn ask(&self, expression: &str) -> Result<serde_json::Value> {
