@@ -14,7 +14,7 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 
 use crate::config::{Watch, Watchlist};
 use crate::state::StateDirectory;
-use crate::surface::Board;
+use crate::surface::{AgentEvent, Board};
 use kept::Keeper;
 pub use kept::{Kept, load};
 
@@ -256,7 +256,12 @@ impl Watches {
                 return Err(Refused::Unknown);
             }
             Ok(())
-        })
+        })?;
+        self.board.events().tell(AgentEvent::WatchRemoved {
+            watch: pattern.to_owned(),
+            domain_id,
+        });
+        Ok(())
     }
 
     /// What is in force.
@@ -295,6 +300,12 @@ impl Watches {
             }
             Ok(())
         })?;
+        if done != Done::Unchanged {
+            self.board.events().tell(AgentEvent::WatchAdded {
+                watch: watch.pattern.clone(),
+                domain_id: watch.domain_id,
+            });
+        }
         Ok(done)
     }
 

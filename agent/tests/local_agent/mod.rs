@@ -53,10 +53,19 @@ impl LocalAgent {
 
     /// As [`Self::start`], with an environment of its own.
     pub fn start_as(command: &mut Command, arguments: &[&str]) -> Self {
+        Self::replay(command, &capture(), arguments)
+    }
+
+    /// As [`Self::start`], with another capture.
+    pub fn start_on(capture: &Path, arguments: &[&str]) -> Self {
+        Self::replay(&mut rp(), capture, arguments)
+    }
+
+    fn replay(command: &mut Command, capture: &Path, arguments: &[&str]) -> Self {
         let mut child = command
             .args(["run", "--metrics", "127.0.0.1:0", "--api", "127.0.0.1:0"])
             .arg("--replay")
-            .arg(capture())
+            .arg(capture)
             .args(arguments)
             .stdout(Stdio::null())
             .stderr(Stdio::piped())

@@ -3,6 +3,7 @@
 //!
 //! A module for each noun gives its routes; what every request has to pass is in `security`.
 
+mod events;
 mod health;
 mod openapi;
 mod parameters;
@@ -45,6 +46,7 @@ pub struct Context {
 fn nouns() -> OpenApiRouter<Context> {
     OpenApiRouter::with_openapi(openapi::head())
         .merge(watch::routes())
+        .merge(events::routes())
         .merge(health::routes())
         .merge(reload::routes())
         .merge(openapi::routes())

@@ -37,6 +37,7 @@ const COMMON: [(&str, &str); 6] = [
     components(schemas(ProblemBody)),
     tags(
         (name = "watch", description = "What is measured, changed while the agent runs."),
+        (name = "events", description = "What happens, as it happens."),
         (name = "agent", description = "The agent itself."),
     )
 )]

@@ -47,6 +47,8 @@ pub enum Code {
     InvalidConfiguration,
     /// Too fast.
     TooManyRequests,
+    /// As many clients follow events as may.
+    TooManyStreams,
     /// The agent is about to end.
     Ending,
 }
@@ -153,6 +155,11 @@ impl Code {
                 StatusCode::TOO_MANY_REQUESTS,
                 "Too many requests",
             ),
+            Self::TooManyStreams => (
+                "too-many-streams",
+                StatusCode::SERVICE_UNAVAILABLE,
+                "Too many streams of events",
+            ),
             Self::Ending => (
                 "ending",
                 StatusCode::SERVICE_UNAVAILABLE,
@@ -204,7 +211,7 @@ impl IntoResponse for Problem {
             Code::Unauthorized => {
                 headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
             }
-            Code::TooManyRequests => {
+            Code::TooManyRequests | Code::TooManyStreams => {
                 headers.insert(RETRY_AFTER, HeaderValue::from_static("1"));
             }
             _ => {}

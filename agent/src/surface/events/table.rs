@@ -221,7 +221,7 @@ pub(super) const WATCH_ADDED: Definition = Definition::new(
     "ros2probe.watch.added",
     Severity::Info,
     &["watch", "watch_domain_id"],
-    "Somebody asked through the API for a topic to be watched.",
+    "Somebody asked through the API for a topic to be watched, or to be watched otherwise.",
 );
 pub(super) const WATCH_REMOVED: Definition = Definition::new(
     "ros2probe.watch.removed",

@@ -1,0 +1,404 @@
+//! `GET /events`: what happens, as server-sent events (WHATWG HTML, 9.2).
+//!
+//! Each stream has its own place in the log of events and reads as fast as its client does; it
+//! holds nobody up. What is overwritten before a slow client came to it is told as `lagged`. Streams
+//! are limited in number and end when the agent ends.
+
+use std::collections::VecDeque;
+use std::convert::Infallible;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::http::HeaderMap;
+use axum::http::header::CACHE_CONTROL;
+use axum::response::sse::{Event, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream;
+use serde::ser::SerializeMap as _;
+use serde::{Deserialize, Serialize, Serializer};
+use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::time::sleep;
+use tokio_util::sync::CancellationToken;
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::parameters::Parameters;
+use super::problem::{Code, Problem, ProblemBody};
+use crate::config::{Watch, Watchlist};
+use crate::surface::EventLog;
+use crate::surface::events::{EVENTS, Place, Reader, Record, Value};
+
+/// Streams at once, of all listeners: fewer than connections, so that requests find one.
+static STREAMS: Semaphore = Semaphore::const_new(MAX_STREAMS);
+const MAX_STREAMS: usize = 16;
+/// Pause after which a stream says that it is alive.
+const BEAT: Duration = Duration::from_secs(15);
+/// After how long a client that was cut off should come again.
+const RETRY: Duration = Duration::from_secs(2);
+/// Events made into text at once.
+const BATCH: usize = 64;
+/// Names or topics in one filter.
+const MAX_FILTERS: usize = 32;
+/// Stands for the place in front of the oldest event that is kept.
+const OLDEST: &str = "0";
+
+#[derive(Clone, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+struct Selection {
+    /// Events behind this id; `0` = all that are kept. Without it, and without the header
+    /// `Last-Event-ID`, which goes first: those that are still to come.
+    #[param(pattern = r"^(0|[0-9a-f]{1,16}-[0-9]{1,19})$", example = "0")]
+    after: Option<String>,
+    /// Only events of these names, separated by commas; `*` at the end of one stands for any rest.
+    #[param(max_length = 1024, example = "ros2.message.lost,ros2.topic.*")]
+    name: Option<String>,
+    /// Only events about these topics, separated by commas: ROS names or globs as in a watch.
+    #[param(max_length = 4096, example = "/points")]
+    topic: Option<String>,
+    /// Whether to wait for what is to come; `false` ends the stream behind the latest event.
+    follow: Option<bool>,
+}
+
+/// One event: the `data` of a message, whose `event` is its name and whose `id` is its id.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Event)]
+struct EventView<'a> {
+    /// Where to go on after a break. Belongs to one run of the agent.
+    #[schema(example = "641a2b3c4d5e6-17")]
+    id: String,
+    /// When it happened, in UTC.
+    #[schema(format = DateTime)]
+    time: String,
+    /// What it is, as the README lists.
+    #[schema(example = "ros2.message.lost")]
+    name: &'static str,
+    /// `INFO`, `WARN` or `ERROR`.
+    severity: &'static str,
+    /// What is known of it, by the names of the metrics' labels.
+    #[schema(value_type = Object)]
+    attributes: Attributes<'a>,
+}
+
+#[derive(Debug)]
+struct Attributes<'a>(&'a [(&'static str, Value)]);
+
+/// Events are missing here: the `data` of a message whose `event` is `lagged`.
+#[derive(Debug, Serialize)]
+struct Lagged {
+    /// How many; null when they were of another run of the agent, which nobody remembers.
+    missed: Option<u64>,
+    /// `overwritten` before they could be sent, or `restarted`: the id was of another run.
+    reason: &'static str,
+}
+
+/// What one client wants to see.
+#[derive(Debug, Default)]
+struct Filter {
+    names: Vec<String>,
+    topics: Option<Watchlist>,
+}
+
+/// One client's stream.
+struct Stream {
+    log: Arc<EventLog>,
+    stop: CancellationToken,
+    filter: Filter,
+    follow: bool,
+    /// The number of the last event that was looked at.
+    place: u64,
+    waiting: VecDeque<Event>,
+    _permit: SemaphorePermit<'static>,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(events))
+}
+
+/// What happens, as it happens
+///
+/// Server-sent events: each message has the event's name as `event`, its id as `id` and an `Event`
+/// as `data`. A client that comes again with the last id gets what it missed, as far as it is kept
+/// (the last 4096 events). What it does not get is told by a message `lagged` whose data have `missed`,
+/// a number or null, and `reason`: `overwritten` before it could be sent, or `restarted`, for an id
+/// of an earlier run of the agent. Comments keep the stream alive.
+#[utoipa::path(
+    get,
+    path = "/events",
+    tag = "events",
+    params(
+        Selection,
+        ("Last-Event-ID" = Option<String>, Header,
+            description = "Id of the last event that was received, as a browser sends it."),
+    ),
+    responses(
+        (status = 200, description = "Events, until the client goes or the agent ends.",
+            body = EventView<'static>, content_type = "text/event-stream"),
+        (status = 422, description = "No such event name or topic, or no id.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 503, description = "There are too many streams already, or the agent is about to end.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn events(
+    State(context): State<Context>,
+    headers: HeaderMap,
+    Parameters(selection): Parameters<Selection>,
+) -> Result<Response, Problem> {
+    let filter = Filter::parse(&selection)?;
+    let last_event_id = headers.get("last-event-id").map(|id| id.to_str());
+    let last_event_id = last_event_id
+        .transpose()
+        .map_err(|_| no_id("Last-Event-ID"))?;
+    // A client that has received nothing yet sends an empty one.
+    let last_event_id = last_event_id.filter(|id| !id.is_empty());
+    let log = Arc::clone(context.board.events());
+    let (place, restarted) = match last_event_id.or(selection.after.as_deref()) {
+        None => (log.last(), false),
+        Some(OLDEST) => (0, false),
+        Some(id) => match log.place(id).ok_or_else(|| no_id(id))? {
+            Place::Behind(number) => (number, false),
+            Place::Elsewhere => (0, true),
+        },
+    };
+    let permit = STREAMS.try_acquire().map_err(|_| {
+        let detail = format!("{MAX_STREAMS} streams are open, which is the limit");
+        Problem::new(Code::TooManyStreams, detail)
+    })?;
+    let mut stream = Stream {
+        log,
+        stop: context.stop.clone(),
+        filter,
+        follow: selection.follow.unwrap_or(true),
+        place,
+        waiting: VecDeque::new(),
+        _permit: permit,
+    };
+    stream.begin(restarted);
+    let stream = stream::unfold(stream, |mut stream| async {
+        let message = stream.next().await?;
+        Some((Ok::<_, Infallible>(message), stream))
+    });
+    Ok(([(CACHE_CONTROL, "no-store")], Sse::new(stream)).into_response())
+}
+
+fn no_id(text: &str) -> Problem {
+    let text: String = text.chars().take(64).collect();
+    Problem::new(
+        Code::InvalidRequest,
+        format!("`{text}` is no id of an event; `after=0` asks for all that are kept"),
+    )
+}
+
+impl Stream {
+    /// The first message tells the place, so that a client that is cut off before the first event
+    /// comes back to it.
+    fn begin(&mut self, restarted: bool) {
+        let greeting = Event::default().comment("ros2probe").retry(RETRY);
+        self.waiting.push_back(greeting.id(self.log.id(self.place)));
+        if restarted {
+            self.lag(None, "restarted");
+        }
+    }
+
+    async fn next(&mut self) -> Option<Event> {
+        loop {
+            if let Some(message) = self.waiting.pop_front() {
+                return Some(message);
+            }
+            if self.read() {
+                continue;
+            }
+            if !self.follow {
+                return None;
+            }
+            tokio::select! {
+                biased;
+                () = self.log.wait(self.place) => {}
+                () = self.stop.cancelled() => return None,
+                () = sleep(BEAT) => {
+                    // Also tells how far a filter has looked.
+                    let beat = Event::default().comment("").id(self.log.id(self.place));
+                    return Some(beat);
+                }
+            }
+        }
+    }
+
+    /// Takes the next events into `waiting`; whether there were any.
+    fn read(&mut self) -> bool {
+        let batch = self.log.read(self.place, BATCH);
+        if batch.lagged > 0 {
+            self.log.overtook(Reader::Stream, batch.lagged);
+            self.place += batch.lagged;
+            self.lag(Some(batch.lagged), "overwritten");
+        }
+        for record in batch
+            .records
+            .iter()
+            .filter(|record| self.filter.wants(record))
+        {
+            let message = Event::default()
+                .event(record.definition.name)
+                .id(self.log.id(record.number));
+            self.waiting.push_back(message.data(self.text(record)));
+        }
+        let is_news = batch.last > self.place || batch.lagged > 0;
+        self.place = batch.last;
+        is_news
+    }
+
+    fn lag(&mut self, missed: Option<u64>, reason: &'static str) {
+        let message = Event::default().event("lagged").id(self.log.id(self.place));
+        let lagged = Lagged { missed, reason };
+        let text = serde_json::to_string(&lagged).unwrap_or_default();
+        self.waiting.push_back(message.data(text));
+    }
+
+    fn text(&self, record: &Record) -> String {
+        let view = EventView {
+            id: self.log.id(record.number),
+            time: record.time(),
+            name: record.definition.name,
+            severity: record.severity.text(),
+            attributes: Attributes(&record.attributes),
+        };
+        // Written to memory, which does not fail.
+        serde_json::to_string(&view).unwrap_or_default()
+    }
+}
+
+impl Serialize for Attributes<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(Some(self.0.len()))?;
+        for (name, value) in self.0 {
+            match value {
+                Value::Text(text) => map.serialize_entry(name, text)?,
+                Value::Number(number) => map.serialize_entry(name, number)?,
+                Value::Real(real) => map.serialize_entry(name, real)?,
+                Value::List(list) => map.serialize_entry(name, list)?,
+            }
+        }
+        map.end()
+    }
+}
+
+impl Filter {
+    fn parse(selection: &Selection) -> Result<Self, Problem> {
+        let invalid = |detail: String| Problem::new(Code::InvalidRequest, detail);
+        let names = split(selection.name.as_deref())?;
+        let unknown = |name: &&String| !EVENTS.iter().any(|event| covers(name, event.name));
+        if let Some(name) = names.iter().find(unknown) {
+            return Err(invalid(format!("no event has the name `{name}`")));
+        }
+        let topics = split(selection.topic.as_deref())?;
+        if topics.is_empty() {
+            let topics = None;
+            return Ok(Self { names, topics });
+        }
+        let watch = |topic: &String| {
+            Watch::named(topic).map_err(|error| invalid(format!("the topic `{topic}` {error}")))
+        };
+        let watches = topics.iter().map(watch).collect::<Result<Vec<_>, _>>()?;
+        let topics = Watchlist::new(watches).map_err(|error| invalid(error.to_string()))?;
+        Ok(Self {
+            names,
+            topics: Some(topics),
+        })
+    }
+
+    fn wants(&self, record: &Record) -> bool {
+        let name = record.definition.name;
+        let named = self.names.is_empty() || self.names.iter().any(|each| covers(each, name));
+        named
+            && self.topics.as_ref().is_none_or(|topics| {
+                matches!(record.attribute("topic"),
+                    Some(Value::Text(topic)) if !topics.matching(0, topic).is_empty())
+            })
+    }
+}
+
+fn split(list: Option<&str>) -> Result<Vec<String>, Problem> {
+    let parts = list.into_iter().flat_map(|list| list.split(','));
+    let parts: Vec<_> = parts.map(|part| part.trim().to_owned()).collect();
+    if parts.len() > MAX_FILTERS {
+        let detail = format!("a filter has at most {MAX_FILTERS} parts");
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    Ok(parts)
+}
+
+fn covers(pattern: &str, name: &str) -> bool {
+    match pattern.strip_suffix('*') {
+        Some(beginning) => name.starts_with(beginning),
+        None => pattern == name,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::AgentEvent;
+
+    fn selection(name: &str, topic: &str) -> Selection {
+        let given = |text: &str| (!text.is_empty()).then(|| text.to_owned());
+        Selection {
+            name: given(name),
+            topic: given(topic),
+            ..Selection::default()
+        }
+    }
+
+    #[test]
+    fn filters_that_can_never_match_are_refused() {
+        for (name, topic) in [
+            ("ros2.message.lost", ""),
+            ("ros2.message.lost, ros2probe.*", "/points,/camera/**"),
+            ("*", ""),
+        ] {
+            assert!(
+                Filter::parse(&selection(name, topic)).is_ok(),
+                "{name} {topic}"
+            );
+        }
+        let many = vec!["/a"; MAX_FILTERS + 1].join(",");
+        for (name, topic) in [
+            ("ros2.message", ""),
+            ("ros3.*", ""),
+            (",", ""),
+            ("", "points"),
+            ("", "/a,,/b"),
+            ("", many.as_str()),
+        ] {
+            let refused = Filter::parse(&selection(name, topic));
+            assert_eq!(refused.unwrap_err().code(), Code::InvalidRequest);
+        }
+    }
+
+    #[tokio::test]
+    async fn a_stream_ends_with_the_agent_after_what_has_happened() {
+        let log = Arc::new(EventLog::new());
+        let stop = CancellationToken::new();
+        log.tell(AgentEvent::Reloaded { watches: 1 });
+        stop.cancel();
+        let mut stream = Stream {
+            log,
+            stop,
+            filter: Filter::default(),
+            follow: true,
+            place: 0,
+            waiting: VecDeque::new(),
+            _permit: STREAMS.try_acquire().unwrap(),
+        };
+        stream.begin(true);
+        let mut count = 0;
+        while stream.next().await.is_some() {
+            count += 1;
+        }
+        // The greeting, `lagged` and the event.
+        assert_eq!(count, 3);
+    }
+}
