@@ -231,7 +231,7 @@ fn a_client_that_comes_back_goes_on_where_it_was_or_is_told_what_it_missed() {
 }
 
 #[test]
-fn lost_messages_are_told_with_writer_node_and_numbers() {
+fn lost_messages_and_unfit_readers_are_told_with_who_and_what() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("lossy.pcap");
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../wire/tests/data");
@@ -263,6 +263,17 @@ fn lost_messages_are_told_with_writer_node_and_numbers() {
             .ends_with(".00001403")
     );
     assert!(lost[0].attribute("ros_node").is_string(), "{lost:?}");
+
+    // Its other reader asks for more than it offers.
+    let unfit = kept(&agent, "&name=ros2.qos.*");
+    assert_eq!(unfit[0].event, "ros2.qos.incompatible");
+    assert_eq!(unfit[0].attribute("topic"), "/chatter_be");
+    assert_eq!(
+        unfit[0].attribute("policies"),
+        serde_json::json!(["reliability"])
+    );
+    assert_eq!(unfit[0].attribute("writer"), lost[0].attribute("writer"));
+    assert_eq!(unfit[0].json()["severity"], "WARN");
 }
 
 #[test]

@@ -13,6 +13,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::churn;
+use super::diagnosis::Diagnosis;
 use super::journal::Loss;
 use super::snapshot::WatchState;
 
@@ -22,6 +23,8 @@ const WAITING: u16 = 512;
 const BURSTS: usize = 1024;
 /// Longest text kept, as of a topic's name.
 const TEXT: usize = 256;
+/// Longest list kept, as of the participants of a duplicate node.
+const LIST: usize = 8;
 
 /// One thing that happened.
 #[derive(Clone, Debug, PartialEq)]
@@ -104,6 +107,13 @@ pub enum EventKind {
         /// When its last message came, if any did.
         last_message: Option<Timestamp>,
     },
+    /// Something is wrong with the graph, in another way than before, or not any more.
+    Diagnosis {
+        /// It is not any more.
+        resolved: bool,
+        /// What it is, or was last.
+        finding: Diagnosis,
+    },
 }
 
 /// Lost samples of one writer.
@@ -136,6 +146,8 @@ pub enum Class {
     Loss,
     /// Expectations and silence.
     Expectation,
+    /// Findings about the graph.
+    Diagnosis,
 }
 
 /// What was taken.
@@ -179,6 +191,7 @@ impl EventKind {
             Self::Node { .. } => Class::Node,
             Self::Loss(_) => Class::Loss,
             Self::Expectation { .. } | Self::Silence { .. } => Class::Expectation,
+            Self::Diagnosis { .. } => Class::Diagnosis,
         }
     }
 }
@@ -264,6 +277,22 @@ pub fn bounded_shared(text: &Arc<str>) -> Arc<str> {
         return Arc::clone(text);
     }
     bounded(text).into()
+}
+
+/// A finding with no more of its lists than is kept.
+#[must_use]
+pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
+    let mut finding = finding.clone();
+    match &mut finding {
+        Diagnosis::TypeConflict { types, .. } => types.truncate(LIST),
+        Diagnosis::TypeHashConflict { hashes, .. } => hashes.truncate(LIST),
+        Diagnosis::DuplicateNode { participants, .. } => participants.truncate(LIST),
+        Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(LIST),
+        Diagnosis::QosIncompatible { .. }
+        | Diagnosis::UnheardPublisher { .. }
+        | Diagnosis::UnfedSubscriber { .. } => {}
+    }
+    finding
 }
 
 #[cfg(test)]

@@ -18,9 +18,9 @@ use ros2probe_wire::{
     Cursor, Endianness, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError,
 };
 
-use super::diagnosis::Examiner;
+use super::diagnosis::{self, Examiner};
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin};
-use super::event::{EventKind, Taken, bounded, bounded_shared};
+use super::event::{EventKind, Taken, bounded, bounded_finding, bounded_shared};
 use super::expectation::Evidence;
 use super::header::begins_with_header;
 use super::interest::Interest;
@@ -667,7 +667,23 @@ impl Observer {
     }
 
     fn examine(&mut self, now: Timestamp) {
+        let before = Arc::clone(self.examiner.current());
         self.examiner.examine(&self.discovery, &self.topics, now);
+        let after = self.examiner.current();
+        if Arc::ptr_eq(&before, after) {
+            return;
+        }
+        for change in diagnosis::changes(&before.list, &after.list) {
+            let (resolved, finding) = match change {
+                diagnosis::Change::Appeared(finding) | diagnosis::Change::Changed(finding) => {
+                    (false, finding)
+                }
+                diagnosis::Change::Resolved(finding) => (true, finding),
+            };
+            let finding = bounded_finding(finding);
+            let kind = EventKind::Diagnosis { resolved, finding };
+            self.journal.events.push(now, kind);
+        }
     }
 
     /// Gives free measuring places, and those of vanished topics, to topics that were kept out.

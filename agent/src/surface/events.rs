@@ -331,6 +331,7 @@ const fn group(class: Class) -> &'static str {
         Class::Node => "ros2.node.*",
         Class::Loss => "ros2.message.*",
         Class::Expectation => "ros2.topic.*",
+        Class::Diagnosis => "ros2.graph.*",
     }
 }
 

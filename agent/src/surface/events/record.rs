@@ -1,7 +1,8 @@
 //! One event in words: what streams and log records carry. Made from the facts when somebody reads
 //! it, so that an event nobody reads costs no formatting.
 
-use std::fmt::Write as _;
+use std::borrow::Cow;
+use std::fmt::{Display, Write as _};
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::discovery::Role;
@@ -9,10 +10,12 @@ use ros2probe_wire::names::DdsTopic;
 
 use super::table::{self, Definition, Severity};
 use crate::model::churn;
+use crate::model::diagnosis::{Diagnosis, Policy};
 use crate::model::event::{EventKind, LossBurst, bounded};
 use crate::model::snapshot::WatchState;
 use crate::model::topic::Naming;
 use crate::surface::SourceKind;
+use crate::surface::robot::series_name;
 
 const SECONDS_OF_A_DAY: u64 = 86_400;
 const NANOSECONDS: u64 = 1_000_000_000;
@@ -109,7 +112,7 @@ pub enum Value {
     /// A quantity.
     Real(f64),
     /// Several texts.
-    List(Vec<&'static str>),
+    List(Vec<String>),
 }
 
 impl Record {
@@ -149,6 +152,12 @@ impl Happened {
             Self::Robot(EventKind::Loss(_)) => &table::MESSAGE_LOST,
             Self::Robot(EventKind::Expectation { .. }) => &table::EXPECTATION_CHANGED,
             Self::Robot(EventKind::Silence { .. }) => &table::TOPIC_SILENT,
+            Self::Robot(EventKind::Diagnosis { resolved, finding }) => match (finding, resolved) {
+                (Diagnosis::QosIncompatible { .. }, false) => &table::QOS_INCOMPATIBLE,
+                (Diagnosis::QosIncompatible { .. }, true) => &table::QOS_RESOLVED,
+                (_, false) => &table::GRAPH_DIAGNOSED,
+                (_, true) => &table::GRAPH_RESOLVED,
+            },
             Self::Agent(event) => match event {
                 AgentEvent::Started { .. } => &table::STARTED,
                 AgentEvent::Dropped { .. } => &table::CAPTURE_DROPPED,
@@ -168,6 +177,11 @@ impl Happened {
         let relieves = match self {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
             Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
+            // Usual while nodes start, and with tools that publish for whoever may come.
+            Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
+                finding,
+                Diagnosis::UnheardPublisher { .. } | Diagnosis::UnfedSubscriber { .. }
+            ),
             _ => false,
         };
         if relieves {
@@ -234,14 +248,13 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             message_type,
         } => {
             let naming = naming(topic);
-            let name = naming.as_ref().map_or(&**topic, |naming| &naming.name);
             let role = match role {
                 Role::Writer => "writer",
                 Role::Reader => "reader",
             };
             vec![
                 domain(domain_id),
-                ("topic", Some(text(name))),
+                ("topic", Some(text(&series(naming.as_ref(), topic)))),
                 ("kind", naming.as_ref().map(|naming| text(naming.kind))),
                 ("role", Some(text(role))),
                 ("endpoint", written(guid)),
@@ -268,9 +281,7 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             first,
             last,
         }) => {
-            let name = |topic: &str| {
-                naming(topic).map_or_else(|| text(topic), |naming| text(&naming.name))
-            };
+            let name = |topic: &str| text(&series(naming(topic).as_ref(), topic));
             let topic = topic.as_ref();
             vec![
                 (
@@ -298,7 +309,7 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             ("watch", Some(text(watch))),
             ("from", from.map(|from| text(from.label()))),
             ("to", Some(text(to.label()))),
-            ("violations", Some(Value::List(violations.clone()))),
+            ("violations", list(violations)),
         ],
         EventKind::Silence {
             domain_id,
@@ -314,7 +325,68 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
                 ("last_message_seconds_ago", ago),
             ]
         }
+        EventKind::Diagnosis { finding, .. } => self::finding(finding),
     }
+}
+
+fn finding(finding: &Diagnosis) -> Vec<(&'static str, Option<Value>)> {
+    let mut values = Vec::new();
+    if !matches!(finding, Diagnosis::QosIncompatible { .. }) {
+        values.push(("diagnosis", Some(text(finding.kind()))));
+    }
+    if let Some(topic) = finding.topic() {
+        let name = series_name(topic.kind, &topic.name, &topic.dds_name);
+        values.push(("domain_id", number(topic.domain_id)));
+        values.push(("topic", Some(text(&name))));
+    }
+    values.extend(match finding {
+        Diagnosis::QosIncompatible {
+            writer,
+            reader,
+            policies,
+            ..
+        } => vec![
+            ("writer", written(writer)),
+            ("reader", written(reader)),
+            ("policies", list(policies.iter().map(Policy::label))),
+        ],
+        Diagnosis::TypeConflict { types, .. } => vec![("message_types", list(types))],
+        Diagnosis::TypeHashConflict {
+            message_type,
+            hashes,
+            ..
+        } => vec![
+            ("message_types", list([message_type])),
+            ("type_hashes", list(hashes)),
+        ],
+        Diagnosis::DuplicateNode {
+            domain_id,
+            node,
+            participants,
+        } => vec![
+            ("domain_id", number(*domain_id)),
+            ("ros_node", Some(text(node))),
+            ("participants", list(participants)),
+        ],
+        Diagnosis::UnheardPublisher { writer, reason, .. } => vec![
+            ("writer", written(writer)),
+            ("reason", Some(text(reason.label()))),
+        ],
+        Diagnosis::UnfedSubscriber { reader, reason, .. } => vec![
+            ("reader", written(reader)),
+            ("reason", Some(text(reason.label()))),
+        ],
+        Diagnosis::NodeInSeveralDomains {
+            node,
+            participant,
+            domains,
+        } => vec![
+            ("ros_node", Some(text(node))),
+            ("participants", list([participant])),
+            ("domains", list(domains)),
+        ],
+    });
+    values
 }
 
 fn agent(event: &AgentEvent) -> Vec<(&'static str, Option<Value>)> {
@@ -347,11 +419,24 @@ fn naming(topic: &str) -> Option<Naming> {
     DdsTopic::parse(topic).ok().map(|topic| Naming::of(&topic))
 }
 
+/// The topic as the metrics name it.
+fn series<'a>(naming: Option<&'a Naming>, topic: &'a str) -> Cow<'a, str> {
+    naming.map_or(Cow::Borrowed(topic), |naming| {
+        series_name(naming.kind, &naming.name, &naming.dds_name)
+    })
+}
+
+fn list<T: Display>(items: impl IntoIterator<Item = T>) -> Option<Value> {
+    let items = items.into_iter();
+    let texts = items.map(|item| bounded(&item.to_string()).to_owned());
+    Some(Value::List(texts.collect()))
+}
+
 fn text(text: &str) -> Value {
     Value::Text(bounded(text).to_owned())
 }
 
-fn written(value: &impl std::fmt::Display) -> Option<Value> {
+fn written(value: &impl Display) -> Option<Value> {
     Some(Value::Text(value.to_string()))
 }
 

@@ -103,6 +103,20 @@ const ENDPOINT_GONE: &[&str] = &[
     "message_type",
     "cause",
 ];
+const QOS: &[&str] = &["domain_id", "topic", "writer", "reader", "policies"];
+const FINDING: &[&str] = &[
+    "diagnosis",
+    "domain_id",
+    "topic",
+    "message_types",
+    "type_hashes",
+    "writer",
+    "reader",
+    "reason",
+    "ros_node",
+    "participants",
+    "domains",
+];
 
 pub(super) const PARTICIPANT_DISCOVERED: Definition = Definition::new(
     "ros2.participant.discovered",
@@ -180,6 +194,31 @@ pub(super) const TOPIC_SILENT: Definition = Definition::new(
     &["domain_id", "topic", "watch", "last_message_seconds_ago"],
     "A watched topic has publishers, but nothing came for longer than max_silence_s.",
 );
+pub(super) const QOS_INCOMPATIBLE: Definition = Definition::new(
+    "ros2.qos.incompatible",
+    Severity::Warn,
+    QOS,
+    "A publisher and a subscriber of one topic do not talk because of these policies.",
+);
+pub(super) const QOS_RESOLVED: Definition = Definition::new(
+    "ros2.qos.resolved",
+    Severity::Info,
+    QOS,
+    "They talk now, or one of them has gone.",
+);
+pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
+    "ros2.graph.diagnosed",
+    Severity::Warn,
+    FINDING,
+    "Something else is wrong with the graph, as `diagnosis` says: type_conflict, type_hash_conflict, duplicate_node, node_in_several_domains, or (INFO) unheard_publisher, unfed_subscriber.",
+)
+.relief(Severity::Info);
+pub(super) const GRAPH_RESOLVED: Definition = Definition::new(
+    "ros2.graph.resolved",
+    Severity::Info,
+    FINDING,
+    "It is not so any more; the attributes say how it was.",
+);
 
 pub(super) const STARTED: Definition = Definition::new(
     "ros2probe.agent.started",
@@ -249,6 +288,10 @@ pub const EVENTS: &[Definition] = &[
     MESSAGE_LOST,
     EXPECTATION_CHANGED,
     TOPIC_SILENT,
+    QOS_INCOMPATIBLE,
+    QOS_RESOLVED,
+    GRAPH_DIAGNOSED,
+    GRAPH_RESOLVED,
     STARTED,
     CAPTURE_DROPPED,
     CAPTURE_BLIND,
