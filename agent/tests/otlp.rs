@@ -10,6 +10,7 @@ mod local_agent;
 mod rotel;
 
 use std::collections::BTreeMap;
+use std::net::TcpListener;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -191,5 +192,85 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
         begun.elapsed() < Duration::from_secs(4),
         "{:?}",
         begun.elapsed()
+    );
+}
+
+/// An event: its name and what is known of it.
+type Told = (String, BTreeMap<String, String>);
+
+/// What the event log keeps.
+fn told(agent: &LocalAgent) -> Vec<Told> {
+    let kept = "/events?after=0&follow=false";
+    let body = local_agent::request(agent.api, "GET", kept, "").body;
+    let data = body.lines().filter_map(|line| line.strip_prefix("data: "));
+    let told = data.map(|data| {
+        let event: serde_json::Value = serde_json::from_str(data).unwrap();
+        let attributes = event["attributes"].as_object().unwrap().iter();
+        let plain = attributes.filter_map(|(key, value)| match value {
+            serde_json::Value::String(text) => Some((key.clone(), text.clone())),
+            serde_json::Value::Number(number) => Some((key.clone(), number.to_string())),
+            _ => None,
+        });
+        (event["name"].as_str().unwrap().to_owned(), plain.collect())
+    });
+    told.collect()
+}
+
+#[test]
+fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
+    let address = address.unwrap();
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = format!("otlp: {{endpoint: 'http://{address}', metrics: false, robot: marvin}}\n");
+    std::fs::write(&configuration, yaml).unwrap();
+    let configuration = configuration.to_str().unwrap();
+    let mut agent = LocalAgent::start(&["--config", configuration, "--speed", "max"]);
+    agent.wait_for_log("the capture has ended");
+    let retried = "ros2probe_otlp_exports_total{signal=\"events\",outcome=\"retried\"}";
+    agent.wait_for_metric(retried, |count| count > 0.0);
+
+    let told = told(&agent);
+    assert!(told.len() > 50, "{}", told.len());
+    let mut receiver = Rotel::start(
+        &mut Command::new(Rotel::binary()),
+        directory.path(),
+        Some(address),
+    );
+    let text = receiver.wait_for("it has all events", |text| {
+        text.matches("\nFlags: ").count() >= told.len()
+    });
+    let exports = exports(&text);
+    let received: Vec<Told> = exports
+        .iter()
+        .flat_map(|export| &export.items)
+        .map(|record| {
+            assert_eq!(record.fields["SeverityText"], "INFO");
+            let time = |field: &str| record.fields[field].parse::<u64>().unwrap();
+            assert!(time("ObservedTimestamp") >= time("Timestamp"));
+            (
+                record.fields["EventName"].clone(),
+                record.attributes.clone(),
+            )
+        })
+        .collect();
+    assert_eq!(received, told);
+    assert_eq!(exports[0].resource["robot.name"], "marvin");
+    assert_eq!(exports[0].resource["service.name"], "ros2probe");
+
+    // What happens from now on follows, and what happens last is sent before the end.
+    let added = local_agent::request(agent.api, "POST", "/watch/imu", "");
+    assert_eq!(added.status, 201);
+    receiver.wait_for("it has one more", |text| text.contains("watch: Str(/imu)"));
+    let removed = local_agent::request(agent.api, "DELETE", "/watch/imu", "");
+    assert_eq!(removed.status, 204);
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+    receiver.wait_for("it has the last one", |text| {
+        text.contains("EventName: ros2probe.watch.removed")
+    });
+    assert_eq!(
+        receiver.text().matches("\nEventName: ").count(),
+        told.len() + 2
     );
 }

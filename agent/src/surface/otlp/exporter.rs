@@ -10,6 +10,7 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use super::client::Client;
+use super::events::Reporter;
 use super::exports::Signal;
 use super::metrics::Collector;
 use super::outlet::Outlet;
@@ -80,6 +81,7 @@ impl Exporter {
 /// What the thread does.
 struct Jobs {
     metrics: Option<(Collector, Outlet, Duration)>,
+    events: Option<(Reporter, Outlet)>,
 }
 
 impl Jobs {
@@ -98,6 +100,7 @@ impl Jobs {
                 .map(|client| Outlet::new(client, stop.clone())))
         };
         let metrics = outlet(Signal::Metrics, settings.metrics)?;
+        let events = outlet(Signal::Events, settings.events)?;
         let collector = || {
             Collector::new(
                 Arc::clone(board),
@@ -107,12 +110,21 @@ impl Jobs {
         };
         Ok(Self {
             metrics: metrics.map(|outlet| (collector(), outlet, settings.interval)),
+            events: events.map(|outlet| (Reporter::new(board, settings.resource.clone()), outlet)),
         })
     }
 
     async fn run(self) {
-        if let Some((collector, outlet, interval)) = self.metrics {
-            collector.run(outlet, interval).await;
-        }
+        let metrics = async {
+            if let Some((collector, outlet, interval)) = self.metrics {
+                collector.run(outlet, interval).await;
+            }
+        };
+        let events = async {
+            if let Some((reporter, outlet)) = self.events {
+                reporter.run(outlet).await;
+            }
+        };
+        tokio::join!(metrics, events);
     }
 }

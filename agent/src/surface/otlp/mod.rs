@@ -4,6 +4,7 @@
 //! counted, and the capture never waits.
 
 mod client;
+mod events;
 mod exporter;
 mod exports;
 mod identity;

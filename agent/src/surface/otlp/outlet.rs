@@ -37,6 +37,11 @@ impl Outlet {
         self.stop.cancelled().await;
     }
 
+    /// Whether the agent ends.
+    pub(super) fn is_stopped(&self) -> bool {
+        self.stop.is_cancelled()
+    }
+
     /// Counts what never became a request.
     pub(super) fn overflowed(&self, items: u64) {
         self.client.drop(Reason::Overflow, items);
