@@ -211,6 +211,8 @@ fn endpoint_facts(
         lifespan_nanoseconds: nanoseconds(qos.lifespan),
         liveliness: qos.liveliness.to_string(),
         liveliness_lease_nanoseconds: nanoseconds(qos.liveliness_lease),
+        ownership: qos.ownership.name().unwrap_or("UNKNOWN"),
+        partitions: qos.partitions.iter().map(ToString::to_string).collect(),
         message_type: endpoint.message_type.as_ref().to_owned(),
         type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
         first_seen: endpoint.first_seen,

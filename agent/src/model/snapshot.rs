@@ -218,6 +218,10 @@ pub struct EndpointFacts {
     pub liveliness: String,
     /// Liveliness lease in nanoseconds; `None` = infinite.
     pub liveliness_lease_nanoseconds: Option<u64>,
+    /// `SHARED` or `EXCLUSIVE`.
+    pub ownership: &'static str,
+    /// Partitions; empty is the default one.
+    pub partitions: Vec<String>,
     /// ROS type.
     pub message_type: String,
     /// RIHS01 hash.

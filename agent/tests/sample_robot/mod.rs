@@ -205,6 +205,8 @@ pub fn topic(name: &str) -> TopicFacts {
         lifespan_nanoseconds: None,
         liveliness: "AUTOMATIC".to_owned(),
         liveliness_lease_nanoseconds: None,
+        ownership: "SHARED",
+        partitions: Vec::new(),
         message_type: "sensor_msgs/msg/PointCloud2".to_owned(),
         type_hash: None,
         first_seen: Timestamp(4),

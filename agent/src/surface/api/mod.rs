@@ -3,14 +3,28 @@
 //!
 //! A module for each noun gives its routes; what every request has to pass is in `security`.
 
+mod actions;
+mod endpoint;
 mod events;
+mod finding;
+mod graph;
 mod health;
+mod index;
+mod measured;
+mod nearest;
+mod nodes;
 mod openapi;
 mod parameters;
+mod participants;
+mod party;
 pub mod problem;
 pub mod reload;
+mod scope;
 mod security;
 mod server;
+mod services;
+mod silence;
+mod topics;
 mod watch;
 
 use std::sync::Arc;
@@ -47,6 +61,12 @@ fn nouns() -> OpenApiRouter<Context> {
     OpenApiRouter::with_openapi(openapi::head())
         .merge(watch::routes())
         .merge(events::routes())
+        .merge(topics::routes())
+        .merge(nodes::routes())
+        .merge(services::routes())
+        .merge(actions::routes())
+        .merge(participants::routes())
+        .merge(graph::routes())
         .merge(health::routes())
         .merge(reload::routes())
         .merge(openapi::routes())

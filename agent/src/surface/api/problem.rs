@@ -27,6 +27,12 @@ pub enum Code {
     NotFound,
     /// No such watch.
     NoSuchWatch,
+    /// No such topic.
+    NoSuchTopic,
+    /// No such node.
+    NoSuchNode,
+    /// Several things have the name.
+    Ambiguous,
     /// The path is there, the method is not.
     MethodNotAllowed,
     /// It is watched with other settings.
@@ -109,6 +115,13 @@ impl Code {
             ),
             Self::NotFound => ("not-found", StatusCode::NOT_FOUND, "No such path"),
             Self::NoSuchWatch => ("no-such-watch", StatusCode::NOT_FOUND, "No such watch"),
+            Self::NoSuchTopic => ("no-such-topic", StatusCode::NOT_FOUND, "No such topic"),
+            Self::NoSuchNode => ("no-such-node", StatusCode::NOT_FOUND, "No such node"),
+            Self::Ambiguous => (
+                "ambiguous",
+                StatusCode::CONFLICT,
+                "Several things have the name",
+            ),
             Self::MethodNotAllowed => (
                 "method-not-allowed",
                 StatusCode::METHOD_NOT_ALLOWED,

@@ -29,7 +29,7 @@ use crate::surface::board::State as BoardState;
 use crate::watches::{Done, Entry, Origin, Refused};
 
 /// How long a reader waits for a snapshot that knows what was asked for just before.
-const PATIENCE: Duration = Duration::from_millis(600);
+pub(super) const PATIENCE: Duration = Duration::from_millis(600);
 
 /// What is watched.
 #[derive(Debug, Serialize, ToSchema)]
