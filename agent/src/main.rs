@@ -102,6 +102,7 @@ fn run(options: cli::Run) -> Result<()> {
     let grace = u64::try_from(config.topic_grace.as_nanos()).unwrap_or(u64::MAX);
     let settings = observer::Settings {
         topic_grace: grace,
+        directed: options.replay.is_none(),
         ..observer::Settings::default().with_limits(&config.limits)
     };
     let mut observer = Observer::new(settings);

@@ -171,7 +171,7 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
         "PUT",
         "/watch/a",
         json,
-        "{\"per_subscriber\": true}",
+        "{\"per_subscriber\": true, \"trace\": 0.5}",
     );
     assert_eq!(problem(&other), (409, "watch-given".to_owned()));
 

@@ -128,6 +128,7 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
         "otlp: {headers: {a: 1}}",
         "otlp: {compression: zstd}",
         "otlp: {interval_s: 0}",
+        "watch: [{topic: /a, trace: 1.5}]",
     ] {
         assert!(
             !validator.is_valid(&serde_yaml::from_str(yaml).unwrap()),

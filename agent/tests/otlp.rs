@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use local_agent::{LocalAgent, metric};
 use ros2probe::surface::catalogue::{CATALOGUE, Kind};
-use rotel::{Export, Rotel, exports};
+use rotel::{Export, Item, Rotel, exports};
 
 /// What changes from one look to the next.
 fn changes(name: &str) -> bool {
@@ -273,4 +273,84 @@ fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
         receiver.text().matches("\nEventName: ").count(),
         told.len() + 2
     );
+}
+
+/// An agent that traces every message of the capture, and what the receiver prints of it.
+fn traced(directory: &std::path::Path) -> Vec<Item> {
+    let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory, None);
+    let configuration = directory.join("traced.yaml");
+    let yaml = format!(
+        "watch: [{{topic: /chatter, trace: 1}}]\n\
+         otlp: {{endpoint: 'http://{}', metrics: false, events: false}}\n",
+        receiver.address
+    );
+    std::fs::write(&configuration, yaml).unwrap();
+    let mut agent = LocalAgent::start(&[
+        "--config",
+        configuration.to_str().unwrap(),
+        "--speed",
+        "max",
+    ]);
+    agent.wait_for_log("the capture has ended");
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+    let text = receiver.wait_for("spans have come", |text| text.contains("settle /chatter"));
+    let exports = exports(&text);
+    let services = exports
+        .iter()
+        .map(|export| export.resource["service.name"].as_str());
+    assert!(services.into_iter().all(|name| name == "ros2probe"));
+    exports
+        .into_iter()
+        .flat_map(|export| export.items)
+        .collect()
+}
+
+#[test]
+fn a_replay_gives_the_same_traces_every_time_and_they_say_what_the_capture_says() {
+    let directory = tempfile::tempdir().unwrap();
+    let spans = traced(directory.path());
+    let again = traced(directory.path());
+    let identity = |span: &Item| {
+        let field = |name: &str| span.fields[name].clone();
+        (
+            field("Trace ID"),
+            field("ID"),
+            field("Parent ID"),
+            field("Start time"),
+            field("End time"),
+        )
+    };
+    let identities = |spans: &[Item]| spans.iter().map(identity).collect::<Vec<_>>();
+    assert_eq!(identities(&spans), identities(&again));
+
+    let named = |name: &str| {
+        let named = spans.iter().filter(|span| span.fields["Name"] == name);
+        named.collect::<Vec<_>>()
+    };
+    let (sent, settled) = (named("send /chatter"), named("settle /chatter"));
+    assert_eq!(sent.len(), 30, "the talker's messages");
+    assert!(!settled.is_empty() && sent.len() + settled.len() == spans.len());
+    for child in settled {
+        let parent = sent
+            .iter()
+            .find(|span| span.fields["ID"] == child.fields["Parent ID"]);
+        let parent = parent.unwrap_or_else(|| panic!("{child:#?} has no parent"));
+        assert_eq!(parent.fields["Trace ID"], child.fields["Trace ID"]);
+        assert_eq!(
+            parent.attributes["messaging.message.id"],
+            child.attributes["messaging.message.id"]
+        );
+        assert!(child.attributes.contains_key("reader"));
+    }
+    let attributes = &sent[0].attributes;
+    for (key, value) in [
+        ("messaging.system", "dds"),
+        ("messaging.destination.name", "/chatter"),
+        ("message_type", "std_msgs/msg/String"),
+        ("domain_id", "0"),
+    ] {
+        assert_eq!(attributes[key], value, "{attributes:?}");
+    }
+    assert!(attributes.contains_key("source_timestamp_unix_nano"));
 }

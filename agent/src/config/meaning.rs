@@ -122,6 +122,7 @@ impl Reader {
                     domain_id: None,
                     expectations: Expectations::default(),
                     per_subscriber: false,
+                    trace: 0.0,
                 },
                 WatchShape::Entry(entry) => self.entry(&key, *entry),
             };
@@ -156,6 +157,7 @@ impl Reader {
                 max_silence_s: entry.max_silence_s,
             },
             per_subscriber: entry.per_subscriber,
+            trace: entry.trace.unwrap_or_default(),
         }
     }
 
@@ -583,7 +585,7 @@ otlp:
 watch:
   - /tf
   - {topic: /points, domain: 5, min_rate_hz: 18, max_rate_hz: 22.5, max_loss_ratio: 0.01,
-     max_latency_ms: 50, max_silence_s: 1, per_subscriber: true}
+     max_latency_ms: 50, max_silence_s: 1, per_subscriber: true, trace: 0.25}
 limits: {topics: 5, participants: 6, endpoints: 7, unknown_writers: 8, reassembly_bytes: 65536}
 capture:
   source: wire
@@ -602,6 +604,7 @@ log: debug
             ("/points", Some(5))
         );
         assert_eq!(points.expectations.max_rate_hz, Some(22.5));
+        assert!((points.trace - 0.25).abs() < 1e-9);
         assert!(points.per_subscriber && !config.watches.first().unwrap().per_subscriber);
         assert_eq!(config.capture.source, SourceChoice::Wire);
         assert_eq!(config.limits.unknown_writers, 8);

@@ -67,6 +67,10 @@ pub(super) struct WatchEntryShape {
     /// subscriber received), besides those per topic.
     #[serde(default)]
     pub(super) per_subscriber: bool,
+    /// The part of each covered topic's messages of which spans are exported (`otlp`), 0 to 1: when
+    /// a message was on the wire, and when each reliable reader acknowledged it.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub(super) trace: Option<f64>,
     /// At least this many messages a second.
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) min_rate_hz: Option<f64>,

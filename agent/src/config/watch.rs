@@ -17,6 +17,8 @@ pub struct Watch {
     pub expectations: Expectations,
     /// Series per delivery.
     pub per_subscriber: bool,
+    /// The part of the messages of which spans are told, 0 to 1.
+    pub trace: f64,
 }
 
 /// Limits on a topic; `None` = no opinion.
@@ -73,6 +75,7 @@ impl Watch {
             domain_id: None,
             expectations: Expectations::default(),
             per_subscriber: false,
+            trace: 0.0,
         })
     }
 
@@ -135,6 +138,17 @@ const RANGES: [(&str, f64, f64); 5] = [
     ("max_latency_ms", 0.0, 3_600_000.0),
     ("max_silence_s", 0.001, 604_800.0),
 ];
+
+/// Says whether `ratio` is a part of the messages.
+///
+/// # Errors
+/// The range.
+pub fn check_trace(ratio: f64) -> Result<(), String> {
+    if (0.0..=1.0).contains(&ratio) {
+        return Ok(());
+    }
+    Err(format!("trace is {ratio}, must be between 0 and 1"))
+}
 
 /// Says whether `pattern` can be a ROS topic name or a glob over such names.
 ///

@@ -31,6 +31,7 @@ use super::rate::Slot;
 use super::receivers::{Around, Receivers};
 use super::snapshot::{Snapshot, SocketFacts, WatchState};
 use super::topic::{Naming, TopicId, Topics, Watched};
+use super::trace::{Spans, Subject, Tracer};
 use super::way::Place;
 use super::writer::Traits;
 use crate::config::{Limits, Watch, Watchlist};
@@ -62,6 +63,8 @@ pub struct Settings {
     pub sample_bytes: usize,
     /// Nanoseconds for which a topic without endpoints is still reported.
     pub topic_grace: u64,
+    /// Records say who sent: not so those of a capture file.
+    pub directed: bool,
 }
 
 impl Default for Settings {
@@ -76,6 +79,7 @@ impl Default for Settings {
             interest: 16_384,
             sample_bytes: 1 << 20,
             topic_grace: 600 * SECOND,
+            directed: true,
         }
     }
 }
@@ -116,6 +120,7 @@ pub struct Observer {
     pub(super) profiler: Profiler,
     pub(super) pieces: Pieces,
     pub(super) receivers: Receivers,
+    pub(super) tracer: Tracer,
     pub(super) examiner: Examiner,
     pub(super) decode_errors: BTreeMap<(&'static str, &'static str), u64>,
     pub(super) datagrams: u64,
@@ -147,6 +152,7 @@ impl Observer {
             ),
             pieces: Pieces::default(),
             receivers: Receivers::new(settings.deliveries),
+            tracer: Tracer::new(settings.directed),
             examiner: Examiner::default(),
             decode_errors: BTreeMap::new(),
             datagrams: 0,
@@ -167,6 +173,9 @@ impl Observer {
         };
         let moved: Vec<_> = before.watches().iter().map(moved).collect();
         self.topics.renumber(&moved);
+        let watches = self.watchlist.watches();
+        self.tracer
+            .restart(watches.iter().any(|watch| watch.trace > 0.0));
         // First give places back, then hand them out.
         for pass in [Watched::Yes, Watched::No] {
             for id in self.topics.ids() {
@@ -308,6 +317,11 @@ impl Observer {
         self.journal.events.take()
     }
 
+    /// Spans of sampled messages that ended since the last call.
+    pub fn take_spans(&mut self) -> Spans {
+        self.tracer.take()
+    }
+
     /// All facts at this moment.
     #[must_use]
     pub fn snapshot(&self, now: Timestamp) -> Snapshot {
@@ -337,6 +351,9 @@ impl Observer {
         if writer.entity.is_builtin() {
             return;
         }
+        if self.tracer.is_wanted() {
+            self.trace(record);
+        }
         let around = around!(self);
         let journal = &mut self.journal;
         if self.profiler.record(writer, record, journal, around) {
@@ -348,6 +365,31 @@ impl Observer {
         if is_strange {
             self.profiler.stranger(writer, record, journal, around);
         }
+    }
+
+    fn trace(&mut self, record: &Record) {
+        let Self {
+            tracer,
+            discovery,
+            topics,
+            watchlist,
+            ..
+        } = self;
+        tracer.record(record, || {
+            let endpoint = discovery.endpoints().get(&record.writer())?;
+            let naming = naming(endpoint)?;
+            let topic = topics.get(topics.find(endpoint.domain_id, &naming)?)?;
+            let covering = topic.judgements.iter();
+            let ratios =
+                covering.filter_map(|(index, _)| Some(watchlist.watches().get(*index)?.trace));
+            let subject = Subject {
+                domain_id: topic.domain_id,
+                topic: bounded_shared(&topic.naming.name),
+                message_type: bounded_shared(&endpoint.message_type),
+                reliable: traits(endpoint).reliable,
+            };
+            (topic.watched == Watched::Yes).then(|| (subject, ratios.fold(0.0, f64::max)))
+        });
     }
 
     fn walk(
@@ -566,6 +608,7 @@ impl Observer {
 
     fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: Timestamp) {
         self.interest.remove(guid);
+        self.tracer.forget(guid);
         self.retire(guid, now);
         let (domain_id, topic) = (endpoint.domain_id, bounded_shared(&endpoint.topic));
         self.journal.events.name(guid, domain_id, &topic);
@@ -663,6 +706,7 @@ impl Observer {
             self.judge(now);
             self.tell_losses();
             self.examine(now);
+            self.tracer.advance(now);
         }
     }
 

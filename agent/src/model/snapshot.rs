@@ -423,7 +423,7 @@ pub struct DecodeErrorCount {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
-    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`.
+    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`.
     pub table: &'static str,
     /// Entries (bytes for `reassembly`).
     pub size: u64,

@@ -113,7 +113,7 @@ impl Run {
                 self.observer.advance(self.source.clock());
             }
             self.tell_interest();
-            self.board.events().add(self.observer.take_events());
+            self.hand_over();
             let age = published.elapsed();
             let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
             if finished || polled.is_err() || due {
@@ -128,9 +128,15 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             live.drain(&mut self.observer);
         }
-        self.board.events().add(self.observer.take_events());
+        self.hand_over();
         self.publish();
         Ok(())
+    }
+
+    /// Gives away what happened since the last time; nobody makes this wait.
+    fn hand_over(&mut self) {
+        self.board.events().add(self.observer.take_events());
+        self.board.add_spans(self.observer.take_spans());
     }
 
     /// Watches what is asked for since the last look. The kernel knows it before the next packets.

@@ -15,9 +15,10 @@ use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
 use super::events::{AgentEvent, EventLog};
-use super::otlp::Exports;
+use super::otlp::{Exports, Reason, Signal, SpanQueue};
 use crate::config::{Config, Watch};
 use crate::model::snapshot::Snapshot;
+use crate::model::trace::Spans;
 
 /// Older than this, the state no longer describes the robot.
 const FRESH: Duration = Duration::from_secs(5);
@@ -30,6 +31,7 @@ pub struct Board {
     reload: ArcSwap<Reload>,
     events: Arc<EventLog>,
     exports: Exports,
+    spans: SpanQueue,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
     bell: Option<Bell>,
@@ -107,6 +109,7 @@ impl Board {
             reload: ArcSwap::from_pointee(reload),
             events: Arc::new(events),
             exports: Exports::default(),
+            spans: SpanQueue::default(),
             asked: AtomicBool::new(false),
             // Without one, askers wait until the capture thread looks by itself.
             bell: Bell::new().ok(),
@@ -211,6 +214,26 @@ impl Board {
     #[must_use]
     pub const fn events(&self) -> &Arc<EventLog> {
         &self.events
+    }
+
+    /// Hands over spans, where they are exported.
+    pub fn add_spans(&self, spans: Spans) {
+        let Spans { spans, lost } = spans;
+        if self
+            .exports
+            .signals()
+            .any(|signal| signal == Signal::Traces)
+        {
+            let refused = self.spans.put(spans);
+            self.exports
+                .count_dropped(Signal::Traces, Reason::Overflow, refused + lost);
+        }
+    }
+
+    /// Spans that wait for being exported.
+    #[must_use]
+    pub const fn spans(&self) -> &SpanQueue {
+        &self.spans
     }
 
     /// What became of what was to be exported.

@@ -13,7 +13,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::MAX_ADDED;
-use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern};
+use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern, check_trace};
 use crate::state::{Found, StateDirectory};
 
 const FILE: &str = "watches.json";
@@ -52,6 +52,8 @@ struct Line {
     topic: String,
     domain_id: Option<u32>,
     per_subscriber: bool,
+    #[serde(default)]
+    trace: f64,
     min_rate_hz: Option<f64>,
     max_rate_hz: Option<f64>,
     max_loss_ratio: Option<f64>,
@@ -119,11 +121,13 @@ impl TryFrom<Line> for Watch {
             max_silence_s: line.max_silence_s,
         };
         expectations.check()?;
+        check_trace(line.trace)?;
         Ok(Self {
             pattern: line.topic,
             domain_id: line.domain_id,
             expectations,
             per_subscriber: line.per_subscriber,
+            trace: line.trace,
         })
     }
 }
@@ -141,6 +145,7 @@ impl From<&Watch> for Line {
             topic: watch.pattern.clone(),
             domain_id: watch.domain_id,
             per_subscriber: watch.per_subscriber,
+            trace: watch.trace,
             min_rate_hz,
             max_rate_hz,
             max_loss_ratio,
@@ -254,6 +259,7 @@ mod tests {
         let expecting = Watch {
             domain_id: Some(5),
             per_subscriber: true,
+            trace: 0.5,
             expectations: Expectations {
                 min_rate_hz: Some(9.5),
                 max_silence_s: Some(1.0),

@@ -23,7 +23,7 @@ use super::Context;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::{MAX_BODY, too_large};
-use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern};
+use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern, check_trace};
 use crate::model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
 use crate::surface::board::State as BoardState;
 use crate::watches::{Done, Entry, Origin, Refused};
@@ -54,6 +54,9 @@ struct WatchView {
     state: Stage,
     /// Series per writer and subscriber.
     per_subscriber: bool,
+    /// The part of the messages of which spans are exported.
+    #[schema(minimum = 0, maximum = 1)]
+    trace: f64,
     #[serde(flatten)]
     expectations: ExpectationsView,
     /// The topics it covers now, and a name that does not exist yet.
@@ -155,6 +158,9 @@ struct WatchRequest {
     domain_id: Option<u32>,
     /// Series per writer and subscriber of each covered topic, besides those per topic.
     per_subscriber: bool,
+    /// The part of each covered topic's messages of which spans are exported, 0 to 1.
+    #[schema(minimum = 0, maximum = 1)]
+    trace: f64,
     /// At least this many messages a second.
     #[schema(minimum = 0, maximum = 1_000_000)]
     min_rate_hz: Option<f64>,
@@ -404,12 +410,14 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         max_latency_ms: settings.max_latency_ms,
         max_silence_s: settings.max_silence_s,
     };
-    match expectations.check() {
+    let trace = settings.trace;
+    match expectations.check().and_then(|()| check_trace(trace)) {
         Ok(()) => Ok(Watch {
             pattern: topic,
             domain_id,
             expectations,
             per_subscriber: settings.per_subscriber,
+            trace,
         }),
         Err(mistake) => invalid(mistake),
     }
@@ -500,6 +508,7 @@ fn view(entry: &Entry, state: &BoardState) -> WatchView {
         },
         state: stage,
         per_subscriber: watch.per_subscriber,
+        trace: watch.trace,
         expectations: ExpectationsView {
             min_rate_hz: watch.expectations.min_rate_hz,
             max_rate_hz: watch.expectations.max_rate_hz,

@@ -15,6 +15,7 @@ use super::exports::Signal;
 use super::metrics::Collector;
 use super::outlet::Outlet;
 use super::settings::{Settings, SettingsError, Target};
+use super::traces::Tracing;
 use crate::surface::board::Board;
 
 /// Ending takes no longer, whatever the receiver does.
@@ -80,8 +81,10 @@ impl Exporter {
 
 /// What the thread does.
 struct Jobs {
+    board: Arc<Board>,
     metrics: Option<(Collector, Outlet, Duration)>,
     events: Option<(Reporter, Outlet)>,
+    traces: Option<(Tracing, Outlet)>,
 }
 
 impl Jobs {
@@ -108,7 +111,11 @@ impl Jobs {
                 SystemTime::now(),
             )
         };
+        let traces = outlet(Signal::Traces, settings.traces)?;
+        let tracing = || Tracing::new(settings.resource.clone(), settings.host);
         Ok(Self {
+            board: Arc::clone(board),
+            traces: traces.map(|outlet| (tracing(), outlet)),
             metrics: metrics.map(|outlet| (collector(), outlet, settings.interval)),
             events: events.map(|outlet| (Reporter::new(board, settings.resource.clone()), outlet)),
         })
@@ -125,6 +132,11 @@ impl Jobs {
                 reporter.run(outlet).await;
             }
         };
-        tokio::join!(metrics, events);
+        let traces = async {
+            if let Some((tracing, outlet)) = self.traces {
+                tracing.run(outlet, self.board.spans()).await;
+            }
+        };
+        tokio::join!(metrics, events, traces);
     }
 }

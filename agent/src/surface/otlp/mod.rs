@@ -7,7 +7,6 @@ mod client;
 mod events;
 mod exporter;
 mod exports;
-mod identity;
 mod metrics;
 mod naming;
 mod outlet;
@@ -17,8 +16,10 @@ mod settings;
 mod starts;
 #[cfg(test)]
 mod tests;
+mod traces;
 
 pub use exporter::{Exporter, StartError};
 pub use exports::{Exports, Outcome, Reason, Signal};
 pub use resource::Host;
 pub use settings::{Settings, SettingsError, endpoint};
+pub use traces::SpanQueue;

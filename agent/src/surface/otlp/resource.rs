@@ -5,8 +5,8 @@ use std::fs;
 
 use opentelemetry_proto::tonic::resource::v1::Resource;
 
-use super::identity::Identity;
 use super::points::attribute;
+use crate::model::identity::Identity;
 
 /// What the operating system says of this host.
 #[derive(Clone, Debug, Default)]
@@ -30,6 +30,15 @@ impl Host {
             name: line("/proc/sys/kernel/hostname"),
             id: line("/etc/machine-id").or_else(|| line("/var/lib/dbus/machine-id")),
         }
+    }
+
+    /// The agent's identity on this host.
+    pub(super) fn bits(&self) -> u128 {
+        let mut identity = Identity::of(b"ros2probe service.instance.id");
+        for text in [&self.id, &self.name] {
+            identity.add(text.as_deref().unwrap_or_default().as_bytes());
+        }
+        identity.bits()
     }
 }
 
@@ -66,11 +75,7 @@ pub(super) fn resource(host: &Host, given: &BTreeMap<String, String>) -> Resourc
 /// A UUID (version 8) that stays through restarts, so that a robot's series go on; derived, for a
 /// machine's id is not to be passed around as it is.
 fn instance(host: &Host) -> String {
-    let text = |text: &Option<String>| text.clone().unwrap_or_default();
-    let mut identity = Identity::of(b"ros2probe service.instance.id");
-    identity.add(text(&host.id).as_bytes());
-    identity.add(text(&host.name).as_bytes());
-    let mut bits = identity.bits();
+    let mut bits = host.bits();
     bits = bits & !(0xf << 76) | 0x8 << 76;
     bits = bits & !(0x3 << 62) | 0x2 << 62;
     let digits = format!("{bits:032x}");

@@ -32,6 +32,8 @@ pub(super) struct Target {
 #[derive(Clone, Debug)]
 pub struct Settings {
     pub(super) resource: Resource,
+    /// Of this host, in ids that depend on it.
+    pub(super) host: u128,
     pub(super) interval: Duration,
     pub(super) metrics: Option<Target>,
     pub(super) events: Option<Target>,
@@ -99,6 +101,7 @@ impl Settings {
         let target = |signal| target(file, &variables, signal);
         let settings = Self {
             resource: resource(host, &attributes(file, &variables)),
+            host: host.bits(),
             interval: file.interval.unwrap_or_else(|| {
                 variables
                     .milliseconds("OTEL_METRIC_EXPORT_INTERVAL")

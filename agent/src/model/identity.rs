@@ -3,28 +3,30 @@
 
 /// Bytes being turned into an identity.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Identity(u128);
+pub struct Identity(u128);
 
 const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
 const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
 
 impl Identity {
     /// Of things called so.
-    pub(super) fn of(kind: &[u8]) -> Self {
+    #[must_use]
+    pub fn of(kind: &[u8]) -> Self {
         let mut identity = Self(OFFSET);
         identity.add(kind);
         identity
     }
 
     /// Further bytes; a boundary counts.
-    pub(super) fn add(&mut self, bytes: &[u8]) {
+    pub fn add(&mut self, bytes: &[u8]) {
         for byte in bytes.iter().chain(&[0xff]) {
             self.0 = (self.0 ^ u128::from(*byte)).wrapping_mul(PRIME);
         }
     }
 
     /// The identity.
-    pub(super) const fn bits(self) -> u128 {
+    #[must_use]
+    pub const fn bits(self) -> u128 {
         let low = mix(self.0 as u64 ^ mix((self.0 >> 64) as u64));
         let high = mix((self.0 >> 64) as u64 ^ low);
         (high as u128) << 64 | low as u128

@@ -1,0 +1,649 @@
+//! Spans of sampled messages: when each was on the wire, and when its reliable readers acknowledged
+//! it.
+//!
+//! Only what was seen is told: nothing here guesses when a message was published or processed. Which
+//! messages are sampled follows from their identity, so that every agent that sees a message
+//! decides alike, without a word between them. What is under way or waits for acknowledgements is
+//! bounded; what is given up for that is counted.
+
+use std::collections::{HashMap, VecDeque};
+use std::sync::Arc;
+
+use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
+
+use super::identity::Identity;
+use super::samples::{Budget, Progress, Samples};
+use super::way::Place;
+
+/// Writers whose messages may be sampled.
+const MAX_WRITERS: usize = 4096;
+/// Messages under way or waiting, of all writers and of one.
+const MAX_OPEN: usize = 4096;
+const MAX_OPEN_OF_WRITER: usize = 256;
+/// Fragmented messages of one writer under way.
+const MAX_UNDER_WAY: usize = 16;
+/// Readers of one message that are told of.
+const MAX_READERS: usize = 32;
+/// Last messages of a writer, which may come again.
+const REMEMBERED: usize = 128;
+/// Spans kept until they are taken.
+const MAX_FINISHED: usize = 2048;
+/// For bitmaps of fragments.
+const BITMAP_BYTES: usize = 1 << 18;
+/// Acknowledgements that come later are of no interest.
+const PATIENCE: u64 = 10_000_000_000;
+/// The loopback interface, in every network namespace.
+const LOOPBACK: u32 = 1;
+/// The part of a trace's identity that decides, as in OpenTelemetry's samplers.
+const RANDOM: u64 = (1 << 56) - 1;
+
+/// What a span tells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// On the wire, or leaving this host: first to last fragment.
+    Send,
+    /// Reaching this host from another: first to last fragment.
+    Receive,
+    /// From its last fragment to the first ACKNACK of this reader that covers it.
+    Settle(Guid),
+}
+
+/// One span.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Span {
+    /// What it tells.
+    pub stage: Stage,
+    /// Of which message.
+    pub message: Message,
+    /// Begin.
+    pub begin: Timestamp,
+    /// End.
+    pub end: Timestamp,
+}
+
+/// One sampled message.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Message {
+    /// Who wrote it.
+    pub writer: Guid,
+    /// Its number.
+    pub sequence_number: u64,
+    /// Out of both.
+    pub trace_id: u128,
+    /// On which topic.
+    pub subject: Arc<Subject>,
+    /// The writer's own time.
+    pub source: RtpsTime,
+    /// Size of the payload in bytes.
+    pub size: u32,
+    /// In so many fragments; 1 for a whole one.
+    pub fragments: u32,
+    /// Where its first datagram went.
+    pub destination: Place,
+}
+
+/// What all messages of a writer have in common.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Subject {
+    /// Domain.
+    pub domain_id: u32,
+    /// ROS name.
+    pub topic: Arc<str>,
+    /// Type.
+    pub message_type: Arc<str>,
+    /// Its readers may acknowledge.
+    pub reliable: bool,
+}
+
+/// What was finished since the last call.
+#[derive(Debug, Default)]
+pub struct Spans {
+    /// In the order in which they ended.
+    pub spans: Vec<Span>,
+    /// For which there was no room.
+    pub lost: u64,
+}
+
+/// All of it.
+#[derive(Debug)]
+pub struct Tracer {
+    wanted: bool,
+    directed: bool,
+    /// `None` = none of its messages is wanted.
+    writers: HashMap<Guid, Option<Box<Traced>>>,
+    ledger: Ledger,
+}
+
+/// What all writers draw on.
+#[derive(Debug)]
+struct Ledger {
+    budget: Budget,
+    open: usize,
+    evictions: u64,
+    finished: Spans,
+}
+
+/// One writer some of whose messages are wanted.
+#[derive(Debug)]
+struct Traced {
+    subject: Arc<Subject>,
+    /// Of its messages, before their numbers.
+    identity: Identity,
+    threshold: u64,
+    samples: Samples,
+    /// Numbers, and whether they were seen leaving first.
+    under_way: VecDeque<(u64, bool, Message)>,
+    waiting: VecDeque<Waiting>,
+    done: VecDeque<u64>,
+}
+
+/// A message that was sent and not acknowledged by everybody.
+#[derive(Debug)]
+struct Waiting {
+    message: Message,
+    at: Timestamp,
+    readers: Vec<Guid>,
+}
+
+impl Tracer {
+    /// Nothing is wanted yet. A capture file does not say who sent: `directed` is false, and all of
+    /// it is taken for sent.
+    #[must_use]
+    pub fn new(directed: bool) -> Self {
+        Self {
+            wanted: false,
+            directed,
+            writers: HashMap::new(),
+            ledger: Ledger {
+                budget: Budget::new(BITMAP_BYTES),
+                open: 0,
+                evictions: 0,
+                finished: Spans::default(),
+            },
+        }
+    }
+
+    /// Whether anything is wanted at all.
+    #[must_use]
+    pub const fn is_wanted(&self) -> bool {
+        self.wanted
+    }
+
+    /// What is wanted has changed.
+    pub fn restart(&mut self, wanted: bool) {
+        self.wanted = wanted;
+        self.writers = HashMap::new();
+        self.ledger.budget = Budget::new(BITMAP_BYTES);
+        self.ledger.open = 0;
+    }
+
+    /// A writer has gone.
+    pub fn forget(&mut self, writer: Guid) {
+        if let Some(Some(traced)) = self.writers.remove(&writer) {
+            traced.close(&mut self.ledger);
+        }
+    }
+
+    /// Takes in a record. `about` says of a writer that was not heard before what it writes and
+    /// which part of it is wanted; `None` = not known yet.
+    pub fn record(&mut self, record: &Record, about: impl FnOnce() -> Option<(Subject, f64)>) {
+        const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
+        let writer = record.writer();
+        if !self.writers.contains_key(&writer) {
+            let Some((subject, ratio)) = about() else {
+                return;
+            };
+            if self.writers.len() >= MAX_WRITERS {
+                self.ledger.evictions += 1;
+                return;
+            }
+            let traced = Traced::new(writer, subject, ratio).map(Box::new);
+            self.writers.insert(writer, traced);
+        }
+        let Some(Some(traced)) = self.writers.get_mut(&writer) else {
+            return;
+        };
+        match record.kind {
+            kind::ACKNACK => traced.acknowledged(record, &mut self.ledger),
+            kind::DATA | kind::DATA_FRAG
+                if record.flags & UNDELIVERED == 0 && record.status_info == 0 =>
+            {
+                traced.sample(record, self.directed, &mut self.ledger);
+            }
+            _ => {}
+        }
+    }
+
+    /// Waits for no acknowledgement that is long overdue.
+    pub fn advance(&mut self, now: Timestamp) {
+        for traced in self.writers.values_mut().flatten() {
+            while let Some(first) = traced.waiting.front()
+                && now.0.saturating_sub(first.at.0) > PATIENCE
+            {
+                traced.waiting.pop_front();
+                self.ledger.open = self.ledger.open.saturating_sub(1);
+            }
+        }
+    }
+
+    /// What was finished since the last call.
+    pub fn take(&mut self) -> Spans {
+        std::mem::take(&mut self.ledger.finished)
+    }
+
+    /// Messages under way or waiting, their cap, and those given up for it.
+    #[must_use]
+    pub const fn size(&self) -> (usize, usize, u64) {
+        (self.ledger.open, MAX_OPEN, self.ledger.evictions)
+    }
+}
+
+impl Message {
+    /// The identity of a message for every agent that sees it.
+    #[must_use]
+    pub fn identity(writer: Guid, sequence_number: u64) -> u128 {
+        numbered(of_writer(writer), sequence_number)
+    }
+}
+
+fn of_writer(writer: Guid) -> Identity {
+    let mut identity = Identity::of(b"ros2 message");
+    identity.add(&writer.to_bytes());
+    identity
+}
+
+fn numbered(mut identity: Identity, sequence_number: u64) -> u128 {
+    identity.add(&sequence_number.to_be_bytes());
+    identity.bits()
+}
+
+impl Traced {
+    /// `None`: nothing of it is wanted.
+    fn new(writer: Guid, subject: Subject, ratio: f64) -> Option<Self> {
+        if ratio.is_nan() || ratio <= 0.0 {
+            return None;
+        }
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            clippy::cast_precision_loss,
+            reason = "a part of 2^56"
+        )]
+        let threshold = ((1.0 - ratio.min(1.0)) * RANDOM as f64) as u64;
+        Some(Self {
+            subject: Arc::new(subject),
+            identity: of_writer(writer),
+            threshold,
+            samples: Samples::default(),
+            under_way: VecDeque::new(),
+            waiting: VecDeque::new(),
+            done: VecDeque::new(),
+        })
+    }
+
+    fn sample(&mut self, record: &Record, directed: bool, ledger: &mut Ledger) {
+        let number = record.sequence_number;
+        let trace_id = numbered(self.identity, number);
+        if (trace_id as u64 & RANDOM) < self.threshold || self.done.contains(&number) {
+            return;
+        }
+        let is_leaving = record.flags & flag::OUTGOING != 0;
+        let known = self
+            .under_way
+            .iter()
+            .position(|(known, ..)| *known == number);
+        let index = known.unwrap_or_else(|| {
+            let message = self.message(record, trace_id);
+            self.begin(number, is_leaving, message, ledger)
+        });
+        // Copies that arrive are no part of how it left, nor the other way round.
+        if self
+            .under_way
+            .get(index)
+            .is_none_or(|(_, leaving, _)| *leaving != is_leaving)
+        {
+            return;
+        }
+        let (at, first) = (Timestamp(record.time), first_datagram(record));
+        let (begin, source) = if record.kind == kind::DATA_FRAG {
+            match self.samples.fragment(record, at, &mut ledger.budget) {
+                Progress::Partial | Progress::Duplicate => return,
+                Progress::Complete(facts) => (facts.began, facts.source),
+                Progress::Rejected | Progress::TooMany => {
+                    self.under_way.remove(index);
+                    ledger.give_up();
+                    return;
+                }
+            }
+        } else {
+            (first, record.source_timestamp())
+        };
+        let Some((_, _, mut message)) = self.under_way.remove(index) else {
+            return;
+        };
+        message.source = source;
+        if self.done.len() >= REMEMBERED {
+            self.done.pop_front();
+        }
+        self.done.push_back(number);
+        let on_wire = record.flags & flag::HOST == 0;
+        let is_sent = is_leaving || !directed || on_wire && record.interface == LOOPBACK;
+        let stage = if is_sent { Stage::Send } else { Stage::Receive };
+        ledger.finish(Span {
+            stage,
+            message: message.clone(),
+            begin,
+            end: at,
+        });
+        if !is_sent || !self.subject.reliable {
+            ledger.open = ledger.open.saturating_sub(1);
+            return;
+        }
+        if self.waiting.len() >= MAX_OPEN_OF_WRITER {
+            self.waiting.pop_front();
+            ledger.give_up();
+        }
+        self.waiting.push_back(Waiting {
+            message,
+            at,
+            readers: Vec::new(),
+        });
+    }
+
+    /// Makes room for a message and gives its place.
+    fn begin(
+        &mut self,
+        number: u64,
+        is_leaving: bool,
+        message: Message,
+        ledger: &mut Ledger,
+    ) -> usize {
+        if self.under_way.len() >= MAX_UNDER_WAY {
+            self.under_way.pop_front();
+            ledger.give_up();
+        }
+        if ledger.open >= MAX_OPEN {
+            if self.waiting.pop_front().is_none() {
+                ledger.evictions += 1;
+                return usize::MAX;
+            }
+            ledger.give_up();
+        }
+        ledger.open += 1;
+        self.under_way.push_back((number, is_leaving, message));
+        self.under_way.len() - 1
+    }
+
+    fn message(&self, record: &Record, trace_id: u128) -> Message {
+        let is_whole = record.kind == kind::DATA;
+        let size = record.fragment_size().max(1);
+        Message {
+            writer: record.writer(),
+            sequence_number: record.sequence_number,
+            trace_id,
+            subject: Arc::clone(&self.subject),
+            source: record.source_timestamp(),
+            size: if is_whole {
+                record.payload_len
+            } else {
+                record.sample_size
+            },
+            fragments: if is_whole {
+                1
+            } else {
+                record.sample_size.div_ceil(size)
+            },
+            destination: Place::of(record),
+        }
+    }
+
+    fn acknowledged(&mut self, record: &Record, ledger: &mut Ledger) {
+        let (reader, at) = (record.reader(), Timestamp(record.time));
+        let covered = |waiting: &&mut Waiting| {
+            waiting.message.sequence_number < record.sequence_number
+                && !waiting.readers.contains(&reader)
+                && waiting.readers.len() < MAX_READERS
+        };
+        for waiting in self.waiting.iter_mut().filter(covered) {
+            waiting.readers.push(reader);
+            ledger.finish(Span {
+                stage: Stage::Settle(reader),
+                message: waiting.message.clone(),
+                begin: waiting.at,
+                end: at.max(waiting.at),
+            });
+        }
+    }
+
+    fn close(mut self, ledger: &mut Ledger) {
+        let open = self.under_way.len() + self.waiting.len();
+        ledger.open = ledger.open.saturating_sub(open);
+        self.samples.clear(&mut ledger.budget);
+    }
+}
+
+impl Ledger {
+    fn finish(&mut self, span: Span) {
+        if self.finished.spans.len() < MAX_FINISHED {
+            self.finished.spans.push(span);
+        } else {
+            self.finished.lost += 1;
+        }
+    }
+
+    fn give_up(&mut self) {
+        self.open = self.open.saturating_sub(1);
+        self.evictions += 1;
+    }
+}
+
+/// A record of several datagrams bears the time of the last one.
+fn first_datagram(record: &Record) -> Timestamp {
+    Timestamp(record.time.saturating_sub(record.elapsed.into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::record::guid_words;
+    use ros2probe_wire::{EntityId, GuidPrefix};
+
+    use super::*;
+
+    const WRITER: Guid = Guid::new(GuidPrefix([7; 12]), EntityId([0, 0, 1, 3]));
+    const SECOND: u64 = 1_000_000_000;
+
+    fn reader(number: u8) -> Guid {
+        Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 4]))
+    }
+
+    fn data(number: u64, time: u64, flags: u16) -> Record {
+        Record {
+            kind: kind::DATA,
+            writer: guid_words(WRITER),
+            sequence_number: number,
+            time,
+            flags,
+            payload_len: 100,
+            interface: 2,
+            ..Record::default()
+        }
+    }
+
+    /// `count` of ten fragments.
+    fn fragments(number: u64, start: u32, count: u32, time: u64, elapsed: u32) -> Record {
+        Record {
+            kind: kind::DATA_FRAG,
+            fragment_start: start,
+            fragments: count << 16 | 1000,
+            sample_size: 10_000,
+            elapsed,
+            source_timestamp: if start == 1 { 99 } else { 0 },
+            ..data(number, time, flag::OUTGOING)
+        }
+    }
+
+    fn acknack(reader: Guid, base: u64, time: u64) -> Record {
+        Record {
+            kind: kind::ACKNACK,
+            reader: guid_words(reader),
+            ..data(base, time, 0)
+        }
+    }
+
+    fn tracer() -> Tracer {
+        let mut tracer = Tracer::new(true);
+        tracer.restart(true);
+        tracer
+    }
+
+    fn subject() -> Subject {
+        Subject {
+            domain_id: 0,
+            topic: "/points".into(),
+            message_type: "sensor_msgs/msg/PointCloud2".into(),
+            reliable: true,
+        }
+    }
+
+    fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
+        for record in records {
+            tracer.record(record, || Some((subject(), ratio)));
+        }
+        tracer.take().spans
+    }
+
+    fn times(spans: &[Span]) -> Vec<(Stage, u64, u64)> {
+        let times = |span: &Span| (span.stage, span.begin.0, span.end.0);
+        spans.iter().map(times).collect()
+    }
+
+    #[test]
+    fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_reader() {
+        let mut tracer = tracer();
+        let spans = take(
+            &mut tracer,
+            &[
+                fragments(5, 1, 4, 1_300, 300),
+                fragments(5, 9, 2, 1_800, 50),
+                fragments(5, 5, 4, 1_900, 40),
+                // Again, to another destination, and a copy that arrives on this host.
+                fragments(5, 1, 4, 2_000, 10),
+                data(5, 2_100, 0),
+                acknack(reader(1), 5, 2_200),
+                acknack(reader(1), 6, 2_300),
+                acknack(reader(1), 6, 2_400),
+                acknack(reader(2), 9, 2_500),
+            ],
+            1.0,
+        );
+        assert_eq!(
+            times(&spans),
+            [
+                (Stage::Send, 1_000, 1_900),
+                (Stage::Settle(reader(1)), 1_900, 2_300),
+                (Stage::Settle(reader(2)), 1_900, 2_500),
+            ]
+        );
+        let [sent, settled, ..] = spans.as_slice() else {
+            panic!()
+        };
+        assert_eq!(sent.message, settled.message);
+        assert_eq!(sent.message.trace_id, Message::identity(WRITER, 5));
+        assert_eq!((sent.message.size, sent.message.fragments), (10_000, 10));
+        assert_eq!(sent.message.source, RtpsTime(99));
+        assert_eq!(tracer.size().0, 1);
+        tracer.advance(Timestamp(1_900 + PATIENCE + 1));
+        assert_eq!(tracer.size(), (0, MAX_OPEN, 0));
+        assert_eq!(take(&mut tracer, &[acknack(reader(3), 9, 9_000)], 1.0), []);
+    }
+
+    #[test]
+    fn where_it_only_arrives_it_is_received_in_the_same_trace() {
+        let arrives = [data(5, 10, flag::HOST), data(5, 11, flag::HOST)];
+        let received = take(&mut tracer(), &arrives, 1.0);
+        assert_eq!(times(&received), [(Stage::Receive, 10, 10)]);
+        let sent = take(&mut tracer(), &[data(5, 3, flag::OUTGOING)], 1.0);
+        let trace = |spans: &[Span]| spans.first().map(|span| span.message.trace_id);
+        assert_eq!(trace(&sent), trace(&received));
+        assert_eq!(take(&mut tracer(), &[acknack(reader(1), 9, 20)], 1.0), []);
+
+        let mut undirected = Tracer::new(false);
+        undirected.restart(true);
+        let spans = take(&mut undirected, &[data(5, 10, 0)], 1.0);
+        assert_eq!(times(&spans), [(Stage::Send, 10, 10)]);
+        let loopback = Record {
+            interface: LOOPBACK,
+            ..data(6, 10, 0)
+        };
+        assert_eq!(
+            times(&take(&mut tracer(), &[loopback], 1.0)),
+            [(Stage::Send, 10, 10)]
+        );
+    }
+
+    #[test]
+    fn every_agent_samples_the_same_messages_and_as_many_as_asked() {
+        let records: Vec<Record> = (1..=20_000).map(|n| data(n, n, flag::OUTGOING)).collect();
+        let sampled = |ratio: f64| {
+            let mut tracer = tracer();
+            let mut numbers = Vec::new();
+            for part in records.chunks(1_000) {
+                let spans = take(&mut tracer, part, ratio);
+                numbers.extend(spans.iter().map(|span| span.message.sequence_number));
+            }
+            numbers
+        };
+        let tenth = sampled(0.1);
+        assert!((1_850..2_150).contains(&tenth.len()), "{}", tenth.len());
+        assert_eq!(tenth, sampled(0.1));
+        let fifth = sampled(0.2);
+        assert!(tenth.iter().all(|number| fifth.contains(number)));
+        assert_eq!(sampled(1.0).len(), records.len());
+        assert_eq!(sampled(0.0).len() + sampled(f64::NAN).len(), 0);
+    }
+
+    #[test]
+    fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
+        let mut tracer = tracer();
+        for number in 1..=1_000 {
+            take(&mut tracer, &[fragments(number, 1, 1, number, 0)], 1.0);
+        }
+        assert!(tracer.size().0 <= MAX_UNDER_WAY && tracer.size().2 >= 900);
+        for number in 1_001..=3_000 {
+            take(&mut tracer, &[data(number, number, flag::OUTGOING)], 1.0);
+        }
+        assert!(tracer.size().0 <= MAX_UNDER_WAY + MAX_OPEN_OF_WRITER);
+        for number in 1..=20_u64 {
+            let other = Guid::new(GuidPrefix([number as u8; 12]), EntityId([0, 0, 9, 3]));
+            for sample in 1..=1_000 {
+                let record = Record {
+                    writer: guid_words(other),
+                    ..data(sample, SECOND, flag::OUTGOING)
+                };
+                tracer.record(&record, || Some((subject(), 1.0)));
+            }
+        }
+        assert!(tracer.size().0 <= MAX_OPEN, "{:?}", tracer.size());
+        let taken = tracer.take();
+        assert_eq!(taken.spans.len(), MAX_FINISHED);
+        assert!(taken.lost > 10_000);
+        tracer.forget(WRITER);
+        tracer.advance(Timestamp(SECOND + PATIENCE + 1));
+        assert_eq!(tracer.size().0, 0);
+    }
+
+    #[test]
+    fn nobody_is_asked_about_a_writer_twice() {
+        let mut tracer = tracer();
+        let mut asked = 0;
+        for number in 1..=3 {
+            tracer.record(&data(number, number, 0), || {
+                asked += 1;
+                // At first discovery does not know it.
+                (asked > 1).then(|| (subject(), 0.0))
+            });
+        }
+        assert_eq!(asked, 2);
+    }
+}
