@@ -68,10 +68,13 @@ fn run(options: cli::Run) -> Result<()> {
     let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
     let watches = Watches::new(Arc::clone(&board), config.watches.clone(), options.watch);
     let watches = Arc::new(watches.context("the watchlist is unusable")?);
-    let server = config
-        .metrics
-        .listen
-        .map(|address| Server::bind(address, Arc::clone(&board)));
+    let server = config.metrics.listen.map(|address| {
+        Server::bind(
+            address,
+            config.metrics.web_config.as_deref(),
+            Arc::clone(&board),
+        )
+    });
     let server = server.transpose()?;
     let control = control::open(&config.api)?;
     let export = otlp::Settings::resolve(

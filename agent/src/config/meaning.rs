@@ -95,7 +95,7 @@ impl Reader {
                 reassembly_bytes: limits.reassembly_bytes,
             },
             capture: self.capture(shape.capture.unwrap_or_default()),
-            metrics: metrics(&shape.metrics.unwrap_or_default()),
+            metrics: metrics(shape.metrics.unwrap_or_default()),
             api: self.api(shape.api.unwrap_or_default()),
             otlp: otlp(shape.otlp.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
@@ -275,6 +275,9 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         "api.socket" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
             "must be an absolute path, as in `/run/ros2probe/api.sock`, `auto` or `off`".to_owned(),
         ),
+        "metrics.web_config" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/etc/ros2probe/web.yml`".to_owned())
+        }
         "api.token_file" if !text.starts_with('/') => Err(
             "must be an absolute path, as in `/run/credentials/ros2probe.service/token`".to_owned(),
         ),
@@ -316,12 +319,13 @@ fn state(text: &str) -> StateChoice {
     }
 }
 
-fn metrics(shape: &MetricsShape) -> MetricsSettings {
+fn metrics(shape: MetricsShape) -> MetricsSettings {
     MetricsSettings {
         // Text that is no address is `off`: everything else was refused before.
         listen: shape.listen.parse().ok(),
         histograms: shape.histograms,
         per_writer: shape.per_writer,
+        web_config: shape.web_config.map(PathBuf::from),
     }
 }
 

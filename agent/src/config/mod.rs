@@ -141,6 +141,8 @@ pub struct MetricsSettings {
     pub histograms: bool,
     /// Series per writer.
     pub per_writer: bool,
+    /// Says who may scrape and how it is encrypted.
+    pub web_config: Option<PathBuf>,
 }
 
 /// The control API.
@@ -301,6 +303,10 @@ impl Config {
             ("limits", self.limits != new.limits),
             ("capture", self.capture != new.capture),
             ("metrics.listen", self.metrics.listen != new.metrics.listen),
+            (
+                "metrics.web_config",
+                self.metrics.web_config != new.metrics.web_config,
+            ),
             ("api", self.api != new.api),
             ("otlp", self.otlp != new.otlp),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
@@ -351,6 +357,7 @@ impl Default for Config {
                 listen: defaults::LISTEN.parse().ok(),
                 histograms: true,
                 per_writer: false,
+                web_config: None,
             },
             api: ApiSettings {
                 listen: defaults::API.parse().ok(),

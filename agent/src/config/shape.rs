@@ -174,6 +174,9 @@ pub(super) struct MetricsShape {
     pub(super) histograms: bool,
     /// Series per writer of watched topics, besides those per topic. Applied on reload.
     pub(super) per_writer: bool,
+    /// File that says who may scrape and with which certificate the listener proves who it is, of
+    /// the form of exporter-toolkit's web.yml: `basic_auth_users` and `tls_server_config`.
+    pub(super) web_config: Option<String>,
 }
 
 /// The control API.
@@ -278,6 +281,7 @@ impl Default for MetricsShape {
             listen: defaults::LISTEN.to_owned(),
             histograms: true,
             per_writer: false,
+            web_config: None,
         }
     }
 }

@@ -1,7 +1,9 @@
-//! The metrics listener: read-only, bounded in connections and in how long one may idle.
+//! The metrics listener: read-only, bounded in connections and in how long one may idle, and open to
+//! those whom `metrics.web_config` names, or to everybody.
 
 use std::io;
 use std::net::SocketAddr;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -9,14 +11,19 @@ use axum::Router;
 use axum::extract::State as Extract;
 use axum::http::header::{ACCEPT, CACHE_CONTROL, CONTENT_TYPE};
 use axum::http::{HeaderMap, Method, StatusCode};
+use axum::middleware;
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
+use super::basic_auth::{self, Gate};
 use super::board::Board;
 use super::bounded::Bounded;
 use super::exposition::{Exposition, Format};
+#[cfg(feature = "tls")]
+use super::tls::{Acceptor, Tls};
+use super::web_config::{WebConfig, WebConfigError};
 
 /// More scrapers than any robot has.
 const MAX_CONNECTIONS: usize = 32;
@@ -30,12 +37,25 @@ const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 
 /// Why there is no listener.
 #[derive(Debug, thiserror::Error)]
-#[error(
-    "cannot listen on {address}: change `metrics.listen` in the configuration or pass `--metrics`"
-)]
-pub struct ListenError {
-    address: SocketAddr,
-    source: io::Error,
+pub enum ListenError {
+    /// The address is taken or not this host's.
+    #[error(
+        "cannot listen on {address}: change `metrics.listen` in the configuration or pass \
+         `--metrics`"
+    )]
+    Address {
+        /// Where.
+        address: SocketAddr,
+        /// Why not.
+        source: io::Error,
+    },
+    /// It cannot be protected as asked for.
+    #[error(transparent)]
+    Web(#[from] WebConfigError),
+    /// It cannot be encrypted as asked for.
+    #[cfg(feature = "tls")]
+    #[error(transparent)]
+    Tls(#[from] super::tls::TlsError),
 }
 
 /// A bound listener that nobody answers yet.
@@ -43,6 +63,9 @@ pub struct ListenError {
 pub struct Server {
     listener: std::net::TcpListener,
     board: Arc<Board>,
+    gate: Option<Arc<Gate>>,
+    #[cfg(feature = "tls")]
+    acceptor: Option<Acceptor>,
 }
 
 #[derive(Clone)]
@@ -52,18 +75,33 @@ struct Pages {
 }
 
 impl Server {
-    /// Binds; needs no runtime.
+    /// Binds; needs no runtime. The file `web_config` says who may come in.
     ///
     /// # Errors
-    /// When the address is taken or not this host's.
-    pub fn bind(address: SocketAddr, board: Arc<Board>) -> Result<Self, ListenError> {
+    /// When the address is taken or not this host's, or the file asks for what cannot be.
+    pub fn bind(
+        address: SocketAddr,
+        web_config: Option<&Path>,
+        board: Arc<Board>,
+    ) -> Result<Self, ListenError> {
+        let web = web_config.map(WebConfig::load).transpose()?;
+        let web = web.unwrap_or_default();
+        let gate = (!web.users.is_empty()).then(|| Arc::new(Gate::new(web.users)));
+        #[cfg(feature = "tls")]
+        let acceptor = web.tls.as_ref().map(Acceptor::new).transpose()?;
         let bind = || {
             let listener = std::net::TcpListener::bind(address)?;
             listener.set_nonblocking(true)?;
             Ok(listener)
         };
-        let listener = bind().map_err(|source| ListenError { address, source })?;
-        Ok(Self { listener, board })
+        let listener = bind().map_err(|source| ListenError::Address { address, source })?;
+        Ok(Self {
+            listener,
+            board,
+            gate,
+            #[cfg(feature = "tls")]
+            acceptor,
+        })
     }
 
     /// Where it listens, with the port the kernel chose when it was 0.
@@ -81,7 +119,17 @@ impl Server {
     pub async fn serve(self, stop: CancellationToken) -> io::Result<()> {
         let listener = Bounded::new(TcpListener::from_std(self.listener)?, MAX_CONNECTIONS);
         let stopped = async move { stop.cancelled().await };
-        axum::serve(listener, router(self.board))
+        let mut router = router(self.board);
+        if let Some(gate) = self.gate {
+            router = router.layer(middleware::from_fn_with_state(gate, basic_auth::guard));
+        }
+        #[cfg(feature = "tls")]
+        if let Some(acceptor) = self.acceptor {
+            return axum::serve(Tls::new(listener, acceptor), router)
+                .with_graceful_shutdown(stopped)
+                .await;
+        }
+        axum::serve(listener, router)
             .with_graceful_shutdown(stopped)
             .await
     }

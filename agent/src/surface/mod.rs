@@ -4,6 +4,7 @@
 mod agent;
 pub mod agent_facts;
 pub mod api;
+mod basic_auth;
 pub mod board;
 mod bounded;
 pub mod catalogue;
@@ -16,7 +17,10 @@ pub mod otlp;
 mod page;
 mod process;
 mod robot;
+#[cfg(feature = "tls")]
+mod tls;
 mod walk;
+pub mod web_config;
 
 pub use agent_facts::{Ability, AgentFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 pub use board::{Board, Settings, State};

@@ -202,7 +202,7 @@ impl Scrape {
         counters.map(str::to_owned).collect()
     }
 
-    fn samples(&self, name: &str, labels: &[(&str, &str)]) -> impl Iterator<Item = f64> {
+    pub(crate) fn samples(&self, name: &str, labels: &[(&str, &str)]) -> impl Iterator<Item = f64> {
         let wanted: Vec<String> = labels
             .iter()
             .map(|(label, value)| format!("{label}=\"{value}\""))

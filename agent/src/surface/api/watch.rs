@@ -25,7 +25,6 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::security::{MAX_BODY, too_large};
 use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern, check_trace};
 use crate::model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
-use crate::surface::board::State as BoardState;
 use crate::watches::{Done, Entry, Origin, Refused};
 
 /// How long a reader waits for a snapshot that knows what was asked for just before.
@@ -207,7 +206,8 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 async fn list(State(context): State<Context>) -> Json<WatchList> {
     context.board.refresh(PATIENCE).await;
     let (in_force, state) = (context.watches.in_force(), context.board.state());
-    let watches = in_force.entries().iter().map(|entry| view(entry, &state));
+    let snapshot = state.snapshot.as_ref();
+    let watches = in_force.entries().iter().map(|entry| view(entry, snapshot));
     Json(WatchList {
         watches: watches.collect(),
     })
@@ -234,7 +234,8 @@ async fn show(
     let in_force = context.watches.in_force();
     let entry = in_force.find(&topic, domain.domain_id);
     let entry = entry.ok_or_else(|| unknown(&topic, domain.domain_id))?;
-    Ok(Json(view(entry, &context.board.state())))
+    let state = context.board.state();
+    Ok(Json(view(entry, state.snapshot.as_ref())))
 }
 
 /// Watch a topic
@@ -436,7 +437,10 @@ fn answer(
         watch: Arc::new(watch.clone()),
         origin: Origin::Api,
     });
-    let body = Json(view(&entry, &context.board.state()));
+    let state = context.board.state();
+    // What is on the board of a new one was of another one, if anything.
+    let snapshot = state.snapshot.as_ref().filter(|_| done == Done::Unchanged);
+    let body = Json(view(&entry, snapshot));
     Ok(match done {
         Done::Added => {
             let location = location(watch);
@@ -483,9 +487,8 @@ fn unknown(topic: &str, domain_id: Option<u32>) -> Problem {
     Problem::new(Code::NoSuchWatch, detail)
 }
 
-fn view(entry: &Entry, state: &BoardState) -> WatchView {
+fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
     let watch = &entry.watch;
-    let snapshot = state.snapshot.as_ref();
     let facts = snapshot.and_then(|snapshot| {
         let mut all = snapshot.watches.iter();
         let same = |facts: &&WatchFacts| {

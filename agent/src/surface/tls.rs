@@ -1,0 +1,195 @@
+//! TLS on the metrics listener (feature `tls`: rustls with ring, which is partly C and assembly).
+//!
+//! A handshake takes place while the connection is read, so that a slow client holds up itself
+//! alone; the limits of the connection below hold for it as well.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll, ready};
+
+use axum::serve::Listener;
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio_rustls::rustls::crypto::ring::default_provider;
+use tokio_rustls::rustls::pki_types::pem::{self, PemObject as _};
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio_rustls::rustls::server::{VerifierBuilderError, WebPkiClientVerifier};
+use tokio_rustls::rustls::version::{TLS12, TLS13};
+use tokio_rustls::rustls::{self, RootCertStore, ServerConfig};
+use tokio_rustls::server::TlsStream;
+use tokio_rustls::{Accept, TlsAcceptor};
+
+use super::web_config::TlsFiles;
+
+/// Why TLS cannot be spoken.
+#[derive(Debug, thiserror::Error)]
+pub enum TlsError {
+    /// A file cannot be read.
+    #[error("cannot read {} (`tls_server_config`)", path.display())]
+    Read {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// A file holds something else.
+    #[error("{} (`tls_server_config`) is not as it should be", path.display())]
+    Pem {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: pem::Error,
+    },
+    /// Certificate and key do not fit.
+    #[error("certificate and key (`tls_server_config`) cannot be used")]
+    Unfit(#[from] rustls::Error),
+    /// Nobody could be verified.
+    #[error("client_ca_file (`tls_server_config`) cannot be used")]
+    Authorities(#[from] VerifierBuilderError),
+}
+
+/// Certificates and key, ready to be used.
+#[derive(Clone)]
+pub(super) struct Acceptor(TlsAcceptor);
+
+/// A listener whose connections are encrypted.
+pub(super) struct Tls<L> {
+    listener: L,
+    acceptor: Acceptor,
+}
+
+/// A connection, from its first byte on.
+pub(super) enum Stream<S> {
+    /// Not agreed yet.
+    Handshake(Box<Accept<S>>),
+    /// Agreed.
+    Open(Box<TlsStream<S>>),
+    /// Not agreed.
+    Failed,
+}
+
+impl Acceptor {
+    /// What the files say.
+    pub(super) fn new(files: &TlsFiles) -> Result<Self, TlsError> {
+        let provider = Arc::new(default_provider());
+        let versions: &[_] = if files.only_tls13 {
+            &[&TLS13]
+        } else {
+            &[&TLS13, &TLS12]
+        };
+        let builder = ServerConfig::builder_with_provider(Arc::clone(&provider));
+        let builder = builder.with_protocol_versions(versions)?;
+        let builder = match &files.client_authorities {
+            None => builder.with_no_client_auth(),
+            Some(path) => {
+                let mut roots = RootCertStore::empty();
+                for certificate in certificates(path)? {
+                    roots.add(certificate)?;
+                }
+                let verifier =
+                    WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider);
+                builder.with_client_cert_verifier(verifier.build()?)
+            }
+        };
+        let key = PrivateKeyDer::from_pem_slice(&read(&files.key)?);
+        let key = key.map_err(|source| TlsError::Pem {
+            path: files.key.clone(),
+            source,
+        })?;
+        let mut config = builder.with_single_cert(certificates(&files.certificates)?, key)?;
+        config.alpn_protocols = vec![b"http/1.1".to_vec()];
+        Ok(Self(TlsAcceptor::from(Arc::new(config))))
+    }
+}
+
+impl std::fmt::Debug for Acceptor {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Acceptor")
+    }
+}
+
+fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, TlsError> {
+    let bytes = read(path)?;
+    let certificates = CertificateDer::pem_slice_iter(&bytes).collect();
+    certificates.map_err(|source| TlsError::Pem {
+        path: path.to_path_buf(),
+        source,
+    })
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, TlsError> {
+    fs::read(path).map_err(|source| TlsError::Read {
+        path: path.to_path_buf(),
+        source,
+    })
+}
+
+impl<L> Tls<L> {
+    pub(super) const fn new(listener: L, acceptor: Acceptor) -> Self {
+        Self { listener, acceptor }
+    }
+}
+
+impl<L: Listener> Listener for Tls<L> {
+    type Io = Stream<L::Io>;
+    type Addr = L::Addr;
+
+    async fn accept(&mut self) -> (Self::Io, Self::Addr) {
+        let (stream, address) = self.listener.accept().await;
+        let handshake = self.acceptor.0.accept(stream);
+        (Stream::Handshake(Box::new(handshake)), address)
+    }
+
+    fn local_addr(&self) -> io::Result<Self::Addr> {
+        self.listener.local_addr()
+    }
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> Stream<S> {
+    /// The stream behind the handshake, which goes on with each call.
+    fn poll_open(&mut self, context: &mut Context<'_>) -> Poll<io::Result<Pin<&mut TlsStream<S>>>> {
+        if let Self::Handshake(accept) = self {
+            let agreed = ready!(Pin::new(&mut **accept).poll(context));
+            *self = Self::Failed;
+            *self = Self::Open(Box::new(agreed?));
+        }
+        Poll::Ready(match self {
+            Self::Open(stream) => Ok(Pin::new(stream)),
+            Self::Handshake(_) | Self::Failed => Err(io::ErrorKind::NotConnected.into()),
+        })
+    }
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for Stream<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        ready!(self.poll_open(context))?.poll_read(context, buffer)
+    }
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for Stream<S> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        ready!(self.poll_open(context))?.poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        ready!(self.poll_open(context))?.poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        match ready!(self.poll_open(context)) {
+            Ok(stream) => stream.poll_shutdown(context),
+            // Nothing was agreed on: nothing to take leave of.
+            Err(_) => Poll::Ready(Ok(())),
+        }
+    }
+}
