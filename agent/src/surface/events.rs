@@ -237,6 +237,16 @@ impl EventLog {
         }
     }
 
+    /// As if so many events had come and all that is kept had gone since.
+    #[cfg(test)]
+    pub(super) fn overwrite(&self, count: u64) {
+        let mut log = self.log();
+        log.kept.clear();
+        log.last += count;
+        drop(log);
+        self.news.notify_waiters();
+    }
+
     fn second(&self, now: Instant) -> u64 {
         now.saturating_duration_since(self.begun).as_secs()
     }

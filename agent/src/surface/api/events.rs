@@ -378,21 +378,38 @@ mod tests {
         }
     }
 
-    #[tokio::test]
-    async fn a_stream_ends_with_the_agent_after_what_has_happened() {
-        let log = Arc::new(EventLog::new());
-        let stop = CancellationToken::new();
-        log.tell(AgentEvent::Reloaded { watches: 1 });
-        stop.cancel();
-        let mut stream = Stream {
-            log,
-            stop,
+    fn stream(log: &Arc<EventLog>, stop: &CancellationToken) -> Stream {
+        Stream {
+            log: Arc::clone(log),
+            stop: stop.clone(),
             filter: Filter::default(),
             follow: true,
             place: 0,
             waiting: VecDeque::new(),
             _permit: STREAMS.try_acquire().unwrap(),
-        };
+        }
+    }
+
+    #[tokio::test]
+    async fn a_slow_client_is_told_how_many_events_it_missed() {
+        let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
+        let mut stream = stream(&log, &stop);
+        log.tell(AgentEvent::Reloaded { watches: 0 });
+        assert!(format!("{:?}", stream.next().await).contains("watches"));
+        log.overwrite(7);
+        assert!(format!("{:?}", stream.next().await).contains("lagged"));
+        assert!(log.dropped().contains(&("stream_lagged", 7)));
+        log.tell(AgentEvent::Reloaded { watches: 0 });
+        assert!(format!("{:?}", stream.next().await).contains("watches"));
+        assert_eq!(stream.place, 9);
+    }
+
+    #[tokio::test]
+    async fn a_stream_ends_with_the_agent_after_what_has_happened() {
+        let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
+        log.tell(AgentEvent::Reloaded { watches: 1 });
+        stop.cancel();
+        let mut stream = stream(&log, &stop);
         stream.begin(true);
         let mut count = 0;
         while stream.next().await.is_some() {
