@@ -1,5 +1,6 @@
 //! The demo robot's troubles reach a real OpenTelemetry receiver as events with names and
 //! attributes: who came, what was lost, who fell silent; and the sums agree with the counters.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod harness;
 mod rotel;
