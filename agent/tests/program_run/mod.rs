@@ -62,7 +62,7 @@ impl Kernel {
     }
 
     pub fn load_hook(hook: Hook) -> Self {
-        go_to_cpu(0);
+        stay_on_cpu();
         let settings = FilterSettings {
             record_ring_bytes: 1 << 20,
             ..FilterSettings::default()
@@ -340,6 +340,13 @@ impl Kernel {
             Duration::from_nanos(attributes.duration.into()),
         )
     }
+}
+
+/// Keeps this thread on the CPU that it is on, which another test may leave alone.
+fn stay_on_cpu() {
+    // SAFETY: takes nothing.
+    let cpu = unsafe { libc::sched_getcpu() };
+    go_to_cpu(usize::try_from(cpu).unwrap());
 }
 
 /// Moves this thread to a CPU: the filter joins fragments by CPU, as packets arrive by CPU.

@@ -15,30 +15,50 @@ const SMALL: Settings = Settings {
     retire: Duration::from_millis(10),
 };
 
-/// UDP payloads seen, of frames that this host sends.
-fn sent(ring: &mut Ring, patience: Duration) -> Vec<(u32, Vec<u8>)> {
-    let mut payloads = Vec::new();
+/// However busy the machine is.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// UDP payloads, by interface.
+type Payloads = Vec<(u32, Vec<u8>)>;
+
+/// UDP payloads seen, of frames that this host sends, until they are as they should be.
+fn sent_until(ring: &mut Ring, done: impl Fn(&Payloads) -> bool) -> Payloads {
+    let mut payloads = Payloads::new();
+    let start = Instant::now();
+    while !done(&payloads) && start.elapsed() < PATIENCE {
+        ring.wait(Duration::from_millis(20)).unwrap();
+        payloads.extend(ready(ring));
+    }
+    payloads
+}
+
+/// UDP payloads seen within a time, of frames that this host sends.
+fn sent(ring: &mut Ring, patience: Duration) -> Payloads {
+    let mut payloads = Payloads::new();
     let start = Instant::now();
     while start.elapsed() < patience {
         ring.wait(Duration::from_millis(20)).unwrap();
-        while let Some(block) = ring.block() {
-            let mut frames = block.frames();
-            for frame in frames.by_ref() {
-                let packet = frame::parse_cooked(
-                    frame.protocol,
-                    frame.packet_type,
-                    frame.bytes,
-                    frame.length,
-                );
-                if let Ok(Some(packet)) = packet
-                    && frame.packet_type == PacketType::OUTGOING
-                    && let Payload::Datagram(datagram) = packet.payload
-                {
-                    payloads.push((frame.interface, datagram.payload.to_vec()));
-                }
+        payloads.extend(ready(ring));
+    }
+    payloads
+}
+
+/// UDP payloads in blocks that the kernel is done with, of frames that this host sends.
+fn ready(ring: &mut Ring) -> Payloads {
+    let mut payloads = Payloads::new();
+    while let Some(block) = ring.block() {
+        let mut frames = block.frames();
+        for frame in frames.by_ref() {
+            let packet =
+                frame::parse_cooked(frame.protocol, frame.packet_type, frame.bytes, frame.length);
+            if let Ok(Some(packet)) = packet
+                && frame.packet_type == PacketType::OUTGOING
+                && let Payload::Datagram(datagram) = packet.payload
+            {
+                payloads.push((frame.interface, datagram.payload.to_vec()));
             }
-            assert!(!frames.damaged());
         }
+        assert!(!frames.damaged());
     }
     payloads
 }
@@ -79,7 +99,7 @@ fn frames_on_loopback_arrive_with_kernel_time_and_direction() {
         let before = now();
         socket.send_to(b"RTPS", "127.0.0.1:7400").unwrap();
         let after = now();
-        assert!(ring.wait(Duration::from_secs(1)).unwrap());
+        assert!(ring.wait(PATIENCE).unwrap());
         let block = ring.block().unwrap();
         let frames: Vec<_> = block
             .frames()
@@ -100,7 +120,7 @@ fn frames_on_loopback_arrive_with_kernel_time_and_direction() {
             assert!(frame.bytes.ends_with(b"RTPS"));
             let time = u128::from(frame.time.0);
             assert!(
-                time >= before && time <= after + 50_000_000,
+                time >= before && time <= after + 1_000_000_000,
                 "{before} {time} {after}"
             );
         }
@@ -112,22 +132,21 @@ fn the_ring_goes_round_many_times_without_losing_a_frame() {
     in_new_namespace(|| {
         let mut ring = Ring::open(SMALL, None).unwrap();
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
-        let mut numbers = Vec::new();
-        // 4 blocks hold about 60 of these; 3000 times two copies are 100 rounds.
-        for batch in 0..150_u32 {
-            for number in batch * 20..batch * 20 + 20 {
-                let mut payload = [0; 800];
-                payload[..4].copy_from_slice(&number.to_be_bytes());
-                socket.send_to(&payload, "127.0.0.1:7400").unwrap();
-            }
-            let mut patience = 100;
-            while numbers.len() < (batch as usize + 1) * 20 && patience > 0 {
-                patience -= 1;
-                for (_, payload) in sent(&mut ring, Duration::from_millis(1)) {
-                    numbers.push(u32::from_be_bytes(*payload.first_chunk().unwrap()));
-                }
-            }
+        let mut seen = Payloads::new();
+        // 4 blocks hold about 60 of these; 3000 times two copies are 100 rounds. On a busy machine
+        // each block may be closed with two of them, so what is there is always read first.
+        for number in 0..3000_u32 {
+            let mut payload = [0; 800];
+            payload[..4].copy_from_slice(&number.to_be_bytes());
+            socket.send_to(&payload, "127.0.0.1:7400").unwrap();
+            seen.extend(ready(&mut ring));
         }
+        let left = 3000 - seen.len();
+        seen.extend(sent_until(&mut ring, |payloads| payloads.len() >= left));
+        let numbers = seen.iter().map(|(_, payload)| payload.first_chunk());
+        let numbers: Vec<u32> = numbers
+            .map(|bytes| u32::from_be_bytes(*bytes.unwrap()))
+            .collect();
         // Not `assert_eq`: nobody reads two lists of 3000 numbers.
         assert!(
             numbers.iter().copied().eq(0..3000),
@@ -151,10 +170,8 @@ fn asking_for_a_block_that_is_not_ready_changes_nothing() {
         assert!(!ring.wait(Duration::from_millis(1)).unwrap());
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         socket.send_to(b"RTPS", "127.0.0.1:7400").unwrap();
-        assert_eq!(
-            sent(&mut ring, Duration::from_millis(50)),
-            [(1, b"RTPS".to_vec())]
-        );
+        let seen = sent_until(&mut ring, |payloads| !payloads.is_empty());
+        assert_eq!(seen, [(1, b"RTPS".to_vec())]);
         assert_eq!(ring.next, 1);
     });
 }
@@ -175,8 +192,11 @@ fn what_a_slow_reader_misses_is_counted_once() {
         assert!(kept > 10, "{kept}");
         // Blocks went back to the kernel: there is room again.
         socket.send_to(b"again", "127.0.0.1:7400").unwrap();
-        let seen = sent(&mut ring, Duration::from_millis(200));
-        assert_eq!(seen.last().unwrap().1, b"again");
+        sent_until(&mut ring, |payloads| {
+            payloads
+                .last()
+                .is_some_and(|(_, payload)| payload == b"again")
+        });
         assert_eq!(ring.statistics().unwrap().drops, first.drops);
     });
 }
@@ -190,7 +210,7 @@ fn the_filter_cuts_frames_and_keeps_their_length() {
         let mut silent = Ring::open(SMALL, Some(nothing.as_fd())).unwrap();
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         socket.send_to(&[1; 5000], "127.0.0.1:7400").unwrap();
-        assert!(ring.wait(Duration::from_secs(1)).unwrap());
+        assert!(ring.wait(PATIENCE).unwrap());
         let block = ring.block().unwrap();
         let frame = block.frames().next().unwrap();
         assert_eq!((frame.bytes.len(), frame.length), (28, 5028));
@@ -209,7 +229,7 @@ fn an_interface_that_appears_later_is_seen() {
         let socket = UdpSocket::bind("10.99.0.1:0").unwrap();
         ip("neighbour add 10.99.0.2 lladdr 02:00:00:00:00:02 dev later");
         // A link takes a moment to come up.
-        let hello = (0..40).find_map(|_| {
+        let hello = (0..400).find_map(|_| {
             socket.send_to(b"hello", "10.99.0.2:7400").unwrap();
             let seen = sent(&mut ring, Duration::from_millis(50));
             seen.into_iter().find(|(_, payload)| payload == b"hello")
@@ -296,7 +316,7 @@ fn any_amount_of_memory_makes_a_ring_for_the_largest_frames() {
         let mut ring = Ring::open(Settings::with_memory(0), None).unwrap();
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         socket.send_to(&[5; 65_507], "127.0.0.1:7400").unwrap();
-        let seen = sent(&mut ring, Duration::from_millis(200));
+        let seen = sent_until(&mut ring, |payloads| !payloads.is_empty());
         assert_eq!(seen, [(1, vec![5; 65_507])]);
     });
 }
@@ -315,7 +335,7 @@ fn fragments_from_the_ring_become_datagrams_in_both_ip_versions() {
             socket.send_to(&payload, to).unwrap();
         }
         let mut seen = Vec::new();
-        while ring.wait(Duration::from_millis(200)).unwrap() {
+        while seen.len() < 4 && ring.wait(PATIENCE).unwrap() {
             while let Some(block) = ring.block() {
                 for frame in block.frames() {
                     let outgoing = frame.packet_type == PacketType::OUTGOING;
