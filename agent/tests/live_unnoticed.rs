@@ -1,5 +1,5 @@
 //! Observing leaves the robot exactly as it was: no participant, no endpoint, no packet, no socket
-//! of the network but the listener, no multicast group, no promiscuous interface.
+//! of the network but the listeners, no multicast group, no promiscuous interface.
 //!
 //! The judges are recordings of the link that tshark reads, the kernel's own counters, and what
 //! `/proc` says about the sockets of every process.
@@ -172,7 +172,7 @@ fn a_host_that_runs_only_the_agent_sends_nothing() -> Result<()> {
 }
 
 #[test]
-fn the_agent_has_no_socket_of_the_network_but_its_listener() -> Result<()> {
+fn the_agent_has_no_socket_of_the_network_but_its_listeners() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let before = memberships(&link.robot)?;
@@ -196,8 +196,11 @@ fn the_agent_has_no_socket_of_the_network_but_its_listener() -> Result<()> {
         Ok(own.collect())
     };
     let listeners = of_table("tcp")?;
-    let addresses: Vec<_> = listeners.iter().map(|row| (&*row[1], &*row[3])).collect();
-    assert_eq!(addresses, [("0100007F:43F8", LISTENING)]);
+    let addresses = listeners.iter().map(|row| (&*row[1], &*row[3]));
+    let addresses: BTreeSet<_> = addresses.collect();
+    // 127.0.0.1:17400 for metrics, and 17401 for control.
+    let expected = ["0100007F:43F8", "0100007F:43F9"];
+    assert_eq!(addresses, expected.map(|each| (each, LISTENING)).into());
     for table in ["tcp6", "udp", "udp6", "udplite", "raw", "raw6", "icmp"] {
         assert_eq!(of_table(table)?, Vec::<Vec<String>>::new(), "{table}");
     }
