@@ -123,11 +123,13 @@ pub fn allow_running_first() -> bool {
         rlim_cur: 1,
         rlim_max: 1,
     };
-    // SAFETY: `limit` outlives both calls.
-    unsafe {
-        libc::setrlimit(libc::RLIMIT_RTPRIO, &raw const limit) == 0
-            || libc::getrlimit(libc::RLIMIT_RTPRIO, &raw mut limit) == 0 && limit.rlim_cur > 0
+    // SAFETY: `limit` outlives the call.
+    if unsafe { libc::setrlimit(libc::RLIMIT_RTPRIO, &raw const limit) } == 0 {
+        return true;
     }
+    // SAFETY: `limit` is ours and outlives the call.
+    let told = unsafe { libc::getrlimit(libc::RLIMIT_RTPRIO, &raw mut limit) };
+    told == 0 && limit.rlim_cur > 0
 }
 
 /// From now on, when this thread wakes it runs before ordinary ones, at the lowest real-time
@@ -141,9 +143,10 @@ pub fn run_first(first: bool) -> io::Result<()> {
         false => (libc::SCHED_OTHER, 0),
     };
     let parameter = libc::sched_param { sched_priority };
+    // SAFETY: has no preconditions.
+    let this_thread = unsafe { libc::pthread_self() };
     // SAFETY: the thread is the calling one; `parameter` outlives the call.
-    match unsafe { libc::pthread_setschedparam(libc::pthread_self(), policy, &raw const parameter) }
-    {
+    match unsafe { libc::pthread_setschedparam(this_thread, policy, &raw const parameter) } {
         0 => Ok(()),
         error => Err(io::Error::from_raw_os_error(error)),
     }
