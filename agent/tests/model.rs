@@ -142,6 +142,7 @@ fn watchlist(patterns: &[&str]) -> Watchlist {
         domain_id: None,
         expectations: Expectations::default(),
         per_subscriber: false,
+        trace: 0.0,
     };
     Watchlist::new(patterns.iter().map(watch).collect()).unwrap()
 }
@@ -876,6 +877,7 @@ fn expectations_are_judged_in_the_sources_time() {
         domain_id: None,
         expectations,
         per_subscriber: false,
+        trace: 0.0,
     };
     world
         .observer
