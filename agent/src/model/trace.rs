@@ -33,6 +33,8 @@ const MAX_FINISHED: usize = 2048;
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements that come later are of no interest.
 const PATIENCE: u64 = 10_000_000_000;
+/// What arrives may turn out to be a copy of what is sent from here.
+const DOUBT: u64 = 500_000_000;
 /// The loopback interface, in every network namespace.
 const LOOPBACK: u32 = 1;
 /// The part of a trace's identity that decides, as in OpenTelemetry's samplers.
@@ -132,8 +134,12 @@ struct Traced {
     identity: Identity,
     threshold: u64,
     samples: Samples,
-    /// Numbers, and whether they were seen leaving first.
-    under_way: VecDeque<(u64, bool, Message)>,
+    /// It sends from here. The kernel shows a multicast's local copies before its sending, so this
+    /// is learned when the first message has arrived already.
+    is_local: bool,
+    under_way: VecDeque<Message>,
+    /// Spans of messages that arrived, until it is sure that they were not sent from here.
+    arrived: VecDeque<Span>,
     waiting: VecDeque<Waiting>,
     done: VecDeque<u64>,
 }
@@ -218,6 +224,7 @@ impl Tracer {
     /// Waits for no acknowledgement that is long overdue.
     pub fn advance(&mut self, now: Timestamp) {
         for traced in self.writers.values_mut().flatten() {
+            traced.release(now, &mut self.ledger);
             while let Some(first) = traced.waiting.front()
                 && now.0.saturating_sub(first.at.0) > PATIENCE
             {
@@ -276,7 +283,9 @@ impl Traced {
             identity: of_writer(writer),
             threshold,
             samples: Samples::default(),
+            is_local: false,
             under_way: VecDeque::new(),
+            arrived: VecDeque::new(),
             waiting: VecDeque::new(),
             done: VecDeque::new(),
         })
@@ -285,26 +294,28 @@ impl Traced {
     fn sample(&mut self, record: &Record, directed: bool, ledger: &mut Ledger) {
         let number = record.sequence_number;
         let trace_id = numbered(self.identity, number);
-        if (trace_id as u64 & RANDOM) < self.threshold || self.done.contains(&number) {
+        if (trace_id as u64 & RANDOM) < self.threshold {
             return;
         }
-        let is_leaving = record.flags & flag::OUTGOING != 0;
-        let known = self
-            .under_way
-            .iter()
-            .position(|(known, ..)| *known == number);
-        let index = known.unwrap_or_else(|| {
-            let message = self.message(record, trace_id);
-            self.begin(number, is_leaving, message, ledger)
-        });
-        // Copies that arrive are no part of how it left, nor the other way round.
-        if self
-            .under_way
-            .get(index)
-            .is_none_or(|(_, leaving, _)| *leaving != is_leaving)
-        {
+        let on_wire = record.flags & flag::HOST == 0;
+        let leaves = record.flags & flag::OUTGOING != 0
+            || !directed
+            || on_wire && record.interface == LOOPBACK;
+        if leaves && !self.is_local {
+            self.forget_arrivals(ledger);
+        }
+        // Copies that arrive are no part of how it left.
+        if leaves != self.is_local || self.done.contains(&number) {
             return;
         }
+        let known = |message: &Message| message.sequence_number == number;
+        let index = match self.under_way.iter().position(known) {
+            Some(index) => index,
+            None => match self.begin(self.message(record, trace_id), ledger) {
+                Some(index) => index,
+                None => return,
+            },
+        };
         let (at, first) = (Timestamp(record.time), first_datagram(record));
         let (begin, source) = if record.kind == kind::DATA_FRAG {
             match self.samples.fragment(record, at, &mut ledger.budget) {
@@ -319,7 +330,7 @@ impl Traced {
         } else {
             (first, record.source_timestamp())
         };
-        let Some((_, _, mut message)) = self.under_way.remove(index) else {
+        let Some(mut message) = self.under_way.remove(index) else {
             return;
         };
         message.source = source;
@@ -327,22 +338,33 @@ impl Traced {
             self.done.pop_front();
         }
         self.done.push_back(number);
-        let on_wire = record.flags & flag::HOST == 0;
-        let is_sent = is_leaving || !directed || on_wire && record.interface == LOOPBACK;
-        let stage = if is_sent { Stage::Send } else { Stage::Receive };
-        ledger.finish(Span {
-            stage,
-            message: message.clone(),
+        self.whole(message, begin, at, ledger);
+    }
+
+    /// A message has been seen whole.
+    fn whole(&mut self, message: Message, begin: Timestamp, at: Timestamp, ledger: &mut Ledger) {
+        if self.waiting.len() + self.arrived.len() >= MAX_OPEN_OF_WRITER {
+            self.arrived
+                .pop_front()
+                .map_or_else(|| drop(self.waiting.pop_front()), drop);
+            ledger.give_up();
+        }
+        let mut span = Span {
+            stage: Stage::Receive,
+            message,
             begin,
             end: at,
-        });
-        if !is_sent || !self.subject.reliable {
+        };
+        if !self.is_local {
+            self.arrived.push_back(span);
+            return self.release(at, ledger);
+        }
+        span.stage = Stage::Send;
+        let message = span.message.clone();
+        ledger.finish(span);
+        if !self.subject.reliable {
             ledger.open = ledger.open.saturating_sub(1);
             return;
-        }
-        if self.waiting.len() >= MAX_OPEN_OF_WRITER {
-            self.waiting.pop_front();
-            ledger.give_up();
         }
         self.waiting.push_back(Waiting {
             message,
@@ -351,14 +373,30 @@ impl Traced {
         });
     }
 
+    /// Tells of what arrived so long ago that it was not sent from here.
+    fn release(&mut self, now: Timestamp, ledger: &mut Ledger) {
+        while let Some(first) = self.arrived.front()
+            && now.0.saturating_sub(first.end.0) > DOUBT
+            && let Some(span) = self.arrived.pop_front()
+        {
+            ledger.open = ledger.open.saturating_sub(1);
+            ledger.finish(span);
+        }
+    }
+
+    /// It turns out to send from here.
+    fn forget_arrivals(&mut self, ledger: &mut Ledger) {
+        self.is_local = true;
+        let open = self.under_way.len() + self.arrived.len();
+        ledger.open = ledger.open.saturating_sub(open);
+        self.under_way.clear();
+        self.arrived.clear();
+        self.done.clear();
+        self.samples.clear(&mut ledger.budget);
+    }
+
     /// Makes room for a message and gives its place.
-    fn begin(
-        &mut self,
-        number: u64,
-        is_leaving: bool,
-        message: Message,
-        ledger: &mut Ledger,
-    ) -> usize {
+    fn begin(&mut self, message: Message, ledger: &mut Ledger) -> Option<usize> {
         if self.under_way.len() >= MAX_UNDER_WAY {
             self.under_way.pop_front();
             ledger.give_up();
@@ -366,13 +404,13 @@ impl Traced {
         if ledger.open >= MAX_OPEN {
             if self.waiting.pop_front().is_none() {
                 ledger.evictions += 1;
-                return usize::MAX;
+                return None;
             }
             ledger.give_up();
         }
         ledger.open += 1;
-        self.under_way.push_back((number, is_leaving, message));
-        self.under_way.len() - 1
+        self.under_way.push_back(message);
+        self.under_way.len().checked_sub(1)
     }
 
     fn message(&self, record: &Record, trace_id: u128) -> Message {
@@ -417,6 +455,7 @@ impl Traced {
     }
 
     fn close(mut self, ledger: &mut Ledger) {
+        self.release(Timestamp(u64::MAX), ledger);
         let open = self.under_way.len() + self.waiting.len();
         ledger.open = ledger.open.saturating_sub(open);
         self.samples.clear(&mut ledger.budget);
@@ -513,6 +552,14 @@ mod tests {
         tracer.take().spans
     }
 
+    /// The same, and what time brings.
+    fn take_all(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
+        let mut spans = take(tracer, records, ratio);
+        tracer.advance(Timestamp(SECOND));
+        spans.extend(tracer.take().spans);
+        spans
+    }
+
     fn times(spans: &[Span]) -> Vec<(Stage, u64, u64)> {
         let times = |span: &Span| (span.stage, span.begin.0, span.end.0);
         spans.iter().map(times).collect()
@@ -561,7 +608,7 @@ mod tests {
     #[test]
     fn where_it_only_arrives_it_is_received_in_the_same_trace() {
         let arrives = [data(5, 10, flag::HOST), data(5, 11, flag::HOST)];
-        let received = take(&mut tracer(), &arrives, 1.0);
+        let received = take_all(&mut tracer(), &arrives, 1.0);
         assert_eq!(times(&received), [(Stage::Receive, 10, 10)]);
         let sent = take(&mut tracer(), &[data(5, 3, flag::OUTGOING)], 1.0);
         let trace = |spans: &[Span]| spans.first().map(|span| span.message.trace_id);
@@ -580,6 +627,23 @@ mod tests {
             times(&take(&mut tracer(), &[loopback], 1.0)),
             [(Stage::Send, 10, 10)]
         );
+    }
+
+    #[test]
+    fn a_multicast_whose_local_copies_are_seen_first_is_sent() {
+        let mut tracer = tracer();
+        let records = [
+            data(5, 10, flag::HOST),
+            data(5, 11, flag::HOST | flag::OUTGOING),
+            data(6, 20, flag::HOST),
+            data(6, 21, flag::HOST | flag::OUTGOING),
+        ];
+        let spans = take_all(&mut tracer, &records, 1.0);
+        assert_eq!(
+            times(&spans),
+            [(Stage::Send, 11, 11), (Stage::Send, 21, 21)]
+        );
+        assert_eq!(tracer.size(), (2, MAX_OPEN, 0));
     }
 
     #[test]

@@ -103,7 +103,7 @@ impl Rotel {
             assert!(
                 ended.is_none() && Instant::now() < deadline,
                 "rotel, while waiting until {what} ({ended:?}):\n{}",
-                text.chars().take(5_000).collect::<String>()
+                names(&text)
             );
             std::thread::sleep(Duration::from_millis(50));
         }
@@ -115,6 +115,20 @@ impl Drop for Rotel {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// The names of all that came, and how often.
+fn names(text: &str) -> String {
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    for line in text.lines().map(str::trim_start) {
+        if line.starts_with("Name ")
+            || line.starts_with("-> Name:")
+            || line.starts_with("EventName")
+        {
+            *counts.entry(line).or_default() += 1;
+        }
+    }
+    format!("{counts:#?}")
 }
 
 /// What was printed, by request. The last one may be cut.
