@@ -490,3 +490,55 @@ fn a_token_a_foreign_name_and_a_foreign_page_are_told_apart() {
     assert!(agent.wait().success());
     assert!(!socket.exists());
 }
+
+/// The commands of a section of the README and what they print.
+fn commands(section: &str) -> Vec<(String, String)> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../README.md");
+    let readme = std::fs::read_to_string(path).unwrap();
+    let (_, section) = readme.split_once(&format!("\n## {section}\n")).unwrap();
+    let (_, block) = section.split_once("```console\n$ ").unwrap();
+    let (block, _) = block.split_once("\n```").unwrap();
+    let commands = block.split("\n$ ").map(|command| {
+        let (command, output) = command.split_once('\n').unwrap_or((command, ""));
+        (command.to_owned(), output.to_owned())
+    });
+    commands.collect()
+}
+
+/// Without what is another number each time.
+fn masked(text: &str) -> String {
+    let mut masked = text.to_owned();
+    for key in ["\"messages\":", "\"rate_hertz\":", "topic=\"/chatter\"} "] {
+        if let Some((before, after)) = masked.split_once(key) {
+            let rest = after.trim_start_matches(|c: char| c.is_ascii_digit() || c == '.');
+            masked = format!("{before}{key}N{rest}");
+        }
+    }
+    masked
+}
+
+#[test]
+fn what_the_readme_prints_is_what_is_printed() {
+    let mut agent = LocalAgent::start(&["--speed", "0.3"]);
+    agent.wait_for_log("ready");
+    for (command, expected) in commands("Observe a topic at runtime") {
+        let here = command.replace("localhost:17401", &agent.api.to_string());
+        let here = here.replace("localhost:17400", &agent.address.to_string());
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let output = Command::new("sh").args(["-c", &here]).output().unwrap();
+            let said = String::from_utf8(output.stdout).unwrap();
+            let counts = !said.contains("\"messages\":0,") && !said.ends_with("\"} 0\n");
+            if counts && masked(said.trim_end()) == masked(&expected) {
+                break;
+            }
+            // Only what changes nothing may be asked again, until the robot has come that far.
+            let may_repeat = !command.contains("-X") && Instant::now() < deadline;
+            assert!(
+                may_repeat,
+                "{command}\n{said}\nbut the README has\n{expected}"
+            );
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}

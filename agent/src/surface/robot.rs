@@ -77,8 +77,9 @@ impl<'a> Rows<'a> {
                 );
             }
         }
-        let watched = snapshot.watches.iter().flat_map(|watch| {
-            let configured = configured(watch, &settings.watches);
+        let watched = snapshot.watches.iter().enumerate();
+        let watched = watched.flat_map(|(place, watch)| {
+            let configured = configured(place, watch, &settings.watches);
             let per_subscriber = configured.is_some_and(|watch| watch.per_subscriber);
             watch
                 .topics
@@ -501,8 +502,8 @@ pub(super) fn watches(
         Ok(())
     })?;
     page.family(&metric::WATCH_VIOLATED, |family| {
-        for watch in &snapshot.watches {
-            let Some(configured) = self::configured(watch, configured) else {
+        for (place, watch) in snapshot.watches.iter().enumerate() {
+            let Some(configured) = self::configured(place, watch, configured) else {
                 continue;
             };
             let expectations = configured.expectations.keys();
@@ -523,11 +524,17 @@ pub(super) fn watches(
     })
 }
 
-/// The entry of the configuration that is in force for what the model calls `watch`.
-fn configured<'c>(watch: &WatchFacts, configured: &'c [Arc<Watch>]) -> Option<&'c Watch> {
+/// The entry that is in force for what the model calls `watch`: in the same place, unless the list
+/// has just changed.
+fn configured<'c>(
+    place: usize,
+    watch: &WatchFacts,
+    configured: &'c [Arc<Watch>],
+) -> Option<&'c Watch> {
     let same =
         |other: &&Watch| (&other.pattern, other.domain_id) == (&watch.pattern, watch.domain_id);
-    configured.iter().map(|watch| &**watch).find(same)
+    let there = configured.get(place).map(|watch| &**watch).filter(same);
+    there.or_else(|| configured.iter().map(|watch| &**watch).find(same))
 }
 
 /// `/points`, or `/points@5` when it is for one domain; `@` is in no ROS name.

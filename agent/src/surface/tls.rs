@@ -112,7 +112,7 @@ impl std::fmt::Debug for Acceptor {
 
 fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, TlsError> {
     let bytes = read(path)?;
-    let certificates = CertificateDer::pem_slice_iter(&bytes).collect();
+    let certificates: Result<Vec<_>, pem::Error> = CertificateDer::pem_slice_iter(&bytes).collect();
     certificates.map_err(|source| TlsError::Pem {
         path: path.to_path_buf(),
         source,
