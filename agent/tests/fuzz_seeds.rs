@@ -51,6 +51,11 @@ fn ring_blocks_survive() {
 }
 
 #[test]
+fn shared_memory_survives() {
+    run("fuzz/seeds/shared_memory", entry::shared_memory);
+}
+
+#[test]
 fn configurations_survive() {
     run("fuzz/seeds/configuration", entry::configuration);
 }

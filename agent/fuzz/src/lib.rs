@@ -8,10 +8,15 @@ use std::io::Cursor;
 
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::ring::block::Frames;
+use ros2probe::capture::shm::cell::Cell;
+use ros2probe::capture::shm::port::Port;
+use ros2probe::capture::shm::segment::{Buffer, Message};
+use ros2probe::capture::shm::verdict::Judge;
 use ros2probe::config::Config;
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, Packet, Payload};
+use ros2probe_wire::record::Record;
 use ros2probe_wire::walk::{self, Envelope};
 
 /// The block's header, and a frame's with its address.
@@ -61,6 +66,52 @@ pub fn ring_block(bytes: &[u8]) {
         }
     }
     assert_eq!(frames.next(), None);
+}
+
+/// A port of Fast DDS's shared memory, the same port a moment later, and a segment: lengths of the
+/// first two, little-endian, come first.
+pub fn shared_memory(bytes: &[u8]) {
+    const PORT: u32 = 7411;
+    const MOMENT: u64 = 1_000_000;
+    let Some((lengths, rest)) = bytes.split_first_chunk::<4>() else {
+        return;
+    };
+    let [before, after] = [[lengths[0], lengths[1]], [lengths[2], lengths[3]]];
+    let [before, after] = [before, after].map(|length| usize::from(u16::from_le_bytes(length)));
+    let Some((before, rest)) = rest.split_at_checked(before) else {
+        return;
+    };
+    let Some((after, segment)) = rest.split_at_checked(after) else {
+        return;
+    };
+    let Some((mut port, mut announced)) = Port::attach(before, PORT, 0) else {
+        return;
+    };
+    assert!(announced.len() * Cell::LEN <= before.len());
+    for (round, file) in [after, before, after].into_iter().enumerate() {
+        let known = announced.len();
+        let now = MOMENT * (round as u64 + 1);
+        let Some(look) = port.look(file, now, &mut announced) else {
+            break;
+        };
+        assert!((announced.len() - known) as u64 <= look.pushed);
+        assert!((announced.len() - known) * Cell::LEN <= file.len());
+    }
+    let mut judge = Judge::default();
+    for descriptor in &announced {
+        let Ok(buffer) = Buffer::find(segment, descriptor) else {
+            continue;
+        };
+        assert!(buffer.is_valid(segment));
+        let mut records = Vec::new();
+        let message = Message::new(segment, buffer);
+        judge.judge(&message, buffer.length, Record::default(), &mut records);
+        assert!(records.len() <= usize::from(buffer.length));
+        let mut whole = Vec::new();
+        if buffer.read(segment, &mut whole) {
+            assert!(whole.len() <= segment.len());
+        }
+    }
 }
 
 /// A configuration file.

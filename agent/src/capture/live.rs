@@ -71,6 +71,8 @@ pub struct LiveSource {
     /// When unclassified writers last got bytes and records to spend.
     bytes_refilled: u64,
     records_refilled: u64,
+    /// When the model was last asked what is wanted of shared memory.
+    wanted_asked: u64,
     refused_updates: u64,
     clock: Timestamp,
 }
@@ -139,6 +141,7 @@ impl LiveSource {
             shared_memory,
             bytes_refilled: 0,
             records_refilled: 0,
+            wanted_asked: 0,
             refused_updates: 0,
             clock: clocks.now,
         };
@@ -201,6 +204,10 @@ impl LiveSource {
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
             shared_memory.take_in(observer);
+            if clocks.monotonic.wrapping_sub(self.wanted_asked) >= SECOND {
+                self.wanted_asked = clocks.monotonic;
+                shared_memory.want(observer.wanted_of_shared_memory());
+            }
         }
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         Ok(())

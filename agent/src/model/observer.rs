@@ -25,6 +25,7 @@ use super::expectation::Evidence;
 use super::header::begins_with_header;
 use super::interest::Interest;
 use super::journal::Journal;
+use super::passage::{lacks_names, may_share_memory};
 use super::pieces::Pieces;
 use super::profiler::Profiler;
 use super::rate::Slot;
@@ -65,6 +66,17 @@ pub struct Settings {
     pub topic_grace: u64,
     /// Records say who sent: not so those of a capture file.
     pub directed: bool,
+}
+
+/// What is wanted of messages in shared memory.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Wanted {
+    /// Nothing that is measured can pass there, and every name is known.
+    Nothing,
+    /// A name is lacking that may be said there.
+    Names,
+    /// Samples of a measured writer may pass there.
+    Samples,
 }
 
 impl Default for Settings {
@@ -199,6 +211,19 @@ impl Observer {
             let flags = record.flags | flag::SHM;
             observer.count(&Record { flags, ..*record });
         });
+    }
+
+    /// What is wanted of shared memory at the moment.
+    #[must_use]
+    pub fn wanted_of_shared_memory(&self) -> Wanted {
+        let mut measured = self.profiler.iter().map(|(guid, _)| *guid);
+        if measured.any(|guid| may_share_memory(&self.discovery, guid)) {
+            Wanted::Samples
+        } else if lacks_names(&self.discovery, self.clock) {
+            Wanted::Names
+        } else {
+            Wanted::Nothing
+        }
     }
 
     /// So much time passed between two looks at shared memory that nobody can tell what happened.

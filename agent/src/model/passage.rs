@@ -4,13 +4,16 @@
 //! It says what they would use, not what they did: whether their QoS fits is theirs to find out.
 
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{Guid, GuidPrefix};
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::discovery::{Discovery, Endpoint};
 use super::snapshot::{Passage, PassageCount};
 
 /// Pairs of one topic that are looked at; the rest is taken to be as those are.
 const MAX_PAIRS: usize = 1024;
+/// After so long a participant that told no nodes is none of ROS, and an endpoint is nobody's.
+const NODES_WITHIN: u64 = 30_000_000_000;
+const NODE_WITHIN: u64 = 10_000_000_000;
 
 /// Pairs of these writers and readers by how messages pass between them.
 pub(super) fn passages<'a>(
@@ -30,6 +33,40 @@ pub(super) fn passages<'a>(
         }
     }
     counts.into_iter().filter(|count| count.pairs > 0).collect()
+}
+
+/// Whether somebody on this writer's host may get its samples through Fast DDS's shared memory, who
+/// need not be known to read it.
+pub(super) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
+    let participants = discovery.participants();
+    let own = participants.get(&writer.prefix);
+    if vendor(discovery, writer.prefix) != VendorId::EPROSIMA {
+        return false;
+    }
+    own.is_none_or(|own| own.portrait.shared_memory)
+        && participants.iter().any(|(prefix, other)| {
+            *prefix != writer.prefix
+                && other.portrait.shared_memory
+                && is_one_host(VendorId::EPROSIMA, *prefix, writer.prefix)
+        })
+}
+
+/// Whether names are lacking that may be said in shared memory just now: those of a participant's
+/// nodes, or those of the node that an endpoint belongs to.
+pub(super) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
+    let is_new =
+        |first_seen: Timestamp, patience: u64| first_seen.0.saturating_add(patience) > now.0;
+    let participants = discovery.participants();
+    participants.values().any(|participant| {
+        participant.portrait.shared_memory
+            && participant.nodes.is_empty()
+            && is_new(participant.first_seen, NODES_WITHIN)
+    }) || discovery.endpoints().iter().any(|(guid, endpoint)| {
+        is_new(endpoint.first_seen, NODE_WITHIN)
+            && participants
+                .get(&guid.prefix)
+                .is_some_and(|participant| participant.portrait.shared_memory)
+    })
 }
 
 fn passage(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Passage> {

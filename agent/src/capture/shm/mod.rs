@@ -21,7 +21,7 @@ mod image;
 use std::collections::BTreeSet;
 use std::io;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
@@ -34,7 +34,7 @@ use self::pace::{Need, Pace};
 use self::scan::{Name, Places};
 use self::tap::{Counters, Moment, Tap};
 use super::system::{Clocks, DirectoryWatch, run_first, thread_cpu};
-use crate::model::observer::Observer;
+use crate::model::observer::{Observer, Wanted};
 
 /// How often the counters are put where others can read them.
 const REPORT: u64 = 200_000_000;
@@ -68,6 +68,7 @@ struct Shared {
     inbox: Inbox,
     interest: Mutex<Vec<(Guid, Option<Verdict>)>>,
     is_told: AtomicBool,
+    wanted: AtomicU8,
     facts: Mutex<Facts>,
     stop: AtomicBool,
 }
@@ -119,6 +120,16 @@ impl SharedMemory {
                 Item::Uncertain(time) => observer.shared_memory_uncertain(Timestamp(time)),
             }
         }
+    }
+
+    /// Says what is wanted: how often it looks follows that.
+    pub fn want(&self, wanted: Wanted) {
+        let need = match wanted {
+            Wanted::Nothing => Need::Nothing,
+            Wanted::Names => Need::Names,
+            Wanted::Samples => Need::Watching,
+        };
+        self.shared.wanted.store(need as u8, Ordering::Relaxed);
     }
 
     /// What it says of itself.
@@ -182,10 +193,14 @@ fn look(shared: &Shared, places: Places, share: f64) {
                 refused: 0,
             };
         }
-        let need = match (tap.has_ports(), tap.judge.measures()) {
-            (false, _) => Need::Nobody,
-            (true, false) => Need::Names,
-            (true, true) => Need::Watching,
+        let wanted = shared.wanted.load(Ordering::Relaxed);
+        let need = if tap.has_ports() {
+            Need::ALL
+                .into_iter()
+                .find(|need| *need as u8 == wanted)
+                .unwrap_or(Need::Names)
+        } else {
+            Need::Nothing
         };
         if tap.met() {
             pace.news(monotonic);

@@ -12,8 +12,8 @@ const WATCHING: f64 = 1e-3;
 /// At most when only discovery is wanted, and when nothing came for a while.
 const NAMES: f64 = 5e-3;
 const QUIET: f64 = 10e-3;
-/// Where nobody communicates: only new ports are looked for.
-const NOBODY: f64 = 100e-3;
+/// Where nothing is wanted: a glance, for what was said last can still be read.
+const NOTHING: f64 = 100e-3;
 /// Nothing came for so long.
 const QUIET_AFTER: f64 = 3.0;
 /// How much longer each sleep after nothing is.
@@ -35,12 +35,17 @@ const LONGEST: f64 = 50e-3;
 /// What the tap is there for at the moment.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Need {
-    /// There is no port.
-    Nobody,
+    /// Nothing is measured that can pass here, and no name is lacking. Who comes is noticed.
+    Nothing,
     /// Nothing is measured; node names and endpoints may come.
     Names,
     /// Something is measured.
     Watching,
+}
+
+impl Need {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Nothing, Self::Names, Self::Watching];
 }
 
 /// The sleeps.
@@ -108,7 +113,7 @@ impl Pace {
         self.meeting_until = now;
         self.account(now, cpu);
         let longest = match need {
-            Need::Nobody => NOBODY,
+            Need::Nothing => NOTHING,
             _ if now - self.quiet_since > QUIET_AFTER => QUIET,
             Need::Names => NAMES,
             Need::Watching => WATCHING,
@@ -207,7 +212,7 @@ mod tests {
             let mut pace = Pace::new(0.015);
             run(&mut pace, 20.0, 5e-6, need, |_| 0).1
         };
-        assert!((9.0..11.0).contains(&looks(Need::Nobody)));
+        assert!((9.0..11.0).contains(&looks(Need::Nothing)));
         assert!((90.0..110.0).contains(&looks(Need::Watching)));
         assert!((90.0..110.0).contains(&looks(Need::Names)));
     }
@@ -216,7 +221,7 @@ mod tests {
     fn when_somebody_comes_it_looks_closely_but_not_for_ever() {
         let mut pace = Pace::new(0.015);
         pace.newcomer(100.0);
-        let look = |pace: &mut Pace, now, cpu| pace.sleep(now, cpu, 0, Need::Nobody).as_micros();
+        let look = |pace: &mut Pace, now, cpu| pace.sleep(now, cpu, 0, Need::Nothing).as_micros();
         assert_eq!(look(&mut pace, 100.01, 0.0), 20);
         assert_eq!(look(&mut pace, 100.3, 0.0), 20);
         assert!(look(&mut pace, 100.6, 0.0) > 20);

@@ -35,7 +35,6 @@ pub enum Judgement {
 #[derive(Debug)]
 pub struct Judge {
     interest: HashMap<[u32; 4], Verdict>,
-    metered: usize,
     /// Bytes captured of unclassified writers.
     unknown: HashMap<[u32; 4], u32>,
     capture_left: i64,
@@ -50,7 +49,6 @@ impl Default for Judge {
     fn default() -> Self {
         Self {
             interest: HashMap::new(),
-            metered: 0,
             unknown: HashMap::new(),
             capture_left: CAPTURE_PER_SECOND,
             records_left: RECORDS_PER_SECOND,
@@ -64,19 +62,11 @@ impl Judge {
     /// What is wanted of this writer or reader from now on; `None` = it is not classified.
     pub fn set(&mut self, guid: Guid, verdict: Option<Verdict>) {
         let key = guid_words(guid);
-        let before = match verdict {
+        match verdict {
             Some(verdict) => self.interest.insert(key, verdict),
             None => self.interest.remove(&key),
         };
-        self.metered -= usize::from(before == Some(Verdict::Meter));
-        self.metered += usize::from(verdict == Some(Verdict::Meter));
         self.unknown.remove(&key);
-    }
-
-    /// Whether anything is measured.
-    #[must_use]
-    pub const fn measures(&self) -> bool {
-        self.metered > 0
     }
 
     /// Gives unclassified writers what they may cost in the next second.
@@ -301,20 +291,5 @@ mod tests {
             "{captured}"
         );
         assert!(rules.unknown.len() <= UNKNOWN_CAPACITY as usize);
-    }
-
-    #[test]
-    fn whether_anything_is_measured_follows_what_is_set() {
-        let mut rules = Judge::default();
-        assert!(!rules.measures());
-        for _ in 0..2 {
-            rules.set(guid(WRITER), Some(Verdict::Meter));
-        }
-        assert!(rules.measures());
-        rules.set(guid(WRITER), Some(Verdict::Capture));
-        assert!(!rules.measures());
-        rules.set(guid(WRITER), Some(Verdict::Meter));
-        rules.set(guid(WRITER), None);
-        assert!(!rules.measures());
     }
 }
