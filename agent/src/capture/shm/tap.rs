@@ -58,6 +58,7 @@ pub struct Tap {
     tried: u64,
     found: u64,
     announced: Vec<Descriptor>,
+    latest: HashMap<(SegmentId, u32), usize>,
     records: Vec<Record>,
 }
 
@@ -155,6 +156,7 @@ impl Tap {
             tried: 0,
             found: 0,
             announced: Vec::new(),
+            latest: HashMap::new(),
             records: Vec::new(),
         }
     }
@@ -266,10 +268,19 @@ impl Tap {
                 self.ports.remove(index);
             }
         }
-        for descriptor in announced.drain(..) {
-            self.read(key, &descriptor, now, true, found);
+        // A buffer that was announced again has lost what it held: only the last use can be read.
+        let mut latest = std::mem::take(&mut self.latest);
+        let places = announced.iter().enumerate();
+        latest.extend(places.map(|(index, it)| ((it.segment, it.node), index)));
+        for (index, descriptor) in announced.drain(..).enumerate() {
+            if latest.get(&(descriptor.segment, descriptor.node)) == Some(&index) {
+                self.read(key, &descriptor, now, true, found);
+            } else {
+                self.counters.missed += 1;
+            }
         }
-        self.announced = announced;
+        latest.clear();
+        (self.announced, self.latest) = (announced, latest);
         number
     }
 
