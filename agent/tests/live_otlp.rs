@@ -1,6 +1,12 @@
 //! Two hosts of the demo robot, an agent and a real OpenTelemetry receiver on each: both report the
 //! same traces, and a receiver that goes and comes back costs no capture.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    reason = "the receiver's helpers may panic in a test"
+)]
+
 mod harness;
 mod rotel;
 
