@@ -16,6 +16,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use local_agent::{Answer, LocalAgent, PATIENCE, capture, exchange, rp};
+use ros2probe::config::Expectations;
 use serde_json::Value;
 
 /// A request with headers (each line ended) and a body.
@@ -73,6 +74,90 @@ fn the_checked_in_document_is_the_generated_one() {
         generated,
         "run `UPDATE_OPENAPI=1 cargo test -p ros2probe --test api` and commit the result"
     );
+}
+
+#[test]
+fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
+    let document = serde_json::to_value(ros2probe::surface::api::document()).unwrap();
+    let topic = &document["paths"]["/watch/{topic}"]["post"]["parameters"][0]["schema"];
+    assert!(topic["pattern"].is_string(), "{topic}");
+    let validator = jsonschema::validator_for(topic).unwrap();
+    let long = format!("a{}", "/b".repeat(127));
+    for name in [
+        "a",
+        "a/b",
+        "_a/b_1",
+        "*",
+        "**",
+        "a/**/b",
+        "cam*/raw",
+        "*a*",
+        "*1",
+        "a*b*",
+        "",
+        "/a",
+        "a/",
+        "a//b",
+        "1a",
+        "a/1b",
+        "a**",
+        "**a",
+        "a b",
+        "a-b",
+        "a.b",
+        "\u{e9}",
+        "a*",
+        "**/**",
+        "*/*",
+        &long,
+        &format!("{long}c"),
+    ] {
+        let documented = validator.is_valid(&Value::from(name));
+        let accepted = ros2probe::config::watch::check_pattern(&format!("/{name}")).is_ok();
+        assert_eq!(documented, accepted, "{name}");
+    }
+    let schema = ros2probe::config::Config::schema();
+    let configured = &schema["$defs"]["WatchShape"]["anyOf"][1]["properties"];
+    let body = &document["components"]["schemas"]["WatchRequest"]["properties"];
+    let (mut low, mut high) = (Expectations::default(), Expectations::default());
+    for (key, place) in [
+        ("min_rate_hz", (&mut low.min_rate_hz, &mut high.min_rate_hz)),
+        ("max_rate_hz", (&mut low.max_rate_hz, &mut high.max_rate_hz)),
+        (
+            "max_loss_ratio",
+            (&mut low.max_loss_ratio, &mut high.max_loss_ratio),
+        ),
+        (
+            "max_latency_ms",
+            (&mut low.max_latency_ms, &mut high.max_latency_ms),
+        ),
+        (
+            "max_silence_s",
+            (&mut low.max_silence_s, &mut high.max_silence_s),
+        ),
+    ] {
+        for (limit, place) in [("minimum", place.0), ("maximum", place.1)] {
+            let value = configured[key][limit].as_f64();
+            assert!(value.is_some(), "{key} {limit}: {configured}");
+            assert_eq!(body[key][limit].as_f64(), value, "{key} {limit}");
+            *place = value;
+        }
+    }
+    assert_eq!((low.check(), high.check()), (Ok(()), Ok(())));
+    let beyond = |change: fn(&mut Expectations)| {
+        let mut wrong = Expectations::default();
+        change(&mut wrong);
+        wrong.check().is_err()
+    };
+    assert!(beyond(|wrong| wrong.min_rate_hz = Some(-0.1)));
+    assert!(beyond(|wrong| wrong.max_rate_hz = Some(1_000_000.1)));
+    assert!(beyond(|wrong| wrong.max_loss_ratio = Some(1.1)));
+    assert!(beyond(|wrong| wrong.max_latency_ms = Some(3_600_000.1)));
+    assert!(beyond(|wrong| wrong.max_silence_s = Some(0.0)));
+    assert!(beyond(|wrong| wrong.max_silence_s = Some(f64::NAN)));
+    assert!(beyond(
+        |wrong| (wrong.min_rate_hz, wrong.max_rate_hz) = (Some(2.0), Some(1.0))
+    ));
 }
 
 #[test]
