@@ -192,6 +192,18 @@ mod tests {
     }
 
     #[test]
+    fn the_daemon_set_grants_what_either_source_needs_and_nothing_else() {
+        let manifest = include_str!("../../deploy/kubernetes/ros2probe.yaml");
+        let mut lines = manifest.lines().map(str::trim);
+        let added = lines.find_map(|line| line.strip_prefix("add: [")?.strip_suffix(']'));
+        let added = added.unwrap().split(", ");
+        let added: CapsHashSet = added
+            .map(|name| format!("CAP_{name}").parse().unwrap())
+            .collect();
+        assert_eq!(added, set(&[HOST, WIRE].concat()));
+    }
+
+    #[test]
     fn what_the_configuration_asks_for_beyond_that_is_needed_too() {
         let named = CaptureSettings {
             include_interfaces: vec!["eth0".to_owned()],
