@@ -393,6 +393,18 @@ fn a_mismatch_of_real_participants_is_named_in_the_topic_and_as_a_metric() {
 }
 
 #[test]
+fn what_goes_through_shared_memory_is_not_called_silent() {
+    let capture = capture_of("fastrtps-default/samehost-any");
+    // Before anybody says goodbye.
+    let goodbye = 1_795_142_305_000_000_000;
+    let robot = Robot::at(&capture, goodbye, "/**");
+    let topic = robot.get("/topics/chatter");
+    let passages = topic["passages"].as_array().unwrap();
+    assert_eq!(passages[0]["passage"], "shared_memory", "{topic}");
+    assert_eq!(topic["reasons"][0]["code"], "shared_memory", "{topic}");
+}
+
+#[test]
 fn a_thousand_topics_are_listed_at_once() {
     let mut file = tempfile::NamedTempFile::with_suffix(".pcap").unwrap();
     std::io::Write::write_all(&mut file, &large_robot(1000)).unwrap();

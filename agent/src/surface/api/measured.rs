@@ -40,6 +40,22 @@ pub(super) struct MeasurementView {
     header_latency: Option<Distribution>,
     /// Messages stamped after their capture: clocks are apart.
     negative_latency_messages: u64,
+    /// Present when some of this was read from shared memory, which is a sampled view.
+    sampled: Option<SampledView>,
+}
+
+/// How much a sampled view saw.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Sampled)]
+struct SampledView {
+    /// Messages of which at least a part was seen.
+    seen_messages: u64,
+    /// Messages that there were, by their sequence numbers.
+    existing_messages: u64,
+    /// How often something may have gone unnoticed between two looks.
+    uncertain_looks: u64,
+    /// Seen of those that there were; null while there were none.
+    coverage_ratio: Option<f64>,
 }
 
 /// Seconds that something took. Percentiles are estimates from a histogram.
@@ -127,6 +143,12 @@ impl From<&Measurement> for MeasurementView {
             latency: Distribution::of(&facts.source_latency),
             header_latency: Distribution::of(&facts.header_latency),
             negative_latency_messages: facts.negative_latency,
+            sampled: facts.sampled.as_ref().map(|sampled| SampledView {
+                seen_messages: sampled.seen,
+                existing_messages: sampled.span,
+                uncertain_looks: sampled.uncertain,
+                coverage_ratio: sampled.coverage(),
+            }),
         }
     }
 }

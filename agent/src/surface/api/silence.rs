@@ -9,7 +9,7 @@ use utoipa::ToSchema;
 use super::index::Index;
 use crate::config::Watchlist;
 use crate::model::diagnosis::Diagnosis;
-use crate::model::snapshot::{EndpointFacts, Measurement, Snapshot, TopicFacts};
+use crate::model::snapshot::{EndpointFacts, Measurement, Passage, Snapshot, TopicFacts};
 use crate::surface::agent_facts::SourceKind;
 
 /// One reason.
@@ -43,6 +43,14 @@ enum Cause {
     WatchRejected,
     /// All its endpoints are on other hosts, and the agent looks at this host's sockets.
     OutsideView,
+    /// Messages go through Fast DDS's shared memory, and none was seen there.
+    SharedMemory,
+    /// Subscribers read the publisher's history in memory: invisible.
+    DataSharing,
+    /// Publishers and subscribers are in one process: invisible.
+    SameProcess,
+    /// Messages go through Cyclone DDS's iceoryx: invisible.
+    Iceoryx,
     /// All is as it should be, and no message was seen, or none lately.
     Quiet,
 }
@@ -54,6 +62,8 @@ pub(super) struct Circumstances<'a> {
     pub(super) index: Index<'a>,
     pub(super) watchlist: &'a Watchlist,
     pub(super) source: SourceKind,
+    /// The agent looks at shared memory too.
+    pub(super) looks_at_memory: bool,
     /// Why the agent sees nothing.
     pub(super) unready: Option<String>,
 }
@@ -99,7 +109,9 @@ impl<'a> Circumstances<'a> {
                 say(code, detail);
             }
             Some(measured) if is_connected && measured.rate_hz == 0.0 => {
-                if self.is_elsewhere(topic) {
+                if let Some((code, detail)) = self.aside(topic) {
+                    say(code, detail);
+                } else if self.is_elsewhere(topic) {
                     let detail = "publishers and subscribers are on other hosts; capture.source: \
                                   wire sees what passes this one";
                     say(Cause::OutsideView, detail.to_owned());
@@ -170,6 +182,37 @@ impl<'a> Circumstances<'a> {
             None => "nothing is counted: the configuration can list it".to_owned(),
         };
         (Cause::NotWatched, detail)
+    }
+
+    /// How messages pass, if no pair of publisher and subscriber uses the network.
+    fn aside(&self, topic: &TopicFacts) -> Option<(Cause, String)> {
+        let passages = topic.passages.iter();
+        let most = passages.clone().max_by_key(|count| count.pairs)?;
+        if passages
+            .clone()
+            .any(|count| count.passage == Passage::Network)
+        {
+            return None;
+        }
+        let pairs: usize = passages.map(|count| count.pairs).sum();
+        let detail = |how: &str| format!("no message of {pairs} pairs uses the network: {how}");
+        Some(match most.passage {
+            Passage::Network => return None,
+            Passage::SharedMemory if self.looks_at_memory => {
+                let how = "they use shared memory, where none was seen lately";
+                (Cause::SharedMemory, detail(how))
+            }
+            Passage::SharedMemory => {
+                let how = "they use shared memory, which this agent does not look at";
+                (Cause::SharedMemory, detail(how))
+            }
+            Passage::DataSharing => {
+                let how = "subscribers read the publisher's history in memory (data sharing)";
+                (Cause::DataSharing, detail(how))
+            }
+            Passage::SameProcess => (Cause::SameProcess, detail("both ends are in one process")),
+            Passage::Iceoryx => (Cause::Iceoryx, detail("they use iceoryx")),
+        })
     }
 
     /// Whether none of its participants has a socket on this host, as far as sockets are seen.

@@ -73,6 +73,8 @@ struct TopicView<'a> {
     sent: Option<DeliveredView>,
     /// Where messages spent their time on this host.
     breakdown: Option<BreakdownView>,
+    /// Pairs of its publishers and subscribers by how messages pass between them.
+    passages: Vec<PassageView>,
     /// What is wrong with it.
     diagnoses: Vec<FindingView<'a>>,
     /// Why it is silent, or why nothing is counted; empty where messages are counted.
@@ -88,6 +90,18 @@ struct TopicDetails<'a> {
     deliveries: Vec<DeliveryView<'a>>,
     /// Every reliable reader that acknowledges.
     acknowledgements: Vec<AcknowledgementView<'a>>,
+}
+
+/// Pairs of publisher and subscriber between which messages pass in one way.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Passage)]
+struct PassageView {
+    /// `network`; `shared_memory`, of which samples are seen; `data_sharing`, `same_process` or
+    /// `iceoryx`, which are not seen.
+    #[schema(value_type = String)]
+    passage: &'static str,
+    /// How many pairs.
+    pairs: usize,
 }
 
 /// A watch that covers the topic.
@@ -277,6 +291,7 @@ impl<'a> Desk<'a> {
                 index: Index::new(snapshot),
                 watchlist: in_force.watchlist(),
                 source: state.agent.source,
+                looks_at_memory: state.agent.shared_memory.is_some(),
                 unready: state.ready(Instant::now()).err(),
             },
         }
@@ -287,6 +302,10 @@ impl<'a> Desk<'a> {
         let endpoint = |facts| EndpointView::new(facts, index);
         let findings = index.findings(facts).iter();
         let watches = index.watches(facts).iter();
+        let passages = facts.passages.iter().map(|count| PassageView {
+            passage: count.passage.label(),
+            pairs: count.pairs,
+        });
         TopicView {
             domain_id: facts.domain_id,
             name: &facts.name,
@@ -303,6 +322,7 @@ impl<'a> Desk<'a> {
             received: facts.received.as_deref().map(Into::into),
             sent: facts.sent.as_deref().map(Into::into),
             breakdown: facts.breakdown.as_deref().map(Into::into),
+            passages: passages.collect(),
             diagnoses: findings.map(|finding| (*finding).into()).collect(),
             reasons: self.circumstances.reasons(facts),
         }
