@@ -1,6 +1,8 @@
 //! Where the control API listens, as the configuration, the command line and the service manager
 //! say.
 
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
@@ -32,6 +34,11 @@ pub(crate) fn choose(settings: &mut ApiSettings, asked: Option<Listen>, is_repor
 pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
     let token = settings.token_file.as_deref();
     let mut server = Server::new(token)?;
+    if let Some(path) = token
+        && fs::metadata(path).is_ok_and(|file| file.permissions().mode() & 0o004 != 0)
+    {
+        tracing::warn!(path = %path.display(), "every user of this host can read the token");
+    }
     if let Some(address) = settings.listen {
         server.bind(address)?;
     }

@@ -514,6 +514,37 @@ fn the_agent_does_not_start_where_the_api_would_be_open_to_everybody_or_cannot_b
 }
 
 #[test]
+fn the_service_managers_directory_has_the_socket_of_one_agent_and_no_other_takes_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let socket = directory.path().join("api.sock");
+    let start = || {
+        let mut agent = rp();
+        agent.env("RUNTIME_DIRECTORY", directory.path());
+        LocalAgent::start_as(&mut agent, &["--watch", "/a"])
+    };
+    let asked = || {
+        let stream = UnixStream::connect(&socket).unwrap();
+        exchange(stream, "GET /watch/a HTTP/1.1\r\nHost: rp\r\n", "").status
+    };
+    let mut first = start();
+    first.wait_for_log("ready");
+    assert_eq!(asked(), 200);
+    let mut second = start();
+    second.wait_for_log("ready");
+    assert!(second.log().contains("another agent serves the socket"));
+    assert_eq!(ask(&second, "GET", "/watch/a", "", "").status, 200);
+    drop(second);
+    assert_eq!(asked(), 200);
+    // Killed, it leaves the file; the next one takes its place.
+    first.signal("-KILL");
+    first.wait();
+    assert!(socket.exists());
+    let mut third = start();
+    third.wait_for_log("ready");
+    assert_eq!(asked(), 200);
+}
+
+#[test]
 fn a_token_a_foreign_name_and_a_foreign_page_are_told_apart() {
     let directory = tempfile::tempdir().unwrap();
     let (config, token) = (

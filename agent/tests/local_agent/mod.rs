@@ -23,6 +23,7 @@ pub fn rp() -> Command {
     command
         .env_remove("RUST_LOG")
         .env_remove("NOTIFY_SOCKET")
+        .env_remove("RUNTIME_DIRECTORY")
         .env("RUST_BACKTRACE", "1");
     command
 }
