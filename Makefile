@@ -31,7 +31,7 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
 	$(if $(NEXTEST),cargo nextest run --workspace,cargo test --workspace --lib --bins --tests)
-	cargo test --package ros2probe --features tls --test web_config --quiet
+	cargo test --package ros2probe --features tls --test web_config --test otlp_tls --quiet
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf

@@ -186,7 +186,19 @@ impl Client {
     }
 }
 
-/// TLS needs C or assembly: not in this build.
+/// The system's certificate authorities, or those in `SSL_CERT_FILE`.
+#[cfg(feature = "tls")]
+fn secured(endpoint: Endpoint, target: &Target) -> Result<Endpoint, SettingsError> {
+    if target.endpoint.scheme_str() != Some("https") {
+        return Ok(endpoint);
+    }
+    let authorities = tonic::transport::ClientTlsConfig::new().with_native_roots();
+    endpoint
+        .tls_config(authorities)
+        .map_err(SettingsError::Client)
+}
+
+#[cfg(not(feature = "tls"))]
 fn secured(endpoint: Endpoint, target: &Target) -> Result<Endpoint, SettingsError> {
     if target.endpoint.scheme_str() == Some("https") {
         return Err(SettingsError::NoTls(target.endpoint.to_string()));

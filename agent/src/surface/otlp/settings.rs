@@ -56,7 +56,7 @@ pub enum SettingsError {
     /// TLS is a feature of the build.
     #[error(
         "the OTLP endpoint {0} wants TLS, which this build has not: use http:// to a collector on \
-         this host that has it"
+         this host, or build with `--features tls`"
     )]
     NoTls(String),
     /// A header that cannot be sent.
