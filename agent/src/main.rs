@@ -63,6 +63,11 @@ fn run(options: cli::Run) -> Result<()> {
     }
     control::choose(&mut config.api, options.api, options.report);
     let log = Log::start(config.log);
+    let export = otlp::Settings::resolve(
+        &config.otlp,
+        &|name| std::env::var(name).ok(),
+        &Host::read(),
+    )?;
     let source = open(&options, &config)?;
     source.announce(&config.capture);
     let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
@@ -77,11 +82,6 @@ fn run(options: cli::Run) -> Result<()> {
     });
     let server = server.transpose()?;
     let control = control::open(&config.api)?;
-    let export = otlp::Settings::resolve(
-        &config.otlp,
-        &|name| std::env::var(name).ok(),
-        &Host::read(),
-    )?;
     let state = match &source {
         Source::Live(_) => memory::open(&config.state_directory),
         Source::Replay(_) => None,

@@ -24,6 +24,8 @@ fn encryption_that_is_not_built_in_is_an_error_that_says_what_to_do() {
         "run",
         "--metrics",
         "127.0.0.1:0",
+        "--api",
+        "off",
         "--config",
         &configuration,
     ]);

@@ -56,7 +56,10 @@ impl Client {
     ) -> Result<Self, SettingsError> {
         let endpoint = Endpoint::from(target.endpoint.clone())
             .user_agent(concat!("ros2probe/", env!("CARGO_PKG_VERSION")));
-        let endpoint = secured(endpoint.map_err(SettingsError::Client)?, &target)?
+        let endpoint = endpoint.map_err(SettingsError::Client)?;
+        #[cfg(feature = "tls")]
+        let endpoint = secured(endpoint, &target)?;
+        let endpoint = endpoint
             .connect_timeout(target.timeout)
             .http2_keep_alive_interval(PING);
         let mut grpc =
@@ -196,14 +199,6 @@ fn secured(endpoint: Endpoint, target: &Target) -> Result<Endpoint, SettingsErro
     endpoint
         .tls_config(authorities)
         .map_err(SettingsError::Client)
-}
-
-#[cfg(not(feature = "tls"))]
-fn secured(endpoint: Endpoint, target: &Target) -> Result<Endpoint, SettingsError> {
-    if target.endpoint.scheme_str() == Some("https") {
-        return Err(SettingsError::NoTls(target.endpoint.to_string()));
-    }
-    Ok(endpoint)
 }
 
 const fn path(signal: Signal) -> &'static str {

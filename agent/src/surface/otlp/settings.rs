@@ -183,6 +183,9 @@ fn target(
     let Some(endpoint) = endpoint(&value) else {
         return Err(SettingsError::Endpoint { name, value });
     };
+    if endpoint.scheme_str() == Some("https") && !cfg!(feature = "tls") {
+        return Err(SettingsError::NoTls(endpoint.to_string()));
+    }
     if let Some((name, value)) = variables.of(signal, "PROTOCOL")
         && value != "grpc"
     {
