@@ -303,9 +303,8 @@ impl Sequence {
 
     /// Nothing in `start..end` is a loss.
     pub fn excuse(&mut self, start: u64, end: u64) {
-        for number in start.max(self.floor()).max(self.settled)..end.min(self.next) {
-            self.excused.set(number);
-        }
+        let start = start.max(self.floor()).max(self.settled);
+        self.excused.set_all(start, end.min(self.next));
     }
 
     /// Decides what has been open for `window`, but nothing from `hold` on.
@@ -482,16 +481,26 @@ impl Bitmap {
         }
     }
 
+    fn set_all(&mut self, start: u64, end: u64) {
+        self.each_word(start, end, |word, mask| *word |= mask);
+    }
+
     fn clear(&mut self, start: u64, end: u64) {
-        if end.saturating_sub(start) >= self.len() {
-            self.words.fill(0);
-            return;
-        }
-        for number in start..end {
-            let (word, mask) = self.place(number);
+        self.each_word(start, end, |word, mask| *word &= !mask);
+    }
+
+    /// Word by word, for a HEARTBEAT may excuse thousands of numbers, and so may the next one.
+    fn each_word(&mut self, start: u64, end: u64, change: impl Fn(&mut u64, u64)) {
+        let end = end.min(start.saturating_add(self.len()));
+        let mut number = start;
+        while number < end {
+            let (word, _) = self.place(number);
+            let (first, left) = (number % 64, end - number);
+            let bits = left.min(64 - first);
             if let Some(word) = self.words.get_mut(word) {
-                *word &= !mask;
+                change(word, (u64::MAX >> (64 - bits)) << first);
             }
+            number += bits;
         }
     }
 

@@ -234,3 +234,40 @@ fn a_late_sample_after_settling_still_counts_once() {
     );
     assert_eq!(bench.duplicates, [2]);
 }
+
+#[test]
+fn ranges_of_a_bitmap_are_set_and_cleared_to_the_bit_also_around_its_end() {
+    for (start, end) in [
+        (0, 0),
+        (5, 6),
+        (60, 70),
+        (64, 128),
+        (100, 300),
+        (1000, 1255),
+        (1000, 1256),
+        (1000, 5000),
+    ] {
+        let mut bits = Bitmap::with_len(256);
+        bits.set_all(start, end);
+        let is_within = |number: u64| {
+            let number = start + (number.wrapping_sub(start) & 255);
+            (start..end).contains(&number)
+        };
+        for number in 1000..1256 {
+            assert_eq!(
+                bits.get(number),
+                is_within(number),
+                "{start} {end} {number}"
+            );
+        }
+        bits.set_all(0, 256);
+        bits.clear(start, end);
+        for number in 1000..1256 {
+            assert_eq!(
+                bits.get(number),
+                !is_within(number),
+                "{start} {end} {number}"
+            );
+        }
+    }
+}
