@@ -2,8 +2,9 @@
 //!
 //! Thin on purpose. What a submessage is and what becomes of it is decided by
 //! `ros2probe_wire::walk`, the same code that user space runs; here are the socket buffer, the maps
-//! and the fragments. Two hooks: [`wire`] sees frames on interfaces, [`host_ingress`] and
-//! [`host_egress`] see datagrams at sockets.
+//! and the fragments. Hooks: [`wire`] sees frames on interfaces, [`host_ingress`] and
+//! [`host_egress`] see datagrams at sockets. On request, [`shm_handed`] sees messages in the process
+//! that sends them.
 //!
 //! Stays inside what Linux 5.10 verifies: bounded loops, global functions that are verified once,
 //! reads of fixed size, no spin lock, no atomics that return a value.
@@ -13,6 +14,7 @@
 #![feature(asm_experimental_arch)]
 
 mod fragment;
+mod handed;
 mod host;
 mod inside;
 mod maps;
@@ -25,9 +27,10 @@ mod runs;
 mod verdict;
 
 use aya_ebpf::{
+    EbpfContext as _,
     bindings::__sk_buff,
-    macros::{cgroup_skb, raw_tracepoint, socket_filter},
-    programs::{RawTracePointContext, SkBuffContext},
+    macros::{cgroup_skb, raw_tracepoint, socket_filter, uprobe},
+    programs::{ProbeContext, RawTracePointContext, SkBuffContext},
 };
 use ros2probe_wire::filter::Counter;
 
@@ -96,6 +99,20 @@ pub fn not_reassembled(context: RawTracePointContext) -> u32 {
 #[raw_tracepoint]
 pub fn not_reassembled_unexplained(context: RawTracePointContext) -> u32 {
     reassembly::unexplained(&context);
+    0
+}
+
+/// Where a process is about to copy a message into shared memory, in one piece (Fast DDS 2.x).
+#[uprobe]
+pub fn shm_handed(context: ProbeContext) -> u32 {
+    handed::look(context.as_ptr() as *const u64, false);
+    0
+}
+
+/// As [`shm_handed`], for a message in a list of buffers (Fast DDS 3.x).
+#[uprobe]
+pub fn shm_handed_list(context: ProbeContext) -> u32 {
+    handed::look(context.as_ptr() as *const u64, true);
     0
 }
 

@@ -50,6 +50,16 @@ pub static PREEMPTED: u32 = 1;
 #[unsafe(no_mangle)]
 pub static IN_PLACE: u32 = 1;
 
+/// How the kernel lays out the registers of a call's arguments: 0 = x86-64, 1 = AArch64. Set by the
+/// loader.
+#[unsafe(no_mangle)]
+pub static ARCHITECTURE: u32 = 0;
+
+/// Messages into shared memory: only those of processes of this control group or below; 0 = all. Set
+/// by the loader.
+#[unsafe(no_mangle)]
+pub static WITHIN: u64 = 0;
+
 /// Reads a setting that the loader may have changed.
 macro_rules! setting {
     ($name:ident) => {{

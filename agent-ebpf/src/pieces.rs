@@ -10,7 +10,7 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{PIECES, count, opaque, piece, scratch, setting},
+    maps::{PIECES, PieceBuffer, count, opaque, piece, scratch, setting},
     verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
 };
 
@@ -85,6 +85,12 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
     if loaded != 0 {
         return 0;
     }
+    publish(slot, buffer)
+}
+
+/// Writes the piece that the buffer holds; 1 = written.
+#[inline(always)]
+pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
     let wake = if scratch(slot).is_some_and(|scratch| scratch.walk.record.writer[3] != SPDP_WRITER)
         || PIECES.query(AVAILABLE_DATA) > setting!(WAKE_PIECE_BYTES)
     {
@@ -92,7 +98,7 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
     } else {
         NO_WAKEUP
     };
-    let size = size_of::<Piece>() + bounded(len);
+    let size = size_of::<Piece>() + bounded(buffer.piece.len);
     // SAFETY: the buffer is that long.
     let bytes = unsafe { core::slice::from_raw_parts((&raw const *buffer).cast::<u8>(), size) };
     u32::from(PIECES.output::<[u8]>(bytes, wake).is_ok())
@@ -101,7 +107,7 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
 /// The same number, 1 to [`PIECE_BYTES`], in a form in which every verifier sees these bounds: a mask
 /// directly before it is used, which the optimizer must not know to be superfluous.
 #[inline(always)]
-fn bounded(len: u32) -> usize {
+pub fn bounded(len: u32) -> usize {
     let len = opaque(len);
     ((len.wrapping_sub(1) & (PIECE_BYTES as u64 - 1)) + 1) as usize
 }

@@ -132,7 +132,7 @@ pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()
 /// Notes the time of a participant's message, if user space follows the participant. One who says
 /// much is not noted each time.
 #[inline(always)]
-fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
+pub fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
     let same = scratch.heard[2] == source[2]
         && scratch.heard[1] == source[1]
         && scratch.heard[0] == source[0];
@@ -189,7 +189,7 @@ pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u3
 
 /// Asks the interest map about the submessage at hand.
 #[inline(always)]
-fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
+pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
     let (key, unknown_counts) = match walk::fate(&scratch.walk.record) {
         Fate::Ignore => return progress::ON,
         Fate::Capture if host::captured_before(slot, scratch) => return progress::ON,

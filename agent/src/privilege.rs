@@ -24,6 +24,13 @@ const WIRE: [Capability; 3] = [
     Capability::CAP_PERFMON,
 ];
 
+/// Breakpoints in other processes: `CAP_PERFMON` was enough from Linux 5.8 on and is not any more.
+/// Which files they map: of those of other users with both.
+const PROBES: [(Capability, &str); 2] = [
+    (Capability::CAP_SYS_ADMIN, "CAP_SYS_ADMIN"),
+    (Capability::CAP_SYS_PTRACE, "CAP_SYS_PTRACE"),
+];
+
 /// Live capture is not possible for lack of these.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Missing {
@@ -93,30 +100,48 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)
 /// unprivileged BPF is disabled, and two where shared memory is looked at: `CAP_SYS_PTRACE`, which
 /// opens `/proc/<pid>/root`, and so the shared memory of containers, to whoever has it anyway; and
 /// `CAP_SYS_NICE` where a limit cannot allow the thread that looks to run first. Call it while the
-/// process has one thread: capabilities belong to threads, and new ones inherit them.
+/// process has one thread: capabilities belong to threads, and new ones inherit them. That of exact
+/// mode looks after itself, see [`keep_for_probes`].
 ///
 /// # Errors
 /// When the kernel refuses, which it does not for a process that gives up what it has.
 pub fn give_up(settings: &CaptureSettings) -> Result<(), DropError> {
     let looks_at_memory = settings.shm.mode == ShmMode::Auto;
     let lacks_limit = looks_at_memory && !allow_running_first();
-    let keep = |set: CapsHashSet| -> CapsHashSet {
-        set.into_iter()
-            .filter(|capability| match capability {
-                Capability::CAP_BPF => true,
-                Capability::CAP_SYS_PTRACE => looks_at_memory,
-                Capability::CAP_SYS_NICE => lacks_limit,
-                _ => false,
-            })
-            .collect()
+    keep(|capability| match capability {
+        Capability::CAP_BPF => true,
+        Capability::CAP_SYS_PTRACE => looks_at_memory,
+        Capability::CAP_SYS_NICE => lacks_limit,
+        _ => false,
+    })
+}
+
+/// What [`crate::capture::exact`] lacks.
+#[must_use]
+pub fn missing_for_probes() -> Vec<&'static str> {
+    let Ok(effective) = caps::read(None, CapSet::Effective) else {
+        return Vec::new();
     };
+    let needed = PROBES.iter().filter(|(one, _)| !effective.contains(one));
+    needed.map(|(_, name)| *name).collect()
+}
+
+/// Gives up what the calling thread does not need to attach to libraries.
+///
+/// # Errors
+/// When the kernel refuses, which it does not for a thread that gives up what it has.
+pub fn keep_for_probes() -> Result<(), DropError> {
+    keep(|capability| PROBES.iter().any(|(one, _)| *one == capability))
+}
+
+fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError> {
     let permitted = caps::read(None, CapSet::Permitted).map_err(DropError)?;
     if caps::has_cap(None, CapSet::Effective, Capability::CAP_SETPCAP).map_err(DropError)? {
         for capability in caps::read(None, CapSet::Bounding).map_err(DropError)? {
             caps::drop(None, CapSet::Bounding, capability).map_err(DropError)?;
         }
     }
-    let kept = keep(permitted);
+    let kept: CapsHashSet = permitted.into_iter().filter(|one| is_kept(*one)).collect();
     caps::clear(None, CapSet::Ambient).map_err(DropError)?;
     caps::clear(None, CapSet::Inheritable).map_err(DropError)?;
     caps::set(None, CapSet::Effective, &kept).map_err(DropError)?;

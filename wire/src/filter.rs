@@ -62,11 +62,13 @@ pub enum Counter {
     NotReassembled,
     /// UDP datagrams likewise whose first fragment was not there, or not where it can be read.
     NotReassembledUnnamed,
+    /// Messages on their way into shared memory that could not be read in their sender's memory.
+    Unreadable,
 }
 
 impl Counter {
     /// All of them, in index order.
-    pub const ALL: [Self; 28] = [
+    pub const ALL: [Self; 29] = [
         Self::Frames,
         Self::Messages,
         Self::Ignored,
@@ -95,6 +97,7 @@ impl Counter {
         Self::NoRoomUnseen,
         Self::NotReassembled,
         Self::NotReassembledUnnamed,
+        Self::Unreadable,
     ];
 
     /// Label value.
@@ -129,6 +132,7 @@ impl Counter {
             Self::NoRoomUnseen => "no_room_unseen",
             Self::NotReassembled => "not_reassembled",
             Self::NotReassembledUnnamed => "not_reassembled_unnamed",
+            Self::Unreadable => "unreadable",
         }
     }
 }

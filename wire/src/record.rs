@@ -60,8 +60,11 @@ pub mod flag {
     /// DATA_FRAG only; `socket` is 0.
     pub const NOT_REASSEMBLED: u16 = 1 << 8;
     /// Read from shared memory between processes of this host: a sampled view, in which what is
-    /// missing may have been sent all the same. Never written by the kernel filter.
+    /// missing may have been sent all the same, unless [`EXACT`] is set.
     pub const SHM: u16 = 1 << 9;
+    /// With [`SHM`]: not read there, but seen in the process that put it there, as every message of
+    /// that process is: what is missing was not sent. Written by the kernel program.
+    pub const EXACT: u16 = 1 << 10;
 }
 
 /// One submessage of one writer or reader. 136 bytes.

@@ -4,6 +4,7 @@
 //! Needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8); attaching the host hook to a
 //! cgroup needs CAP_NET_ADMIN besides.
 
+mod handed;
 mod host;
 
 use std::io;
@@ -19,6 +20,7 @@ use zerocopy::FromBytes;
 
 use super::inside::Places;
 
+pub use handed::{Form, Probe, Probes};
 pub use host::CapturedPiece;
 
 /// The object `agent-ebpf/build.sh` made. Aligned, because ELF is read in place.
@@ -48,6 +50,9 @@ pub enum FilterError {
          tolerates no other"
     )]
     AttachNotPermitted(#[source] io::Error),
+    /// The kernel does not put a breakpoint into the library.
+    #[error("the kernel does not attach to it")]
+    Probe(#[source] ProgramError),
     /// The cgroup takes no program.
     #[error("the host hook does not attach to the cgroup")]
     Attach(#[source] ProgramError),
@@ -97,6 +102,8 @@ pub struct Filter {
     /// The wire hook's program, or the host hook's for datagrams on their way in.
     program: ProgramFd,
     host: Option<host::Hook>,
+    /// Captured datagrams, but not on the wire hook.
+    pieces: Option<RingBuf<MapData>>,
     interest: HashMap<MapData, [u32; 4], u32>,
     participants: HashMap<MapData, [u32; 3], u64>,
     interfaces: HashMap<MapData, u32, u32>,
@@ -115,7 +122,7 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
-        let mut ebpf = open(settings, false, &sizes, None)?;
+        let mut ebpf = open(settings, false, &sizes, None, 0)?;
         let program = load_program(&mut ebpf, "wire")?;
         Self::with_maps(&mut ebpf, program, None)
     }
@@ -134,6 +141,7 @@ impl Filter {
         Ok(Self {
             program,
             host,
+            pieces: None,
             interest: take(ebpf, "INTEREST")?,
             participants: take(ebpf, "PARTICIPANTS")?,
             interfaces: take(ebpf, "INTERFACES")?,
@@ -310,17 +318,20 @@ fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error>
 const UNUSED: u32 = 64;
 
 /// Opens the object and creates its maps, of which those named have another size.
-/// `host`: for the host hook. `places`: for programs that read the kernel's structures.
+/// `host`: for the host hook. `places`: for programs that read the kernel's structures. `within`: the
+/// control group of the processes whose messages into shared memory are looked at; 0 = all.
 fn open(
     settings: &FilterSettings,
     host: bool,
     sizes: &[(&'static str, u32)],
     places: Option<&Places>,
+    within: u64,
 ) -> Result<Ebpf, FilterError> {
     let in_place = u32::from(host);
     let preempted = u32::from(preempts_everything());
     let ring = ring_size(settings.record_ring_bytes);
     let accept = u32::from(settings.accept_new_interfaces);
+    let architecture = u32::from(cfg!(target_arch = "aarch64"));
     let (wake, wake_pieces) = (
         u64::from(ring / 2),
         u64::from(ring_size(settings.piece_ring_bytes) / 2),
@@ -330,6 +341,8 @@ fn open(
         .override_global("NEW_INTERFACES", &accept, true)
         .override_global("IN_PLACE", &in_place, true)
         .override_global("PREEMPTED", &preempted, true)
+        .override_global("ARCHITECTURE", &architecture, true)
+        .override_global("WITHIN", &within, true)
         .override_global("WAKE_BYTES", &wake, true)
         .override_global("WAKE_PIECE_BYTES", &wake_pieces, true)
         .map_max_entries("RECORDS", ring);

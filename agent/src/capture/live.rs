@@ -14,15 +14,18 @@ use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
+use super::exact::Exact;
+use super::exact::search::Facts as ExactFacts;
 use super::filter::{Filter, FilterError};
-use super::host::{self, HostError, HostSettings, HostTap};
+use super::host::{HostError, HostSettings, HostTap};
+use super::intake::{self, Intake};
 use super::interfaces::Selection;
 use super::netns::{self, NetnsError};
 use super::shm::scan::{Places, Scope};
 use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
 use super::wire::{self, TapError, WireSettings, WireTap};
-use crate::config::{CaptureSettings, ShmMode, SourceChoice};
+use crate::config::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
 use crate::model::observer::Observer;
 use crate::model::reassembly::Limits;
 
@@ -68,6 +71,9 @@ pub struct LiveSource {
     /// Why the host hook is not used although it would show more.
     without_host: Option<String>,
     shared_memory: Shm,
+    exact: Option<Exact>,
+    /// Why messages into shared memory are not seen in their senders although that was asked for.
+    without_exact: Option<String>,
     /// When unclassified writers last got bytes and records to spend.
     bytes_refilled: u64,
     records_refilled: u64,
@@ -125,6 +131,7 @@ impl LiveSource {
                 open_wires(settings, limits, mirrors)?
             }
         };
+        let (exact, without_exact) = open_exact(settings, host.is_some());
         give_back_memory();
         let shared_memory = match settings.shm.mode {
             ShmMode::Off => Shm::Off,
@@ -139,6 +146,8 @@ impl LiveSource {
             wires,
             without_host,
             shared_memory,
+            exact,
+            without_exact,
             bytes_refilled: 0,
             records_refilled: 0,
             wanted_asked: 0,
@@ -179,15 +188,20 @@ impl LiveSource {
         observer: &mut Observer,
     ) -> Result<(), CaptureError> {
         self.start_shared_memory();
+        if let Shm::Running(shared_memory) = &self.shared_memory {
+            let covers_all = self.exact.as_ref().is_some_and(Exact::covers_all);
+            shared_memory.pause(covers_all);
+        }
         let sockets = self.host.iter().flat_map(HostTap::descriptors);
         let interfaces = self.wires.iter().flat_map(WireTap::descriptors);
+        let processes = self.exact.iter().flat_map(Exact::descriptors);
         let rings = bell.is_some().into();
-        let bell = bell.into_iter();
-        let descriptors: Vec<_> = bell.chain(sockets).chain(interfaces).collect();
+        let taps = sockets.chain(processes).chain(interfaces);
+        let descriptors: Vec<_> = bell.into_iter().chain(taps).collect();
         let began = Instant::now();
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
-        if self.host.is_some() && woken {
+        if (self.host.is_some() || self.exact.is_some()) && woken {
             // News seldom comes alone. What nobody was woken for has had its time.
             std::thread::sleep(GATHER);
         }
@@ -196,7 +210,11 @@ impl LiveSource {
         let mut settle = 0;
         if let Some(host) = &mut self.host {
             host.take_in(&clocks, observer);
-            settle = host::SETTLE_NANOSECONDS;
+            settle = intake::SETTLE_NANOSECONDS;
+        }
+        if let Some(exact) = &mut self.exact {
+            exact.take_in(&clocks, observer);
+            settle = intake::SETTLE_NANOSECONDS;
         }
         for wire in &mut self.wires {
             wire.take_in(&clocks, observer)?;
@@ -218,6 +236,9 @@ impl LiveSource {
         let clocks = Clocks::read();
         if let Some(host) = &mut self.host {
             host.drain(&clocks, observer);
+        }
+        if let Some(exact) = &mut self.exact {
+            exact.drain(&clocks, observer);
         }
         for wire in &mut self.wires {
             wire.drain(&clocks, observer);
@@ -313,7 +334,7 @@ impl LiveSource {
     /// Bytes that came from the kernel: frames, datagrams and records.
     #[must_use]
     pub fn copied_bytes(&self) -> u64 {
-        let host: u64 = self.host.iter().map(HostTap::copied_bytes).sum();
+        let host: u64 = self.intakes().map(Intake::copied_bytes).sum();
         host + self.wires.iter().map(WireTap::copied_bytes).sum::<u64>()
     }
 
@@ -321,7 +342,7 @@ impl LiveSource {
     /// together here.
     #[must_use]
     pub fn incomplete_datagrams(&self) -> u64 {
-        let host: u64 = self.host.iter().map(HostTap::incomplete_datagrams).sum();
+        let host: u64 = self.intakes().map(Intake::incomplete_datagrams).sum();
         let wires = self.wires.iter().map(WireTap::incomplete_datagrams);
         host + wires.sum::<u64>()
     }
@@ -329,7 +350,7 @@ impl LiveSource {
     /// Bytes held for reassembly.
     #[must_use]
     pub fn reassembly_bytes(&self) -> usize {
-        let host: usize = self.host.iter().map(HostTap::waiting_bytes).sum();
+        let host: usize = self.intakes().map(Intake::waiting_bytes).sum();
         host + self
             .wires
             .iter()
@@ -352,6 +373,30 @@ impl LiveSource {
         !matches!(self.shared_memory, Shm::Off)
     }
 
+    /// What is attached to processes that send into shared memory, if that was asked for and can be
+    /// had.
+    #[must_use]
+    pub fn exact(&self) -> Option<ExactFacts> {
+        self.exact.as_ref().map(Exact::facts)
+    }
+
+    /// Messages that were captured whole in the processes that sent them.
+    #[must_use]
+    pub fn messages_of_processes(&self) -> Option<u64> {
+        Some(self.exact.as_ref()?.intake().datagrams())
+    }
+
+    /// Why they are not looked at there although that was asked for, in plain words.
+    #[must_use]
+    pub fn without_exact(&self) -> Option<&str> {
+        self.without_exact.as_deref()
+    }
+
+    fn intakes(&self) -> impl Iterator<Item = &Intake> {
+        let host = self.host.iter().map(HostTap::intake);
+        host.chain(self.exact.iter().map(Exact::intake))
+    }
+
     fn start_shared_memory(&mut self) {
         let Shm::Later(scope, share) = &self.shared_memory else {
             return;
@@ -367,13 +412,17 @@ impl LiveSource {
     }
 
     fn filters(&self) -> impl Iterator<Item = &Filter> {
-        let host = self.host.iter().map(HostTap::filter);
-        host.chain(self.wires.iter().map(WireTap::filter))
+        let intakes = self.intakes().map(Intake::filter);
+        intakes.chain(self.wires.iter().map(WireTap::filter))
     }
 
     fn tell(&mut self, mut what: impl FnMut(&mut Filter) -> Result<(), FilterError>) {
         let host = self.host.iter_mut().map(HostTap::filter_mut);
-        for filter in host.chain(self.wires.iter_mut().map(WireTap::filter_mut)) {
+        let exact = self.exact.iter_mut().map(Exact::filter_mut);
+        for filter in host
+            .chain(exact)
+            .chain(self.wires.iter_mut().map(WireTap::filter_mut))
+        {
             self.refused_updates += u64::from(what(filter).is_err());
         }
     }
@@ -430,6 +479,28 @@ fn open_host(
     }
 }
 
+/// The programs for messages into shared memory, or why there are none. Without them shared memory
+/// is looked at as usual.
+fn open_exact(settings: &CaptureSettings, host: bool) -> (Option<Exact>, Option<String>) {
+    if settings.shm.exact == ExactChoice::Off {
+        return (None, None);
+    }
+    if !host {
+        // Of processes, only control groups can be told apart where the programs run.
+        let reason = "it goes with looking at the host's sockets (capture.source)";
+        return (None, Some(reason.to_owned()));
+    }
+    let opened = Exact::open(
+        settings.cgroup.as_deref(),
+        settings.ring_bytes,
+        settings.record_ring_bytes,
+    );
+    match opened {
+        Ok(exact) => (Some(exact), None),
+        Err(error) => (None, Some(in_words(&error))),
+    }
+}
+
 /// A tap for this namespace and one for each configured one.
 fn open_wires(
     settings: &CaptureSettings,
@@ -451,7 +522,7 @@ fn open_wires(
 }
 
 /// An error and its causes in one line; of a verifier's log, the first line.
-fn in_words(error: &dyn Error) -> String {
+pub(super) fn in_words(error: &dyn Error) -> String {
     let mut words = String::new();
     let mut cause = Some(error);
     while let Some(error) = cause {

@@ -1,11 +1,13 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
 pub mod control_groups;
+pub mod exact;
 pub mod feed;
 pub mod filter;
 pub mod hierarchy;
 pub mod host;
 pub mod inside;
+pub mod intake;
 pub mod interfaces;
 pub mod kernel_types;
 pub mod live;

@@ -87,6 +87,12 @@ impl Order {
         None
     }
 
+    /// Records of the kernel's ring that wait.
+    #[must_use]
+    pub fn waiting(&self) -> usize {
+        self.kernel.len()
+    }
+
     /// The oldest record, if it is not younger than `until` in the kernel's clock.
     pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
         let kernel = self.kernel.front().map(|record| record.time);

@@ -199,6 +199,7 @@ impl Reader {
             record_ring_bytes: shape.record_ring_bytes,
             shm: ShmSettings {
                 mode: shm.mode,
+                exact: shm.exact,
                 cpu_percent: shm.cpu_percent,
             },
         };

@@ -91,6 +91,8 @@ pub struct CaptureSettings {
 pub struct ShmSettings {
     /// Whether it is.
     pub mode: ShmMode,
+    /// Whether every message is to be seen in the process that sends it.
+    pub exact: ExactChoice,
     /// Share of one CPU that it may cost, in percent.
     pub cpu_percent: f64,
 }
@@ -104,6 +106,17 @@ pub enum ShmMode {
     Auto,
     /// Never.
     Off,
+}
+
+/// How every message into shared memory is seen, if at all.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum ExactChoice {
+    /// It is not: shared memory is only read.
+    #[default]
+    Off,
+    /// By a breakpoint of the kernel's in the code of the processes that send.
+    Uprobe,
 }
 
 /// Where the agent looks.
@@ -350,6 +363,7 @@ impl Default for Config {
                 record_ring_bytes: defaults::RECORD_RING_BYTES,
                 shm: ShmSettings {
                     mode: ShmMode::default(),
+                    exact: ExactChoice::default(),
                     cpu_percent: defaults::SHM_CPU_PERCENT,
                 },
             },

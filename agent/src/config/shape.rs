@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-use super::{Compression, Level, ShmMode, SourceChoice, defaults};
+use super::{Compression, ExactChoice, Level, ShmMode, SourceChoice, defaults};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
@@ -145,6 +145,9 @@ pub(super) struct CaptureShape {
 pub(super) struct ShmShape {
     /// `auto`: where there is any; `off`: never.
     pub(super) mode: ShmMode,
+    /// `uprobe`: see every message, by a breakpoint that the kernel puts into the code of all
+    /// processes that use Fast DDS; where that is not possible, shared memory is read as usual.
+    pub(super) exact: ExactChoice,
     /// Share of one CPU that looking may cost, in percent. With less, fewer of the messages are
     /// seen; they are counted all the same.
     #[schemars(range(min = 0.1, max = 100))]
@@ -270,6 +273,7 @@ impl Default for ShmShape {
     fn default() -> Self {
         Self {
             mode: ShmMode::default(),
+            exact: ExactChoice::default(),
             cpu_percent: defaults::SHM_CPU_PERCENT,
         }
     }

@@ -86,6 +86,11 @@ impl Sampled {
         takes
     }
 
+    /// It is seen otherwise from now on.
+    pub const fn end(&mut self) {
+        (self.last, self.left) = (Timestamp(0), true);
+    }
+
     /// The tap cannot tell what passed before `now`.
     pub const fn uncertain(&mut self) {
         self.uncertain += 1;

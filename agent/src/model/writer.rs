@@ -23,6 +23,10 @@ pub const RELIABLE_WINDOW: u64 = 10_000_000_000;
 /// A first sample older than this is history that a late joiner asked for.
 const HISTORY: u64 = 10_000_000_000;
 
+/// A writer that was seen in its own process is so for this long after its last record: what else
+/// is read in shared memory in that time has been seen.
+const EXACT_FOR: u64 = 10_000_000_000;
+
 /// What discovery says about the writer; all false while it is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Traits {
@@ -59,6 +63,8 @@ pub struct Writer {
     negative_latency: u64,
     /// Of a writer that was seen in shared memory.
     sampled: Option<Box<Sampled>>,
+    /// Of a writer that was seen in the process that it belongs to: its last record from there.
+    exact: Option<Timestamp>,
 }
 
 /// The counters that settling changes.
@@ -89,6 +95,7 @@ impl Writer {
             last_message: None,
             negative_latency: 0,
             sampled: None,
+            exact: None,
         }
     }
 
@@ -147,6 +154,14 @@ impl Writer {
     /// that this host sees: what is missing before it went elsewhere.
     pub fn record(&mut self, record: &Record, opened: Timestamp, scene: &mut Scene<'_>) {
         let at = record_time(record);
+        let is_exact = record.flags & flag::EXACT != 0;
+        let is_sampled = record.flags & flag::SHM != 0 && !is_exact;
+        if is_exact {
+            self.exact = self.exact.max(Some(at));
+        } else if is_sampled && self.is_exact(at) {
+            // It has been seen already, or is on its way.
+            return;
+        }
         let takes = self
             .sampled
             .as_mut()
@@ -154,8 +169,12 @@ impl Writer {
                 kind::DATA | kind::DATA_FRAG | kind::HEARTBEAT => sampled.takes(at),
                 _ => sampled.is_current(at),
             });
-        if record.flags & flag::SHM != 0 || takes {
-            self.sampled_record(record);
+        if is_sampled || takes {
+            self.sampled_record(record, is_sampled);
+            if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
+                // From here on every message is seen.
+                sampled.end();
+            }
             return;
         }
         let sequence = self.reception.sequence();
@@ -271,7 +290,7 @@ impl Writer {
             Outcome::Open => {}
             // Seen at several sockets is not sent again: there the caller knows.
             Outcome::Again => {
-                self.tally.duplicates += u64::from(record.flags & flag::HOST == 0);
+                self.tally.duplicates += u64::from(record.flags & (flag::HOST | flag::SHM) == 0);
             }
             Outcome::Whole(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);
@@ -281,13 +300,18 @@ impl Writer {
         }
     }
 
+    fn is_exact(&self, now: Timestamp) -> bool {
+        let last = self.exact;
+        last.is_some_and(|last| last.0.saturating_add(EXACT_FOR) > now.0)
+    }
+
     fn is_sampled(&self, now: Timestamp) -> bool {
         let sampled = self.sampled.as_ref();
         sampled.is_some_and(|sampled| sampled.is_current(now))
     }
 
     /// Takes in a record of a view in which what is missing may have been sent all the same.
-    fn sampled_record(&mut self, record: &Record) {
+    fn sampled_record(&mut self, record: &Record, is_sampled: bool) {
         let now = record_time(record);
         if self.sampled.is_none() || !self.is_sampled(now) {
             self.tally.messages += self.reception.abandon();
@@ -295,7 +319,7 @@ impl Writer {
         let sampled = self
             .sampled
             .get_or_insert_with(|| Box::new(Sampled::new(now)));
-        if record.flags & flag::SHM != 0 {
+        if is_sampled {
             sampled.touch(now);
         }
         let sequence = self.reception.sequence_mut();

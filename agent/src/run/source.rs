@@ -16,7 +16,9 @@ use crate::capture::live::LiveSource;
 use crate::capture::shm;
 use crate::config::CaptureSettings;
 use crate::model::observer::Observer;
-use crate::surface::{Ability, AgentFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
+use crate::surface::{
+    Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
+};
 
 /// Where packets come from.
 pub enum Source {
@@ -41,6 +43,9 @@ impl Source {
         let Self::Live(live) = self else { return };
         if let Some(reason) = live.without_host() {
             tracing::warn!("host hook not used: {reason}; using packet sockets");
+        }
+        if let Some(reason) = live.without_exact() {
+            tracing::warn!("capture.shm.exact not used: {reason}; shared memory is sampled");
         }
         if !live.is_on_the_wire() && !settings.network_namespaces.is_empty() {
             tracing::info!("capture.network_namespaces is not needed: all sockets are seen");
@@ -137,7 +142,12 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     }));
     interfaces.extend(live.host().map(|host| InterfaceFacts {
         name: "sockets".to_owned(),
-        packets: Some(host.datagrams()),
+        packets: Some(host.intake().datagrams()),
+        dropped: None,
+    }));
+    interfaces.extend(live.messages_of_processes().map(|messages| InterfaceFacts {
+        name: "processes".to_owned(),
+        packets: Some(messages),
         dropped: None,
     }));
     let counters = live.counters().unwrap_or_default();
@@ -165,8 +175,30 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
         shared_memory: live.shared_memory().map(shared_memory),
+        exact: exact(live),
         ..AgentFacts::new(kind(live), now)
     }
+}
+
+/// What exact mode covers, and why not everything; nothing where it was not asked for.
+fn exact(live: &LiveSource) -> Vec<ExactFacts> {
+    let whole = |reason: &str| ExactFacts {
+        library: String::new(),
+        refused: Some(reason.to_owned()),
+    };
+    let Some(facts) = live.exact() else {
+        return live.without_exact().map(whole).into_iter().collect();
+    };
+    let libraries = facts.libraries.into_iter().map(|library| ExactFacts {
+        library: library.path.display().to_string(),
+        refused: library.refused,
+    });
+    // Containers have the same library by the same name.
+    let mut libraries: Vec<_> = libraries.collect();
+    libraries.sort();
+    libraries.dedup();
+    libraries.extend(facts.uncovered.as_deref().map(whole));
+    libraries
 }
 
 fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
@@ -207,6 +239,9 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     }
     if live.looks_at_shared_memory() {
         abilities.push(Ability::SharedMemory);
+    }
+    if live.exact().is_some_and(|facts| facts.uncovered.is_none()) {
+        abilities.push(Ability::SharedMemoryExact);
     }
     abilities
 }

@@ -64,7 +64,20 @@ pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
     page.single(&metric::CONTENDED, agent.contended)?;
     page.single(&metric::INCOMPLETE_DATAGRAMS, agent.incomplete_datagrams)?;
     page.single(&metric::REASSEMBLY, agent.reassembly_bytes)?;
-    shared_memory(page, agent.shared_memory.as_ref())
+    shared_memory(page, agent.shared_memory.as_ref())?;
+    page.family(&metric::SHM_EXACT_INFO, |family| {
+        agent.exact.iter().try_for_each(|facts| {
+            let (state, reason) = match &facts.refused {
+                None => ("attached", ""),
+                Some(reason) => ("refused", reason.as_str()),
+            };
+            family.info(&[
+                Label::Text(&facts.library),
+                Label::Text(state),
+                Label::Text(reason),
+            ])
+        })
+    })
 }
 
 /// The look at shared memory; nothing where there is none.

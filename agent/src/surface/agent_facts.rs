@@ -43,6 +43,18 @@ pub struct AgentFacts {
     pub state: Option<StateFacts>,
     /// The look at shared memory, where there is one.
     pub shared_memory: Option<SharedMemoryFacts>,
+    /// Libraries whose processes' messages into shared memory are to be seen one by one, if that was
+    /// asked for.
+    pub exact: Vec<ExactFacts>,
+}
+
+/// One library of exact mode.
+#[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct ExactFacts {
+    /// Its path as its processes see it; empty = this is about all of them.
+    pub library: String,
+    /// Why messages are not seen, `None` where they are.
+    pub refused: Option<String>,
 }
 
 /// The look at shared memory.
@@ -88,6 +100,8 @@ pub enum Ability {
     Forwarded,
     /// Messages between processes of this host through shared memory, sampled.
     SharedMemory,
+    /// Each of them, in every process that sends there.
+    SharedMemoryExact,
 }
 
 /// Counters of one interface.
@@ -123,6 +137,7 @@ impl AgentFacts {
             refused_updates: 0,
             state: None,
             shared_memory: None,
+            exact: Vec::new(),
         }
     }
 }
@@ -151,7 +166,7 @@ impl SourceKind {
 
 impl Ability {
     /// All of them.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Subscribers,
         Self::Sent,
         Self::SocketLosses,
@@ -160,6 +175,7 @@ impl Ability {
         Self::Containers,
         Self::Forwarded,
         Self::SharedMemory,
+        Self::SharedMemoryExact,
     ];
 
     /// Label value.
@@ -174,6 +190,7 @@ impl Ability {
             Self::Containers => "containers",
             Self::Forwarded => "forwarded",
             Self::SharedMemory => "shared_memory",
+            Self::SharedMemoryExact => "shared_memory_exact",
         }
     }
 }

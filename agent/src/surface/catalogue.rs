@@ -456,6 +456,7 @@ pub const CATALOGUE: &[Metric] = &[
     SHM_EVENTS,
     SHM_LOOKS,
     SHM_CPU,
+    SHM_EXACT_INFO,
     DATAGRAMS,
     RECORDS,
     DECODE_ERRORS,

@@ -22,7 +22,9 @@ mod tls;
 mod walk;
 pub mod web_config;
 
-pub use agent_facts::{Ability, AgentFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
+pub use agent_facts::{
+    Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
+};
 pub use board::{Board, Settings, State};
 pub use events::{AgentEvent, EventLog};
 pub use exposition::{Exposition, Format};

@@ -11,6 +11,7 @@ pub(crate) mod agent;
 pub(crate) mod bpf;
 pub(crate) mod capture;
 pub(crate) mod cgroup;
+pub(crate) mod code;
 pub(crate) mod dissection;
 pub(crate) mod event_log;
 pub(crate) mod loss;

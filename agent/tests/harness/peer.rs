@@ -62,16 +62,11 @@ impl Stack {
     pub(crate) const ALL: [Stack; 3] = [Stack::Fast, Stack::Cyclone, Stack::Rust];
 
     fn program(self) -> Result<PathBuf> {
-        let target = target_directory()?;
-        let (program, remedy) = match self {
-            Stack::Fast => (target.join("peers/fastdds"), "make peers"),
-            Stack::Cyclone => (target.join("peers/cyclonedds"), "make peers"),
-            Stack::Rust => (robot()?, "cargo build --example robot"),
-        };
-        if !program.exists() {
-            bail!("{} is missing: run `{remedy}`", program.display());
+        match self {
+            Stack::Fast => built("fastdds"),
+            Stack::Cyclone => built("cyclonedds"),
+            Stack::Rust => is_there(robot()?, "cargo build --example robot"),
         }
-        Ok(program)
     }
 }
 
@@ -235,6 +230,18 @@ fn profile_directory() -> Result<PathBuf> {
         .nth(2)
         .context("this program is not in a target directory")?;
     Ok(directory.to_owned())
+}
+
+/// A program that `make peers` builds.
+pub(crate) fn built(name: &str) -> Result<PathBuf> {
+    is_there(target_directory()?.join("peers").join(name), "make peers")
+}
+
+fn is_there(program: PathBuf, remedy: &str) -> Result<PathBuf> {
+    if !program.exists() {
+        bail!("{} is missing: run `{remedy}`", program.display());
+    }
+    Ok(program)
 }
 
 fn target_directory() -> Result<PathBuf> {

@@ -16,7 +16,7 @@ use ros2probe::model::snapshot::{
     WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe::state::StateFacts;
-use ros2probe::surface::{AgentFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
+use ros2probe::surface::{AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -182,6 +182,10 @@ pub fn agent() -> AgentFacts {
             writes: 3,
             failures: 0,
         }),
+        exact: vec![ExactFacts {
+            library: "/opt/ros/humble/lib/libfastrtps.so.2.6".to_owned(),
+            refused: None,
+        }],
         shared_memory: Some(SharedMemoryFacts {
             open: vec![("port", 4)],
             events: vec![("read", 7)],

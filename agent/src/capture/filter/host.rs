@@ -34,7 +34,6 @@ pub(super) struct Hook {
     inside: Option<Inside>,
     egress: ProgramFd,
     links: Vec<FdLink>,
-    pieces: RingBuf<MapData>,
     /// Values are [`Socket`]s.
     sockets: HashMap<MapData, u64, [u64; 2]>,
 }
@@ -67,7 +66,7 @@ impl Filter {
             Places::unknown("the kernel was not asked for its types".to_owned())
         };
         let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
-        let mut ebpf = open(settings, true, &sizes, Some(&places))?;
+        let mut ebpf = open(settings, true, &sizes, Some(&places), 0)?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
@@ -78,9 +77,9 @@ impl Filter {
             inside: None,
             egress,
             links: Vec::new(),
-            pieces,
             sockets,
         });
+        filter.pieces = Some(pieces);
         Ok(filter)
     }
 
@@ -142,12 +141,12 @@ impl Filter {
     /// Readable when the ring of captured datagrams is half full; `None` on the wire hook.
     #[must_use]
     pub fn piece_ring(&self) -> Option<BorrowedFd<'_>> {
-        self.host.as_ref().map(|host| host.pieces.as_fd())
+        self.pieces.as_ref().map(RingBuf::as_fd)
     }
 
     /// The oldest piece of a captured datagram not read yet.
     pub fn next_piece(&mut self) -> Option<CapturedPiece<'_>> {
-        self.host.as_mut()?.pieces.next().map(CapturedPiece)
+        self.pieces.as_mut()?.next().map(CapturedPiece)
     }
 
     /// What the hook knows of a socket, by its cookie.

@@ -24,6 +24,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;
@@ -38,6 +39,8 @@ use crate::model::observer::{Observer, Wanted};
 
 /// How often the counters are put where others can read them.
 const REPORT: u64 = 200_000_000;
+/// How long it sleeps at a time while it is paused.
+const PAUSE: Duration = Duration::from_millis(50);
 
 /// Close looks between two readings of the CPU time that they cost.
 const ACCOUNT_EVERY: u64 = 16;
@@ -70,6 +73,8 @@ struct Shared {
     is_told: AtomicBool,
     wanted: AtomicU8,
     facts: Mutex<Facts>,
+    /// Everything there is seen otherwise.
+    is_paused: AtomicBool,
     stop: AtomicBool,
 }
 
@@ -102,6 +107,11 @@ impl SharedMemory {
         let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
         interest.extend_from_slice(changes);
         self.shared.is_told.store(true, Ordering::Release);
+    }
+
+    /// Looks no longer, or again: everything is seen in the processes that send it.
+    pub fn pause(&self, is_paused: bool) {
+        self.shared.is_paused.store(is_paused, Ordering::Release);
     }
 
     /// Gives the model what was found since the last time.
@@ -153,6 +163,20 @@ impl Drop for SharedMemory {
     }
 }
 
+impl Shared {
+    /// Puts what the thread says of itself where others can read it.
+    fn report(&self, tap: &Tap, looks: u64, stretch: f64) {
+        let facts = self.facts.lock();
+        *facts.unwrap_or_else(PoisonError::into_inner) = Facts {
+            counters: tap.counters(),
+            cpu_seconds: seconds(thread_cpu()),
+            looks,
+            stretch,
+            refused: 0,
+        };
+    }
+}
+
 /// The thread.
 fn look(shared: &Shared, places: Places, share: f64) {
     let mut tap = Tap::new(places);
@@ -170,6 +194,13 @@ fn look(shared: &Shared, places: Places, share: f64) {
                 tap.judge.set(guid, verdict);
             }
         }
+        if shared.is_paused.load(Ordering::Acquire) {
+            tap.let_go();
+            reported = 0;
+            shared.report(&tap, looks, pace.stretch());
+            std::thread::sleep(PAUSE);
+            continue;
+        }
         let clocks = Clocks::read();
         let now = Moment {
             monotonic: clocks.monotonic,
@@ -184,14 +215,7 @@ fn look(shared: &Shared, places: Places, share: f64) {
         }
         if now.monotonic.saturating_sub(reported) >= REPORT {
             reported = now.monotonic;
-            let facts = shared.facts.lock();
-            *facts.unwrap_or_else(PoisonError::into_inner) = Facts {
-                counters: tap.counters(),
-                cpu_seconds: cpu,
-                looks,
-                stretch: pace.stretch(),
-                refused: 0,
-            };
+            shared.report(&tap, looks, pace.stretch());
         }
         let wanted = shared.wanted.load(Ordering::Relaxed);
         let need = if tap.has_ports() {

@@ -88,6 +88,22 @@ pub struct Places {
     pub left_out: u64,
 }
 
+impl Scope {
+    /// Its processes. Those of directories are not known.
+    #[must_use]
+    pub fn processes(&self) -> Vec<u32> {
+        match self {
+            Self::Everybody | Self::Networks(_) => all_processes(),
+            Self::Cgroup(cgroup) => {
+                let mut processes = Vec::new();
+                processes_of(cgroup, DEPTH, &mut processes);
+                processes
+            }
+            Self::Directories(_) => Vec::new(),
+        }
+    }
+}
+
 impl Name {
     /// From a file's name; `None` for everything that is not read.
     #[must_use]

@@ -169,6 +169,13 @@ impl Tap {
         }
     }
 
+    /// Lets go of everything that is open. What is there then is found with the next look.
+    pub fn let_go(&mut self) {
+        self.ports.clear();
+        self.segments.clear();
+        (self.listed, self.found) = (0, 0);
+    }
+
     /// Whether participants met since the last time that was asked: a port appeared, or an
     /// endpoint was announced.
     pub fn met(&mut self) -> bool {

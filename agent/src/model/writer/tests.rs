@@ -399,3 +399,49 @@ fn a_sample_half_of_which_came_by_the_network_is_no_loss_of_shared_memory() {
     let facts = bench.wait(60_000).facts();
     assert_eq!((facts.messages, facts.lost, facts.incomplete), (2, 0, 0));
 }
+
+fn in_its_process(record: Record) -> Record {
+    Record {
+        flags: flag::SHM | flag::EXACT,
+        ..record
+    }
+}
+
+#[test]
+fn seen_in_its_process_a_writer_s_gap_is_a_loss_and_a_copy_is_nothing() {
+    let mut bench = Bench::new(Traits::default());
+    for number in [1, 2, 3, 5, 6] {
+        bench.put(in_its_process(data(number)));
+        // By the network to another host, and read in shared memory.
+        bench.data(number);
+        bench.put(in_shared_memory(data(number))).wait(10);
+    }
+    // What is only read in shared memory meanwhile is on its way.
+    bench.put(in_shared_memory(data(8)));
+    let facts = bench.wait(5_000).facts();
+    assert_eq!((facts.messages, facts.bytes, facts.lost), (5, 500, 1));
+    assert_eq!((facts.sampled, facts.duplicates), (None, 5));
+    assert_eq!(facts.interarrival.count(), 4);
+}
+
+#[test]
+fn what_passed_before_a_writer_was_seen_in_its_process_counts_by_its_span() {
+    let mut bench = Bench::new(Traits::default());
+    for number in [1, 4, 7] {
+        bench.put(in_shared_memory(data(number))).wait(10);
+    }
+    for number in [10, 11, 13, 14] {
+        bench.put(in_its_process(data(number))).wait(10);
+    }
+    let facts = bench.wait(5_000).facts();
+    let sampled = facts.sampled.unwrap();
+    assert_eq!((sampled.seen, sampled.span), (4, 10));
+    assert_eq!((facts.messages, facts.lost), (13, 1));
+    // It is no longer seen that way: shared memory is read again.
+    bench.wait(20_000);
+    for number in [20, 25] {
+        bench.put(in_shared_memory(data(number))).wait(10);
+    }
+    let facts = bench.wait(60_000).facts();
+    assert_eq!((facts.messages, facts.lost), (13 + 11, 1));
+}

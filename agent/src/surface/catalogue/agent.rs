@@ -15,7 +15,7 @@ pub(in crate::surface) const SOURCE_INFO: Metric = Metric::info(
 pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
     "ros2probe_capture_ability",
     &["ability"],
-    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded, shared memory.",
+    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded, shared memory, each message there.",
 );
 pub(in crate::surface) const READY: Metric = Metric::gauge(
     "ros2probe_ready",
@@ -25,7 +25,7 @@ pub(in crate::surface) const READY: Metric = Metric::gauge(
 pub(in crate::surface) const CAPTURE_PACKETS: Metric = Metric::counter(
     "ros2probe_capture_packets_total",
     &["interface"],
-    "Packets that the filter let through to user space; `sockets` are datagrams captured at the host's sockets.",
+    "Packets that the filter let through to user space; `sockets` are datagrams captured at the host's sockets, `processes` messages captured in those that send into shared memory.",
 );
 pub(in crate::surface) const CAPTURE_DROPPED: Metric = Metric::counter(
     "ros2probe_capture_dropped_packets_total",
@@ -94,6 +94,11 @@ pub(in crate::surface) const SHM_CPU: Metric = Metric::counter(
     "CPU time that they took, kept to capture.shm.cpu_percent.",
 )
 .unit("seconds");
+pub(in crate::surface) const SHM_EXACT_INFO: Metric = Metric::info(
+    "ros2probe_shm_exact_info",
+    &["library", "state", "reason"],
+    "With capture.shm.exact: the Fast DDS libraries in use, attached or refused with the reason; without a library: why some messages, or all, are only sampled.",
+);
 pub(in crate::surface) const DATAGRAMS: Metric = Metric::counter(
     "ros2probe_datagrams_total",
     &[],

@@ -1,0 +1,469 @@
+//! Messages that a process hands to Fast DDS's shared memory, seen in the process itself.
+//!
+//! A uprobe where the library is about to copy a message there: once for each message, however many
+//! others will read it. It reads the sender's memory at the addresses that the call names, never
+//! writes, and does not wait: a page that is not there is a message that is counted as unreadable.
+//! Fast DDS 2.x gives the message in one piece, 3.x in a list of buffers.
+
+use aya_ebpf::{
+    helpers::{
+        bpf_ktime_get_ns,
+        generated::{
+            bpf_get_current_ancestor_cgroup_id, bpf_get_smp_processor_id, bpf_probe_read_user,
+        },
+    },
+    macros::map,
+    maps::PerCpuArray,
+};
+use core::{arch::asm, mem::MaybeUninit};
+use ros2probe_wire::{
+    filter::Counter,
+    host::PIECE_BYTES,
+    record::flag,
+    walk::{self, Bytes, MAGIC, Step},
+};
+
+use crate::{
+    maps::{SLOTS, claim_outgoing, count, piece, release, scratch, setting},
+    pieces,
+    verdict::{self, progress},
+};
+
+/// `maps::ARCHITECTURE`.
+const AARCH64: u32 = 1;
+/// Ancestors of a control group that are compared.
+const LEVELS: i32 = 16;
+/// Submessages of one message that are followed; one with more is captured.
+const SUBMESSAGES: u32 = 64;
+/// Bytes of a buffer's description in a list: an address and a length.
+const BUFFER: u64 = 16;
+/// Buffers of a list that one search goes through, and those that a list may have.
+const SEARCH: u32 = 64;
+const MAX_BUFFERS: u64 = 4096;
+/// Pieces that one message is captured in at most.
+const MAX_PIECES: u32 = 256;
+/// Longer ones are metered, but not captured: user space knows datagrams.
+const MAX_CAPTURED: u32 = 0xffff;
+/// No list of buffers comes near it.
+const MAX_LEN: u32 = 1 << 28;
+/// Words that the walk reads at once, and room for them where they lie in two buffers.
+const BRIDGE: usize = 8;
+
+/// The message at hand, by slot.
+#[map]
+static HANDED: PerCpuArray<Handed> = PerCpuArray::with_max_entries(SLOTS, 0);
+
+/// One message in its sender's memory.
+#[repr(C)]
+struct Handed {
+    /// Address of the list of buffers; 0 = it lies in one piece.
+    list: u64,
+    /// Buffers of the list.
+    buffers: u32,
+    /// The next one to be looked at.
+    next: u32,
+    /// Address of the buffer at hand.
+    address: u64,
+    /// Where in the message it begins and ends.
+    start: u32,
+    end: u32,
+    /// Words that lie in two buffers.
+    bridge: [u32; BRIDGE],
+}
+
+/// The message as the walk reads it.
+struct Message {
+    slot: u32,
+}
+
+impl Bytes for Message {
+    #[inline(always)]
+    fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]> {
+        let len = 4 * N as u32;
+        let mut handed = handed(self.slot)?;
+        if offset < handed.start || offset + len > handed.end {
+            let found = shm_find(self.slot, offset, len);
+            handed = self::handed(self.slot)?;
+            match found {
+                found::HERE => {}
+                found::BRIDGED => {
+                    let mut words = [core::hint::black_box(0); N];
+                    let mut index = 0;
+                    while index < N {
+                        words[index] = handed.bridge[index];
+                        index += 1;
+                    }
+                    return Some(words);
+                }
+                _ => return None,
+            }
+        }
+        read(handed.address + u64::from(offset.wrapping_sub(handed.start)))
+    }
+}
+
+/// A register at this place of the program's context. In one instruction: the verifier wants the place
+/// to be a part of it.
+macro_rules! register {
+    ($registers:expr, $place:literal) => {{
+        let value: u64;
+        // SAFETY: reads the program's context, of which the verifier allows any register.
+        unsafe {
+            asm!(
+                concat!("{0} = *(u64 *)({1} + ", $place, ")"),
+                out(reg) value,
+                in(reg) $registers,
+                options(readonly, nostack, preserves_flags),
+            );
+        }
+        value
+    }};
+}
+
+/// What [`shm_find`] says; values cross a function boundary as `u32`.
+mod found {
+    pub const NOWHERE: u32 = 0;
+    /// In the buffer at hand.
+    pub const HERE: u32 = 1;
+    /// In the bridge.
+    pub const BRIDGED: u32 = 2;
+}
+
+/// A call that hands over a message: its registers as the kernel keeps them. `in_list`: the second
+/// argument behind the object is a list of buffers.
+#[inline(always)]
+pub fn look(registers: *const u64, in_list: bool) {
+    // The result is an object that the caller makes room for. On x86-64 its address is the first
+    // argument, before the object's own; on AArch64 it has a register of its own, so x1 and x2 follow.
+    let (message, len) = if setting!(ARCHITECTURE) == AARCH64 {
+        (register!(registers, 8), register!(registers, 16))
+    } else {
+        // rdx and rcx.
+        (register!(registers, 96), register!(registers, 88))
+    };
+    if !is_within() {
+        return;
+    }
+    let Some(slot) = claim_outgoing() else { return };
+    shm_message(slot, message, len as u32, u32::from(in_list));
+    release(slot);
+}
+
+/// Whether the running process belongs to those that are looked at.
+#[inline(always)]
+fn is_within() -> bool {
+    let within = setting!(WITHIN);
+    if within == 0 {
+        return true;
+    }
+    let mut level = 0;
+    while level < LEVELS {
+        // SAFETY: no preconditions.
+        if unsafe { bpf_get_current_ancestor_cgroup_id(level) } == within {
+            return true;
+        }
+        level += 1;
+    }
+    false
+}
+
+/// One message at `address`, of `len` bytes.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -> u32 {
+    let (Some(scratch), Some(handed)) = (scratch(slot), handed(slot)) else {
+        return 0;
+    };
+    let zero = core::hint::black_box(0);
+    if len < walk::HEADER_LEN || len > MAX_LEN {
+        count(slot, Counter::Malformed, 1);
+        return 0;
+    }
+    handed.next = zero;
+    handed.start = zero;
+    if in_list == 0 {
+        (handed.list, handed.buffers) = (u64::from(zero), zero);
+        (handed.address, handed.end) = (address, len);
+    } else {
+        // A std::vector: where its contents begin and end.
+        let Some([begin, end]) = read::<[u64; 2]>(address) else {
+            count(slot, Counter::Unreadable, 1);
+            return 0;
+        };
+        let buffers = end.wrapping_sub(begin) / BUFFER;
+        if buffers == 0 || buffers > MAX_BUFFERS {
+            count(slot, Counter::Malformed, 1);
+            return 0;
+        }
+        (handed.list, handed.buffers) = (begin, buffers as u32);
+        (handed.address, handed.end) = (u64::from(zero), zero);
+    }
+    let message = Message { slot };
+    let Some([magic, _version, source @ ..]) = message.words::<5>(0) else {
+        count(slot, Counter::Unreadable, 1);
+        return 0;
+    };
+    if magic != MAGIC {
+        count(slot, Counter::Malformed, 1);
+        return 0;
+    }
+    count(slot, Counter::Messages, 1);
+    // SAFETY: no preconditions.
+    let now = unsafe { bpf_ktime_get_ns() };
+    scratch.packet.now = now;
+    scratch.packet.host = zero;
+    scratch.count = zero;
+    scratch.unknown = zero;
+    scratch.repeated = zero;
+    scratch.named = scratch.named.wrapping_add(1);
+    // SAFETY: no preconditions.
+    let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
+    // As `host::identify` does.
+    let token = scratch.named << 12 | (slot + 1) << 8 | (cpu & 0xff);
+    let record = &mut scratch.walk.record;
+    record.time = now;
+    record.destination = [zero; 4];
+    record.destination_port = zero as u16;
+    record.source_port = zero as u16;
+    record.interface = zero;
+    record.datagram = zero;
+    record.socket = u64::from(zero);
+    record.elapsed = zero;
+    record.unused = zero as u16;
+    record.flags = zero as u16;
+    scratch.walk.begin(source, len);
+    if len > MAX_CAPTURED {
+        scratch.walk.record.datagram_len = MAX_CAPTURED as u16;
+    }
+    verdict::heard(scratch, source, now);
+    let mut submessages = 0;
+    let mut result = progress::CAPTURE;
+    while submessages < SUBMESSAGES {
+        result = shm_advance(slot, len);
+        if result != progress::ON {
+            break;
+        }
+        result = progress::CAPTURE;
+        submessages += 1;
+    }
+    if result == progress::CAPTURE && len <= MAX_CAPTURED {
+        verdict::captured(slot, scratch);
+        shm_capture(slot, len, token);
+        return 1;
+    }
+    if result == progress::CAPTURE {
+        count(slot, Counter::PiecesLost, 1);
+    }
+    let records = scratch.count;
+    count(
+        slot,
+        if records == 0 {
+            Counter::Ignored
+        } else {
+            Counter::Metered
+        },
+        1,
+    );
+    verdict::flush(records, u32::from(flag::SHM | flag::EXACT), slot);
+    1
+}
+
+/// One submessage, as `verdict::advance` does it.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
+    let Some(scratch) = scratch(slot) else {
+        return progress::STOP;
+    };
+    match walk::step(&mut scratch.walk, &Message { slot }, len) {
+        Step::End | Step::Later | Step::Split => progress::STOP,
+        Step::Passed => progress::ON,
+        Step::Malformed => {
+            count(slot, Counter::Malformed, 1);
+            progress::STOP
+        }
+        Step::Endpoint => verdict::endpoint(slot, scratch, false),
+        Step::LongGap => verdict::endpoint(slot, scratch, true),
+    }
+}
+
+/// Hands over the whole message; 1 = all of it found room.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
+    let (Some(scratch), Some(buffer)) = (scratch(slot), piece(slot)) else {
+        return 0;
+    };
+    let zero = core::hint::black_box(0);
+    let piece = &mut buffer.piece;
+    piece.time = scratch.packet.now;
+    piece.socket = u64::from(zero);
+    piece.source = [zero; 4];
+    piece.destination = [zero; 4];
+    piece.source_port = zero as u16;
+    piece.destination_port = zero as u16;
+    piece.interface = zero;
+    piece.datagram = token;
+    piece.datagram_len = len;
+    piece.flags = flag::SHM | flag::EXACT;
+    let (mut offset, mut number) = (0, 0);
+    while number < MAX_PIECES {
+        if offset >= len {
+            count(slot, Counter::CapturedBytes, u64::from(len));
+            return 1;
+        }
+        let taken = shm_piece(slot, offset);
+        if taken == 0 {
+            break;
+        }
+        offset += taken;
+        number += 1;
+    }
+    count(slot, Counter::PiecesLost, 1);
+    0
+}
+
+/// One piece from `offset` of the message on, to the end of its buffer at most; its length, 0 = it
+/// was not read or found no room.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
+    if shm_find(slot, offset, 1) != found::HERE {
+        return 0;
+    }
+    let (Some(handed), Some(buffer)) = (handed(slot), piece(slot)) else {
+        return 0;
+    };
+    let within = handed.end.wrapping_sub(offset);
+    let left = buffer.piece.datagram_len.wrapping_sub(offset);
+    let len = if within < left { within } else { left };
+    let len = if len > PIECE_BYTES { PIECE_BYTES } else { len };
+    if len == 0 {
+        return 0;
+    }
+    buffer.piece.offset = offset;
+    buffer.piece.len = len;
+    let from = handed.address + u64::from(offset.wrapping_sub(handed.start));
+    // SAFETY: the buffer has room for the longest piece; the kernel checks the address.
+    let loaded = unsafe {
+        bpf_probe_read_user(
+            buffer.bytes.as_mut_ptr().cast(),
+            pieces::bounded(len) as u32,
+            from as *const _,
+        )
+    };
+    if loaded != 0 || pieces::publish(slot, buffer) == 0 {
+        return 0;
+    }
+    len
+}
+
+/// Looks for the buffer with these bytes of the message and puts it at hand. Bytes of two or more
+/// buffers are put into the bridge.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
+    let Some(handed) = handed(slot) else {
+        return found::NOWHERE;
+    };
+    if offset < handed.start {
+        // From the beginning again: whoever captures does that once.
+        let zero = core::hint::black_box(0);
+        (handed.next, handed.start, handed.end) = (zero, zero, zero);
+    }
+    if shm_move(slot, offset) == 0 {
+        return found::NOWHERE;
+    }
+    if offset + len <= handed.end {
+        return found::HERE;
+    }
+    let mut index = 0;
+    while index < 4 * BRIDGE as u32 {
+        if index >= len {
+            break;
+        }
+        if shm_bridge(slot, offset + index, index) == 0 {
+            return found::NOWHERE;
+        }
+        index += 1;
+    }
+    found::BRIDGED
+}
+
+/// One byte of the message for the bridge.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
+    if shm_move(slot, offset) == 0 {
+        return 0;
+    }
+    let Some(handed) = handed(slot) else { return 0 };
+    let from = handed.address + u64::from(offset.wrapping_sub(handed.start));
+    let Some([byte]) = read::<[u8; 1]>(from) else {
+        return 0;
+    };
+    let index = crate::maps::opaque(index) as usize & (4 * BRIDGE - 1);
+    // SAFETY: an index below the array's length.
+    unsafe {
+        *(&raw mut handed.bridge).cast::<u8>().add(index) = byte;
+    }
+    1
+}
+
+/// Goes on in the list to the buffer with this byte; 0 = there is none.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
+    let Some(handed) = handed(slot) else { return 0 };
+    let mut steps = 0;
+    while steps < SEARCH {
+        if offset < handed.end {
+            return u32::from(offset >= handed.start);
+        }
+        if handed.next >= handed.buffers {
+            return 0;
+        }
+        let at = handed.list + u64::from(handed.next) * BUFFER;
+        let Some([address, len]) = read::<[u64; 2]>(at) else {
+            return 0;
+        };
+        // The length is a `uint32_t` with padding behind it.
+        let len = len as u32;
+        if len > MAX_LEN || handed.end > MAX_LEN {
+            return 0;
+        }
+        handed.address = address;
+        handed.start = handed.end;
+        handed.end += len;
+        handed.next += 1;
+        steps += 1;
+    }
+    0
+}
+
+#[inline(always)]
+fn handed(slot: u32) -> Option<&'static mut Handed> {
+    // SAFETY: as for `maps::scratch`.
+    HANDED
+        .get_ptr_mut(slot)
+        .map(|handed| unsafe { &mut *handed })
+}
+
+/// A plain value in the memory of the running process.
+#[inline(always)]
+fn read<T: Copy>(address: u64) -> Option<T> {
+    let mut value = MaybeUninit::<T>::uninit();
+    // SAFETY: the destination has the size given; the kernel checks the address.
+    let result = unsafe {
+        bpf_probe_read_user(
+            value.as_mut_ptr().cast(),
+            size_of::<T>() as u32,
+            address as *const _,
+        )
+    };
+    if result != 0 {
+        return None;
+    }
+    // SAFETY: the helper has filled all of it; only arrays of integers are read.
+    Some(unsafe { value.assume_init() })
+}

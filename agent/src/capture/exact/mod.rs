@@ -1,0 +1,142 @@
+//! Every message into Fast DDS's shared memory, seen in the process that sends it.
+//!
+//! On request only: it puts a breakpoint into code that other processes run. They notice nothing but
+//! a microsecond for each message. In return nothing is sampled: the kernel program sees a message
+//! before it is copied, so names, samples and losses are as exact as at a socket. It sees what is
+//! handed over; what a full port or a full segment refuses afterwards it does not tell.
+
+pub mod library;
+pub mod processes;
+pub mod search;
+
+use std::fs::File;
+use std::io;
+use std::os::fd::BorrowedFd;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
+
+use self::search::{Facts, Search};
+use super::filter::{Filter, FilterError, FilterSettings};
+use super::intake::Intake;
+use super::shm::scan::Scope;
+use super::system::Clocks;
+use crate::model::observer::Observer;
+use crate::privilege;
+
+/// A process hands over a hundred thousand messages a second if it can, ten times what a socket
+/// takes: its ring is larger by this.
+const RECORD_RINGS: usize = 4;
+
+/// Why messages are not seen in the processes that send them.
+#[derive(Debug, thiserror::Error)]
+pub enum ExactError {
+    /// Breakpoints in other processes, and looking which processes there are.
+    #[error("it needs {0}")]
+    Missing(String),
+    /// The control group.
+    #[error("the control group {} cannot be looked at", path.display())]
+    Cgroup {
+        /// Its directory.
+        path: PathBuf,
+        /// Why.
+        #[source]
+        source: io::Error,
+    },
+    /// The kernel programs.
+    #[error(transparent)]
+    Filter(#[from] FilterError),
+    /// There can be no more threads.
+    #[error("there is no thread to be had")]
+    Thread(#[source] io::Error),
+}
+
+/// The kernel programs and the thread that attaches them.
+pub struct Exact {
+    intake: Intake,
+    search: Search,
+}
+
+impl Exact {
+    /// Loads the programs and looks for libraries to attach them to from now on, in a thread that
+    /// keeps the privileges for that. `cgroup`: only for processes of this control group.
+    ///
+    /// # Errors
+    /// A capability is missing, or the kernel has no uprobes.
+    pub fn open(
+        cgroup: Option<&Path>,
+        ring_bytes: usize,
+        record_ring_bytes: usize,
+    ) -> Result<Self, ExactError> {
+        let missing = privilege::missing_for_probes();
+        if !missing.is_empty() {
+            return Err(ExactError::Missing(missing.join(" and ")));
+        }
+        let within = cgroup.map(inode).transpose()?;
+        let size = |bytes| u32::try_from(bytes).unwrap_or(u32::MAX >> 1);
+        let settings = FilterSettings {
+            record_ring_bytes: size(record_ring_bytes.saturating_mul(RECORD_RINGS)),
+            piece_ring_bytes: size(ring_bytes),
+            ..FilterSettings::default()
+        };
+        let (filter, probes) = Filter::load_handed(&settings, within)?;
+        let scope = cgroup.map_or(Scope::Everybody, |path| Scope::Cgroup(path.to_path_buf()));
+        Ok(Self {
+            intake: Intake::new(filter),
+            search: Search::start(probes, scope).map_err(ExactError::Thread)?,
+        })
+    }
+
+    /// Readable when a ring is half full.
+    pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
+        self.intake.descriptors()
+    }
+
+    /// Gives the model what was found.
+    pub fn take_in(&mut self, clocks: &Clocks, observer: &mut Observer) {
+        self.intake.take_in(clocks, observer);
+    }
+
+    /// Gives the model what still waits, at the end.
+    pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
+        self.intake.drain(clocks, observer);
+    }
+
+    /// The kernel programs' maps.
+    #[must_use]
+    pub const fn filter(&self) -> &Filter {
+        self.intake.filter()
+    }
+
+    /// The kernel programs' maps, to tell them what is of interest.
+    pub const fn filter_mut(&mut self) -> &mut Filter {
+        self.intake.filter_mut()
+    }
+
+    /// What was taken in so far.
+    #[must_use]
+    pub const fn intake(&self) -> &Intake {
+        &self.intake
+    }
+
+    /// What is attached, and what is not covered.
+    #[must_use]
+    pub fn facts(&self) -> Facts {
+        self.search.facts()
+    }
+
+    /// Whether every process that uses Fast DDS's shared memory is seen this way.
+    #[must_use]
+    pub fn covers_all(&self) -> bool {
+        self.search.covers_all()
+    }
+}
+
+/// A control group's number: the inode of its directory.
+fn inode(path: &Path) -> Result<u64, ExactError> {
+    let metadata = File::open(path).and_then(|directory| directory.metadata());
+    let metadata = metadata.map_err(|source| ExactError::Cgroup {
+        path: path.to_path_buf(),
+        source,
+    })?;
+    Ok(metadata.ino())
+}
