@@ -43,7 +43,8 @@ const RANDOM: u64 = (1 << 56) - 1;
 /// What a span tells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
-    /// On the wire, or leaving this host: first to last fragment.
+    /// Leaving this host, or on the wire where that is not told apart: first to last fragment. A
+    /// gateway that looks at its wire sees what it forwards leaving, too.
     Send,
     /// Reaching this host from another: first to last fragment.
     Receive,
