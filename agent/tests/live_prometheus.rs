@@ -35,21 +35,23 @@ fn prometheus_answers_the_rates_at_which_the_demo_robot_publishes() -> Result<()
     ] {
         roles.push(Process::start(&host.inside(), robot()?, ["--role", role])?);
     }
-    // A publisher that logs every sample: the truth to compare with.
+    // A publisher that logs every sample: the truth to compare with. On a busy machine RustDDS would
+    // drop some that it has logged.
     let stream = Stream {
         topic: "/truth".to_owned(),
+        domain: 1,
         ..Stream::small(0)
     };
     let mut subscriber = Peer::start(
         &link.monitor,
-        Stack::Rust,
+        Stack::Cyclone,
         Role::Subscriber,
         &stream,
         &["/listener"],
     )?;
     let mut publisher = Peer::start(
         &link.robot,
-        Stack::Rust,
+        Stack::Cyclone,
         Role::Publisher,
         &stream,
         &["/sensor"],
