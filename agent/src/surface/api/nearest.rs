@@ -20,10 +20,11 @@ fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Vec<&'a st
     let near = names.take(COMPARED).filter_map(|name| {
         // The namespace forgotten, or one too many.
         let is_end = name.ends_with(wanted) || wanted.ends_with(name);
+        let steps = distance(wanted.as_bytes(), name.as_bytes(), limit);
         let steps = if is_end && name.len() > 1 {
-            Some(1)
+            Some(steps.unwrap_or(1).min(1))
         } else {
-            distance(wanted.as_bytes(), name.as_bytes(), limit)
+            steps
         };
         steps.map(|steps| (steps, name))
     });
