@@ -30,8 +30,8 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	@$(MAKE) --no-print-directory peers
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
-	$(if $(NEXTEST),cargo nextest run --workspace,cargo test --workspace --lib --bins --tests)
 	cargo test --package ros2probe --features tls --test web_config --test otlp_tls --quiet
+	$(if $(NEXTEST),cargo nextest run --workspace,cargo test --workspace --lib --bins --tests)
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf
