@@ -420,6 +420,10 @@ fn a_thousand_topics_are_listed_at_once() {
     }
     let topics = robot.get("/topics");
     assert_eq!(topics["topics"].as_array().unwrap().len(), 1000);
+    let nodes = robot.get("/nodes");
+    assert_eq!(nodes["nodes"].as_array().unwrap().len(), 100);
+    let graph = robot.get("/graph");
+    assert_eq!(graph["edges"].as_array().unwrap().len(), 2000);
     let (_, _, detail) = robot.problem("/topics/topic_0999x");
     assert!(detail.contains("did you mean /topic_0999"), "{detail}");
 }
@@ -462,6 +466,7 @@ fn large_robot(topics: u32) -> Vec<u8> {
     }
     let nodes = nodes.iter().map(|(name, guid)| ("/", name.as_str(), *guid));
     let entities = forge::entities(prefix, 24, &nodes.collect::<Vec<_>>());
-    put(Message::from(prefix).data(EntityId([0, 0, 4, 3]), 1, &entities));
+    let writer = EntityId([1, 0, 0, 3]);
+    put(Message::from(prefix).data(writer, 1, &entities));
     capture
 }
