@@ -414,6 +414,37 @@ mod tests {
     use super::*;
 
     #[test]
+    fn what_matching_asks_for_comes_back_and_may_be_missing_in_older_files() {
+        let prefix = GuidPrefix([1; 12]);
+        let guid = Guid::new(prefix, EntityId([0, 0, 1, 3]));
+        let defaults = Qos::defaults(Role::Writer, VendorId::CYCLONE);
+        let mut qos = defaults.clone();
+        qos.latency_budget = Duration::Finite(7);
+        qos.destination_order = DestinationOrder::BY_SOURCE_TIMESTAMP;
+        qos.presentation.is_ordered = true;
+        qos.representations = vec![DataRepresentation::XCDR2];
+        let endpoint = Endpoint {
+            role: Role::Writer,
+            domain_id: 0,
+            topic: "rt/points".into(),
+            message_type: "std_msgs/msg/String".into(),
+            type_hash: None,
+            qos: qos.clone(),
+            first_seen: Timestamp(1),
+            shared_memory: None,
+            data_sharing: false,
+        };
+        let back = |kept: &serde_json::Value| {
+            let kept: RememberedEndpoint = serde_json::from_value(kept.clone()).unwrap();
+            kept.endpoint(prefix, 0, Timestamp(2)).unwrap().1.qos
+        };
+        let mut kept = serde_json::to_value(RememberedEndpoint::of(guid, &endpoint)).unwrap();
+        assert_eq!(back(&kept), qos);
+        kept.as_object_mut().unwrap().remove("matching");
+        assert_eq!(back(&kept), defaults);
+    }
+
+    #[test]
     fn only_whole_pairs_of_digits_are_bytes() {
         assert_eq!(hexadecimal("010f"), Some([1, 15]));
         assert_eq!(hexadecimal("FFa0"), Some([255, 160]));
