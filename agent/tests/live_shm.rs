@@ -493,6 +493,92 @@ fn an_agent_with_nothing_to_see_costs_next_to_nothing() -> Result<()> {
     Ok(())
 }
 
+/// What `BENCHMARKS.md` says of names: `cargo test --test live_shm -- --ignored --nocapture`.
+#[test]
+#[ignore = "takes two minutes and prints a figure"]
+fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
+    const STARTS: usize = 20;
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let mut known = 0;
+    for _ in 0..STARTS {
+        let (mut publisher, mut subscriber) = host.pair(&shared())?;
+        std::thread::sleep(Duration::from_millis(1500));
+        known += usize::from(is_known(&agent.scrape()?, &shared()));
+        publisher.process.terminate()?;
+        subscriber.process.terminate()?;
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    let page = agent.scrape()?;
+    let cpu = page.sum("ros2probe_shm_cpu_seconds_total", &[]);
+    println!("all known after {known} of {STARTS} starts, for {cpu:.1} s of CPU time");
+    ensure!(known * 2 > STARTS, "{known} of {STARTS}");
+    Ok(())
+}
+
+/// What `BENCHMARKS.md` says of the peers: `cargo test --test live_shm -- --ignored --nocapture`.
+#[test]
+#[ignore = "takes two minutes and a quiet machine to mean anything"]
+fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {
+    const PAIRS: usize = 10;
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let stream = Stream {
+        count: 600,
+        reliable: false,
+        linger: 60.0,
+        ..shared()
+    };
+    let mut runs = [Vec::new(), Vec::new()];
+    for pair in 0..2 * PAIRS {
+        // Without, with, with, without, ...: what drifts touches both.
+        let with = usize::from(matches!(pair % 4, 1 | 2));
+        let agent = match with {
+            1 => Some(start_agent(&network, directory.path())?),
+            _ => None,
+        };
+        let (mut publisher, mut subscriber) = host.pair(&stream)?;
+        publisher.go()?;
+        publisher.wait_sent(PATIENCE)?;
+        subscriber
+            .process
+            .wait_for("done", Duration::from_secs(2))
+            .ok();
+        let log = subscriber.log()?;
+        let received = log.sequences("sub").len() as u64;
+        let mut latencies: Vec<u64> = log
+            .0
+            .iter()
+            .filter_map(|event| Some(event.t.saturating_sub(event.stamp_ns?)))
+            .collect();
+        latencies.sort_unstable();
+        let at = |share: usize| latencies.get(latencies.len() * share / 100).copied();
+        let missing = stream.count.saturating_sub(received);
+        runs[with].push([
+            missing,
+            at(50).unwrap_or(0) / 1000,
+            at(99).unwrap_or(0) / 1000,
+        ]);
+        drop(agent);
+    }
+    for (name, mut runs) in ["without", "with"].iter().zip(runs) {
+        let mut median = |column: usize| {
+            runs.sort_unstable_by_key(|run| run[column]);
+            runs[runs.len() / 2][column]
+        };
+        let [missing, typical, worst] = [0, 1, 2].map(&mut median);
+        println!(
+            "{name} an agent, medians of {PAIRS}: {missing} of {} lost, latency {typical} us, \
+             99th percentile {worst} us",
+            stream.count
+        );
+    }
+    Ok(())
+}
+
 /// A host with a `/dev/shm` of its own.
 struct Host<'n> {
     network: &'n Namespace,

@@ -24,10 +24,10 @@ const ACCOUNT: f64 = 0.1;
 /// Short sleeps see more than none: who sleeps is woken before those who compute.
 const MEETING: f64 = 20e-6;
 /// How long that goes on after a participant created its files, and after anything was announced.
-const NEWCOMER: f64 = 0.4;
-const NEWS: f64 = 0.15;
+const NEWCOMER: f64 = 0.3;
+const NEWS: f64 = 0.1;
 /// CPU time for it: at most so many seconds, and so much more each second.
-const CREDIT: f64 = 5.0;
+const CREDIT: f64 = 10.0;
 const CREDIT_PER_SECOND: f64 = 0.01;
 /// Sleeps get no longer than this, whatever it costs.
 const LONGEST: f64 = 50e-3;
@@ -223,7 +223,7 @@ mod tests {
         pace.newcomer(100.0);
         let look = |pace: &mut Pace, now, cpu| pace.sleep(now, cpu, 0, Need::Nothing).as_micros();
         assert_eq!(look(&mut pace, 100.01, 0.0), 20);
-        assert_eq!(look(&mut pace, 100.3, 0.0), 20);
+        assert_eq!(look(&mut pace, 100.2, 0.0), 20);
         assert!(look(&mut pace, 100.6, 0.0) > 20);
         // Somebody comes all the time, and close looks take a third of a CPU.
         let (mut now, mut cpu) = (101.0, 0.0);
@@ -234,7 +234,7 @@ mod tests {
             cpu += if close { 0.003 } else { 0.0 };
         }
         // The credit, and what a hundred seconds give.
-        assert!((5.0..=6.1).contains(&cpu), "{cpu}");
+        assert!((10.0..=11.1).contains(&cpu), "{cpu}");
     }
 
     #[test]

@@ -35,7 +35,7 @@ const LIST_EVERY: u64 = 100_000_000;
 /// How often a port that is not laid out yet is looked at.
 const TRY_EVERY: u64 = 1_000_000;
 const FIND_EVERY: u64 = 1_000_000_000;
-const FIND_IN_A_HURRY: u64 = 3_000_000_000;
+const FIND_IN_A_HURRY: u64 = 10_000_000_000;
 
 /// What is open and how far it was read.
 pub struct Tap {
