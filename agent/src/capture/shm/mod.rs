@@ -180,7 +180,8 @@ impl Shared {
 /// The thread.
 fn look(shared: &Shared, places: Places, share: f64) {
     let mut tap = Tap::new(places);
-    let mut pace = Pace::new(share);
+    let cpus = std::thread::available_parallelism().map_or(1, usize::from);
+    let mut pace = Pace::new(share).on(cpus);
     // Without it, somebody who comes is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched = BTreeSet::new();

@@ -22,7 +22,9 @@ const SLOWER: f64 = 1.5;
 const ACCOUNT: f64 = 0.1;
 /// When participants meet, each says its names once, and uses the buffer again some 50 us later.
 /// Short sleeps see more than none: who sleeps is woken before those who compute.
-const MEETING: f64 = 20e-6;
+const MEETING: f64 = 10e-6;
+/// Messages come in bursts, and it does not sleep at all for so long after each.
+const BURSTS: f64 = 200e-6;
 /// How long that goes on after a participant created its files, and after anything was announced.
 const NEWCOMER: f64 = 0.3;
 const NEWS: f64 = 0.1;
@@ -58,6 +60,9 @@ pub struct Pace {
     quiet_since: f64,
     accounted: (f64, f64),
     meeting_until: f64,
+    awake_until: f64,
+    /// Others have a CPU while it does not sleep.
+    has_company: bool,
     was_close: bool,
     /// CPU time for close looks that is left.
     credit: f64,
@@ -74,8 +79,19 @@ impl Pace {
             quiet_since: 0.0,
             accounted: (0.0, 0.0),
             meeting_until: 0.0,
+            awake_until: 0.0,
+            has_company: false,
             was_close: false,
             credit: CREDIT,
+        }
+    }
+
+    /// With more than one CPU it may stay awake for a moment.
+    #[must_use]
+    pub const fn on(self, cpus: usize) -> Self {
+        Self {
+            has_company: cpus > 1,
+            ..self
         }
     }
 
@@ -108,6 +124,12 @@ impl Pace {
         self.was_close = self.is_meeting(now) && self.credit > 0.0;
         if self.was_close {
             self.sleep = MEETING;
+            if found > 0 && self.has_company {
+                self.awake_until = now + BURSTS;
+            }
+            if now < self.awake_until {
+                return Duration::ZERO;
+            }
             return Duration::from_secs_f64(MEETING);
         }
         self.meeting_until = now;
@@ -222,19 +244,33 @@ mod tests {
         let mut pace = Pace::new(0.015);
         pace.newcomer(100.0);
         let look = |pace: &mut Pace, now, cpu| pace.sleep(now, cpu, 0, Need::Nothing).as_micros();
-        assert_eq!(look(&mut pace, 100.01, 0.0), 20);
-        assert_eq!(look(&mut pace, 100.2, 0.0), 20);
-        assert!(look(&mut pace, 100.6, 0.0) > 20);
+        assert_eq!(look(&mut pace, 100.01, 0.0), 10);
+        assert_eq!(look(&mut pace, 100.2, 0.0), 10);
+        assert!(look(&mut pace, 100.6, 0.0) > 10);
         // Somebody comes all the time, and close looks take a third of a CPU.
         let (mut now, mut cpu) = (101.0, 0.0);
         while now < 201.0 {
             pace.newcomer(now);
-            let close = look(&mut pace, now, cpu) == 20;
+            let close = look(&mut pace, now, cpu) == 10;
             now += 0.01;
             cpu += if close { 0.003 } else { 0.0 };
         }
         // The credit, and what a hundred seconds give.
         assert!((10.0..=11.1).contains(&cpu), "{cpu}");
+    }
+
+    #[test]
+    fn after_each_message_of_a_newcomer_it_stays_awake_where_others_have_a_cpu() {
+        for cpus in [1, 2] {
+            let mut pace = Pace::new(0.015).on(cpus);
+            pace.newcomer(100.0);
+            let mut look = |now, found| pace.sleep(now, 0.0, found, Need::Names).as_micros();
+            let awake = if cpus > 1 { 0 } else { 10 };
+            assert_eq!(look(100.0, 0), 10);
+            assert_eq!(look(100.001, 1), awake);
+            assert_eq!(look(100.001_1, 0), awake);
+            assert_eq!(look(100.001_3, 0), 10);
+        }
     }
 
     #[test]
