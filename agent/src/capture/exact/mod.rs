@@ -42,6 +42,9 @@ pub enum ExactError {
         #[source]
         source: io::Error,
     },
+    /// The kernel does not tell a program which control group a process is in.
+    #[error("for one control group (capture.cgroup) it takes Linux 5.16")]
+    Scope(#[source] FilterError),
     /// The kernel programs.
     #[error(transparent)]
     Filter(#[from] FilterError),
@@ -78,7 +81,11 @@ impl Exact {
             piece_ring_bytes: size(ring_bytes),
             ..FilterSettings::default()
         };
-        let (filter, probes) = Filter::load_handed(&settings, within)?;
+        let loaded = Filter::load_handed(&settings, within);
+        let (filter, probes) = loaded.map_err(|error| match error {
+            FilterError::Program(_) if within.is_some() => ExactError::Scope(error),
+            error => error.into(),
+        })?;
         let scope = cgroup.map_or(Scope::Everybody, |path| Scope::Cgroup(path.to_path_buf()));
         Ok(Self {
             intake: Intake::new(filter),
