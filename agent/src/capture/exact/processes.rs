@@ -81,13 +81,7 @@ impl Use {
             };
             found.shares |= SHARED.iter().any(|start| path.starts_with(start));
             let name = path.rsplit('/').next().unwrap_or_default();
-            let of_library = LIBRARIES
-                .iter()
-                .find_map(|library| name.strip_prefix(library));
-            let is_library = of_library.is_some_and(|rest| {
-                let rest = rest.strip_suffix(DELETED).unwrap_or(rest);
-                rest.is_empty() || rest.starts_with('.')
-            });
+            let is_library = is_library(name.strip_suffix(DELETED).unwrap_or(name));
             let mut fields = line.split_ascii_whitespace();
             let (range, device, inode) = (fields.next(), fields.nth(2), fields.next());
             let inode = inode.and_then(|inode| inode.parse().ok());
@@ -182,6 +176,15 @@ impl Processes {
             .find(|(pid, _)| holders.contains(pid))
             .map(|(pid, _)| *pid)
     }
+}
+
+/// Whether a file by this name is Fast DDS's library.
+#[must_use]
+pub fn is_library(name: &str) -> bool {
+    let version = LIBRARIES
+        .iter()
+        .find_map(|library| name.strip_prefix(library));
+    version.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
 /// Who holds the lock that a line of [`LOCKS`] is about, if it is one of the kind that Fast DDS takes

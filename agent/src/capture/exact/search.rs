@@ -5,17 +5,17 @@
 //! seen from its first message on. It reads `/proc` and library files, and writes nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::OpenOptions;
+use std::fs::{self, OpenOptions};
 use std::io;
-use std::os::unix::fs::OpenOptionsExt as _;
-use std::path::PathBuf;
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use super::library::{self, LibraryError};
-use super::processes::{LibraryId, Mapped, Processes};
+use super::processes::{LibraryId, Mapped, Processes, is_library};
 use crate::capture::filter::{FilterError, Probe, Probes};
 use crate::capture::live::in_words;
 use crate::capture::shm::scan::{Name, Places, Scope};
@@ -32,6 +32,16 @@ const LINGER: Duration = Duration::from_secs(60);
 const RETRY: Duration = Duration::from_secs(5);
 /// Libraries with a probe of their own: images of containers on one host.
 const MAX_LIBRARIES: usize = 64;
+
+/// Where libraries are installed, and where ROS's distributions are.
+const INSTALLED: [&str; 5] = [
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib",
+    "/usr/lib64",
+    "/usr/local/lib",
+];
+const DISTRIBUTIONS: &str = "/opt/ros";
 
 /// The thread, from the outside.
 pub struct Search {
@@ -59,9 +69,9 @@ pub struct LibraryFacts {
     pub refused: Option<String>,
 }
 
-#[derive(Default)]
 struct Shared {
     facts: Mutex<Facts>,
+    /// Also until the first look is over: it takes a moment, and what is installed is seen.
     covers_all: AtomicBool,
     stop: AtomicBool,
 }
@@ -78,6 +88,8 @@ struct Library {
     processes: usize,
     used: Instant,
     tried: Instant,
+    /// Attached to before anybody used it, and kept.
+    is_installed: bool,
 }
 
 /// Why a library is not attached to.
@@ -110,12 +122,23 @@ impl Search {
     /// # Errors
     /// There can be no more threads.
     pub fn start(probes: Probes, scope: Scope) -> io::Result<Self> {
-        let shared = Arc::<Shared>::default();
+        let mut attachments = Attachments {
+            probes,
+            libraries: BTreeMap::new(),
+        };
+        // A participant says its names once, within a tenth of a second: what is there already is
+        // not waited for.
+        attachments.install(&installed(), Instant::now());
+        let shared = Arc::new(Shared {
+            facts: Mutex::default(),
+            covers_all: AtomicBool::new(true),
+            stop: AtomicBool::new(false),
+        });
         let thread = std::thread::Builder::new()
             .name("exact".to_owned())
             .spawn({
                 let shared = Arc::clone(&shared);
-                move || follow(&shared, probes, scope)
+                move || follow(&shared, attachments, scope)
             })?;
         Ok(Self {
             shared,
@@ -149,14 +172,10 @@ impl Drop for Search {
 }
 
 /// The thread.
-fn follow(shared: &Shared, probes: Probes, scope: Scope) {
+fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
     if let Err(error) = privilege::keep_for_probes() {
         tracing::warn!(%error, "looking at processes with more privileges than that takes");
     }
-    let mut attachments = Attachments {
-        probes,
-        libraries: BTreeMap::new(),
-    };
     let mut processes = Processes::new(scope.clone());
     let mut places = Places::new(scope);
     // Without it, a participant that starts is noticed within a second.
@@ -169,8 +188,13 @@ fn follow(shared: &Shared, probes: Probes, scope: Scope) {
         if all {
             asked_all = Some(now);
         }
-        processes.find(all);
+        // Who is new comes first.
+        processes.find(false);
         attachments.follow(&processes, now);
+        if all {
+            processes.find(true);
+            attachments.follow(&processes, now);
+        }
         shared.tell(attachments.facts(&processes));
         let Some(watch) = &mut watch else {
             std::thread::park_timeout(EVERY);
@@ -183,8 +207,8 @@ fn follow(shared: &Shared, probes: Probes, scope: Scope) {
             watch.add(new);
         }
         watched = directories;
-        somebody_came = watch.wait(EVERY, |name| Name::parse(name).is_some());
         std::thread::sleep(GATHER);
+        somebody_came = watch.wait(EVERY, |name| Name::parse(name).is_some());
     }
 }
 
@@ -204,6 +228,36 @@ impl Shared {
 }
 
 impl Attachments {
+    /// Attaches to libraries that nobody uses yet.
+    fn install(&mut self, paths: &[PathBuf], now: Instant) {
+        for path in paths {
+            let Ok(metadata) = fs::metadata(path) else {
+                continue;
+            };
+            let device = metadata.dev();
+            let id = LibraryId {
+                device: format!("{:02x}:{:02x}", libc::major(device), libc::minor(device)),
+                inode: metadata.ino(),
+            };
+            if self.libraries.contains_key(&id) || self.libraries.len() >= MAX_LIBRARIES {
+                continue;
+            }
+            // If it cannot be, that is said when somebody uses it.
+            if let Ok(probe) = attach(&mut self.probes, path) {
+                tracing::info!(library = %path.display(), "attached before it is used");
+                let library = Library {
+                    path: path.clone(),
+                    probe: Ok(probe),
+                    processes: 0,
+                    used: now,
+                    tried: now,
+                    is_installed: true,
+                };
+                self.libraries.insert(id, library);
+            }
+        }
+    }
+
     /// Attaches to what is new, and lets go of what nobody has used for a while.
     fn follow(&mut self, processes: &Processes, now: Instant) {
         for library in self.libraries.values_mut() {
@@ -215,7 +269,7 @@ impl Attachments {
             }
         }
         self.libraries.retain(|_, library| {
-            let is_used = now - library.used < LINGER;
+            let is_used = library.is_installed || now - library.used < LINGER;
             if !is_used && library.probe.is_ok() {
                 let library = library.path.display();
                 tracing::info!(%library, "no longer attached: nobody uses it");
@@ -231,7 +285,9 @@ impl Attachments {
             .get(id)
             .is_some_and(|known| known.probe.is_ok() || now - known.tried < RETRY);
         if !is_known && (self.libraries.contains_key(id) || self.libraries.len() < MAX_LIBRARIES) {
-            let probe = attach(&mut self.probes, process, range);
+            // The very file that the process maps, whatever its name means by now.
+            let file = PathBuf::from(format!("/proc/{process}/map_files/{range}"));
+            let probe = attach(&mut self.probes, &file);
             let probe = probe.map_err(|refusal| in_words(&refusal));
             let (library, is_new) = (path.display(), !self.libraries.contains_key(id));
             match &probe {
@@ -245,6 +301,7 @@ impl Attachments {
                 processes: 0,
                 used: now,
                 tried: now,
+                is_installed: false,
             };
             self.libraries.insert(id.clone(), library);
         }
@@ -255,7 +312,9 @@ impl Attachments {
     }
 
     fn facts(&self, processes: &Processes) -> Facts {
-        let libraries = self.libraries.values().map(|library| LibraryFacts {
+        let in_use = |library: &&Library| library.processes > 0;
+        let libraries = self.libraries.values().filter(in_use);
+        let libraries = libraries.map(|library| LibraryFacts {
             path: library.path.clone(),
             processes: library.processes,
             refused: library.probe.as_ref().err().cloned(),
@@ -288,13 +347,33 @@ impl Attachments {
     }
 }
 
-fn attach(probes: &mut Probes, process: u32, range: &str) -> Result<Probe, Refusal> {
-    // The very file that the process maps, whatever its name means by now. One that would keep us
-    // waiting is none of a library.
+/// Libraries where they are usually installed; none of a container's.
+fn installed() -> Vec<PathBuf> {
+    let mut directories: Vec<_> = INSTALLED.iter().map(PathBuf::from).collect();
+    let distributions = fs::read_dir(DISTRIBUTIONS).into_iter().flatten().flatten();
+    directories.extend(
+        distributions
+            .take(MAX_LIBRARIES)
+            .map(|entry| entry.path().join("lib")),
+    );
+    let entries = directories
+        .iter()
+        .flat_map(fs::read_dir)
+        .flatten()
+        .flatten();
+    let libraries = entries.filter(|entry| {
+        let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+        is_file && entry.file_name().to_str().is_some_and(is_library)
+    });
+    libraries.map(|entry| entry.path()).collect()
+}
+
+fn attach(probes: &mut Probes, path: &Path) -> Result<Probe, Refusal> {
+    // One that would keep us waiting is none of a library.
     let file = OpenOptions::new()
         .read(true)
         .custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY)
-        .open(format!("/proc/{process}/map_files/{range}"))
+        .open(path)
         .map_err(Refusal::Open)?;
     if !file.metadata().map_err(Refusal::Open)?.is_file() {
         return Err(Refusal::NoFile);
