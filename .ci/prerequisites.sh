@@ -168,10 +168,11 @@ for need; do
         rust
         ;;
     test)
-        packages "${network_tools[@]}" gcc g++ make tshark systemd \
+        packages "${network_tools[@]}" gcc g++ make tshark systemd strace \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
         prometheus
         schemathesis
+        rotel
         types
         rust
         ebpf

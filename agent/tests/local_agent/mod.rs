@@ -153,11 +153,12 @@ impl LocalAgent {
         }
     }
 
-    /// Waits for the end.
+    /// Waits for the end, and for the last line of the log.
     pub fn wait(&mut self) -> ExitStatus {
         let deadline = Instant::now() + PATIENCE;
         loop {
             if let Some(status) = self.child.try_wait().unwrap() {
+                self.seen.extend(self.log.iter());
                 return status;
             }
             assert!(Instant::now() < deadline, "still running:\n{}", self.log());
