@@ -6,8 +6,8 @@
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
@@ -259,6 +259,13 @@ impl Bell {
 }
 
 impl State {
+    /// The robot; nothing at all until the first snapshot.
+    #[must_use]
+    pub fn known(&self) -> &Snapshot {
+        static NOTHING: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
+        self.snapshot.as_ref().unwrap_or(&NOTHING)
+    }
+
     /// Whether what is shown describes the robot at `now`.
     ///
     /// # Errors

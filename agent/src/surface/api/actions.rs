@@ -17,7 +17,6 @@ use super::parameters::Parameters;
 use super::party::{Parties, PartyView, action, action_type};
 use super::problem::Problem;
 use super::scope::Scope;
-use super::watch::PATIENCE;
 use crate::model::snapshot::{Snapshot, TopicFacts};
 
 /// Actions.
@@ -70,10 +69,8 @@ async fn list(
     Parameters(scope): Parameters<Scope>,
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let state = context.board.state();
-    let nothing = Snapshot::default();
-    let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+    let state = context.state().await;
+    let snapshot = state.known();
     let index = Index::new(snapshot);
     let actions = actions(snapshot, scope).into_iter();
     let answer = ActionsView {

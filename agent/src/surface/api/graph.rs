@@ -18,7 +18,6 @@ use super::party::PartyView;
 use super::problem::Problem;
 use super::scope::Scope;
 use super::services::services;
-use super::watch::PATIENCE;
 use crate::model::snapshot::{Snapshot, TopicFacts};
 
 /// The graph.
@@ -114,10 +113,8 @@ async fn show(
     Parameters(scope): Parameters<Scope>,
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let state = context.board.state();
-    let nothing = Snapshot::default();
-    let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+    let state = context.state().await;
+    let snapshot = state.known();
     Ok(Json(graph(snapshot, scope)).into_response())
 }
 

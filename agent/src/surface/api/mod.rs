@@ -28,6 +28,7 @@ mod topics;
 mod watch;
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use axum::Router;
 use axum::http::Method;
@@ -35,13 +36,16 @@ use axum::middleware;
 use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
-use super::board::Board;
+use super::board::{Board, State};
 use crate::watches::Watches;
 pub use openapi::document;
 use problem::{Code, Problem};
 use reload::Reloader;
 use security::Door;
 pub use server::{OpenError, Server};
+
+/// How long a reader waits for a snapshot that knows what was asked for just before.
+const PATIENCE: Duration = Duration::from_millis(600);
 
 /// What the routes work on.
 #[derive(Clone)]
@@ -54,6 +58,14 @@ pub struct Context {
     pub reloader: Reloader,
     /// Ends streams when the agent ends.
     pub stop: CancellationToken,
+}
+
+impl Context {
+    /// What is known at this moment, or a little earlier where the capture has no time.
+    async fn state(&self) -> Arc<State> {
+        self.board.refresh(PATIENCE).await;
+        self.board.state()
+    }
 }
 
 /// The routes of all nouns and what the document says of them.

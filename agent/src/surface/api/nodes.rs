@@ -20,7 +20,6 @@ use super::parameters::{Name, Parameters};
 use super::party::{Side, action, action_type, service_type};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Scope, only};
-use super::watch::PATIENCE;
 use crate::model::diagnosis::Diagnosis;
 use crate::model::snapshot::{NodeFacts, Snapshot, TopicFacts};
 
@@ -112,10 +111,8 @@ async fn list(
     Parameters(scope): Parameters<Scope>,
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let state = context.board.state();
-    let nothing = Snapshot::default();
-    let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+    let state = context.state().await;
+    let snapshot = state.known();
     let desk = Desk::new(snapshot, scope);
     let nodes = nodes(snapshot).filter(|nodes| {
         let first = nodes.first();
@@ -150,10 +147,8 @@ async fn show(
     Parameters(scope): Parameters<Scope>,
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let state = context.board.state();
-    let nothing = Snapshot::default();
-    let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+    let state = context.state().await;
+    let snapshot = state.known();
     let admitted = || {
         let all = nodes(snapshot).filter_map(|nodes| Some((nodes.first()?, nodes)));
         all.filter(|(node, _)| scope.admits(node.domain_id))

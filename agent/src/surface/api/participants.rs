@@ -18,7 +18,6 @@ use super::measured::MeasurementView;
 use super::parameters::Parameters;
 use super::problem::Problem;
 use super::scope::Domain;
-use super::watch::PATIENCE;
 use crate::model::snapshot::{ParticipantFacts, Snapshot, UnknownWriterFacts};
 
 /// Participants.
@@ -114,10 +113,8 @@ async fn list(
     Parameters(domain): Parameters<Domain>,
 ) -> Result<Response, Problem> {
     let domain = domain.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let state = context.board.state();
-    let nothing = Snapshot::default();
-    let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+    let state = context.state().await;
+    let snapshot = state.known();
     let counts = counts(snapshot);
     let participants = snapshot.participants.iter();
     let participants = participants.filter(|each| domain.admits(each.domain_id));

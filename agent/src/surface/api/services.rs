@@ -18,7 +18,6 @@ use super::parameters::Parameters;
 use super::party::{Parties, PartyView, service_type};
 use super::problem::Problem;
 use super::scope::Scope;
-use super::watch::PATIENCE;
 use crate::model::snapshot::{Snapshot, TopicFacts};
 
 /// Services.
@@ -81,10 +80,8 @@ async fn list(
     Parameters(scope): Parameters<Scope>,
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let state = context.board.state();
-    let nothing = Snapshot::default();
-    let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+    let state = context.state().await;
+    let snapshot = state.known();
     let index = Index::new(snapshot);
     let answer = ServicesView {
         timestamp_seconds: snapshot.at.seconds(),

@@ -21,7 +21,6 @@ use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Domain, Scope, only};
 use super::silence::{Circumstances, ReasonView};
-use super::watch::PATIENCE;
 use crate::model::snapshot::{AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts};
 use crate::surface::board::State as BoardState;
 use crate::watches::InForce;
@@ -198,10 +197,8 @@ async fn list(
     Parameters(scope): Parameters<Scope>,
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let (state, in_force) = (context.board.state(), context.watches.in_force());
-    let nothing = Snapshot::default();
-    let desk = Desk::new(&state, &in_force, &nothing);
+    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let desk = Desk::new(&state, &in_force);
     let topics = desk.snapshot.topics.iter().filter(|topic| {
         let is_plain = matches!(topic.kind, "topic" | "dds") && !topic.hidden;
         scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
@@ -235,10 +232,8 @@ async fn show(
     Parameters(domain): Parameters<Domain>,
 ) -> Result<Response, Problem> {
     let domain = domain.checked()?;
-    context.board.refresh(PATIENCE).await;
-    let (state, in_force) = (context.board.state(), context.watches.in_force());
-    let nothing = Snapshot::default();
-    let desk = Desk::new(&state, &in_force, &nothing);
+    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let desk = Desk::new(&state, &in_force);
     let admitted = || {
         let topics = desk.snapshot.topics.iter();
         topics.filter(|topic| domain.admits(topic.domain_id))
@@ -281,8 +276,8 @@ struct Desk<'a> {
 }
 
 impl<'a> Desk<'a> {
-    fn new(state: &'a BoardState, in_force: &'a InForce, nothing: &'a Snapshot) -> Self {
-        let snapshot = state.snapshot.as_ref().unwrap_or(nothing);
+    fn new(state: &'a BoardState, in_force: &'a InForce) -> Self {
+        let snapshot = state.known();
         Self {
             in_force,
             snapshot,

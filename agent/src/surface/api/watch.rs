@@ -4,7 +4,6 @@
 //! POST adds and never changes what is there; PUT adds or replaces.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::Json;
 use axum::body::Bytes;
@@ -26,9 +25,6 @@ use super::security::{MAX_BODY, too_large};
 use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern, check_trace};
 use crate::model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
 use crate::watches::{Done, Entry, Origin, Refused};
-
-/// How long a reader waits for a snapshot that knows what was asked for just before.
-pub(super) const PATIENCE: Duration = Duration::from_millis(600);
 
 /// What is watched.
 #[derive(Debug, Serialize, ToSchema)]
@@ -204,8 +200,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "Watches of every origin.", body = WatchList))
 )]
 async fn list(State(context): State<Context>) -> Json<WatchList> {
-    context.board.refresh(PATIENCE).await;
-    let (in_force, state) = (context.watches.in_force(), context.board.state());
+    let (state, in_force) = (context.state().await, context.watches.in_force());
     let snapshot = state.snapshot.as_ref();
     let watches = in_force.entries().iter().map(|entry| view(entry, snapshot));
     Json(WatchList {
@@ -230,11 +225,9 @@ async fn show(
     Name(topic): Name,
     Parameters(domain): Parameters<Domain>,
 ) -> Result<Json<WatchView>, Problem> {
-    context.board.refresh(PATIENCE).await;
-    let in_force = context.watches.in_force();
+    let (state, in_force) = (context.state().await, context.watches.in_force());
     let entry = in_force.find(&topic, domain.domain_id);
     let entry = entry.ok_or_else(|| unknown(&topic, domain.domain_id))?;
-    let state = context.board.state();
     Ok(Json(view(entry, state.snapshot.as_ref())))
 }
 
