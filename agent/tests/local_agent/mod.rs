@@ -118,8 +118,11 @@ impl LocalAgent {
         }
     }
 
-    /// All of the log so far.
+    /// All of the log so far, and to its last line once the agent has ended.
     pub fn log(&mut self) -> String {
+        if matches!(self.child.try_wait(), Ok(Some(_))) {
+            self.seen.extend(self.log.iter());
+        }
         self.seen.extend(self.log.try_iter());
         self.seen.join("\n")
     }
@@ -153,12 +156,11 @@ impl LocalAgent {
         }
     }
 
-    /// Waits for the end, and for the last line of the log.
+    /// Waits for the end.
     pub fn wait(&mut self) -> ExitStatus {
         let deadline = Instant::now() + PATIENCE;
         loop {
             if let Some(status) = self.child.try_wait().unwrap() {
-                self.seen.extend(self.log.iter());
                 return status;
             }
             assert!(Instant::now() < deadline, "still running:\n{}", self.log());
