@@ -70,6 +70,7 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
     println!("{share:.2} % of a CPU; {}", telling(&half));
     // Nothing more comes until it is told to.
     let half = agent.settled_scrape("/imu", 0)?;
+    let began = Instant::now();
     for (publisher, _) in &mut pairs {
         publisher.go()?;
     }
@@ -79,6 +80,8 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
         ensure!(sent == stream.count, "{sent} of {stream:?}");
     }
     let page = agent.settled_scrape("/imu", 0)?;
+    let share = 100.0 * (cpu(&page) - cpu(&half)) / began.elapsed().as_secs_f64();
+    println!("{share:.2} % of a CPU once nobody is new");
     for stream in &streams {
         let topic = [("topic", stream.topic.as_str())];
         let sum = |name: &str| page.sum(name, &topic);
