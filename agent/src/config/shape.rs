@@ -148,8 +148,8 @@ pub(super) struct ShmShape {
     /// `uprobe`: see every message, by a breakpoint that the kernel puts into the code of all
     /// processes that use Fast DDS; where that is not possible, shared memory is read as usual.
     pub(super) exact: ExactChoice,
-    /// Share of one CPU that looking may cost, in percent. With less, fewer of the messages are
-    /// seen; they are counted all the same.
+    /// Share of one CPU that looking may cost, in percent, but for moments in which participants
+    /// meet. With less, fewer of the messages are seen; they are counted all the same.
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) cpu_percent: f64,
 }

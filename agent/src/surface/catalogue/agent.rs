@@ -91,7 +91,7 @@ pub(in crate::surface) const SHM_LOOKS: Metric =
 pub(in crate::surface) const SHM_CPU: Metric = Metric::counter(
     "ros2probe_shm_cpu_seconds_total",
     &[],
-    "CPU time that they took, kept to capture.shm.cpu_percent.",
+    "CPU time that they took: capture.shm.cpu_percent of a CPU, and more for moments in which participants meet.",
 )
 .unit("seconds");
 pub(in crate::surface) const SHM_EXACT_INFO: Metric = Metric::info(
