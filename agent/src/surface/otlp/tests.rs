@@ -84,9 +84,9 @@ impl Receiver {
     }
 }
 
-/// An agent of a quiet robot that exports every second.
-fn exporting(address: SocketAddr, more: &str) -> (Arc<Board>, Exporter) {
-    let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: 1, {more}}}");
+/// An agent of a quiet robot that exports every so many seconds.
+fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Board>, Exporter) {
+    let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: {interval}, {more}}}");
     let config = Config::parse(yaml.as_bytes()).unwrap();
     let host = Host::default();
     let settings = Settings::resolve(&config.otlp, &|_| None, &host).unwrap();
@@ -121,7 +121,8 @@ async fn what_fails_in_passing_is_sent_again_and_what_is_refused_is_not() {
         Answer::Rejects(7),
     ];
     let (receiver, address) = Receiver::listening(script).await;
-    let (board, exporter) = exporting(address, "compression: gzip");
+    // The pause before it is sent again is up to a second: what comes next must not overtake it.
+    let (board, exporter) = exporting(address, 3, "compression: gzip");
     let exports = board.exports();
     until("a part is rejected", || {
         exports.requests(Signal::Metrics, Outcome::Partial) == 1
@@ -141,7 +142,7 @@ async fn what_fails_in_passing_is_sent_again_and_what_is_refused_is_not() {
 #[tokio::test]
 async fn newer_points_take_the_place_of_those_a_slow_receiver_does_not_take() {
     let (receiver, address) = Receiver::listening([Answer::Sleeps, Answer::Sleeps]).await;
-    let (board, exporter) = exporting(address, "timeout_s: 30");
+    let (board, exporter) = exporting(address, 1, "timeout_s: 30");
     let exports = board.exports();
     until("it takes some in the end", || receiver.requests() > 0).await;
     let [_, _, retried, failed] = requests(exports);
@@ -155,7 +156,7 @@ async fn a_receiver_that_comes_later_gets_the_latest_and_one_that_never_comes_de
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     drop(listener);
-    let (board, exporter) = exporting(address, "");
+    let (board, exporter) = exporting(address, 1, "");
     let exports = board.exports();
     until("a batch is given up", || {
         exports.dropped(Signal::Metrics, Reason::Superseded) > 0
@@ -181,7 +182,7 @@ async fn a_receiver_that_comes_later_gets_the_latest_and_one_that_never_comes_de
     let address = listener.local_addr().unwrap();
     let mut mute = Some(listener);
     for _ in 0..2 {
-        let (board, exporter) = exporting(address, "");
+        let (board, exporter) = exporting(address, 1, "");
         tokio::time::sleep(Duration::from_millis(400)).await;
         let begun = Instant::now();
         exporter.finish().await;
