@@ -17,6 +17,7 @@ use harness::agent::{Agent, Scrape, at_the_sockets_of};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
 use harness::process::Process;
+use harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Of the samples that there were, those that were seen: what is asked for on a machine that does
@@ -743,15 +744,6 @@ fn run(agent: &Agent<'_>, mut publisher: Peer, stream: &Stream) -> Result<Scrape
         stream.count
     );
     agent.settled_scrape(&stream.topic, 0)
-}
-
-fn wait_until(what: &str, mut holds: impl FnMut() -> Result<bool>) -> Result<()> {
-    let deadline = Instant::now() + PATIENCE;
-    while !holds()? {
-        ensure!(Instant::now() < deadline, "{what}: not within {PATIENCE:?}");
-        std::thread::sleep(Duration::from_millis(100));
-    }
-    Ok(())
 }
 
 /// What the agent says of its look at shared memory.

@@ -15,6 +15,7 @@ use harness::code::{self, Code};
 use harness::network::Namespace;
 use harness::peer::{Peer, Role, Stack, Stream};
 use harness::process::Process;
+use harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const SAMPLES: u64 = 600;
@@ -269,15 +270,6 @@ fn mapped(process: u32, name: &str) -> Result<PathBuf> {
     let line = maps.lines().find(|line| line.contains(name));
     let path = line.and_then(|line| line.find('/').and_then(|at| line.get(at..)));
     Ok(PathBuf::from(path.with_context(|| format!("no {name}"))?))
-}
-
-fn wait_until(what: &str, mut holds: impl FnMut() -> Result<bool>) -> Result<()> {
-    let deadline = Instant::now() + PATIENCE;
-    while !holds()? {
-        ensure!(Instant::now() < deadline, "{what}: not within {PATIENCE:?}");
-        std::thread::sleep(Duration::from_millis(100));
-    }
-    Ok(())
 }
 
 /// What the agent says of shared memory.

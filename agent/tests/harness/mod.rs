@@ -26,8 +26,9 @@ pub(crate) mod witness;
 
 use std::path::Path;
 use std::process::Command;
+use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Context as _, Result, bail, ensure};
 
 /// Tools the harness runs, with the Debian or Ubuntu package that has each.
 const TOOLS: [(&str, &str); 8] = [
@@ -56,6 +57,17 @@ pub(crate) fn require() -> Result<()> {
         if !std::env::split_paths(&path).any(|directory| directory.join(tool).exists()) {
             bail!("`{tool}` is missing: run `apt-get install {package}` or `make prerequisites`");
         }
+    }
+    Ok(())
+}
+
+/// Looks ten times a second whether it holds, for a minute.
+pub(crate) fn wait_until(what: &str, mut holds: impl FnMut() -> Result<bool>) -> Result<()> {
+    const PATIENCE: Duration = Duration::from_secs(60);
+    let deadline = Instant::now() + PATIENCE;
+    while !holds()? {
+        ensure!(Instant::now() < deadline, "{what}: not within {PATIENCE:?}");
+        std::thread::sleep(Duration::from_millis(100));
     }
     Ok(())
 }
