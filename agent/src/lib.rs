@@ -6,6 +6,7 @@
 pub mod capture;
 pub mod config;
 pub mod discover;
+pub mod message;
 pub mod model;
 pub mod privilege;
 pub mod run;

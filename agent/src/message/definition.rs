@@ -1,0 +1,698 @@
+//! What a ROS message consists of: type names, fields, and a type with everything it is made of.
+//!
+//! A [`MessageType`] is closed (every nested type is there), free of recursion and no deeper than
+//! [`MAX_DEPTH`], so whoever walks it needs no checks of its own. Defaults and constants are not
+//! kept but in the text: neither is on the wire nor part of the type hash.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::fmt;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use super::parse::{self, ParseError};
+
+/// How deep types may be nested.
+pub const MAX_DEPTH: usize = 32;
+/// How many types one type may be made of.
+pub const MAX_TYPES: usize = 1024;
+/// How long a package's or a type's name may be: both are names of files.
+const MAX_NAME: usize = 200;
+
+/// What kind of file a type is defined in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Kind {
+    /// An `.action` file.
+    Action,
+    /// A `.msg` file.
+    Message,
+    /// A `.srv` file.
+    Service,
+}
+
+impl Kind {
+    /// As it stands in a type's name; also the file's extension and its directory.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Action => "action",
+            Self::Message => "msg",
+            Self::Service => "srv",
+        }
+    }
+}
+
+/// A type's full name: `sensor_msgs/msg/Imu`. Ordered as its text is.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct TypeName {
+    package: Arc<str>,
+    kind: Kind,
+    name: Arc<str>,
+}
+
+/// Why a text is no type's name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("not a type's name: it has to look like std_msgs/msg/String")]
+pub struct NotATypeName;
+
+impl TypeName {
+    /// From its parts, which have to be identifiers.
+    pub fn new(package: &str, kind: Kind, name: &str) -> Result<Self, NotATypeName> {
+        if !is_identifier(package) || !is_identifier(name) {
+            return Err(NotATypeName);
+        }
+        Ok(Self {
+            package: package.into(),
+            kind,
+            name: name.into(),
+        })
+    }
+
+    /// `sensor_msgs`.
+    pub fn package(&self) -> &str {
+        &self.package
+    }
+
+    /// What kind of file it is defined in.
+    pub fn kind(&self) -> Kind {
+        self.kind
+    }
+
+    /// `Imu`.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Another type of the same file: this one's name and an ending.
+    pub(super) fn with_suffix(&self, suffix: &str) -> Self {
+        Self {
+            package: self.package.clone(),
+            kind: self.kind,
+            name: format!("{}{suffix}", self.name).into(),
+        }
+    }
+
+    /// The types whose file may define this one: its own, and those whose name with one of the
+    /// endings that services and actions have gives this name.
+    pub(super) fn files(&self) -> Vec<Self> {
+        const SERVICE: [&str; 3] = ["_Request", "_Response", "_Event"];
+        const ACTION: [&str; 12] = [
+            "_SendGoal_Request",
+            "_SendGoal_Response",
+            "_SendGoal_Event",
+            "_GetResult_Request",
+            "_GetResult_Response",
+            "_GetResult_Event",
+            "_SendGoal",
+            "_GetResult",
+            "_FeedbackMessage",
+            "_Goal",
+            "_Result",
+            "_Feedback",
+        ];
+        let endings: &[&str] = match self.kind {
+            Kind::Message => &[],
+            Kind::Service => &SERVICE,
+            Kind::Action => &ACTION,
+        };
+        let mut found = vec![self.clone()];
+        for ending in endings {
+            if let Some(name) = self.name.strip_suffix(ending)
+                && !name.is_empty()
+            {
+                found.push(Self {
+                    name: name.into(),
+                    ..self.clone()
+                });
+                break;
+            }
+        }
+        found
+    }
+}
+
+impl FromStr for TypeName {
+    type Err = NotATypeName;
+
+    fn from_str(text: &str) -> Result<Self, NotATypeName> {
+        let mut parts = text.split('/');
+        let (Some(package), Some(kind), Some(name), None) =
+            (parts.next(), parts.next(), parts.next(), parts.next())
+        else {
+            return Err(NotATypeName);
+        };
+        let kind = match kind {
+            "action" => Kind::Action,
+            "msg" => Kind::Message,
+            "srv" => Kind::Service,
+            _ => return Err(NotATypeName),
+        };
+        Self::new(package, kind, name)
+    }
+}
+
+impl fmt::Display for TypeName {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            formatter,
+            "{}/{}/{}",
+            self.package,
+            self.kind.as_str(),
+            self.name
+        )
+    }
+}
+
+/// Whether a name of a package, type or field can be this.
+pub(super) fn is_identifier(text: &str) -> bool {
+    text.len() <= MAX_NAME
+        && text.starts_with(|first: char| first.is_ascii_alphabetic())
+        && text
+            .bytes()
+            .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
+}
+
+/// One member of a message.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Field {
+    /// Its name.
+    pub name: String,
+    /// What it holds, or an array of it does.
+    pub element: Element,
+    /// How many.
+    pub shape: Shape,
+}
+
+/// What a field holds one or many of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Element {
+    /// `bool`.
+    Bool,
+    /// `byte`, an octet.
+    Byte,
+    /// `char`, an octet too.
+    Char,
+    /// `int8`.
+    Int8,
+    /// `uint8`.
+    UInt8,
+    /// `int16`.
+    Int16,
+    /// `uint16`.
+    UInt16,
+    /// `int32`.
+    Int32,
+    /// `uint32`.
+    UInt32,
+    /// `int64`.
+    Int64,
+    /// `uint64`.
+    UInt64,
+    /// `float32`.
+    Float32,
+    /// `float64`.
+    Float64,
+    /// `string`, `string<=N`.
+    String {
+        /// How long at most.
+        bound: Option<u32>,
+    },
+    /// `wstring`, `wstring<=N`.
+    WString {
+        /// How long at most.
+        bound: Option<u32>,
+    },
+    /// Another type.
+    Nested(TypeName),
+}
+
+/// How many elements a field has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shape {
+    /// One, no array.
+    Single,
+    /// `[N]`.
+    Array(u32),
+    /// `[<=N]`.
+    Bounded(u32),
+    /// `[]`.
+    Unbounded,
+}
+
+/// The members of one type. One without members is an octet on the wire, which rosidl calls
+/// `structure_needs_at_least_one_member`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Structure {
+    /// The type.
+    pub name: TypeName,
+    /// Its members, in the order of the wire.
+    pub fields: Vec<Field>,
+}
+
+/// One file: what it defines, including the types that services and actions imply.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Definition {
+    /// The type it is named after.
+    pub name: TypeName,
+    /// The file, as it was read; for an `.idl` file the `.msg` text that means the same.
+    pub text: Arc<str>,
+    pub(super) structures: Vec<Arc<Structure>>,
+    /// The messages that the text itself names.
+    pub(super) uses: BTreeSet<TypeName>,
+}
+
+impl Definition {
+    /// Reads a `.msg`, `.srv` or `.action` file, whichever the name is of.
+    pub fn parse(name: TypeName, text: &str) -> Result<Self, ParseError> {
+        let structures = parse::file(&name, text)?;
+        Ok(Self::new(name, text.into(), structures))
+    }
+
+    pub(super) fn new(name: TypeName, text: Arc<str>, written: Vec<Structure>) -> Self {
+        let uses = written
+            .iter()
+            .flat_map(|structure| &structure.fields)
+            .filter_map(|field| match &field.element {
+                Element::Nested(nested) if nested.kind() == Kind::Message => Some(nested.clone()),
+                _ => None,
+            })
+            .collect();
+        let implied = implied(&name);
+        let structures = written.into_iter().chain(implied).map(Arc::new).collect();
+        Self {
+            name,
+            text,
+            structures,
+            uses,
+        }
+    }
+}
+
+/// The types that a service or an action has besides what its file spells out, as
+/// `rosidl_parser` composes them.
+fn implied(name: &TypeName) -> Vec<Structure> {
+    let mut structures = Vec::new();
+    match name.kind() {
+        Kind::Message => {}
+        Kind::Service => service(name, &mut structures),
+        Kind::Action => {
+            let nested = |suffix: &str| Element::Nested(name.with_suffix(suffix));
+            let goal_id = || single("goal_id", known("unique_identifier_msgs", "UUID"));
+            let mut push = |suffix: &str, fields: Vec<Field>| {
+                structures.push(Structure {
+                    name: name.with_suffix(suffix),
+                    fields,
+                });
+            };
+            push(
+                "_SendGoal_Request",
+                vec![goal_id(), single("goal", nested("_Goal"))],
+            );
+            push(
+                "_SendGoal_Response",
+                vec![
+                    single("accepted", Element::Bool),
+                    single("stamp", known("builtin_interfaces", "Time")),
+                ],
+            );
+            push("_GetResult_Request", vec![goal_id()]);
+            push(
+                "_GetResult_Response",
+                vec![
+                    single("status", Element::Int8),
+                    single("result", nested("_Result")),
+                ],
+            );
+            push(
+                "_FeedbackMessage",
+                vec![goal_id(), single("feedback", nested("_Feedback"))],
+            );
+            push(
+                "",
+                vec![
+                    single("goal", nested("_Goal")),
+                    single("result", nested("_Result")),
+                    single("feedback", nested("_Feedback")),
+                    single("send_goal_service", nested("_SendGoal")),
+                    single("get_result_service", nested("_GetResult")),
+                    single("feedback_message", nested("_FeedbackMessage")),
+                ],
+            );
+            service(&name.with_suffix("_SendGoal"), &mut structures);
+            service(&name.with_suffix("_GetResult"), &mut structures);
+        }
+    }
+    structures
+}
+
+/// A service's event and the service itself, of which only the hash is ever seen.
+fn service(name: &TypeName, structures: &mut Vec<Structure>) {
+    let nested = |suffix: &str| Element::Nested(name.with_suffix(suffix));
+    let one_at_most = |member: &str, suffix: &str| Field {
+        name: member.to_owned(),
+        element: nested(suffix),
+        shape: Shape::Bounded(1),
+    };
+    structures.push(Structure {
+        name: name.with_suffix("_Event"),
+        fields: vec![
+            single("info", known("service_msgs", "ServiceEventInfo")),
+            one_at_most("request", "_Request"),
+            one_at_most("response", "_Response"),
+        ],
+    });
+    structures.push(Structure {
+        name: name.clone(),
+        fields: vec![
+            single("request_message", nested("_Request")),
+            single("response_message", nested("_Response")),
+            single("event_message", nested("_Event")),
+        ],
+    });
+}
+
+fn single(name: &str, element: Element) -> Field {
+    Field {
+        name: name.to_owned(),
+        element,
+        shape: Shape::Single,
+    }
+}
+
+fn known(package: &str, name: &str) -> Element {
+    Element::Nested(TypeName {
+        package: package.into(),
+        kind: Kind::Message,
+        name: name.into(),
+    })
+}
+
+/// A type and all that it is made of.
+#[derive(Debug, PartialEq, Eq)]
+pub struct MessageType {
+    /// The type itself.
+    pub root: TypeName,
+    pub(super) structures: BTreeMap<TypeName, Arc<Structure>>,
+    /// The files that it comes from, by what they are named after.
+    pub(super) definitions: BTreeMap<TypeName, Arc<Definition>>,
+}
+
+/// Why a type cannot be put together.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NotClosed {
+    /// It, or something in it, is defined nowhere.
+    #[error("no definition of {0}")]
+    Missing(TypeName),
+    /// It contains itself.
+    #[error("{0} contains itself")]
+    Recursive(TypeName),
+    /// Its types are nested too deeply.
+    #[error("nested deeper than {MAX_DEPTH} types")]
+    TooDeep,
+    /// It has too many types.
+    #[error("made of more than {MAX_TYPES} types")]
+    TooMany,
+}
+
+impl MessageType {
+    /// Reads the text of a bag's schema in encoding `ros2msg`: the type's own definition, then
+    /// those that it needs, each below a line of 80 `=` and a line `MSG: package/Type`.
+    pub fn parse(root: &TypeName, text: &str) -> Result<Self, SchemaError> {
+        let mut definitions = HashMap::new();
+        for (name, part) in super::schema::parts(root, text)? {
+            let definition = Definition::parse(name.clone(), part)
+                .map_err(|error| SchemaError::Definition(name.clone(), error))?;
+            if definitions.len() == MAX_TYPES {
+                return Err(NotClosed::TooMany.into());
+            }
+            definitions
+                .entry(name)
+                .or_insert_with(|| Arc::new(definition));
+        }
+        Ok(Self::assemble(root, |name| {
+            Ok::<_, NotClosed>(definitions.get(name).cloned())
+        })?)
+    }
+
+    /// Puts a type together from its files; `find` is asked for each of them once or twice.
+    pub(super) fn assemble<E: From<NotClosed>>(
+        root: &TypeName,
+        mut find: impl FnMut(&TypeName) -> Result<Option<Arc<Definition>>, E>,
+    ) -> Result<Self, E> {
+        let mut found = Self {
+            root: root.clone(),
+            structures: BTreeMap::new(),
+            definitions: BTreeMap::new(),
+        };
+        let mut wanted = vec![root.clone()];
+        while let Some(name) = wanted.pop() {
+            if found.structures.contains_key(&name) {
+                continue;
+            }
+            if found.structures.len() == MAX_TYPES {
+                return Err(NotClosed::TooMany.into());
+            }
+            let structure = found.look_up(&name, &mut find)?;
+            for field in &structure.fields {
+                if let Element::Nested(nested) = &field.element {
+                    wanted.push(nested.clone());
+                }
+            }
+            found.structures.insert(name, structure);
+        }
+        found.check(root, &mut Vec::new(), &mut HashMap::new())?;
+        Ok(found)
+    }
+
+    fn look_up<E: From<NotClosed>>(
+        &mut self,
+        name: &TypeName,
+        find: &mut impl FnMut(&TypeName) -> Result<Option<Arc<Definition>>, E>,
+    ) -> Result<Arc<Structure>, E> {
+        for file in name.files() {
+            let definition = match self.definitions.get(&file) {
+                Some(definition) => Some(definition.clone()),
+                None => find(&file)?,
+            };
+            let Some(definition) = definition else {
+                continue;
+            };
+            let structure = definition
+                .structures
+                .iter()
+                .find(|structure| structure.name == *name)
+                .cloned();
+            if let Some(structure) = structure {
+                self.definitions.insert(file, definition);
+                return Ok(structure);
+            }
+        }
+        Err(NotClosed::Missing(name.clone()).into())
+    }
+
+    /// How deep a type is; refuses what contains itself. A level of the stack for each level of
+    /// types, no more than the limit.
+    fn check(
+        &self,
+        name: &TypeName,
+        above: &mut Vec<TypeName>,
+        depths: &mut HashMap<TypeName, usize>,
+    ) -> Result<usize, NotClosed> {
+        if let Some(depth) = depths.get(name) {
+            return Ok(*depth);
+        }
+        if above.contains(name) {
+            return Err(NotClosed::Recursive(name.clone()));
+        }
+        if above.len() == MAX_DEPTH {
+            return Err(NotClosed::TooDeep);
+        }
+        above.push(name.clone());
+        let mut depth = 0;
+        let structure = self
+            .structure(name)
+            .ok_or_else(|| NotClosed::Missing(name.clone()))?;
+        for field in &structure.fields {
+            if let Element::Nested(nested) = &field.element {
+                depth = depth.max(self.check(nested, above, depths)?);
+            }
+        }
+        above.pop();
+        depth += 1;
+        if above.len() + depth > MAX_DEPTH {
+            return Err(NotClosed::TooDeep);
+        }
+        depths.insert(name.clone(), depth);
+        Ok(depth)
+    }
+
+    /// The members of the type itself or of one that it is made of.
+    pub fn structure(&self, name: &TypeName) -> Option<&Structure> {
+        self.structures.get(name).map(Arc::as_ref)
+    }
+
+    /// Every type that it is made of, itself included, sorted by name.
+    pub fn structures(&self) -> impl Iterator<Item = &Structure> {
+        self.structures.values().map(Arc::as_ref)
+    }
+}
+
+/// Why a schema's text cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SchemaError {
+    /// The line that names a part is not one of `MSG: package/Type`.
+    #[error("line {line}: expected `MSG: package/Type` below the line of `=`")]
+    Heading {
+        /// Which line.
+        line: usize,
+    },
+    /// One of its definitions cannot be read.
+    #[error("definition of {0}")]
+    Definition(TypeName, #[source] ParseError),
+    /// They do not belong together.
+    #[error(transparent)]
+    NotClosed(#[from] NotClosed),
+}
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a failed expectation may panic")]
+mod tests {
+    use super::*;
+
+    fn name(text: &str) -> TypeName {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn names_are_three_identifiers() {
+        for text in [
+            "std_msgs/msg/String",
+            "a/srv/B_Request",
+            "a/action/B_FeedbackMessage",
+        ] {
+            assert_eq!(name(text).to_string(), text);
+        }
+        for text in [
+            "",
+            "String",
+            "std_msgs/String",
+            "std_msgs/msg/",
+            "/msg/A",
+            "a/msg/B/c",
+            "a/idl/B",
+            "../msg/B",
+            "a/msg/../../etc",
+            "a/msg/B.C",
+            "a/msg/1",
+            "a/msg/Ä",
+        ] {
+            assert_eq!(text.parse::<TypeName>(), Err(NotATypeName), "{text}");
+        }
+        assert!(
+            format!("a/msg/B{}", "b".repeat(MAX_NAME))
+                .parse::<TypeName>()
+                .is_err()
+        );
+    }
+
+    #[test]
+    fn names_are_ordered_as_their_text_is() {
+        let texts = [
+            "a/action/Z",
+            "a/msg/B",
+            "a/msg/B_Event",
+            "a/srv/A",
+            "ab/msg/A",
+            "a_b/msg/A",
+        ];
+        let mut names = texts.map(name);
+        let mut sorted = texts;
+        names.sort();
+        sorted.sort_unstable();
+        assert_eq!(names.map(|name| name.to_string()), sorted);
+    }
+
+    #[test]
+    fn services_and_actions_imply_types() {
+        let definition =
+            Definition::parse(name("a/action/B"), "int8 a\n---\n---\nint8 c\n").unwrap();
+        let names: Vec<_> = definition
+            .structures
+            .iter()
+            .map(|one| one.name.name())
+            .collect();
+        assert_eq!(
+            names,
+            [
+                "B_Goal",
+                "B_Result",
+                "B_Feedback",
+                "B_SendGoal_Request",
+                "B_SendGoal_Response",
+                "B_GetResult_Request",
+                "B_GetResult_Response",
+                "B_FeedbackMessage",
+                "B",
+                "B_SendGoal_Event",
+                "B_SendGoal",
+                "B_GetResult_Event",
+                "B_GetResult"
+            ]
+        );
+        for implied in &definition.structures {
+            assert!(
+                implied.name.files().contains(&definition.name),
+                "{}",
+                implied.name
+            );
+        }
+    }
+
+    /// A schema in which each of `count` types has a member of the next one.
+    fn chain(count: usize) -> String {
+        let mut text = String::from("T1 next\n");
+        for index in 1..count {
+            let line = "=".repeat(80);
+            text.push_str(&format!("{line}\nMSG: a/T{index}\nT{} next\n", index + 1));
+        }
+        text + &format!("{}\nMSG: a/T{count}\nint8 end\n", "=".repeat(80))
+    }
+
+    #[test]
+    fn types_are_nested_up_to_the_limit() {
+        let root = name("a/msg/T0");
+        let deepest = MessageType::parse(&root, &chain(MAX_DEPTH - 1)).unwrap();
+        assert_eq!(deepest.structures().count(), MAX_DEPTH);
+        let deeper = MessageType::parse(&root, &chain(MAX_DEPTH));
+        assert_eq!(
+            deeper.unwrap_err(),
+            SchemaError::NotClosed(NotClosed::TooDeep)
+        );
+    }
+
+    #[test]
+    fn what_contains_itself_or_misses_a_part_is_refused() {
+        let text = format!("B b\n{}\nMSG: a/B\nA a\n", "=".repeat(80));
+        let error = MessageType::parse(&name("a/msg/A"), &text).unwrap_err();
+        assert!(
+            matches!(error, SchemaError::NotClosed(NotClosed::Recursive(_))),
+            "{error}"
+        );
+        let error = MessageType::parse(&name("a/msg/A"), "B b\n").unwrap_err();
+        assert_eq!(
+            error,
+            SchemaError::NotClosed(NotClosed::Missing(name("a/msg/B")))
+        );
+    }
+
+    #[test]
+    fn a_type_has_a_bounded_number_of_types() {
+        let mut text = String::new();
+        for index in 0..=MAX_TYPES {
+            text.push_str(&format!("other/T{index} f{index}\n"));
+        }
+        for index in 0..=MAX_TYPES {
+            text.push_str(&format!("{}\nMSG: other/T{index}\n", "=".repeat(80)));
+        }
+        let error = MessageType::parse(&name("a/msg/A"), &text).unwrap_err();
+        assert_eq!(error, SchemaError::NotClosed(NotClosed::TooMany));
+    }
+}

@@ -1,0 +1,402 @@
+//! Reads `.msg`, `.srv` and `.action` files as `rosidl_adapter` reads them.
+//!
+//! Constants and defaults are passed over, not interpreted. Where rosidl is strict only about style
+//! (capital letters in a field's name, spaces before it), this is not; what it cannot represent on
+//! the wire is refused.
+
+use std::collections::BTreeSet;
+
+use super::definition::{Element, Field, Kind, Shape, Structure, TypeName, is_identifier};
+
+/// The longest file that is read: the longest in use have 30 kB.
+pub(super) const MAX_TEXT: usize = 1 << 20;
+/// How many members a type may have.
+pub(super) const MAX_FIELDS: usize = 4096;
+/// Between a service's request and response, and the parts of an action.
+const SEPARATOR: &str = "---";
+
+/// Why a definition cannot be read, and where.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("line {line}: {problem}")]
+pub struct ParseError {
+    /// The line, counted from 1.
+    pub line: usize,
+    /// What is wrong with it.
+    pub problem: Problem,
+}
+
+/// What is wrong with a definition.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Problem {
+    /// The file is too long to be a definition.
+    #[error("longer than {MAX_TEXT} bytes")]
+    TooLong,
+    /// It is not text.
+    #[error("not UTF-8")]
+    NotText,
+    /// A type alone.
+    #[error("a type without a name behind it")]
+    NoName,
+    /// A field's or a constant's name is none.
+    #[error("`{0}` is no name")]
+    Name(String),
+    /// The same field twice.
+    #[error("`{0}` is there twice")]
+    Twice(String),
+    /// Neither a basic type nor the name of a message.
+    #[error("`{0}` is no type")]
+    Type(String),
+    /// The bound of a string or an array.
+    #[error("`{0}` is no size from 1 to 4294967295")]
+    Size(String),
+    /// A constant of a type that has no constants, or without a value.
+    #[error("no constant can be like this")]
+    Constant,
+    /// An annotation that changes what is on the wire.
+    #[error("`{0}` is not supported")]
+    Unsupported(String),
+    /// Too many members.
+    #[error("more than {MAX_FIELDS} fields")]
+    TooMany,
+    /// Not as many `---` as the kind of file has.
+    #[error("{expected} lines `---` expected, found {found}")]
+    Separators {
+        /// How many there should be.
+        expected: usize,
+        /// How many there are.
+        found: usize,
+    },
+}
+
+/// The types that a file spells out: one for a message, two for a service, three for an action.
+pub(super) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseError> {
+    if text.len() > MAX_TEXT {
+        return Err(ParseError {
+            line: 1,
+            problem: Problem::TooLong,
+        });
+    }
+    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+    let parts: &[&str] = match name.kind() {
+        Kind::Message => &[""],
+        Kind::Service => &["_Request", "_Response"],
+        Kind::Action => &["_Goal", "_Result", "_Feedback"],
+    };
+    let mut parts_left = parts.iter();
+    let mut current = match parts_left.next() {
+        Some(part) => Members::of(name, part),
+        None => return Ok(Vec::new()),
+    };
+    let mut structures = Vec::new();
+    let (mut found, mut lines) = (0, 0);
+    for (index, line) in text.lines().enumerate() {
+        lines = index + 1;
+        let line = line.trim_end();
+        if line == SEPARATOR && name.kind() != Kind::Message {
+            found += 1;
+            if let Some(part) = parts_left.next() {
+                structures.push(std::mem::replace(&mut current, Members::of(name, part)).structure);
+            }
+            continue;
+        }
+        current
+            .line(name.package(), line)
+            .map_err(|problem| ParseError {
+                line: lines,
+                problem,
+            })?;
+    }
+    structures.push(current.structure);
+    let expected = parts.len() - 1;
+    if found != expected {
+        let problem = Problem::Separators { expected, found };
+        return Err(ParseError {
+            line: lines.max(1),
+            problem,
+        });
+    }
+    Ok(structures)
+}
+
+/// The members of the part that is being read.
+struct Members {
+    structure: Structure,
+    names: BTreeSet<String>,
+}
+
+impl Members {
+    fn of(name: &TypeName, part: &str) -> Self {
+        let structure = Structure {
+            name: name.with_suffix(part),
+            fields: Vec::new(),
+        };
+        Self {
+            structure,
+            names: BTreeSet::new(),
+        }
+    }
+
+    fn line(&mut self, package: &str, line: &str) -> Result<(), Problem> {
+        let line = line
+            .split_once('#')
+            .map_or(line, |(before, _)| before)
+            .trim();
+        let Some(line) = without_annotations(line)? else {
+            return Ok(());
+        };
+        let Some((type_text, rest)) = line.split_once(char::is_whitespace) else {
+            return Err(Problem::NoName);
+        };
+        let rest = rest.trim_start();
+        if let Some((constant, value)) = rest.split_once('=')
+            && !constant.trim_end().contains(char::is_whitespace)
+        {
+            return check_constant(type_text, constant.trim_end(), value.trim());
+        }
+        let name = rest.split(char::is_whitespace).next().unwrap_or(rest);
+        if !is_identifier(name) {
+            return Err(Problem::Name(shortened(name)));
+        }
+        let (element, shape) = field_type(package, type_text)?;
+        if self.structure.fields.len() == MAX_FIELDS {
+            return Err(Problem::TooMany);
+        }
+        if !self.names.insert(name.to_owned()) {
+            return Err(Problem::Twice(name.to_owned()));
+        }
+        self.structure.fields.push(Field {
+            name: name.to_owned(),
+            element,
+            shape,
+        });
+        Ok(())
+    }
+}
+
+/// The line behind its annotations, if there is anything. `@key` says nothing about the encoding
+/// that ROS uses, any other may.
+fn without_annotations(mut line: &str) -> Result<Option<&str>, Problem> {
+    while line.starts_with('@') {
+        let (annotation, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
+        if annotation != "@key" {
+            return Err(Problem::Unsupported(shortened(annotation)));
+        }
+        line = rest.trim_start();
+    }
+    Ok((!line.is_empty()).then_some(line))
+}
+
+fn check_constant(type_text: &str, name: &str, value: &str) -> Result<(), Problem> {
+    if !is_identifier(name) {
+        return Err(Problem::Name(shortened(name)));
+    }
+    // A string's value may be empty where nothing but a comment is behind the sign.
+    match basic(type_text)? {
+        Some(Element::String { .. } | Element::WString { .. }) => Ok(()),
+        Some(_) if !value.is_empty() => Ok(()),
+        _ => Err(Problem::Constant),
+    }
+}
+
+/// `string<=5[<=3]`: an element, and behind it how many.
+fn field_type(package: &str, text: &str) -> Result<(Element, Shape), Problem> {
+    let no_type = || Problem::Type(shortened(text));
+    let (element, shape) = match text.strip_suffix(']') {
+        None => (text, Shape::Single),
+        Some(inside) => {
+            let (element, number) = inside.rsplit_once('[').ok_or_else(no_type)?;
+            let shape = match number.strip_prefix("<=") {
+                _ if number.is_empty() => Shape::Unbounded,
+                Some(bound) => Shape::Bounded(size(bound)?),
+                None => Shape::Array(size(number)?),
+            };
+            (element, shape)
+        }
+    };
+    if let Some(element) = basic(element)? {
+        return Ok((element, shape));
+    }
+    let (package, name) = element.split_once('/').unwrap_or((package, element));
+    if !name.starts_with(|first: char| first.is_ascii_uppercase()) {
+        return Err(no_type());
+    }
+    let nested = TypeName::new(package, Kind::Message, name).map_err(|_| no_type())?;
+    Ok((Element::Nested(nested), shape))
+}
+
+/// One of the types that are not defined in a file.
+fn basic(text: &str) -> Result<Option<Element>, Problem> {
+    let (name, bound) = match text.split_once("<=") {
+        Some((name, bound)) => (name, Some(size(bound)?)),
+        None => (text, None),
+    };
+    Ok(Some(match (name, bound) {
+        ("string", bound) => Element::String { bound },
+        ("wstring", bound) => Element::WString { bound },
+        (_, Some(_)) => return Err(Problem::Type(shortened(text))),
+        ("bool", _) => Element::Bool,
+        ("byte", _) => Element::Byte,
+        ("char", _) => Element::Char,
+        ("int8", _) => Element::Int8,
+        ("uint8", _) => Element::UInt8,
+        ("int16", _) => Element::Int16,
+        ("uint16", _) => Element::UInt16,
+        ("int32", _) => Element::Int32,
+        ("uint32", _) => Element::UInt32,
+        ("int64", _) => Element::Int64,
+        ("uint64", _) => Element::UInt64,
+        ("float32", _) => Element::Float32,
+        ("float64", _) => Element::Float64,
+        _ => return Ok(None),
+    }))
+}
+
+fn size(text: &str) -> Result<u32, Problem> {
+    let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let number = digits
+        .then(|| text.parse().ok())
+        .flatten()
+        .filter(|number| *number > 0);
+    number.ok_or_else(|| Problem::Size(shortened(text)))
+}
+
+/// As much of a text as an error shows.
+pub(super) fn shortened(text: &str) -> String {
+    text.chars().take(60).collect()
+}
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a failed expectation may panic")]
+mod tests {
+    use super::*;
+
+    fn name(text: &str) -> TypeName {
+        text.parse().unwrap()
+    }
+
+    fn fields(text: &str) -> Result<Vec<Field>, ParseError> {
+        file(&name("a/msg/A"), text).map(|mut structures| structures.swap_remove(0).fields)
+    }
+
+    fn field(text: &str) -> (Element, Shape) {
+        let mut fields = fields(text).unwrap();
+        assert_eq!(fields.len(), 1, "{text}");
+        let field = fields.swap_remove(0);
+        (field.element, field.shape)
+    }
+
+    #[test]
+    fn types_are_read_with_their_bounds() {
+        let nested = |text| Element::Nested(name(text));
+        let string = |bound| Element::String { bound };
+        for (text, expected) in [
+            ("bool x", (Element::Bool, Shape::Single)),
+            ("byte x 7", (Element::Byte, Shape::Single)),
+            ("char[] x", (Element::Char, Shape::Unbounded)),
+            ("float32[9] x", (Element::Float32, Shape::Array(9))),
+            ("uint64[<=3] x [1, 2]", (Element::UInt64, Shape::Bounded(3))),
+            ("string x \"a b\"", (string(None), Shape::Single)),
+            ("string<=5 x", (string(Some(5)), Shape::Single)),
+            ("string<=5[<=3] x", (string(Some(5)), Shape::Bounded(3))),
+            (
+                "wstring<=4294967295[] x",
+                (
+                    Element::WString {
+                        bound: Some(u32::MAX),
+                    },
+                    Shape::Unbounded,
+                ),
+            ),
+            ("Point x", (nested("a/msg/Point"), Shape::Single)),
+            ("b/Point[2] x", (nested("b/msg/Point"), Shape::Array(2))),
+            ("  \tint8\t x\r", (Element::Int8, Shape::Single)),
+            ("@key int8 x # why", (Element::Int8, Shape::Single)),
+            ("string x 'a=b'", (string(None), Shape::Single)),
+        ] {
+            assert_eq!(field(text), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn comments_constants_and_empty_lines_are_no_fields() {
+        let text = "\u{feff}# head\n\nuint8 A=1\nint8 B = -1 # b\nstring C=\nstring<=5 D=\"=#\"\n\
+                    \t# indented\nfloat32 value # m\nbyte E=0x1\n@key\n";
+        let fields = fields(text).unwrap();
+        assert_eq!(fields.len(), 1);
+        assert_eq!(fields.first().unwrap().name, "value");
+        assert_eq!(self::fields(""), Ok(vec![]));
+    }
+
+    #[test]
+    fn mistakes_are_told_with_their_line() {
+        let problem = |text: &str| {
+            let text = format!("int8 ok\n# comment\n{text}\nint8 after\n");
+            let error = fields(&text).unwrap_err();
+            assert_eq!(error.line, 3, "{text}");
+            error.to_string()
+        };
+        for (text, expected) in [
+            ("int8", "line 3: a type without a name behind it"),
+            ("int8 9x", "line 3: `9x` is no name"),
+            ("int8 a-b", "line 3: `a-b` is no name"),
+            ("int8 ok", "line 3: `ok` is there twice"),
+            ("time x", "line 3: `time` is no type"),
+            ("a/b/C x", "line 3: `a/b/C` is no type"),
+            ("../C x", "line 3: `../C` is no type"),
+            ("int8] x", "line 3: `int8]` is no type"),
+            ("int8<=5 x", "line 3: `int8<=5` is no type"),
+            ("int8[][] x", "line 3: `int8[][]` is no type"),
+            ("int8[0] x", "line 3: `0` is no size from 1 to 4294967295"),
+            (
+                "int8[4294967296] x",
+                "line 3: `4294967296` is no size from 1 to 4294967295",
+            ),
+            ("int8[+1] x", "line 3: `+1` is no size from 1 to 4294967295"),
+            ("int8[<=] x", "line 3: `` is no size from 1 to 4294967295"),
+            ("string<= x", "line 3: `` is no size from 1 to 4294967295"),
+            ("Point P=1", "line 3: no constant can be like this"),
+            ("int8 P=", "line 3: no constant can be like this"),
+            ("int8[2] P=1", "line 3: no constant can be like this"),
+            ("int8 =1", "line 3: `` is no name"),
+            ("@optional int8 x", "line 3: `@optional` is not supported"),
+            ("---", "line 3: a type without a name behind it"),
+        ] {
+            assert_eq!(problem(text), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn services_have_two_parts_and_actions_three() {
+        let service = file(&name("a/srv/A"), "int8 x\n---   \n---").unwrap_err();
+        assert_eq!(
+            service.to_string(),
+            "line 3: 1 lines `---` expected, found 2"
+        );
+        let parts = file(&name("a/srv/A"), "int8 x\r\n---\r\nB y\r\n").unwrap();
+        assert_eq!(parts.len(), 2);
+        let parts = file(&name("a/action/A"), "---\n#\n---\nint8 x").unwrap();
+        let counts: Vec<_> = parts
+            .iter()
+            .map(|part| (part.name.name(), part.fields.len()))
+            .collect();
+        assert_eq!(counts, [("A_Goal", 0), ("A_Result", 0), ("A_Feedback", 1)]);
+        let empty = file(&name("a/action/A"), "").unwrap_err();
+        assert_eq!(empty.to_string(), "line 1: 2 lines `---` expected, found 0");
+    }
+
+    #[test]
+    fn sizes_are_bounded() {
+        let long = "#".repeat(MAX_TEXT + 1);
+        assert_eq!(fields(&long).unwrap_err().problem, Problem::TooLong);
+        let many: String = (0..=MAX_FIELDS)
+            .map(|index| format!("int8 f{index}\n"))
+            .collect();
+        let error = fields(&many).unwrap_err();
+        assert_eq!(
+            (error.line, error.problem),
+            (MAX_FIELDS + 1, Problem::TooMany)
+        );
+        let error = fields(&format!("{} x", "y".repeat(100_000))).unwrap_err();
+        assert!(error.to_string().len() < 100);
+    }
+}

@@ -1,0 +1,227 @@
+//! A type's definition as one text, the way bags carry it (encoding `ros2msg` of MCAP's registry).
+//!
+//! In the order in which `rosbag2_cpp` writes it: the type's own text, then below a line of `=`
+//! each message it needs, once, sorted within a file and each followed by its own.
+
+use std::collections::BTreeSet;
+use std::fmt::Write as _;
+
+use super::definition::{
+    Definition, Element, Kind, MessageType, SchemaError, Shape, Structure, TypeName,
+};
+
+/// The line between definitions.
+const LINE: &str =
+    "================================================================================";
+const ENCODING: &str = "ros2msg";
+
+impl MessageType {
+    /// Encoding and text for a bag's schema: the files as they were read. Of a service's event it is
+    /// the service's file below a heading, as `rosbag2` has it. The other types that services and
+    /// actions imply stand in no file: their text is made from their members.
+    pub fn schema_text(&self) -> (&'static str, String) {
+        let mut text = String::new();
+        let mut written = BTreeSet::new();
+        if let Some(definition) = self.definitions.get(&self.root)
+            && self.root.kind() == Kind::Message
+        {
+            self.append_file(&mut text, definition, &mut written);
+        } else if let Some(definition) = self.service_of_event() {
+            heading(&mut text, "SRV", &definition.name.to_string());
+            self.append_file(&mut text, definition, &mut written);
+        } else if let Some(structure) = self.structure(&self.root) {
+            self.append_structure(&mut text, structure, &mut written);
+        }
+        (ENCODING, text)
+    }
+
+    fn service_of_event(&self) -> Option<&Definition> {
+        let name = self.root.name().strip_suffix("_Event")?;
+        let file = TypeName::new(self.root.package(), Kind::Service, name).ok()?;
+        (self.root.kind() == Kind::Service)
+            .then(|| self.definitions.get(&file))?
+            .map(AsRef::as_ref)
+    }
+
+    /// A file and what it uses. As deep as types are nested, which is bounded.
+    fn append_file<'a>(
+        &'a self,
+        text: &mut String,
+        definition: &'a Definition,
+        written: &mut BTreeSet<&'a TypeName>,
+    ) {
+        text.push_str(&definition.text);
+        for name in &definition.uses {
+            if written.insert(name)
+                && let Some(next) = self.definitions.get(name)
+            {
+                text.push('\n');
+                heading(text, "MSG", &short(name));
+                self.append_file(text, next, written);
+            }
+        }
+    }
+
+    /// A type that stands in no file, and what it uses.
+    fn append_structure<'a>(
+        &'a self,
+        text: &mut String,
+        structure: &'a Structure,
+        written: &mut BTreeSet<&'a TypeName>,
+    ) {
+        text.push_str(&members(structure));
+        let nested = structure
+            .fields
+            .iter()
+            .filter_map(|field| match &field.element {
+                Element::Nested(name) => Some(name),
+                _ => None,
+            });
+        for name in nested.collect::<BTreeSet<_>>() {
+            if !written.insert(name) {
+                continue;
+            }
+            text.push('\n');
+            heading(text, "MSG", &short(name));
+            if let Some(definition) = self.definitions.get(name)
+                && name.kind() == Kind::Message
+            {
+                self.append_file(text, definition, written);
+            } else if let Some(next) = self.structure(name) {
+                self.append_structure(text, next, written);
+            }
+        }
+    }
+}
+
+/// `package/Type`: as it is written in a `.msg` file.
+fn short(name: &TypeName) -> String {
+    format!("{}/{}", name.package(), name.name())
+}
+
+fn heading(text: &mut String, kind: &str, name: &str) {
+    let _ = writeln!(text, "{LINE}\n{kind}: {name}");
+}
+
+/// The lines of a `.msg` file that has these members.
+pub(super) fn members(structure: &Structure) -> String {
+    let mut text = String::new();
+    for field in &structure.fields {
+        let _ = match &field.element {
+            Element::Bool => write!(text, "bool"),
+            Element::Byte => write!(text, "byte"),
+            Element::Char => write!(text, "char"),
+            Element::Int8 => write!(text, "int8"),
+            Element::UInt8 => write!(text, "uint8"),
+            Element::Int16 => write!(text, "int16"),
+            Element::UInt16 => write!(text, "uint16"),
+            Element::Int32 => write!(text, "int32"),
+            Element::UInt32 => write!(text, "uint32"),
+            Element::Int64 => write!(text, "int64"),
+            Element::UInt64 => write!(text, "uint64"),
+            Element::Float32 => write!(text, "float32"),
+            Element::Float64 => write!(text, "float64"),
+            Element::String { bound: None } => write!(text, "string"),
+            Element::String { bound: Some(bound) } => write!(text, "string<={bound}"),
+            Element::WString { bound: None } => write!(text, "wstring"),
+            Element::WString { bound: Some(bound) } => write!(text, "wstring<={bound}"),
+            Element::Nested(name) => write!(text, "{}", short(name)),
+        };
+        let _ = match field.shape {
+            Shape::Single => Ok(()),
+            Shape::Array(size) => write!(text, "[{size}]"),
+            Shape::Bounded(size) => write!(text, "[<={size}]"),
+            Shape::Unbounded => write!(text, "[]"),
+        };
+        let _ = writeln!(text, " {}", field.name);
+    }
+    text
+}
+
+/// The definitions in a schema's text, each with the type that it is of.
+pub(super) fn parts<'a>(
+    root: &TypeName,
+    text: &'a str,
+) -> Result<Vec<(TypeName, &'a str)>, SchemaError> {
+    let mut parts = Vec::new();
+    let (mut name, mut start, mut offset) = (root.clone(), 0, 0);
+    let mut lines = text.split_inclusive('\n').enumerate();
+    while let Some((index, line)) = lines.next() {
+        let line_start = offset;
+        offset += line.len();
+        if line.trim_end() != LINE {
+            continue;
+        }
+        let (_, below) = lines.next().unwrap_or((index, ""));
+        offset += below.len();
+        let next = below.trim_end().strip_prefix("MSG: ").and_then(message);
+        let next = next.ok_or(SchemaError::Heading { line: index + 2 })?;
+        let part = text.get(start..line_start).unwrap_or_default();
+        parts.push((std::mem::replace(&mut name, next), part));
+        start = offset;
+    }
+    parts.push((name, text.get(start..).unwrap_or_default()));
+    Ok(parts)
+}
+
+/// `package/Type`, or `package/msg/Type` as some writers have it.
+fn message(text: &str) -> Option<TypeName> {
+    if let Ok(name) = text.parse() {
+        return Some(name);
+    }
+    let (package, name) = text.split_once('/')?;
+    TypeName::new(package, Kind::Message, name).ok()
+}
+
+#[cfg(test)]
+#[expect(clippy::unwrap_used, reason = "a failed expectation may panic")]
+mod tests {
+    use super::*;
+
+    const STAMPED: &str = "\
+# This represents a Point with reference coordinate frame and timestamp
+
+std_msgs/Header header
+Point point
+
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp # when
+string frame_id
+
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+";
+
+    #[test]
+    fn a_schema_is_written_as_it_was_read() {
+        let root = "geometry_msgs/msg/PointStamped".parse().unwrap();
+        let parsed = MessageType::parse(&root, STAMPED).unwrap();
+        // What is between two definitions ends with an empty line that belongs to the separator.
+        let tight = STAMPED.replace("\n\n====", "\n====");
+        let again = MessageType::parse(&root, &tight).unwrap();
+        assert_eq!(again.schema_text(), (ENCODING, STAMPED.to_owned()));
+        assert_eq!(parsed.type_hash(), again.type_hash());
+        assert_eq!(parsed.structures().count(), 4);
+    }
+
+    #[test]
+    fn both_ways_of_writing_a_heading_are_read() {
+        let text = format!("B b\n{LINE}\nMSG: a/msg/B\nint8 x\n");
+        let read = MessageType::parse(&"a/msg/A".parse().unwrap(), &text).unwrap();
+        assert_eq!(read.structures().count(), 2);
+        for heading in ["IDL: a/msg/B", "MSG: B", "MSG: a/../B", ""] {
+            let text = format!("B b\n{LINE}\n{heading}\nint8 x\n");
+            let error = MessageType::parse(&"a/msg/A".parse().unwrap(), &text).unwrap_err();
+            assert_eq!(error, SchemaError::Heading { line: 3 }, "{heading}");
+        }
+    }
+}
