@@ -9,6 +9,7 @@ pub mod discover;
 pub mod message;
 pub mod model;
 pub mod privilege;
+pub mod ros2;
 pub mod run;
 pub mod state;
 pub mod surface;

@@ -1,0 +1,11 @@
+//! What `rp topic`, `rp node`, `rp service` and `rp action` say: the text of the `ros2` command
+//! line in the dialect of a distribution.
+//!
+//! Pure: facts in, text out. Nothing here asks an agent, reads a clock or prints.
+
+mod dialect;
+pub mod rates;
+mod refusal;
+
+pub use dialect::Dialect;
+pub use refusal::Refused;

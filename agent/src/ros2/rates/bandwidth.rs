@@ -1,0 +1,181 @@
+//! Bytes a second of one topic, as `ros2 topic bw` reports them.
+//!
+//! The span is from the oldest message of the window until now, so it decays when nothing comes.
+//! A size is the serialized payload with its encapsulation, without what RTPS and UDP add.
+
+use super::NANOSECOND;
+use super::window::Window;
+
+/// Sizes and arrivals of one topic.
+#[derive(Debug)]
+pub struct Sizes {
+    sizes: Window,
+    times: Window,
+    newest: i64,
+    printed: Option<i64>,
+}
+
+/// Numbers of one report, as text with one unit.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Bandwidth {
+    /// With `/s`.
+    pub bandwidth: String,
+    /// Number of messages.
+    pub window: String,
+    /// Mean size.
+    pub mean: String,
+    /// Smallest size.
+    pub min: String,
+    /// Largest size.
+    pub max: String,
+}
+
+/// Now is not after the oldest message: the clock was set back, and the window is empty now.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TimeReset;
+
+impl Sizes {
+    /// No message yet.
+    #[must_use]
+    pub fn new(window: usize) -> Self {
+        Self {
+            sizes: Window::new(window),
+            times: Window::new(window),
+            newest: 0,
+            printed: None,
+        }
+    }
+
+    /// Takes a message.
+    pub fn arrived(&mut self, time: i64, size: u32) {
+        self.sizes.push(i64::from(size));
+        self.times.push(time);
+        self.newest = time;
+    }
+
+    /// The report of now, as soon as there are two messages.
+    ///
+    /// # Errors
+    /// [`TimeReset`].
+    pub fn report(&mut self, now: i64) -> Result<Option<Bandwidth>, TimeReset> {
+        let (Some(oldest), Some(found)) = (self.times.oldest(), self.sizes.statistics()) else {
+            return Ok(None);
+        };
+        if found.count < 2 {
+            return Ok(None);
+        }
+        if now <= oldest {
+            self.sizes.clear();
+            self.times.clear();
+            return Err(TimeReset);
+        }
+        self.printed = Some(self.newest);
+        let elapsed = now.saturating_sub(oldest) as f64 * NANOSECOND;
+        let bytes_per_second = self.sizes.sum() as f64 / elapsed;
+        let unit = Unit::of(bytes_per_second);
+        Ok(Some(Bandwidth {
+            bandwidth: unit.text(bytes_per_second) + "/s",
+            window: found.count.to_string(),
+            mean: unit.text(found.mean),
+            min: unit.text(found.min as f64),
+            max: unit.text(found.max as f64),
+        }))
+    }
+
+    /// The report of now where silence is not reported (Lyrical and later).
+    ///
+    /// # Errors
+    /// [`TimeReset`].
+    pub fn report_of_new(&mut self, now: i64) -> Result<Option<Bandwidth>, TimeReset> {
+        if self.printed == Some(self.newest) {
+            return Ok(None);
+        }
+        self.report(now)
+    }
+}
+
+impl Bandwidth {
+    /// The two lines of a single topic.
+    #[must_use]
+    pub fn lines(&self) -> String {
+        format!(
+            "{} from {} messages\n\tMessage size mean: {} min: {} max: {}\n",
+            self.bandwidth, self.window, self.mean, self.min, self.max
+        )
+    }
+}
+
+/// One for all numbers of a report, decimal, and never more than mega.
+#[derive(Clone, Copy)]
+enum Unit {
+    Bytes,
+    Kilobytes,
+    Megabytes,
+}
+
+impl Unit {
+    fn of(bytes_per_second: f64) -> Self {
+        if bytes_per_second < 1000.0 {
+            Self::Bytes
+        } else if bytes_per_second < 1_000_000.0 {
+            Self::Kilobytes
+        } else {
+            Self::Megabytes
+        }
+    }
+
+    fn text(self, bytes: f64) -> String {
+        match self {
+            Self::Bytes => format!("{bytes:.0} B"),
+            Self::Kilobytes => format!("{:.2} KB", bytes / 1000.0),
+            // In two steps as the original: one division by a million can round differently.
+            Self::Megabytes => format!("{:.2} MB", bytes / 1000.0 / 1000.0),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SECOND: i64 = 1_000_000_000;
+
+    #[test]
+    fn the_span_goes_until_now() {
+        let mut sizes = Sizes::new(100);
+        sizes.arrived(10 * SECOND, 28);
+        assert_eq!(sizes.report(11 * SECOND), Ok(None));
+        sizes.arrived(10 * SECOND + SECOND / 2, 32);
+        let text = |sizes: &mut Sizes, now| sizes.report(now).unwrap().unwrap().lines();
+        assert_eq!(
+            text(&mut sizes, 11 * SECOND),
+            "60 B/s from 2 messages\n\tMessage size mean: 30 B min: 28 B max: 32 B\n"
+        );
+        // Nothing new: 60 bytes in 4 s.
+        assert!(text(&mut sizes, 14 * SECOND).starts_with("15 B/s from 2"));
+        assert_eq!(sizes.report_of_new(14 * SECOND), Ok(None));
+    }
+
+    #[test]
+    fn one_unit_serves_all_numbers() {
+        let mut sizes = Sizes::new(100);
+        for _ in 0..3 {
+            sizes.arrived(SECOND, 644_148);
+        }
+        let text = |sizes: &mut Sizes, now| sizes.report(now).unwrap().unwrap().lines();
+        assert_eq!(
+            text(&mut sizes, 2 * SECOND),
+            "1.93 MB/s from 3 messages\n\tMessage size mean: 0.64 MB min: 0.64 MB max: 0.64 MB\n"
+        );
+        assert!(text(&mut sizes, 3 * SECOND).starts_with("966.22 KB/s from 3"));
+    }
+
+    #[test]
+    fn a_clock_set_back_empties_the_window() {
+        let mut sizes = Sizes::new(100);
+        sizes.arrived(10 * SECOND, 1);
+        sizes.arrived(11 * SECOND, 1);
+        assert_eq!(sizes.report(10 * SECOND), Err(TimeReset));
+        assert_eq!(sizes.report(12 * SECOND), Ok(None));
+    }
+}

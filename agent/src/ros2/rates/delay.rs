@@ -1,0 +1,125 @@
+//! The age of one topic's messages by their header, as `ros2 topic delay` reports it.
+//!
+//! The age is that of the capture: what a subscriber's process adds is not in it.
+
+use super::NANOSECOND;
+use super::window::Window;
+
+/// Ages of one topic's messages.
+#[derive(Debug)]
+pub struct Ages {
+    ages: Window,
+    first: Option<i64>,
+    newest: i64,
+    printed: Option<i64>,
+}
+
+/// Numbers of one report, as text.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Age {
+    /// Mean age in seconds.
+    pub delay: String,
+    /// Smallest age, in seconds.
+    pub min: String,
+    /// Largest age, in seconds.
+    pub max: String,
+    /// Standard deviation, in seconds.
+    pub standard_deviation: String,
+    /// Number of messages.
+    pub window: String,
+}
+
+impl Ages {
+    /// No message yet.
+    #[must_use]
+    pub fn new(window: usize) -> Self {
+        Self {
+            ages: Window::new(window),
+            first: None,
+            newest: 0,
+            printed: None,
+        }
+    }
+
+    /// Takes a message. The first one is not counted, nor is one before the first, when the clock
+    /// was set back.
+    pub fn arrived(&mut self, time: i64, stamp: i64) {
+        if self.first.is_none_or(|first| first > time) {
+            self.first = Some(time);
+            self.ages.clear();
+        } else {
+            self.ages.push(time.saturating_sub(stamp));
+        }
+        self.newest = time;
+    }
+
+    /// The lines of every second; nothing before the second message.
+    pub fn lines(&mut self) -> Option<String> {
+        if self.ages.is_empty() {
+            return None;
+        }
+        let text = match self.report() {
+            Some(age) => age.lines(),
+            None => "no new messages\n".to_owned(),
+        };
+        Some(text)
+    }
+
+    /// The report of every second, when a message came since the one before.
+    pub fn report(&mut self) -> Option<Age> {
+        if self.printed == Some(self.newest) {
+            return None;
+        }
+        let found = self.ages.statistics()?;
+        self.printed = Some(self.newest);
+        Some(Age {
+            delay: format!("{:.3}", found.mean * NANOSECOND),
+            min: format!("{:.3}", found.min as f64 * NANOSECOND),
+            max: format!("{:.3}", found.max as f64 * NANOSECOND),
+            standard_deviation: format!("{:.5}", found.standard_deviation * NANOSECOND),
+            window: found.count.to_string(),
+        })
+    }
+}
+
+impl Age {
+    fn lines(&self) -> String {
+        format!(
+            "average delay: {}\n\tmin: {}s max: {}s std dev: {}s window: {}\n",
+            self.delay, self.min, self.max, self.standard_deviation, self.window
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MILLISECOND: i64 = 1_000_000;
+
+    #[test]
+    fn the_first_message_is_not_counted() {
+        let mut ages = Ages::new(10);
+        ages.arrived(1000 * MILLISECOND, 500 * MILLISECOND);
+        assert_eq!(ages.lines(), None);
+        ages.arrived(1100 * MILLISECOND, 1099 * MILLISECOND);
+        ages.arrived(1200 * MILLISECOND, 1197 * MILLISECOND);
+        // 1 ms and 3 ms: the mean is 2 ms, each is 1 ms away from it.
+        let text = "average delay: 0.002\n\tmin: 0.001s max: 0.003s std dev: 0.00100s window: 2\n";
+        assert_eq!(ages.lines().as_deref(), Some(text));
+        assert_eq!(ages.lines().as_deref(), Some("no new messages\n"));
+        ages.arrived(1300 * MILLISECOND, 1300 * MILLISECOND);
+        assert!(ages.lines().unwrap().ends_with("window: 3\n"));
+    }
+
+    #[test]
+    fn a_stamp_of_the_future_is_a_delay_below_zero() {
+        let mut ages = Ages::new(10);
+        ages.arrived(1000 * MILLISECOND, 0);
+        ages.arrived(1000 * MILLISECOND, 1000 * MILLISECOND + 400_000);
+        // Half a millisecond and less rounds to a zero that keeps its sign, as in the original.
+        let text =
+            "average delay: -0.000\n\tmin: -0.000s max: -0.000s std dev: 0.00000s window: 1\n";
+        assert_eq!(ages.lines().as_deref(), Some(text));
+    }
+}

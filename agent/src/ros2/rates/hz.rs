@@ -1,0 +1,188 @@
+//! The times between messages of one topic, as `ros2 topic hz` reports them.
+//!
+//! Arrival is when the message was captured, not when somebody came to read it.
+
+use super::window::Window;
+use super::{NANOSECOND, SECOND};
+
+/// Arrivals of one topic.
+#[derive(Debug)]
+pub struct Intervals {
+    between: Window,
+    first: Option<i64>,
+    newest: i64,
+    printed: Option<i64>,
+}
+
+/// Numbers of one report, as text.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Rate {
+    /// Messages a second.
+    pub rate: String,
+    /// Shortest interval, in seconds.
+    pub min: String,
+    /// Longest interval, in seconds.
+    pub max: String,
+    /// Standard deviation of the intervals, in seconds.
+    pub standard_deviation: String,
+    /// Number of intervals.
+    pub window: String,
+}
+
+impl Intervals {
+    /// No message yet.
+    #[must_use]
+    pub fn new(window: usize) -> Self {
+        Self {
+            between: Window::new(window),
+            first: None,
+            newest: 0,
+            printed: None,
+        }
+    }
+
+    /// Takes a message. The first one only begins; so does one before the first, when the clock was
+    /// set back.
+    pub fn arrived(&mut self, time: i64) {
+        if self.first.is_none_or(|first| first > time) {
+            self.first = Some(time);
+            self.between.clear();
+        } else {
+            self.between.push(time.saturating_sub(self.newest));
+        }
+        self.newest = time;
+    }
+
+    /// The report that a message brings about (Humble, Jazzy): when it came a second or more
+    /// after the one of the report before. The first interval only says from when to count.
+    pub fn report_at_message(&mut self) -> Option<Rate> {
+        if self.between.is_empty() {
+            return None;
+        }
+        let Some(printed) = self.printed else {
+            self.printed = Some(self.newest);
+            return None;
+        };
+        // A clock set back puts the newest below the printed: silence until it is a second above.
+        if self.newest < printed.saturating_add(SECOND) {
+            return None;
+        }
+        self.report()
+    }
+
+    /// The report of every second (Kilted and later): when a message came since the one before.
+    pub fn report_at_second(&mut self) -> Option<Rate> {
+        if self.printed == Some(self.newest) {
+            return None;
+        }
+        self.report()
+    }
+
+    fn report(&mut self) -> Option<Rate> {
+        let found = self.between.statistics()?;
+        self.printed = Some(self.newest);
+        let rate = if found.mean > 0.0 {
+            1.0 / found.mean
+        } else {
+            0.0
+        };
+        Some(Rate {
+            rate: format!("{:.3}", rate * 1e9),
+            min: format!("{:.3}", found.min as f64 * NANOSECOND),
+            max: format!("{:.3}", found.max as f64 * NANOSECOND),
+            standard_deviation: format!("{:.5}", found.standard_deviation * NANOSECOND),
+            window: found.count.to_string(),
+        })
+    }
+}
+
+impl Rate {
+    /// The two lines of a single topic.
+    #[must_use]
+    pub fn lines(&self) -> String {
+        format!(
+            "average rate: {}\n\tmin: {}s max: {}s std dev: {}s window: {}\n",
+            self.rate, self.min, self.max, self.standard_deviation, self.window
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const START: i64 = 1_795_142_000_000_000_000;
+
+    fn at(intervals: &mut Intervals, milliseconds: i64) -> Option<String> {
+        intervals.arrived(START + milliseconds * 1_000_000);
+        intervals.report_at_message().map(|rate| rate.lines())
+    }
+
+    #[test]
+    fn a_message_a_second_after_the_last_report_brings_the_next() {
+        let mut intervals = Intervals::new(10_000);
+        // Messages every 100 ms: the second one is the first to be remembered as reported.
+        for step in 0..=10 {
+            assert_eq!(at(&mut intervals, step * 100), None, "{step}");
+        }
+        let first =
+            "average rate: 10.000\n\tmin: 0.100s max: 0.100s std dev: 0.00000s window: 11\n";
+        assert_eq!(at(&mut intervals, 1100).as_deref(), Some(first));
+        // 13 intervals in 2.1 s.
+        assert_eq!(at(&mut intervals, 1999), None);
+        let second =
+            "average rate: 6.190\n\tmin: 0.100s max: 0.899s std dev: 0.21289s window: 13\n";
+        assert_eq!(at(&mut intervals, 2100).as_deref(), Some(second));
+    }
+
+    #[test]
+    fn a_slow_topic_reports_with_each_message_from_the_third_on() {
+        let mut intervals = Intervals::new(10_000);
+        assert_eq!(at(&mut intervals, 0), None);
+        assert_eq!(at(&mut intervals, 5000), None);
+        for step in 2..5 {
+            assert!(at(&mut intervals, step * 5000).is_some(), "{step}");
+        }
+    }
+
+    #[test]
+    fn the_window_counts_intervals() {
+        let mut intervals = Intervals::new(2);
+        for time in [0, 900, 1000, 1010] {
+            at(&mut intervals, time);
+        }
+        let text = at(&mut intervals, 1910).unwrap();
+        assert!(text.contains("min: 0.010s max: 0.900s"), "{text}");
+        assert!(text.ends_with("window: 2\n"), "{text}");
+    }
+
+    #[test]
+    fn a_clock_set_back_begins_again() {
+        let mut intervals = Intervals::new(100);
+        at(&mut intervals, 10_000);
+        at(&mut intervals, 10_100);
+        assert_eq!(at(&mut intervals, 5_000), None);
+        intervals.arrived(START + 5_500 * 1_000_000);
+        let rate = intervals.report_at_second().unwrap();
+        assert_eq!((rate.rate.as_str(), rate.window.as_str()), ("2.000", "1"));
+    }
+
+    #[test]
+    fn messages_at_the_same_instant_have_no_rate() {
+        let mut intervals = Intervals::new(100);
+        intervals.arrived(START);
+        intervals.arrived(START);
+        let rate = intervals.report_at_second().unwrap();
+        assert_eq!(rate.rate, "0.000");
+    }
+
+    #[test]
+    fn a_second_without_a_message_has_no_report() {
+        let mut intervals = Intervals::new(100);
+        intervals.arrived(START);
+        assert_eq!(intervals.report_at_second(), None);
+        intervals.arrived(START + 1);
+        assert!(intervals.report_at_second().is_some());
+        assert_eq!(intervals.report_at_second(), None);
+    }
+}

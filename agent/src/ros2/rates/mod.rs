@@ -1,0 +1,465 @@
+//! What `ros2 topic hz`, `bw` and `delay` say, by dialect: text from samples and a clock.
+//!
+//! A state machine without clock or I/O: time comes in with the samples and with the stream's clock,
+//! so a live stream and a capture print the same. Every sample on the wire counts, at the time it
+//! was captured.
+
+pub mod bandwidth;
+pub mod delay;
+pub mod hz;
+pub mod table;
+pub mod window;
+
+use std::collections::HashMap;
+use std::fmt::Write as _;
+use std::mem;
+
+use self::bandwidth::{Bandwidth, Sizes};
+use self::delay::{Age, Ages};
+use self::hz::{Intervals, Rate};
+use self::table::table;
+use super::{Dialect, Refused};
+use crate::model::header::begins_with_header;
+
+const SECOND: i64 = 1_000_000_000;
+/// Of a nanosecond, in seconds.
+const NANOSECOND: f64 = 1e-9;
+/// Clears a terminal, as `--all` does before each table.
+const CLEAR: &str = "\x1b[H\x1b[2J\n";
+/// A clock that jumped further has been set: the seconds between are not made up for.
+const LONGEST_JUMP: i64 = 3600 * SECOND;
+
+/// What is asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Quantity {
+    /// `hz`
+    Rate,
+    /// `bw`
+    Bandwidth,
+    /// `delay`
+    Delay,
+}
+
+/// One command: what it measures, of which topics, in whose words.
+#[derive(Debug)]
+pub struct Rates {
+    quantity: Quantity,
+    dialect: Dialect,
+    window: usize,
+    all: bool,
+    topics: Vec<Watched>,
+    places: HashMap<String, usize>,
+    /// When the next report of every second is due.
+    next: Option<i64>,
+    said: Said,
+}
+
+/// Text for the two outputs.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Said {
+    /// For standard output.
+    pub out: String,
+    /// For standard error.
+    pub err: String,
+}
+
+/// Why a command is over.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum End {
+    /// There is nothing to do.
+    Idle,
+    /// It cannot be done; the text says why.
+    Refused(Refused),
+}
+
+/// A topic by the name that was typed and the one that it has.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Named {
+    /// As typed: what is printed.
+    pub typed: String,
+    /// With its namespace.
+    pub name: String,
+}
+
+/// One message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Arrival {
+    /// When it was captured, in nanoseconds since the epoch.
+    pub time: i64,
+    /// Bytes of its serialized payload with encapsulation.
+    pub size: u32,
+    /// The stamp in its header, in nanoseconds since the epoch.
+    pub header_stamp: Option<i64>,
+}
+
+#[derive(Debug)]
+struct Watched {
+    topic: Named,
+    /// Nothing as long as the topic is not there.
+    message_type: Option<String>,
+    series: Series,
+}
+
+#[derive(Debug)]
+enum Series {
+    Rate(Intervals),
+    Bandwidth(Sizes),
+    Delay(Ages),
+}
+
+impl Rates {
+    /// Of these topics.
+    #[must_use]
+    pub fn of(quantity: Quantity, dialect: Dialect, window: usize, topics: Vec<Named>) -> Self {
+        let mut rates = Self::empty(quantity, dialect, window, false);
+        for topic in topics {
+            rates.add(topic);
+        }
+        rates
+    }
+
+    /// Of all topics, also of those that appear later.
+    #[must_use]
+    pub fn of_all(quantity: Quantity, dialect: Dialect, window: usize) -> Self {
+        Self::empty(quantity, dialect, window, true)
+    }
+
+    fn empty(quantity: Quantity, dialect: Dialect, window: usize, all: bool) -> Self {
+        Self {
+            quantity,
+            dialect,
+            window,
+            all,
+            topics: Vec::new(),
+            places: HashMap::new(),
+            next: None,
+            said: Said::default(),
+        }
+    }
+
+    /// The topics that are there at the beginning, in order, with their types.
+    ///
+    /// # Errors
+    /// When the command is over with that.
+    pub fn opened(&mut self, present: &[(String, Vec<String>)]) -> Result<(), End> {
+        if self.all {
+            let present = present.iter();
+            let present: Vec<_> = present
+                .filter(|(_, types)| self.measurable(types))
+                .collect();
+            if present.is_empty() {
+                self.said.out.push_str("No topics available\n");
+                return Err(End::Idle);
+            }
+            let count = present.len();
+            let _ = writeln!(
+                self.said.out,
+                "Subscribing to all {count} available topics..."
+            );
+            for (name, _) in &present {
+                self.add(Named::absolute(name));
+            }
+            for (name, types) in present {
+                self.appeared(name, types)?;
+            }
+            return Ok(());
+        }
+        let types: HashMap<&str, &Vec<String>> = present
+            .iter()
+            .map(|(name, types)| (name.as_str(), types))
+            .collect();
+        let names = self.topics.iter().map(|watched| watched.topic.clone());
+        for Named { typed, name } in names.collect::<Vec<_>>() {
+            match types.get(name.as_str()) {
+                Some(types) => self.appeared(&name, types)?,
+                None => {
+                    let _ = writeln!(
+                        self.said.out,
+                        "WARNING: topic [{typed}] does not appear to be published yet"
+                    );
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// A topic is there, with these types. What is not asked for is left alone.
+    ///
+    /// # Errors
+    /// When the topic has several types.
+    pub fn appeared(&mut self, name: &str, types: &[String]) -> Result<(), End> {
+        if self.all && !self.places.contains_key(name) && self.measurable(types) {
+            self.add(Named::absolute(name));
+        }
+        let many = self.many();
+        let Some(watched) = self
+            .places
+            .get(name)
+            .and_then(|at| self.topics.get_mut(*at))
+        else {
+            return Ok(());
+        };
+        let typed = &watched.topic.typed;
+        let message_type = match types {
+            [] => return Ok(()),
+            [one] => one,
+            [first, ..] if self.all => first,
+            several => {
+                return Err(End::Refused(Refused(format!(
+                    "Cannot echo topic '{typed}', as it contains more than one type: [{}]",
+                    several.join(", ")
+                ))));
+            }
+        };
+        if watched.message_type.is_some() {
+            return Ok(());
+        }
+        watched.message_type = Some(message_type.clone());
+        if many || self.quantity == Quantity::Bandwidth {
+            let _ = writeln!(self.said.out, "Subscribed to [{typed}]");
+        }
+        Ok(())
+    }
+
+    /// A message of a topic.
+    ///
+    /// # Errors
+    /// When its delay is asked for and it has no header.
+    pub fn arrived(&mut self, name: &str, arrival: &Arrival) -> Result<(), End> {
+        self.clock(arrival.time);
+        let reported_at_message = self.reported_at_message();
+        let Some(watched) = self
+            .places
+            .get(name)
+            .and_then(|at| self.topics.get_mut(*at))
+        else {
+            return Ok(());
+        };
+        let Some(message_type) = &watched.message_type else {
+            return Ok(());
+        };
+        match &mut watched.series {
+            Series::Rate(intervals) => {
+                intervals.arrived(arrival.time);
+                if reported_at_message && let Some(rate) = intervals.report_at_message() {
+                    self.said.out.push_str(&rate.lines());
+                }
+            }
+            Series::Bandwidth(sizes) => sizes.arrived(arrival.time, arrival.size),
+            Series::Delay(ages) => match arrival.header_stamp {
+                Some(stamp) => ages.arrived(arrival.time, stamp),
+                None if begins_with_header(message_type) || self.all => {}
+                None => return Err(End::Refused(Refused("msg does not have header".to_owned()))),
+            },
+        }
+        Ok(())
+    }
+
+    /// Everything before this time was given.
+    pub fn clock(&mut self, now: i64) {
+        if self.reported_at_message() || self.topics.iter().all(|one| one.message_type.is_none()) {
+            return;
+        }
+        let next = match self.next {
+            None => {
+                self.clear();
+                now.saturating_add(SECOND)
+            }
+            // Set back, or far ahead: the seconds are counted from here.
+            Some(next) if next.saturating_sub(now) > 2 * SECOND => now.saturating_add(SECOND),
+            Some(next) if now.saturating_sub(next) > LONGEST_JUMP => now,
+            Some(next) => next,
+        };
+        let mut due = next;
+        while due <= now {
+            self.report(due);
+            due = due.saturating_add(SECOND);
+        }
+        self.next = Some(due);
+    }
+
+    /// What was said since the last time.
+    pub fn take(&mut self) -> Said {
+        mem::take(&mut self.said)
+    }
+
+    fn add(&mut self, topic: Named) {
+        if self.places.contains_key(&topic.name) {
+            return;
+        }
+        let series = match self.quantity {
+            Quantity::Rate => Series::Rate(Intervals::new(self.window)),
+            Quantity::Bandwidth => Series::Bandwidth(Sizes::new(self.window)),
+            Quantity::Delay => Series::Delay(Ages::new(self.window)),
+        };
+        self.places.insert(topic.name.clone(), self.topics.len());
+        self.topics.push(Watched {
+            topic,
+            message_type: None,
+            series,
+        });
+    }
+
+    /// With `--all`, delays are those of the types that have a header.
+    fn measurable(&self, types: &[String]) -> bool {
+        let mut types = types.iter();
+        self.quantity != Quantity::Delay || types.any(|one| begins_with_header(one))
+    }
+
+    fn many(&self) -> bool {
+        self.topics.len() > 1
+    }
+
+    fn reported_at_message(&self) -> bool {
+        let at_message = self.quantity == Quantity::Rate && self.dialect < Dialect::Kilted;
+        at_message && !self.all && !self.many()
+    }
+
+    fn clear(&mut self) {
+        if self.all {
+            self.said.out.push_str(CLEAR);
+        }
+    }
+
+    fn report(&mut self, now: i64) {
+        self.clear();
+        let text = match self.quantity {
+            Quantity::Rate => self.rates(),
+            Quantity::Bandwidth => self.bandwidths(now),
+            Quantity::Delay => self.delays(),
+        };
+        self.said.out.push_str(&text);
+    }
+
+    fn rates(&mut self) -> String {
+        let many = self.many();
+        let mut rows = Vec::new();
+        for watched in &mut self.topics {
+            let Series::Rate(intervals) = &mut watched.series else {
+                continue;
+            };
+            let Some(rate) = intervals.report_at_second() else {
+                continue;
+            };
+            if !many {
+                return rate.lines();
+            }
+            let Rate {
+                rate,
+                min,
+                max,
+                standard_deviation,
+                window,
+            } = rate;
+            rows.push([
+                watched.topic.typed.clone(),
+                rate,
+                min,
+                max,
+                standard_deviation,
+                window,
+            ]);
+        }
+        let headings = [
+            "topic",
+            "rate",
+            "min_delta",
+            "max_delta",
+            "std_dev",
+            "window",
+        ];
+        table(headings, &rows)
+    }
+
+    fn bandwidths(&mut self, now: i64) -> String {
+        let many = self.many();
+        let new_only = many || self.all || self.dialect >= Dialect::Rolling;
+        let mut rows = Vec::new();
+        for watched in &mut self.topics {
+            let Series::Bandwidth(sizes) = &mut watched.series else {
+                continue;
+            };
+            let report = if new_only {
+                sizes.report_of_new(now)
+            } else {
+                sizes.report(now)
+            };
+            let report = report.unwrap_or_else(|_| {
+                self.said.err.push_str("WARNING: time is reset!\n");
+                None
+            });
+            let Some(report) = report else {
+                continue;
+            };
+            if !many {
+                return report.lines();
+            }
+            let Bandwidth {
+                bandwidth,
+                window,
+                mean,
+                min,
+                max,
+            } = report;
+            rows.push([
+                watched.topic.typed.clone(),
+                bandwidth,
+                window,
+                mean,
+                min,
+                max,
+            ]);
+        }
+        table(
+            ["topic", "bandwidth", "window", "mean", "min", "max"],
+            &rows,
+        )
+    }
+
+    fn delays(&mut self) -> String {
+        let many = self.many();
+        let mut rows = Vec::new();
+        for watched in &mut self.topics {
+            let Series::Delay(ages) = &mut watched.series else {
+                continue;
+            };
+            if !many {
+                return ages.lines().unwrap_or_default();
+            }
+            let Some(Age {
+                delay,
+                min,
+                max,
+                standard_deviation,
+                window,
+            }) = ages.report()
+            else {
+                continue;
+            };
+            rows.push([
+                watched.topic.typed.clone(),
+                delay,
+                min,
+                max,
+                standard_deviation,
+                window,
+            ]);
+        }
+        table(["topic", "delay", "min", "max", "std_dev", "window"], &rows)
+    }
+}
+
+impl Named {
+    /// A name that was typed in full, or was not typed at all.
+    #[must_use]
+    pub fn absolute(name: &str) -> Self {
+        let name = name.to_owned();
+        Self {
+            typed: name.clone(),
+            name,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

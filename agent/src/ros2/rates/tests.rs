@@ -1,0 +1,292 @@
+use serde::Deserialize;
+
+use super::*;
+
+const START: i64 = 1_795_142_000_000_000_000;
+const MILLISECOND: i64 = 1_000_000;
+const IMU: &str = "sensor_msgs/msg/Imu";
+const STRING: &str = "std_msgs/msg/String";
+
+#[derive(Deserialize)]
+struct Case {
+    kind: String,
+    window: usize,
+    messages: Vec<(i64, u32, i64)>,
+    now: i64,
+    text: String,
+}
+
+#[test]
+fn numbers_are_those_of_python() {
+    for line in include_str!("golden/reports.jsonl").lines() {
+        let case: Case = serde_json::from_str(line).unwrap();
+        let mut intervals = Intervals::new(case.window);
+        let mut sizes = Sizes::new(case.window);
+        let mut ages = Ages::new(case.window);
+        for (time, size, stamp) in case.messages {
+            intervals.arrived(START + time);
+            sizes.arrived(START + time, size);
+            ages.arrived(START + time, START + stamp);
+        }
+        let found = match case.kind.as_str() {
+            "hz" => intervals.report_at_second().unwrap().lines(),
+            "bw" => sizes.report(START + case.now).unwrap().unwrap().lines(),
+            _ => ages.lines().unwrap(),
+        };
+        assert_eq!(found, case.text, "{line}");
+    }
+}
+
+fn named(names: &[&str]) -> Vec<Named> {
+    names.iter().map(|name| Named::absolute(name)).collect()
+}
+
+fn present(topics: &[(&str, &str)]) -> Vec<(String, Vec<String>)> {
+    let topics = topics.iter();
+    topics
+        .map(|(name, types)| ((*name).to_owned(), vec![(*types).to_owned()]))
+        .collect()
+}
+
+fn at(milliseconds: i64) -> i64 {
+    START + milliseconds * MILLISECOND
+}
+
+/// A message at each of these times, of 100 bytes and 2 ms of age; returns what was said.
+fn messages(rates: &mut Rates, name: &str, times: impl IntoIterator<Item = i64>) -> String {
+    for time in times {
+        let header_stamp = Some(at(time - 2));
+        let arrival = Arrival {
+            time: at(time),
+            size: 100,
+            header_stamp,
+        };
+        rates.arrived(name, &arrival).unwrap();
+    }
+    rates.take().out
+}
+
+#[test]
+fn a_topic_that_is_not_there_is_told_once_and_waited_for() {
+    let topics = vec![Named {
+        typed: "x".to_owned(),
+        name: "/x".to_owned(),
+    }];
+    let mut rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, topics);
+    rates.opened(&[]).unwrap();
+    let warning = "WARNING: topic [x] does not appear to be published yet\n";
+    assert_eq!(rates.take().out, warning);
+    rates.clock(at(0));
+    rates.clock(at(5000));
+    assert_eq!(rates.take(), Said::default());
+    rates.appeared("/x", &[STRING.to_owned()]).unwrap();
+    rates.appeared("/x", &[STRING.to_owned()]).unwrap();
+    assert_eq!(rates.take().out, "Subscribed to [x]\n");
+    rates.clock(at(6000));
+    messages(&mut rates, "/x", [6100, 6600]);
+    // The seconds count from when it was there.
+    rates.clock(at(6999));
+    assert_eq!(rates.take().out, "");
+    rates.clock(at(7000));
+    let text = "222 B/s from 2 messages\n\tMessage size mean: 100 B min: 100 B max: 100 B\n";
+    assert_eq!(rates.take().out, text);
+}
+
+#[test]
+fn a_single_hz_says_nothing_but_rates() {
+    for (dialect, windows) in [
+        (Dialect::Jazzy, ["201", "401", "601"]),
+        (Dialect::Kilted, ["198", "398", "598"]),
+    ] {
+        let mut rates = Rates::of(Quantity::Rate, dialect, 10_000, named(&["/imu"]));
+        let topics = present(&[("/imu", IMU), ("/other", STRING)]);
+        rates.opened(&topics).unwrap();
+        assert_eq!(rates.take().out, "");
+        rates.clock(at(0));
+        messages(&mut rates, "/other", [5]);
+        let text = messages(&mut rates, "/imu", (1..=620).map(|step| step * 5));
+        let report = |window| {
+            format!(
+                "average rate: 200.000\n\t\
+                 min: 0.005s max: 0.005s std dev: 0.00000s window: {window}\n"
+            )
+        };
+        assert_eq!(text, windows.map(report).concat());
+    }
+}
+
+#[test]
+fn silence_is_reported_by_dialect() {
+    let reports = |quantity, dialect| {
+        let mut rates = Rates::of(quantity, dialect, 100, named(&["/imu"]));
+        rates.opened(&present(&[("/imu", IMU)])).unwrap();
+        rates.clock(at(0));
+        let mut text = messages(&mut rates, "/imu", [100, 200, 300]);
+        rates.clock(at(3000));
+        text.push_str(&rates.take().out);
+        text
+    };
+    let bandwidth = |span: &str| format!("{span} B/s from 3 messages");
+    for (dialect, decays) in [(Dialect::Kilted, true), (Dialect::Rolling, false)] {
+        let text = reports(Quantity::Bandwidth, dialect);
+        assert!(text.contains(&bandwidth("333")), "{text}");
+        assert_eq!(text.contains(&bandwidth("158")), decays, "{text}");
+        assert_eq!(text.contains(&bandwidth("103")), decays, "{text}");
+    }
+    for dialect in [Dialect::Humble, Dialect::Rolling] {
+        let text = reports(Quantity::Delay, dialect);
+        let expected = "average delay: 0.002\n\tmin: 0.002s max: 0.002s std dev: 0.00000s \
+                        window: 2\nno new messages\nno new messages\n";
+        assert_eq!(text, expected);
+        let text = reports(Quantity::Rate, dialect);
+        assert_eq!(
+            text.lines().count(),
+            if dialect == Dialect::Humble { 0 } else { 2 },
+            "{text}"
+        );
+    }
+}
+
+#[test]
+fn several_topics_share_a_table_that_leaves_out_the_silent_ones() {
+    let mut rates = Rates::of(
+        Quantity::Rate,
+        Dialect::Kilted,
+        100,
+        named(&["/b", "/a", "/c"]),
+    );
+    rates
+        .opened(&present(&[("/a", IMU), ("/b", STRING)]))
+        .unwrap();
+    let begin = "Subscribed to [/b]\nSubscribed to [/a]\n\
+                 WARNING: topic [/c] does not appear to be published yet\n";
+    assert_eq!(rates.take().out, begin);
+    rates.clock(at(0));
+    for step in 1..=9 {
+        messages(&mut rates, "/a", [step * 100]);
+        messages(&mut rates, "/b", [step * 100 + 10]);
+    }
+    rates.clock(at(1000));
+    let both = "\
+        topic    rate    min_delta   max_delta   std_dev   window\n\
+        =========================================================\n\
+        /b      10.000   0.100       0.100       0.00000   8     \n\
+        /a      10.000   0.100       0.100       0.00000   8     \n\
+        \n";
+    assert_eq!(rates.take().out, both);
+    messages(&mut rates, "/a", [1100]);
+    rates.clock(at(2000));
+    let table = rates.take().out;
+    assert!(table.contains("/a  ") && !table.contains("/b"), "{table}");
+    rates.clock(at(3000));
+    assert_eq!(rates.take().out, "");
+}
+
+#[test]
+fn bandwidths_of_several_topics_each_have_their_unit() {
+    let mut rates = Rates::of(
+        Quantity::Bandwidth,
+        Dialect::Rolling,
+        100,
+        named(&["/a", "/b"]),
+    );
+    rates
+        .opened(&present(&[("/a", IMU), ("/b", STRING)]))
+        .unwrap();
+    rates.clock(at(0));
+    rates.take();
+    messages(&mut rates, "/a", [0, 100]);
+    for time in [0, 500] {
+        let arrival = Arrival {
+            time: at(time),
+            size: 4096,
+            header_stamp: None,
+        };
+        rates.arrived("/b", &arrival).unwrap();
+    }
+    rates.clock(at(1000));
+    let expected = "\
+        topic   bandwidth   window     mean      min       max  \n\
+        ========================================================\n\
+        /a      200 B/s     2        100 B     100 B     100 B  \n\
+        /b      8.19 KB/s   2        4.10 KB   4.10 KB   4.10 KB\n\
+        \n";
+    assert_eq!(rates.take().out, expected);
+}
+
+#[test]
+fn all_topics_are_those_that_are_there_and_those_that_come() {
+    let mut rates = Rates::of_all(Quantity::Rate, Dialect::Kilted, 100);
+    rates
+        .opened(&present(&[("/a", IMU), ("/b", STRING)]))
+        .unwrap();
+    let begin =
+        "Subscribing to all 2 available topics...\nSubscribed to [/a]\nSubscribed to [/b]\n";
+    assert_eq!(rates.take().out, begin);
+    rates.clock(at(0));
+    assert_eq!(rates.take().out, CLEAR);
+    rates.appeared("/late", &[STRING.to_owned()]).unwrap();
+    let text = messages(&mut rates, "/late", [100, 200]);
+    assert_eq!(text, "Subscribed to [/late]\n");
+    rates.clock(at(1000));
+    let table = rates.take().out;
+    assert!(
+        table.starts_with(CLEAR) && table.contains("\n/late   10.000"),
+        "{table}"
+    );
+}
+
+#[test]
+fn with_no_topic_at_all_there_is_nothing_to_do() {
+    let mut rates = Rates::of_all(Quantity::Rate, Dialect::Kilted, 100);
+    assert_eq!(rates.opened(&[]), Err(End::Idle));
+    assert_eq!(rates.take().out, "No topics available\n");
+    let mut rates = Rates::of_all(Quantity::Delay, Dialect::Kilted, 100);
+    assert_eq!(
+        rates.opened(&present(&[("/chatter", STRING)])),
+        Err(End::Idle)
+    );
+}
+
+#[test]
+fn a_topic_of_several_types_cannot_be_measured() {
+    let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/x"]));
+    let types = vec!["a/msg/X".to_owned(), "b/msg/Y".to_owned()];
+    let text = "Cannot echo topic '/x', as it contains more than one type: [a/msg/X, b/msg/Y]";
+    let expected = Err(End::Refused(Refused(text.to_owned())));
+    assert_eq!(rates.opened(&[("/x".to_owned(), types)]), expected);
+}
+
+#[test]
+fn a_delay_needs_a_header() {
+    let mut rates = Rates::of(Quantity::Delay, Dialect::Jazzy, 100, named(&["/chatter"]));
+    rates.opened(&present(&[("/chatter", STRING)])).unwrap();
+    let arrival = Arrival {
+        time: at(0),
+        size: 28,
+        header_stamp: None,
+    };
+    let expected = Err(End::Refused(Refused("msg does not have header".to_owned())));
+    assert_eq!(rates.arrived("/chatter", &arrival), expected);
+    assert_eq!(rates.take().out, "");
+}
+
+#[test]
+fn a_clock_that_was_set_is_no_flood_and_no_silence() {
+    let mut rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
+    rates.opened(&present(&[("/imu", IMU)])).unwrap();
+    rates.clock(at(0));
+    messages(&mut rates, "/imu", [100, 200]);
+    rates.clock(at(400 * 24 * 3600 * 1000));
+    assert_eq!(rates.take().out.matches(" from 2 messages").count(), 1);
+    rates.clock(at(-60_000));
+    rates.clock(at(-59_000));
+    let said = rates.take();
+    assert_eq!(
+        (said.out.as_str(), said.err.as_str()),
+        ("", "WARNING: time is reset!\n")
+    );
+    messages(&mut rates, "/imu", [-58_900, -58_800]);
+    rates.clock(at(-58_000));
+    assert!(rates.take().out.starts_with("222 B/s from 2 messages\n"));
+}

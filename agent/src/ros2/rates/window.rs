@@ -1,0 +1,137 @@
+//! The newest values of something, and their mean, extremes and deviation.
+//!
+//! A window is a number of values, never a span of time: an old pause stays in it until enough
+//! newer values came. That is what the original does, and what its readers compare with.
+
+use std::collections::VecDeque;
+
+/// At most so many of the newest values.
+#[derive(Clone, Debug)]
+pub struct Window {
+    values: VecDeque<i64>,
+    size: usize,
+}
+
+/// What a window holds. In the unit of its values.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Statistics {
+    /// Arithmetic mean.
+    pub mean: f64,
+    /// The smallest value.
+    pub min: i64,
+    /// The largest value.
+    pub max: i64,
+    /// Of the population: the sum of squares is divided by the number of values.
+    pub standard_deviation: f64,
+    /// How many values there are.
+    pub count: usize,
+}
+
+impl Window {
+    /// An empty window for so many values.
+    #[must_use]
+    pub fn new(size: usize) -> Self {
+        let values = VecDeque::new();
+        Self { values, size }
+    }
+
+    /// Takes the next value; the oldest goes when there are too many.
+    pub fn push(&mut self, value: i64) {
+        self.values.push_back(value);
+        if self.values.len() > self.size {
+            self.values.pop_front();
+        }
+    }
+
+    /// Forgets all values.
+    pub fn clear(&mut self) {
+        self.values.clear();
+    }
+
+    /// Whether there is no value.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.values.is_empty()
+    }
+
+    /// The oldest value.
+    #[must_use]
+    pub fn oldest(&self) -> Option<i64> {
+        self.values.front().copied()
+    }
+
+    /// How many values there are.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.values.len()
+    }
+
+    /// The sum of all values.
+    #[must_use]
+    pub fn sum(&self) -> i128 {
+        self.values.iter().map(|value| i128::from(*value)).sum()
+    }
+
+    /// Nothing of an empty window.
+    #[must_use]
+    pub fn statistics(&self) -> Option<Statistics> {
+        let (min, max) = (self.values.iter().min()?, self.values.iter().max()?);
+        let count = self.values.len() as f64;
+        let mean = self.sum() as f64 / count;
+        let mut squares = 0.0;
+        for value in &self.values {
+            let distance = *value as f64 - mean;
+            squares += distance * distance;
+        }
+        Some(Statistics {
+            mean,
+            min: *min,
+            max: *max,
+            standard_deviation: (squares / count).sqrt(),
+            count: self.values.len(),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn window(size: usize, values: &[i64]) -> Window {
+        let mut window = Window::new(size);
+        for value in values {
+            window.push(*value);
+        }
+        window
+    }
+
+    #[test]
+    fn the_deviation_is_of_the_population() {
+        // Mean 5, squares 9 + 1 + 1 + 1 + 0 + 0 + 4 + 16 = 32, 32 / 8 = 4.
+        let found = window(100, &[2, 4, 4, 4, 5, 5, 7, 9]).statistics();
+        let expected = Statistics {
+            mean: 5.0,
+            min: 2,
+            max: 9,
+            standard_deviation: 2.0,
+            count: 8,
+        };
+        assert_eq!(found, Some(expected));
+        assert_eq!(Window::new(3).statistics(), None);
+    }
+
+    #[test]
+    fn the_oldest_goes_first() {
+        let window = window(2, &[100, 1, 3]);
+        assert_eq!(window.oldest(), Some(1));
+        let found = window.statistics().unwrap();
+        assert_eq!((found.mean, found.max, found.count), (2.0, 3, 2));
+    }
+
+    #[test]
+    fn values_below_zero_and_of_any_size_are_summed() {
+        let window = window(4, &[i64::MAX, i64::MAX, -1]);
+        assert_eq!(window.sum(), 2 * i128::from(i64::MAX) - 1);
+        assert_eq!(window.statistics().map(|found| found.min), Some(-1));
+    }
+}
