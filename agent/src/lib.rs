@@ -1,9 +1,11 @@
 //! ros2probe: watches a ROS 2 robot from copies of its RTPS traffic, without joining the domain.
 //!
 //! Three layers, dependencies pointing inwards: `capture` (I/O) and `surface` (metrics, HTTP)
-//! around `model` (discovery and statistics, deterministic).
+//! around `model` (discovery and statistics, deterministic). `client` asks a running agent, and
+//! `ros2` is the text that people know.
 
 pub mod capture;
+pub mod client;
 pub mod config;
 pub mod discover;
 pub mod message;

@@ -29,27 +29,32 @@ use ros2probe::surface::{Board, Exposition, Format, Settings};
 use ros2probe::watches::Watches;
 use tokio_util::sync::CancellationToken;
 
-use cli::{Arguments, Command, DEFAULT_CONFIG};
+use cli::{Arguments, Command, DEFAULT_CONFIG, Said};
 use logging::Log;
 use supervise::{Supervisor, Surfaces};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
 const BAD_CONFIG: u8 = 78;
+/// What a shell sees of a process that `SIGPIPE` ended.
+const BROKEN_PIPE: u8 = 141;
 
 fn main() -> ExitCode {
-    let done = match Arguments::parse().command {
-        Command::Run(options) => run(options),
-        Command::CheckConfig { file } => check_config(&file),
-        Command::Discover(options) => ask::discover(&options),
+    let done = |done: Result<()>| done.map(|()| ExitCode::SUCCESS);
+    let ended = match Arguments::parse().command {
+        None => cli::help(&[]),
+        Some(Command::Run(options)) => done(run(options)),
+        Some(Command::CheckConfig { file }) => done(check_config(&file)),
+        Some(Command::Discover(options)) => done(ask::discover(&options)),
+        Some(Command::Ask(question)) => question.ask(),
     };
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("{}", message(&error));
-            exit_code(&error)
+    ended.unwrap_or_else(|error| {
+        if cli::is_broken_pipe(&error) {
+            return ExitCode::from(BROKEN_PIPE);
         }
-    }
+        eprintln!("{}", message(&error));
+        exit_code(&error)
+    })
 }
 
 /// The agent's life, in order.
@@ -214,6 +219,7 @@ fn check_config(file: &Path) -> Result<()> {
 fn message(error: &anyhow::Error) -> String {
     match error.downcast_ref::<ConfigError>() {
         Some(mistakes @ ConfigError::Invalid { .. }) => mistakes.to_string(),
+        _ if error.is::<Said>() => error.to_string(),
         _ => format!("rp: {error:#}"),
     }
 }

@@ -4,8 +4,10 @@
 //! Pure: facts in, text out. Nothing here asks an agent, reads a clock or prints.
 
 mod dialect;
+pub mod facts;
 pub mod rates;
 mod refusal;
+pub mod topic;
 
 pub use dialect::Dialect;
 pub use refusal::Refused;

@@ -11,6 +11,7 @@ mod graph;
 mod health;
 mod index;
 mod measured;
+mod names;
 mod nearest;
 mod nodes;
 mod openapi;
@@ -79,6 +80,7 @@ fn nouns() -> OpenApiRouter<Context> {
         .merge(actions::routes())
         .merge(participants::routes())
         .merge(graph::routes())
+        .merge(names::routes())
         .merge(health::routes())
         .merge(reload::routes())
         .merge(openapi::routes())

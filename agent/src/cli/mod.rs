@@ -1,0 +1,95 @@
+//! The command line: a module for each noun, and what all verbs share. A verb asks an agent, has
+//! the answer put into words, and prints; it decides nothing else.
+
+mod discover;
+mod interrupt;
+mod output;
+mod run;
+mod shared;
+mod topic;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{CommandFactory as _, Parser, Subcommand};
+
+pub(crate) use discover::Discover;
+pub(crate) use output::{Output, Said, is_broken_pipe};
+pub(crate) use run::{Listen, Run};
+
+/// Where the package puts it.
+pub(crate) const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
+
+/// Watches a ROS 2 robot from copies of its DDS traffic, without joining it.
+#[derive(Debug, Parser)]
+#[command(name = "rp", version, max_term_width = 100)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    pub(crate) command: Option<Command>,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Run the agent: observe this host or a capture, serve /metrics
+    Run(Run),
+    /// Check a configuration file and report every mistake
+    #[command(after_help = "Exit code: 0 when it is good, 78 when it is not.")]
+    CheckConfig {
+        /// The file
+        #[arg(default_value = DEFAULT_CONFIG)]
+        file: PathBuf,
+    },
+    /// Ask running participants to repeat their announcements: the only command that sends
+    Discover(Discover),
+    #[command(flatten)]
+    Ask(Question),
+}
+
+/// What an agent, or a capture, is asked.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Question {
+    /// What topics there are and what comes by them, as `ros2 topic` says
+    Topic(topic::Topic),
+}
+
+impl Question {
+    /// Asks, prints, and says with which code to end.
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        if let Some(code) = self.interrupted() {
+            interrupt::listen(code)?;
+        }
+        match self {
+            Self::Topic(topic) => topic.ask(),
+        }
+    }
+
+    /// The exit code when Ctrl-C ends it at once; `None` for what wants to end by itself.
+    const fn interrupted(&self) -> Option<u8> {
+        match self {
+            Self::Topic(_) => Some(interrupt::INTERRUPTED),
+        }
+    }
+}
+
+/// The help of a command that was given no verb, as the original prints it.
+pub(crate) fn help(names: &[&str]) -> Result<ExitCode> {
+    let mut command = Arguments::command();
+    command.build();
+    let named = names
+        .iter()
+        .try_fold(&command, |command, name| command.find_subcommand(name));
+    let text = named.cloned().unwrap_or(command).render_help().to_string();
+    Output::new().write(&text)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Arguments::command().debug_assert();
+    }
+}

@@ -1,0 +1,61 @@
+//! `rp run`: the agent's options.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use clap::Args;
+use ros2probe::capture::pcap::Speed;
+use ros2probe::config::Watch;
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Signals: SIGHUP reads the configuration again, SIGTERM and SIGINT end the agent.
+Exit codes: 0 ended as asked, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
+RUST_LOG, read at the start, overrides the configured log level.
+
+Examples:
+  sudo rp run                                     observe this host
+  rp run --replay robot.pcap.gz --report          what was on the wire, as metrics on stdout
+  rp run --replay robot.pcap --watch '/camera/**' --metrics 127.0.0.1:9400")]
+pub(crate) struct Run {
+    /// Configuration file; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Observe a capture (pcap or pcapng, may be gzipped) instead of this host; needs no privilege
+    #[arg(long, value_name = "FILE")]
+    pub(crate) replay: Option<PathBuf>,
+    /// How fast to replay: a factor, or `max` [default: 1, with --report max]
+    #[arg(long, value_name = "N|max", requires = "replay")]
+    pub(crate) speed: Option<Speed>,
+    /// At the end of the capture, print the metrics on stdout and exit
+    #[arg(long, requires = "replay")]
+    pub(crate) report: bool,
+    /// Also measure this topic or glob, as /points or '/camera/**'; may be repeated
+    #[arg(long, value_name = "GLOB", value_parser = watch)]
+    pub(crate) watch: Vec<Watch>,
+    /// Address and port of the metrics listener, or `off`, instead of the configured one
+    #[arg(long, value_name = "ADDR|off", value_parser = listen)]
+    pub(crate) metrics: Option<Listen>,
+    /// Address and port of the control API, or `off` (also for its unix socket), instead of the
+    /// configured one
+    #[arg(long, value_name = "ADDR|off", value_parser = listen)]
+    pub(crate) api: Option<Listen>,
+}
+
+/// Where `--metrics` or `--api` wants the listener.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Listen(pub(crate) Option<SocketAddr>);
+
+fn watch(pattern: &str) -> Result<Watch, String> {
+    Watch::named(pattern).map_err(|error| format!("the topic {error}"))
+}
+
+fn listen(address: &str) -> Result<Listen, String> {
+    if address == "off" {
+        return Ok(Listen(None));
+    }
+    let address = address.parse();
+    address
+        .map(|address| Listen(Some(address)))
+        .map_err(|_| "must be an IP address and port, as 127.0.0.1:17400, or `off`".to_owned())
+}

@@ -1,0 +1,127 @@
+//! A stream of lines, with raw bytes between them where a line says so.
+
+use std::time::Duration;
+
+use bytes::{Bytes, BytesMut};
+use http_body_util::BodyExt as _;
+use hyper::body::Incoming;
+use tokio::time::timeout;
+
+use super::{Agent, ClientError};
+
+/// Longer than any line.
+const MAX_LINE: usize = 1 << 20;
+
+/// What an agent goes on saying.
+#[derive(Debug)]
+pub struct Lines<'a> {
+    agent: &'a Agent,
+    body: Incoming,
+    buffer: BytesMut,
+    /// So much of the buffer has no end of a line in it.
+    searched: usize,
+    ended: bool,
+}
+
+/// What came within a time.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Next {
+    /// A line, without its end.
+    Line(Bytes),
+    /// Nothing yet.
+    Nothing,
+    /// The agent hung up.
+    End,
+}
+
+impl<'a> Lines<'a> {
+    pub(super) fn new(agent: &'a Agent, body: Incoming) -> Self {
+        Self {
+            agent,
+            body,
+            buffer: BytesMut::new(),
+            searched: 0,
+            ended: false,
+        }
+    }
+
+    /// Waits for a line; `None` when the agent hung up.
+    ///
+    /// # Errors
+    /// The connection broke, or what comes has no lines.
+    pub fn line(&mut self) -> Result<Option<Bytes>, ClientError> {
+        let agent = self.agent;
+        agent.runtime.block_on(self.next_line())
+    }
+
+    /// Waits for a line, but no longer than `patience`.
+    ///
+    /// # Errors
+    /// As [`Self::line`].
+    pub fn line_within(&mut self, patience: Duration) -> Result<Next, ClientError> {
+        let agent = self.agent;
+        agent.runtime.block_on(async {
+            match timeout(patience, self.next_line()).await {
+                Ok(line) => Ok(line?.map_or(Next::End, Next::Line)),
+                Err(_) => Ok(Next::Nothing),
+            }
+        })
+    }
+
+    /// Exactly this many bytes that follow the line which was read last.
+    ///
+    /// # Errors
+    /// The stream ends before.
+    pub fn bytes(&mut self, count: usize) -> Result<Bytes, ClientError> {
+        let agent = self.agent;
+        agent.runtime.block_on(async {
+            while self.buffer.len() < count {
+                if !self.fill().await? {
+                    return Err(self.agent.way.broke("the stream ended within a message"));
+                }
+            }
+            self.searched = 0;
+            Ok(self.buffer.split_to(count).freeze())
+        })
+    }
+
+    /// Nothing is lost when this is given up while it waits: what came is in the buffer.
+    async fn next_line(&mut self) -> Result<Option<Bytes>, ClientError> {
+        loop {
+            let fresh = self.buffer.get(self.searched..).unwrap_or_default();
+            if let Some(end) = fresh.iter().position(|byte| *byte == b'\n') {
+                let end = self.searched + end;
+                self.searched = 0;
+                let mut line = self.buffer.split_to(end + 1);
+                line.truncate(end);
+                return Ok(Some(line.freeze()));
+            }
+            self.searched = self.buffer.len();
+            if self.searched > MAX_LINE {
+                return Err(self.agent.way.not_an_agent());
+            }
+            if !self.fill().await? {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// Whether anything more came.
+    async fn fill(&mut self) -> Result<bool, ClientError> {
+        while !self.ended {
+            match self.body.frame().await {
+                None => self.ended = true,
+                Some(Ok(frame)) => {
+                    if let Ok(data) = frame.into_data()
+                        && !data.is_empty()
+                    {
+                        self.buffer.extend_from_slice(&data);
+                        return Ok(true);
+                    }
+                }
+                Some(Err(error)) => return Err(self.agent.way.broke(error)),
+            }
+        }
+        Ok(false)
+    }
+}

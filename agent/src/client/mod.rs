@@ -1,0 +1,220 @@
+//! The connection to an agent, with a blocking face: on this host by its unix socket or loopback
+//! address, on another robot by `--host` and a token.
+//!
+//! It asks and decodes; what answers mean is said elsewhere. It never reads a clock for what it
+//! shows, and keeps nothing between requests.
+
+mod error;
+mod lines;
+mod target;
+mod way;
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::{BodyExt as _, Full, Limited};
+use hyper::body::Incoming;
+use hyper::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
+use hyper::{Method, Request, Response, StatusCode};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::runtime::Runtime;
+use tokio::time::timeout;
+
+pub use error::{ClientError, Refusal};
+pub use lines::{Lines, Next};
+pub use target::{Moment, Target, Unfit};
+use way::Way;
+
+/// The longest wait for a whole answer: graphs of thousands of topics come within a second.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// More than any answer has; a stream is not bounded by it.
+const MAX_ANSWER: usize = 256 << 20;
+
+/// An agent that can be asked.
+pub struct Agent {
+    runtime: Runtime,
+    way: Way,
+    token: Option<String>,
+}
+
+impl Agent {
+    /// Finds the agent that `target` means.
+    ///
+    /// # Errors
+    /// There is none, or its token cannot be read.
+    pub fn reach(target: &Target) -> Result<Self, ClientError> {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .map_err(|source| ClientError::Runtime { source })?;
+        let token = target.token()?;
+        let way = runtime.block_on(Way::find(target))?;
+        Ok(Self {
+            runtime,
+            way,
+            token,
+        })
+    }
+
+    /// What is at `path`, which may have a query; names in it go through [`encoded`].
+    ///
+    /// # Errors
+    /// The agent is gone, refuses, or answers something else.
+    pub fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        self.exchange(Method::GET, path, None)
+    }
+
+    /// Sends `body`.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn post<B: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
+        self.exchange(Method::POST, path, Some(json(body)))
+    }
+
+    /// Puts `body` there.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn put<B: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
+        self.exchange(Method::PUT, path, Some(json(body)))
+    }
+
+    /// Removes what is there.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn delete(&self, path: &str) -> Result<(), ClientError> {
+        self.runtime.block_on(async {
+            let answer = self.send(Method::DELETE, path, None).await?;
+            self.whole(path, answer).await.map(drop)
+        })
+    }
+
+    /// Lines that go on coming, perhaps with raw bytes between them, until this end or the other
+    /// one hangs up.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn stream(&self, path: &str) -> Result<Lines<'_>, ClientError> {
+        self.runtime.block_on(async {
+            let answer = self.send(Method::GET, path, None).await?;
+            if answer.status().is_success() {
+                Ok(Lines::new(self, answer.into_body()))
+            } else {
+                let refused = self.whole(path, answer).await;
+                Err(refused.err().unwrap_or_else(|| self.way.not_an_agent()))
+            }
+        })
+    }
+
+    /// Where it is, for people.
+    #[must_use]
+    pub fn place(&self) -> String {
+        self.way.to_string()
+    }
+
+    fn exchange<T: DeserializeOwned>(
+        &self,
+        method: Method,
+        path: &str,
+        body: Option<Bytes>,
+    ) -> Result<T, ClientError> {
+        let answer = self.runtime.block_on(async {
+            let exchange = async {
+                let answer = self.send(method, path, body).await?;
+                self.whole(path, answer).await
+            };
+            let patience = timeout(PATIENCE, exchange).await;
+            patience.unwrap_or_else(|_| Err(self.way.slow()))
+        })?;
+        serde_json::from_slice(&answer).map_err(|source| self.way.unreadable(path, source))
+    }
+
+    async fn send(
+        &self,
+        method: Method,
+        path: &str,
+        body: Option<Bytes>,
+    ) -> Result<Response<Incoming>, ClientError> {
+        let mut request = Request::builder()
+            .method(method)
+            .uri(path)
+            .header(HOST, self.way.host())
+            .header(ACCEPT, "*/*");
+        if let Some(token) = &self.token {
+            request = request.header(AUTHORIZATION, format!("Bearer {token}"));
+        }
+        if body.is_some() {
+            request = request.header(CONTENT_TYPE, "application/json");
+        }
+        let request = request.body(Full::new(body.unwrap_or_default()));
+        let request = request.map_err(|_| ClientError::Path {
+            path: path.to_owned(),
+        })?;
+        self.way.send(request).await
+    }
+
+    /// The whole body of an answer that is no refusal.
+    async fn whole(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
+        let status = answer.status();
+        let body = Limited::new(answer.into_body(), MAX_ANSWER).collect().await;
+        let body = body.map_err(|source| self.way.broke(source))?.to_bytes();
+        if status.is_success() {
+            return Ok(body);
+        }
+        let Some(refusal) = Refusal::read(status.as_u16(), &body) else {
+            return Err(self.way.not_an_agent());
+        };
+        Err(match (status, refusal.code.as_str()) {
+            (StatusCode::UNAUTHORIZED, _) => self.way.unauthorized(self.token.is_some()),
+            (_, "not-found") => self.way.older(path),
+            _ => ClientError::Refused(refusal),
+        })
+    }
+}
+
+impl std::fmt::Debug for Agent {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Agent({})", self.way)
+    }
+}
+
+/// What has no JSON form would be refused by the agent as an empty body.
+fn json<B: Serialize>(body: &B) -> Bytes {
+    serde_json::to_vec(body).unwrap_or_default().into()
+}
+
+/// A name as it stands in a path or in a query's value: slashes stay.
+#[must_use]
+pub fn encoded(name: &str) -> String {
+    let mut path = String::with_capacity(name.len());
+    for byte in name.bytes() {
+        if byte.is_ascii_alphanumeric() || b"/_-.~".contains(&byte) {
+            path.push(char::from(byte));
+        } else {
+            path.push_str(&format!("%{byte:02X}"));
+        }
+    }
+    path
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_keep_their_slashes_and_nothing_that_ends_a_path() {
+        assert_eq!(encoded("/robot1/imu_data"), "/robot1/imu_data");
+        assert_eq!(encoded("/a?b#c d%é"), "/a%3Fb%23c%20d%25%C3%A9");
+    }
+}

@@ -1,0 +1,160 @@
+//! Which agent a command is for, and what it is asked about: the options that all verbs share.
+
+use std::io;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use clap::Args;
+use ros2probe_wire::Timestamp;
+
+use super::ClientError;
+use crate::ros2::Dialect;
+
+/// Highest domain there is.
+const MAX_DOMAIN: u32 = 232;
+/// A longer file is no token.
+const MAX_TOKEN: u64 = 4096;
+
+/// Which agent, which domain, which `ros2`. To be flattened last, for its heading.
+#[derive(Args, Clone, Debug, Default)]
+#[command(next_help_heading = "Which agent")]
+pub struct Target {
+    /// The agent on another host; its port is 17401 when left out
+    #[arg(long, value_name = "HOST[:PORT]", conflicts_with = "socket")]
+    pub host: Option<String>,
+    /// File that holds the agent's token [default: $ROS2PROBE_TOKEN_FILE]
+    #[arg(long, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
+    /// The agent behind this unix socket [default: /run/ros2probe/api.sock, then loopback]
+    #[arg(long, value_name = "PATH")]
+    pub socket: Option<PathBuf>,
+    /// The robot's domain [default: $ROS_DOMAIN_ID, else 0]
+    #[arg(long = "domain", value_name = "N",
+        value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN)))]
+    pub domain_id: Option<u32>,
+    /// Whose output to print [default: $ROS_DISTRO, else jazzy]
+    #[arg(long, value_name = "DISTRO", value_enum, hide_possible_values = true)]
+    pub distro: Option<Dialect>,
+}
+
+/// A time in a capture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Moment {
+    /// Since the epoch.
+    At(Timestamp),
+    /// Nanoseconds since the capture's beginning.
+    After(u64),
+}
+
+/// The environment says what cannot be.
+#[derive(Debug, thiserror::Error)]
+#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN}")]
+pub struct Unfit(String);
+
+impl Target {
+    /// The domain that is asked about.
+    ///
+    /// # Errors
+    /// The environment names none that there is.
+    pub fn domain(&self) -> Result<u32, Unfit> {
+        if let Some(domain_id) = self.domain_id {
+            return Ok(domain_id);
+        }
+        match std::env::var("ROS_DOMAIN_ID") {
+            Ok(text) if !text.trim().is_empty() => {
+                let domain_id = text.trim().parse().ok();
+                domain_id
+                    .filter(|domain_id| *domain_id <= MAX_DOMAIN)
+                    .ok_or(Unfit(text))
+            }
+            _ => Ok(0),
+        }
+    }
+
+    /// The output's dialect.
+    #[must_use]
+    pub fn dialect(&self) -> Dialect {
+        let named = || Dialect::of_distro(&std::env::var("ROS_DISTRO").ok()?);
+        self.distro.or_else(named).unwrap_or_default()
+    }
+
+    /// The token, where one was named.
+    pub(super) fn token(&self) -> Result<Option<String>, ClientError> {
+        let named = || std::env::var_os("ROS2PROBE_TOKEN_FILE").filter(|path| !path.is_empty());
+        let path = self.token_file.clone();
+        let Some(path) = path.or_else(|| named().map(PathBuf::from)) else {
+            return Ok(None);
+        };
+        let read = || {
+            let mut text = String::new();
+            let file = std::fs::File::open(&path)?;
+            io::Read::read_to_string(&mut io::Read::take(file, MAX_TOKEN), &mut text)?;
+            let token = text.trim();
+            if token.is_empty() || !token.bytes().all(|byte| byte.is_ascii_graphic()) {
+                let reason = "it must hold one line of printable characters";
+                return Err(io::Error::new(io::ErrorKind::InvalidData, reason));
+            }
+            Ok(token.to_owned())
+        };
+        match read() {
+            Ok(token) => Ok(Some(token)),
+            Err(source) => Err(ClientError::Token { path, source }),
+        }
+    }
+}
+
+impl FromStr for Moment {
+    type Err = &'static str;
+
+    /// Unix seconds, or `+` and seconds from the capture's beginning; nanoseconds are kept.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        const WRONG: &str =
+            "must be Unix seconds, or `+S` for seconds from the capture's beginning";
+        let (seconds, is_after) = match text.strip_prefix('+') {
+            Some(seconds) => (seconds, true),
+            None => (text, false),
+        };
+        let (whole, fraction) = seconds.split_once('.').unwrap_or((seconds, ""));
+        let is_number = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
+        if whole.is_empty() || fraction.len() > 9 || !is_number(whole) || !is_number(fraction) {
+            return Err(WRONG);
+        }
+        let whole: u64 = whole.parse().map_err(|_| WRONG)?;
+        let fraction: u64 = format!("{fraction:0<9}").parse().map_err(|_| WRONG)?;
+        let nanoseconds = whole.checked_mul(1_000_000_000);
+        let nanoseconds = nanoseconds.and_then(|whole| whole.checked_add(fraction));
+        let nanoseconds = nanoseconds.ok_or(WRONG)?;
+        Ok(if is_after {
+            Self::After(nanoseconds)
+        } else {
+            Self::At(Timestamp(nanoseconds))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn moments_keep_their_nanoseconds() {
+        let at = |text: &str| text.parse::<Moment>();
+        let exact = Timestamp(1_795_142_407_300_015_394);
+        assert_eq!(at("1795142407.300015394"), Ok(Moment::At(exact)));
+        assert_eq!(at("+2.5"), Ok(Moment::After(2_500_000_000)));
+        assert_eq!(at("+3"), Ok(Moment::After(3_000_000_000)));
+        for wrong in [
+            "",
+            "+",
+            ".5",
+            "-1",
+            "1.0000000001",
+            "1e9",
+            "12:00",
+            "++1",
+            "99999999999999",
+        ] {
+            assert!(at(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,117 @@
+//! `rp topic`, `rp node`, `rp service` and `rp action`: the text of the original, from an agent and
+//! from a capture, and how they behave among other tools.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+
+mod local_agent;
+
+use std::io::{Read as _, Write as _};
+use std::net::TcpListener;
+use std::os::unix::net::UnixListener;
+use std::process::Output;
+
+use local_agent::{LocalAgent, rp};
+
+fn run(arguments: &[&str]) -> Output {
+    let mut rp = rp();
+    rp.env_remove("ROS_DOMAIN_ID").env_remove("ROS_DISTRO");
+    rp.args(arguments).output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+/// One line that says what to do, and exit code 1.
+fn fails_with(output: &Output, part: &str) {
+    let said = stderr(output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+    assert!(said.contains(part), "`{part}` is not in {said}");
+}
+
+#[test]
+fn a_running_agent_answers() {
+    let agent = LocalAgent::start(&["--speed", "max"]);
+    let host = agent.api.to_string();
+    let names = || {
+        let listed = run(&["topic", "list", "-t", "--host", &host]);
+        assert_eq!(listed.status.code(), Some(0), "{}", stderr(&listed));
+        stdout(&listed)
+    };
+    let deadline = std::time::Instant::now() + local_agent::PATIENCE;
+    while !names().contains("/rosout [rcl_interfaces/msg/Log]\n") {
+        assert!(std::time::Instant::now() < deadline, "{}", names());
+    }
+    let elsewhere = run(&["topic", "list", "--host", &host, "--domain", "7"]);
+    assert_eq!(
+        (stdout(&elsewhere).as_str(), elsewhere.status.code()),
+        ("", Some(0))
+    );
+    assert!(
+        stderr(&elsewhere).contains("`--domain N`"),
+        "{}",
+        stderr(&elsewhere)
+    );
+}
+
+/// Answers every connection with these bytes.
+fn answering(answer: &'static [u8]) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    std::thread::spawn(move || {
+        for stream in listener.incoming() {
+            let mut stream = stream.unwrap();
+            let _ = stream.read(&mut [0; 4096]);
+            let _ = stream.write_all(answer);
+        }
+    });
+    address
+}
+
+#[test]
+fn who_cannot_be_asked_is_said_in_one_line() {
+    let ask = |host: &str| run(&["topic", "list", "--host", host]);
+    // Nobody listens there once the listener is gone.
+    let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
+    fails_with(&ask(&closed.unwrap().to_string()), "connection refused");
+    fails_with(
+        &ask(&answering(b"SSH-2.0-OpenSSH_9.6\r\n")),
+        "is no ros2probe agent",
+    );
+    let page = b"HTTP/1.1 404 Not Found\r\ncontent-length: 4\r\n\r\noops";
+    fails_with(&ask(&answering(page)), "is no ros2probe agent");
+    let problem = b"HTTP/1.1 404 Not Found\r\nconnection: close\r\n\r\n\
+        {\"type\":\"urn:ros2probe:problem:not-found\",\"detail\":\"\"}";
+    fails_with(&ask(&answering(problem)), "does not know /names");
+    let problem = b"HTTP/1.1 401 Unauthorized\r\nconnection: close\r\n\r\n\
+        {\"type\":\"urn:ros2probe:problem:unauthorized\",\"detail\":\"\"}";
+    fails_with(&ask(&answering(problem)), "`--token-file FILE`");
+
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("api.sock");
+    drop(UnixListener::bind(&path).unwrap());
+    let path = path.to_str().unwrap();
+    fails_with(&run(&["topic", "list", "--socket", path]), path);
+    fails_with(
+        &run(&["topic", "list", "--token-file", path]),
+        "cannot read the token",
+    );
+}
+
+#[test]
+fn a_command_without_a_verb_prints_its_help() {
+    for arguments in [&[][..], &["topic"]] {
+        let output = run(arguments);
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        assert!(stdout(&output).contains("Usage: rp"), "{}", stdout(&output));
+    }
+    let wrong = run(&["topic", "list", "--no-such-option"]);
+    assert_eq!(
+        (stdout(&wrong).as_str(), wrong.status.code()),
+        ("", Some(2))
+    );
+}
