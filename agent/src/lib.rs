@@ -4,6 +4,7 @@
 //! around `model` (discovery and statistics, deterministic). `client` asks a running agent, and
 //! `ros2` is the text that people know.
 
+pub mod bag;
 pub mod capture;
 pub mod client;
 pub mod config;

@@ -1,0 +1,254 @@
+//! Compression of chunks and of whole files, in pure Rust.
+//!
+//! Knows one zstd level, the fastest: `ruzstd` has no other. Zstd frames carry their content size,
+//! without which rosbag2 refuses to decompress a file.
+
+use std::fs::File;
+use std::io::{self, BufReader, Read, Write};
+
+use ruzstd::encoding::CompressionLevel;
+
+/// What a chunk or a file is compressed with.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub enum Compression {
+    /// Not at all.
+    #[default]
+    None,
+    /// LZ4 frames.
+    Lz4,
+    /// Zstandard frames.
+    Zstd,
+}
+
+impl Compression {
+    /// As MCAP, metadata.yaml and file names spell it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "",
+            Self::Lz4 => "lz4",
+            Self::Zstd => "zstd",
+        }
+    }
+
+    /// From that spelling.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        let all = [Self::None, Self::Lz4, Self::Zstd];
+        all.into_iter()
+            .find(|compression| compression.name() == name)
+    }
+
+    /// `bytes` compressed; `None` where that is not asked for or does not make them smaller.
+    #[must_use]
+    pub fn compressed(self, bytes: &[u8]) -> Option<Vec<u8>> {
+        let compressed = match self {
+            Self::None => return None,
+            Self::Lz4 => {
+                let mut encoder = lz4_flex::frame::FrameEncoder::new(Vec::new());
+                encoder.write_all(bytes).ok()?;
+                encoder.finish().ok()?
+            }
+            Self::Zstd => {
+                let mut drain = SizedFrame::new(Vec::new(), bytes.len() as u64);
+                ruzstd::encoding::compress(bytes, &mut drain, CompressionLevel::Fastest);
+                drain.finish().ok()?
+            }
+        };
+        (compressed.len() < bytes.len()).then_some(compressed)
+    }
+
+    /// What was compressed to `bytes`, if it is at most `limit` bytes.
+    pub fn decompressed(self, bytes: &[u8], limit: u64) -> io::Result<Vec<u8>> {
+        let mut out = Vec::new();
+        self.reader(bytes)?.take(limit + 1).read_to_end(&mut out)?;
+        if out.len() as u64 > limit {
+            return Err(io::Error::new(
+                io::ErrorKind::InvalidData,
+                "is larger than it says",
+            ));
+        }
+        Ok(out)
+    }
+
+    /// Reads `source` decompressed.
+    pub fn reader<'a>(self, source: impl Read + 'a) -> io::Result<Box<dyn Read + 'a>> {
+        Ok(match self {
+            Self::None => Box::new(source),
+            Self::Lz4 => Box::new(lz4_flex::frame::FrameDecoder::new(source)),
+            Self::Zstd => {
+                Box::new(ruzstd::decoding::StreamingDecoder::new(source).map_err(io::Error::other)?)
+            }
+        })
+    }
+
+    /// Compresses one file into another, as one frame.
+    pub fn compress_file(self, source: &File, into: &File) -> io::Result<()> {
+        let size = source.metadata()?.len();
+        let mut source = Watched::new(BufReader::with_capacity(1 << 17, source));
+        match self {
+            Self::None => {
+                io::copy(&mut source.inner, &mut &*into)?;
+            }
+            Self::Lz4 => {
+                let info = lz4_flex::frame::FrameInfo::new().content_size(Some(size));
+                let mut encoder = lz4_flex::frame::FrameEncoder::with_frame_info(info, into);
+                io::copy(&mut source.inner, &mut encoder)?;
+                encoder.finish().map_err(io::Error::other)?;
+            }
+            Self::Zstd => {
+                let mut drain = SizedFrame::new(into, size);
+                ruzstd::encoding::compress(&mut source, &mut drain, CompressionLevel::Fastest);
+                drain.finish()?;
+                source.failed.map_or(Ok(()), Err)?;
+                if source.read != size {
+                    return Err(io::Error::other("the file changed while it was compressed"));
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Remembers an error and ends, for `ruzstd` takes none.
+struct Watched<R> {
+    inner: R,
+    read: u64,
+    failed: Option<io::Error>,
+}
+
+impl<R: Read> Watched<R> {
+    fn new(inner: R) -> Self {
+        Self {
+            inner,
+            read: 0,
+            failed: None,
+        }
+    }
+}
+
+impl<R: Read> Read for Watched<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        if self.failed.is_some() {
+            return Ok(0);
+        }
+        loop {
+            match self.inner.read(buffer) {
+                Ok(read) => {
+                    self.read += read as u64;
+                    return Ok(read);
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => {
+                    self.failed = Some(error);
+                    return Ok(0);
+                }
+            }
+        }
+    }
+}
+
+/// Takes a zstd frame that does not say its content's size, and says it (RFC 8878, 3.1.1.1).
+/// Remembers an error, for `ruzstd` takes none.
+struct SizedFrame<W> {
+    inner: W,
+    size: u64,
+    /// Magic number, descriptor and window: what precedes the size.
+    head: Vec<u8>,
+    failed: Option<io::Error>,
+}
+
+impl<W: Write> SizedFrame<W> {
+    const HEAD: usize = 6;
+    /// A size of 8 bytes follows.
+    const SIZE_FLAG: u8 = 0b1100_0000;
+    /// A size, a dictionary or no window: not what `ruzstd` writes.
+    const OTHERWISE: u8 = 0b1110_0011;
+
+    fn new(inner: W, size: u64) -> Self {
+        Self {
+            inner,
+            size,
+            head: Vec::with_capacity(Self::HEAD + 8),
+            failed: None,
+        }
+    }
+
+    fn take(&mut self, mut bytes: &[u8]) -> io::Result<()> {
+        if let Some(missing) = Self::HEAD.checked_sub(self.head.len())
+            && missing > 0
+        {
+            let (head, rest) = bytes.split_at(missing.min(bytes.len()));
+            self.head.extend_from_slice(head);
+            bytes = rest;
+            if self.head.len() < Self::HEAD {
+                return Ok(());
+            }
+            match self.head.get_mut(4) {
+                Some(descriptor) if *descriptor & Self::OTHERWISE == 0 => {
+                    *descriptor |= Self::SIZE_FLAG;
+                }
+                _ => return Err(io::Error::other("zstd began a frame in another form")),
+            }
+            self.inner.write_all(&self.head)?;
+            self.inner.write_all(&self.size.to_le_bytes())?;
+        }
+        self.inner.write_all(bytes)
+    }
+
+    fn finish(self) -> io::Result<W> {
+        self.failed.map_or(Ok(self.inner), Err)
+    }
+}
+
+impl<W: Write> Write for &mut SizedFrame<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.failed.is_none()
+            && let Err(error) = self.take(bytes)
+        {
+            self.failed = Some(error);
+        }
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_compressed_comes_back_and_a_zstd_frame_says_its_size() {
+        let bytes = b"ros2probe ".repeat(40_000);
+        for compression in [Compression::Lz4, Compression::Zstd] {
+            let compressed = compression.compressed(&bytes).unwrap();
+            assert!(compressed.len() < bytes.len() / 20, "{}", compressed.len());
+            let size = bytes.len() as u64;
+            assert_eq!(compression.decompressed(&compressed, size).unwrap(), bytes);
+            assert!(compression.decompressed(&compressed, size - 1).is_err());
+            assert!(compression.decompressed(&compressed[..100], size).is_err());
+            assert_eq!(compression.compressed(&[1, 2, 3]), None, "does not shrink");
+            if compression == Compression::Zstd {
+                assert_eq!(&compressed[6..14], &size.to_le_bytes());
+            }
+        }
+        assert_eq!(Compression::None.compressed(&bytes), None);
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error_and_no_panic() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("source");
+        std::fs::write(&path, b"0123456789".repeat(100_000)).unwrap();
+        let full = File::options().write(true).open("/dev/full").unwrap();
+        for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
+            let error = compression
+                .compress_file(&File::open(&path).unwrap(), &full)
+                .unwrap_err();
+            assert!(error.to_string().contains("No space left"), "{error}");
+        }
+    }
+}

@@ -1,0 +1,438 @@
+//! One MCAP file while it is written: chunks, indexes, summary.
+//!
+//! Records come in the order of rosbag2's files. A file only ever grows by whole pieces: what could
+//! not be written whole is cut off again, and before a piece is written, room is reserved for it
+//! and for the summary behind it, so that a full disk is noticed while the file can still be
+//! finished. Knows nothing of topics beyond their channel.
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::{self, Write as _};
+use std::os::fd::AsRawFd as _;
+use std::path::{Path, PathBuf};
+
+use flate2::Crc;
+
+use super::mcap::{
+    self, Channel, Chunk, ChunkIndex, Footer, Message, Metadata, Opcode, Schema, Statistics,
+};
+use super::options::Storage;
+
+/// What a file's header names as its writer.
+pub(super) const LIBRARY: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
+/// Of the metadata records.
+pub(super) const METADATA_NAME: &str = "rosbag2";
+/// Without chunks, records are handed to the system in pieces of this size.
+const PIECE_BYTES: u64 = 256 << 10;
+/// Room for metadata.yaml, its record, and what the report at the end adds to them.
+const SPARE_BYTES: u64 = 64 << 10;
+
+/// A file that is being written.
+#[derive(Debug)]
+pub(super) struct FileWriter {
+    path: PathBuf,
+    file: File,
+    storage: Storage,
+    /// Bytes in the file, every record of them whole.
+    position: u64,
+    /// A checksum of those bytes, where it is asked for.
+    data_crc: Option<Crc>,
+    pending: Pending,
+    schemas: BTreeMap<u16, Schema>,
+    /// Channels with messages.
+    channels: BTreeMap<u16, Channel>,
+    chunk_indexes: Vec<u8>,
+    /// Offset and length of metadata records.
+    metadata: Vec<(u64, u64)>,
+    statistics: Statistics,
+    /// The file system can reserve room.
+    reserves: bool,
+}
+
+/// What is not in the file yet: a chunk's records, or just records.
+#[derive(Debug, Default)]
+struct Pending {
+    records: Vec<u8>,
+    start: u64,
+    end: u64,
+    messages: u64,
+    /// Of each channel: log time and offset in the chunk.
+    index: BTreeMap<u16, Vec<(u64, u64)>>,
+}
+
+impl FileWriter {
+    /// Makes the file, which must not exist, and writes what it begins with.
+    pub(super) fn create(path: &Path, storage: Storage, metadata: &Metadata) -> io::Result<Self> {
+        let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        let mut writer = Self {
+            path: path.to_owned(),
+            file,
+            storage,
+            position: 0,
+            data_crc: storage.data_crc.then(Crc::new),
+            pending: Pending::default(),
+            schemas: BTreeMap::new(),
+            channels: BTreeMap::new(),
+            chunk_indexes: Vec::new(),
+            metadata: Vec::new(),
+            statistics: Statistics::default(),
+            reserves: true,
+        };
+        let mut begin = mcap::MAGIC.to_vec();
+        mcap::header(&mut begin, "ros2", LIBRARY);
+        writer.reserve(0)?;
+        writer.append(&[&begin])?;
+        writer.write_metadata(metadata)?;
+        Ok(writer)
+    }
+
+    /// Takes one message. On an error it was not taken; what was taken before is in the file or
+    /// still waits.
+    pub(super) fn write(
+        &mut self,
+        message: &Message<'_>,
+        channel: impl FnOnce() -> (Schema, Channel),
+    ) -> io::Result<()> {
+        if self.pending.records.len() as u64 >= self.piece_bytes() {
+            self.write_pending()?;
+        }
+        if !self.channels.contains_key(&message.channel_id) {
+            let (schema, channel) = channel();
+            if !self.schemas.contains_key(&schema.id) {
+                schema.write(&mut self.pending.records);
+                self.schemas.insert(schema.id, schema);
+            }
+            channel.write(&mut self.pending.records);
+            self.channels.insert(channel.id, channel);
+        }
+        let pending = &mut self.pending;
+        let offset = pending.records.len() as u64;
+        message.write(&mut pending.records);
+        if pending.messages == 0 {
+            (pending.start, pending.end) = (message.log_time, message.log_time);
+        }
+        pending.start = pending.start.min(message.log_time);
+        pending.end = pending.end.max(message.log_time);
+        pending.messages += 1;
+        let index = pending.index.entry(message.channel_id).or_default();
+        index.push((message.log_time, offset));
+        Ok(())
+    }
+
+    /// Hands everything taken to the system: it survives the end of this process.
+    pub(super) fn flush(&mut self) -> io::Result<()> {
+        if self.pending.records.is_empty() {
+            return Ok(());
+        }
+        self.write_pending()
+    }
+
+    /// Waits until everything flushed is on the disk: it survives the loss of power.
+    pub(super) fn sync(&self) -> io::Result<()> {
+        self.file.sync_data()
+    }
+
+    /// Appends a metadata record behind everything taken.
+    pub(super) fn write_metadata(&mut self, metadata: &Metadata) -> io::Result<()> {
+        self.flush()?;
+        let mut record = Vec::new();
+        metadata.write(&mut record);
+        let at = (self.position, record.len() as u64);
+        self.append(&[&record])?;
+        self.metadata.push(at);
+        self.statistics.metadata_count += 1;
+        Ok(())
+    }
+
+    /// Forgets what is not in the file, and says how many messages of which channel that was.
+    pub(super) fn discard(&mut self) -> BTreeMap<u16, u64> {
+        let pending = std::mem::take(&mut self.pending);
+        let counts = pending.index.into_iter();
+        counts
+            .map(|(channel, index)| (channel, index.len() as u64))
+            .collect()
+    }
+
+    /// Writes summary and footer. `channels` are all that are known, also without messages.
+    pub(super) fn finish(
+        &mut self,
+        channels: impl Iterator<Item = (Schema, Channel)>,
+    ) -> io::Result<()> {
+        self.flush()?;
+        for (schema, channel) in channels {
+            if !self.channels.contains_key(&channel.id) {
+                self.schemas.entry(schema.id).or_insert(schema);
+                self.channels.insert(channel.id, channel);
+            }
+        }
+        let mut end = Vec::new();
+        let data_crc = self.data_crc.as_ref().map_or(0, Crc::sum);
+        mcap::data_end(&mut end, data_crc);
+        let summary = self.summary(self.position + end.len() as u64);
+        end.extend_from_slice(&summary);
+        end.extend_from_slice(&mcap::MAGIC);
+        self.append(&[&end])?;
+        // Gives back what is still reserved behind the end.
+        self.file.set_len(self.position)
+    }
+
+    /// Bytes in the file.
+    pub(super) fn position(&self) -> u64 {
+        self.position
+    }
+
+    /// Bytes in the file, and those that wait as far as their size is known.
+    pub(super) fn expected_bytes(&self) -> u64 {
+        match self.storage.compression {
+            super::Compression::None => self.position + self.pending.records.len() as u64,
+            _ => self.position,
+        }
+    }
+
+    /// Messages taken.
+    pub(super) fn messages(&self) -> u64 {
+        self.statistics.message_count + self.pending.messages
+    }
+
+    /// Messages of each channel in the file.
+    pub(super) fn counts(&self) -> &BTreeMap<u16, u64> {
+        &self.statistics.channel_message_counts
+    }
+
+    /// Earliest and latest log time in the file and of what waits.
+    pub(super) fn times(&self) -> Option<(u64, u64)> {
+        let written = self.statistics.message_count > 0;
+        let written = written.then_some((self.statistics.start, self.statistics.end));
+        let waiting = self.pending.messages > 0;
+        let waiting = waiting.then_some((self.pending.start, self.pending.end));
+        match (written, waiting) {
+            (Some(a), Some(b)) => Some((a.0.min(b.0), a.1.max(b.1))),
+            (one, other) => one.or(other),
+        }
+    }
+
+    pub(super) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    fn piece_bytes(&self) -> u64 {
+        if self.storage.chunked {
+            self.storage.chunk_bytes
+        } else {
+            PIECE_BYTES
+        }
+    }
+
+    fn write_pending(&mut self) -> io::Result<()> {
+        // Taken out while it is written; put back where that fails.
+        let mut pending = std::mem::take(&mut self.pending);
+        let written = if self.storage.chunked {
+            self.write_chunk(&pending)
+        } else {
+            let reserved = self.reserve(pending.records.len() as u64);
+            reserved.and_then(|()| self.append(&[&pending.records]))
+        };
+        if let Err(error) = written {
+            self.pending = pending;
+            return Err(error);
+        }
+        let statistics = &mut self.statistics;
+        if pending.messages > 0 {
+            if statistics.message_count == 0 {
+                (statistics.start, statistics.end) = (pending.start, pending.end);
+            }
+            statistics.start = statistics.start.min(pending.start);
+            statistics.end = statistics.end.max(pending.end);
+            statistics.message_count += pending.messages;
+        }
+        for (channel, index) in &pending.index {
+            let count = statistics
+                .channel_message_counts
+                .entry(*channel)
+                .or_default();
+            *count += index.len() as u64;
+        }
+        // The memory is used again.
+        pending.records.clear();
+        self.pending.records = pending.records;
+        Ok(())
+    }
+
+    fn write_chunk(&mut self, pending: &Pending) -> io::Result<()> {
+        let compressed = self.storage.compression.compressed(&pending.records);
+        let compression = match &compressed {
+            Some(_) => self.storage.compression.name(),
+            None => "",
+        };
+        let records = compressed.as_deref().unwrap_or(&pending.records);
+        let mut uncompressed_crc = Crc::new();
+        if self.storage.chunk_crc {
+            uncompressed_crc.update(&pending.records);
+        }
+        let chunk = Chunk {
+            start: pending.start,
+            end: pending.end,
+            uncompressed_size: pending.records.len() as u64,
+            uncompressed_crc: uncompressed_crc.sum(),
+            compression,
+            records,
+        };
+        let mut head = Vec::with_capacity(64);
+        chunk.write_head(&mut head);
+        let length = (head.len() + records.len()) as u64;
+        let (mut indexes, mut offsets) = (Vec::new(), BTreeMap::new());
+        for (channel, entries) in &pending.index {
+            offsets.insert(*channel, self.position + length + indexes.len() as u64);
+            mcap::message_index(&mut indexes, *channel, entries);
+        }
+        let index = ChunkIndex {
+            start: chunk.start,
+            end: chunk.end,
+            offset: self.position,
+            length,
+            message_indexes: offsets,
+            message_indexes_length: indexes.len() as u64,
+            compression: compression.to_owned(),
+            compressed_size: records.len() as u64,
+            uncompressed_size: chunk.uncompressed_size,
+        };
+        self.reserve(length + index.message_indexes_length)?;
+        self.append(&[&head, records, &indexes])?;
+        index.write(&mut self.chunk_indexes);
+        self.statistics.chunk_count += 1;
+        Ok(())
+    }
+
+    /// All pieces or nothing.
+    fn append(&mut self, pieces: &[&[u8]]) -> io::Result<()> {
+        let length: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
+        for piece in pieces {
+            if let Err(error) = self.file.write_all(piece) {
+                self.cut()?;
+                return Err(error);
+            }
+        }
+        if let Some(crc) = &mut self.data_crc {
+            pieces.iter().for_each(|piece| crc.update(piece));
+        }
+        self.position += length;
+        Ok(())
+    }
+
+    /// Back to the last whole record.
+    fn cut(&mut self) -> io::Result<()> {
+        use std::io::Seek as _;
+        self.file.set_len(self.position)?;
+        self.file.seek(io::SeekFrom::Start(self.position)).map(drop)
+    }
+
+    /// Room for this much more, and for the end of the file.
+    fn reserve(&mut self, length: u64) -> io::Result<()> {
+        if !self.reserves {
+            return Ok(());
+        }
+        let definitions = self.schemas.values().map(|schema| schema.data.len() + 64);
+        let channels = self.channels.values().map(|channel| {
+            let metadata = channel.metadata.values().map(String::len);
+            metadata.sum::<usize>() + channel.topic.len() + 128
+        });
+        // Channels come again in metadata.yaml and in its record.
+        let channels = channels.sum::<usize>() * 3;
+        let summary = definitions.sum::<usize>() + channels + self.chunk_indexes.len();
+        match allocate(
+            &self.file,
+            self.position,
+            length + summary as u64 + SPARE_BYTES,
+        ) {
+            Ok(()) => Ok(()),
+            Err(error) => match error.kind() {
+                io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Err(error),
+                _ => {
+                    self.reserves = false;
+                    Ok(())
+                }
+            },
+        }
+    }
+
+    /// Schemas, channels, statistics, indexes, offsets of these groups, footer.
+    fn summary(&self, start: u64) -> Vec<u8> {
+        let mut out = Vec::new();
+        let mut groups = Vec::new();
+        let mut group = |out: &mut Vec<u8>, opcode: Opcode, write: &dyn Fn(&mut Vec<u8>)| {
+            let from = out.len() as u64;
+            write(out);
+            let length = out.len() as u64 - from;
+            if length > 0 {
+                groups.push((opcode, start + from, length));
+            }
+        };
+        group(&mut out, Opcode::SCHEMA, &|out| {
+            self.schemas.values().for_each(|schema| schema.write(out));
+        });
+        group(&mut out, Opcode::CHANNEL, &|out| {
+            self.channels
+                .values()
+                .for_each(|channel| channel.write(out));
+        });
+        group(&mut out, Opcode::STATISTICS, &|out| {
+            self.statistics().write(out);
+        });
+        group(&mut out, Opcode::CHUNK_INDEX, &|out| {
+            out.extend_from_slice(&self.chunk_indexes);
+        });
+        group(&mut out, Opcode::METADATA_INDEX, &|out| {
+            for (offset, length) in &self.metadata {
+                mcap::metadata_index(out, *offset, *length, METADATA_NAME);
+            }
+        });
+        let summary_offset_start = start + out.len() as u64;
+        for (opcode, start, length) in groups {
+            mcap::summary_offset(&mut out, opcode, start, length);
+        }
+        let footer = Footer {
+            summary_start: start,
+            summary_offset_start,
+            summary_crc: 0,
+        };
+        footer.write_without_crc(&mut out);
+        let mut crc = Crc::new();
+        if self.storage.summary_crc {
+            crc.update(&out);
+        }
+        out.extend_from_slice(&crc.sum().to_le_bytes());
+        out
+    }
+
+    fn statistics(&self) -> Statistics {
+        let counts = &self.statistics.channel_message_counts;
+        let used = counts.keys().filter_map(|id| self.channels.get(id));
+        let mut schemas: Vec<u16> = used.map(|channel| channel.schema_id).collect();
+        schemas.sort_unstable();
+        schemas.dedup();
+        Statistics {
+            schema_count: u16::try_from(schemas.len()).unwrap_or(u16::MAX),
+            channel_count: u32::try_from(counts.len()).unwrap_or(u32::MAX),
+            ..self.statistics.clone()
+        }
+    }
+}
+
+/// Reserves room behind `offset` without changing the file's length.
+fn allocate(file: &File, offset: u64, length: u64) -> io::Result<()> {
+    let (Ok(offset), Ok(length)) = (i64::try_from(offset), i64::try_from(length)) else {
+        return Err(io::ErrorKind::InvalidInput.into());
+    };
+    loop {
+        // SAFETY: takes integers alone, and the descriptor is open as long as `file` is borrowed.
+        let result =
+            unsafe { libc::fallocate(file.as_raw_fd(), libc::FALLOC_FL_KEEP_SIZE, offset, length) };
+        if result == 0 {
+            return Ok(());
+        }
+        let error = io::Error::last_os_error();
+        if error.kind() != io::ErrorKind::Interrupted {
+            return Err(error);
+        }
+    }
+}

@@ -1,0 +1,468 @@
+//! metadata.yaml: what a bag directory says about its files.
+//!
+//! Written byte for byte as rosbag2 does (yaml-cpp's layout, no newline at the end), read in every
+//! version. Knows nothing of MCAP; the same text stands in the files' own metadata records.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use serde::Deserialize;
+
+/// The file in every bag directory.
+pub const FILE_NAME: &str = "metadata.yaml";
+/// `starting_time` of a bag without messages.
+pub const NO_START: u64 = i64::MAX.cast_unsigned();
+
+/// What metadata.yaml holds.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Metadata {
+    /// 5 is Humble's, 9 that of Jazzy and later.
+    pub version: u32,
+    /// `mcap` or `sqlite3`.
+    pub storage_identifier: String,
+    /// From the first to the last message, nanoseconds.
+    pub duration: u64,
+    /// Of the first message; [`NO_START`] without any.
+    pub starting_time: u64,
+    /// Of all topics.
+    pub message_count: u64,
+    /// Also those without messages.
+    pub topics: Vec<Topic>,
+    /// Empty or `zstd`.
+    pub compression_format: String,
+    /// Empty, `FILE` or `MESSAGE`.
+    pub compression_mode: String,
+    /// Within the directory.
+    pub relative_file_paths: Vec<String>,
+    /// One for each file.
+    pub files: Vec<File>,
+    /// What the recorder wants to say.
+    pub custom_data: BTreeMap<String, String>,
+    /// Empty when unknown.
+    pub ros_distro: String,
+}
+
+/// One topic.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Topic {
+    /// With leading `/`.
+    pub name: String,
+    /// `pkg/msg/Type`.
+    pub type_name: String,
+    /// `cdr`.
+    pub serialization_format: String,
+    /// The text of `super::qos::profiles`; not read back from version 9, whose form is another.
+    pub offered_qos_profiles: String,
+    /// `RIHS01_...` or empty.
+    pub type_description_hash: String,
+    /// Of this topic.
+    pub message_count: u64,
+}
+
+/// One file.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct File {
+    /// Within the directory; where files are compressed, without that suffix, as rosbag2 writes it.
+    pub path: String,
+    /// Of its first message.
+    pub starting_time: u64,
+    /// To its last message.
+    pub duration: u64,
+    /// In it.
+    pub message_count: u64,
+}
+
+impl Metadata {
+    /// The file's text.
+    #[must_use]
+    pub fn file_text(&self) -> String {
+        let mut text = "rosbag2_bagfile_information:".to_owned();
+        self.lines(|line| {
+            let _ = write!(text, "\n  {line}");
+        });
+        text
+    }
+
+    /// The same map without its outer key, as in an MCAP metadata record.
+    #[must_use]
+    pub fn record_text(&self) -> String {
+        let mut text = String::new();
+        self.lines(|line| {
+            if !text.is_empty() {
+                text.push('\n');
+            }
+            text.push_str(line);
+        });
+        text
+    }
+
+    fn lines(&self, mut line: impl FnMut(&str)) {
+        line(&format!("version: {}", self.version));
+        line(&format!(
+            "storage_identifier: {}",
+            scalar(&self.storage_identifier)
+        ));
+        line("duration:");
+        line(&format!("  nanoseconds: {}", self.duration));
+        line("starting_time:");
+        line(&format!(
+            "  nanoseconds_since_epoch: {}",
+            self.starting_time
+        ));
+        line(&format!("message_count: {}", self.message_count));
+        if self.topics.is_empty() {
+            line("topics_with_message_count:\n    []");
+        } else {
+            line("topics_with_message_count:");
+        }
+        for topic in &self.topics {
+            self.topic(topic, &mut line);
+        }
+        line(&format!(
+            "compression_format: {}",
+            scalar(&self.compression_format)
+        ));
+        line(&format!(
+            "compression_mode: {}",
+            scalar(&self.compression_mode)
+        ));
+        line("relative_file_paths:");
+        for path in &self.relative_file_paths {
+            line(&format!("  - {}", scalar(path)));
+        }
+        line("files:");
+        for file in &self.files {
+            line(&format!("  - path: {}", scalar(&file.path)));
+            line("    starting_time:");
+            line(&format!(
+                "      nanoseconds_since_epoch: {}",
+                file.starting_time
+            ));
+            line("    duration:");
+            line(&format!("      nanoseconds: {}", file.duration));
+            line(&format!("    message_count: {}", file.message_count));
+        }
+        if self.custom_data.is_empty() {
+            if self.version >= 6 {
+                line("custom_data: ~");
+            }
+        } else {
+            line("custom_data:");
+            for (key, value) in &self.custom_data {
+                line(&format!("  {}: {}", scalar(key), scalar(value)));
+            }
+        }
+        if self.version >= 8 || !self.ros_distro.is_empty() {
+            line(&format!("ros_distro: {}", scalar(&self.ros_distro)));
+        }
+    }
+
+    fn topic(&self, topic: &Topic, line: &mut impl FnMut(&str)) {
+        line("  - topic_metadata:");
+        line(&format!("      name: {}", scalar(&topic.name)));
+        line(&format!("      type: {}", scalar(&topic.type_name)));
+        line(&format!(
+            "      serialization_format: {}",
+            scalar(&topic.serialization_format)
+        ));
+        let profiles = &topic.offered_qos_profiles;
+        if self.version < 9 {
+            line(&format!("      offered_qos_profiles: {}", scalar(profiles)));
+        } else if profiles.starts_with("- ") {
+            line("      offered_qos_profiles:");
+            for profile in profiles.lines() {
+                line(&format!("        {profile}"));
+            }
+        } else {
+            line("      offered_qos_profiles: []");
+        }
+        if self.version >= 7 || !topic.type_description_hash.is_empty() {
+            let hash = scalar(&topic.type_description_hash);
+            line(&format!("      type_description_hash: {hash}"));
+        }
+        line(&format!("    message_count: {}", topic.message_count));
+    }
+
+    /// Reads the file's text.
+    pub fn read(text: &str) -> Result<Self, serde_yaml::Error> {
+        let file: shape::File = serde_yaml::from_str(text)?;
+        Ok(file.rosbag2_bagfile_information.into())
+    }
+
+    /// Reads the text of a metadata record.
+    pub fn read_record(text: &str) -> Result<Self, serde_yaml::Error> {
+        let information: shape::Information = serde_yaml::from_str(text)?;
+        Ok(information.into())
+    }
+}
+
+/// A YAML scalar: plain where nothing can be misread, else in double quotes.
+fn scalar(text: &str) -> String {
+    let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/_-.".contains(&byte);
+    let begins = |byte: u8| byte.is_ascii_alphabetic() || b"/_".contains(&byte);
+    let word = matches!(
+        text.to_ascii_lowercase().as_str(),
+        "true" | "false" | "null" | "yes" | "no" | "on" | "off" | "y" | "n"
+    );
+    if !word && text.bytes().next().is_some_and(begins) && text.bytes().all(plain) {
+        return text.to_owned();
+    }
+    let mut quoted = String::with_capacity(text.len() + 2);
+    quoted.push('"');
+    for character in text.chars() {
+        match character {
+            '"' => quoted.push_str("\\\""),
+            '\\' => quoted.push_str("\\\\"),
+            '\n' => quoted.push_str("\\n"),
+            '\t' => quoted.push_str("\\t"),
+            '\r' => quoted.push_str("\\r"),
+            // Control characters, and what YAML takes for the end of a line or does not print.
+            '\0'..='\u{1f}'
+            | '\u{7f}'..='\u{a0}'
+            | '\u{2028}'
+            | '\u{2029}'
+            | '\u{feff}'
+            | '\u{fffe}'
+            | '\u{ffff}' => {
+                let _ = write!(quoted, "\\u{:04x}", u32::from(character));
+            }
+            other => quoted.push(other),
+        }
+    }
+    quoted.push('"');
+    quoted
+}
+
+/// What stands in the file, key by key.
+mod shape {
+    use super::{BTreeMap, Deserialize};
+
+    #[derive(Deserialize)]
+    pub(super) struct File {
+        pub(super) rosbag2_bagfile_information: Information,
+    }
+
+    #[derive(Deserialize)]
+    pub(super) struct Information {
+        version: u32,
+        storage_identifier: String,
+        duration: Nanoseconds,
+        starting_time: SinceEpoch,
+        message_count: u64,
+        topics_with_message_count: Option<Vec<Topic>>,
+        #[serde(default)]
+        compression_format: Option<String>,
+        #[serde(default)]
+        compression_mode: Option<String>,
+        relative_file_paths: Option<Vec<String>>,
+        #[serde(default)]
+        files: Option<Vec<Piece>>,
+        #[serde(default)]
+        custom_data: Option<BTreeMap<String, String>>,
+        #[serde(default)]
+        ros_distro: Option<String>,
+    }
+
+    #[derive(Deserialize)]
+    struct Nanoseconds {
+        nanoseconds: i64,
+    }
+
+    #[derive(Deserialize)]
+    struct SinceEpoch {
+        nanoseconds_since_epoch: u64,
+    }
+
+    #[derive(Deserialize)]
+    struct Topic {
+        topic_metadata: TopicMetadata,
+        message_count: u64,
+    }
+
+    #[derive(Deserialize)]
+    struct TopicMetadata {
+        name: String,
+        #[serde(rename = "type")]
+        type_name: String,
+        serialization_format: String,
+        #[serde(default)]
+        offered_qos_profiles: Option<serde_yaml::Value>,
+        #[serde(default)]
+        type_description_hash: Option<String>,
+    }
+
+    #[derive(Deserialize)]
+    struct Piece {
+        path: String,
+        starting_time: SinceEpoch,
+        duration: Nanoseconds,
+        message_count: u64,
+    }
+
+    impl From<Information> for super::Metadata {
+        fn from(from: Information) -> Self {
+            Self {
+                version: from.version,
+                storage_identifier: from.storage_identifier,
+                duration: u64::try_from(from.duration.nanoseconds).unwrap_or(0),
+                starting_time: from.starting_time.nanoseconds_since_epoch,
+                message_count: from.message_count,
+                topics: from
+                    .topics_with_message_count
+                    .into_iter()
+                    .flatten()
+                    .map(topic)
+                    .collect(),
+                compression_format: from.compression_format.unwrap_or_default(),
+                compression_mode: from.compression_mode.unwrap_or_default(),
+                relative_file_paths: from.relative_file_paths.unwrap_or_default(),
+                files: from.files.into_iter().flatten().map(piece).collect(),
+                custom_data: from.custom_data.unwrap_or_default(),
+                ros_distro: from.ros_distro.unwrap_or_default(),
+            }
+        }
+    }
+
+    fn topic(from: Topic) -> super::Topic {
+        let metadata = from.topic_metadata;
+        let profiles = metadata.offered_qos_profiles.as_ref();
+        super::Topic {
+            name: metadata.name,
+            type_name: metadata.type_name,
+            serialization_format: metadata.serialization_format,
+            offered_qos_profiles: profiles
+                .and_then(|profiles| profiles.as_str())
+                .unwrap_or_default()
+                .to_owned(),
+            type_description_hash: metadata.type_description_hash.unwrap_or_default(),
+            message_count: from.message_count,
+        }
+    }
+
+    fn piece(from: Piece) -> super::File {
+        super::File {
+            path: from.path,
+            starting_time: from.starting_time.nanoseconds_since_epoch,
+            duration: u64::try_from(from.duration.nanoseconds).unwrap_or(0),
+            message_count: from.message_count,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn metadata(version: u32) -> Metadata {
+        Metadata {
+            version,
+            storage_identifier: "mcap".into(),
+            duration: 4_500_000_000,
+            starting_time: 1_699_345_836_270_074_454,
+            message_count: 10,
+            topics: vec![Topic {
+                name: "/chatter".into(),
+                type_name: "std_msgs/msg/String".into(),
+                serialization_format: "cdr".into(),
+                offered_qos_profiles: "- history: unknown\n  depth: 0\n  deadline:\n    sec: 1"
+                    .into(),
+                type_description_hash: "RIHS01_df66".into(),
+                message_count: 10,
+            }],
+            compression_format: String::new(),
+            compression_mode: String::new(),
+            relative_file_paths: vec!["mybag_0.mcap".into()],
+            files: vec![File {
+                path: "mybag_0.mcap".into(),
+                starting_time: 1_699_345_836_270_074_454,
+                duration: 4_500_000_000,
+                message_count: 10,
+            }],
+            custom_data: BTreeMap::new(),
+            ros_distro: "jazzy".into(),
+        }
+    }
+
+    #[test]
+    fn version_9_is_laid_out_as_the_serializer_of_jazzy_does() {
+        let text = "rosbag2_bagfile_information:
+  version: 9
+  storage_identifier: mcap
+  duration:
+    nanoseconds: 4500000000
+  starting_time:
+    nanoseconds_since_epoch: 1699345836270074454
+  message_count: 10
+  topics_with_message_count:
+    - topic_metadata:
+        name: /chatter
+        type: std_msgs/msg/String
+        serialization_format: cdr
+        offered_qos_profiles:
+          - history: unknown
+            depth: 0
+            deadline:
+              sec: 1
+        type_description_hash: RIHS01_df66
+      message_count: 10
+  compression_format: \"\"
+  compression_mode: \"\"
+  relative_file_paths:
+    - mybag_0.mcap
+  files:
+    - path: mybag_0.mcap
+      starting_time:
+        nanoseconds_since_epoch: 1699345836270074454
+      duration:
+        nanoseconds: 4500000000
+      message_count: 10
+  custom_data: ~
+  ros_distro: jazzy";
+        assert_eq!(metadata(9).file_text(), text);
+        let read = Metadata::read(text).unwrap();
+        assert_eq!(read.topics[0].name, "/chatter");
+        assert_eq!((read.version, read.files), (9, metadata(9).files));
+    }
+
+    #[test]
+    fn version_5_has_qos_as_a_string_and_comes_back_whole() {
+        let mut written = metadata(5);
+        written
+            .custom_data
+            .insert("ros2probe.dropped: /a".into(), "3\nof \"7\"".into());
+        let text = written.file_text();
+        let qos = "        offered_qos_profiles: \"- history: unknown\\n  depth: 0\\n  deadline:\\n    sec: 1\"\n";
+        assert!(text.contains(qos), "{text}");
+        assert_eq!(Metadata::read(&text).unwrap(), written);
+        assert_eq!(
+            Metadata::read_record(&written.record_text()).unwrap(),
+            written
+        );
+    }
+
+    #[test]
+    fn a_bag_without_topics_is_still_yaml() {
+        let mut written = metadata(5);
+        written.topics.clear();
+        assert_eq!(Metadata::read(&written.file_text()).unwrap(), written);
+        assert_eq!(
+            Metadata::read_record(&written.record_text()).unwrap(),
+            written
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn any_name_comes_back_as_it_went_in(name in any::<String>(), value in ".*") {
+            let mut written = metadata(5);
+            written.topics[0].name = name.clone();
+            written.topics[0].type_name = value.clone();
+            written.relative_file_paths[0] = name.clone();
+            written.custom_data.insert(name, value);
+            let text = written.file_text();
+            prop_assert_eq!(Metadata::read(&text).unwrap(), written);
+        }
+    }
+}

@@ -1,0 +1,677 @@
+//! Writing a bag: its directory, its files one after the other, its metadata.yaml.
+//!
+//! No thread and no clock: the caller says when to flush, and the messages' times say when to split.
+//! metadata.yaml is there from the beginning and follows at each flush and split, so that a bag whose
+//! writer was killed is one that `ros2 bag info` still opens. What takes long, compressing whole
+//! files, is handed out as work for another thread.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs::{self, File, OpenOptions};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::qos::Qos;
+
+use super::file::{FileWriter, METADATA_NAME};
+use super::mcap::{Channel, Message, Metadata as MetadataRecord, Schema as SchemaRecord};
+use super::metadata::{self, Metadata};
+use super::{Compression, Error, Form, Options, qos};
+
+/// The only encoding of ROS 2 messages.
+const CDR: &str = "cdr";
+
+/// What a bag says about a topic.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct TopicDescription {
+    /// With leading `/`.
+    pub name: String,
+    /// `pkg/msg/Type`.
+    pub type_name: String,
+    /// `RIHS01_...`, if somebody announced it.
+    pub type_hash: Option<String>,
+    /// Of every publisher seen.
+    pub publishers: Vec<Qos>,
+    /// How its messages look, if that is known.
+    pub schema: Option<Schema>,
+}
+
+/// A definition, as `message::MessageType::schema_text` gives it.
+#[derive(Clone, PartialEq, Eq, Hash, Debug)]
+pub struct Schema {
+    /// `ros2msg` or `ros2idl`.
+    pub encoding: String,
+    /// With everything nested.
+    pub text: String,
+}
+
+/// A topic of one [`Writer`].
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct TopicId(u16);
+
+/// A bag that is being written.
+#[derive(Debug)]
+pub struct Writer {
+    directory: PathBuf,
+    /// The directory's name, which its files bear.
+    name: String,
+    options: Options,
+    topics: Vec<Topic>,
+    by_name: HashMap<String, TopicId>,
+    schemas: HashMap<(String, Option<Schema>), u16>,
+    /// Complete files; `current` comes after them.
+    done: Vec<DoneFile>,
+    current: Option<FileWriter>,
+    /// Files that wait to be compressed.
+    uncompressed: Vec<FileCompression>,
+    /// Taken, but never in a file.
+    unwritten: BTreeMap<u16, u64>,
+}
+
+#[derive(Debug)]
+struct Topic {
+    description: TopicDescription,
+    channel_id: u16,
+    schema_id: u16,
+    /// In complete files.
+    messages: u64,
+}
+
+#[derive(Clone, Debug)]
+struct DoneFile {
+    /// Without the suffix of a compression.
+    name: String,
+    compression: Compression,
+    times: Option<(u64, u64)>,
+    messages: u64,
+    bytes: u64,
+}
+
+/// What became of a bag.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Summary {
+    /// Where it lies.
+    pub directory: PathBuf,
+    /// Files in it, in order, without metadata.yaml.
+    pub files: Vec<PathBuf>,
+    /// Their size.
+    pub bytes: u64,
+    /// Messages in them.
+    pub messages: u64,
+    /// Earliest and latest log time.
+    pub times: Option<(Timestamp, Timestamp)>,
+    /// In the order in which they were described.
+    pub topics: Vec<TopicSummary>,
+}
+
+/// What a bag has of a topic.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct TopicSummary {
+    /// Its name.
+    pub name: String,
+    /// In the files.
+    pub messages: u64,
+    /// Taken by [`Writer::write`], and lost since the storage took no more.
+    pub unwritten: u64,
+}
+
+/// Work for another thread: one complete file to compress.
+#[derive(Clone, Debug)]
+pub struct FileCompression {
+    path: PathBuf,
+    compression: Compression,
+    index: usize,
+}
+
+/// That work, done; for [`Writer::compressed`].
+#[derive(Debug)]
+pub struct Compressed {
+    index: usize,
+    compression: Compression,
+    bytes: u64,
+}
+
+impl Writer {
+    /// Makes the directory, which must not exist, the first file and a metadata.yaml without
+    /// messages.
+    pub fn create(directory: &Path, options: Options) -> Result<Self, Error> {
+        let name = directory.file_name().and_then(|name| name.to_str());
+        let Some(name) = name.map(str::to_owned) else {
+            return Err(match directory.exists() {
+                true => Error::Exists(directory.to_owned()),
+                false => Error::Name(directory.to_owned()),
+            });
+        };
+        if let Some(parent) = directory.parent() {
+            fs::create_dir_all(parent).map_err(|error| Error::creating(parent, error))?;
+        }
+        fs::create_dir(directory).map_err(|error| match error.kind() {
+            std::io::ErrorKind::AlreadyExists => Error::Exists(directory.to_owned()),
+            _ => Error::creating(directory, error),
+        })?;
+        let mut writer = Self {
+            directory: directory.to_owned(),
+            name,
+            options,
+            topics: Vec::new(),
+            by_name: HashMap::new(),
+            schemas: HashMap::new(),
+            done: Vec::new(),
+            current: None,
+            uncompressed: Vec::new(),
+            unwritten: BTreeMap::new(),
+        };
+        writer.open_file()?;
+        writer.write_metadata_file()?;
+        Ok(writer)
+    }
+
+    /// Where the bag lies.
+    #[must_use]
+    pub fn directory(&self) -> &Path {
+        &self.directory
+    }
+
+    /// Describes a topic before its first message, or again when its publishers changed. In a file
+    /// the first description of a topic with messages stays; metadata.yaml and files after a split
+    /// have the last one.
+    pub fn topic(&mut self, description: TopicDescription) -> Result<TopicId, Error> {
+        let known = self.by_name.get(&description.name).copied();
+        if let Some(known) = known
+            && let Some(topic) = self.topics.get_mut(usize::from(known.0))
+        {
+            if topic.description.type_name != description.type_name {
+                return Err(Error::TypeConflict {
+                    topic: description.name,
+                    first: topic.description.type_name.clone(),
+                    second: description.type_name,
+                });
+            }
+            // A channel may not change its schema within a file.
+            let schema = topic.description.schema.take();
+            topic.description = TopicDescription {
+                schema,
+                ..description
+            };
+            return Ok(known);
+        }
+        let index = u16::try_from(self.topics.len()).ok();
+        let index = index.filter(|index| *index < u16::MAX);
+        let index = index.ok_or(Error::TooManyTopics)?;
+        let next_schema = u16::try_from(self.schemas.len() + 1);
+        let schema = (description.type_name.clone(), description.schema.clone());
+        let schema_id = match self.schemas.get(&schema) {
+            Some(id) => *id,
+            None => next_schema.map_err(|_| Error::TooManyTopics)?,
+        };
+        self.schemas.insert(schema, schema_id);
+        self.by_name
+            .insert(description.name.clone(), TopicId(index));
+        self.topics.push(Topic {
+            description,
+            channel_id: index + 1,
+            schema_id,
+            messages: 0,
+        });
+        Ok(TopicId(index))
+    }
+
+    /// Takes one message: its bytes with the encapsulation header, when it was received, when it was
+    /// sent, and its publisher's sequence number. On an error it was not taken; everything before
+    /// is in a file or still waits to be, and the next call tries again.
+    pub fn write(
+        &mut self,
+        topic: TopicId,
+        log_time: Timestamp,
+        publish_time: Timestamp,
+        sequence: u64,
+        data: &[u8],
+    ) -> Result<(), Error> {
+        if self.is_due(log_time) {
+            self.split()?;
+        }
+        if self.current.is_none() {
+            self.open_file()?;
+        }
+        let (Some(topic), Some(current)) =
+            (self.topics.get(usize::from(topic.0)), self.current.as_mut())
+        else {
+            // Not a topic of this bag: there is no place for it.
+            return Ok(());
+        };
+        let message = Message {
+            channel_id: topic.channel_id,
+            // The record has the low half.
+            sequence: (sequence & u64::from(u32::MAX)) as u32,
+            log_time: log_time.0,
+            publish_time: publish_time.0,
+            data,
+        };
+        let spelling = self.options.form;
+        let written = current.write(&message, || topic.records(spelling));
+        written.map_err(|error| Error::writing(current.path(), error))
+    }
+
+    /// Hands everything taken so far to the system, and brings metadata.yaml up to it: all of it
+    /// survives the end of this process.
+    pub fn flush(&mut self) -> Result<(), Error> {
+        if let Some(current) = &mut self.current {
+            current
+                .flush()
+                .map_err(|error| Error::writing(current.path(), error))?;
+        }
+        write_metadata(&self.directory, &self.metadata(), Durability::Process)
+    }
+
+    /// Flushes, and waits until it is on the disk: all of it survives the loss of power.
+    pub fn sync(&mut self) -> Result<(), Error> {
+        if let Some(current) = &mut self.current {
+            let synced = current.flush().and_then(|()| current.sync());
+            synced.map_err(|error| Error::writing(current.path(), error))?;
+        }
+        self.write_metadata_file()?;
+        let synced = File::open(&self.directory).and_then(|directory| directory.sync_all());
+        synced.map_err(|error| Error::writing(&self.directory, error))
+    }
+
+    /// Completes the file and begins the next one; not where it has no messages.
+    pub fn split(&mut self) -> Result<(), Error> {
+        if self
+            .current
+            .as_ref()
+            .is_none_or(|current| current.messages() == 0)
+        {
+            return Ok(());
+        }
+        self.finish_file()?;
+        self.open_file()?;
+        self.write_metadata_file()
+    }
+
+    /// Completes the bag. `custom_data` stands in metadata.yaml and in the last file: what was lost
+    /// or left out belongs there. Where the storage takes no more, what waits is given up, counted in
+    /// the summary, and the file completed in the room that was kept for that.
+    pub fn close(mut self, custom_data: BTreeMap<String, String>) -> Result<Summary, Error> {
+        self.options.custom_data.extend(custom_data);
+        let mut refused = None;
+        match self.finish_file() {
+            Err(error @ (Error::DiskFull { .. } | Error::FileTooLarge { .. })) => {
+                self.give_up_waiting();
+                // Without the summary a file can still be read, and completed by `rp bag reindex`.
+                if self.finish_file().is_err() {
+                    self.abandon_file();
+                }
+                refused = Some(error);
+            }
+            finished => finished?,
+        }
+        for work in self.take_file_compressions() {
+            let done = work.run()?;
+            self.compressed(&done)?;
+        }
+        match self.write_metadata_file() {
+            Err(error) if refused.is_none() => return Err(error),
+            _ => {}
+        }
+        Ok(self.summary())
+    }
+
+    /// Complete files to compress, each once. What is not taken is done by [`Self::close`].
+    pub fn take_file_compressions(&mut self) -> Vec<FileCompression> {
+        std::mem::take(&mut self.uncompressed)
+    }
+
+    /// Takes note that a file is compressed.
+    pub fn compressed(&mut self, done: &Compressed) -> Result<(), Error> {
+        if let Some(file) = self.done.get_mut(done.index) {
+            file.compression = done.compression;
+            file.bytes = done.bytes;
+        }
+        self.write_metadata_file()
+    }
+
+    /// Bytes in the bag's files so far.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        let current = self.current.as_ref().map_or(0, FileWriter::position);
+        current + self.done.iter().map(|file| file.bytes).sum::<u64>()
+    }
+
+    /// Files begun so far.
+    #[must_use]
+    pub fn files(&self) -> usize {
+        self.done.len() + usize::from(self.current.is_some())
+    }
+
+    fn is_due(&self, log_time: Timestamp) -> bool {
+        let Some(current) = &self.current else {
+            return false;
+        };
+        let Some((start, _)) = current.times() else {
+            return false;
+        };
+        let bytes = self.options.max_file_bytes;
+        let duration = self.options.max_file_duration;
+        bytes.is_some_and(|limit| current.expected_bytes() >= limit)
+            || duration.is_some_and(|limit| {
+                u128::from(log_time.0.saturating_sub(start)) > limit.as_nanos()
+            })
+    }
+
+    fn open_file(&mut self) -> Result<(), Error> {
+        let path = self.directory.join(self.file_name(self.done.len()));
+        let begin = self.metadata_record();
+        let file = FileWriter::create(&path, self.options.storage, &begin);
+        match file {
+            Ok(file) => {
+                self.current = Some(file);
+                Ok(())
+            }
+            Err(error) => {
+                // A file that could not even begin would be in nobody's list.
+                let _ = fs::remove_file(&path);
+                Err(Error::creating(&path, error))
+            }
+        }
+    }
+
+    /// Keeps the file where it fails: what waits may still find room.
+    fn finish_file(&mut self) -> Result<(), Error> {
+        if let Some(current) = &mut self.current {
+            current
+                .flush()
+                .map_err(|error| Error::writing(current.path(), error))?;
+        }
+        let end = self.metadata_record();
+        let Some(current) = &mut self.current else {
+            return Ok(());
+        };
+        let form = self.options.form;
+        let channels = self.topics.iter().map(|topic| topic.records(form));
+        let finished = match form {
+            // Humble writes its record at the beginning only.
+            Form::Humble => Ok(()),
+            Form::Compatible | Form::Named => current.write_metadata(&end),
+        };
+        let finished = finished.and_then(|()| current.finish(channels));
+        let finished = finished.and_then(|()| current.sync());
+        finished.map_err(|error| Error::writing(current.path(), error))?;
+        self.abandon_file();
+        Ok(())
+    }
+
+    /// Counts the file as it is among the complete ones.
+    fn abandon_file(&mut self) {
+        let Some(current) = self.current.take() else {
+            return;
+        };
+        for topic in &mut self.topics {
+            topic.messages += current
+                .counts()
+                .get(&topic.channel_id)
+                .copied()
+                .unwrap_or(0);
+        }
+        let index = self.done.len();
+        self.done.push(DoneFile {
+            name: self.file_name(index),
+            compression: Compression::None,
+            times: current.times(),
+            messages: current.messages(),
+            bytes: current.position(),
+        });
+        if self.options.file_compression != Compression::None {
+            self.uncompressed.push(FileCompression {
+                path: current.path().to_owned(),
+                compression: self.options.file_compression,
+                index,
+            });
+        }
+    }
+
+    fn give_up_waiting(&mut self) {
+        if let Some(current) = &mut self.current {
+            for (channel, messages) in current.discard() {
+                *self.unwritten.entry(channel).or_default() += messages;
+            }
+        }
+    }
+
+    fn file_name(&self, index: usize) -> String {
+        format!("{}_{index}.mcap", self.name)
+    }
+
+    fn metadata(&self) -> Metadata {
+        let current = self.current.as_ref().map(|current| DoneFile {
+            name: self.file_name(self.done.len()),
+            compression: Compression::None,
+            times: current.times(),
+            messages: current.messages(),
+            bytes: current.position(),
+        });
+        let files: Vec<&DoneFile> = self.done.iter().chain(&current).collect();
+        let times = times(&files);
+        let compression = files.iter().map(|file| file.compression);
+        let compression = compression.max_by_key(|compression| *compression != Compression::None);
+        let compression = compression.unwrap_or_default();
+        let in_current = self.current.as_ref().map(FileWriter::counts);
+        let topics = self.topics.iter().map(|topic| {
+            let current = in_current.and_then(|counts| counts.get(&topic.channel_id));
+            topic.metadata(self.options.form, current.copied().unwrap_or(0))
+        });
+        let custom_data = match self.options.form {
+            Form::Humble => BTreeMap::new(),
+            Form::Compatible | Form::Named => self.options.custom_data.clone(),
+        };
+        let ros_distro = match self.options.form {
+            Form::Humble => String::new(),
+            Form::Compatible | Form::Named => self.options.ros_distro.clone(),
+        };
+        Metadata {
+            version: self.options.form.version(),
+            storage_identifier: "mcap".to_owned(),
+            duration: times.map_or(0, |(start, end)| end - start),
+            starting_time: times.map_or(metadata::NO_START, |(start, _)| start),
+            message_count: files.iter().map(|file| file.messages).sum(),
+            topics: topics.collect(),
+            compression_format: compression.name().to_owned(),
+            compression_mode: match compression {
+                Compression::None => String::new(),
+                Compression::Lz4 | Compression::Zstd => "FILE".to_owned(),
+            },
+            relative_file_paths: files.iter().map(|file| file.path()).collect(),
+            files: files.iter().map(|file| file.metadata()).collect(),
+            custom_data,
+            ros_distro,
+        }
+    }
+
+    /// What stands in the files themselves.
+    fn metadata_record(&self) -> MetadataRecord {
+        let mut entries = BTreeMap::new();
+        if self.options.form != Form::Named {
+            entries.insert("ROS_DISTRO".to_owned(), self.options.ros_distro.clone());
+        }
+        if self.options.form != Form::Humble {
+            let text = self.metadata().record_text();
+            entries.insert("serialized_metadata".to_owned(), text);
+        }
+        MetadataRecord {
+            name: METADATA_NAME.to_owned(),
+            entries,
+        }
+    }
+
+    fn write_metadata_file(&self) -> Result<(), Error> {
+        write_metadata(&self.directory, &self.metadata(), Durability::Power)
+    }
+
+    fn summary(&self) -> Summary {
+        let files: Vec<&DoneFile> = self.done.iter().collect();
+        let topics = self.topics.iter().map(|topic| TopicSummary {
+            name: topic.description.name.clone(),
+            messages: topic.messages,
+            unwritten: self.unwritten.get(&topic.channel_id).copied().unwrap_or(0),
+        });
+        Summary {
+            directory: self.directory.clone(),
+            files: files
+                .iter()
+                .map(|file| self.directory.join(file.path()))
+                .collect(),
+            bytes: self.bytes(),
+            messages: files.iter().map(|file| file.messages).sum(),
+            times: times(&files).map(|(start, end)| (Timestamp(start), Timestamp(end))),
+            topics: topics.collect(),
+        }
+    }
+}
+
+impl FileCompression {
+    /// Compresses the file beside itself, then removes it. Takes long; needs room for both.
+    pub fn run(&self) -> Result<Compressed, Error> {
+        let into = with_suffix(&self.path, self.compression.name());
+        let part = with_suffix(&into, "part");
+        let wrong = |error| Error::writing(&part, error);
+        let done = || {
+            let source = File::open(&self.path)?;
+            let target = OpenOptions::new()
+                .write(true)
+                .create_new(true)
+                .open(&part)?;
+            self.compression.compress_file(&source, &target)?;
+            target.sync_data()?;
+            let bytes = target.metadata()?.len();
+            fs::rename(&part, &into)?;
+            fs::remove_file(&self.path)?;
+            Ok(bytes)
+        };
+        let bytes = done().map_err(|error| {
+            let _ = fs::remove_file(&part);
+            wrong(error)
+        })?;
+        Ok(Compressed {
+            index: self.index,
+            compression: self.compression,
+            bytes,
+        })
+    }
+}
+
+impl Topic {
+    fn records(&self, form: Form) -> (SchemaRecord, Channel) {
+        let description = &self.description;
+        let (encoding, data) = match &description.schema {
+            Some(schema) => (schema.encoding.as_str(), schema.text.as_bytes()),
+            None if form == Form::Humble => ("", &[][..]),
+            None => ("unknown", &[][..]),
+        };
+        let schema = SchemaRecord {
+            id: self.schema_id,
+            name: description.type_name.clone(),
+            encoding: encoding.to_owned(),
+            data: data.to_vec(),
+        };
+        let mut metadata = BTreeMap::new();
+        let profiles = qos::profiles(&description.publishers, form.spelling());
+        metadata.insert("offered_qos_profiles".to_owned(), profiles);
+        if form != Form::Humble {
+            let hash = description.type_hash.clone().unwrap_or_default();
+            metadata.insert("topic_type_hash".to_owned(), hash);
+        }
+        let channel = Channel {
+            id: self.channel_id,
+            schema_id: self.schema_id,
+            topic: description.name.clone(),
+            message_encoding: CDR.to_owned(),
+            metadata,
+        };
+        (schema, channel)
+    }
+
+    fn metadata(&self, form: Form, in_current: u64) -> metadata::Topic {
+        let hash = match form {
+            Form::Humble => None,
+            Form::Compatible | Form::Named => self.description.type_hash.clone(),
+        };
+        metadata::Topic {
+            name: self.description.name.clone(),
+            type_name: self.description.type_name.clone(),
+            serialization_format: CDR.to_owned(),
+            offered_qos_profiles: qos::profiles(&self.description.publishers, form.spelling()),
+            type_description_hash: hash.unwrap_or_default(),
+            message_count: self.messages + in_current,
+        }
+    }
+}
+
+impl DoneFile {
+    fn path(&self) -> String {
+        match self.compression {
+            Compression::None => self.name.clone(),
+            Compression::Lz4 | Compression::Zstd => {
+                format!("{}.{}", self.name, self.compression.name())
+            }
+        }
+    }
+
+    fn metadata(&self) -> metadata::File {
+        metadata::File {
+            path: self.name.clone(),
+            starting_time: self.times.map_or(metadata::NO_START, |(start, _)| start),
+            duration: self.times.map_or(0, |(start, end)| end - start),
+            message_count: self.messages,
+        }
+    }
+}
+
+/// What a metadata.yaml has to survive.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Durability {
+    /// The end of this process.
+    Process,
+    /// The loss of power.
+    Power,
+}
+
+/// Replaces a bag's metadata.yaml as a whole.
+pub(super) fn write_metadata(
+    directory: &Path,
+    metadata: &Metadata,
+    durability: Durability,
+) -> Result<(), Error> {
+    let path = directory.join(metadata::FILE_NAME);
+    let part = with_suffix(&path, "part");
+    let write = || {
+        // Left behind by one that was killed; made anew, so that nothing is written through a link.
+        match fs::remove_file(&part) {
+            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+        let mut file = OpenOptions::new()
+            .write(true)
+            .create_new(true)
+            .open(&part)?;
+        file.write_all(metadata.file_text().as_bytes())?;
+        if durability == Durability::Power {
+            file.sync_data()?;
+        }
+        fs::rename(&part, &path)
+    };
+    write().map_err(|error| {
+        let _ = fs::remove_file(&part);
+        Error::writing(&path, error)
+    })
+}
+
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".");
+    name.push(suffix);
+    PathBuf::from(name)
+}
+
+fn times(files: &[&DoneFile]) -> Option<(u64, u64)> {
+    let times = files.iter().filter_map(|file| file.times);
+    times.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+}
