@@ -15,5 +15,6 @@ pub mod privilege;
 pub mod ros2;
 pub mod run;
 pub mod state;
+pub mod subscriptions;
 pub mod surface;
 pub mod watches;

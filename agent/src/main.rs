@@ -22,6 +22,7 @@ use ros2probe::privilege::{self, Missing};
 use ros2probe::run::replay::Replay;
 use ros2probe::run::{Run, Source};
 use ros2probe::state::{Keeper, StateDirectory};
+use ros2probe::subscriptions::{Caps, Subscriptions};
 use ros2probe::surface::api::{self, reload};
 use ros2probe::surface::http::Server;
 use ros2probe::surface::otlp::{self, Exporter, Host, SettingsError};
@@ -107,6 +108,12 @@ fn run(options: cli::Run) -> Result<()> {
     }
 
     let stop = CancellationToken::new();
+    let caps = Caps {
+        subscriptions: config.limits.subscriptions,
+        bytes: config.limits.payload_bytes,
+    };
+    let subscriptions = Subscriptions::new(Arc::clone(&board), caps, stop.clone());
+    let subscriptions = Arc::new(subscriptions);
     let grace = u64::try_from(config.topic_grace.as_nanos()).unwrap_or(u64::MAX);
     let settings = observer::Settings {
         topic_grace: grace,
@@ -128,6 +135,7 @@ fn run(options: cli::Run) -> Result<()> {
         observer,
         Arc::clone(&board),
         Arc::clone(&watches),
+        Arc::clone(&subscriptions),
         stop.clone(),
     );
     let run = run.keeping(keeper);
@@ -144,6 +152,7 @@ fn run(options: cli::Run) -> Result<()> {
     let context = api::Context {
         board: Arc::clone(&board),
         watches: Arc::clone(&watches),
+        subscriptions,
         reloader,
         stop: stop.clone(),
     };

@@ -93,6 +93,8 @@ impl Reader {
                 topics: limits.topics,
                 unknown_writers: limits.unknown_writers,
                 reassembly_bytes: limits.reassembly_bytes,
+                subscriptions: limits.subscriptions,
+                payload_bytes: limits.payload_bytes,
             },
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(shape.metrics.unwrap_or_default()),

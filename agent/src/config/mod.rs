@@ -20,7 +20,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 pub use mistake::{Mistake, Mistakes, Position};
-pub use watch::{Expectations, Watch, Watchlist};
+pub use watch::{Expectations, PatternError, Watch, Watchlist, check_pattern};
 
 /// A larger file is no configuration.
 const MAX_BYTES: u64 = 1 << 20;
@@ -61,6 +61,10 @@ pub struct Limits {
     pub unknown_writers: usize,
     /// Bytes held while datagrams are reassembled.
     pub reassembly_bytes: usize,
+    /// Streams of messages and recordings.
+    pub subscriptions: usize,
+    /// Bytes of messages put together for those and waiting for them.
+    pub payload_bytes: usize,
 }
 
 /// Where packets come from and the memory used for it.
@@ -351,6 +355,8 @@ impl Default for Config {
                 topics: defaults::TOPICS,
                 unknown_writers: defaults::UNKNOWN_WRITERS,
                 reassembly_bytes: defaults::REASSEMBLY_BYTES,
+                subscriptions: defaults::SUBSCRIPTIONS,
+                payload_bytes: defaults::PAYLOAD_BYTES,
             },
             capture: CaptureSettings {
                 source: SourceChoice::default(),
@@ -419,6 +425,8 @@ mod defaults {
     pub(super) const TOPICS: usize = 1_000;
     pub(super) const UNKNOWN_WRITERS: usize = 256;
     pub(super) const REASSEMBLY_BYTES: usize = 4 << 20;
+    pub(super) const SUBSCRIPTIONS: usize = 32;
+    pub(super) const PAYLOAD_BYTES: usize = 40 << 20;
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
     pub(super) const SHM_CPU_PERCENT: f64 = 1.5;

@@ -108,6 +108,12 @@ pub(super) struct LimitsShape {
     /// Bytes held while fragmented datagrams are put together.
     #[schemars(range(min = 65_536, max = 1_073_741_824))]
     pub(super) reassembly_bytes: usize,
+    /// Clients that get messages one by one, and recordings, at once.
+    #[schemars(range(min = 1, max = 1_000))]
+    pub(super) subscriptions: usize,
+    /// Bytes of messages that are put together for them, or wait for them to be read.
+    #[schemars(range(min = 1_048_576, max = 17_179_869_184_u64))]
+    pub(super) payload_bytes: usize,
 }
 
 /// Where packets are taken from.
@@ -250,6 +256,8 @@ impl Default for LimitsShape {
             topics: defaults::TOPICS,
             unknown_writers: defaults::UNKNOWN_WRITERS,
             reassembly_bytes: defaults::REASSEMBLY_BYTES,
+            subscriptions: defaults::SUBSCRIPTIONS,
+            payload_bytes: defaults::PAYLOAD_BYTES,
         }
     }
 }

@@ -26,10 +26,12 @@ use super::header::begins_with_header;
 use super::interest::Interest;
 use super::journal::Journal;
 use super::passage::{lacks_names, may_share_memory};
+use super::payloads::{self, Given, Payloads};
 use super::pieces::Pieces;
-use super::profiler::Profiler;
+use super::profiler::{Profiler, Sighting};
 use super::rate::Slot;
 use super::receivers::{Around, Receivers};
+use super::selection::Wish;
 use super::snapshot::{Snapshot, SocketFacts, WatchState};
 use super::topic::{Naming, TopicId, Topics, Watched};
 use super::trace::{Spans, Subject, Tracer};
@@ -131,6 +133,8 @@ pub struct Observer {
     pub(super) interest: Interest,
     pub(super) profiler: Profiler,
     pub(super) pieces: Pieces,
+    pub(super) payloads: Payloads,
+    wishes: Arc<Vec<Wish>>,
     pub(super) receivers: Receivers,
     pub(super) tracer: Tracer,
     pub(super) examiner: Examiner,
@@ -163,6 +167,8 @@ impl Observer {
                 settings.deliveries,
             ),
             pieces: Pieces::default(),
+            payloads: Payloads::default(),
+            wishes: Arc::default(),
             receivers: Receivers::new(settings.deliveries),
             tracer: Tracer::new(settings.directed),
             examiner: Examiner::default(),
@@ -188,15 +194,25 @@ impl Observer {
         let watches = self.watchlist.watches();
         self.tracer
             .restart(watches.iter().any(|watch| watch.trace > 0.0));
-        // First give places back, then hand them out.
-        for pass in [Watched::Yes, Watched::No] {
-            for id in self.topics.ids() {
-                let watched = self.topics.get(id).map(|topic| topic.watched);
-                if (watched == Some(Watched::Yes)) == (pass == Watched::Yes) {
-                    self.consult(id, self.clock);
-                }
-            }
-        }
+        self.consult_all();
+    }
+
+    /// Gives the samples that these wish for from now on, and no others. Their topics are measured
+    /// meanwhile, whether they are watched or not; what was counted stays.
+    pub fn set_wishes(&mut self, wishes: Arc<Vec<Wish>>) {
+        self.wishes = wishes;
+        self.consult_all();
+    }
+
+    /// What is to be given since the last call.
+    pub fn take_given(&mut self) -> Vec<Given> {
+        self.payloads.take()
+    }
+
+    /// So much waits to be given that it should be taken before more comes.
+    #[must_use]
+    pub const fn has_much_to_give(&self) -> bool {
+        self.payloads.is_full()
     }
 
     /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`
@@ -381,8 +397,13 @@ impl Observer {
         }
         let around = around!(self);
         let journal = &mut self.journal;
-        if self.profiler.record(writer, record, journal, around) {
-            return;
+        match self.profiler.record(writer, record, journal, around) {
+            Sighting::Unmeasured => {}
+            Sighting::Measured => return,
+            Sighting::Counted(counted) => {
+                self.payloads.counted(writer, &counted);
+                return;
+            }
         }
         let is_strange = writer.entity.is_writer()
             && !self.discovery.endpoints().contains_key(&writer)
@@ -635,6 +656,7 @@ impl Observer {
         self.interest.remove(guid);
         self.tracer.forget(guid);
         self.retire(guid, now);
+        self.payloads.release(guid);
         let (domain_id, topic) = (endpoint.domain_id, bounded_shared(&endpoint.topic));
         self.journal.events.name(guid, domain_id, &topic);
         let id = naming(endpoint).and_then(|naming| self.topics.find(endpoint.domain_id, &naming));
@@ -657,10 +679,23 @@ impl Observer {
         });
     }
 
-    /// Asks the watchlist about a topic and lets its endpoints follow.
+    /// Asks about every topic.
+    fn consult_all(&mut self) {
+        // First give places back, then hand them out.
+        for pass in [Watched::Yes, Watched::No] {
+            for id in self.topics.ids() {
+                let watched = self.topics.get(id).map(|topic| topic.watched);
+                if (watched == Some(Watched::Yes)) == (pass == Watched::Yes) {
+                    self.consult(id, self.clock);
+                }
+            }
+        }
+    }
+
+    /// Asks the watchlist and the wishes about a topic and lets its endpoints follow.
     fn consult(&mut self, id: TopicId, now: Timestamp) {
         self.topics
-            .consult(id, &self.watchlist, self.settings.topics, now);
+            .consult(id, &self.watchlist, &self.wishes, self.settings.topics, now);
         let Some(topic) = self.topics.get(id) else {
             return;
         };
@@ -692,6 +727,18 @@ impl Observer {
                     _ => Verdict::Ignore,
                 };
                 self.interest.set(guid, verdict);
+                match &topic.wished {
+                    Some(wished) if measured => {
+                        let topic = payloads::Topic {
+                            domain_id: topic.domain_id,
+                            name: Arc::clone(&topic.naming.name),
+                            dds_name: Arc::clone(&topic.naming.dds_name),
+                            message_type: Arc::clone(&endpoint.message_type),
+                        };
+                        self.payloads.want(guid, topic, wished);
+                    }
+                    _ => self.payloads.release(guid),
+                }
                 if measured {
                     let (traits, opened) = (traits(endpoint), topic.reader_appeared);
                     self.profiler.measure(guid, id, traits, opened, now);

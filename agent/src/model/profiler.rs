@@ -16,7 +16,7 @@ use super::samples::Budget;
 use super::snapshot::Measurement;
 use super::subscribers::{Room, Sight, Stage, Subscribers};
 use super::topic::TopicId;
-use super::writer::{Scene, Traits, Writer};
+use super::writer::{Counted, Scene, Traits, Writer};
 
 const SECOND: u64 = 1_000_000_000;
 /// A stranger is shown and metered after this long: announcements come within a second or so.
@@ -98,6 +98,17 @@ pub struct Retired {
     pub totals: Option<Totals>,
 }
 
+/// What a record was to the profiler.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sighting {
+    /// Of a writer that is not measured.
+    Unmeasured,
+    /// Of one that is.
+    Measured,
+    /// It completed a message, which was counted.
+    Counted(Counted),
+}
+
 /// What became of the strangers.
 #[derive(Debug, Default)]
 pub struct Strangers {
@@ -170,16 +181,16 @@ impl Profiler {
         &self.shared.room
     }
 
-    /// Takes in a record of a measured writer; `false` if it is of another.
+    /// Takes in a record, if it is of a measured writer.
     pub fn record(
         &mut self,
         guid: Guid,
         record: &Record,
         journal: &mut Journal,
         around: Around<'_>,
-    ) -> bool {
+    ) -> Sighting {
         let Some(measured) = self.writers.get_mut(&guid) else {
-            return false;
+            return Sighting::Unmeasured;
         };
         let now = Timestamp(record.time);
         measured.last_seen = measured.last_seen.max(now);
@@ -202,10 +213,10 @@ impl Profiler {
             sight = subscribers.record(record, &mut stage);
         }
         if record.flags & UNDELIVERED != 0 || sight == Sight::Covered {
-            return true;
+            return Sighting::Measured;
         }
         let next = measured.writer.next();
-        measured.writer.record(
+        let counted = measured.writer.record(
             record,
             measured.opened,
             &mut self.shared.scene(subject, now, journal),
@@ -218,7 +229,7 @@ impl Profiler {
         {
             subscribers.wrote(measured.writer.next() - 1, now);
         }
-        true
+        counted.map_or(Sighting::Measured, Sighting::Counted)
     }
 
     /// The tap on shared memory cannot tell what passed before `now`.

@@ -13,6 +13,7 @@ use ros2probe_wire::{Guid, Timestamp};
 
 use super::delivery::Totals;
 use super::expectation::Judgement;
+use super::selection::{Depth, Wish};
 use super::snapshot::Measurement;
 use crate::config::Watchlist;
 
@@ -48,6 +49,15 @@ pub enum Watched {
     Rejected,
 }
 
+/// Wishes for the samples of one topic.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Wished {
+    /// Whose.
+    pub ids: Arc<[u64]>,
+    /// The most that any of them wants.
+    pub depth: Depth,
+}
+
 /// One topic.
 #[derive(Debug)]
 pub struct Topic {
@@ -67,6 +77,8 @@ pub struct Topic {
     pub watched: Watched,
     /// Watchlist entries that cover it, and how it stands with them.
     pub judgements: Vec<(usize, Judgement)>,
+    /// Who wants its samples; `None` = nobody.
+    pub wished: Option<Wished>,
     /// What writers had counted that are measured no more.
     pub retired: Option<Box<Measurement>>,
     /// What had become of their samples.
@@ -159,6 +171,14 @@ impl Naming {
             covering.retain(names_hidden);
         }
         covering
+    }
+
+    /// Who wants its samples.
+    fn wished_by(&self, domain_id: u32, wishes: &[Wish]) -> Option<Wished> {
+        let covering = || wishes.iter().filter(|wish| wish.covers(domain_id, self));
+        let depth = covering().map(|wish| wish.depth).max()?;
+        let ids = covering().map(|wish| wish.id).collect();
+        Some(Wished { ids, depth })
     }
 }
 
@@ -306,14 +326,22 @@ impl Topics {
         }
     }
 
-    /// Asks the watchlist about one topic, within the cap.
-    pub fn consult(&mut self, id: TopicId, watchlist: &Watchlist, cap: usize, now: Timestamp) {
+    /// Asks the watchlist and the wishes about one topic, within the cap.
+    pub fn consult(
+        &mut self,
+        id: TopicId,
+        watchlist: &Watchlist,
+        wishes: &[Wish],
+        cap: usize,
+        now: Timestamp,
+    ) {
         let Some(topic) = self.topics.get(&id) else {
             return;
         };
         let covering = topic.naming.covered_by(topic.domain_id, watchlist);
+        let wished = topic.naming.wished_by(topic.domain_id, wishes);
         let before = topic.watched;
-        let after = if covering.is_empty() {
+        let after = if covering.is_empty() && wished.is_none() {
             Watched::No
         } else if before == Watched::Yes || self.watched < cap || self.give_up_vanished(id) {
             Watched::Yes
@@ -331,6 +359,7 @@ impl Topics {
             topic.retired.get_or_insert_default();
         }
         topic.watched = after;
+        topic.wished = wished.filter(|_| after == Watched::Yes);
         if let Some(at) = topic.vanished {
             match after {
                 Watched::Yes => self.vanished_watched.insert((at, id)),
@@ -396,6 +425,7 @@ impl Topics {
                 last_type: None,
                 watched: Watched::No,
                 judgements: Vec::new(),
+                wished: None,
                 retired: None,
                 retired_totals: None,
                 reader_appeared: Timestamp(0),
@@ -499,13 +529,13 @@ mod tests {
         let mut ids = Vec::new();
         for name in ["rt/a", "rt/b", "rt/c"] {
             let (id, _) = topics.join(0, &naming(name), guid(1), Role::Writer, Timestamp(1));
-            topics.consult(id, &all, 2, Timestamp(1));
+            topics.consult(id, &all, &[], 2, Timestamp(1));
             ids.push(id);
         }
         let state = |topics: &Topics, index: usize| topics.get(ids[index]).unwrap().watched;
         assert_eq!((state(&topics, 2), topics.rejected), (Watched::Rejected, 1));
         topics.leave(ids[0], guid(1), Timestamp(2));
-        topics.consult(ids[2], &all, 2, Timestamp(3));
+        topics.consult(ids[2], &all, &[], 2, Timestamp(3));
         assert_eq!((state(&topics, 2), topics.watched()), (Watched::Yes, 2));
         assert!(topics.get(ids[0]).is_none());
     }

@@ -49,6 +49,23 @@ pub struct Scene<'a> {
     pub journal: &'a mut Journal,
 }
 
+/// A message as it was counted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Counted {
+    /// Its sequence number.
+    pub number: u64,
+    /// Payload bytes, encapsulation included.
+    pub bytes: u64,
+    /// INFO_TS.
+    pub source: RtpsTime,
+    /// Its header's stamp, where the type begins with a header.
+    pub stamp: Option<(i32, u32)>,
+    /// Time of the datagram that completed it.
+    pub at: Timestamp,
+    /// Time of its first one.
+    pub began: Timestamp,
+}
+
 /// One measured writer.
 #[derive(Debug)]
 pub struct Writer {
@@ -150,9 +167,14 @@ impl Writer {
         }
     }
 
-    /// Takes in a record of this writer. `opened` is when last a way for its samples was opened
-    /// that this host sees: what is missing before it went elsewhere.
-    pub fn record(&mut self, record: &Record, opened: Timestamp, scene: &mut Scene<'_>) {
+    /// Takes in a record of this writer; gives the message that it completed. `opened` is when last
+    /// a way for its samples was opened that this host sees: what is missing before it went elsewhere.
+    pub fn record(
+        &mut self,
+        record: &Record,
+        opened: Timestamp,
+        scene: &mut Scene<'_>,
+    ) -> Option<Counted> {
         let at = record_time(record);
         let is_exact = record.flags & flag::EXACT != 0;
         let is_sampled = record.flags & flag::SHM != 0 && !is_exact;
@@ -160,7 +182,7 @@ impl Writer {
             self.exact = self.exact.max(Some(at));
         } else if is_sampled && self.is_exact(at) {
             // It has been seen already, or is on its way.
-            return;
+            return None;
         }
         let takes = self
             .sampled
@@ -170,17 +192,18 @@ impl Writer {
                 _ => sampled.is_current(at),
             });
         if is_sampled || takes {
-            self.sampled_record(record, is_sampled);
+            let counted = self.sampled_record(record, is_sampled);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From here on every message is seen.
                 sampled.end();
             }
-            return;
+            return counted;
         }
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
+        let mut counted = None;
         match record.kind {
-            kind::DATA | kind::DATA_FRAG => self.sample(record, scene),
+            kind::DATA | kind::DATA_FRAG => counted = self.sample(record, scene),
             kind::HEARTBEAT => {
                 self.traits.reliable = true;
                 let (reception, mut settling) = self.parts(scene.journal, scene.now);
@@ -207,6 +230,7 @@ impl Writer {
             // The newest one is excused too, which means nothing once it is received.
             sequence.excuse(next, sequence.next());
         }
+        counted
     }
 
     /// Settles what has waited long enough.
@@ -279,7 +303,7 @@ impl Writer {
         (&mut self.reception, settling)
     }
 
-    fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) {
+    fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) -> Option<Counted> {
         let now = record_time(record);
         let reliable = self.traits.reliable;
         let (reception, mut settling) = self.parts(scene.journal, scene.now);
@@ -295,9 +319,18 @@ impl Writer {
             Outcome::Whole(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);
                 self.delays(whole.number, whole.newest, whole.source, whole.stamp, now);
+                return Some(Counted {
+                    number: whole.number,
+                    bytes: whole.bytes,
+                    source: whole.source,
+                    stamp: whole.stamp.filter(|_| self.traits.has_header),
+                    at: now,
+                    began: whole.began,
+                });
             }
             Outcome::Whole(_) => {}
         }
+        None
     }
 
     fn is_exact(&self, now: Timestamp) -> bool {
@@ -311,7 +344,7 @@ impl Writer {
     }
 
     /// Takes in a record of a view in which what is missing may have been sent all the same.
-    fn sampled_record(&mut self, record: &Record, is_sampled: bool) {
+    fn sampled_record(&mut self, record: &Record, is_sampled: bool) -> Option<Counted> {
         let now = record_time(record);
         if self.sampled.is_none() || !self.is_sampled(now) {
             self.tally.messages += self.reception.abandon();
@@ -329,8 +362,7 @@ impl Writer {
                 let ends = record.kind == kind::DATA || record.ends_sample();
                 let source = record.source_timestamp().timestamp();
                 let news = sampled.sample(number, source, ends, now, sequence);
-                self.sampled_sample(record, &news, now);
-                return;
+                return self.sampled_sample(record, &news, now);
             }
             kind::HEARTBEAT => {
                 self.traits.reliable = true;
@@ -344,9 +376,10 @@ impl Writer {
         };
         self.tally.messages += told;
         self.tally.window.current(now).messages += told;
+        None
     }
 
-    fn sampled_sample(&mut self, record: &Record, news: &News, now: Timestamp) {
+    fn sampled_sample(&mut self, record: &Record, news: &News, now: Timestamp) -> Option<Counted> {
         let (bytes, is_message) = match record.kind {
             kind::DATA => (record.payload_len, is_message(record)),
             _ => (record.sample_size, record.status_info == 0),
@@ -354,18 +387,17 @@ impl Writer {
         // Those that were not seen are taken for as large as the next one that was.
         let disposals = u64::from(!is_message && news.samples > 0);
         let messages = news.samples - disposals;
-        let bytes = (news.alike - disposals).saturating_mul(bytes.into());
+        let bytes = u64::from(bytes);
+        let told = (news.alike - disposals).saturating_mul(bytes);
         self.tally.messages += messages;
-        self.tally.bytes = self.tally.bytes.saturating_add(bytes);
+        self.tally.bytes = self.tally.bytes.saturating_add(told);
         let slot = self.tally.window.current(now);
         slot.messages += messages;
-        slot.bytes = slot.bytes.saturating_add(bytes);
+        slot.bytes = slot.bytes.saturating_add(told);
         if messages > 0 {
             self.last_message = self.last_message.max(Some(now));
         }
-        let Some(sampled) = &mut self.sampled else {
-            return;
-        };
+        let sampled = self.sampled.as_mut()?;
         let stamp = sampled.stamp(record.sequence_number, record.header_stamp());
         if let Some(interval) = news.interval {
             self.interarrival.observe(seconds(interval));
@@ -373,7 +405,16 @@ impl Writer {
         if news.arrived && is_message {
             let source = record.source_timestamp();
             self.delays(record.sequence_number, true, source, stamp, now);
+            return Some(Counted {
+                number: record.sequence_number,
+                bytes,
+                source,
+                stamp: stamp.filter(|_| self.traits.has_header),
+                at: now,
+                began: now,
+            });
         }
+        None
     }
 
     fn count(&mut self, now: Timestamp, bytes: u64, recovered: bool) {

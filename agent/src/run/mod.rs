@@ -8,7 +8,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros2probe_wire::GuidPrefix;
+use ros2probe_wire::{GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
 use crate::capture::live::{CaptureError, LiveSource};
@@ -16,6 +16,7 @@ use crate::capture::pcap::PcapError;
 use crate::model::observer::Observer;
 use crate::model::snapshot::Snapshot;
 use crate::state::Keeper;
+use crate::subscriptions::Subscriptions;
 use crate::surface::Board;
 use crate::surface::events::Drops;
 use crate::watches::Watches;
@@ -27,6 +28,9 @@ const SLICE: Duration = Duration::from_millis(250);
 /// How often surfaces get a new snapshot unasked, and how often at most when they ask.
 const PUBLISH: Duration = Duration::from_secs(1);
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);
+/// Subscribers learn at least this often that nothing came.
+const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
+const CLOCK_NANOSECONDS: u64 = 100_000_000;
 
 /// Why the working thread ended although nobody asked it to.
 #[derive(Debug, thiserror::Error)]
@@ -48,6 +52,9 @@ pub struct Run {
     board: Arc<Board>,
     drops: Drops,
     watches: Arc<Watches>,
+    subscriptions: Arc<Subscriptions>,
+    /// The time that subscriptions were last told.
+    told: Timestamp,
     stop: CancellationToken,
     keeper: Option<Keeper>,
 }
@@ -60,6 +67,7 @@ impl Run {
         observer: Observer,
         board: Arc<Board>,
         watches: Arc<Watches>,
+        subscriptions: Arc<Subscriptions>,
         stop: CancellationToken,
     ) -> Self {
         Self {
@@ -69,6 +77,8 @@ impl Run {
             board,
             drops: Drops::default(),
             watches,
+            subscriptions,
+            told: Timestamp::default(),
             stop,
             keeper: None,
         }
@@ -86,6 +96,11 @@ impl Run {
     /// When the source fails for good.
     pub fn run(mut self) -> Result<(), RunError> {
         let ended = self.work();
+        self.subscriptions.end(match &ended {
+            Ok(()) if self.source.is_finished() => "end of capture",
+            Ok(()) => "agent ends",
+            Err(_) => "the capture failed",
+        });
         if let Some(keeper) = self.keeper.take() {
             keeper.finish(self.observer.memory());
         }
@@ -97,13 +112,17 @@ impl Run {
         self.publish();
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
+            let subscribed = self.subscriptions.is_open();
             let slice = if self.board.is_asked() {
                 PUBLISH_ASKED
+            } else if subscribed {
+                SLICE_SUBSCRIBED
             } else {
                 SLICE
             };
+            let step = subscribed.then(|| Timestamp(self.told.0.saturating_add(CLOCK_NANOSECONDS)));
             let bell = self.board.bell();
-            let polled = self.source.poll(slice, bell, &mut self.observer);
+            let polled = self.source.poll(slice, step, bell, &mut self.observer);
             self.board.hear();
             self.take_watches();
             let finished = self.source.is_finished();
@@ -137,13 +156,22 @@ impl Run {
     fn hand_over(&mut self) {
         self.board.events().add(self.observer.take_events());
         self.board.add_spans(self.observer.take_spans());
+        let clock = self.source.clock();
+        let news = (clock > self.told).then_some(clock);
+        self.told = self.told.max(clock);
+        self.subscriptions.deliver(self.observer.take_given(), news);
     }
 
-    /// Watches what is asked for since the last look. The kernel knows it before the next packets.
+    /// Watches and gives what is asked for since the last look. The kernel knows it before the next packets.
     fn take_watches(&mut self) {
         if let Some(watchlist) = self.watches.take_news() {
             self.observer.set_watchlist(watchlist);
             self.tell_interest();
+        }
+        if let Some(wishes) = self.subscriptions.take_news() {
+            self.observer.set_wishes(Arc::clone(&wishes));
+            self.tell_interest();
+            self.subscriptions.in_force(&wishes);
         }
     }
 

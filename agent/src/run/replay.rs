@@ -15,6 +15,8 @@ use crate::model::reassembly::{Limits, Reassembly};
 
 /// How often a terminal is told how far it is.
 const PROGRESS: Duration = Duration::from_secs(1);
+/// A packet this far from the last one is gone to at once, not step by step.
+const FAR: u64 = 3600 * 1_000_000_000;
 
 /// A capture being replayed.
 pub struct Replay {
@@ -63,26 +65,48 @@ impl Replay {
     }
 
     /// Delivers what is due within `timeout`, then returns: at the latest after it, earlier at the
-    /// end of the capture.
+    /// end of the capture, before a packet that is not older than `until`, and when the model has
+    /// much to give.
     ///
     /// # Errors
     /// When the rest of the capture cannot be read; what came before has been delivered.
-    pub fn poll(&mut self, timeout: Duration, observer: &mut Observer) -> Result<(), PcapError> {
+    pub fn poll(
+        &mut self,
+        timeout: Duration,
+        until: Option<Timestamp>,
+        observer: &mut Observer,
+    ) -> Result<(), PcapError> {
         let end = Instant::now() + timeout;
         while !self.finished {
             let now = Instant::now();
-            if now >= end {
+            if now >= end || observer.has_much_to_give() {
                 break;
             }
             if let Some(waiting) = &self.waiting {
                 let delay = self.pacer.delay(waiting.time, now);
+                let later = until.filter(|until| waiting.time > *until);
+                if let Some(until) = later
+                    && delay.is_zero()
+                {
+                    let is_far = waiting.time.0 - until.0 > FAR;
+                    let time = if is_far { waiting.time.0 - 1 } else { until.0 };
+                    self.clock = self.clock.max(Timestamp(time));
+                    break;
+                }
                 let slice = delay.min(end.saturating_duration_since(now));
+                let slice = slice.min(until.map_or(slice, |_| step(self.speed)));
                 if !slice.is_zero() {
                     std::thread::sleep(slice);
                 }
                 if slice < delay {
-                    self.clock = before(waiting.time, delay - slice, self.speed).max(self.clock);
+                    let clock = before(waiting.time, delay - slice, self.speed);
+                    self.clock = until
+                        .map_or(clock, |until| clock.min(until))
+                        .max(self.clock);
                     break;
+                }
+                if later.is_some() {
+                    continue;
                 }
                 let Waiting {
                     time,
@@ -186,6 +210,14 @@ impl Replay {
                 self.packets
             );
         }
+    }
+}
+
+/// How long a tenth of a second of the capture takes.
+fn step(speed: Speed) -> Duration {
+    match speed {
+        Speed::Max => Duration::ZERO,
+        Speed::Times(factor) => Duration::try_from_secs_f64(0.1 / factor).unwrap_or(Duration::MAX),
     }
 }
 

@@ -69,15 +69,19 @@ impl Source {
         );
     }
 
+    /// Takes in what comes, for `timeout` at most; of a capture nothing from `until` on.
     pub(super) fn poll(
         &mut self,
         timeout: Duration,
+        until: Option<Timestamp>,
         bell: Option<BorrowedFd<'_>>,
         observer: &mut Observer,
     ) -> Result<(), RunError> {
         match self {
             Self::Live(live) => Ok(live.poll(timeout, bell, observer)?),
-            Self::Replay(replay) => replay.poll(timeout, observer).map_err(RunError::Replay),
+            Self::Replay(replay) => replay
+                .poll(timeout, until, observer)
+                .map_err(RunError::Replay),
         }
     }
 

@@ -20,6 +20,7 @@ mod participants;
 mod party;
 pub mod problem;
 pub mod reload;
+mod samples;
 mod scope;
 mod security;
 mod server;
@@ -38,6 +39,7 @@ use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::board::{Board, State};
+use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
 pub use openapi::document;
 use problem::{Code, Problem};
@@ -55,6 +57,8 @@ pub struct Context {
     pub board: Arc<Board>,
     /// What is watched.
     pub watches: Arc<Watches>,
+    /// Who gets messages one by one.
+    pub subscriptions: Arc<Subscriptions>,
     /// Has the configuration read again.
     pub reloader: Reloader,
     /// Ends streams when the agent ends.
@@ -74,6 +78,7 @@ fn nouns() -> OpenApiRouter<Context> {
     OpenApiRouter::with_openapi(openapi::head())
         .merge(watch::routes())
         .merge(events::routes())
+        .merge(samples::routes())
         .merge(topics::routes())
         .merge(nodes::routes())
         .merge(services::routes())

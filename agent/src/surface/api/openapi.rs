@@ -38,6 +38,7 @@ const COMMON: [(&str, &str); 6] = [
     tags(
         (name = "watch", description = "What is measured, changed while the agent runs."),
         (name = "events", description = "What happens, as it happens."),
+        (name = "samples", description = "Messages of topics, one by one, as they come."),
         (name = "graph", description = "What is known of the robot."),
         (name = "agent", description = "The agent itself."),
     )

@@ -55,6 +55,8 @@ pub enum Code {
     TooManyRequests,
     /// As many clients follow events as may.
     TooManyStreams,
+    /// As many subscriptions are open as may.
+    TooManySubscriptions,
     /// The agent is about to end.
     Ending,
 }
@@ -173,6 +175,11 @@ impl Code {
                 StatusCode::SERVICE_UNAVAILABLE,
                 "Too many streams of events",
             ),
+            Self::TooManySubscriptions => (
+                "too-many-subscriptions",
+                StatusCode::SERVICE_UNAVAILABLE,
+                "Too many streams of messages",
+            ),
             Self::Ending => (
                 "ending",
                 StatusCode::SERVICE_UNAVAILABLE,
@@ -224,7 +231,7 @@ impl IntoResponse for Problem {
             Code::Unauthorized => {
                 headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
             }
-            Code::TooManyRequests | Code::TooManyStreams => {
+            Code::TooManyRequests | Code::TooManyStreams | Code::TooManySubscriptions => {
                 headers.insert(RETRY_AFTER, HeaderValue::from_static("1"));
             }
             _ => {}

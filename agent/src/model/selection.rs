@@ -1,0 +1,267 @@
+//! Which topics somebody wants the samples of, and how much of them.
+//!
+//! A subscription's choice, matched against topics as they appear. It decides nothing about
+//! measuring beyond that: the watchlist has its own patterns.
+
+use std::sync::Arc;
+
+use globset::{GlobBuilder, GlobMatcher};
+use regex::{Regex, RegexBuilder};
+
+use super::topic::Naming;
+use crate::config::{PatternError, check_pattern};
+
+/// Largest compiled form of one regular expression, in bytes.
+const REGEX_BYTES: usize = 1 << 20;
+
+/// How much of each sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Depth {
+    /// That it came, and what is known of it.
+    Arrivals,
+    /// With its bytes.
+    Payloads,
+}
+
+/// One way to name topics.
+#[derive(Clone, Debug)]
+pub enum Choice {
+    /// Every topic that `ros2 topic list` shows.
+    All,
+    /// One topic by its ROS name, hidden or not, or by its DDS name.
+    Name(String),
+    /// `*` within one token, `**` across tokens; hidden topics where it names a hidden token.
+    Glob(GlobMatcher),
+    /// Every topic in whose name it is found.
+    Regex(Regex),
+}
+
+/// Why nothing can be chosen that way.
+#[derive(Debug, thiserror::Error)]
+pub enum ChoiceError {
+    /// No name and no glob.
+    #[error("`{pattern}` {reason}")]
+    Pattern {
+        /// As given.
+        pattern: String,
+        /// What is wrong with it.
+        reason: PatternError,
+    },
+    /// No glob.
+    #[error("`{pattern}` is no glob")]
+    Glob {
+        /// As given.
+        pattern: String,
+        /// Why not.
+        source: globset::Error,
+    },
+    /// No regular expression, or one that is too large.
+    #[error("`{pattern}` is no regular expression that can be used")]
+    Regex {
+        /// As given.
+        pattern: String,
+        /// Why not.
+        source: Box<regex::Error>,
+    },
+}
+
+/// Topics by what is wanted and what is not.
+#[derive(Clone, Debug, Default)]
+pub struct Selection {
+    /// A topic is wanted that one of these names.
+    pub include: Vec<Choice>,
+    /// Unless one of these names it.
+    pub exclude: Vec<Choice>,
+    /// [`Choice::All`], globs and regular expressions find hidden topics, too.
+    pub hidden: bool,
+}
+
+/// A subscription as the model sees it.
+#[derive(Clone, Debug)]
+pub struct Wish {
+    /// Names the subscription.
+    pub id: u64,
+    /// Which topics.
+    pub selection: Arc<Selection>,
+    /// Only of this domain; `None` = every domain.
+    pub domain_id: Option<u32>,
+    /// How much of them.
+    pub depth: Depth,
+}
+
+impl Choice {
+    /// A name, or a glob where it has a star.
+    ///
+    /// # Errors
+    /// It can be neither.
+    pub fn parse(pattern: &str) -> Result<Self, ChoiceError> {
+        let is_dds = !pattern.is_empty() && !pattern.starts_with('/') && pattern.len() <= 255;
+        if is_dds && !pattern.contains('*') {
+            return Ok(Self::Name(pattern.to_owned()));
+        }
+        check_pattern(pattern).map_err(|reason| ChoiceError::Pattern {
+            pattern: pattern.to_owned(),
+            reason,
+        })?;
+        if !pattern.contains('*') {
+            return Ok(Self::Name(pattern.to_owned()));
+        }
+        let glob = GlobBuilder::new(pattern).literal_separator(true).build();
+        let glob = glob.map_err(|source| ChoiceError::Glob {
+            pattern: pattern.to_owned(),
+            source,
+        })?;
+        Ok(Self::Glob(glob.compile_matcher()))
+    }
+
+    /// A regular expression, found anywhere in a name.
+    ///
+    /// # Errors
+    /// It is none, or too large.
+    pub fn regex(pattern: &str) -> Result<Self, ChoiceError> {
+        let mut builder = RegexBuilder::new(pattern);
+        let regex = builder.size_limit(REGEX_BYTES).build();
+        let regex = regex.map_err(|source| ChoiceError::Regex {
+            pattern: pattern.to_owned(),
+            source: Box::new(source),
+        })?;
+        Ok(Self::Regex(regex))
+    }
+
+    fn covers(&self, name: &str, dds_name: &str, is_ros: bool, hidden: bool) -> bool {
+        match self {
+            Self::Name(wanted) => wanted == name || wanted == dds_name,
+            _ if !is_ros => false,
+            Self::All => hidden,
+            Self::Glob(glob) => {
+                (hidden || glob.glob().glob().contains("/_")) && glob.is_match(name)
+            }
+            Self::Regex(regex) => hidden && regex.is_match(name),
+        }
+    }
+}
+
+impl Selection {
+    /// These names and globs.
+    ///
+    /// # Errors
+    /// The first that is neither.
+    pub fn named<'a>(patterns: impl IntoIterator<Item = &'a str>) -> Result<Self, ChoiceError> {
+        let include: Result<_, _> = patterns.into_iter().map(Choice::parse).collect();
+        Ok(Self {
+            include: include?,
+            ..Self::default()
+        })
+    }
+
+    /// Everything that `ros2 topic list` shows.
+    #[must_use]
+    pub fn all() -> Self {
+        Self {
+            include: vec![Choice::All],
+            ..Self::default()
+        }
+    }
+
+    /// Whether this topic is wanted. `kind` as in [`super::snapshot::TopicFacts`]: requests and
+    /// replies of services, and what follows no ROS convention, go by their exact names alone.
+    #[must_use]
+    pub fn covers(&self, kind: &str, name: &str, dds_name: &str, hidden: bool) -> bool {
+        let is_ros = !matches!(
+            kind,
+            "service_request" | "service_reply" | "discovery" | "dds"
+        );
+        // The ROS name of a request is the service's, which may be a topic's as well.
+        let name = if is_ros { name } else { dds_name };
+        let shown = self.hidden || !hidden;
+        let covers = |choice: &Choice| choice.covers(name, dds_name, is_ros, shown);
+        let named = |choice: &Choice| choice.covers(name, dds_name, is_ros, true);
+        self.include.iter().any(covers) && !self.exclude.iter().any(named)
+    }
+}
+
+impl Wish {
+    /// Whether it is for this topic.
+    #[must_use]
+    pub fn covers(&self, domain_id: u32, naming: &Naming) -> bool {
+        self.domain_id.is_none_or(|wanted| wanted == domain_id)
+            && self
+                .selection
+                .covers(naming.kind, &naming.name, &naming.dds_name, naming.hidden)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::names::DdsTopic;
+
+    use super::*;
+
+    fn covers(selection: &Selection, dds_name: &str) -> bool {
+        let naming = Naming::of(&DdsTopic::parse(dds_name).unwrap());
+        let wish = Wish {
+            id: 1,
+            selection: Arc::new(selection.clone()),
+            domain_id: Some(3),
+            depth: Depth::Arrivals,
+        };
+        assert!(!wish.covers(4, &naming));
+        wish.covers(3, &naming)
+    }
+
+    #[test]
+    fn names_find_hidden_topics_and_patterns_only_when_asked() {
+        let exact = Selection::named(["/add/_service_event", "/points"]).unwrap();
+        assert!(covers(&exact, "rt/add/_service_event") && covers(&exact, "rt/points"));
+        assert!(!covers(&exact, "rt/points2"));
+        let hidden = Selection {
+            hidden: true,
+            ..Selection::all()
+        };
+        assert!(covers(&hidden, "rt/fib/_action/feedback"));
+        assert!(!covers(&Selection::all(), "rt/fib/_action/feedback"));
+        assert!(covers(&Selection::all(), "rt/robot1/points"));
+        let glob = Selection::named(["/robot1/**", "/**/_action/feedback"]).unwrap();
+        assert!(covers(&glob, "rt/robot1/lidar/points") && !covers(&glob, "rt/robot2/points"));
+        assert!(covers(&glob, "rt/fib/_action/feedback"));
+        assert!(!covers(&glob, "rt/robot1/_hidden"));
+        let regex = Selection {
+            include: vec![Choice::regex("camera|lidar").unwrap()],
+            exclude: vec![Choice::parse("/**/info").unwrap()],
+            hidden: false,
+        };
+        assert!(covers(&regex, "rt/front_camera/image"));
+        assert!(!covers(&regex, "rt/front_camera/info") && !covers(&regex, "rt/front/_lidar"));
+    }
+
+    #[test]
+    fn services_and_foreign_topics_go_by_their_exact_names() {
+        for dds_name in [
+            "rq/addRequest",
+            "rr/addReply",
+            "ros_discovery_info",
+            "Square",
+        ] {
+            let everything = Selection {
+                include: vec![Choice::All, Choice::regex(".").unwrap()],
+                hidden: true,
+                ..Selection::default()
+            };
+            assert!(!covers(&everything, dds_name), "{dds_name}");
+            assert!(covers(&Selection::named([dds_name]).unwrap(), dds_name));
+        }
+        assert!(!covers(
+            &Selection::named(["/add"]).unwrap(),
+            "rq/addRequest"
+        ));
+    }
+
+    #[test]
+    fn what_names_nothing_is_refused() {
+        for pattern in ["", "/", "/a//b", "/**x", "a*"] {
+            assert!(Choice::parse(pattern).is_err(), "{pattern}");
+        }
+        assert!(Choice::regex("(").is_err());
+        assert!(Choice::regex("((a{100}){100}){100}").is_err());
+    }
+}

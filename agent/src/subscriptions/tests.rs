@@ -1,0 +1,223 @@
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+use super::*;
+use crate::surface::{Settings, SourceKind};
+
+const LONG: Duration = Duration::from_secs(60);
+
+fn subscriptions(caps: Caps) -> Arc<Subscriptions> {
+    let board = Arc::new(Board::new(SourceKind::Wire, Settings::default()));
+    Arc::new(Subscriptions::new(board, caps, CancellationToken::new()))
+}
+
+fn caps() -> Caps {
+    Caps {
+        subscriptions: 4,
+        bytes: 1 << 20,
+    }
+}
+
+fn request(depth: Depth, queue_bytes: usize, overflow: Overflow) -> Request {
+    Request {
+        topics: Selection::all(),
+        domain_id: None,
+        depth,
+        queue_bytes,
+        overflow,
+        label: "test".to_owned(),
+    }
+}
+
+fn sample(number: u64, payload: Option<usize>) -> Arc<Sample> {
+    Arc::new(Sample {
+        topic: Arc::new(Topic {
+            domain_id: 0,
+            name: "/points".into(),
+            dds_name: "rt/points".into(),
+            message_type: "a/msg/B".into(),
+        }),
+        time: Timestamp(number),
+        writer: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3])),
+        sequence_number: number,
+        source_timestamp: None,
+        header_stamp: None,
+        size: 10_000,
+        payload: payload.map(|len| vec![7; len].into()),
+    })
+}
+
+fn given(to: &[u64], number: u64, payload: Option<usize>) -> Given {
+    Given {
+        to: to.into(),
+        news: News::Sample(sample(number, payload)),
+    }
+}
+
+fn numbers(subscription: &mut Subscription) -> Vec<u64> {
+    let mut numbers = Vec::new();
+    while let Some(item) = subscription.try_next() {
+        if let Item::Sample(sample) = item {
+            numbers.push(sample.sequence_number);
+        }
+    }
+    numbers
+}
+
+#[test]
+fn each_reader_gets_what_is_for_it_and_bytes_only_when_asked() {
+    let all = subscriptions(caps());
+    let mut arrivals = all.open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest));
+    let mut payloads = all.open(request(Depth::Payloads, 1 << 16, Overflow::DropOldest));
+    let (arrivals, payloads) = (arrivals.as_mut().unwrap(), payloads.as_mut().unwrap());
+    let wishes = all.take_news().unwrap();
+    assert_eq!(wishes.len(), 2);
+    all.deliver(
+        vec![given(&[1, 2], 1, Some(5)), given(&[2], 2, Some(6))],
+        Some(Timestamp(9)),
+    );
+    assert_eq!(arrivals.try_next(), Some(Item::Sample(sample(1, None))));
+    assert_eq!(arrivals.try_next(), Some(Item::Clock(Timestamp(9))));
+    assert_eq!(arrivals.try_next(), None);
+    assert_eq!(payloads.try_next(), Some(Item::Sample(sample(1, Some(5)))));
+    assert_eq!(all.facts().queued_bytes, 6);
+    assert_eq!(payloads.try_next(), Some(Item::Sample(sample(2, Some(6)))));
+    assert_eq!((all.facts().queued_bytes, all.facts().given), (0, 3));
+}
+
+#[test]
+fn a_slow_reader_loses_the_oldest_and_is_told_before_what_is_left() {
+    let all = subscriptions(caps());
+    let mut slow = all
+        .open(request(Depth::Payloads, 4 * 1256, Overflow::DropOldest))
+        .unwrap();
+    for number in 1..=10 {
+        all.deliver(vec![given(&[1], number, Some(1000))], None);
+    }
+    let Some(Item::Missed(missed)) = slow.try_next() else {
+        panic!("nothing was told");
+    };
+    assert_eq!((missed.first, missed.last, missed.samples), (1, 6, 6));
+    assert_eq!(missed.reason, MissedReason::QueueFull);
+    assert_eq!(numbers(&mut slow), [7, 8, 9, 10]);
+    assert!(all.facts().missed.contains(&("queue_full", 6)));
+    assert_eq!(all.facts().queued_bytes, 0);
+}
+
+#[test]
+fn all_queues_together_keep_their_cap_and_a_payload_counts_once() {
+    let all = subscriptions(Caps {
+        subscriptions: 12,
+        bytes: 10_000,
+    });
+    let mut readers: Vec<_> = (0..10)
+        .map(|_| all.open(request(Depth::Payloads, 1 << 20, Overflow::DropOldest)))
+        .map(Result::unwrap)
+        .collect();
+    let everybody: Vec<u64> = (1..=10).collect();
+    for number in 1..=10 {
+        all.deliver(vec![given(&everybody, number, Some(1000))], None);
+    }
+    assert_eq!(all.facts().queued_bytes, 10_000);
+    for number in 11..=100 {
+        all.deliver(vec![given(&everybody, number, Some(1000))], None);
+        assert!(all.facts().queued_bytes <= 10_000);
+    }
+    for reader in &mut readers {
+        assert_eq!(numbers(reader).last(), Some(&100));
+    }
+    assert_eq!(all.facts().queued_bytes, 0);
+}
+
+#[test]
+fn on_a_replay_the_source_waits_for_the_reader_and_not_for_one_that_has_gone() {
+    let all = subscriptions(caps());
+    let mut reader = all
+        .open(request(Depth::Payloads, 3000, Overflow::Wait))
+        .unwrap();
+    let source = std::thread::spawn({
+        let all = Arc::clone(&all);
+        move || {
+            for number in 1..=200 {
+                all.deliver(
+                    vec![given(&[1], number, Some(1000))],
+                    Some(Timestamp(number)),
+                );
+            }
+        }
+    });
+    let mut expected = 1;
+    while expected <= 100 {
+        match reader.next_blocking(LONG).unwrap() {
+            Item::Sample(sample) => {
+                assert_eq!(sample.sequence_number, expected);
+                expected += 1;
+            }
+            Item::Clock(now) => assert_eq!(now.0, expected - 1),
+            other => panic!("{other:?}"),
+        }
+    }
+    drop(reader);
+    source.join().unwrap();
+    assert!(!all.is_open());
+}
+
+#[test]
+fn a_waiting_source_goes_on_when_the_agent_ends() {
+    let all = subscriptions(caps());
+    let _reader = all
+        .open(request(Depth::Payloads, 1, Overflow::Wait))
+        .unwrap();
+    let source = std::thread::spawn({
+        let all = Arc::clone(&all);
+        move || {
+            for number in 1..=10 {
+                all.deliver(vec![given(&[1], number, Some(1000))], None);
+            }
+        }
+    });
+    all.stop.cancel();
+    source.join().unwrap();
+}
+
+#[test]
+fn dropping_a_subscription_closes_its_interest_and_makes_room_for_another() {
+    let all = subscriptions(caps());
+    let open = || all.open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest));
+    let mut readers: Vec<_> = (0..4).map(|_| open().unwrap()).collect();
+    assert_eq!(open().unwrap_err(), Refused::TooMany(4));
+    all.deliver(vec![given(&[4], 1, Some(1000))], None);
+    readers.pop();
+    assert_eq!((all.facts().open, all.facts().queued_bytes), (3, 0));
+    let wishes = all.take_news().unwrap();
+    assert_eq!(wishes.iter().map(|wish| wish.id).max(), Some(3));
+    assert!(all.take_news().is_none());
+    assert!(open().is_ok());
+    assert_eq!(all.facts().refused, 1);
+}
+
+#[tokio::test]
+async fn a_reader_is_woken_told_the_end_and_then_nothing() {
+    let all = subscriptions(caps());
+    let mut reader = all
+        .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
+        .unwrap();
+    assert!(!reader.in_force(Duration::from_millis(1)).await);
+    all.in_force(&all.take_news().unwrap());
+    assert!(reader.in_force(LONG).await);
+    let source = std::thread::spawn({
+        let all = Arc::clone(&all);
+        move || {
+            all.deliver(vec![given(&[1], 1, None)], Some(Timestamp(3)));
+            all.end("end of capture");
+        }
+    });
+    assert_eq!(reader.next().await, Some(Item::Sample(sample(1, None))));
+    assert_eq!(reader.next().await, Some(Item::Clock(Timestamp(3))));
+    assert_eq!(reader.next().await, Some(Item::End("end of capture")));
+    assert_eq!(reader.next().await, None);
+    source.join().unwrap();
+    let mut late = all
+        .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
+        .unwrap();
+    assert_eq!(late.next().await, Some(Item::End("end of capture")));
+}

@@ -1,0 +1,275 @@
+//! `GET /samples`: the messages of topics as they come, one by one, for as long as the client
+//! stays. The topics are measured meanwhile, whether they are watched or not.
+//!
+//! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
+//! and is told, on a replay it is waited for. It holds nobody else up.
+
+use std::convert::Infallible;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::State;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use futures_util::stream;
+use serde::Deserialize;
+use tokio_util::sync::CancellationToken;
+use utoipa::IntoParams;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::parameters::Parameters;
+use super::problem::{Code, Problem, ProblemBody};
+use crate::config::watch::MAX_DOMAIN;
+use crate::model::snapshot::Snapshot;
+use crate::subscriptions::line::{LINES, Line, Open, OpenTopic, SAMPLES};
+use crate::subscriptions::{
+    Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
+};
+use crate::surface::SourceKind;
+
+/// Names and globs in one request.
+const MAX_PATTERNS: usize = 256;
+/// Lines made into one piece of the answer.
+const BATCH_BYTES: usize = 16 * 1024;
+/// Room for arrivals, a few thousand; and for messages with their bytes.
+const ARRIVALS_BYTES: usize = 1 << 20;
+const PAYLOADS_BYTES: usize = 16 << 20;
+/// How long a stream waits with its first line for the capture to know what is wanted.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+#[derive(Clone, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+struct Wanted {
+    /// Topics, separated by commas: ROS names, globs as in a watch, or exact DDS names. Also those
+    /// that appear later.
+    #[param(max_length = 65536, example = "/points,/robot1/**")]
+    topic: Option<String>,
+    /// Topics in whose names this regular expression is found.
+    #[param(max_length = 4096)]
+    regex: Option<String>,
+    /// Every topic that `ros2 topic list` shows.
+    all: bool,
+    /// Except these: as `topic`.
+    #[param(max_length = 65536)]
+    exclude: Option<String>,
+    /// Except those in whose names this regular expression is found.
+    #[param(max_length = 4096)]
+    exclude_regex: Option<String>,
+    /// Whether globs, `regex` and `all` find hidden topics, too. A name finds them anyway.
+    hidden: bool,
+    /// Only of this domain.
+    #[param(maximum = 232)]
+    domain_id: Option<u32>,
+    /// Whether the bytes of the messages are wanted.
+    payload: bool,
+}
+
+/// One client's stream.
+struct Stream {
+    subscription: Subscription,
+    stop: CancellationToken,
+    /// Payload that goes out next, behind its line.
+    payload: Option<Bytes>,
+    first: Option<Line>,
+    ended: bool,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(samples))
+}
+
+/// The messages of topics, as they come
+///
+/// Each line is a JSON object with one key: first `open`, with the topics that are known and
+/// wanted; then `sample` for each message, once, however often it is seen; `clock` at least ten times
+/// a second, when everything up to a time has been told; `missed` for messages that will not be told,
+/// with the reason; `end` when nothing will follow. With `payload=true`, as many raw bytes as
+/// `payload_bytes` says follow a sample's line: the serialized message with its encapsulation. The topics are
+/// measured as long as the stream is open, and are not listed as watches.
+#[utoipa::path(
+    get,
+    path = "/samples",
+    tag = "samples",
+    params(Wanted),
+    responses(
+        (status = 200, description = "Lines, until the client goes, the capture or the agent ends.",
+            content((Line = "application/x-ndjson"), (Line = "application/vnd.ros2probe.samples"))),
+        (status = 422, description = "Nothing is wanted, or what is wanted can be no topic.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 503, description = "There are too many subscriptions already.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn samples(
+    State(context): State<Context>,
+    Parameters(wanted): Parameters<Wanted>,
+) -> Result<Response, Problem> {
+    let domain_id = wanted.domain_id;
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+        let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    let is_replay = context.board.state().agent.source == SourceKind::Replay;
+    let (depth, queue_bytes, media_type) = if wanted.payload {
+        (Depth::Payloads, PAYLOADS_BYTES, SAMPLES)
+    } else {
+        (Depth::Arrivals, ARRIVALS_BYTES, LINES)
+    };
+    let request = Request {
+        topics: selection(&wanted)?,
+        domain_id,
+        depth,
+        queue_bytes,
+        overflow: if is_replay {
+            Overflow::Wait
+        } else {
+            Overflow::DropOldest
+        },
+        label: "GET /samples".to_owned(),
+    };
+    let opened = context.subscriptions.open(request);
+    let subscription = opened.map_err(|refused @ Refused::TooMany(_)| {
+        Problem::new(Code::TooManySubscriptions, refused.to_string())
+    })?;
+    let known = if is_replay {
+        context.board.state()
+    } else {
+        subscription.in_force(PATIENCE).await;
+        context.state().await
+    };
+    let first = Line::Open(Open {
+        topics: topics(known.known(), subscription.selection(), domain_id),
+    });
+    let stream = Stream {
+        subscription,
+        stop: context.stop.clone(),
+        payload: None,
+        first: Some(first),
+        ended: false,
+    };
+    let stream = stream::unfold(stream, |mut stream| async {
+        let piece = stream.next().await?;
+        Some((Ok::<_, Infallible>(piece), stream))
+    });
+    let headers = [(CACHE_CONTROL, "no-store"), (CONTENT_TYPE, media_type)];
+    Ok((headers, Body::from_stream(stream)).into_response())
+}
+
+impl Stream {
+    /// The next piece of the answer: some lines, or the payload behind the last one.
+    async fn next(&mut self) -> Option<Bytes> {
+        if let Some(payload) = self.payload.take() {
+            return Some(payload);
+        }
+        let mut lines = Vec::new();
+        if let Some(first) = self.first.take() {
+            write(&mut lines, &first);
+        }
+        while !self.ended && self.payload.is_none() && lines.len() < BATCH_BYTES {
+            let item = match self.subscription.try_next() {
+                Some(item) => item,
+                None if !lines.is_empty() => break,
+                None => self.wait().await,
+            };
+            write(&mut lines, &Line::from(&item));
+            match item {
+                Item::Sample(sample) => self.payload.clone_from(&sample.payload),
+                Item::End(_) => self.ended = true,
+                Item::Clock(_) | Item::Missed(_) => {}
+            }
+        }
+        (!lines.is_empty()).then(|| lines.into())
+    }
+
+    async fn wait(&mut self) -> Item {
+        let item = tokio::select! {
+            biased;
+            item = self.subscription.next() => item,
+            () = self.stop.cancelled() => None,
+        };
+        item.unwrap_or(Item::End("agent ends"))
+    }
+}
+
+fn write(lines: &mut Vec<u8>, line: &Line) {
+    // Plain numbers and strings into memory: nothing that could fail.
+    let _ = serde_json::to_writer(&mut *lines, line);
+    lines.push(b'\n');
+}
+
+fn selection(wanted: &Wanted) -> Result<Selection, Problem> {
+    let mut include = patterns(wanted.topic.as_deref(), wanted.regex.as_deref())?;
+    if wanted.all {
+        include.push(Choice::All);
+    }
+    if include.is_empty() {
+        let detail = "nothing is wanted: `topic`, `regex` or `all=true`";
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    Ok(Selection {
+        include,
+        exclude: patterns(wanted.exclude.as_deref(), wanted.exclude_regex.as_deref())?,
+        hidden: wanted.hidden,
+    })
+}
+
+fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Problem> {
+    let names: Vec<_> = names.into_iter().flat_map(|list| list.split(',')).collect();
+    if names.len() > MAX_PATTERNS {
+        let detail = format!("at most {MAX_PATTERNS} topics can be named, use globs");
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    let names = names.into_iter().map(|name| Choice::parse(name.trim()));
+    let choices: Result<_, _> = names.chain(regex.map(Choice::regex)).collect();
+    choices.map_err(|error| {
+        let detail = format!("{:#}", anyhow::anyhow!(error));
+        Problem::new(Code::InvalidRequest, detail)
+    })
+}
+
+/// The topics that are wanted and known.
+fn topics(snapshot: &Snapshot, selection: &Selection, domain_id: Option<u32>) -> Vec<OpenTopic> {
+    let topics = snapshot.topics.iter().filter(|topic| {
+        domain_id.is_none_or(|wanted| wanted == topic.domain_id)
+            && selection.covers(topic.kind, &topic.name, &topic.dds_name, topic.hidden)
+    });
+    topics
+        .map(|topic| OpenTopic {
+            topic: topic.name.clone(),
+            domain_id: topic.domain_id,
+            types: topic.message_types.clone(),
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_can_never_be_given_is_refused() {
+        let wanted = |topic: &str, regex: &str| Wanted {
+            topic: (!topic.is_empty()).then(|| topic.to_owned()),
+            regex: (!regex.is_empty()).then(|| regex.to_owned()),
+            ..Wanted::default()
+        };
+        for (topic, regex) in [("/points, /robot1/**,rq/addRequest", ""), ("", "^/cam.*,x")] {
+            assert!(selection(&wanted(topic, regex)).is_ok(), "{topic} {regex}");
+        }
+        let many = vec!["/a"; MAX_PATTERNS + 1].join(",");
+        for (topic, regex) in [
+            ("", ""),
+            ("/a//b", ""),
+            ("/a,,/b", ""),
+            (&many, ""),
+            ("", "("),
+        ] {
+            let refused = selection(&wanted(topic, regex)).unwrap_err();
+            assert_eq!(refused.code(), Code::InvalidRequest, "{topic} {regex}");
+        }
+    }
+}
