@@ -100,6 +100,19 @@ schemathesis() {
     "$place/bin/pip" install --quiet --disable-pip-version-check "schemathesis==$version"
 }
 
+# Other readers of bags, to see what they make of ours.
+bags() {
+    local place=$tools/bags
+    local versions=("mcap==1.6.0" "rosbags==0.11.9")
+    [ "$(cat "$place/versions" 2>/dev/null)" = "${versions[*]}" ] && return
+    packages python3 python3-venv
+    say "installing ${versions[*]} from PyPI into target/tools/bags"
+    rm -rf "$place"
+    python3 -m venv "$place"
+    "$place/bin/pip" install --quiet --disable-pip-version-check "${versions[@]}"
+    echo "${versions[*]}" >"$place/versions"
+}
+
 rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
@@ -173,6 +186,7 @@ for need; do
         prometheus
         schemathesis
         rotel
+        bags
         types
         rust
         ebpf

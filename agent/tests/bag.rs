@@ -1,8 +1,15 @@
 //! Bags as things on disk: what is written, and what other readers make of it.
+#![allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::panic,
+    reason = "a test that meets the unexpected has failed"
+)]
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 use std::time::Duration;
 
 use ros2probe::bag::metadata::Metadata;
@@ -12,6 +19,7 @@ use ros2probe::bag::{
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::{Durability, History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
+use serde_json::{Value, json};
 
 const SECOND: u64 = 1_000_000_000;
 const BEGIN: u64 = 1_795_142_331_000_000_000;
@@ -51,7 +59,7 @@ fn bag(directory: &Path, options: Options, count: u64) -> Summary {
     for index in 0..count {
         let time = Timestamp(BEGIN + index * SECOND / 10);
         let sent = Timestamp(time.0 - 1000);
-        let (topic, data) = if index % 3 == 0 {
+        let (topic, data) = if index.is_multiple_of(3) {
             (points, cloud(index))
         } else {
             (chatter, text(index))
@@ -142,7 +150,7 @@ fn another_reader_finds_every_message_in_its_place() {
             found.into_iter().enumerate()
         {
             let index = index as u64;
-            let of_cloud = index % 3 == 0;
+            let of_cloud = index.is_multiple_of(3);
             assert_eq!(topic, if of_cloud { "/points" } else { "/chatter" });
             assert_eq!(data, if of_cloud { cloud(index) } else { text(index) });
             assert_eq!(u64::from(sequence), index + 1);
@@ -303,7 +311,7 @@ fn what_exists_is_not_written_into() {
 }
 
 #[test]
-fn publishers_that_come_later_are_in_metadata_and_in_the_next_file() {
+fn publishers_that_come_later_are_named_apart_from_the_topic() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("later");
     let mut writer = Writer::create(&path, Options::default()).unwrap();
@@ -330,19 +338,17 @@ fn publishers_that_come_later_are_in_metadata_and_in_the_next_file() {
     ));
     let summary = writer.close(BTreeMap::new()).unwrap();
     let profiles = |text: &str| text.matches("- history: 1").count();
-    assert_eq!(profiles(&metadata(&path).topics[0].offered_qos_profiles), 2);
-    let in_files: Vec<_> = summary
-        .files
-        .iter()
-        .map(|file| {
-            let read = mcap::Summary::read(&fs::read(file).unwrap())
-                .unwrap()
-                .unwrap();
-            let channel = read.channels.values().next().unwrap().clone();
-            profiles(&channel.metadata["offered_qos_profiles"])
-        })
-        .collect();
-    assert_eq!(in_files, [1, 2]);
+    let found = metadata(&path);
+    assert_eq!(profiles(&found.topics[0].offered_qos_profiles), 1);
+    let later = &found.custom_data["ros2probe.later_qos_profiles /chatter"];
+    assert_eq!(profiles(later), 2);
+    for file in &summary.files {
+        let read = mcap::Summary::read(&fs::read(file).unwrap())
+            .unwrap()
+            .unwrap();
+        let channel = read.channels.values().next().unwrap().clone();
+        assert_eq!(profiles(&channel.metadata["offered_qos_profiles"]), 1);
+    }
 }
 
 #[test]
@@ -435,5 +441,152 @@ fn whole_files_are_compressed_by_whoever_takes_the_work() {
         let bytes = compression.decompressed(&packed, 1 << 20).unwrap();
         assert_eq!(mcap::MessageStream::new(&bytes).unwrap().count(), 8);
         assert_eq!(metadata(&path).files[2].path, format!("{suffix}_2.mcap"));
+    }
+}
+
+/// What the PyPI readers found in these bags.
+fn read_by_others(bags: &[&Path]) -> Vec<Value> {
+    let target = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target");
+    let python = target.join("tools/bags/bin/python");
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/bags/read.py");
+    let output = Command::new(&python)
+        .arg(script)
+        .args(bags)
+        .output()
+        .unwrap_or_else(|error| panic!("{}: {error}; run `make prerequisites`", python.display()));
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{stderr}");
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
+    let directory = tempfile::tempdir().unwrap();
+    let usual = Options {
+        ros_distro: "jazzy".into(),
+        ..Options::default()
+    };
+    let storage = |preset: &str| Storage::preset(preset).unwrap();
+    let lz4 = Storage {
+        compression: Compression::Lz4,
+        data_crc: true,
+        ..storage("none")
+    };
+    let split = Some(Duration::from_secs(1));
+    let forms = [
+        ("usual", usual.clone()),
+        (
+            "humble",
+            Options {
+                form: Form::Humble,
+                ..usual.clone()
+            },
+        ),
+        (
+            "named",
+            Options {
+                form: Form::Named,
+                max_file_duration: split,
+                ..usual.clone()
+            },
+        ),
+        (
+            "fastwrite",
+            Options {
+                storage: storage("fastwrite"),
+                ..usual.clone()
+            },
+        ),
+        (
+            "zstd_fast",
+            Options {
+                storage: storage("zstd_fast"),
+                ..usual.clone()
+            },
+        ),
+        (
+            "zstd_small",
+            Options {
+                storage: storage("zstd_small"),
+                ..usual.clone()
+            },
+        ),
+        (
+            "lz4",
+            Options {
+                storage: lz4,
+                ..usual.clone()
+            },
+        ),
+        (
+            "files",
+            Options {
+                file_compression: Compression::Zstd,
+                max_file_duration: split,
+                ..usual
+            },
+        ),
+    ];
+    let bags = forms.map(|(name, options)| {
+        let path = directory.path().join(name);
+        bag(&path, options, 40);
+        path
+    });
+    let paths: Vec<&Path> = bags.iter().map(AsRef::as_ref).collect();
+    for (path, found) in bags.iter().zip(read_by_others(&paths)) {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        let bag = &found["rosbags"];
+        assert_eq!(
+            (bag["count"].as_u64(), bag["start"].as_u64()),
+            (Some(40), Some(BEGIN)),
+            "{name}"
+        );
+        assert_eq!(bag["end"], BEGIN + 39 * SECOND / 10 + 1, "{name}");
+        let messages = bag["messages"].as_array().unwrap();
+        assert_eq!(messages.len(), 40, "{name}");
+        let connections = bag["connections"].as_array().unwrap();
+        let counts: Vec<_> = connections
+            .iter()
+            .map(|connection| &connection["count"])
+            .collect();
+        assert_eq!(counts, [26, 14, 0], "{name}");
+        for connection in &connections[..2] {
+            assert_eq!(connection["definition"], "MSG", "{name}");
+            let qos = &connection["qos"][0];
+            assert_eq!(
+                (&qos["history"], &qos["depth"]),
+                (&"KEEP_LAST".into(), &10.into())
+            );
+            assert_eq!(
+                (&qos["reliability"], &qos["durability"]),
+                (&"RELIABLE".into(), &"VOLATILE".into())
+            );
+            assert_eq!(qos["deadline"], json!([9_223_372_036_u64, 854_775_807]));
+            let hash = if name == "humble" { "" } else { "RIHS01_00" };
+            assert_eq!(connection["hash"], hash, "{name}");
+        }
+        assert_eq!(
+            bag["distro"],
+            if name == "humble" {
+                Value::Null
+            } else {
+                "jazzy".into()
+            }
+        );
+        let files = found["mcap"].as_array().unwrap();
+        if name == "files" {
+            continue;
+        }
+        assert_eq!(files.len(), if name == "named" { 4 } else { 1 }, "{name}");
+        let in_files: Vec<_> = files
+            .iter()
+            .flat_map(|file| file["messages"].as_array().unwrap())
+            .collect();
+        assert_eq!(in_files.len(), 40, "{name}");
+        for (index, message) in in_files.iter().enumerate() {
+            assert_eq!(message["sequence"], index + 1, "{name}");
+            assert_eq!(message["digest"], messages[index]["digest"], "{name}");
+        }
+        assert!(files.iter().all(|file| file["profile"] == "ros2"));
     }
 }

@@ -75,6 +75,10 @@ struct Topic {
     schema_id: u16,
     /// In complete files.
     messages: u64,
+    /// Has messages: the description stays as it is.
+    is_written: bool,
+    /// All publishers, where they changed after that.
+    later: Option<Vec<Qos>>,
 }
 
 #[derive(Clone, Debug)]
@@ -172,9 +176,10 @@ impl Writer {
         &self.directory
     }
 
-    /// Describes a topic before its first message, or again when its publishers changed. In a file
-    /// the first description of a topic with messages stays; metadata.yaml and files after a split
-    /// have the last one.
+    /// Describes a topic before its first message, or again when its publishers changed. What was
+    /// said last before the first message stays in all files and in metadata.yaml: readers find a
+    /// topic's messages by comparing both (PyPI `rosbags` leaves out what differs). Publishers that
+    /// come later are named in the custom data.
     pub fn topic(&mut self, description: TopicDescription) -> Result<TopicId, Error> {
         let known = self.by_name.get(&description.name).copied();
         if let Some(known) = known
@@ -187,12 +192,16 @@ impl Writer {
                     second: description.type_name,
                 });
             }
-            // A channel may not change its schema within a file.
-            let schema = topic.description.schema.take();
-            topic.description = TopicDescription {
-                schema,
-                ..description
-            };
+            if topic.is_written {
+                topic.later = Some(description.publishers);
+            } else {
+                // The schema has its number already.
+                let schema = topic.description.schema.take();
+                topic.description = TopicDescription {
+                    schema,
+                    ..description
+                };
+            }
             return Ok(known);
         }
         let index = u16::try_from(self.topics.len()).ok();
@@ -212,6 +221,8 @@ impl Writer {
             channel_id: index + 1,
             schema_id,
             messages: 0,
+            is_written: false,
+            later: None,
         });
         Ok(TopicId(index))
     }
@@ -233,9 +244,10 @@ impl Writer {
         if self.current.is_none() {
             self.open_file()?;
         }
-        let (Some(topic), Some(current)) =
-            (self.topics.get(usize::from(topic.0)), self.current.as_mut())
-        else {
+        let (Some(topic), Some(current)) = (
+            self.topics.get_mut(usize::from(topic.0)),
+            self.current.as_mut(),
+        ) else {
             // Not a topic of this bag: there is no place for it.
             return Ok(());
         };
@@ -249,6 +261,7 @@ impl Writer {
         };
         let spelling = self.options.form;
         let written = current.write(&message, || topic.records(spelling));
+        topic.is_written |= written.is_ok();
         written.map_err(|error| Error::writing(current.path(), error))
     }
 
@@ -461,7 +474,7 @@ impl Writer {
         });
         let custom_data = match self.options.form {
             Form::Humble => BTreeMap::new(),
-            Form::Compatible | Form::Named => self.options.custom_data.clone(),
+            Form::Compatible | Form::Named => self.custom_data(),
         };
         let ros_distro = match self.options.form {
             Form::Humble => String::new(),
@@ -484,6 +497,19 @@ impl Writer {
             custom_data,
             ros_distro,
         }
+    }
+
+    fn custom_data(&self) -> BTreeMap<String, String> {
+        let mut data = self.options.custom_data.clone();
+        for topic in &self.topics {
+            if let Some(publishers) = &topic.later
+                && *publishers != topic.description.publishers
+            {
+                let key = format!("ros2probe.later_qos_profiles {}", topic.description.name);
+                data.insert(key, qos::profiles(publishers, self.options.form.spelling()));
+            }
+        }
+        data
     }
 
     /// What stands in the files themselves.
