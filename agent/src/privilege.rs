@@ -116,6 +116,15 @@ pub fn give_up(settings: &CaptureSettings) -> Result<(), DropError> {
     })
 }
 
+/// The effective capabilities of the calling thread, by name; empty where they cannot be read.
+#[must_use]
+pub fn held() -> Vec<String> {
+    let effective = caps::read(None, CapSet::Effective).unwrap_or_default();
+    let mut names: Vec<_> = effective.iter().map(Capability::to_string).collect();
+    names.sort();
+    names
+}
+
 /// What [`crate::capture::exact`] lacks.
 #[must_use]
 pub fn missing_for_probes() -> Vec<&'static str> {
@@ -148,8 +157,10 @@ fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError> {
     caps::set(None, CapSet::Permitted, &kept).map_err(DropError)
 }
 
-impl fmt::Display for Missing {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+impl Missing {
+    /// The capabilities that each source lacks.
+    #[must_use]
+    pub fn needs(&self) -> String {
         let needs: Vec<String> = self
             .sources
             .iter()
@@ -158,15 +169,27 @@ impl fmt::Display for Missing {
                 format!("{} for the source `{}`", names.join(", "), source.label())
             })
             .collect();
+        needs.join(", or ")
+    }
+
+    /// The command that grants them to this program.
+    #[must_use]
+    pub fn command(&self) -> String {
         let grant = self.grant.iter().map(|one| one.to_string().to_lowercase());
+        let grant: Vec<_> = grant.collect();
         let program = std::env::current_exe();
         let program = program.map_or_else(|_| "rp".to_owned(), |path| path.display().to_string());
+        format!("sudo setcap {}+ep {program}", grant.join(","))
+    }
+}
+
+impl fmt::Display for Missing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "live capture needs {}: run `sudo setcap {}+ep {program}`, use sudo, or start the \
-             service ros2probe",
-            needs.join(", or "),
-            grant.collect::<Vec<_>>().join(","),
+            "live capture needs {}: run `{}`, use sudo, or start the service ros2probe",
+            self.needs(),
+            self.command(),
         )
     }
 }

@@ -290,6 +290,22 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
     assert_eq!(health["ready"], true);
     assert_eq!(health["watches"], 4);
     assert_eq!(health["watches_kept"], false);
+    let abilities = health["abilities"].as_array().unwrap();
+    let able = |name: &str| {
+        let found = abilities.iter().find(|each| each["ability"] == name);
+        found.map(|each| each["able"].as_bool().unwrap())
+    };
+    assert_eq!(able("forwarded"), Some(true), "{health}");
+    assert_eq!(able("subscribers"), Some(false), "{health}");
+    assert_eq!(health["interfaces"][0]["interface"], "replay");
+    let tables = health["tables"].as_array().unwrap();
+    let endpoints = tables.iter().find(|table| table["table"] == "endpoints");
+    assert_eq!(endpoints.unwrap()["evictions"], 0, "{health}");
+    assert!(health["process_id"].as_u64().unwrap() > 1, "{health}");
+    assert!(
+        health["uptime_seconds"].as_f64().unwrap() < 3600.0,
+        "{health}"
+    );
     agent.signal("-TERM");
     assert!(agent.wait().success());
 }

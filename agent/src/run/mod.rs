@@ -20,7 +20,7 @@ use crate::subscriptions::Subscriptions;
 use crate::surface::Board;
 use crate::surface::events::Drops;
 use crate::watches::Watches;
-pub use source::Source;
+pub use source::{Source, look};
 
 /// Longest time without looking at commands and the clock. Captured frames and a record ring that
 /// is half full end it earlier; each round costs a wake-up, and on a quiet host nothing else does.

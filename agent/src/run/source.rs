@@ -12,10 +12,11 @@ use ros2probe_wire::filter::Counter;
 use super::RunError;
 use super::replay::Replay;
 use crate::capture::host::HostTap;
-use crate::capture::live::LiveSource;
+use crate::capture::live::{CaptureError, LiveSource};
 use crate::capture::shm;
 use crate::config::CaptureSettings;
 use crate::model::observer::Observer;
+use crate::model::reassembly::Limits;
 use crate::surface::{
     Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
@@ -26,6 +27,16 @@ pub enum Source {
     Live(Box<LiveSource>),
     /// A capture.
     Replay(Box<Replay>),
+}
+
+/// What an agent with these settings would see on this host: its taps are opened for a moment, and
+/// read nothing.
+///
+/// # Errors
+/// A capability is missing, or the kernel refuses.
+pub fn look(settings: &CaptureSettings) -> Result<AgentFacts, CaptureError> {
+    let live = LiveSource::open(settings, Limits::default())?;
+    Ok(Source::Live(Box::new(live)).facts())
 }
 
 impl Source {
@@ -176,6 +187,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         refused_updates: live.refused_updates(),
         source_reason: live.without_host().map(str::to_owned),
         abilities: abilities(live),
+        blind: blind(live),
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
         shared_memory: live.shared_memory().map(shared_memory),
@@ -248,6 +260,18 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
         abilities.push(Ability::SharedMemoryExact);
     }
     abilities
+}
+
+/// Why it cannot see the rest, where that is known.
+fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
+    let inside = inside(live).into_iter().flatten();
+    let mut blind: Vec<_> = inside
+        .filter_map(|(ability, able)| Some((ability, able.as_ref().err()?.clone())))
+        .collect();
+    let uncovered = live.exact().and_then(|facts| facts.uncovered);
+    let exact = live.without_exact().map(str::to_owned).or(uncovered);
+    blind.extend(exact.map(|reason| (Ability::SharedMemoryExact, reason)));
+    blind
 }
 
 /// What depends on the kernel.

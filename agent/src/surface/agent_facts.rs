@@ -14,6 +14,8 @@ pub struct AgentFacts {
     pub source_reason: Option<String>,
     /// What the source can see, each ability once; what is not listed it cannot.
     pub abilities: Vec<Ability>,
+    /// Why it cannot see what it otherwise could, in words; not of every ability it lacks.
+    pub blind: Vec<(Ability, String)>,
     /// When this was filled in.
     pub at: Instant,
     /// When the source last came back from waiting for packets, with or without any.
@@ -123,6 +125,7 @@ impl AgentFacts {
             source,
             source_reason: None,
             abilities: source.abilities().to_vec(),
+            blind: Vec::new(),
             at,
             capture_progress: at,
             finished: false,

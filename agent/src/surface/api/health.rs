@@ -1,6 +1,6 @@
 //! `GET /health`: whether the agent sees the robot, and how well.
 
-use std::time::Instant;
+use std::time::{Instant, SystemTime};
 
 use axum::Json;
 use axum::extract::State;
@@ -10,6 +10,9 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use crate::privilege;
+use crate::surface::agent_facts::{Ability, AgentFacts};
+use crate::surface::process::Process;
 
 /// How the agent is.
 #[derive(Debug, Serialize, ToSchema)]
@@ -30,6 +33,70 @@ pub(super) struct Health {
     watches_kept: bool,
     /// Packets lost because a ring was full: above 0, counts are lower bounds.
     dropped_packets: u64,
+    /// Measurement records lost likewise.
+    dropped_records: u64,
+    /// Datagrams captured at the host's sockets that were lost likewise.
+    dropped_datagrams: u64,
+    /// Topics that a watch matched but `limits.topics` kept from being measured.
+    topics_rejected: u64,
+    /// Why it does not look where it would see more.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    source_reason: Option<String>,
+    /// What it can see and what not.
+    abilities: Vec<AbilityView>,
+    /// Where packets come from: interfaces, or `sockets`.
+    interfaces: Vec<InterfaceView>,
+    /// Bounded tables.
+    tables: Vec<TableView>,
+    /// Capabilities it holds, after it has given up what it does not need any more.
+    capabilities: Vec<String>,
+    /// Its process, in its own process namespace.
+    process_id: u32,
+    /// Since its process started; null where that cannot be read.
+    uptime_seconds: Option<f64>,
+}
+
+/// One thing that an agent may be able to see.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Ability)]
+struct AbilityView {
+    /// Which: see `ros2probe_capture_ability`.
+    #[schema(value_type = String, example = "socket_losses")]
+    ability: &'static str,
+    /// Whether this one can.
+    able: bool,
+    /// Why not, where there is more to say than that it was not asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    reason: Option<String>,
+}
+
+/// Where packets come from.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Interface)]
+struct InterfaceView {
+    /// Its name; `sockets` for those of this host, `any` for all interfaces of a namespace.
+    interface: String,
+    /// Packets that the filter let through, where they are counted so.
+    packets: Option<u64>,
+    /// Packets lost because a ring was full, where they are counted so.
+    dropped_packets: Option<u64>,
+}
+
+/// A bounded table.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Table)]
+struct TableView {
+    /// Its name, as in `limits`.
+    #[schema(value_type = String, example = "endpoints")]
+    table: &'static str,
+    /// Entries; bytes for `reassembly`.
+    entries: u64,
+    /// Its cap.
+    limit: u64,
+    /// Entries given up because of the cap.
+    evictions: u64,
 }
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -46,14 +113,53 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 async fn health(State(context): State<Context>) -> Json<Health> {
     let state = context.board.state();
     let ready = state.ready(Instant::now());
-    let interfaces = state.agent.interfaces.iter();
+    let (agent, snapshot) = (&state.agent, state.snapshot.as_ref());
+    let interfaces = agent.interfaces.iter();
+    let tables = snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
+    let started = Process::read().start_time;
+    let now = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
     Json(Health {
         ready: ready.is_ok(),
         reason: ready.err(),
         version: env!("CARGO_PKG_VERSION"),
-        source: state.agent.source.label(),
+        source: agent.source.label(),
         watches: context.watches.in_force().entries().len(),
         watches_kept: context.watches.is_kept(),
-        dropped_packets: interfaces.filter_map(|interface| interface.dropped).sum(),
+        dropped_packets: interfaces.clone().filter_map(|each| each.dropped).sum(),
+        dropped_records: agent.records_dropped,
+        dropped_datagrams: agent.pieces_dropped,
+        topics_rejected: snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
+        source_reason: agent.source_reason.clone(),
+        abilities: abilities(agent),
+        interfaces: interfaces
+            .map(|each| InterfaceView {
+                interface: each.name.clone(),
+                packets: each.packets,
+                dropped_packets: each.dropped,
+            })
+            .collect(),
+        tables: tables
+            .map(|table| TableView {
+                table: table.table,
+                entries: table.size,
+                limit: table.limit,
+                evictions: table.evictions,
+            })
+            .collect(),
+        capabilities: privilege::held(),
+        process_id: std::process::id(),
+        uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),
     })
+}
+
+fn abilities(agent: &AgentFacts) -> Vec<AbilityView> {
+    let view = |ability: Ability| {
+        let reason = agent.blind.iter().find(|(blind, _)| *blind == ability);
+        AbilityView {
+            ability: ability.label(),
+            able: agent.abilities.contains(&ability),
+            reason: reason.map(|(_, reason)| reason.clone()),
+        }
+    };
+    Ability::ALL.map(view).into()
 }
