@@ -115,3 +115,40 @@ fn a_command_without_a_verb_prints_its_help() {
         ("", Some(2))
     );
 }
+
+#[test]
+fn a_capture_answers_as_an_agent_does_and_only_up_to_the_moment_asked_for() {
+    let capture = local_agent::capture();
+    let capture = capture.to_str().unwrap();
+    let list = |further: &[&str]| {
+        let listed = run(&[&["topic", "list", "--replay", capture], further].concat());
+        assert_eq!(listed.status.code(), Some(0), "{}", stderr(&listed));
+        assert_eq!(stderr(&listed), "");
+        stdout(&listed)
+    };
+    assert_eq!(list(&["-c", "--until", "+0"]), "0\n");
+    let whole = list(&[]);
+    assert!(whole.contains("/rosout\n"), "{whole}");
+    assert_eq!(list(&["--until", "+86400"]), whole);
+
+    let missing = run(&["topic", "list", "--replay", "/nowhere.pcap"]);
+    fails_with(&missing, "cannot replay /nowhere.pcap");
+    let wrong = run(&["topic", "list", "--replay", capture, "--until", "noon"]);
+    assert_eq!(wrong.status.code(), Some(2));
+}
+
+#[test]
+fn a_capture_that_was_cut_off_tells_what_came_before() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("cut.pcap.gz");
+    let whole = std::fs::read(local_agent::capture()).unwrap();
+    std::fs::write(&path, &whole[..whole.len() - 100]).unwrap();
+    let listed = run(&["topic", "list", "--replay", path.to_str().unwrap()]);
+    assert_eq!(listed.status.code(), Some(0));
+    assert!(stdout(&listed).contains("/rosout\n"), "{}", stdout(&listed));
+    assert!(
+        stderr(&listed).contains("up to a fault"),
+        "{}",
+        stderr(&listed)
+    );
+}

@@ -26,8 +26,9 @@ pub(crate) fn names(target: &Target) -> Result<Names> {
     let domain_id = target.domain()?;
     let agent = Agent::reach(target)?;
     let names: Names = agent.get(&format!("/names?domain_id={domain_id}&hidden=true"))?;
-    if names.is_empty() && !names.domains.is_empty() {
-        let others: Vec<String> = names.domains.iter().map(u32::to_string).collect();
+    let others = names.domains.iter().filter(|other| **other != domain_id);
+    let others: Vec<String> = others.map(u32::to_string).collect();
+    if names.is_empty() && !others.is_empty() {
         eprintln!(
             "rp: nothing is in domain {domain_id}; the agent sees domain {}: pass `--domain N`",
             others.join(", ")

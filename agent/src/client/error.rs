@@ -5,13 +5,15 @@ use std::path::PathBuf;
 
 use serde::Deserialize;
 
+use crate::capture::pcap::PcapError;
+
 /// Why there is no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
     /// Nobody listens on this host.
     #[error(
         "no agent runs here: start one with `sudo systemctl start ros2probe`, or in a terminal \
-         with `sudo rp run`"
+         with `sudo rp run`; a capture is asked with `--replay FILE`"
     )]
     NoAgent,
     /// Somebody listens, but not for this user.
@@ -94,6 +96,14 @@ pub enum ClientError {
         path: PathBuf,
         /// Why not.
         source: io::Error,
+    },
+    /// The capture is none, or cannot be opened.
+    #[error("cannot replay {}", path.display())]
+    Capture {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: PcapError,
     },
     /// Not even a connection could be begun.
     #[error("cannot start the runtime of the connection")]

@@ -1,11 +1,13 @@
 //! The connection to an agent, with a blocking face: on this host by its unix socket or loopback
-//! address, on another robot by `--host` and a token.
+//! address, on another robot by `--host` and a token. A capture is replayed into an agent within
+//! this process, which is asked the same way.
 //!
 //! It asks and decodes; what answers mean is said elsewhere. It never reads a clock for what it
 //! shows, and keeps nothing between requests.
 
 mod error;
 mod lines;
+mod replayed;
 mod target;
 mod way;
 
@@ -23,7 +25,8 @@ use tokio::time::timeout;
 
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
-pub use target::{Moment, Target, Unfit};
+use replayed::Stop;
+pub use target::{Target, Unfit};
 use way::Way;
 
 /// The longest wait for a whole answer: graphs of thousands of topics come within a second.
@@ -39,17 +42,31 @@ pub struct Agent {
 }
 
 impl Agent {
-    /// Finds the agent that `target` means.
+    /// Finds the agent that `target` means. A capture is replayed to its end, or to `--until`:
+    /// what it is asked for is how things stand then.
     ///
     /// # Errors
-    /// There is none, or its token cannot be read.
+    /// There is none, its token cannot be read, or the capture cannot.
     pub fn reach(target: &Target) -> Result<Self, ClientError> {
+        Self::find(target, Stop::AtEnd)
+    }
+
+    /// As [`Self::reach`], but a capture is replayed only to `--from`, else not at all, and goes on
+    /// with the first [`Self::stream`].
+    ///
+    /// # Errors
+    /// As [`Self::reach`].
+    pub fn reach_stream(target: &Target) -> Result<Self, ClientError> {
+        Self::find(target, Stop::AtBeginning)
+    }
+
+    fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
             .map_err(|source| ClientError::Runtime { source })?;
         let token = target.token()?;
-        let way = runtime.block_on(Way::find(target))?;
+        let way = runtime.block_on(Way::find(target, stop))?;
         Ok(Self {
             runtime,
             way,
@@ -109,6 +126,7 @@ impl Agent {
         self.runtime.block_on(async {
             let answer = self.send(Method::GET, path, None).await?;
             if answer.status().is_success() {
+                self.way.go_on();
                 Ok(Lines::new(self, answer.into_body()))
             } else {
                 let refused = self.whole(path, answer).await;

@@ -2,13 +2,12 @@
 
 use std::io;
 use std::path::PathBuf;
-use std::str::FromStr;
 
 use clap::Args;
-use ros2probe_wire::Timestamp;
 
 use super::ClientError;
 use crate::ros2::Dialect;
+use crate::run::Moment;
 
 /// Highest domain there is.
 const MAX_DOMAIN: u32 = 232;
@@ -28,6 +27,15 @@ pub struct Target {
     /// The agent behind this unix socket [default: /run/ros2probe/api.sock, then loopback]
     #[arg(long, value_name = "PATH")]
     pub socket: Option<PathBuf>,
+    /// Ask a capture (pcap or pcapng, may be gzipped) instead of an agent
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["host", "socket"])]
+    pub replay: Option<PathBuf>,
+    /// Messages from this time of the capture on: Unix seconds, or +S from its beginning
+    #[arg(long, value_name = "T", requires = "replay")]
+    pub from: Option<Moment>,
+    /// The capture up to this time
+    #[arg(long, value_name = "T", requires = "replay")]
+    pub until: Option<Moment>,
     /// The robot's domain [default: $ROS_DOMAIN_ID, else 0]
     #[arg(long = "domain", value_name = "N",
         value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN)))]
@@ -35,15 +43,6 @@ pub struct Target {
     /// Whose output to print [default: $ROS_DISTRO, else jazzy]
     #[arg(long, value_name = "DISTRO", value_enum, hide_possible_values = true)]
     pub distro: Option<Dialect>,
-}
-
-/// A time in a capture.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Moment {
-    /// Since the epoch.
-    At(Timestamp),
-    /// Nanoseconds since the capture's beginning.
-    After(u64),
 }
 
 /// The environment says what cannot be.
@@ -99,62 +98,6 @@ impl Target {
         match read() {
             Ok(token) => Ok(Some(token)),
             Err(source) => Err(ClientError::Token { path, source }),
-        }
-    }
-}
-
-impl FromStr for Moment {
-    type Err = &'static str;
-
-    /// Unix seconds, or `+` and seconds from the capture's beginning; nanoseconds are kept.
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        const WRONG: &str =
-            "must be Unix seconds, or `+S` for seconds from the capture's beginning";
-        let (seconds, is_after) = match text.strip_prefix('+') {
-            Some(seconds) => (seconds, true),
-            None => (text, false),
-        };
-        let (whole, fraction) = seconds.split_once('.').unwrap_or((seconds, ""));
-        let is_number = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
-        if whole.is_empty() || fraction.len() > 9 || !is_number(whole) || !is_number(fraction) {
-            return Err(WRONG);
-        }
-        let whole: u64 = whole.parse().map_err(|_| WRONG)?;
-        let fraction: u64 = format!("{fraction:0<9}").parse().map_err(|_| WRONG)?;
-        let nanoseconds = whole.checked_mul(1_000_000_000);
-        let nanoseconds = nanoseconds.and_then(|whole| whole.checked_add(fraction));
-        let nanoseconds = nanoseconds.ok_or(WRONG)?;
-        Ok(if is_after {
-            Self::After(nanoseconds)
-        } else {
-            Self::At(Timestamp(nanoseconds))
-        })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn moments_keep_their_nanoseconds() {
-        let at = |text: &str| text.parse::<Moment>();
-        let exact = Timestamp(1_795_142_407_300_015_394);
-        assert_eq!(at("1795142407.300015394"), Ok(Moment::At(exact)));
-        assert_eq!(at("+2.5"), Ok(Moment::After(2_500_000_000)));
-        assert_eq!(at("+3"), Ok(Moment::After(3_000_000_000)));
-        for wrong in [
-            "",
-            "+",
-            ".5",
-            "-1",
-            "1.0000000001",
-            "1e9",
-            "12:00",
-            "++1",
-            "99999999999999",
-        ] {
-            assert!(at(wrong).is_err(), "{wrong}");
         }
     }
 }

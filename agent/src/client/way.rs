@@ -16,6 +16,7 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::time::timeout;
 
+use super::replayed::{Replayed, Stop};
 use super::{ClientError, Target};
 
 /// Where the package and the service manager put the agent's socket.
@@ -34,11 +35,17 @@ pub(super) enum Way {
     Socket(PathBuf),
     /// By host name or address, and port.
     Address(String),
+    /// Within this process.
+    Replayed(Box<Replayed>),
 }
 
 impl Way {
     /// As `target` says; else by what there is on this host.
-    pub(super) async fn find(target: &Target) -> Result<Self, ClientError> {
+    pub(super) async fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
+        if let Some(capture) = &target.replay {
+            let replayed = Replayed::start(capture, target, stop).await?;
+            return Ok(Self::Replayed(Box::new(replayed)));
+        }
         if let Some(host) = &target.host {
             return Ok(Self::Address(with_port(host)));
         }
@@ -63,7 +70,7 @@ impl Way {
     /// What requests call the agent.
     pub(super) fn host(&self) -> &str {
         match self {
-            Self::Socket(_) => "localhost",
+            Self::Socket(_) | Self::Replayed(_) => "localhost",
             Self::Address(address) => address,
         }
     }
@@ -83,6 +90,14 @@ impl Way {
                 let _ = stream.set_nodelay(true);
                 self.ask(stream, request).await
             }
+            Self::Replayed(replayed) => self.ask(replayed.connect(), request).await,
+        }
+    }
+
+    /// What a replay waited for has begun.
+    pub(super) fn go_on(&self) {
+        if let Self::Replayed(replayed) = self {
+            replayed.go_on();
         }
     }
 
@@ -174,6 +189,7 @@ impl fmt::Display for Way {
         match self {
             Self::Socket(path) => write!(f, "{}", path.display()),
             Self::Address(address) => f.write_str(address),
+            Self::Replayed(replayed) => write!(f, "{}", replayed.capture().display()),
         }
     }
 }

@@ -1,6 +1,7 @@
 //! The agent's one working thread: takes packets from the source, feeds the model, pins a snapshot
 //! to the board once a second and when a scrape asks for one. Surfaces never reach in here; they read the board.
 
+mod moment;
 pub mod replay;
 mod source;
 
@@ -20,6 +21,7 @@ use crate::subscriptions::Subscriptions;
 use crate::surface::Board;
 use crate::surface::events::Drops;
 use crate::watches::Watches;
+pub use moment::Moment;
 pub use source::{Source, look};
 
 /// Longest time without looking at commands and the clock. Captured frames and a record ring that
@@ -127,6 +129,9 @@ impl Run {
             self.take_watches();
             let finished = self.source.is_finished();
             if finished {
+                if let Some(end) = self.source.cut() {
+                    self.observer.advance(end);
+                }
                 self.observer.settle();
             } else {
                 self.observer.advance(self.source.clock());
@@ -135,9 +140,13 @@ impl Run {
             self.hand_over();
             let age = published.elapsed();
             let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
-            if finished || polled.is_err() || due {
+            let held = self.source.takes_a_rest();
+            if finished || held || polled.is_err() || due {
                 self.publish();
                 published = Instant::now();
+            }
+            if held {
+                self.source.rest();
             }
             polled?;
             if finished {

@@ -3,11 +3,14 @@
 
 use std::io::IsTerminal as _;
 use std::path::Path;
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::Link;
+use tokio::sync::watch;
 
+use super::Moment;
 use crate::capture::feed::Feed;
 use crate::capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed};
 use crate::model::observer::Observer;
@@ -17,6 +20,46 @@ use crate::model::reassembly::{Limits, Reassembly};
 const PROGRESS: Duration = Duration::from_secs(1);
 /// A packet this far from the last one is gone to at once, not step by step.
 const FAR: u64 = 3600 * 1_000_000_000;
+
+/// While it rests, what the agent is asked is answered so often.
+const REST: Duration = Duration::from_millis(5);
+
+/// Both ends of a rest that a replay takes at some moment, until it is told to go on.
+#[must_use]
+pub fn rest(at: Option<Moment>) -> (Rest, Waiter) {
+    let (go_on, told) = mpsc::channel();
+    let (resting, rests) = watch::channel(false);
+    let rest = Rest { at, told, resting };
+    (rest, Waiter { go_on, rests })
+}
+
+/// Where a replay waits.
+#[derive(Debug)]
+pub struct Rest {
+    /// The beginning when left out.
+    at: Option<Moment>,
+    told: mpsc::Receiver<()>,
+    resting: watch::Sender<bool>,
+}
+
+/// Who waits for the replay's rest, and ends it.
+#[derive(Debug)]
+pub struct Waiter {
+    go_on: mpsc::Sender<()>,
+    rests: watch::Receiver<bool>,
+}
+
+impl Waiter {
+    /// Returns when the replay rests, or when it has ended before.
+    pub async fn rests(&mut self) {
+        let _ = self.rests.wait_for(|resting| *resting).await;
+    }
+
+    /// Has the replay go on.
+    pub fn go_on(&self) {
+        let _ = self.go_on.send(());
+    }
+}
 
 /// A capture being replayed.
 pub struct Replay {
@@ -31,6 +74,10 @@ pub struct Replay {
     bytes: u64,
     began: Option<Timestamp>,
     progress: Option<Instant>,
+    until: Option<Moment>,
+    rest: Option<Rest>,
+    /// The capture goes on where the replay ends.
+    cut: bool,
     finished: bool,
 }
 
@@ -60,8 +107,26 @@ impl Replay {
             bytes: 0,
             began: None,
             progress: std::io::stderr().is_terminal().then(Instant::now),
+            until: None,
+            rest: None,
+            cut: false,
             finished: false,
         })
+    }
+
+    /// Ends at this moment, as if the capture ended there.
+    #[must_use]
+    pub fn until(self, until: Option<Moment>) -> Self {
+        Self { until, ..self }
+    }
+
+    /// Waits at some moment until it is told to go on.
+    #[must_use]
+    pub fn resting(self, rest: Rest) -> Self {
+        Self {
+            rest: Some(rest),
+            ..self
+        }
     }
 
     /// Delivers what is due within `timeout`, then returns: at the latest after it, earlier at the
@@ -83,14 +148,28 @@ impl Replay {
                 break;
             }
             if let Some(waiting) = &self.waiting {
+                let (time, beginning) = (waiting.time, self.began.unwrap_or_default());
+                let rest = self.rest.as_ref();
+                if rest.is_some_and(|rest| rest.at_or_behind(time, beginning)) {
+                    self.wait();
+                    break;
+                }
+                let last = self.until.map(|moment| moment.in_capture(beginning));
+                let last = last.filter(|last| *last < time);
+                let time = last.unwrap_or(time);
                 let delay = self.pacer.delay(waiting.time, now);
-                let later = until.filter(|until| waiting.time > *until);
+                let later = until.filter(|until| time > *until);
                 if let Some(until) = later
                     && delay.is_zero()
                 {
-                    let is_far = waiting.time.0 - until.0 > FAR;
-                    let time = if is_far { waiting.time.0 - 1 } else { until.0 };
+                    let is_far = time.0 - until.0 > FAR;
+                    let time = if is_far { time.0 - 1 } else { until.0 };
                     self.clock = self.clock.max(Timestamp(time));
+                    break;
+                }
+                if last.is_some() {
+                    self.clock = self.clock.max(time);
+                    (self.cut, self.finished) = (true, true);
                     break;
                 }
                 let slice = delay.min(end.saturating_duration_since(now));
@@ -171,6 +250,43 @@ impl Replay {
         }
     }
 
+    /// Waits a moment for being told to go on. What was asked for meanwhile is to be taken before the
+    /// next packets.
+    fn wait(&mut self) {
+        let Some(rest) = &self.rest else { return };
+        let begins = rest
+            .at
+            .map(|moment| moment.in_capture(self.began.unwrap_or_default()));
+        self.clock = self.clock.max(begins.unwrap_or_default());
+        if *rest.resting.borrow() && rest.told.recv_timeout(REST) != Err(RecvTimeoutError::Timeout)
+        {
+            self.rest = None;
+        }
+    }
+
+    /// It has come to where it waits and nobody was told yet.
+    #[must_use]
+    pub fn takes_a_rest(&self) -> bool {
+        let time = self.waiting.as_ref().map(|waiting| waiting.time);
+        let beginning = self.began.unwrap_or_default();
+        time.zip(self.rest.as_ref()).is_some_and(|(time, rest)| {
+            rest.at_or_behind(time, beginning) && !*rest.resting.borrow()
+        })
+    }
+
+    /// Tells who waits for the rest.
+    pub fn rest(&mut self) {
+        if let Some(rest) = &self.rest {
+            rest.resting.send_replace(true);
+        }
+    }
+
+    /// Where it ended although the capture goes on.
+    #[must_use]
+    pub fn cut(&self) -> Option<Timestamp> {
+        self.cut.then_some(self.clock)
+    }
+
     /// The capture's clock: the time of its last packet, running on while the next one is waited
     /// for.
     #[must_use]
@@ -218,6 +334,12 @@ fn step(speed: Speed) -> Duration {
     match speed {
         Speed::Max => Duration::ZERO,
         Speed::Times(factor) => Duration::try_from_secs_f64(0.1 / factor).unwrap_or(Duration::MAX),
+    }
+}
+
+impl Rest {
+    fn at_or_behind(&self, time: Timestamp, beginning: Timestamp) -> bool {
+        self.at.is_none_or(|at| at.in_capture(beginning) <= time)
     }
 }
 

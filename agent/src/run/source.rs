@@ -110,6 +110,29 @@ impl Source {
         }
     }
 
+    /// Where a replay was told to end although the capture goes on.
+    pub(super) fn cut(&self) -> Option<Timestamp> {
+        match self {
+            Self::Live(_) => None,
+            Self::Replay(replay) => replay.cut(),
+        }
+    }
+
+    /// A replay has just come to where it waits: what is known there is to be shown.
+    pub(super) fn takes_a_rest(&self) -> bool {
+        match self {
+            Self::Live(_) => false,
+            Self::Replay(replay) => replay.takes_a_rest(),
+        }
+    }
+
+    /// It is shown.
+    pub(super) fn rest(&mut self) {
+        if let Self::Replay(replay) = self {
+            replay.rest();
+        }
+    }
+
     pub(super) fn facts(&mut self) -> AgentFacts {
         let now = Instant::now();
         match self {

@@ -1,0 +1,149 @@
+//! An agent within this process that looks at a capture, asked over pipes in memory as any other is
+//! over sockets: what is true of a capture and of a robot is said by the same code.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use tokio::io::{DuplexStream, duplex};
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
+
+use super::{ClientError, Target};
+use crate::capture::pcap::Speed;
+use crate::config::Config;
+use crate::model::observer::{self, Observer};
+use crate::model::reassembly::Limits;
+use crate::run::replay::{Replay, Waiter, rest};
+use crate::run::{Run, Source};
+use crate::subscriptions::{Caps, Subscriptions};
+use crate::surface::api::{self, reload};
+use crate::surface::{Board, Settings};
+use crate::watches::Watches;
+
+/// What a pipe holds: more than most answers.
+const PIPE: usize = 1 << 20;
+
+/// How far a capture is replayed before anything is asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Stop {
+    /// To the end.
+    AtEnd,
+    /// To where messages are wanted from.
+    AtBeginning,
+}
+
+/// A capture with an agent of its own.
+#[derive(Debug)]
+pub(super) struct Replayed {
+    capture: PathBuf,
+    pipes: mpsc::UnboundedSender<DuplexStream>,
+    waiter: Option<Waiter>,
+    stop: CancellationToken,
+}
+
+impl Replayed {
+    /// Replays `capture` as far as is asked for. What cannot be read of it is said on stderr; what
+    /// came before counts.
+    pub(super) async fn start(
+        capture: &Path,
+        target: &Target,
+        stop: Stop,
+    ) -> Result<Self, ClientError> {
+        let config = Config::default();
+        let limits = Limits {
+            bytes: config.limits.reassembly_bytes,
+            ..Limits::default()
+        };
+        let failed = |source| ClientError::Capture {
+            path: capture.to_path_buf(),
+            source,
+        };
+        let replay = Replay::open(capture, Speed::Max, limits).map_err(failed)?;
+        let mut replay = replay.until(target.until);
+        let mut waiter = None;
+        if stop == Stop::AtBeginning {
+            let (rest, other) = rest(target.from);
+            replay = replay.resting(rest);
+            waiter = Some(other);
+        }
+        let source = Source::Replay(Box::new(replay));
+        let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
+        let watches = Watches::new(Arc::clone(&board), Vec::new(), Vec::new());
+        let watches = watches.map_err(|error| ClientError::Runtime {
+            source: std::io::Error::other(error),
+        })?;
+        let watches = Arc::new(watches);
+        let settings = observer::Settings::default().with_limits(&config.limits);
+        let token = CancellationToken::new();
+        let caps = Caps {
+            subscriptions: config.limits.subscriptions,
+            bytes: config.limits.payload_bytes,
+        };
+        let subscriptions = Subscriptions::new(Arc::clone(&board), caps, token.clone());
+        let subscriptions = Arc::new(subscriptions);
+        let run = Run::new(
+            source,
+            Observer::new(settings),
+            Arc::clone(&board),
+            Arc::clone(&watches),
+            Arc::clone(&subscriptions),
+            token.clone(),
+        );
+        let (tell, ended) = oneshot::channel();
+        let work = move || {
+            if let Err(error) = run.run() {
+                eprintln!("rp: {:#}", anyhow::Error::from(error));
+            }
+            let _ = tell.send(());
+        };
+        let thread = std::thread::Builder::new().name("replay".to_owned());
+        let thread = thread.spawn(work);
+        thread.map_err(|source| ClientError::Runtime { source })?;
+        let (pipes, opened) = mpsc::unbounded_channel();
+        let (reloader, _) = reload::channel();
+        let context = api::Context {
+            board,
+            watches,
+            subscriptions,
+            reloader,
+            stop: token.clone(),
+        };
+        tokio::spawn(api::serve_in_process(opened, context));
+        match &mut waiter {
+            None => drop(ended.await),
+            Some(waiter) => waiter.rests().await,
+        }
+        Ok(Self {
+            capture: capture.to_path_buf(),
+            pipes,
+            waiter,
+            stop: token,
+        })
+    }
+
+    /// A pipe to the agent.
+    pub(super) fn connect(&self) -> DuplexStream {
+        let (ours, theirs) = duplex(PIPE);
+        // The agent lives as long as this; else the pipe is broken, which is said.
+        let _ = self.pipes.send(theirs);
+        ours
+    }
+
+    /// Replays the rest.
+    pub(super) fn go_on(&self) {
+        if let Some(waiter) = &self.waiter {
+            waiter.go_on();
+        }
+    }
+
+    /// The file.
+    pub(super) fn capture(&self) -> &Path {
+        &self.capture
+    }
+}
+
+impl Drop for Replayed {
+    fn drop(&mut self) {
+        self.stop.cancel();
+    }
+}

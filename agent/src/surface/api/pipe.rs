@@ -1,0 +1,46 @@
+//! The API within one process: requests come through pipes in memory instead of sockets.
+//!
+//! Whoever holds the other ends is the process itself, so only what protects from floods remains.
+
+use std::io;
+use std::sync::Arc;
+
+use axum::serve::Listener;
+use tokio::io::DuplexStream;
+use tokio::sync::mpsc;
+
+use super::security::{Door, Kind};
+use super::{Context, router};
+
+/// Pipes as they are opened.
+#[derive(Debug)]
+struct Pipes(mpsc::UnboundedReceiver<DuplexStream>);
+
+impl Listener for Pipes {
+    type Io = DuplexStream;
+    type Addr = ();
+
+    async fn accept(&mut self) -> (DuplexStream, ()) {
+        match self.0.recv().await {
+            Some(pipe) => (pipe, ()),
+            // Nobody will ask any more; the server ends with its runtime.
+            None => std::future::pending().await,
+        }
+    }
+
+    fn local_addr(&self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Answers on every pipe.
+///
+/// # Errors
+/// Never: pipes do not fail to be accepted.
+pub async fn serve(
+    pipes: mpsc::UnboundedReceiver<DuplexStream>,
+    context: Context,
+) -> io::Result<()> {
+    let router = router(&context, Arc::new(Door::new(Kind::Socket)));
+    axum::serve(Pipes(pipes), router).await
+}
