@@ -12,6 +12,7 @@ pub mod discover;
 pub mod message;
 pub mod model;
 pub mod privilege;
+pub mod recording;
 pub mod ros2;
 pub mod run;
 pub mod state;

@@ -16,12 +16,12 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 use ros2probe_wire::Timestamp;
 use tokio_util::sync::CancellationToken;
 
-use crate::model::payloads::{Given, MissedReason, News, Sample};
+use crate::model::payloads::{Given, News, Sample};
 use crate::model::selection::Wish;
 use crate::surface::Board;
 use channel::Channel;
 
-pub use crate::model::payloads::{Missed, Topic};
+pub use crate::model::payloads::{Missed, MissedReason, Topic};
 pub use crate::model::selection::{Choice, ChoiceError, Depth, Selection};
 
 /// How much there may be of it.

@@ -1,0 +1,14 @@
+//! Recordings: which topics, what of them is in the bag, and what is not.
+//!
+//! A recording takes samples from a subscription, as a stream of the API does: nothing on the
+//! network tells that there is one. How a bag looks on disk is the business of [`crate::bag`].
+
+mod announced;
+mod filter;
+mod recorder;
+mod report;
+
+pub use announced::Announced;
+pub use filter::{Asked, Candidate, Filter, FilterError};
+pub use recorder::{Ended, Recorder, Sources};
+pub use report::{MissingRun, Report, TopicReport};

@@ -1,0 +1,245 @@
+//! What a recording has and what it has not: counted for each topic, with the numbers of what is
+//! missing. It stands in the bag's metadata and in the answer of whoever ends the recording.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::subscriptions::{Missed, MissedReason};
+
+/// Runs of missing samples that are named; further ones are counted.
+const RUNS: usize = 256;
+/// Under this name in the bag's custom data.
+pub const CUSTOM_DATA: &str = "ros2probe";
+
+/// What became of what was to be recorded.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[schema(as = RecordingReport)]
+pub struct Report {
+    /// Messages in the bag.
+    pub messages: u64,
+    /// Bytes of those messages.
+    pub bytes: u64,
+    /// Messages that were on the wire and are not in the bag.
+    pub missing: u64,
+    /// By topic.
+    pub topics: BTreeMap<String, TopicReport>,
+    /// Which messages are missing, by writer and sequence number: the first ones.
+    pub missing_runs: Vec<MissingRun>,
+    /// Further runs that are counted but not named.
+    pub missing_runs_unnamed: u64,
+    /// Topics that late joiners are given samples of, which were sent before the recording began and
+    /// are not in the bag.
+    pub sent_before: Vec<String>,
+    /// Topics that are left out because they have several types; a bag holds one.
+    pub left_out: Vec<String>,
+}
+
+/// What became of one topic's messages.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[schema(as = TopicReport)]
+pub struct TopicReport {
+    /// In the bag.
+    pub messages: u64,
+    /// Bytes of those.
+    pub bytes: u64,
+    /// Never complete on the wire: fragments were lost.
+    pub incomplete: u64,
+    /// On the wire, but lost on the way to the agent.
+    pub not_captured: u64,
+    /// Dropped because the storage was too slow.
+    pub dropped: u64,
+    /// Taken, and lost because the storage took no more.
+    pub unwritten: u64,
+    /// Came while the recording was paused.
+    pub paused: u64,
+}
+
+/// Consecutive samples of one writer that are missing for one reason.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[schema(as = MissingRun)]
+pub struct MissingRun {
+    /// Topic.
+    pub topic: String,
+    /// GUID of the writer.
+    pub writer: String,
+    /// Number of the first.
+    pub first_sequence_number: u64,
+    /// Number of the last.
+    pub last_sequence_number: u64,
+    /// How many of those in between.
+    pub samples: u64,
+    /// `incomplete`, `not_captured` or `dropped`.
+    pub reason: String,
+}
+
+impl Report {
+    /// A message is in the bag.
+    pub(super) fn written(&mut self, topic: &str, bytes: usize) {
+        let bytes = bytes as u64;
+        self.messages += 1;
+        self.bytes += bytes;
+        let topic = self.topic(topic);
+        topic.messages += 1;
+        topic.bytes += bytes;
+    }
+
+    /// A message came while the recording was paused.
+    pub(super) fn paused(&mut self, topic: &str) {
+        self.topic(topic).paused += 1;
+    }
+
+    /// Messages will never be in the bag.
+    pub(super) fn missed(&mut self, missed: &Missed) {
+        self.missing += missed.samples;
+        let topic = self.topic(&missed.topic.name);
+        let (count, reason) = match missed.reason {
+            MissedReason::Incomplete => (&mut topic.incomplete, "incomplete"),
+            MissedReason::NotCaptured => (&mut topic.not_captured, "not_captured"),
+            MissedReason::QueueFull => (&mut topic.dropped, "dropped"),
+        };
+        *count += missed.samples;
+        if self.missing_runs.len() >= RUNS {
+            self.missing_runs_unnamed += 1;
+            return;
+        }
+        self.missing_runs.push(MissingRun {
+            topic: missed.topic.name.to_string(),
+            writer: missed.writer.to_string(),
+            first_sequence_number: missed.first,
+            last_sequence_number: missed.last,
+            samples: missed.samples,
+            reason: reason.to_owned(),
+        });
+    }
+
+    /// Messages that were taken for written are not in the bag after all.
+    pub(super) fn unwritten(&mut self, topic: &str, messages: u64) {
+        self.messages = self.messages.saturating_sub(messages);
+        self.missing += messages;
+        let topic = self.topic(topic);
+        topic.messages = topic.messages.saturating_sub(messages);
+        topic.unwritten += messages;
+    }
+
+    /// The topic is in the bag, if only by its name.
+    pub(super) fn topic(&mut self, name: &str) -> &mut TopicReport {
+        if !self.topics.contains_key(name) {
+            self.topics.insert(name.to_owned(), TopicReport::default());
+        }
+        self.topics.entry(name.to_owned()).or_default()
+    }
+
+    /// For a bag's metadata: one line of JSON.
+    #[must_use]
+    pub fn custom_data(&self) -> BTreeMap<String, String> {
+        // Numbers and strings: nothing that could fail.
+        let text = serde_json::to_string(self).unwrap_or_default();
+        BTreeMap::from([(CUSTOM_DATA.to_owned(), text)])
+    }
+
+    /// For people: what is missing, a line for each topic; nothing where nothing is.
+    #[must_use]
+    pub fn shortfalls(&self) -> Vec<String> {
+        let mut lines = Vec::new();
+        for (name, topic) in &self.topics {
+            let counts = [
+                (topic.incomplete, "incomplete on the wire"),
+                (topic.not_captured, "lost on the way to the agent"),
+                (topic.dropped, "dropped, the storage was too slow"),
+                (topic.unwritten, "not written, the storage took no more"),
+            ];
+            let told: Vec<String> = counts
+                .iter()
+                .filter(|(count, _)| *count > 0)
+                .map(|(count, what)| format!("{count} {what}"))
+                .collect();
+            if !told.is_empty() {
+                let all = topic.messages;
+                lines.push(format!("{name}: {all} recorded, {}", told.join(", ")));
+            }
+        }
+        for name in &self.sent_before {
+            let why = "what was sent before the recording began is not in it";
+            lines.push(format!(
+                "{name}: {why}; publishers keep it for subscribers that join late"
+            ));
+        }
+        for name in &self.left_out {
+            lines.push(format!("{name}: left out, it has several types"));
+        }
+        lines
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ros2probe_wire::Guid;
+
+    use super::*;
+    use crate::subscriptions::Topic;
+
+    fn missed(first: u64, samples: u64, reason: MissedReason) -> Missed {
+        Missed {
+            topic: Arc::new(Topic {
+                domain_id: 0,
+                name: "/points".into(),
+                dds_name: "rt/points".into(),
+                message_type: "sensor_msgs/msg/PointCloud2".into(),
+            }),
+            writer: Guid::default(),
+            first,
+            last: first + samples - 1,
+            samples,
+            reason,
+        }
+    }
+
+    #[test]
+    fn what_is_missing_is_counted_by_reason_and_named_with_its_numbers() {
+        let mut report = Report::default();
+        report.written("/points", 100);
+        report.missed(&missed(2, 3, MissedReason::Incomplete));
+        report.missed(&missed(9, 1, MissedReason::QueueFull));
+        assert_eq!((report.messages, report.missing), (1, 4));
+        let topic = &report.topics["/points"];
+        assert_eq!((topic.incomplete, topic.dropped), (3, 1));
+        let run = &report.missing_runs[0];
+        assert_eq!(
+            (run.first_sequence_number, run.last_sequence_number),
+            (2, 4)
+        );
+        assert_eq!(
+            report.shortfalls(),
+            ["/points: 1 recorded, 3 incomplete on the wire, 1 dropped, the storage was too slow"]
+        );
+    }
+
+    #[test]
+    fn a_long_list_of_runs_is_cut_and_counted() {
+        let mut report = Report::default();
+        for first in 0..RUNS as u64 + 5 {
+            report.missed(&missed(first * 2 + 1, 1, MissedReason::Incomplete));
+        }
+        assert_eq!(report.missing_runs.len(), RUNS);
+        assert_eq!(
+            (report.missing_runs_unnamed, report.missing),
+            (5, RUNS as u64 + 5)
+        );
+    }
+
+    #[test]
+    fn what_the_storage_refused_counts_as_missing() {
+        let mut report = Report::default();
+        report.written("/points", 100);
+        report.written("/points", 100);
+        report.unwritten("/points", 1);
+        assert_eq!((report.messages, report.missing), (1, 1));
+        assert!(report.shortfalls()[0].ends_with("1 not written, the storage took no more"));
+        let json = &report.custom_data()[CUSTOM_DATA];
+        assert_eq!(serde_json::from_str::<Report>(json).unwrap(), report);
+    }
+}
