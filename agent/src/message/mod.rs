@@ -3,12 +3,23 @@
 //! Definitions are read from files as rosidl reads them; nothing is generated, loaded or executed.
 //! Files and names may be anybody's: every size, number and depth is bounded.
 
+pub mod csv;
+pub mod decode;
 pub mod definition;
+pub mod filter;
 mod hash;
+mod numpy;
 mod parse;
+pub mod python;
 mod schema;
+pub mod shown;
+pub mod value;
+pub mod yaml;
 
+pub use decode::{DecodeError, Decoded, Limits, decode};
 pub use definition::{
     Definition, Element, Field, Kind, MessageType, NotClosed, Shape, Structure, TypeName,
 };
 pub use parse::{ParseError, Problem};
+pub use shown::Shown;
+pub use value::Value;

@@ -1,0 +1,78 @@
+//! A message as one line of comma-separated values, without quoting, as `ros2 topic echo --csv`.
+//!
+//! A comma only stands behind something: empty values at the beginning of a message or an array
+//! leave no trace, which is the original's form and what its users parse.
+
+use super::python;
+use super::shown::Shown;
+use super::value::{Array, Items, Message, Scalar, Value};
+
+/// The line, without its end.
+pub fn line(message: &Message<'_>, shown: &Shown) -> String {
+    let mut line = String::new();
+    for (_, value) in message.fields() {
+        if !line.is_empty() {
+            line.push(',');
+        }
+        match value {
+            Value::Scalar(value) => scalar(&mut line, *value, shown),
+            Value::Text(text) => {
+                line.push_str(&shown.text(text).unwrap_or_else(|| text.to_string()));
+            }
+            Value::Message(message) => line.push_str(&self::line(message, shown)),
+            Value::Array(array) => match shown.array(array) {
+                Some(words) => line.push_str(&words),
+                None => line.push_str(&elements(array, shown)),
+            },
+        }
+    }
+    line
+}
+
+fn elements(array: &Array<'_>, shown: &Shown) -> String {
+    let (count, cut) = shown.elements(array.length);
+    let mut line = String::new();
+    let separate = |line: &mut String| {
+        if !line.is_empty() {
+            line.push(',');
+        }
+    };
+    match &array.items {
+        Items::Scalars(scalars) => {
+            for value in scalars.iter().take(count) {
+                separate(&mut line);
+                match value {
+                    // numpy prints the digits of its width.
+                    Scalar::Float32(number) if array.is_fixed() => {
+                        line.push_str(&python::float32(number));
+                    }
+                    _ => scalar(&mut line, value, shown),
+                }
+            }
+        }
+        Items::Texts(texts) => {
+            for text in texts.iter().take(count) {
+                separate(&mut line);
+                line.push_str(&shown.text(text).unwrap_or_else(|| text.to_string()));
+            }
+        }
+        Items::Messages(messages) => {
+            for message in messages.iter().take(count) {
+                separate(&mut line);
+                line.push_str(&self::line(message, shown));
+            }
+        }
+    }
+    if cut {
+        separate(&mut line);
+        line.push_str("...");
+    }
+    line
+}
+
+fn scalar(line: &mut String, value: Scalar, shown: &Shown) {
+    match (value, shown.truncate) {
+        (Scalar::Byte(_), Some(0)) => line.push_str("b'...'"),
+        _ => line.push_str(&python::scalar(value)),
+    }
+}

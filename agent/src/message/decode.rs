@@ -1,0 +1,708 @@
+//! Reads a payload by its type: CDR as ROS 2 and other DDS applications write it.
+//!
+//! The payload is anybody's: a length is held against the bytes that are left before anything is
+//! made of it, and what is made is bounded by [`Limits`]. XCDR1 and XCDR2 (plain and delimited)
+//! in both byte orders; parameter lists are refused by name.
+//!
+//! Strings that are not UTF-8 and octets that are no truth value are shown as the original shows
+//! them, and counted ([`Oddities`]); a NUL that is missing at a string's end is missed by nobody.
+
+use std::borrow::Cow;
+
+use ros2probe_wire::cursor::{Cursor, Endianness, Reason, WireError};
+
+use super::definition::{Element, Field, MessageType, Shape, Structure, TypeName};
+use super::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
+
+/// Every XCDR structure begins at the first byte behind this.
+const ENCAPSULATION: usize = 4;
+/// Bytes behind the last field that RTPS pads submessages with.
+const PADDING: usize = 3;
+
+/// What one message may cost.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Levels of nested messages.
+    pub depth: usize,
+    /// Values that are kept, arrays of numbers being one.
+    pub values: usize,
+    /// Elements of an array of messages or strings that are kept; the others are only checked.
+    pub kept: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            depth: 64,
+            values: 2_000_000,
+            kept: usize::MAX,
+        }
+    }
+}
+
+/// A message and what was strange about it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Decoded<'a> {
+    /// The message.
+    pub message: Message<'a>,
+    /// What a reader may take as a sign of a wrong definition.
+    pub oddities: Oddities,
+}
+
+/// What does not keep a message from being shown.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Oddities {
+    /// Bytes behind the last field, more than padding.
+    pub trailing: usize,
+    /// Strings that are not UTF-8 (UTF-16 for `wstring`).
+    pub texts: usize,
+    /// Truth values that are neither 0 nor 1: they count as true.
+    pub booleans: usize,
+}
+
+impl Oddities {
+    /// Whether there was any.
+    pub fn any(&self) -> bool {
+        *self != Self::default()
+    }
+}
+
+/// Why a payload cannot be read as its type.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum DecodeError {
+    /// Not even the encapsulation header is there.
+    #[error("the payload of {0} bytes has no encapsulation header")]
+    NoEncapsulation(usize),
+    /// It is encoded in a way that is not read.
+    #[error("{name} (encapsulation {id:#06x}) is not read")]
+    Encapsulation {
+        /// The header's number.
+        id: u16,
+        /// Its name in the specification.
+        name: &'static str,
+    },
+    /// The bytes are not a message of this type.
+    #[error("{0} (counted behind the encapsulation header)")]
+    Malformed(#[from] WireError),
+    /// More values, or deeper ones, than are kept.
+    #[error("more than {0}")]
+    Limit(&'static str),
+}
+
+/// Reads a payload that begins with its encapsulation header.
+///
+/// # Errors
+/// Where it cannot be of this type, or is larger than the limits.
+pub fn decode<'a>(
+    message_type: &'a MessageType,
+    payload: &'a [u8],
+    limits: &Limits,
+) -> Result<Decoded<'a>, DecodeError> {
+    let (header, body) = payload
+        .split_first_chunk::<ENCAPSULATION>()
+        .ok_or(DecodeError::NoEncapsulation(payload.len()))?;
+    let encoding = Encoding::parse(u16::from_be_bytes([header[0], header[1]]))?;
+    let mut reader = Reader {
+        message_type,
+        encoding,
+        limits: *limits,
+        values: 0,
+        oddities: Oddities::default(),
+    };
+    let mut cursor = Cursor::new(body, encoding.endianness);
+    let message = reader.message(&mut cursor, reader.structure(&message_type.root)?, 0)?;
+    let trailing = cursor.remaining();
+    if trailing > PADDING {
+        reader.oddities.trailing = trailing;
+    }
+    Ok(Decoded {
+        message,
+        oddities: reader.oddities,
+    })
+}
+
+/// How a payload is encoded (RTPS 2.5, 10.2; XTypes 1.3, 7.6.3.1.2).
+#[derive(Debug, Clone, Copy)]
+struct Encoding {
+    endianness: Endianness,
+    /// Alignment of 64-bit numbers.
+    widest: usize,
+    /// Collections of anything but numbers are preceded by their size in bytes.
+    sized: bool,
+    /// Structures are, too.
+    delimited: bool,
+}
+
+impl Encoding {
+    fn parse(id: u16) -> Result<Self, DecodeError> {
+        let endianness = if id & 1 == 0 {
+            Endianness::Big
+        } else {
+            Endianness::Little
+        };
+        let refused = |name| Err(DecodeError::Encapsulation { id, name });
+        match id {
+            0x0000 | 0x0001 => Ok(Self {
+                endianness,
+                widest: 8,
+                sized: false,
+                delimited: false,
+            }),
+            0x0006 | 0x0007 => Ok(Self {
+                endianness,
+                widest: 4,
+                sized: true,
+                delimited: false,
+            }),
+            0x0008 | 0x0009 => Ok(Self {
+                endianness,
+                widest: 4,
+                sized: true,
+                delimited: true,
+            }),
+            0x0002 | 0x0003 => refused("a parameter list (PL_CDR)"),
+            0x000a | 0x000b => refused("a parameter list (PL_CDR2)"),
+            0x0004 => refused("XML"),
+            _ => refused("an unknown encoding"),
+        }
+    }
+}
+
+struct Reader<'a> {
+    message_type: &'a MessageType,
+    encoding: Encoding,
+    limits: Limits,
+    values: usize,
+    oddities: Oddities,
+}
+
+impl<'a> Reader<'a> {
+    fn structure(&self, name: &TypeName) -> Result<&'a Structure, DecodeError> {
+        self.message_type
+            .structure(name)
+            .ok_or(DecodeError::Limit("the definition tells"))
+    }
+
+    fn count(&mut self, values: usize) -> Result<(), DecodeError> {
+        self.values = self.values.saturating_add(values);
+        if self.values > self.limits.values {
+            return Err(DecodeError::Limit("the values kept of one message"));
+        }
+        Ok(())
+    }
+
+    /// What a structure's or collection's size in front of it leaves to read, if there is one.
+    fn delimited(
+        &self,
+        there: bool,
+        cursor: &mut Cursor<'a>,
+        what: &'static str,
+    ) -> Result<Option<Cursor<'a>>, DecodeError> {
+        if !there {
+            return Ok(None);
+        }
+        cursor.align(4);
+        let size = length(cursor, what)?;
+        Ok(Some(cursor.sub(what, size)?))
+    }
+
+    fn message(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        structure: &'a Structure,
+        depth: usize,
+    ) -> Result<Message<'a>, DecodeError> {
+        if depth >= self.limits.depth {
+            return Err(DecodeError::Limit("the levels of nested messages"));
+        }
+        let mut inner = self.delimited(self.encoding.delimited, cursor, "size of a structure")?;
+        let cursor = inner.as_mut().unwrap_or(cursor);
+        if structure.fields.is_empty() {
+            cursor.u8("structure_needs_at_least_one_member")?;
+        }
+        self.count(structure.fields.len())?;
+        let mut values = Vec::with_capacity(structure.fields.len());
+        for field in &structure.fields {
+            values.push(self.field(cursor, field, depth)?);
+        }
+        Ok(Message { structure, values })
+    }
+
+    fn field(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        field: &'a Field,
+        depth: usize,
+    ) -> Result<Value<'a>, DecodeError> {
+        if field.shape != Shape::Single {
+            return self.array(cursor, field, depth).map(Value::Array);
+        }
+        if let Some(kind) = ScalarKind::of(&field.element) {
+            return Ok(Value::Scalar(self.scalar(cursor, kind)?));
+        }
+        match &field.element {
+            Element::Nested(name) => {
+                let structure = self.structure(name)?;
+                self.message(cursor, structure, depth + 1)
+                    .map(Value::Message)
+            }
+            element => self.text(cursor, element).map(Value::Text),
+        }
+    }
+
+    fn scalar(&mut self, cursor: &mut Cursor<'a>, kind: ScalarKind) -> Result<Scalar, DecodeError> {
+        let scalars = self.scalars(cursor, kind, 1)?;
+        scalars
+            .get(0)
+            .ok_or(cursor.error("number", Reason::Truncated).into())
+    }
+
+    fn scalars(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        kind: ScalarKind,
+        length: usize,
+    ) -> Result<Scalars<'a>, DecodeError> {
+        if length > 0 {
+            cursor.align(kind.size().min(self.encoding.widest));
+        }
+        let size = length.checked_mul(kind.size());
+        let size = size.ok_or(cursor.error("numbers", Reason::BadLength))?;
+        let bytes = cursor.take("numbers", size)?;
+        if kind == ScalarKind::Bool {
+            self.oddities.booleans += bytes.iter().filter(|byte| **byte > 1).count();
+        }
+        Ok(Scalars::new(kind, self.encoding.endianness, bytes))
+    }
+
+    fn array(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        field: &'a Field,
+        depth: usize,
+    ) -> Result<Array<'a>, DecodeError> {
+        let kind = ScalarKind::of(&field.element);
+        let sized = self.encoding.sized && kind.is_none();
+        let mut inner = self.delimited(sized, cursor, "size of a collection")?;
+        let cursor = inner.as_mut().unwrap_or(cursor);
+        let length = match field.shape {
+            Shape::Single => 1,
+            Shape::Array(length) => {
+                usize::try_from(length).map_err(|_| cursor.error("array", Reason::OverLimit))?
+            }
+            Shape::Bounded(_) | Shape::Unbounded => {
+                cursor.align(4);
+                let length = length(cursor, "sequence length")?;
+                within(cursor, length, field.shape)?;
+                length
+            }
+        };
+        let items = match (kind, &field.element) {
+            (Some(kind), _) => Items::Scalars(self.scalars(cursor, kind, length)?),
+            (None, Element::Nested(name)) => {
+                let structure = self.structure(name)?;
+                Items::Messages(self.messages(cursor, structure, length, depth)?)
+            }
+            (None, element) => Items::Texts(self.texts(cursor, element, length)?),
+        };
+        Ok(Array {
+            field,
+            length,
+            items,
+        })
+    }
+
+    fn messages(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        structure: &'a Structure,
+        length: usize,
+        depth: usize,
+    ) -> Result<Vec<Message<'a>>, DecodeError> {
+        // The smallest message is an octet, or its own size where that is written.
+        let least = if self.encoding.delimited { 4 } else { 1 };
+        let kept = self.keep(cursor, length, least)?;
+        let mut messages = Vec::with_capacity(kept);
+        for _ in 0..kept {
+            messages.push(self.message(cursor, structure, depth + 1)?);
+        }
+        for _ in kept..length {
+            self.skip_message(cursor, structure, depth + 1)?;
+        }
+        Ok(messages)
+    }
+
+    fn texts(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        element: &Element,
+        length: usize,
+    ) -> Result<Vec<Cow<'a, str>>, DecodeError> {
+        let kept = self.keep(cursor, length, 4)?;
+        let mut texts = Vec::with_capacity(kept);
+        for _ in 0..kept {
+            texts.push(self.text(cursor, element)?);
+        }
+        for _ in kept..length {
+            self.text_bytes(cursor, element)?;
+        }
+        Ok(texts)
+    }
+
+    /// How many of `length` elements are kept; refuses more than there can be in what is left.
+    fn keep(
+        &mut self,
+        cursor: &Cursor<'a>,
+        length: usize,
+        least: usize,
+    ) -> Result<usize, DecodeError> {
+        if length
+            .checked_mul(least)
+            .is_none_or(|size| size > cursor.remaining())
+        {
+            return Err(cursor
+                .error("elements of a sequence", Reason::BadLength)
+                .into());
+        }
+        let kept = length.min(self.limits.kept);
+        self.count(kept)?;
+        Ok(kept)
+    }
+
+    /// Moves past what [`Self::message`] would read, and keeps nothing of it.
+    fn skip_message(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        structure: &'a Structure,
+        depth: usize,
+    ) -> Result<(), DecodeError> {
+        if depth >= self.limits.depth {
+            return Err(DecodeError::Limit("the levels of nested messages"));
+        }
+        if self
+            .delimited(self.encoding.delimited, cursor, "size of a structure")?
+            .is_some()
+        {
+            return Ok(());
+        }
+        if structure.fields.is_empty() {
+            cursor.u8("structure_needs_at_least_one_member")?;
+        }
+        for field in &structure.fields {
+            match (&field.element, field.shape) {
+                (Element::Nested(name), Shape::Single) => {
+                    let structure = self.structure(name)?;
+                    self.skip_message(cursor, structure, depth + 1)?;
+                }
+                (_, Shape::Single) => {
+                    self.field(cursor, field, depth)?;
+                }
+                _ => {
+                    let kept = std::mem::replace(&mut self.limits.kept, 0);
+                    let skipped = self.array(cursor, field, depth);
+                    self.limits.kept = kept;
+                    skipped?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn text(
+        &mut self,
+        cursor: &mut Cursor<'a>,
+        element: &Element,
+    ) -> Result<Cow<'a, str>, DecodeError> {
+        let bytes = self.text_bytes(cursor, element)?;
+        let text = match bytes {
+            Characters::Octets(bytes) => {
+                let bytes = bytes.strip_suffix(&[0]).unwrap_or(bytes);
+                String::from_utf8_lossy(bytes)
+            }
+            Characters::Wide(units) => Cow::Owned(wide(&units)),
+        };
+        let replaced = |text: &str| text.contains(char::REPLACEMENT_CHARACTER);
+        if matches!(&text, Cow::Owned(text) if replaced(text)) {
+            self.oddities.texts += 1;
+        }
+        Ok(text)
+    }
+
+    fn text_bytes(
+        &self,
+        cursor: &mut Cursor<'a>,
+        element: &Element,
+    ) -> Result<Characters<'a>, DecodeError> {
+        cursor.align(4);
+        let length = length(cursor, "string length")?;
+        let (bound, characters, written) = match element {
+            Element::WString { bound } if self.encoding.sized => {
+                // XTypes counts octets of UTF-16.
+                let bytes = cursor.take("wide string", length)?;
+                let units = Scalars::new(ScalarKind::UInt16, self.encoding.endianness, bytes);
+                (*bound, Characters::Wide(units), length / 2)
+            }
+            Element::WString { bound } => {
+                // Both RMWs write a character of UTF-16 in four octets.
+                let size = length.checked_mul(4);
+                let size = size.ok_or(cursor.error("wide string", Reason::BadLength))?;
+                let bytes = cursor.take("wide string", size)?;
+                let units = Scalars::new(ScalarKind::UInt32, self.encoding.endianness, bytes);
+                (*bound, Characters::Wide(units), length)
+            }
+            Element::String { bound } => {
+                let bytes = cursor.take("string", length)?;
+                let written = bytes.strip_suffix(&[0]).unwrap_or(bytes).len();
+                (*bound, Characters::Octets(bytes), written)
+            }
+            _ => return Err(cursor.error("string", Reason::BadValue).into()),
+        };
+        if let Some(bound) = bound {
+            within(cursor, written, Shape::Bounded(bound))?;
+        }
+        Ok(characters)
+    }
+}
+
+enum Characters<'a> {
+    Octets(&'a [u8]),
+    /// Units of UTF-16, each in a number of two or four octets.
+    Wide(Scalars<'a>),
+}
+
+/// A length field, aligned already.
+fn length(cursor: &mut Cursor<'_>, what: &'static str) -> Result<usize, DecodeError> {
+    let length = cursor.u32(what)?;
+    usize::try_from(length).map_err(|_| cursor.error(what, Reason::BadLength).into())
+}
+
+fn within(cursor: &Cursor<'_>, length: usize, shape: Shape) -> Result<(), DecodeError> {
+    match shape {
+        Shape::Bounded(bound) if u32::try_from(length).map_or(true, |length| length > bound) => {
+            Err(cursor
+                .error("length over its type's bound", Reason::OverLimit)
+                .into())
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Text of UTF-16; a number that is no unit of it counts as a character of its own.
+fn wide(units: &Scalars<'_>) -> String {
+    let mut text = String::with_capacity(units.len());
+    let mut pending = Vec::new();
+    let flush = |pending: &mut Vec<u16>, text: &mut String| {
+        let decoded = char::decode_utf16(pending.drain(..));
+        text.extend(decoded.map(|unit| unit.unwrap_or(char::REPLACEMENT_CHARACTER)));
+    };
+    for unit in units.iter() {
+        let Scalar::UInt(unit) = unit else { continue };
+        if let Ok(unit) = u16::try_from(unit) {
+            pending.push(unit);
+        } else {
+            flush(&mut pending, &mut text);
+            let character = u32::try_from(unit).ok().and_then(char::from_u32);
+            text.push(character.unwrap_or(char::REPLACEMENT_CHARACTER));
+        }
+    }
+    flush(&mut pending, &mut text);
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::message::python;
+
+    fn message_type(schema: &str) -> MessageType {
+        MessageType::parse(&"a/msg/B".parse().unwrap(), schema).unwrap()
+    }
+
+    fn read(schema: &str, payload: &[u8]) -> Result<(String, Oddities), DecodeError> {
+        let message_type = message_type(schema);
+        let decoded = decode(&message_type, payload, &Limits::default())?;
+        Ok((
+            python::repr(&Value::Message(decoded.message)),
+            decoded.oddities,
+        ))
+    }
+
+    fn text(schema: &str, payload: &[u8]) -> String {
+        let (text, oddities) = read(schema, payload).unwrap();
+        assert_eq!(oddities, Oddities::default());
+        text
+    }
+
+    const NESTED: &str = "Inner[] inner\nint64 last\n
+================================================================================
+MSG: a/Inner\nuint8 small\nuint32 middle\nfloat64 large\nstring name";
+
+    #[test]
+    fn xcdr1_aligns_to_eight_and_xcdr2_to_four() {
+        let xcdr1 = b"\0\x01\0\0\x01\0\0\0\x05\0\0\0\x09\0\0\0\0\0\0\0\0\0\0\0\0\0\xf8\x3f\
+            \x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
+        let shown = "a.msg.B(inner=[a.msg.Inner(small=5, middle=9, large=1.5, name='x')], last=7)";
+        assert_eq!(text(NESTED, xcdr1), shown);
+        // The sequence's size stands before its length.
+        let plain = b"\0\x07\0\0\x1a\0\0\0\x01\0\0\0\x05\0\0\0\x09\0\0\0\0\0\0\0\0\0\xf8\x3f\
+            \x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
+        assert_eq!(text(NESTED, plain), shown);
+        // Each structure has its size, too.
+        let delimited = b"\0\x09\0\0\x2c\0\0\0\x1e\0\0\0\x01\0\0\0\x16\0\0\0\x05\0\0\0\x09\0\0\0\
+            \0\0\0\0\0\0\xf8\x3f\x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
+        assert_eq!(text(NESTED, delimited), shown);
+    }
+
+    #[test]
+    fn members_that_a_newer_type_appends_are_skipped() {
+        let newer = b"\0\x09\0\0\x0c\0\0\0\x05\0\0\0\x01\x02\x03\x04\x05\x06\x07\x08";
+        assert_eq!(text("uint8 a", newer), "a.msg.B(a=5)");
+    }
+
+    #[test]
+    fn big_endian_numbers_and_strings_are_read() {
+        let payload =
+            b"\0\0\0\0\0\0\0\x02\0\x01\xff\xfe\0\0\0\x04\0\0\0a\0\0\0b\0\0\0c\0\x01\xf6\0";
+        let shown = "a.msg.B(n=[1, -2], w='abc\u{1f600}')";
+        assert_eq!(text("int16[] n\nwstring w", payload), shown);
+    }
+
+    #[test]
+    fn utf_16_is_put_together_also_where_a_unit_has_four_octets() {
+        let one = b"\0\x01\0\0\x02\0\0\0\x3d\xd8\0\0\0\xde\0\0";
+        assert_eq!(text("wstring w", one), "a.msg.B(w='\u{1f600}')");
+        let two = b"\0\x07\0\0\x04\0\0\0\x3d\xd8\0\xde";
+        assert_eq!(text("wstring w", two), "a.msg.B(w='\u{1f600}')");
+        let half = b"\0\x01\0\0\x01\0\0\0\x3d\xd8\0\0";
+        let (shown, oddities) = read("wstring w", half).unwrap();
+        assert_eq!(
+            (shown.as_str(), oddities.texts),
+            ("a.msg.B(w='\u{fffd}')", 1)
+        );
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_refused_by_name() {
+        let refused = |id: u8| read("uint8 a", &[0, id, 0, 0, 1]).unwrap_err().to_string();
+        assert_eq!(
+            refused(3),
+            "a parameter list (PL_CDR) (encapsulation 0x0003) is not read"
+        );
+        assert_eq!(
+            refused(11),
+            "a parameter list (PL_CDR2) (encapsulation 0x000b) is not read"
+        );
+        assert_eq!(
+            refused(0x20),
+            "an unknown encoding (encapsulation 0x0020) is not read"
+        );
+        assert_eq!(
+            read("uint8 a", &[0, 1, 0]),
+            Err(DecodeError::NoEncapsulation(3))
+        );
+    }
+
+    #[test]
+    fn a_length_beyond_the_payload_is_refused_before_anything_is_made_of_it() {
+        let payload = [0, 1, 0, 0, 0x00, 0xe1, 0xf5, 0x05];
+        for schema in [
+            NESTED,
+            "string[] a",
+            "float64[] a",
+            "wstring a",
+            "string a",
+            "bool[] a",
+        ] {
+            let error = read(schema, &payload).unwrap_err();
+            assert!(
+                matches!(error, DecodeError::Malformed(_)),
+                "{schema}: {error}"
+            );
+        }
+        // Nothing has no octet: an empty message takes one.
+        let empty = "Empty[] a\n
+================================================================================
+MSG: a/Empty\n";
+        let mut payload = vec![0, 1, 0, 0, 3, 0, 0, 0, 0, 0, 0];
+        let shown = "a.msg.B(a=[a.msg.Empty(), a.msg.Empty(), a.msg.Empty()])";
+        assert_eq!(text(empty, &payload), shown);
+        payload.pop();
+        assert!(read(empty, &payload).is_err());
+    }
+
+    #[test]
+    fn what_is_kept_is_bounded_and_what_is_not_kept_is_checked_all_the_same() {
+        let schema = "Inner[] a\nstring[] b\n
+================================================================================
+MSG: a/Inner\nuint8 x\nuint8 y";
+        let message_type = message_type(schema);
+        let mut payload = vec![0, 1, 0, 0, 0xe8, 3, 0, 0];
+        payload.extend([7; 2000]);
+        payload.extend(b"\x03\0\0\0\x02\0\0\0a\0\0\0\x02\0\0\0b\0\0\0\x02\0\0\0c\0");
+        let few = Limits {
+            values: 100,
+            ..Limits::default()
+        };
+        assert!(matches!(
+            decode(&message_type, &payload, &few),
+            Err(DecodeError::Limit(_))
+        ));
+        let some = Limits { kept: 2, ..few };
+        let decoded = decode(&message_type, &payload, &some).unwrap();
+        let lengths: Vec<_> = decoded
+            .message
+            .values
+            .iter()
+            .map(|value| match value {
+                Value::Array(Array {
+                    length,
+                    items: Items::Messages(kept),
+                    ..
+                }) => (*length, kept.len()),
+                Value::Array(Array {
+                    length,
+                    items: Items::Texts(kept),
+                    ..
+                }) => (*length, kept.len()),
+                _ => unreachable!(),
+            })
+            .collect();
+        assert_eq!(lengths, [(1000, 2), (3, 2)]);
+        payload.pop();
+        assert!(decode(&message_type, &payload, &some).is_err());
+    }
+
+    #[test]
+    fn what_is_strange_is_shown_and_counted() {
+        let payload = b"\0\x01\0\0\x05\0\0\0\x03\0\0\0ab\xff\x01";
+        let (shown, oddities) = read("bool ok\nstring s", payload).unwrap();
+        assert_eq!(shown, "a.msg.B(ok=True, s='ab\u{fffd}')");
+        assert_eq!(
+            oddities,
+            Oddities {
+                trailing: 0,
+                texts: 1,
+                booleans: 1
+            }
+        );
+        let odd = |payload: &[u8]| read("uint8 a", payload).unwrap().1.trailing;
+        assert_eq!(odd(&[0, 1, 0, 0, 1, 2, 3, 4]), 0);
+        assert_eq!(odd(&[0, 1, 0, 0, 1, 2, 3, 4, 5]), 4);
+        // A string without its NUL, and one that says it has not even that.
+        assert_eq!(
+            text("string a", b"\0\x01\0\0\x02\0\0\0ab"),
+            "a.msg.B(a='ab')"
+        );
+        assert_eq!(text("string a", b"\0\x01\0\0\0\0\0\0"), "a.msg.B(a='')");
+    }
+
+    #[test]
+    fn bounds_are_kept() {
+        let payload = b"\0\x01\0\0\x03\0\0\0ab\0";
+        assert_eq!(text("string<=2 a", payload), "a.msg.B(a='ab')");
+        assert!(read("string<=1 a", payload).is_err());
+        let payload = b"\0\x01\0\0\x02\0\0\0\x01\x02";
+        assert_eq!(text("int8[<=2] a", payload), "a.msg.B(a=[1, 2])");
+        assert!(read("int8[<=1] a", payload).is_err());
+    }
+}

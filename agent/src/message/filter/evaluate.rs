@@ -1,0 +1,535 @@
+//! An expression's value for a message, as Python would have it. What raises an exception there is
+//! an error here, in the same words where they are short.
+
+use std::borrow::Cow;
+use std::cmp::Ordering;
+
+use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
+use crate::message::python;
+use crate::message::value::{Array, Items, Message, Scalar, Value};
+
+/// What `m` is.
+#[derive(Debug, Clone, Copy)]
+pub enum Subject<'a> {
+    /// The whole message.
+    Message(&'a Message<'a>),
+    /// A part of it, which `--field` selected.
+    Value(&'a Value<'a>),
+    /// The payload, with `--raw`.
+    Bytes(&'a [u8]),
+}
+
+pub(super) fn passes(node: &Node, subject: Subject<'_>) -> Result<bool, FilterError> {
+    let object = match subject {
+        Subject::Message(message) => Object::Message(message),
+        Subject::Value(value) => Object::of(value),
+        Subject::Bytes(bytes) => Object::Bytes(Cow::Borrowed(bytes)),
+    };
+    Ok(evaluate(node, &object)?.is_true())
+}
+
+/// A value on the way.
+#[derive(Debug, Clone)]
+enum Object<'a> {
+    None,
+    Bool(bool),
+    Int(i128),
+    Float(f64),
+    Text(Cow<'a, str>),
+    Bytes(Cow<'a, [u8]>),
+    List(Vec<Object<'a>>),
+    Array(&'a Array<'a>),
+    Message(&'a Message<'a>),
+}
+
+impl<'a> Object<'a> {
+    fn of(value: &'a Value<'a>) -> Self {
+        match value {
+            Value::Scalar(scalar) => Self::scalar(*scalar),
+            Value::Text(text) => Self::Text(Cow::Borrowed(text)),
+            Value::Array(array) => Self::Array(array),
+            Value::Message(message) => Self::Message(message),
+        }
+    }
+
+    fn scalar(scalar: Scalar) -> Self {
+        match scalar {
+            Scalar::Bool(value) => Self::Bool(value),
+            Scalar::Byte(byte) => Self::Bytes(Cow::Owned(vec![byte])),
+            Scalar::Int(number) => Self::Int(number.into()),
+            Scalar::UInt(number) => Self::Int(number.into()),
+            Scalar::Float32(number) => Self::Float(number.into()),
+            Scalar::Float64(number) => Self::Float(number),
+        }
+    }
+
+    fn is_true(&self) -> bool {
+        match self {
+            Self::None => false,
+            Self::Bool(value) => *value,
+            Self::Int(number) => *number != 0,
+            Self::Float(number) => *number != 0.0,
+            Self::Text(text) => !text.is_empty(),
+            Self::Bytes(bytes) => !bytes.is_empty(),
+            Self::List(items) => !items.is_empty(),
+            Self::Array(array) => array.length > 0,
+            Self::Message(_) => true,
+        }
+    }
+
+    fn type_name(&self) -> &str {
+        match self {
+            Self::None => "NoneType",
+            Self::Bool(_) => "bool",
+            Self::Int(_) => "int",
+            Self::Float(_) => "float",
+            Self::Text(_) => "str",
+            Self::Bytes(_) => "bytes",
+            Self::List(_) => "list",
+            Self::Array(_) => "array",
+            Self::Message(message) => message.structure.name.name(),
+        }
+    }
+
+    /// Truth values are numbers, too.
+    fn number(&self) -> Option<Number> {
+        match self {
+            Self::Bool(value) => Some(Number::Int(i128::from(*value))),
+            Self::Int(number) => Some(Number::Int(*number)),
+            Self::Float(number) => Some(Number::Float(*number)),
+            _ => None,
+        }
+    }
+
+    /// The elements, where there are any to walk.
+    fn elements(&self) -> Option<Vec<Self>> {
+        Some(match self {
+            Self::List(items) => items.clone(),
+            Self::Array(array) => match &array.items {
+                Items::Scalars(scalars) => scalars.iter().map(Self::scalar).collect(),
+                Items::Texts(texts) => texts
+                    .iter()
+                    .map(|text| Self::Text(Cow::Borrowed(text)))
+                    .collect(),
+                Items::Messages(messages) => messages.iter().map(Self::Message).collect(),
+            },
+            Self::Bytes(bytes) => bytes.iter().map(|byte| Self::Int((*byte).into())).collect(),
+            _ => return None,
+        })
+    }
+
+    fn equals(&self, other: &Self) -> bool {
+        match (self, other) {
+            (Self::None, Self::None) => true,
+            (Self::Text(one), Self::Text(other)) => one == other,
+            (Self::Bytes(one), Self::Bytes(other)) => one == other,
+            (Self::Message(one), Self::Message(other)) => one == other,
+            _ => match (self.number(), other.number()) {
+                (Some(one), Some(other)) => one.compare(other) == Some(Ordering::Equal),
+                _ => match (self.elements(), other.elements()) {
+                    (Some(one), Some(other)) => {
+                        one.len() == other.len()
+                            && one.iter().zip(&other).all(|(one, other)| one.equals(other))
+                    }
+                    _ => false,
+                },
+            },
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Number {
+    Int(i128),
+    Float(f64),
+}
+
+impl Number {
+    #[expect(clippy::cast_precision_loss, reason = "as Python's float() does")]
+    fn float(self) -> f64 {
+        match self {
+            Self::Int(number) => number as f64,
+            Self::Float(number) => number,
+        }
+    }
+
+    fn compare(self, other: Self) -> Option<Ordering> {
+        match (self, other) {
+            (Self::Int(one), Self::Int(other)) => Some(one.cmp(&other)),
+            _ => self.float().partial_cmp(&other.float()),
+        }
+    }
+}
+
+fn evaluate<'a>(node: &Node, subject: &Object<'a>) -> Result<Object<'a>, FilterError> {
+    let wrong = |message: String| FilterError::new(node.column, message);
+    let of = |inner: &Node| evaluate(inner, subject);
+    Ok(match &node.kind {
+        Kind::Subject => subject.clone(),
+        Kind::None => Object::None,
+        Kind::Bool(value) => Object::Bool(*value),
+        Kind::Int(number) => Object::Int(*number),
+        Kind::Float(number) => Object::Float(*number),
+        Kind::Text(text) => Object::Text(Cow::Owned(text.clone())),
+        Kind::List(nodes) => Object::List(nodes.iter().map(of).collect::<Result<_, _>>()?),
+        Kind::Attribute(inner, name) => {
+            let object = of(inner)?;
+            let field = match &object {
+                Object::Message(message) => message.get(name).map(Object::of),
+                _ => None,
+            };
+            let kind = object.type_name();
+            field.ok_or_else(|| wrong(format!("'{kind}' object has no attribute '{name}'")))?
+        }
+        Kind::Index(inner, index) => element(&of(inner)?, &of(index)?).map_err(wrong)?,
+        Kind::Not(inner) => Object::Bool(!of(inner)?.is_true()),
+        Kind::And(left, right) => match of(left)? {
+            left if left.is_true() => of(right)?,
+            left => left,
+        },
+        Kind::Or(left, right) => match of(left)? {
+            left if left.is_true() => left,
+            _ => of(right)?,
+        },
+        Kind::Negative(inner) => {
+            let object = of(inner)?;
+            match object.number() {
+                Some(Number::Int(number)) => {
+                    Object::Int(number.checked_neg().ok_or_else(|| wrong(too_large()))?)
+                }
+                Some(Number::Float(number)) => Object::Float(-number),
+                None => {
+                    let kind = object.type_name();
+                    return Err(wrong(format!("bad operand type for unary -: '{kind}'")));
+                }
+            }
+        }
+        Kind::Binary(operator, left, right) => {
+            binary(*operator, &of(left)?, &of(right)?).map_err(wrong)?
+        }
+        Kind::Compare(first, rest) => {
+            let mut left = of(first)?;
+            for (comparison, right) in rest {
+                let right = of(right)?;
+                if !compare(*comparison, &left, &right).map_err(wrong)? {
+                    return Ok(Object::Bool(false));
+                }
+                left = right;
+            }
+            Object::Bool(true)
+        }
+        Kind::Call(function, arguments) => {
+            let arguments = arguments.iter().map(of).collect::<Result<Vec<_>, _>>()?;
+            call(*function, &arguments).map_err(wrong)?
+        }
+        Kind::Method(inner, method, arguments) => {
+            let arguments = arguments.iter().map(of).collect::<Result<Vec<_>, _>>()?;
+            self::method(&of(inner)?, *method, &arguments).map_err(wrong)?
+        }
+    })
+}
+
+fn too_large() -> String {
+    "a number too large".to_owned()
+}
+
+fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, String> {
+    let index = match index {
+        Object::Int(index) => *index,
+        Object::Bool(index) => i128::from(*index),
+        _ => {
+            return Err(format!(
+                "an index has to be a number, not '{}'",
+                index.type_name()
+            ));
+        }
+    };
+    let place = |length: usize| {
+        let length = i128::try_from(length).unwrap_or(i128::MAX);
+        let index = if index < 0 { index + length } else { index };
+        usize::try_from(index)
+            .ok()
+            .filter(|_| index < length)
+            .ok_or("index out of range")
+    };
+    Ok(match object {
+        Object::Array(array) => {
+            let place = place(array.length)?;
+            let element = match &array.items {
+                Items::Scalars(scalars) => scalars.get(place).map(Object::scalar),
+                Items::Texts(texts) => texts
+                    .get(place)
+                    .map(|text| Object::Text(Cow::Borrowed(text))),
+                Items::Messages(messages) => messages.get(place).map(Object::Message),
+            };
+            element.ok_or("index out of range")?
+        }
+        Object::List(items) => items
+            .get(place(items.len())?)
+            .cloned()
+            .ok_or("index out of range")?,
+        Object::Bytes(bytes) => {
+            let byte = bytes.get(place(bytes.len())?).ok_or("index out of range")?;
+            Object::Int((*byte).into())
+        }
+        Object::Text(text) => {
+            let place = place(text.chars().count())?;
+            let character = text.chars().nth(place).ok_or("index out of range")?;
+            Object::Text(Cow::Owned(character.to_string()))
+        }
+        _ => {
+            return Err(format!(
+                "'{}' object is not subscriptable",
+                object.type_name()
+            ));
+        }
+    })
+}
+
+fn binary<'a>(
+    operator: Operator,
+    left: &Object<'a>,
+    right: &Object<'a>,
+) -> Result<Object<'a>, String> {
+    if let (Operator::Add, Object::Text(left), Object::Text(right)) = (operator, left, right) {
+        return Ok(Object::Text(Cow::Owned(format!("{left}{right}"))));
+    }
+    let (Some(one), Some(other)) = (left.number(), right.number()) else {
+        let (left, right) = (left.type_name(), right.type_name());
+        return Err(format!("cannot calculate with '{left}' and '{right}'"));
+    };
+    if let (Number::Int(one), Number::Int(other)) = (one, other) {
+        let floor = |one: i128, other: i128| {
+            let quotient = one.checked_div(other)?;
+            let exact = quotient * other == one;
+            Some(if exact || (one < 0) == (other < 0) {
+                quotient
+            } else {
+                quotient - 1
+            })
+        };
+        if other == 0
+            && matches!(
+                operator,
+                Operator::Divide | Operator::FloorDivide | Operator::Remainder
+            )
+        {
+            return Err("division by zero".to_owned());
+        }
+        let result = match operator {
+            Operator::Add => one.checked_add(other),
+            Operator::Subtract => one.checked_sub(other),
+            Operator::Multiply => one.checked_mul(other),
+            Operator::FloorDivide => floor(one, other),
+            Operator::Remainder => {
+                floor(one, other).and_then(|quotient| one.checked_sub(quotient * other))
+            }
+            Operator::Power if other >= 0 => u32::try_from(other)
+                .ok()
+                .and_then(|other| one.checked_pow(other)),
+            Operator::Divide | Operator::Power => {
+                return floats(
+                    operator,
+                    Number::Int(one).float(),
+                    Number::Int(other).float(),
+                );
+            }
+        };
+        return result.map(Object::Int).ok_or_else(too_large);
+    }
+    floats(operator, one.float(), other.float())
+}
+
+fn floats<'a>(operator: Operator, one: f64, other: f64) -> Result<Object<'a>, String> {
+    let dividing = matches!(
+        operator,
+        Operator::Divide | Operator::FloorDivide | Operator::Remainder
+    );
+    if dividing && other == 0.0 {
+        return Err("division by zero".to_owned());
+    }
+    Ok(Object::Float(match operator {
+        Operator::Add => one + other,
+        Operator::Subtract => one - other,
+        Operator::Multiply => one * other,
+        Operator::Divide => one / other,
+        Operator::FloorDivide => (one / other).floor(),
+        Operator::Remainder => one - (one / other).floor() * other,
+        Operator::Power => one.powf(other),
+    }))
+}
+
+fn compare(comparison: Comparison, left: &Object<'_>, right: &Object<'_>) -> Result<bool, String> {
+    match comparison {
+        Comparison::Equal => return Ok(left.equals(right)),
+        Comparison::NotEqual => return Ok(!left.equals(right)),
+        Comparison::In => return contains(right, left),
+        Comparison::NotIn => return contains(right, left).map(|found| !found),
+        Comparison::Less
+        | Comparison::LessOrEqual
+        | Comparison::Greater
+        | Comparison::GreaterOrEqual => {}
+    }
+    let order = match (left, right) {
+        (Object::Text(left), Object::Text(right)) => Some(left.cmp(right)),
+        (Object::Bytes(left), Object::Bytes(right)) => Some(left.cmp(right)),
+        _ => match (left.number(), right.number()) {
+            (Some(left), Some(right)) => left.compare(right),
+            _ => {
+                return Err(format!(
+                    "'{}' not supported between instances of '{}' and '{}'",
+                    comparison.as_str(),
+                    left.type_name(),
+                    right.type_name()
+                ));
+            }
+        },
+    };
+    Ok(order.is_some_and(|order| match comparison {
+        Comparison::Less => order.is_lt(),
+        Comparison::LessOrEqual => order.is_le(),
+        Comparison::Greater => order.is_gt(),
+        _ => order.is_ge(),
+    }))
+}
+
+fn contains(whole: &Object<'_>, part: &Object<'_>) -> Result<bool, String> {
+    if let (Object::Text(whole), Object::Text(part)) = (whole, part) {
+        return Ok(whole.contains(part.as_ref()));
+    }
+    if let (Object::Bytes(whole), Object::Bytes(part)) = (whole, part) {
+        return Ok(part.is_empty()
+            || whole
+                .windows(part.len())
+                .any(|window| window == part.as_ref()));
+    }
+    match whole.elements() {
+        Some(elements) => Ok(elements.iter().any(|element| element.equals(part))),
+        None => Err(format!(
+            "'in' needs a string or a list, not '{}'",
+            whole.type_name()
+        )),
+    }
+}
+
+fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, String> {
+    let several = matches!(function, Function::Min | Function::Max) && arguments.len() > 1;
+    if several {
+        return extreme(function, arguments);
+    }
+    let [argument] = arguments else {
+        return Err(format!("takes one argument, not {}", arguments.len()));
+    };
+    let kind = argument.type_name();
+    let elements = || {
+        argument
+            .elements()
+            .ok_or_else(|| format!("'{kind}' object is not iterable"))
+    };
+    Ok(match function {
+        Function::Len => {
+            let length = match argument {
+                Object::Text(text) => text.chars().count(),
+                Object::Bytes(bytes) => bytes.len(),
+                Object::List(items) => items.len(),
+                Object::Array(array) => array.length,
+                _ => return Err(format!("object of type '{kind}' has no len()")),
+            };
+            Object::Int(i128::try_from(length).unwrap_or(i128::MAX))
+        }
+        Function::Abs => match argument.number() {
+            Some(Number::Int(number)) => Object::Int(number.checked_abs().ok_or_else(too_large)?),
+            Some(Number::Float(number)) => Object::Float(number.abs()),
+            None => return Err(format!("bad operand type for abs(): '{kind}'")),
+        },
+        Function::Bool => Object::Bool(argument.is_true()),
+        Function::All => Object::Bool(elements()?.iter().all(Object::is_true)),
+        Function::Any => Object::Bool(elements()?.iter().any(Object::is_true)),
+        Function::Min | Function::Max => extreme(function, &elements()?)?,
+        Function::Sum => {
+            let mut total = Object::Int(0);
+            for element in elements()? {
+                total = binary(Operator::Add, &total, &element)?;
+            }
+            total
+        }
+        Function::Int => integer(argument)?,
+        Function::Float => match (argument, argument.number()) {
+            (_, Some(number)) => Object::Float(number.float()),
+            (Object::Text(text), None) => {
+                let number = text.trim().parse();
+                Object::Float(number.map_err(|_| format!("not a number: '{text}'"))?)
+            }
+            _ => return Err(format!("'{kind}' cannot become a number")),
+        },
+        Function::Str => Object::Text(Cow::Owned(match argument {
+            Object::None => "None".to_owned(),
+            Object::Bool(value) => python::scalar(Scalar::Bool(*value)),
+            Object::Int(number) => number.to_string(),
+            Object::Float(number) => python::float(*number),
+            Object::Text(text) => text.to_string(),
+            Object::Bytes(bytes) => python::bytes(bytes),
+            Object::List(_) | Object::Array(_) | Object::Message(_) => {
+                return Err(format!("'{kind}' cannot become a string"));
+            }
+        })),
+    })
+}
+
+fn integer<'a>(object: &Object<'a>) -> Result<Object<'a>, String> {
+    const LARGEST: f64 = 1e38;
+    Ok(Object::Int(match (object, object.number()) {
+        (_, Some(Number::Int(number))) => number,
+        (_, Some(Number::Float(number))) if number.abs() < LARGEST => {
+            #[expect(clippy::cast_possible_truncation, reason = "int() drops the fraction")]
+            let whole = number.trunc() as i128;
+            whole
+        }
+        (Object::Text(text), None) => text
+            .trim()
+            .parse()
+            .map_err(|_| format!("not a whole number: '{text}'"))?,
+        _ => {
+            return Err(format!(
+                "'{}' cannot become a whole number",
+                object.type_name()
+            ));
+        }
+    }))
+}
+
+fn extreme<'a>(function: Function, objects: &[Object<'a>]) -> Result<Object<'a>, String> {
+    let comparison = if function == Function::Min {
+        Comparison::Less
+    } else {
+        Comparison::Greater
+    };
+    let (mut best, rest) = objects.split_first().ok_or("nothing to choose from")?;
+    for object in rest {
+        if compare(comparison, object, best)? {
+            best = object;
+        }
+    }
+    Ok(best.clone())
+}
+
+fn method<'a>(
+    object: &Object<'a>,
+    method: Method,
+    arguments: &[Object<'a>],
+) -> Result<Object<'a>, String> {
+    let Object::Text(text) = object else {
+        return Err(format!(
+            "'{}' object has no methods here",
+            object.type_name()
+        ));
+    };
+    Ok(match (method, arguments) {
+        (Method::StartsWith, [Object::Text(part)]) => Object::Bool(text.starts_with(part.as_ref())),
+        (Method::EndsWith, [Object::Text(part)]) => Object::Bool(text.ends_with(part.as_ref())),
+        (Method::Lower, []) => Object::Text(Cow::Owned(text.to_lowercase())),
+        (Method::Upper, []) => Object::Text(Cow::Owned(text.to_uppercase())),
+        (Method::StartsWith | Method::EndsWith, _) => return Err("takes one string".to_owned()),
+        (Method::Lower | Method::Upper, _) => return Err("takes no argument".to_owned()),
+    })
+}

@@ -1,0 +1,293 @@
+//! Values as Python writes them: what `print()` makes of a field, and numbers in all outputs.
+//!
+//! ROS keeps arrays of a fixed length in numpy arrays, sequences of numbers in `array.array` and
+//! everything else in lists; each of them prints in its own way.
+
+use std::fmt::Write as _;
+
+use super::numpy;
+use super::value::{Array, Items, Message, Scalar, ScalarKind, Value};
+
+/// `str()` of a value: what `--field` prints where it selects no message.
+pub fn str(value: &Value<'_>) -> String {
+    match value {
+        Value::Text(text) => text.clone().into_owned(),
+        Value::Array(array) if array.is_fixed() && is_numeric(array) => match &array.items {
+            Items::Scalars(scalars) => numpy::str(*scalars),
+            Items::Texts(_) | Items::Messages(_) => repr(value),
+        },
+        _ => repr(value),
+    }
+}
+
+/// `repr()` of a value.
+pub fn repr(value: &Value<'_>) -> String {
+    let mut text = String::new();
+    write_repr(&mut text, value);
+    text
+}
+
+/// `repr()` of a float.
+pub fn float(value: f64) -> String {
+    exponent(format!("{value:?}"))
+}
+
+/// `str()` of a numpy `float32`: the digits that it takes to tell it from its neighbours.
+pub fn float32(value: f32) -> String {
+    exponent(format!("{value:?}"))
+}
+
+/// `str()` of a scalar.
+pub fn scalar(value: Scalar) -> String {
+    match value {
+        Scalar::Bool(true) => "True".to_owned(),
+        Scalar::Bool(false) => "False".to_owned(),
+        Scalar::Byte(byte) => bytes(&[byte]),
+        Scalar::Int(number) => number.to_string(),
+        Scalar::UInt(number) => number.to_string(),
+        Scalar::Float32(number) => float(number.into()),
+        Scalar::Float64(number) => float(number),
+    }
+}
+
+/// `repr()` of bytes.
+pub fn bytes(bytes: &[u8]) -> String {
+    let quote = quote(bytes.contains(&b'\''), bytes.contains(&b'"'));
+    let mut text = String::with_capacity(bytes.len() * 4 + 3);
+    text.push('b');
+    text.push(quote);
+    for byte in bytes {
+        match byte {
+            b'\\' => text.push_str("\\\\"),
+            b'\t' => text.push_str("\\t"),
+            b'\n' => text.push_str("\\n"),
+            b'\r' => text.push_str("\\r"),
+            0x20..=0x7e if char::from(*byte) == quote => {
+                text.push('\\');
+                text.push(quote);
+            }
+            0x20..=0x7e => text.push(char::from(*byte)),
+            _ => drop(write!(text, "\\x{byte:02x}")),
+        }
+    }
+    text.push(quote);
+    text
+}
+
+/// `repr()` of a string. What is printable is judged by a few ranges instead of the whole table.
+pub fn string(value: &str) -> String {
+    let quote = quote(value.contains('\''), value.contains('"'));
+    let mut text = String::with_capacity(value.len() + 2);
+    text.push(quote);
+    for character in value.chars() {
+        let code = u32::from(character);
+        match character {
+            '\\' => text.push_str("\\\\"),
+            '\t' => text.push_str("\\t"),
+            '\n' => text.push_str("\\n"),
+            '\r' => text.push_str("\\r"),
+            _ if character == quote => {
+                text.push('\\');
+                text.push(character);
+            }
+            _ if is_printable(character) => text.push(character),
+            _ if code <= 0xff => drop(write!(text, "\\x{code:02x}")),
+            _ if code <= 0xffff => drop(write!(text, "\\u{code:04x}")),
+            _ => drop(write!(text, "\\U{code:08x}")),
+        }
+    }
+    text.push(quote);
+    text
+}
+
+/// What Python calls the type of a value, for messages about attributes that it has not.
+pub fn type_name<'a>(value: &Value<'a>) -> &'a str {
+    match value {
+        Value::Scalar(Scalar::Bool(_)) => "bool",
+        Value::Scalar(Scalar::Byte(_)) => "bytes",
+        Value::Scalar(Scalar::Int(_) | Scalar::UInt(_)) => "int",
+        Value::Scalar(Scalar::Float32(_) | Scalar::Float64(_)) => "float",
+        Value::Text(_) => "str",
+        Value::Message(message) => message.structure.name.name(),
+        Value::Array(array) if !is_numeric(array) => "list",
+        Value::Array(array) if array.is_fixed() => "numpy.ndarray",
+        Value::Array(_) => "array.array",
+    }
+}
+
+/// Whether it is kept in an `array.array` or a numpy array: truth values and octets are not.
+fn is_numeric(array: &Array<'_>) -> bool {
+    match &array.items {
+        Items::Scalars(scalars) => !matches!(scalars.kind(), ScalarKind::Bool | ScalarKind::Byte),
+        Items::Texts(_) | Items::Messages(_) => false,
+    }
+}
+
+fn quote(single: bool, double: bool) -> char {
+    if single && !double { '"' } else { '\'' }
+}
+
+fn is_printable(character: char) -> bool {
+    match character {
+        ' ' => true,
+        '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' => false,
+        '\u{2060}'..='\u{206f}' | '\u{e000}'..='\u{f8ff}' | '\u{feff}' => false,
+        '\u{fff0}'..='\u{fffb}' | '\u{e0000}'..='\u{10ffff}' => false,
+        _ => !character.is_control() && !character.is_whitespace(),
+    }
+}
+
+/// Rust's shortest digits switch to an exponent where Python's do; Python writes it with a sign and
+/// at least two digits.
+fn exponent(digits: String) -> String {
+    match digits.as_str() {
+        "NaN" => return "nan".to_owned(),
+        "inf" | "-inf" => return digits,
+        _ => {}
+    }
+    let Some((mantissa, exponent)) = digits.split_once('e') else {
+        return digits;
+    };
+    let mantissa = mantissa.strip_suffix(".0").unwrap_or(mantissa);
+    match exponent.strip_prefix('-') {
+        Some(exponent) => format!("{mantissa}e-{exponent:0>2}"),
+        None => format!("{mantissa}e+{exponent:0>2}"),
+    }
+}
+
+fn write_repr(text: &mut String, value: &Value<'_>) {
+    match value {
+        Value::Scalar(one) => text.push_str(&scalar(*one)),
+        Value::Text(value) => text.push_str(&string(value)),
+        Value::Message(message) => write_message(text, message),
+        Value::Array(array) => match &array.items {
+            Items::Scalars(scalars) if !is_numeric(array) => {
+                write_list(text, scalars.iter(), |text, one| {
+                    text.push_str(&scalar(one));
+                });
+            }
+            Items::Scalars(scalars) if array.is_fixed() => text.push_str(&numpy::repr(*scalars)),
+            Items::Scalars(scalars) => {
+                let _ = write!(text, "array('{}'", type_code(scalars.kind()));
+                if !scalars.is_empty() {
+                    text.push_str(", ");
+                    write_list(text, scalars.iter(), |text, one| {
+                        text.push_str(&scalar(one));
+                    });
+                }
+                text.push(')');
+            }
+            Items::Texts(texts) => {
+                write_list(text, texts, |text, one| text.push_str(&string(one)));
+            }
+            Items::Messages(messages) => write_list(text, messages, write_message),
+        },
+    }
+}
+
+fn write_list<T>(
+    text: &mut String,
+    items: impl IntoIterator<Item = T>,
+    mut write: impl FnMut(&mut String, T),
+) {
+    text.push('[');
+    for (index, item) in items.into_iter().enumerate() {
+        if index > 0 {
+            text.push_str(", ");
+        }
+        write(text, item);
+    }
+    text.push(']');
+}
+
+/// As `rosidl_generator_py` has messages print themselves: a sequence of numbers as a list.
+fn write_message(text: &mut String, message: &Message<'_>) {
+    let name = &message.structure.name;
+    let _ = write!(
+        text,
+        "{}.{}.{}(",
+        name.package(),
+        name.kind().as_str(),
+        name.name()
+    );
+    for (index, (field, value)) in message.fields().enumerate() {
+        if index > 0 {
+            text.push_str(", ");
+        }
+        let _ = write!(text, "{}=", field.name);
+        match value {
+            Value::Array(Array {
+                items: Items::Scalars(scalars),
+                ..
+            }) if type_name(value) == "array.array" => {
+                write_list(text, scalars.iter(), |text, one| {
+                    text.push_str(&scalar(one));
+                });
+            }
+            _ => write_repr(text, value),
+        }
+    }
+    text.push(')');
+}
+
+/// The type code of the `array` module.
+fn type_code(kind: ScalarKind) -> char {
+    match kind {
+        ScalarKind::Int8 => 'b',
+        ScalarKind::Bool | ScalarKind::Byte | ScalarKind::UInt8 => 'B',
+        ScalarKind::Int16 => 'h',
+        ScalarKind::UInt16 => 'H',
+        ScalarKind::Int32 => 'i',
+        ScalarKind::UInt32 => 'I',
+        ScalarKind::Int64 => 'q',
+        ScalarKind::UInt64 => 'Q',
+        ScalarKind::Float32 => 'f',
+        ScalarKind::Float64 => 'd',
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn floats_print_as_python_prints_them() {
+        for (value, text) in [
+            (0.0, "0.0"),
+            (-0.0, "-0.0"),
+            (1.0, "1.0"),
+            (0.1, "0.1"),
+            (1e-4, "0.0001"),
+            (1e-5, "1e-05"),
+            (1.5e-7, "1.5e-07"),
+            (1e15, "1000000000000000.0"),
+            (1e16, "1e+16"),
+            (1.25e100, "1.25e+100"),
+            (-1e-300, "-1e-300"),
+            (9007199254740993.0, "9007199254740992.0"),
+            (f64::NAN, "nan"),
+            (f64::NEG_INFINITY, "-inf"),
+            (f64::from(0.1_f32), "0.10000000149011612"),
+        ] {
+            assert_eq!(float(value), text);
+        }
+        assert_eq!(float32(0.1), "0.1");
+        assert_eq!(float32(1e-7), "1e-07");
+        assert_eq!(float32(16_777_216.0), "16777216.0");
+    }
+
+    #[test]
+    fn strings_and_bytes_choose_their_quotes_as_python_does() {
+        assert_eq!(string("it's"), "\"it's\"");
+        assert_eq!(string("it's \"so\""), "'it\\'s \"so\"'");
+        assert_eq!(
+            string("a\n\u{1}\u{200b}\u{e9}\\"),
+            "'a\\n\\x01\\u200b\u{e9}\\\\'"
+        );
+        assert_eq!(
+            bytes(b"\x00\x01\x00'\"~\x7f\xff"),
+            "b'\\x00\\x01\\x00\\'\"~\\x7f\\xff'"
+        );
+        assert_eq!(bytes(b"it's"), "b\"it's\"");
+    }
+}
