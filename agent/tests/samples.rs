@@ -2,64 +2,118 @@
 //! `GET /samples`.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
+#[path = "model/forge.rs"]
+#[allow(dead_code, reason = "each test file uses its own part")]
+mod forge;
 mod local_agent;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use bytes::Bytes;
+use forge::{Message, SEDP_WRITERS, SPDP};
 use local_agent::LocalAgent;
 use ros2probe::capture::feed::Feed;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::payloads::{News, Sample};
+use ros2probe::model::payloads::{MissedReason, News};
 use ros2probe::model::reassembly::Limits;
 use ros2probe::model::selection::{Depth, Selection, Wish};
 use ros2probe::model::snapshot::Snapshot;
 use ros2probe::subscriptions::line::Line;
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
-/// The captures of the repository.
+const SECOND: u64 = 1_000_000_000;
+const START: u64 = 1_795_143_000 * SECOND;
+const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
+const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
+const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
+
+/// The captures of the repository, and those of large messages where there are more.
 fn captures() -> Vec<PathBuf> {
-    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../wire/tests/data");
-    let files = std::fs::read_dir(data).unwrap();
-    let files = files.map(|file| file.unwrap().path());
-    let mut captures: Vec<_> = files
-        .filter(|path| path.to_string_lossy().ends_with(".pcap.gz"))
-        .collect();
-    captures.sort();
-    assert!(!captures.is_empty());
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut captures = Vec::new();
+    find(&here.join("../wire/tests/data"), &mut captures);
+    find(&here.join("tests/data"), &mut captures);
+    let own = captures.len();
+    find(&here.join("../../shared/fixtures"), &mut captures);
+    let mut others = captures.split_off(own);
+    others.retain(|path| path.to_string_lossy().contains("/points-"));
+    captures.extend(others);
+    assert!(own >= 10, "{captures:?}");
     captures
 }
 
+fn find(folder: &Path, captures: &mut Vec<PathBuf>) {
+    for file in std::fs::read_dir(folder).into_iter().flatten() {
+        let path = file.unwrap().path();
+        if path.is_dir() {
+            find(&path, captures);
+        } else if path.to_string_lossy().ends_with(".pcap.gz") {
+            captures.push(path);
+        }
+    }
+}
+
+fn wish(id: u64, depth: Depth) -> Wish {
+    Wish {
+        id,
+        selection: Arc::new(Selection::all()),
+        domain_id: None,
+        depth,
+    }
+}
+
 /// What a capture says when everything is watched and, with a depth, everything wished for.
-fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<Arc<Sample>>) {
+fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
     let mut observer = Observer::new(Settings::default());
     let everything = vec![Watch::named("/**").unwrap()];
     observer.set_watchlist(Watchlist::new(everything).unwrap());
     if let Some(depth) = depth {
-        let wish = Wish {
-            id: 1,
-            selection: Arc::new(Selection::all()),
-            domain_id: None,
-            depth,
-        };
-        observer.set_wishes(Arc::new(vec![wish]));
+        observer.set_wishes(Arc::new(vec![wish(1, depth)]));
     }
     let mut reader = PcapReader::open(capture).unwrap();
     let mut feed = Feed::new(Limits::default());
-    let mut samples = Vec::new();
-    while let Some(captured) = reader.next_packet().unwrap() {
-        feed.packet(&captured, &mut observer);
+    let mut news = Vec::new();
+    let mut take = |observer: &mut Observer| {
         for given in observer.take_given() {
             assert_eq!(*given.to, [1]);
-            if let News::Sample(sample) = given.news {
-                samples.push(sample);
-            }
+            news.push(given.news);
         }
+    };
+    while let Some(captured) = reader.next_packet().unwrap() {
+        feed.packet(&captured, &mut observer);
+        take(&mut observer);
     }
     observer.settle();
-    (observer.snapshot(feed.last()), samples)
+    take(&mut observer);
+    let mut snapshot = observer.snapshot(feed.last());
+    snapshot.tables.retain(|table| table.table != "payloads");
+    (snapshot, news)
+}
+
+/// Samples and their bytes by topic, each sample checked to be the next and the only one.
+fn counts(news: &[News], depth: Depth) -> BTreeMap<(u32, String), (u64, u64)> {
+    let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
+    let mut seen = BTreeSet::new();
+    let mut last = 0;
+    for news in news {
+        let News::Sample(sample) = news else { continue };
+        assert!(seen.insert((sample.writer, sample.sequence_number)));
+        assert!(sample.time.0 >= last);
+        last = sample.time.0;
+        let len = sample.payload.as_ref().map(Bytes::len);
+        let expected = (depth == Depth::Payloads).then_some(sample.size as usize);
+        assert_eq!(len, expected, "{sample:?}");
+        let key = (sample.topic.domain_id, sample.topic.dds_name.to_string());
+        let count = counts.entry(key).or_default();
+        count.0 += 1;
+        count.1 += u64::from(sample.size);
+    }
+    counts
 }
 
 #[test]
@@ -68,34 +122,225 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
     for capture in captures() {
         let (alone, none) = replayed(&capture, None);
         assert!(none.is_empty());
-        let (with, samples) = replayed(&capture, Some(Depth::Arrivals));
-        let name = capture.display();
-        assert_eq!(format!("{alone:?}"), format!("{with:?}"), "{name}");
-        let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
-        let mut seen = BTreeSet::new();
-        let mut last = 0;
-        for sample in samples {
-            assert!(seen.insert((sample.writer, sample.sequence_number)));
-            assert!(sample.time.0 >= last && sample.payload.is_none());
-            last = sample.time.0;
-            let key = (sample.topic.domain_id, sample.topic.dds_name.to_string());
-            let count = counts.entry(key).or_default();
-            count.0 += 1;
-            count.1 += u64::from(sample.size);
-        }
-        for topic in &with.topics {
-            let Some(measured) = &topic.measurement else {
+        let is_cut = |snapshot: &Snapshot| {
+            let mut errors = snapshot.decode_errors.iter();
+            errors.any(|error| error.stage == "frame")
+        };
+        for depth in [Depth::Arrivals, Depth::Payloads] {
+            if depth == Depth::Payloads && is_cut(&alone) {
                 continue;
-            };
-            let key = (topic.domain_id, topic.dds_name.clone());
-            let given = counts.remove(&key).unwrap_or_default();
-            let measured = (measured.messages, measured.bytes);
-            assert_eq!(given, measured, "{name}: {key:?}");
-            messages += given.0;
+            }
+            let (with, news) = replayed(&capture, Some(depth));
+            let name = capture.display();
+            assert_eq!(format!("{alone:?}"), format!("{with:?}"), "{name}");
+            let mut counts = counts(&news, depth);
+            let mut incomplete = 0;
+            for topic in &with.topics {
+                let Some(measured) = &topic.measurement else {
+                    continue;
+                };
+                let key = (topic.domain_id, topic.dds_name.clone());
+                let given = counts.remove(&key).unwrap_or_default();
+                let expected = (measured.messages, measured.bytes);
+                assert_eq!(given, expected, "{name}: {key:?}");
+                messages += given.0;
+                incomplete += measured.incomplete;
+            }
+            assert!(counts.is_empty(), "{name}: {counts:?}");
+            let missed = news.iter().filter_map(|news| match news {
+                News::Missed(missed) => Some((missed.reason, missed.samples)),
+                News::Sample(_) => None,
+            });
+            let missed: Vec<_> = missed.collect();
+            let expected = (MissedReason::Incomplete, 1);
+            assert!(
+                missed.iter().all(|missed| *missed == expected),
+                "{name}: {missed:?}"
+            );
+            assert_eq!(missed.len() as u64, incomplete, "{name}");
         }
-        assert!(counts.is_empty(), "{name}: {counts:?}");
     }
     assert!(messages >= 64, "{messages}");
+}
+
+/// A domain in which two participants announce a writer of a topic each.
+struct Robot {
+    observer: Observer,
+    at: u64,
+}
+
+impl Robot {
+    fn new(settings: Settings) -> Self {
+        let mut robot = Self {
+            observer: Observer::new(settings),
+            at: START,
+        };
+        robot.observer.advance(Timestamp(START));
+        for (prefix, topic) in [(ALICE, "rt/points"), (BOB, "rt/add/_service_event")] {
+            let payload = forge::participant(prefix, 100, None);
+            robot.put(Message::from(prefix).data(SPDP, 1, &payload));
+            let guid = Guid::new(prefix, WRITER);
+            let payload = forge::endpoint(guid, topic, "a::msg::dds_::B_", true);
+            robot.put(Message::from(prefix).data(SEDP_WRITERS, 1, &payload));
+        }
+        robot
+    }
+
+    fn put(&mut self, message: Message) {
+        self.at += 1_000_000;
+        let envelope = forge::multicast(self.at, 0);
+        self.observer.datagram(&envelope, &message.bytes(), None);
+    }
+
+    fn fragment(&mut self, prefix: GuidPrefix, number: u64, start: u32, payload: &[u8]) {
+        self.put(Message::from(prefix).fragment(WRITER, number, start, 1000, payload));
+    }
+
+    fn subscribe(&mut self, topics: &[&str], depth: Depth) {
+        let selection = Selection::named(topics.iter().copied()).unwrap();
+        let wishes = vec![Wish {
+            selection: Arc::new(selection),
+            ..wish(3, depth)
+        }];
+        self.observer.set_wishes(Arc::new(wishes));
+    }
+
+    /// Writer, number and payload, or the reason why not, of what is given.
+    fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
+        let given = self.observer.take_given().into_iter();
+        given
+            .map(|given| match given.news {
+                News::Sample(sample) => {
+                    let payload = sample.payload.as_ref().map(|bytes| bytes.to_vec());
+                    let payload = payload.unwrap_or_default();
+                    (sample.writer.prefix, sample.sequence_number, Ok(payload))
+                }
+                News::Missed(missed) => (missed.writer.prefix, missed.first, Err(missed.reason)),
+            })
+            .collect()
+    }
+}
+
+/// A payload in which every place can be told.
+fn payload(size: usize) -> Vec<u8> {
+    (0..size).map(|place| (place * 7 % 251) as u8).collect()
+}
+
+#[test]
+fn fragments_make_the_payload_that_was_sent_in_the_order_of_counting() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points", "/add/_service_event"], Depth::Payloads);
+    let (large, small) = (payload(4321), payload(1234));
+    for start in [1, 3, 3, 2] {
+        robot.fragment(ALICE, 1, start, &large);
+        robot.fragment(BOB, 1, start.min(2), &small);
+    }
+    assert_eq!(robot.given(), [(BOB, 1, Ok(small.clone()))]);
+    for start in [5, 1, 4] {
+        robot.fragment(ALICE, 1, start, &large);
+    }
+    robot.fragment(ALICE, 1, 2, &large);
+    robot.put(Message::from(BOB).data(WRITER, 2, &small[..400]));
+    robot.put(Message::from(BOB).data(WRITER, 2, &small[..400]));
+    let guid = Guid::new(BOB, WRITER);
+    robot.put(Message::from(BOB).dispose_by_key(WRITER, 3, 0x70, guid));
+    let expected = [(ALICE, 1, Ok(large)), (BOB, 2, Ok(small[..400].to_vec()))];
+    assert_eq!(robot.given(), expected);
+}
+
+#[test]
+fn a_sample_that_stays_incomplete_is_told_and_not_given() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    robot.at += SECOND;
+    robot.put(Message::from(ALICE).data(WRITER, 1, &payload(20)));
+    robot.fragment(ALICE, 2, 1, &payload(3000));
+    robot.fragment(ALICE, 2, 3, &payload(3000));
+    robot.put(Message::from(ALICE).data(WRITER, 3, &payload(24)));
+    robot.observer.advance(Timestamp(robot.at + 30 * SECOND));
+    let given: Vec<_> = robot.given();
+    let expected = [
+        (ALICE, 1, Ok(payload(20))),
+        (ALICE, 3, Ok(payload(24))),
+        (ALICE, 2, Err(MissedReason::Incomplete)),
+    ];
+    assert_eq!(given, expected);
+}
+
+#[test]
+fn interest_measures_what_nobody_watches_and_ends_with_the_last_wish() {
+    let mut robot = Robot::new(Settings::default());
+    let guid = Guid::new(ALICE, WRITER);
+    let verdict = |robot: &mut Robot| {
+        let changes = robot.observer.interest_changes().into_iter();
+        let mut of_it = changes.filter(|(endpoint, _)| *endpoint == guid);
+        of_it.next().and_then(|(_, verdict)| verdict)
+    };
+    assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
+    robot.put(Message::from(ALICE).data(WRITER, 1, &payload(20)));
+    robot.subscribe(&["/points"], Depth::Arrivals);
+    assert_eq!(verdict(&mut robot), Some(Verdict::Meter));
+    robot.put(Message::from(ALICE).data(WRITER, 2, &payload(20)));
+    assert_eq!(robot.given(), [(ALICE, 2, Ok(Vec::new()))]);
+    robot.subscribe(&["/points"], Depth::Payloads);
+    assert_eq!(verdict(&mut robot), Some(Verdict::Capture));
+    robot.put(Message::from(ALICE).data(WRITER, 3, &payload(20)));
+    assert_eq!(robot.given(), [(ALICE, 3, Ok(payload(20)))]);
+    robot.observer.set_wishes(Arc::default());
+    assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
+    robot.put(Message::from(ALICE).data(WRITER, 4, &payload(20)));
+    assert!(robot.given().is_empty());
+    let snapshot = robot.observer.snapshot(Timestamp(robot.at));
+    assert!(snapshot.watches.is_empty());
+    let points = snapshot.topics.iter().find(|topic| topic.name == "/points");
+    assert_eq!(points.unwrap().measurement.as_ref().unwrap().messages, 2);
+}
+
+#[test]
+fn what_finds_no_room_is_told_and_memory_stays_bounded() {
+    let mut robot = Robot::new(Settings {
+        payload_bytes: 100_000,
+        ..Settings::default()
+    });
+    robot.subscribe(&["/points"], Depth::Payloads);
+    robot.at += SECOND;
+    let held = |robot: &Robot| {
+        let snapshot = robot.observer.snapshot(Timestamp(robot.at));
+        let table = snapshot
+            .tables
+            .iter()
+            .find(|table| table.table == "payloads");
+        table.unwrap().size
+    };
+    // Nobody takes what is given.
+    for number in 1..=20 {
+        robot.put(Message::from(ALICE).data(WRITER, number, &payload(10_000)));
+        assert!(held(&robot) <= 100_000);
+    }
+    let given = robot.given();
+    let (whole, missed): (Vec<_>, Vec<_>) = given.iter().partition(|given| given.2.is_ok());
+    assert_eq!(given.len(), 20);
+    assert!(
+        whole.len() >= 8 && missed.len() >= 8,
+        "{} {}",
+        whole.len(),
+        missed.len()
+    );
+    assert!(
+        missed
+            .iter()
+            .all(|given| given.2 == Err(MissedReason::NotCaptured))
+    );
+    // Samples that are begun and never ended make room for one that is.
+    for number in 30..60 {
+        robot.fragment(ALICE, number, 1, &payload(50_000));
+        assert!(held(&robot) <= 100_000);
+    }
+    let large = payload(30_000);
+    for start in 1..=30 {
+        robot.fragment(ALICE, 60, start, &large);
+    }
+    assert!(robot.given().contains(&(ALICE, 60, Ok(large))));
 }
 
 #[test]

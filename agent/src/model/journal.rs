@@ -73,6 +73,7 @@ pub struct Journal {
     discovery: VecDeque<DiscoveryEvent>,
     losses: VecDeque<Loss>,
     delivery_losses: VecDeque<DeliveryLoss>,
+    unfinished: Vec<(Guid, u64)>,
     /// What waits to be told.
     pub events: Events,
 }
@@ -99,6 +100,18 @@ impl Journal {
             self.discovery.pop_front();
         }
         self.discovery.push_back(event);
+    }
+
+    /// A sample of which fragments came is lost; kept for whoever wants it until the next look.
+    pub fn leave_unfinished(&mut self, writer: Guid, number: u64) {
+        if self.unfinished.len() < LIMIT {
+            self.unfinished.push((writer, number));
+        }
+    }
+
+    /// Those since the last look.
+    pub fn take_unfinished(&mut self) -> Vec<(Guid, u64)> {
+        std::mem::take(&mut self.unfinished)
     }
 
     /// Adds a loss, to the last entry when it continues that one.

@@ -2,6 +2,7 @@
 
 pub mod acknowledgement;
 pub mod ahead;
+pub mod assembly;
 pub mod cancelled;
 pub mod cause;
 pub mod churn;

@@ -33,7 +33,7 @@ use super::rate::Slot;
 use super::receivers::{Around, Receivers};
 use super::selection::Wish;
 use super::snapshot::{Snapshot, SocketFacts, WatchState};
-use super::topic::{Naming, TopicId, Topics, Watched};
+use super::topic::{Naming, Topic, TopicId, Topics, Watched};
 use super::trace::{Spans, Subject, Tracer};
 use super::way::Place;
 use super::writer::Traits;
@@ -64,6 +64,8 @@ pub struct Settings {
     pub interest: usize,
     /// Bytes for the bitmaps of fragmented samples.
     pub sample_bytes: usize,
+    /// Bytes of samples that are put together for those who want them whole.
+    pub payload_bytes: usize,
     /// Nanoseconds for which a topic without endpoints is still reported.
     pub topic_grace: u64,
     /// Records say who sent: not so those of a capture file.
@@ -92,6 +94,7 @@ impl Default for Settings {
             deliveries: 4096,
             interest: 16_384,
             sample_bytes: 1 << 20,
+            payload_bytes: 20 << 20,
             topic_grace: 600 * SECOND,
             directed: true,
         }
@@ -107,6 +110,8 @@ impl Settings {
             endpoints: limits.endpoints,
             topics: limits.topics,
             unknown_writers: limits.unknown_writers,
+            // The other half is for what waits to be read.
+            payload_bytes: limits.payload_bytes / 2,
             ..self
         }
     }
@@ -167,7 +172,7 @@ impl Observer {
                 settings.deliveries,
             ),
             pieces: Pieces::default(),
-            payloads: Payloads::default(),
+            payloads: Payloads::new(settings.payload_bytes),
             wishes: Arc::default(),
             receivers: Receivers::new(settings.deliveries),
             tracer: Tracer::new(settings.directed),
@@ -303,6 +308,7 @@ impl Observer {
     pub fn settle(&mut self) {
         let around = around!(self);
         self.profiler.settle(self.clock, &mut self.journal, around);
+        self.tell_unfinished();
         self.tell_losses();
         self.examine(self.clock);
     }
@@ -401,6 +407,7 @@ impl Observer {
             Sighting::Unmeasured => {}
             Sighting::Measured => return,
             Sighting::Counted(counted) => {
+                self.tell_unfinished();
                 self.payloads.counted(writer, &counted);
                 return;
             }
@@ -474,6 +481,25 @@ impl Observer {
             };
             self.read(found, vendor, &origin);
             self.follow_up(origin.at);
+            self.keep(found);
+        }
+    }
+
+    /// Keeps the bytes of a sample that somebody wants and that was not counted yet.
+    fn keep(&mut self, found: &Found<'_>) {
+        let (writer, number) = (found.record.writer(), found.record.sequence_number);
+        if self.payloads.wants_bytes(writer) {
+            let known = self.profiler.get(writer);
+            if known.is_some_and(|known| !known.writer.has(number)) {
+                self.payloads.keep(&found.record, found.payload);
+            }
+        }
+    }
+
+    /// Tells those who want samples which of them will stay incomplete.
+    fn tell_unfinished(&mut self) {
+        for (writer, number) in self.journal.take_unfinished() {
+            self.payloads.unfinished(writer, number);
         }
     }
 
@@ -723,6 +749,7 @@ impl Observer {
                 let measured = is_watched && counts;
                 let verdict = match topic.naming.kind {
                     "discovery" => Verdict::Capture,
+                    _ if measured && wants_bytes(topic) => Verdict::Capture,
                     _ if measured => Verdict::Meter,
                     _ => Verdict::Ignore,
                 };
@@ -735,7 +762,7 @@ impl Observer {
                             dds_name: Arc::clone(&topic.naming.dds_name),
                             message_type: Arc::clone(&endpoint.message_type),
                         };
-                        self.payloads.want(guid, topic, wished);
+                        self.payloads.want(guid, topic, wished, now);
                     }
                     _ => self.payloads.release(guid),
                 }
@@ -755,6 +782,7 @@ impl Observer {
         let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, around) else {
             return;
         };
+        self.tell_unfinished();
         if let Some(topic) = self.topics.get_mut(retired.topic) {
             topic.retire(&retired.measurement, retired.totals.as_ref());
         }
@@ -771,7 +799,9 @@ impl Observer {
         for guid in strangers.forgotten {
             self.interest.remove(guid);
         }
+        self.tell_unfinished();
         if now.0.is_multiple_of(SECOND) {
+            self.payloads.expire(now);
             self.topics.expire(now, self.settings.topic_grace);
             self.receivers.tidy(&self.discovery);
             self.promote();
@@ -893,6 +923,12 @@ impl Observer {
             }
         }
     }
+}
+
+/// Whether somebody wants its samples whole.
+fn wants_bytes(topic: &Topic) -> bool {
+    let wished = topic.wished.as_ref();
+    wished.is_some_and(|wished| !wished.payloads.is_empty())
 }
 
 pub(super) fn naming(endpoint: &Endpoint) -> Option<Naming> {

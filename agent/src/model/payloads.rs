@@ -8,13 +8,17 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, Record, Timestamp};
 
+use super::assembly::Assembly;
 use super::topic::Wished;
 use super::writer::Counted;
 
 /// Entries that wait to be taken: a round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
+/// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
+/// not told of.
+const TELLING: u64 = 400_000_000;
 
 /// The topic of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -100,14 +104,23 @@ pub enum News {
 #[derive(Debug)]
 struct Interested {
     topic: Arc<Topic>,
+    /// Ids of the wishes, and of those for bytes, and of the others.
     to: Arc<[u64]>,
+    payloads: Arc<[u64]>,
+    arrivals: Arc<[u64]>,
+    /// Since when bytes are wanted.
+    since: Timestamp,
 }
 
 /// The wanted writers and what waits to be taken.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Payloads {
     writers: HashMap<Guid, Interested>,
+    /// How many of them are wanted with bytes.
+    deep: usize,
+    assembly: Assembly,
     given: Vec<Given>,
+    given_bytes: usize,
     refused: u64,
 }
 
@@ -127,29 +140,68 @@ impl MissedReason {
 }
 
 impl Payloads {
-    /// Nobody wants anything.
+    /// Nobody wants anything; later at most `limit` bytes at once.
     #[must_use]
-    pub fn is_idle(&self) -> bool {
-        self.writers.is_empty()
+    pub fn new(limit: usize) -> Self {
+        Self {
+            writers: HashMap::new(),
+            deep: 0,
+            assembly: Assembly::new(limit),
+            given: Vec::new(),
+            given_bytes: 0,
+            refused: 0,
+        }
     }
 
-    /// Gives the samples of this writer from now on.
-    pub fn want(&mut self, writer: Guid, topic: Topic, wished: &Wished) {
-        let known = self.writers.get(&writer).map(|known| &known.topic);
-        let topic = match known {
-            Some(known) if **known == topic => Arc::clone(known),
-            _ => Arc::new(topic),
-        };
+    /// Bytes held, their cap, and what found no room.
+    #[must_use]
+    pub const fn size(&self) -> (usize, usize, u64) {
+        let (bytes, limit, evictions) = self.assembly.size();
+        (bytes + self.given_bytes, limit, evictions + self.refused)
+    }
+
+    /// Whether the bytes of this writer's samples are wanted.
+    #[must_use]
+    pub fn wants_bytes(&self, writer: Guid) -> bool {
+        let is_deep = |interested: &Interested| !interested.payloads.is_empty();
+        self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
+    }
+
+    /// Gives the samples of this writer from `now` on.
+    pub fn want(&mut self, writer: Guid, topic: Topic, wished: &Wished, now: Timestamp) {
+        let before = self.writers.remove(&writer);
+        let known = before.as_ref().filter(|known| *known.topic == topic);
+        let topic = known.map_or_else(|| Arc::new(topic), |known| Arc::clone(&known.topic));
+        let was_deep = before.filter(|before| !before.payloads.is_empty());
+        self.deep -= usize::from(was_deep.is_some());
+        self.deep += usize::from(!wished.payloads.is_empty());
+        if was_deep.is_some() && wished.payloads.is_empty() {
+            self.assembly.release(writer);
+        }
+        let arrivals = wished.ids.iter();
+        let arrivals = arrivals.filter(|id| !wished.payloads.contains(id));
         let interested = Interested {
             topic,
             to: Arc::clone(&wished.ids),
+            payloads: Arc::clone(&wished.payloads),
+            arrivals: arrivals.copied().collect(),
+            since: was_deep.map_or(now, |before| before.since),
         };
         self.writers.insert(writer, interested);
     }
 
     /// No longer.
     pub fn release(&mut self, writer: Guid) {
-        self.writers.remove(&writer);
+        let before = self.writers.remove(&writer);
+        if before.is_some_and(|before| !before.payloads.is_empty()) {
+            self.deep -= 1;
+            self.assembly.release(writer);
+        }
+    }
+
+    /// Keeps what a DATA or DATA_FRAG brings of a sample that has not been counted yet.
+    pub fn keep(&mut self, record: &Record, payload: &[u8]) {
+        self.assembly.put(record, payload, self.given_bytes);
     }
 
     /// A sample of this writer was counted.
@@ -157,39 +209,104 @@ impl Payloads {
         let Some(interested) = self.writers.get(&writer) else {
             return;
         };
-        let sample = Sample {
-            topic: Arc::clone(&interested.topic),
-            time: counted.at,
-            writer,
-            sequence_number: counted.number,
-            source_timestamp: counted.source.timestamp(),
-            header_stamp: counted.stamp,
-            size: u32::try_from(counted.bytes).unwrap_or(u32::MAX),
-            payload: None,
+        let payload = match interested.payloads.is_empty() {
+            true => None,
+            false => self.assembly.take(writer, counted.number),
         };
-        let given = Given {
-            to: Arc::clone(&interested.to),
-            news: News::Sample(Arc::new(sample)),
+        let (to, bytes) = match &payload {
+            Some(payload) => (&interested.to, payload.len()),
+            None => (&interested.arrivals, 0),
         };
-        self.give(given);
+        let sample = Given {
+            to: Arc::clone(to),
+            news: News::Sample(Arc::new(Sample {
+                topic: Arc::clone(&interested.topic),
+                time: counted.at,
+                writer,
+                sequence_number: counted.number,
+                source_timestamp: counted.source.timestamp(),
+                header_stamp: counted.stamp,
+                size: u32::try_from(counted.bytes).unwrap_or(u32::MAX),
+                payload,
+            })),
+        };
+        // What was under way when bytes were first wanted has not come whole.
+        let is_expected = counted.began.0 >= interested.since.0.saturating_add(TELLING);
+        let missed = (bytes == 0 && is_expected && !interested.payloads.is_empty())
+            .then(|| interested.missed(writer, counted.number, MissedReason::NotCaptured));
+        if !sample.to.is_empty() {
+            self.give(sample, bytes);
+        }
+        if let Some(missed) = missed {
+            self.give(missed, 0);
+        }
+    }
+
+    /// Fragments of this sample came, but not all of them: it will never be counted.
+    pub fn unfinished(&mut self, writer: Guid, number: u64) {
+        let Some(interested) = self.writers.get(&writer) else {
+            return;
+        };
+        let missed = interested.missed(writer, number, MissedReason::Incomplete);
+        self.assembly.forget(writer, number);
+        self.give(missed, 0);
+    }
+
+    /// Forgets what will not be complete.
+    pub fn expire(&mut self, now: Timestamp) {
+        self.assembly.expire(now);
     }
 
     /// Takes what is to be given.
     pub fn take(&mut self) -> Vec<Given> {
+        self.given_bytes = 0;
         std::mem::take(&mut self.given)
     }
 
     /// So much waits that whoever feeds the model should let it be taken first.
     #[must_use]
     pub const fn is_full(&self) -> bool {
-        self.given.len() >= WAITING / 2
+        let (_, limit, _) = self.assembly.size();
+        self.given.len() >= WAITING / 2 || self.given_bytes > limit / 4
     }
 
-    fn give(&mut self, given: Given) {
-        if self.given.len() < WAITING {
+    fn give(&mut self, given: Given, bytes: usize) {
+        let (used, limit, _) = self.size();
+        if self.given.len() < WAITING && (bytes == 0 || used + bytes <= limit) {
+            self.given_bytes += bytes;
             self.given.push(given);
-        } else {
-            self.refused += 1;
+            return;
+        }
+        self.refused += 1;
+        if let News::Sample(sample) = &given.news
+            && let Some(interested) = self.writers.get(&sample.writer)
+            && self.given.len() < 2 * WAITING
+        {
+            let (writer, number) = (sample.writer, sample.sequence_number);
+            let mut missed = interested.missed(writer, number, MissedReason::NotCaptured);
+            missed.to = given.to;
+            self.given.push(missed);
+        }
+    }
+}
+
+impl Interested {
+    /// That a sample is missed: by those who want its bytes, where only those were lost.
+    fn missed(&self, writer: Guid, number: u64, reason: MissedReason) -> Given {
+        let to = match reason {
+            MissedReason::NotCaptured => &self.payloads,
+            MissedReason::Incomplete | MissedReason::QueueFull => &self.to,
+        };
+        Given {
+            to: Arc::clone(to),
+            news: News::Missed(Missed {
+                topic: Arc::clone(&self.topic),
+                writer,
+                first: number,
+                last: number,
+                samples: 1,
+                reason,
+            }),
         }
     }
 }

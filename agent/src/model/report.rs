@@ -343,6 +343,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     let (sockets, sockets_limit, sockets_evictions) = observer.receivers.sockets().size();
     let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
     let (spans, spans_limit, spans_evictions) = observer.tracer.size();
+    let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
     let room = profiler.room();
     let refused = profiler.iter().filter_map(|(_, measured)| {
         let subscribers = measured.subscribers.as_ref()?;
@@ -394,6 +395,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         table("sockets", sockets, sockets_limit, sockets_evictions),
         table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
         table("spans", spans, spans_limit, spans_evictions),
+        table("payloads", payloads, payloads_limit, payloads_evictions),
     ]
 }
 

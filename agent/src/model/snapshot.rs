@@ -423,9 +423,9 @@ pub struct DecodeErrorCount {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
-    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`.
+    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `payloads`.
     pub table: &'static str,
-    /// Entries (bytes for `reassembly`).
+    /// Entries (bytes for `reassembly` and `payloads`).
     pub size: u64,
     /// Cap.
     pub limit: u64,

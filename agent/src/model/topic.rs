@@ -54,8 +54,8 @@ pub enum Watched {
 pub struct Wished {
     /// Whose.
     pub ids: Arc<[u64]>,
-    /// The most that any of them wants.
-    pub depth: Depth,
+    /// Those of them that want the bytes.
+    pub payloads: Arc<[u64]>,
 }
 
 /// One topic.
@@ -175,10 +175,16 @@ impl Naming {
 
     /// Who wants its samples.
     fn wished_by(&self, domain_id: u32, wishes: &[Wish]) -> Option<Wished> {
-        let covering = || wishes.iter().filter(|wish| wish.covers(domain_id, self));
-        let depth = covering().map(|wish| wish.depth).max()?;
-        let ids = covering().map(|wish| wish.id).collect();
-        Some(Wished { ids, depth })
+        let covering = wishes.iter().filter(|wish| wish.covers(domain_id, self));
+        let covering: Vec<_> = covering.collect();
+        let of_depth = |depth| {
+            let deep = covering.iter().filter(move |wish| wish.depth >= depth);
+            deep.map(|wish| wish.id).collect()
+        };
+        (!covering.is_empty()).then(|| Wished {
+            ids: of_depth(Depth::Arrivals),
+            payloads: of_depth(Depth::Payloads),
+        })
     }
 }
 

@@ -148,6 +148,12 @@ impl Writer {
         self.tally.duplicates += 1;
     }
 
+    /// Whether this sample needs nothing more: it was counted, or is settled.
+    #[must_use]
+    pub fn has(&self, number: u64) -> bool {
+        self.reception.sequence().has(number)
+    }
+
     /// Messages counted.
     #[must_use]
     pub const fn messages(&self) -> u64 {
@@ -502,6 +508,9 @@ impl Settling<'_> {
             return;
         };
         self.tally.incomplete += u64::from(incomplete);
+        if incomplete {
+            self.journal.leave_unfinished(self.writer, first);
+        }
         let count = last - first + 1;
         self.tally.lost += count;
         self.tally.window.current(self.at).lost += count;

@@ -1,0 +1,397 @@
+//! Puts the bytes of samples together that somebody wants whole: in one DATA, or in DATA_FRAGs by
+//! their fragment numbers, in any order and however often they come.
+//!
+//! It believes no size: memory grows with the bytes that came, to twice as many at most, within a
+//! budget for all. When that is spent, the sample that has waited longest is given up. Whether a
+//! sample counts is not decided here.
+
+use std::collections::{BTreeMap, HashMap};
+
+use bytes::Bytes;
+use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::{Guid, Record, Timestamp};
+
+use super::reception::is_message;
+
+/// What keeping one sample or one fragment that came too early costs besides its bytes.
+const OVERHEAD: usize = 128;
+/// Samples under way at once.
+const SAMPLES: usize = 16_384;
+/// A sample that got nothing for so long will not be complete, nor counted.
+const FORGET: u64 = 30_000_000_000;
+/// Least memory that is asked for at once.
+const LEAST: usize = 4096;
+const FRAGMENT_KEY_FLAG: u8 = 0x04;
+
+/// The samples under way.
+#[derive(Debug)]
+pub struct Assembly {
+    parts: HashMap<(Guid, u64), Part>,
+    /// The same, in the order in which they began.
+    ages: BTreeMap<u64, (Guid, u64)>,
+    begun: u64,
+    bytes: usize,
+    limit: usize,
+    evictions: u64,
+}
+
+#[derive(Debug)]
+struct Part {
+    age: u64,
+    size: usize,
+    fragment_size: usize,
+    /// The bytes up to the first fragment that has not come.
+    head: Vec<u8>,
+    /// Number of that fragment, from 1.
+    next: u32,
+    /// Fragments behind it, by the number of the first of those that came together.
+    ahead: BTreeMap<u32, Box<[u8]>>,
+    /// Bytes of `ahead`, and what keeping them costs.
+    ahead_bytes: usize,
+    touched: Timestamp,
+}
+
+impl Assembly {
+    /// Empty, for at most `limit` bytes.
+    #[must_use]
+    pub fn new(limit: usize) -> Self {
+        Self {
+            parts: HashMap::new(),
+            ages: BTreeMap::new(),
+            begun: 0,
+            bytes: 0,
+            limit,
+            evictions: 0,
+        }
+    }
+
+    /// Bytes held, their cap, and samples given up because of it.
+    #[must_use]
+    pub const fn size(&self) -> (usize, usize, u64) {
+        (self.bytes, self.limit, self.evictions)
+    }
+
+    /// Keeps what a DATA or DATA_FRAG brings; `beside` bytes are spent elsewhere.
+    pub fn put(&mut self, record: &Record, payload: &[u8], beside: usize) {
+        let Some((size, fragment_size)) = sizes(record, payload) else {
+            return;
+        };
+        let key = (record.writer(), record.sequence_number);
+        let now = Timestamp(record.time);
+        if !self.parts.contains_key(&key) {
+            self.begun += 1;
+            self.ages.insert(self.begun, key);
+            self.bytes += OVERHEAD;
+            let part = Part::new(self.begun, size, fragment_size, now);
+            self.parts.insert(key, part);
+        }
+        let Some(part) = self.parts.get_mut(&key) else {
+            return;
+        };
+        // Fragments of a writer that contradicts itself are of no use; a DATA is all there is.
+        if part.size != size || part.fragment_size != fragment_size {
+            return;
+        }
+        let before = part.bytes();
+        part.touched = now;
+        let start = match record.kind {
+            kind::DATA => 1,
+            _ => record.fragment_start,
+        };
+        part.put(start, payload);
+        self.bytes = self.bytes + part.bytes() - before;
+        while self.bytes + beside > self.limit || self.parts.len() > SAMPLES {
+            let Some((_, key)) = self.ages.first_key_value() else {
+                return;
+            };
+            let key = *key;
+            self.forget(key.0, key.1);
+            self.evictions += 1;
+        }
+    }
+
+    /// The bytes of a sample that was counted, if all of them came; nothing of it is kept.
+    pub fn take(&mut self, writer: Guid, number: u64) -> Option<Bytes> {
+        let part = self.remove((writer, number))?;
+        (part.head.len() == part.size).then(|| part.head.into())
+    }
+
+    /// Keeps nothing of this sample any more.
+    pub fn forget(&mut self, writer: Guid, number: u64) {
+        self.remove((writer, number));
+    }
+
+    /// Nobody wants the samples of this writer any more.
+    pub fn release(&mut self, writer: Guid) {
+        self.retain(|key, _| key.0 != writer);
+    }
+
+    /// Forgets what has got nothing for a long time.
+    pub fn expire(&mut self, now: Timestamp) {
+        self.retain(|_, part| part.touched.0.saturating_add(FORGET) > now.0);
+    }
+
+    fn retain(&mut self, mut keep: impl FnMut(&(Guid, u64), &Part) -> bool) {
+        let (ages, bytes) = (&mut self.ages, &mut self.bytes);
+        self.parts.retain(|key, part| {
+            let keeps = keep(key, part);
+            if !keeps {
+                ages.remove(&part.age);
+                *bytes -= part.bytes() + OVERHEAD;
+            }
+            keeps
+        });
+    }
+
+    fn remove(&mut self, key: (Guid, u64)) -> Option<Part> {
+        let part = self.parts.remove(&key)?;
+        self.ages.remove(&part.age);
+        self.bytes -= part.bytes() + OVERHEAD;
+        Some(part)
+    }
+}
+
+impl Part {
+    const fn new(age: u64, size: usize, fragment_size: usize, now: Timestamp) -> Self {
+        Self {
+            age,
+            size,
+            fragment_size,
+            head: Vec::new(),
+            next: 1,
+            ahead: BTreeMap::new(),
+            ahead_bytes: 0,
+            touched: now,
+        }
+    }
+
+    fn bytes(&self) -> usize {
+        self.head.capacity() + self.ahead_bytes
+    }
+
+    /// Takes in consecutive fragments, the first of which is number `start`.
+    fn put(&mut self, start: u32, bytes: &[u8]) {
+        if start > self.next {
+            let known = self.ahead.get(&start).map_or(0, |known| known.len());
+            if bytes.len() > known {
+                let entry = self.ahead.insert(start, bytes.into());
+                let before = entry.map_or(0, |entry| entry.len() + OVERHEAD);
+                self.ahead_bytes = self.ahead_bytes + bytes.len() + OVERHEAD - before;
+            }
+            return;
+        }
+        self.append(start, bytes);
+        while let Some(entry) = self.ahead.first_entry()
+            && *entry.key() <= self.next
+        {
+            let (start, bytes) = entry.remove_entry();
+            self.ahead_bytes -= bytes.len() + OVERHEAD;
+            self.append(start, &bytes);
+        }
+    }
+
+    /// Appends those that are new, of fragments that begin at `start`, which is not too early.
+    fn append(&mut self, start: u32, bytes: &[u8]) {
+        let skipped = usize::try_from(self.next - start).unwrap_or(usize::MAX);
+        let Some(known) = skipped.checked_mul(self.fragment_size) else {
+            return;
+        };
+        let left = self.size - self.head.len();
+        let bytes = bytes.get(known..).unwrap_or_default();
+        // The last fragment may have padding behind it, and only that one may be short.
+        let len = if bytes.len() >= left {
+            left
+        } else {
+            bytes.len() - bytes.len() % self.fragment_size
+        };
+        let bytes = bytes.get(..len).unwrap_or_default();
+        let needed = self.head.len() + len;
+        if needed > self.head.capacity() {
+            let roomy = needed.max(2 * self.head.capacity()).max(LEAST);
+            let more = roomy.min(self.size) - self.head.len();
+            self.head.reserve_exact(more);
+        }
+        self.head.extend_from_slice(bytes);
+        let fragments = u32::try_from(len.div_ceil(self.fragment_size));
+        self.next = self.next.saturating_add(fragments.unwrap_or(u32::MAX));
+    }
+}
+
+/// Size of the sample and of its fragments; `None` where the bytes are of no use.
+fn sizes(record: &Record, payload: &[u8]) -> Option<(usize, usize)> {
+    if record.flags & flag::INLINE_QOS_UNREAD != 0 {
+        // Where the payload begins is not known.
+        return None;
+    }
+    match record.kind {
+        kind::DATA if is_message(record) && !payload.is_empty() => {
+            Some((payload.len(), payload.len()))
+        }
+        kind::DATA_FRAG => {
+            let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
+            let size = usize::try_from(record.sample_size).ok()?;
+            let fragment_size = usize::try_from(record.fragment_size()).ok()?;
+            let is_possible = size > 0 && fragment_size > 0 && record.fragment_start > 0;
+            (is_possible && !is_key && record.status_info == 0).then_some((size, fragment_size))
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use ros2probe_wire::{EntityId, GuidPrefix};
+
+    use super::*;
+
+    fn writer(number: u8) -> Guid {
+        Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 3]))
+    }
+
+    fn fragment(of: Guid, number: u64, start: u32, count: u32, size: u32, of_size: u32) -> Record {
+        Record {
+            kind: kind::DATA_FRAG,
+            writer: zerocopy::transmute!(of),
+            sequence_number: number,
+            fragment_start: start,
+            fragments: count << 16 | of_size,
+            sample_size: size,
+            time: number,
+            ..Record::default()
+        }
+    }
+
+    /// A payload in which every place can be told.
+    fn payload(size: usize) -> Vec<u8> {
+        (0..size).map(|place| (place * 7 % 251) as u8).collect()
+    }
+
+    proptest! {
+        #[test]
+        fn any_order_and_repetition_makes_the_same_bytes(
+            size in 1_usize..4000,
+            fragment_size in 1_usize..700,
+            cuts in prop::collection::vec((0_usize..400, 1_usize..9), 0..60),
+            padding in 0_usize..4,
+        ) {
+            let whole = payload(size);
+            let total = size.div_ceil(fragment_size);
+            let mut assembly = Assembly::new(1 << 20);
+            let all = (0..total).rev().map(|start| (start, 1));
+            for (start, count) in cuts.into_iter().chain(all) {
+                let start = start % total;
+                let count = count.min(total - start);
+                let end = size.min((start + count) * fragment_size);
+                let mut bytes = whole[start * fragment_size..end].to_vec();
+                if end == size {
+                    bytes.resize(bytes.len() + padding, 0xee);
+                }
+                let first = u32::try_from(start + 1).unwrap();
+                let (count, sample) = (count as u32, size as u32);
+                let record = fragment(writer(1), 5, first, count, sample, fragment_size as u32);
+                assembly.put(&record, &bytes, 0);
+            }
+            prop_assert_eq!(assembly.take(writer(1), 5).map(|bytes| bytes.to_vec()), Some(whole));
+            prop_assert_eq!((assembly.bytes, assembly.ages.len()), (0, 0));
+        }
+    }
+
+    #[test]
+    fn samples_of_several_writers_come_mixed() {
+        let (one, two) = (payload(2500), payload(2000));
+        let mut assembly = Assembly::new(1 << 20);
+        for start in [2_u32, 1, 3] {
+            let from = (start as usize - 1) * 1000;
+            let to = |len: usize| len.min(from + 1000);
+            let record = fragment(writer(1), 9, start, 1, 2500, 1000);
+            assembly.put(&record, &one[from..to(2500)], 0);
+            if from < 2000 {
+                let record = fragment(writer(2), 9, start, 1, 2000, 1000);
+                assembly.put(&record, &two[from..to(2000)], 0);
+            }
+        }
+        assert_eq!(assembly.take(writer(1), 9).unwrap(), one);
+        assert_eq!(assembly.take(writer(2), 9).unwrap(), two);
+        assert_eq!(assembly.take(writer(2), 9), None);
+    }
+
+    #[test]
+    fn an_incomplete_sample_is_never_given_and_keeps_nothing() {
+        let mut assembly = Assembly::new(1 << 20);
+        assembly.put(&fragment(writer(1), 1, 1, 1, 2500, 1000), &[0; 1000], 0);
+        assembly.put(&fragment(writer(1), 1, 3, 1, 2500, 1000), &[0; 500], 0);
+        // A datagram that claims more fragments than it has bytes for.
+        assembly.put(&fragment(writer(1), 1, 2, 2, 2500, 1000), &[0; 999], 0);
+        assert_eq!(assembly.take(writer(1), 1), None);
+        assert_eq!(assembly.bytes, 0);
+        assembly.put(&fragment(writer(1), 2, 1, 1, 2500, 1000), &[0; 1000], 0);
+        assembly.expire(Timestamp(FORGET + 2));
+        assert_eq!((assembly.bytes, assembly.parts.len()), (0, 0));
+    }
+
+    #[test]
+    fn a_disposal_a_key_and_other_sizes_are_no_payload() {
+        let mut assembly = Assembly::new(1 << 20);
+        let whole = fragment(writer(1), 1, 1, 1, 100, 1000);
+        let strange = [
+            Record {
+                status_info: 1,
+                ..whole
+            },
+            Record {
+                submessage_flags: FRAGMENT_KEY_FLAG,
+                ..whole
+            },
+            Record {
+                kind: kind::DATA,
+                submessage_flags: 0x08,
+                ..whole
+            },
+            Record {
+                flags: flag::INLINE_QOS_UNREAD,
+                ..whole
+            },
+            fragment(writer(1), 1, 0, 1, 100, 1000),
+            fragment(writer(1), 1, 1, 1, 0, 1000),
+            fragment(writer(1), 1, 1, 1, 100, 0),
+        ];
+        for record in strange {
+            assembly.put(&record, &[1; 100], 0);
+            assert_eq!(assembly.bytes, 0, "{record:?}");
+        }
+        assembly.put(&fragment(writer(1), 1, 1, 1, 3000, 1000), &[1; 1000], 0);
+        assembly.put(&fragment(writer(1), 1, 1, 3, 2999, 1000), &[1; 2999], 0);
+        assert_eq!(assembly.take(writer(1), 1), None);
+    }
+
+    #[test]
+    fn a_claimed_size_allocates_in_proportion_to_what_came() {
+        let mut assembly = Assembly::new(1 << 20);
+        let hostile = fragment(writer(1), 1, 1, 1, u32::MAX, 65_535);
+        assembly.put(&hostile, &[0; 100], 0);
+        let far = fragment(writer(1), 1, 60_000, 1, u32::MAX, 65_535);
+        assembly.put(&far, &[0; 100], 0);
+        assert!(assembly.bytes < LEAST + 1000, "{}", assembly.bytes);
+    }
+
+    #[test]
+    fn a_storm_stays_in_the_budget_and_gives_up_the_oldest() {
+        let mut assembly = Assembly::new(1 << 20);
+        for number in 0..50_000 {
+            let record = fragment(writer(1), number, 1, 1, 2_000_000, 1000);
+            assembly.put(&record, &[0; 1000], 1 << 19);
+            assert!(assembly.bytes <= 1 << 19);
+        }
+        assert!(assembly.evictions > 49_000);
+        let newest = assembly.parts.keys().map(|(_, number)| *number).max();
+        assert_eq!(newest, Some(49_999));
+        // One that is larger than the budget is given up as it grows.
+        for start in 1..3000 {
+            let record = fragment(writer(2), 1, start, 1, 3_000_000, 1000);
+            assembly.put(&record, &[0; 1000], 0);
+            assert!(assembly.bytes <= 1 << 20);
+        }
+        assert_eq!(assembly.take(writer(2), 1), None);
+    }
+}
