@@ -15,6 +15,8 @@ use super::parse::{self, ParseError};
 pub const MAX_DEPTH: usize = 32;
 /// How many types one type may be made of.
 pub const MAX_TYPES: usize = 1024;
+/// How much text may define one type, all its parts together.
+pub const MAX_TEXT: usize = 4 << 20;
 /// How long a package's or a type's name may be: both are names of files.
 const MAX_NAME: usize = 200;
 
@@ -410,6 +412,9 @@ pub enum NotClosed {
     /// It has too many types.
     #[error("made of more than {MAX_TYPES} types")]
     TooMany,
+    /// Its definitions are too long.
+    #[error("defined by more than {MAX_TEXT} bytes of text")]
+    TooLong,
 }
 
 impl MessageType {
@@ -482,6 +487,13 @@ impl MessageType {
                 .cloned();
             if let Some(structure) = structure {
                 self.definitions.insert(file, definition);
+                let text = self
+                    .definitions
+                    .values()
+                    .map(|definition| definition.text.len());
+                if text.sum::<usize>() > MAX_TEXT {
+                    return Err(NotClosed::TooLong.into());
+                }
                 return Ok(structure);
             }
         }
@@ -553,7 +565,6 @@ pub enum SchemaError {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a failed expectation may panic")]
 mod tests {
     use super::*;
 

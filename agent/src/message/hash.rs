@@ -97,7 +97,6 @@ fn member(text: &mut String, name: &str, element: &Element, shape: Shape) {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a failed expectation may panic")]
 mod tests {
     use super::*;
 

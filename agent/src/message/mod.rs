@@ -6,8 +6,10 @@
 pub mod csv;
 pub mod decode;
 pub mod definition;
+mod embedded;
 pub mod filter;
 mod hash;
+pub mod library;
 mod numpy;
 mod parse;
 pub mod python;
@@ -20,6 +22,7 @@ pub use decode::{DecodeError, Decoded, Limits, decode};
 pub use definition::{
     Definition, Element, Field, Kind, MessageType, NotClosed, Shape, Structure, TypeName,
 };
+pub use library::{Library, NotFound, Sources};
 pub use parse::{ParseError, Problem};
 pub use shown::Shown;
 pub use value::Value;

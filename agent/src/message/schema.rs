@@ -174,7 +174,6 @@ fn message(text: &str) -> Option<TypeName> {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a failed expectation may panic")]
 mod tests {
     use super::*;
 

@@ -1,0 +1,841 @@
+//! Where definitions come from: directories that are named, an installed ROS, else what comes with
+//! the program.
+//!
+//! Two machines may have different definitions of one name. Where discovery announces a type's hash
+//! the definition has to agree with it, whatever place it is from; a wrong one is never used.
+
+use std::collections::{BTreeSet, HashMap};
+use std::ffi::OsStr;
+use std::fs::{File, OpenOptions};
+use std::io::{self, Read as _};
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::definition::{Definition, MessageType, NotClosed, TypeName};
+use super::embedded;
+use super::parse::{MAX_TEXT, ParseError, Problem};
+use crate::ros2::Dialect;
+
+/// Where ROS is installed, one directory for each distribution.
+const INSTALLED: &str = "/opt/ros";
+/// How many places are looked at: a workspace that is installed package by package has hundreds.
+const MAX_PLACES: usize = 1024;
+/// How many types are kept, and how much text.
+const MAX_KEPT: usize = 1024;
+const MAX_KEPT_TEXT: usize = 32 << 20;
+/// How often a type is put together at most until it has the announced hash.
+const MAX_TRIES: usize = 256;
+/// How many times one search asks the file system whether a file is there.
+const MAX_ASKED: usize = 1 << 18;
+/// How much text a search holds.
+const MAX_HELD: usize = 16 << 20;
+/// The only version of type hashes there is.
+const HASH: &str = "RIHS01_";
+
+/// Where to look, in this order.
+#[derive(Debug, Clone, Default)]
+pub struct Sources {
+    /// What the user named: `DIR/package/msg/Type.msg`, also below `DIR/share`.
+    pub directories: Vec<PathBuf>,
+    /// Prefixes of an installed ROS: `PREFIX/share/package/msg/Type.msg`.
+    pub prefixes: Vec<PathBuf>,
+    /// Whose definitions are taken where distributions differ and no hash tells.
+    pub dialect: Dialect,
+}
+
+impl Sources {
+    /// Named directories, what `AMENT_PREFIX_PATH` holds, then what is installed in `/opt/ros`, the
+    /// dialect's distribution first.
+    pub fn new(
+        directories: Vec<PathBuf>,
+        ament_prefix_path: Option<&OsStr>,
+        dialect: Dialect,
+    ) -> Self {
+        let mut prefixes: Vec<PathBuf> = ament_prefix_path
+            .map(|paths| {
+                std::env::split_paths(paths)
+                    .filter(|path| path.is_absolute())
+                    .collect()
+            })
+            .unwrap_or_default();
+        for prefix in installed(Path::new(INSTALLED), dialect) {
+            if !prefixes.contains(&prefix) {
+                prefixes.push(prefix);
+            }
+        }
+        Self {
+            directories,
+            prefixes,
+            dialect,
+        }
+    }
+}
+
+/// The distributions in a directory, the dialect's first, then the newer before the older ones.
+fn installed(directory: &Path, dialect: Dialect) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(directory) else {
+        return Vec::new();
+    };
+    let of = |path: &PathBuf| path.file_name()?.to_str().and_then(Dialect::of_distro);
+    let mut found: Vec<PathBuf> = entries
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .take(MAX_PLACES)
+        .collect();
+    found.sort_by(|a, b| b.cmp(a));
+    found.sort_by_key(|path| of(path) != Some(dialect));
+    found
+}
+
+/// Finds definitions and keeps the types that were found.
+#[derive(Debug)]
+pub struct Library {
+    places: Vec<Place>,
+    kept: Mutex<Kept>,
+}
+
+#[derive(Debug)]
+enum Place {
+    /// Named by the user.
+    Directory(PathBuf),
+    /// An installed ROS.
+    Prefix(PathBuf),
+    /// In the program.
+    Embedded(Dialect),
+}
+
+#[derive(Debug, Default)]
+struct Kept {
+    types: HashMap<(TypeName, Option<String>), Arc<MessageType>>,
+    text: usize,
+}
+
+/// Why there is no definition that can be used.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum NotFound {
+    /// The name is none.
+    #[error("`{0}` is no type's name: it has to look like std_msgs/msg/String")]
+    NotATypeName(String),
+    /// No place has it, or has all that it is made of.
+    #[error(
+        "no definition of {missing}{} here: install the package {}, or name a directory that has \
+         {}/{}/{}.{} with --definitions",
+        of(missing, root),
+        missing.package(), missing.package(), missing.kind().as_str(), file_name(missing),
+        missing.kind().as_str()
+    )]
+    Nowhere {
+        /// What is missing.
+        missing: TypeName,
+        /// What was asked for.
+        root: TypeName,
+    },
+    /// Definitions, but none that the nodes use.
+    #[error(
+        "the definition of {name} {place} is another one than the nodes use: its hash is {found}, \
+         theirs {announced}; install their version of {}, or name a directory that has it with \
+         --definitions",
+        name.package()
+    )]
+    Another {
+        /// The type.
+        name: TypeName,
+        /// Where the first one found is from.
+        place: String,
+        /// Its hash.
+        found: String,
+        /// The hash that discovery announces.
+        announced: String,
+    },
+    /// A file has a definition that is none.
+    #[error("{}: {mistake}", path.display())]
+    Mistake {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        mistake: ParseError,
+    },
+    /// A file cannot be read.
+    #[error("cannot read {}", path.display())]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Why not.
+        source: Arc<io::Error>,
+    },
+    /// The type is recursive or too large.
+    #[error("{root} cannot be used: {reason}")]
+    Refused {
+        /// What was asked for.
+        root: TypeName,
+        /// Why it is refused.
+        reason: NotClosed,
+    },
+}
+
+/// ` (in X)`, where it is not asked for itself.
+fn of(missing: &TypeName, root: &TypeName) -> String {
+    if missing == root {
+        String::new()
+    } else {
+        format!(" (part of {root})")
+    }
+}
+
+/// What the file is called that defines a type.
+fn file_name(name: &TypeName) -> String {
+    name.files().last().unwrap_or(name).name().to_owned()
+}
+
+impl Library {
+    /// Looks at these places from now on.
+    pub fn new(sources: Sources) -> Self {
+        let Sources {
+            directories,
+            prefixes,
+            dialect,
+        } = sources;
+        let mut places: Vec<_> = directories
+            .into_iter()
+            .map(Place::Directory)
+            .chain(prefixes.into_iter().map(Place::Prefix))
+            .take(MAX_PLACES)
+            .collect();
+        places.push(Place::Embedded(dialect));
+        let others = [
+            Dialect::Rolling,
+            Dialect::Kilted,
+            Dialect::Jazzy,
+            Dialect::Humble,
+        ];
+        let others = others.into_iter().filter(|other| *other != dialect);
+        places.extend(others.map(Place::Embedded));
+        Self {
+            places,
+            kept: Mutex::default(),
+        }
+    }
+
+    /// The type of a name. With an announced hash the first place's that agrees with it, otherwise
+    /// the first place's. A hash of a version that is not known is as good as none.
+    pub fn find(
+        &self,
+        name: &str,
+        announced_hash: Option<&str>,
+    ) -> Result<Arc<MessageType>, NotFound> {
+        let root: TypeName = name
+            .parse()
+            .map_err(|_| NotFound::NotATypeName(name.to_owned()))?;
+        let announced = announced_hash
+            .filter(|hash| hash.starts_with(HASH))
+            .map(str::to_owned);
+        let key = (root, announced);
+        let kept = self
+            .kept
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .types
+            .get(&key)
+            .cloned();
+        if let Some(found) = kept {
+            return Ok(found);
+        }
+        let found = Arc::new(Search::new(&self.places, &key.0).run(key.1.as_deref())?);
+        self.keep(key, found.clone());
+        Ok(found)
+    }
+
+    fn keep(&self, key: (TypeName, Option<String>), found: Arc<MessageType>) {
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        let text = found
+            .definitions
+            .values()
+            .map(|definition| definition.text.len())
+            .sum::<usize>();
+        if kept.types.len() >= MAX_KEPT || kept.text + text > MAX_KEPT_TEXT {
+            *kept = Kept::default();
+        }
+        kept.text += text;
+        kept.types.insert(key, found);
+    }
+}
+
+/// What a file holds, if it is still there.
+type Read = Result<Option<Arc<Definition>>, NotFound>;
+
+/// One search for one type.
+struct Search<'a> {
+    places: &'a [Place],
+    root: &'a TypeName,
+    /// Which places have a file, and how often they were asked.
+    having: HashMap<TypeName, Vec<usize>>,
+    asked: usize,
+    /// What was read, by place and file, and how much text that is.
+    read: HashMap<(usize, TypeName), Read>,
+    held: usize,
+}
+
+impl<'a> Search<'a> {
+    fn new(places: &'a [Place], root: &'a TypeName) -> Self {
+        let (having, read) = Default::default();
+        Self {
+            places,
+            root,
+            having,
+            asked: 0,
+            read,
+            held: 0,
+        }
+    }
+
+    /// The first type that can be put together, or that agrees with the hash. Usually all parts are
+    /// of one place and those behind it; a workspace that lies over another ROS than the nodes'
+    /// needs the type from the one and the rest from the other.
+    fn run(&mut self, announced: Option<&str>) -> Result<MessageType, NotFound> {
+        let mut firsts = BTreeSet::new();
+        for file in self.root.files() {
+            firsts.extend(self.places_of(&file)?);
+        }
+        let Some(announced) = announced else {
+            let Some(first) = firsts.first() else {
+                return Err(self.nowhere(self.root.clone()));
+            };
+            // Nothing says that what comes later is right: it is not guessed.
+            return self.assemble(*first, *first);
+        };
+        let mut tries: Vec<_> = firsts.iter().map(|first| (*first, *first)).collect();
+        let (mut next, mut failure, mut another) = (0, None, None);
+        while let Some((first, second)) = tries.get(next).copied().filter(|_| next < MAX_TRIES) {
+            next += 1;
+            match self
+                .assemble(first, second)
+                .map(|found| (found.type_hash(), found))
+            {
+                Ok((hash, found)) if hash == announced => return Ok(found),
+                Ok((hash, _)) => _ = another.get_or_insert((first, hash)),
+                Err(reason) => _ = failure.get_or_insert(reason),
+            }
+            if next == firsts.len() {
+                let seconds: BTreeSet<_> = self.having.values().flatten().copied().collect();
+                let mixed = firsts
+                    .iter()
+                    .flat_map(|first| seconds.iter().map(move |second| (*first, *second)));
+                tries.extend(
+                    mixed
+                        .filter(|(first, second)| first != second)
+                        .take(MAX_TRIES),
+                );
+            }
+        }
+        if let Some((place, found)) = another {
+            let place = self
+                .places
+                .get(place)
+                .map(Place::describe)
+                .unwrap_or_default();
+            let (name, announced) = (self.root.clone(), announced.to_owned());
+            return Err(NotFound::Another {
+                name,
+                place,
+                found,
+                announced,
+            });
+        }
+        Err(failure.unwrap_or_else(|| self.nowhere(self.root.clone())))
+    }
+
+    fn nowhere(&self, missing: TypeName) -> NotFound {
+        NotFound::Nowhere {
+            missing,
+            root: self.root.clone(),
+        }
+    }
+
+    /// The type with each part from `first` if it is there, then `second` and what is behind it, at
+    /// last from what is before it.
+    fn assemble(&mut self, first: usize, second: usize) -> Result<MessageType, NotFound> {
+        let root = self.root.clone();
+        let rank = |place: usize| match place {
+            _ if place == first => 0,
+            _ if place >= second => 1 + place - second,
+            _ => 1 + MAX_PLACES + place,
+        };
+        let found = MessageType::assemble(&root, |file| {
+            let mut places = self.places_of(file).map_err(Failure::Known)?;
+            places.sort_by_key(|place| rank(*place));
+            for place in places {
+                if let Some(found) = self.definition(place, file).map_err(Failure::Known)? {
+                    return Ok(Some(found));
+                }
+            }
+            Ok(None)
+        });
+        found.map_err(|failure| match failure {
+            Failure::Known(failure) => failure,
+            Failure::NotClosed(NotClosed::Missing(missing)) => self.nowhere(missing),
+            Failure::NotClosed(reason) => NotFound::Refused { root, reason },
+        })
+    }
+
+    /// The places that have a file, readable or not.
+    fn places_of(&mut self, file: &TypeName) -> Result<Vec<usize>, NotFound> {
+        if let Some(known) = self.having.get(file) {
+            return Ok(known.clone());
+        }
+        self.asked += self.places.len();
+        if self.asked > MAX_ASKED {
+            let (root, reason) = (self.root.clone(), NotClosed::TooMany);
+            return Err(NotFound::Refused { root, reason });
+        }
+        let places = self.places.iter().enumerate();
+        let having: Vec<_> = places
+            .filter(|(_, place)| place.has(file))
+            .map(|(index, _)| index)
+            .collect();
+        self.having.insert(file.clone(), having.clone());
+        Ok(having)
+    }
+
+    fn definition(&mut self, place: usize, file: &TypeName) -> Read {
+        let key = (place, file.clone());
+        if let Some(known) = self.read.get(&key) {
+            return known.clone();
+        }
+        let found = match self.places.get(place) {
+            Some(place) => place.read(file).map(|found| found.map(Arc::new)),
+            None => Ok(None),
+        };
+        if self.held > MAX_HELD {
+            self.read.clear();
+            self.held = 0;
+        }
+        self.held += found
+            .iter()
+            .flatten()
+            .map(|found| found.text.len())
+            .sum::<usize>();
+        self.read.insert(key, found.clone());
+        found
+    }
+}
+
+/// Why parts could not be put together.
+enum Failure {
+    /// What was found of one.
+    Known(NotFound),
+    NotClosed(NotClosed),
+}
+
+impl From<NotClosed> for Failure {
+    fn from(reason: NotClosed) -> Self {
+        Self::NotClosed(reason)
+    }
+}
+
+impl Place {
+    fn describe(&self) -> String {
+        match self {
+            Self::Directory(path) | Self::Prefix(path) => format!("in {}", path.display()),
+            Self::Embedded(_) => "that comes with ros2probe".to_owned(),
+        }
+    }
+
+    fn has(&self, name: &TypeName) -> bool {
+        match self {
+            Self::Embedded(dialect) => embedded::find(name, *dialect).is_some(),
+            Self::Directory(_) | Self::Prefix(_) => self.file(name).is_some(),
+        }
+    }
+
+    /// The file that defines a type; also one that cannot be read, which has to be told.
+    fn file(&self, name: &TypeName) -> Option<PathBuf> {
+        let kind = name.kind().as_str();
+        let below = Path::new(name.package())
+            .join(kind)
+            .join(format!("{}.{kind}", name.name()));
+        let candidates = match self {
+            Self::Embedded(_) => Vec::new(),
+            Self::Directory(path) => vec![path.join(&below), path.join("share").join(&below)],
+            Self::Prefix(path) => vec![path.join("share").join(&below)],
+        };
+        candidates
+            .into_iter()
+            .find(|path| match std::fs::metadata(path) {
+                Ok(_) => true,
+                Err(error) => !is_absent(&error),
+            })
+    }
+
+    fn read(&self, name: &TypeName) -> Result<Option<Definition>, NotFound> {
+        let (path, text) = match self {
+            Self::Embedded(dialect) => match embedded::find(name, *dialect) {
+                Some(text) => (PathBuf::from(name.to_string()), text.to_owned()),
+                None => return Ok(None),
+            },
+            Self::Directory(_) | Self::Prefix(_) => {
+                let Some(path) = self.file(name) else {
+                    return Ok(None);
+                };
+                let Some(text) = read(&path)? else {
+                    return Ok(None);
+                };
+                (path, text)
+            }
+        };
+        let definition = Definition::parse(name.clone(), &text);
+        definition
+            .map(Some)
+            .map_err(|mistake| NotFound::Mistake { path, mistake })
+    }
+}
+
+fn is_absent(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        io::ErrorKind::NotFound | io::ErrorKind::NotADirectory
+    )
+}
+
+/// A file's text, if it is there. Never waits: what is no regular file is refused.
+fn read(path: &Path) -> Result<Option<String>, NotFound> {
+    let unreadable = |source: io::Error| NotFound::Unreadable {
+        path: path.to_owned(),
+        source: Arc::new(source),
+    };
+    let mistake = |line, problem| NotFound::Mistake {
+        path: path.to_owned(),
+        mistake: ParseError { line, problem },
+    };
+    let mut options = OpenOptions::new();
+    let file: File = match options.read(true).custom_flags(libc::O_NONBLOCK).open(path) {
+        Ok(file) => file,
+        Err(error) if is_absent(&error) => return Ok(None),
+        Err(error) => return Err(unreadable(error)),
+    };
+    if !file.metadata().map_err(unreadable)?.is_file() {
+        return Err(unreadable(io::Error::new(
+            io::ErrorKind::InvalidInput,
+            "not a regular file",
+        )));
+    }
+    let mut bytes = Vec::new();
+    file.take(MAX_TEXT as u64 + 1)
+        .read_to_end(&mut bytes)
+        .map_err(unreadable)?;
+    if bytes.len() > MAX_TEXT {
+        return Err(mistake(1, Problem::TooLong));
+    }
+    String::from_utf8(bytes).map(Some).map_err(|error| {
+        let good = error.utf8_error().valid_up_to();
+        let lines = error
+            .as_bytes()
+            .iter()
+            .take(good)
+            .filter(|byte| **byte == b'\n')
+            .count();
+        mistake(lines + 1, Problem::NotText)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use tempfile::TempDir;
+
+    use super::*;
+
+    /// An installed ROS with these files: `a/msg/B.msg` and its text.
+    fn prefix(files: &[(&str, &str)]) -> TempDir {
+        let directory = tempfile::tempdir().unwrap();
+        for (name, text) in files {
+            let path = directory.path().join("share").join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        directory
+    }
+
+    fn library(prefixes: &[&TempDir]) -> Library {
+        let prefixes = prefixes
+            .iter()
+            .map(|prefix| prefix.path().to_owned())
+            .collect();
+        Library::new(Sources {
+            prefixes,
+            ..Sources::default()
+        })
+    }
+
+    fn hash(name: &str, prefixes: &[&TempDir]) -> String {
+        library(prefixes).find(name, None).unwrap().type_hash()
+    }
+
+    #[test]
+    fn the_first_place_wins_unless_the_hash_says_otherwise() {
+        let old = prefix(&[("a/msg/B.msg", "int8 x")]);
+        let new = prefix(&[("a/msg/B.msg", "int8 x\nint8 y")]);
+        let (old_hash, new_hash) = (hash("a/msg/B", &[&old]), hash("a/msg/B", &[&new]));
+        assert_ne!(old_hash, new_hash);
+        let library = library(&[&old, &new]);
+        assert_eq!(library.find("a/msg/B", None).unwrap().type_hash(), old_hash);
+        for hash in [&new_hash, &old_hash, &new_hash] {
+            assert_eq!(
+                library.find("a/msg/B", Some(hash)).unwrap().type_hash(),
+                *hash
+            );
+        }
+        // A version of hashes that is not known tells nothing.
+        let found = library.find("a/msg/B", Some("RIHS02_00")).unwrap();
+        assert_eq!(found.type_hash(), old_hash);
+    }
+
+    #[test]
+    fn a_named_directory_comes_before_what_is_installed_and_needs_no_share() {
+        let installed = prefix(&[("a/msg/B.msg", "int8 x")]);
+        for share in ["", "share"] {
+            let named = tempfile::tempdir().unwrap();
+            let package = named.path().join(share).join("a/msg");
+            fs::create_dir_all(&package).unwrap();
+            fs::write(package.join("B.msg"), "int16 y").unwrap();
+            let library = Library::new(Sources {
+                directories: vec![named.path().to_owned()],
+                prefixes: vec![installed.path().to_owned()],
+                dialect: Dialect::Humble,
+            });
+            let found = library.find("a/msg/B", None).unwrap();
+            assert_eq!(
+                found
+                    .structure(&found.root)
+                    .unwrap()
+                    .fields
+                    .first()
+                    .unwrap()
+                    .name,
+                "y"
+            );
+        }
+    }
+
+    #[test]
+    fn parts_come_from_another_place_where_only_so_the_hash_agrees() {
+        let workspace = prefix(&[("w/msg/W.msg", "a/B b\nstd_msgs/Header header")]);
+        let below = prefix(&[("a/msg/B.msg", "int8 x")]);
+        let nodes = prefix(&[("a/msg/B.msg", "int16 x")]);
+        let announced = hash("w/msg/W", &[&workspace, &nodes]);
+        assert_ne!(announced, hash("w/msg/W", &[&workspace, &below]));
+        let library = library(&[&workspace, &below, &nodes]);
+        let found = library.find("w/msg/W", Some(&announced)).unwrap();
+        assert_eq!(found.type_hash(), announced);
+        // The rest is embedded.
+        assert!(
+            found
+                .structures()
+                .any(|one| one.name.package() == "builtin_interfaces")
+        );
+    }
+
+    #[test]
+    fn services_events_and_actions_are_found_by_the_names_that_are_announced() {
+        let here = prefix(&[
+            ("a/srv/S.srv", "# S\nint8 x\n---\nstd_msgs/String y # why\n"),
+            (
+                "a/action/A.action",
+                "int8 x\n---\nint8 y\n---\ngeometry_msgs/Point z\n",
+            ),
+        ]);
+        let library = library(&[&here]);
+        for name in [
+            "a/srv/S",
+            "a/srv/S_Request",
+            "a/srv/S_Response",
+            "a/srv/S_Event",
+        ] {
+            assert_eq!(library.find(name, None).unwrap().root.to_string(), name);
+        }
+        for suffix in [
+            "",
+            "_Goal",
+            "_Result",
+            "_Feedback",
+            "_FeedbackMessage",
+            "_SendGoal",
+            "_SendGoal_Request",
+            "_SendGoal_Response",
+            "_SendGoal_Event",
+            "_GetResult",
+            "_GetResult_Request",
+            "_GetResult_Response",
+            "_GetResult_Event",
+        ] {
+            library.find(&format!("a/action/A{suffix}"), None).unwrap();
+        }
+        let line = "=".repeat(80);
+        let event = library.find("a/srv/S_Event", None).unwrap();
+        assert_eq!(
+            event.schema_text().1,
+            format!(
+                "{line}\nSRV: a/srv/S\n# S\nint8 x\n---\nstd_msgs/String y # why\n\
+                 \n{line}\nMSG: std_msgs/String\nstring data\n"
+            )
+        );
+        // What stands in no file is written so that it can be read again.
+        let feedback = library.find("a/action/A_FeedbackMessage", None).unwrap();
+        let text = feedback.schema_text().1;
+        assert!(text.starts_with("unique_identifier_msgs/UUID goal_id\na/A_Feedback feedback\n"));
+        let again = MessageType::parse(&"a/msg/A_FeedbackMessage".parse().unwrap(), &text);
+        assert_eq!(
+            again.unwrap().structures().count(),
+            feedback.structures().count()
+        );
+    }
+
+    #[test]
+    fn what_is_missing_is_told_with_what_to_do() {
+        let here = prefix(&[("a/msg/B.msg", "c/D d")]);
+        let message = |name| library(&[&here]).find(name, None).unwrap_err().to_string();
+        assert_eq!(
+            message("x_msgs/msg/Y"),
+            "no definition of x_msgs/msg/Y here: install the package x_msgs, or name a directory \
+             that has x_msgs/msg/Y.msg with --definitions"
+        );
+        assert_eq!(
+            message("a/msg/B"),
+            "no definition of c/msg/D (part of a/msg/B) here: install the package c, or name a \
+             directory that has c/msg/D.msg with --definitions"
+        );
+        assert!(message("x/action/Y_SendGoal_Request").contains("x/action/Y.action"));
+        assert!(message("x/srv/Y_Event").contains("x/srv/Y.srv"));
+        assert!(message("../etc/passwd").contains("no type's name"));
+    }
+
+    #[test]
+    fn a_mistake_is_told_with_its_file_and_line() {
+        let here = prefix(&[("a/msg/B.msg", "int8 x\nint9 y\n")]);
+        let path = here.path().join("share/a/msg/B.msg");
+        let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
+        assert_eq!(
+            failure.to_string(),
+            format!("{}: line 2: `int9` is no type", path.display())
+        );
+        // With a hash whatever place agrees is good.
+        let good = prefix(&[("a/msg/B.msg", "int8 x")]);
+        let announced = hash("a/msg/B", &[&good]);
+        library(&[&here, &good])
+            .find("a/msg/B", Some(&announced))
+            .unwrap();
+        fs::write(&path, b"int8 x\n\xff").unwrap();
+        let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
+        assert_eq!(
+            failure.to_string(),
+            format!("{}: line 2: not UTF-8", path.display())
+        );
+        fs::write(&path, vec![b'#'; MAX_TEXT + 1]).unwrap();
+        let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
+        assert!(failure.to_string().contains("longer than"), "{failure}");
+    }
+
+    #[test]
+    fn what_is_no_regular_file_is_refused_without_waiting() {
+        let here = prefix(&[("a/msg/B.msg", "")]);
+        let path = here.path().join("share/a/msg/B.msg");
+        fs::remove_file(&path).unwrap();
+        fs::create_dir(&path).unwrap();
+        let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
+        assert!(matches!(failure, NotFound::Unreadable { .. }), "{failure}");
+        fs::remove_dir(&path).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", &path).unwrap();
+        let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
+        assert!(matches!(failure, NotFound::Unreadable { .. }), "{failure}");
+        fs::remove_file(&path).unwrap();
+        let status = std::process::Command::new("mkfifo")
+            .arg(&path)
+            .status()
+            .unwrap();
+        assert!(status.success());
+        let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
+        assert!(matches!(failure, NotFound::Unreadable { .. }), "{failure}");
+    }
+
+    #[test]
+    fn hostile_trees_end_with_a_reason() {
+        // Each type of two places names two of the next: a tree of 2^40 paths, and every place has
+        // another variant.
+        let make = |extra: &str| {
+            let file = |index| {
+                let text = format!("T{0} a\nT{0} b\n{extra}", index + 1);
+                (format!("a/msg/T{index}.msg"), text)
+            };
+            let files: Vec<_> = (0..40).map(file).collect();
+            let files: Vec<_> = files
+                .iter()
+                .map(|(name, text)| (&**name, &**text))
+                .collect();
+            prefix(&files)
+        };
+        let (one, two) = (make("int8 x"), make("int16 x"));
+        let announced = format!("RIHS01_{}", "0".repeat(64));
+        let library = library(&[&one, &two]);
+        let failure = library.find("a/msg/T0", Some(&announced)).unwrap_err();
+        assert!(matches!(failure, NotFound::Nowhere { .. }), "{failure}");
+        let last = |prefix: &TempDir| {
+            fs::write(prefix.path().join("share/a/msg/T40.msg"), "int8 x").unwrap();
+        };
+        last(&one);
+        last(&two);
+        let failure = library.find("a/msg/T0", Some(&announced)).unwrap_err();
+        let deep = NotClosed::TooDeep;
+        assert!(matches!(failure, NotFound::Refused { reason, .. } if reason == deep));
+        let failure = library.find("a/msg/T20", Some(&announced)).unwrap_err();
+        assert!(matches!(failure, NotFound::Another { .. }), "{failure}");
+        assert_eq!(
+            library
+                .find("a/msg/T20", None)
+                .unwrap()
+                .structures()
+                .count(),
+            21
+        );
+    }
+
+    #[test]
+    fn what_is_kept_is_bounded() {
+        let here = prefix(&[("a/msg/B.msg", "int8 x")]);
+        let library = library(&[&here]);
+        for index in 0..=MAX_KEPT {
+            let hash = format!("RIHS02_{index}");
+            library.find("a/msg/B", Some(&hash)).unwrap();
+            let key = ("a/msg/B".parse().unwrap(), Some(format!("RIHS01_{index}")));
+            library.keep(key, library.find("a/msg/B", None).unwrap());
+        }
+        assert!(library.kept.lock().unwrap().types.len() <= MAX_KEPT);
+    }
+
+    #[test]
+    fn the_dialects_distribution_comes_first_then_newer_ones() {
+        let here = tempfile::tempdir().unwrap();
+        for name in ["humble", "iron", "jazzy", "rolling"] {
+            fs::create_dir(here.path().join(name)).unwrap();
+        }
+        let names = |dialect| {
+            let found = installed(here.path(), dialect);
+            found
+                .iter()
+                .map(|path| path.file_name().unwrap().to_owned())
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(
+            names(Dialect::Humble),
+            ["humble", "rolling", "jazzy", "iron"]
+        );
+        assert_eq!(
+            names(Dialect::Jazzy),
+            ["jazzy", "iron", "rolling", "humble"]
+        );
+        let environment = std::env::join_paths([Path::new("/x"), Path::new("relative")]).unwrap();
+        let sources = Sources::new(vec!["/d".into()], Some(&environment), Dialect::Jazzy);
+        assert_eq!(sources.prefixes.first().unwrap(), Path::new("/x"));
+        assert!(!sources.prefixes.contains(&PathBuf::from("relative")));
+        assert_eq!(sources.directories, [PathBuf::from("/d")]);
+    }
+}
