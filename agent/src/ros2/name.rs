@@ -1,0 +1,80 @@
+//! Names of topics as they are typed.
+
+use super::Refused;
+
+/// The full name of a topic; a relative one is in the root namespace, as the original's own node
+/// is.
+///
+/// # Errors
+/// No topic can have this name; the text points at what is wrong, as the original's does.
+pub fn full_name(typed: &str) -> Result<String, Refused> {
+    let name = if typed.is_empty() || typed.starts_with('/') {
+        typed.to_owned()
+    } else {
+        format!("/{typed}")
+    };
+    match mistake(&name) {
+        None => Ok(name),
+        Some((why, at)) => Err(Refused(format!(
+            "Invalid topic name: {why}:\n  '{name}'\n   {:at$}^",
+            ""
+        ))),
+    }
+}
+
+/// What is wrong, and the character where.
+fn mistake(name: &str) -> Option<(&'static str, usize)> {
+    if name.is_empty() {
+        return Some(("topic name must not be empty", 0));
+    }
+    let length = name.chars().count();
+    let allowed = |character: char| character.is_ascii_alphanumeric() || "_/".contains(character);
+    if let Some(at) = name.chars().position(|character| !allowed(character)) {
+        let why = "topic name must not contain characters other than alphanumerics, '_', or '/'";
+        return Some((why, at));
+    }
+    if name.ends_with('/') {
+        let why = "topic name must not end with a '/'";
+        return Some((why, length.saturating_sub(1)));
+    }
+    if let Some(at) = name.find("//") {
+        return Some(("topic name must not contain repeated '/'", at + 1));
+    }
+    let mut before = '/';
+    for (at, character) in name.chars().enumerate() {
+        if before == '/' && character.is_ascii_digit() {
+            return Some(("topic name token must not start with a number", at));
+        }
+        before = character;
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_relative_name_is_in_the_root() {
+        for (typed, name) in [
+            ("/robot1/imu", "/robot1/imu"),
+            ("chatter", "/chatter"),
+            ("robot1/imu_2", "/robot1/imu_2"),
+            ("/_hidden", "/_hidden"),
+        ] {
+            assert_eq!(full_name(typed).as_deref(), Ok(name));
+        }
+    }
+
+    #[test]
+    fn what_no_topic_is_called_is_pointed_at() {
+        let refused = full_name("/foo bar").unwrap_err().0;
+        let expected = "Invalid topic name: topic name must not contain characters other than \
+            alphanumerics, '_', or '/':\n  '/foo bar'\n       ^";
+        assert_eq!(refused, expected);
+        for (typed, at) in [("", 0), ("/", 0), ("/a/", 2), ("/a//b", 3), ("/a/2b", 3), ("é", 1)] {
+            let refused = full_name(typed).unwrap_err().0;
+            assert!(refused.ends_with(&format!("\n   {:at$}^", "")), "{refused}");
+        }
+    }
+}
