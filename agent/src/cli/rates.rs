@@ -1,0 +1,221 @@
+//! `rp topic hz`, `bw` and `delay`: interest in topics for as long as the verb runs, and what comes
+//! of it put into words. How it is reported is decided elsewhere, by the stream's own clock.
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Args;
+use clap::error::ErrorKind;
+use ros2probe::client::{Agent, Target, encoded};
+use ros2probe::ros2::name::full_name;
+use ros2probe::ros2::rates::{Arrival, End, Named, Quantity, Rates};
+use ros2probe::ros2::{Dialect, Refused};
+use ros2probe::subscriptions::line::{Line, Reason};
+
+use super::interrupt::INTERRUPTED;
+use super::shared::{Matching, Spinning, hint_at_other_domains};
+use super::{Output, Said};
+
+/// Window of `hz` and `delay`.
+const LONG: usize = 10_000;
+/// Window of `bw`.
+const SHORT: usize = 100;
+
+/// `rp topic hz`.
+#[derive(Args, Debug)]
+pub(crate) struct Hz {
+    #[command(flatten)]
+    topics: Topics,
+    /// Calculate from so many of the newest intervals
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
+    window: usize,
+    /// Accepted without effect: messages are always timed by the clock of the capture
+    #[arg(long)]
+    wall_time: bool,
+    #[command(flatten)]
+    options: Options,
+}
+
+/// `rp topic bw`.
+#[derive(Args, Debug)]
+pub(crate) struct Bandwidth {
+    #[command(flatten)]
+    topics: Topics,
+    /// Calculate from so many of the newest messages
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = SHORT, value_parser = positive)]
+    window: usize,
+    #[command(flatten)]
+    options: Options,
+}
+
+/// `rp topic delay`.
+#[derive(Args, Debug)]
+pub(crate) struct Delay {
+    #[command(flatten)]
+    topics: Topics,
+    /// Calculate from so many of the newest messages
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
+    window: usize,
+    #[command(flatten)]
+    options: Options,
+}
+
+#[derive(Args, Debug)]
+struct Topics {
+    /// Topics to measure, as /chatter
+    #[arg(value_name = "TOPIC")]
+    names: Vec<String>,
+    /// Measure all topics, also those that appear later
+    #[arg(long, short = 'a')]
+    all: bool,
+}
+
+#[derive(Args, Debug)]
+struct Options {
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    matching: Matching,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Hz {
+    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+        measure(Quantity::Rate, self.window, self.topics, &self.options.target, hidden)
+    }
+
+    /// With which code Ctrl-C ends it.
+    pub(crate) fn interrupted(&self) -> u8 {
+        since(Dialect::Kilted, &self.options.target)
+    }
+}
+
+impl Bandwidth {
+    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+        measure(Quantity::Bandwidth, self.window, self.topics, &self.options.target, hidden)
+    }
+
+    /// With which code Ctrl-C ends it.
+    pub(crate) fn interrupted(&self) -> u8 {
+        since(Dialect::Rolling, &self.options.target)
+    }
+}
+
+impl Delay {
+    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+        measure(Quantity::Delay, self.window, self.topics, &self.options.target, hidden)
+    }
+}
+
+/// From this distribution on, Ctrl-C is how a measurement ends well.
+fn since(first: Dialect, target: &Target) -> u8 {
+    if target.dialect() < first {
+        INTERRUPTED
+    } else {
+        0
+    }
+}
+
+fn measure(
+    quantity: Quantity,
+    window: usize,
+    topics: Topics,
+    target: &Target,
+    hidden: bool,
+) -> Result<ExitCode> {
+    let dialect = target.dialect();
+    let domain_id = target.domain()?;
+    let (mut rates, query) = if topics.all {
+        if !topics.names.is_empty() {
+            return Err(Said("Cannot specify both --all/-a and topic names".to_owned()).into());
+        }
+        let query = format!("all=true&hidden={hidden}");
+        (Rates::of_all(quantity, dialect, window), query)
+    } else {
+        if topics.names.is_empty() {
+            return Err(unnamed(quantity, dialect));
+        }
+        let named = topics.names.into_iter().map(|typed| {
+            let name = full_name(&typed)?;
+            Ok(Named { typed, name })
+        });
+        let named: Vec<Named> = named.collect::<Result<_, Refused>>().map_err(said)?;
+        let names: Vec<String> = named.iter().map(|named| encoded(&named.name)).collect();
+        let query = format!("topic={}", names.join(","));
+        (Rates::of(quantity, dialect, window, named), query)
+    };
+    let agent = Agent::reach(target)?;
+    let path = format!("/samples?{query}&domain_id={domain_id}");
+    let mut lines = agent.stream(&path)?;
+    let mut output = Output::new();
+    while let Some(line) = lines.line()? {
+        let line: Line = serde_json::from_slice(&line)?;
+        let over = match line {
+            Line::Open(open) => {
+                let topics = open.topics.into_iter();
+                let present: Vec<_> = topics.map(|topic| (topic.topic, topic.types)).collect();
+                if present.is_empty() {
+                    hint_at_other_domains(&agent, domain_id)?;
+                }
+                rates.opened(&present)
+            }
+            Line::Sample(sample) => {
+                let arrival = Arrival {
+                    time: sample.time_ns,
+                    size: sample.size,
+                    header_stamp: sample.header_stamp_ns,
+                };
+                let appeared = rates.appeared(&sample.topic, &[sample.message_type]);
+                appeared.and_then(|()| rates.arrived(&sample.topic, &arrival))
+            }
+            Line::Clock(clock) => {
+                rates.clock(clock.time_ns);
+                Ok(())
+            }
+            Line::Missed(missed) => {
+                if missed.reason == Reason::QueueFull {
+                    let (samples, topic) = (missed.samples, missed.topic);
+                    eprintln!("rp: {samples} messages of {topic} are not counted: too slow here");
+                }
+                Ok(())
+            }
+            Line::End(end) if end.reason == END_OF_CAPTURE => break,
+            Line::End(_) => return Err(Said("the agent has ended".to_owned()).into()),
+        };
+        let text = rates.take();
+        if !text.out.is_empty() {
+            output.write(&text.out)?;
+        }
+        eprint!("{}", text.err);
+        match over {
+            Ok(()) => {}
+            Err(End::Idle) => break,
+            Err(End::Refused(refused)) => return Err(said(refused)),
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn said(refused: Refused) -> anyhow::Error {
+    Said(refused.0).into()
+}
+
+/// What the original says when it is given no topic: a usage error as long as it took one alone.
+fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
+    let several = match quantity {
+        Quantity::Rate => dialect >= Dialect::Kilted,
+        Quantity::Bandwidth => dialect >= Dialect::Rolling,
+        Quantity::Delay => false,
+    };
+    let text = "Either specify topic names or use --all/-a option";
+    if several {
+        return Said(text.to_owned()).into();
+    }
+    clap::Error::raw(ErrorKind::MissingRequiredArgument, format!("{text}\n")).exit()
+}
+
+fn positive(text: &str) -> Result<usize, String> {
+    let value = text.parse().ok().filter(|value| *value > 0);
+    value.ok_or_else(|| "value must be a positive integer".to_owned())
+}
