@@ -4,6 +4,7 @@
 mod discover;
 mod interrupt;
 mod output;
+mod rates;
 mod run;
 mod shared;
 mod topic;
@@ -65,9 +66,9 @@ impl Question {
     }
 
     /// The exit code when Ctrl-C ends it at once; `None` for what wants to end by itself.
-    const fn interrupted(&self) -> Option<u8> {
+    fn interrupted(&self) -> Option<u8> {
         match self {
-            Self::Topic(_) => Some(interrupt::INTERRUPTED),
+            Self::Topic(topic) => Some(topic.interrupted()),
         }
     }
 }

@@ -13,13 +13,15 @@ use ros2probe::ros2::{Dialect, Refused};
 use ros2probe::subscriptions::line::{Line, Reason};
 
 use super::interrupt::INTERRUPTED;
-use super::shared::{Matching, Spinning, hint_at_other_domains};
+use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
 /// Window of `hz` and `delay`.
 const LONG: usize = 10_000;
 /// Window of `bw`.
 const SHORT: usize = 100;
+/// How a replay ends.
+const END_OF_CAPTURE: &str = "end of capture";
 
 /// `rp topic hz`.
 #[derive(Args, Debug)]
@@ -82,7 +84,13 @@ struct Options {
 
 impl Hz {
     pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
-        measure(Quantity::Rate, self.window, self.topics, &self.options.target, hidden)
+        measure(
+            Quantity::Rate,
+            self.window,
+            self.topics,
+            &self.options.target,
+            hidden,
+        )
     }
 
     /// With which code Ctrl-C ends it.
@@ -93,7 +101,13 @@ impl Hz {
 
 impl Bandwidth {
     pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
-        measure(Quantity::Bandwidth, self.window, self.topics, &self.options.target, hidden)
+        measure(
+            Quantity::Bandwidth,
+            self.window,
+            self.topics,
+            &self.options.target,
+            hidden,
+        )
     }
 
     /// With which code Ctrl-C ends it.
@@ -104,7 +118,13 @@ impl Bandwidth {
 
 impl Delay {
     pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
-        measure(Quantity::Delay, self.window, self.topics, &self.options.target, hidden)
+        measure(
+            Quantity::Delay,
+            self.window,
+            self.topics,
+            &self.options.target,
+            hidden,
+        )
     }
 }
 
@@ -156,7 +176,7 @@ fn measure(
                 let topics = open.topics.into_iter();
                 let present: Vec<_> = topics.map(|topic| (topic.topic, topic.types)).collect();
                 if present.is_empty() {
-                    hint_at_other_domains(&agent, domain_id)?;
+                    names_of(&agent, domain_id)?;
                 }
                 rates.opened(&present)
             }

@@ -20,11 +20,36 @@ pub(crate) struct Spinning {
     no_daemon: bool,
 }
 
+/// Quality of service of the original's own subscription; accepted, so that scripts go on working.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct Matching {
+    /// Accepted without effect, as all options of quality of service: there is no subscription
+    #[arg(long, value_name = "PROFILE")]
+    qos_profile: Option<String>,
+    #[arg(long, value_name = "N", hide = true)]
+    qos_depth: Option<String>,
+    #[arg(long, value_name = "HISTORY", hide = true)]
+    qos_history: Option<String>,
+    #[arg(long, value_name = "RELIABILITY", hide = true)]
+    qos_reliability: Option<String>,
+    #[arg(long, value_name = "DURABILITY", hide = true)]
+    qos_durability: Option<String>,
+    #[arg(long, value_name = "LIVELINESS", hide = true)]
+    qos_liveliness: Option<String>,
+    #[arg(long, value_name = "SECONDS", hide = true)]
+    qos_liveliness_lease_duration_seconds: Option<String>,
+}
+
 /// All names in the target's domain, also hidden ones. Where there is nothing but in other domains,
 /// stderr says so once.
 pub(crate) fn names(target: &Target) -> Result<Names> {
     let domain_id = target.domain()?;
     let agent = Agent::reach(target)?;
+    names_of(&agent, domain_id)
+}
+
+/// As [`names`], of an agent that is known already.
+pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
     let names: Names = agent.get(&format!("/names?domain_id={domain_id}&hidden=true"))?;
     let others = names.domains.iter().filter(|other| **other != domain_id);
     let others: Vec<String> = others.map(u32::to_string).collect();

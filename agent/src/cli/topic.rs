@@ -8,6 +8,8 @@ use ros2probe::client::Target;
 use ros2probe::ros2::topic;
 
 use super::Output;
+use super::interrupt::INTERRUPTED;
+use super::rates::{Bandwidth, Delay, Hz};
 use super::shared::{Spinning, names};
 
 /// `rp topic VERB`.
@@ -24,6 +26,12 @@ pub(crate) struct Topic {
 enum Verb {
     /// Print a list of topics
     List(List),
+    /// Print how often messages come
+    Hz(Hz),
+    /// Print how many bytes a second come
+    Bw(Bandwidth),
+    /// Print how old messages are by the stamp in their header
+    Delay(Delay),
 }
 
 #[derive(Args, Debug)]
@@ -47,11 +55,23 @@ struct List {
 }
 
 impl Topic {
+    /// With which code Ctrl-C ends it.
+    pub(crate) fn interrupted(&self) -> u8 {
+        match &self.verb {
+            Some(Verb::Hz(hz)) => hz.interrupted(),
+            Some(Verb::Bw(bandwidth)) => bandwidth.interrupted(),
+            _ => INTERRUPTED,
+        }
+    }
+
     pub(crate) fn ask(self) -> Result<ExitCode> {
         let hidden = self.include_hidden_topics;
         match self.verb {
             None => super::help(&["topic"]),
             Some(Verb::List(list)) => list.ask(hidden),
+            Some(Verb::Hz(hz)) => hz.ask(hidden),
+            Some(Verb::Bw(bandwidth)) => bandwidth.ask(hidden),
+            Some(Verb::Delay(delay)) => delay.ask(hidden),
         }
     }
 }

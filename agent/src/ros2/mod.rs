@@ -5,6 +5,7 @@
 
 mod dialect;
 pub mod facts;
+pub mod name;
 pub mod rates;
 mod refusal;
 pub mod topic;

@@ -72,7 +72,14 @@ mod tests {
         let expected = "Invalid topic name: topic name must not contain characters other than \
             alphanumerics, '_', or '/':\n  '/foo bar'\n       ^";
         assert_eq!(refused, expected);
-        for (typed, at) in [("", 0), ("/", 0), ("/a/", 2), ("/a//b", 3), ("/a/2b", 3), ("é", 1)] {
+        for (typed, at) in [
+            ("", 0),
+            ("/", 0),
+            ("/a/", 2),
+            ("/a//b", 3),
+            ("/a/2b", 3),
+            ("é", 1),
+        ] {
             let refused = full_name(typed).unwrap_err().0;
             assert!(refused.ends_with(&format!("\n   {:at$}^", "")), "{refused}");
         }
