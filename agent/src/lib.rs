@@ -9,6 +9,7 @@ pub mod capture;
 pub mod client;
 pub mod config;
 pub mod discover;
+pub mod doctor;
 pub mod message;
 pub mod model;
 pub mod privilege;

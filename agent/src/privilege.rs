@@ -57,7 +57,8 @@ pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     missing(&effective, settings).map_or(Ok(()), Err)
 }
 
-fn missing(effective: &CapsHashSet, settings: &CaptureSettings) -> Option<Missing> {
+/// What a process with these effective capabilities lacks.
+pub(crate) fn missing(effective: &CapsHashSet, settings: &CaptureSettings) -> Option<Missing> {
     // The old, wider capability still counts for its successors.
     let admin = effective.contains(&Capability::CAP_SYS_ADMIN);
     let has = |capability: &Capability| {
@@ -131,6 +132,11 @@ pub fn missing_for_probes() -> Vec<&'static str> {
     let Ok(effective) = caps::read(None, CapSet::Effective) else {
         return Vec::new();
     };
+    lacking_for_probes(&effective)
+}
+
+/// Likewise, of a process with these effective capabilities.
+pub(crate) fn lacking_for_probes(effective: &CapsHashSet) -> Vec<&'static str> {
     let needed = PROBES.iter().filter(|(one, _)| !effective.contains(one));
     needed.map(|(_, name)| *name).collect()
 }

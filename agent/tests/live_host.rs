@@ -11,7 +11,8 @@ mod harness;
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
@@ -120,8 +121,11 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
 #[test]
 fn who_receives_is_named_by_process_and_control_group() -> Result<()> {
     let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let socket = directory.path().join("api.sock");
     let configuration = format!(
-        "watch: [{{topic: /imu, per_subscriber: true}}]\n{}",
+        "watch: [{{topic: /imu, per_subscriber: true}}]\napi: {{socket: {}}}\n{}",
+        socket.display(),
         at_the_sockets_of(&host)
     );
     let observed = Observed::start(&host, &configuration)?;
@@ -142,6 +146,42 @@ fn who_receives_is_named_by_process_and_control_group() -> Result<()> {
         ("cgroup", &cgroup),
     ];
     observed.wait(|page| page.value("ros2_subscriber_info", &expected) == Some(1.0))?;
+    the_doctor_finds_them(&host, &socket, subscriber.process.pid())
+}
+
+/// What `rp doctor` says of a host with an agent and two nodes.
+fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Result<()> {
+    let [program, arguments @ ..] = &host.outside();
+    let output = Command::new(program)
+        .args(arguments)
+        .args([env!("CARGO_BIN_EXE_rp"), "doctor", "--json", "--socket"])
+        .arg(socket)
+        .output()?;
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout)
+        .with_context(|| String::from_utf8_lossy(&output.stderr).into_owned())?;
+    let find = |area: &str, check: &str| {
+        let mut findings = report["findings"].as_array().into_iter().flatten();
+        let found = findings.find(|each| each["area"] == area && each["check"] == check);
+        found.with_context(|| format!("no {area} {check} in {report:#}"))
+    };
+    for (area, check) in [
+        ("agent", "ready"),
+        ("sight", "source"),
+        ("kernel", "version"),
+        ("interfaces", "looked_at"),
+        ("graph", "participants"),
+    ] {
+        assert_eq!(find(area, check)?["verdict"], "ok", "{report:#}");
+    }
+    let participants = find("graph", "participants")?["sentence"].as_str();
+    let seen = participants.is_some_and(|said| said.starts_with("2 participants, "));
+    assert!(seen, "{participants:?}");
+    // Others of this machine may be among them.
+    let processes = find("processes", "processes")?.to_string();
+    assert!(
+        processes.contains(&format!("({subscriber}): domain 0, Cyclone DDS")),
+        "{processes}"
+    );
     Ok(())
 }
 

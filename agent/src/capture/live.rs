@@ -522,7 +522,7 @@ fn open_wires(
 }
 
 /// An error and its causes in one line; of a verifier's log, the first line.
-pub(super) fn in_words(error: &dyn Error) -> String {
+pub(crate) fn in_words(error: &dyn Error) -> String {
     let mut words = String::new();
     let mut cause = Some(error);
     while let Some(error) = cause {

@@ -2,6 +2,7 @@
 //! the answer put into words, and prints; it decides nothing else.
 
 mod discover;
+mod doctor;
 mod interrupt;
 mod output;
 mod rates;
@@ -52,6 +53,8 @@ pub(crate) enum Command {
 pub(crate) enum Question {
     /// What topics there are and what comes by them, as `ros2 topic` says
     Topic(topic::Topic),
+    /// Say what this host will show and what not, and what to do about it
+    Doctor(doctor::Doctor),
 }
 
 impl Question {
@@ -62,6 +65,7 @@ impl Question {
         }
         match self {
             Self::Topic(topic) => topic.ask(),
+            Self::Doctor(doctor) => doctor.ask(),
         }
     }
 
@@ -69,6 +73,7 @@ impl Question {
     fn interrupted(&self) -> Option<u8> {
         match self {
             Self::Topic(topic) => Some(topic.interrupted()),
+            Self::Doctor(_) => Some(interrupt::INTERRUPTED),
         }
     }
 }

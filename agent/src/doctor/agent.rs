@@ -1,0 +1,466 @@
+//! The agent itself: whether it answers, sees, loses nothing and keeps what it knows; where none
+//! runs, what would keep it from starting.
+
+use std::fs;
+use std::net::SocketAddr;
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
+use std::path::Path;
+
+use super::answers::{Answers, Health};
+use super::finding::{Area, Finding, Verdict};
+use super::host::Host;
+use super::privileges::is_installed;
+use crate::config::{Config, StateChoice};
+
+const AREA: Area = Area::Agent;
+const FROM: &str = "GET /health";
+/// Where the package puts what is kept.
+const STATE: &str = "/var/lib/ros2probe";
+const SOCKETS: [&str; 2] = ["/proc/net/tcp", "/proc/net/tcp6"];
+/// State of a listening socket in those files.
+const LISTENING: &str = "0A";
+/// Bytes of those files that are read.
+const MAX_SOCKETS: u64 = 8 << 20;
+/// Watches that are named.
+const NAMED: usize = 5;
+
+/// One that answers.
+#[must_use]
+pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> {
+    let health = &answers.health;
+    let mut findings = vec![running(health, place), version(health, own_version)];
+    findings.extend(losses(health));
+    findings.extend(evictions(health));
+    findings.push(watches(answers));
+    if health.source != "replay" {
+        findings.push(kept(health));
+    }
+    findings
+}
+
+/// None that answers, for this reason.
+#[must_use]
+pub fn absent(host: &Host, config: &Config, reason: &str, is_denied: bool) -> Vec<Finding> {
+    let finding = if is_denied {
+        let sentence = "an agent runs, and this user may not ask it";
+        Finding::new(AREA, "reachable", Verdict::Unknown, sentence)
+            .seen(reason, "connect(2)")
+            .remedy("sudo rp doctor    # or: sudo usermod -aG ros2probe $USER, and log in again")
+    } else {
+        let sentence = "no agent answers: nothing is observed, and of the graph nothing is known";
+        Finding::new(AREA, "reachable", Verdict::Warning, sentence)
+            .seen(reason, "connect(2)")
+            .remedy(match is_installed(host) {
+                true => "sudo systemctl start ros2probe    # or, in a terminal: sudo rp run",
+                false => "sudo rp run",
+            })
+    };
+    let mut findings = vec![finding];
+    if !is_denied {
+        findings.extend(ports(host, config));
+        findings.extend(state_directory(host, &config.state_directory));
+    }
+    findings
+}
+
+/// A configuration that an agent would not start with.
+#[must_use]
+pub fn misconfigured(path: &Path, mistakes: &str) -> Finding {
+    let first = mistakes.lines().next().unwrap_or_default();
+    let count = mistakes.lines().count();
+    let more = if count > 1 {
+        format!(" (and {} more)", count - 1)
+    } else {
+        String::new()
+    };
+    let sentence = format!("the configuration is wrong: {first}{more}");
+    let finding = Finding::new(AREA, "configuration", Verdict::Problem, sentence);
+    let finding = finding.seen(mistakes, path.display().to_string());
+    finding.remedy("rp check-config    # says all of it")
+}
+
+fn running(health: &Health, place: &str) -> Finding {
+    let since = health
+        .uptime_seconds
+        .map_or_else(String::new, |up| format!(", up {}", duration(up)));
+    let finding = if health.ready {
+        let sentence = format!("an agent answers and sees{since}");
+        Finding::new(AREA, "ready", Verdict::Ok, sentence).seen("true", format!("{FROM} ready"))
+    } else {
+        let reason = health.reason.as_deref().unwrap_or("it does not say why");
+        let sentence = format!("an agent answers and does not see: {reason}");
+        Finding::new(AREA, "ready", Verdict::Problem, sentence)
+            .seen(reason, format!("{FROM} reason"))
+            .remedy("journalctl -u ros2probe -e")
+    };
+    finding.seen(place, "this connection")
+}
+
+fn version(health: &Health, own: &str) -> Finding {
+    let finding = if health.version == own {
+        Finding::new(
+            AREA,
+            "version",
+            Verdict::Ok,
+            format!("version {own}, as this rp"),
+        )
+    } else {
+        let sentence = format!(
+            "the agent is of version {}, this rp of {own}",
+            health.version
+        );
+        Finding::new(AREA, "version", Verdict::Note, sentence)
+            .remedy("sudo systemctl restart ros2probe    # runs what is installed now")
+    };
+    finding.seen(&health.version, format!("{FROM} version"))
+}
+
+fn losses(health: &Health) -> Vec<Finding> {
+    let rings = [
+        (
+            health.dropped_packets,
+            "packets",
+            "dropped_packets",
+            "ring_bytes",
+        ),
+        (
+            health.dropped_datagrams,
+            "captured datagrams",
+            "dropped_datagrams",
+            "ring_bytes",
+        ),
+        (
+            health.dropped_records,
+            "records",
+            "dropped_records",
+            "record_ring_bytes",
+        ),
+    ];
+    let lossy = rings.iter().filter(|(count, ..)| *count > 0);
+    let mut findings: Vec<_> = lossy
+        .map(|(count, what, check, ring)| {
+            let sentence =
+                format!("{count} {what} were lost in a full ring: counts are lower bounds");
+            Finding::new(AREA, check, Verdict::Warning, sentence)
+                .seen(count.to_string(), format!("{FROM} {check}"))
+                .remedy(format!(
+                    "capture: {{{ring}: BYTES}}    # twice what it is, and more CPU for the agent"
+                ))
+        })
+        .collect();
+    if findings.is_empty() {
+        let finding = Finding::new(
+            AREA,
+            "losses",
+            Verdict::Ok,
+            "it lost no packet and no record",
+        );
+        findings.push(finding.seen("0", format!("{FROM} dropped_*")));
+    }
+    findings
+}
+
+fn evictions(health: &Health) -> Vec<Finding> {
+    let full = health.tables.iter().filter(|table| table.evictions > 0);
+    let mut findings: Vec<_> = full
+        .map(|table| {
+            let sentence = format!(
+                "its table of {} was full at {}: {} entries were given up",
+                table.table, table.limit, table.evictions
+            );
+            Finding::new(AREA, "evictions", Verdict::Warning, sentence)
+                .seen(
+                    table.evictions.to_string(),
+                    format!("{FROM} tables {}", table.table),
+                )
+                .remedy(
+                    "limits: {...}    # raise that one; a storm of forged writers does this too",
+                )
+        })
+        .collect();
+    if health.topics_rejected > 0 {
+        let sentence = format!(
+            "{} watched topics are beyond limits.topics and not measured",
+            health.topics_rejected
+        );
+        let finding = Finding::new(AREA, "topics_rejected", Verdict::Warning, sentence);
+        let finding = finding.seen(
+            health.topics_rejected.to_string(),
+            format!("{FROM} topics_rejected"),
+        );
+        findings.push(finding.remedy("limits: {topics: N}    # or fewer watches"));
+    }
+    findings
+}
+
+fn watches(answers: &Answers) -> Finding {
+    let watches = &answers.watches.watches;
+    let say = |verdict, sentence: String| {
+        let finding = Finding::new(AREA, "watches", verdict, sentence);
+        finding.seen(watches.len().to_string(), "GET /watch")
+    };
+    if watches.is_empty() {
+        let sentence = "nothing is watched: the graph is known, no topic is measured";
+        return say(Verdict::Note, sentence.to_owned())
+            .remedy("watch: ['/**']    # or: curl -X POST localhost:17401/watch/TOPIC");
+    }
+    let idle: Vec<_> = watches
+        .iter()
+        .filter(|watch| watch.state == "waiting")
+        .map(|watch| watch.topic.as_str())
+        .collect();
+    match idle.len() {
+        0 => say(
+            Verdict::Ok,
+            format!("{} watches, each with a topic", watches.len()),
+        ),
+        count => {
+            let named: Vec<_> = idle.iter().take(NAMED).copied().collect();
+            let more = match count.saturating_sub(NAMED) {
+                0 => String::new(),
+                more => format!(" and {more} more"),
+            };
+            let sentence = format!("no topic yet for the watches {}{more}", named.join(", "));
+            say(Verdict::Note, sentence).remedy("rp topic list    # is it called so?")
+        }
+    }
+}
+
+fn kept(health: &Health) -> Finding {
+    let finding = if health.watches_kept {
+        let sentence = "what it knows outlives a restart";
+        Finding::new(AREA, "state", Verdict::Ok, sentence)
+    } else {
+        let sentence = "it has no state directory that it can write: a restart loses names and added \
+                        watches";
+        Finding::new(AREA, "state", Verdict::Warning, sentence)
+            .remedy("sudo mkdir -p /var/lib/ros2probe    # or the unit's StateDirectory=ros2probe")
+    };
+    finding.seen(
+        health.watches_kept.to_string(),
+        format!("{FROM} watches_kept"),
+    )
+}
+
+/// Listeners that an agent would find taken.
+fn ports(host: &Host, config: &Config) -> Vec<Finding> {
+    let wanted = [
+        ("metrics.listen", config.metrics.listen),
+        ("api.listen", config.api.listen),
+    ];
+    let taken = listening(host);
+    let wanted = wanted
+        .into_iter()
+        .filter_map(|(key, address)| Some((key, address?)));
+    wanted
+        .filter(|(_, address)| taken.contains(&address.port()))
+        .map(|(key, address)| busy(key, address))
+        .collect()
+}
+
+fn busy(key: &str, address: SocketAddr) -> Finding {
+    let port = address.port();
+    let sentence = format!("somebody else listens on port {port}: an agent would not start");
+    let finding = Finding::new(AREA, "ports", Verdict::Problem, sentence);
+    let finding = finding.seen(port.to_string(), SOCKETS.join(", "));
+    finding
+        .remedy(format!("sudo ss -ltnp 'sport = :{port}'    # who"))
+        .remedy(format!(
+            "{}    # another one",
+            key.replace('.', ": {") + ": 127.0.0.1:PORT}"
+        ))
+}
+
+fn listening(host: &Host) -> Vec<u16> {
+    let mut ports = Vec::new();
+    for path in SOCKETS {
+        let bytes = host.files.bytes(path, MAX_SOCKETS).unwrap_or_default();
+        let text = String::from_utf8_lossy(&bytes);
+        ports.extend(text.lines().skip(1).filter_map(|line| {
+            // Number, local address and port in hexadecimal, remote ones, state.
+            let mut fields = line.split_whitespace();
+            let (_, port) = fields.nth(1)?.rsplit_once(':')?;
+            (fields.nth(1)? == LISTENING).then(|| u16::from_str_radix(port, 16).ok())?
+        }));
+    }
+    ports
+}
+
+/// Whether an agent could write where it keeps what it knows.
+fn state_directory(host: &Host, choice: &StateChoice) -> Option<Finding> {
+    let path = match choice {
+        StateChoice::Off => return None,
+        StateChoice::At(path) => path.display().to_string(),
+        StateChoice::Auto => STATE.to_owned(),
+    };
+    let say = |verdict, sentence: String| Finding::new(AREA, "state", verdict, sentence);
+    let finding = match fs::metadata(host.files.path(&path)) {
+        Ok(directory) if !directory.is_dir() => say(
+            Verdict::Problem,
+            format!("{path} is no directory: an agent cannot keep what it knows"),
+        )
+        .remedy(format!(
+            "state_directory: {path}    # must name a directory"
+        )),
+        Ok(directory) => {
+            let is_mine = host.is_root() || directory.uid() == host.user_id;
+            let mode = directory.permissions().mode() & 0o7777;
+            let say = match is_mine || mode & 0o002 != 0 {
+                true => say(
+                    Verdict::Ok,
+                    format!("{path} is there to keep what an agent knows"),
+                ),
+                false => say(
+                    Verdict::Note,
+                    format!("an agent of this user could not keep what it knows in {path}"),
+                )
+                .remedy("sudo rp run    # or the service"),
+            };
+            say.seen(format!("mode {mode:o}, user {}", directory.uid()), &path)
+        }
+        Err(error) => say(
+            Verdict::Note,
+            format!("{path} is not there: an agent started by hand keeps nothing over a restart"),
+        )
+        .seen(error.to_string(), &path)
+        .remedy(format!(
+            "sudo mkdir -p {path}    # the service makes its own"
+        )),
+    };
+    Some(finding)
+}
+
+/// Whole seconds, minutes, hours or days.
+fn duration(seconds: f64) -> String {
+    match seconds {
+        seconds if seconds < 120.0 => format!("{seconds:.0} s"),
+        seconds if seconds < 7_200.0 => format!("{:.0} min", seconds / 60.0),
+        seconds if seconds < 172_800.0 => format!("{:.0} h", seconds / 3_600.0),
+        seconds => format!("{:.0} days", seconds / 86_400.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::host::tests::host;
+    use super::*;
+
+    fn answers(health: &str, watches: &str) -> Answers {
+        Answers {
+            health: serde_json::from_str(health).unwrap(),
+            watches: serde_json::from_str(watches).unwrap(),
+            ..Answers::default()
+        }
+    }
+
+    fn verdict(findings: &[Finding], check: &str) -> Option<Verdict> {
+        let found = findings.iter().find(|finding| finding.check == check);
+        found.map(|finding| finding.verdict)
+    }
+
+    const WELL: &str = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
+        "uptime_seconds":7300}"#;
+    const WATCHED: &str = r#"{"watches":[{"topic":"/a","state":"measuring"}]}"#;
+
+    #[test]
+    fn an_agent_that_is_well_is_fine_in_everything() {
+        let findings = check(&answers(WELL, WATCHED), "/run/api.sock", "1.0.0");
+        assert!(
+            findings.iter().all(|each| each.verdict == Verdict::Ok),
+            "{findings:?}"
+        );
+        assert!(
+            findings[0].sentence.ends_with("up 2 h"),
+            "{}",
+            findings[0].sentence
+        );
+    }
+
+    #[test]
+    fn what_is_wrong_with_an_agent_is_said_one_by_one() {
+        let ill = r#"{"ready":false,"reason":"no packet for 30 s","version":"0.9.0",
+            "source":"host","dropped_packets":5,"dropped_records":6,"topics_rejected":2,
+            "tables":[{"table":"endpoints","limit":10,"evictions":3},{"table":"nodes"}]}"#;
+        let watches = r#"{"watches":[{"topic":"/nobody","state":"waiting"}]}"#;
+        let findings = check(&answers(ill, watches), "here", "1.0.0");
+        for (check, expected) in [
+            ("ready", Verdict::Problem),
+            ("version", Verdict::Note),
+            ("dropped_packets", Verdict::Warning),
+            ("dropped_records", Verdict::Warning),
+            ("evictions", Verdict::Warning),
+            ("topics_rejected", Verdict::Warning),
+            ("watches", Verdict::Note),
+            ("state", Verdict::Warning),
+        ] {
+            assert_eq!(verdict(&findings, check), Some(expected), "{check}");
+        }
+        assert_eq!(verdict(&findings, "dropped_datagrams"), None);
+        assert_eq!(
+            findings
+                .iter()
+                .filter(|each| each.check == "evictions")
+                .count(),
+            1
+        );
+    }
+
+    #[test]
+    fn nothing_watched_is_a_note_with_the_command() {
+        let findings = check(&answers(WELL, "{}"), "here", "1.0.0");
+        assert_eq!(verdict(&findings, "watches"), Some(Verdict::Note));
+    }
+
+    #[test]
+    fn a_port_that_is_taken_keeps_an_agent_from_starting() {
+        let table = "  sl  local_address rem_address   st\n\
+            0: 0100007F:43F8 00000000:0000 0A 00000000:00000000\n\
+            1: 0100007F:43F9 00000000:0000 01 00000000:00000000\n";
+        let (_directory, host) = host(&[("/proc/net/tcp", table)]);
+        let findings = absent(&host, &Config::default(), "nobody", false);
+        let busy: Vec<_> = findings
+            .iter()
+            .filter(|each| each.check == "ports")
+            .collect();
+        assert_eq!(busy.len(), 1);
+        assert!(busy[0].sentence.contains("17400"), "{}", busy[0].sentence);
+        assert_eq!(
+            busy[0].remedies[1],
+            "metrics: {listen: 127.0.0.1:PORT}    # another one"
+        );
+        assert_eq!(verdict(&findings, "reachable"), Some(Verdict::Warning));
+    }
+
+    #[test]
+    fn an_agent_that_may_not_be_asked_is_unknown_and_nothing_else_is_guessed() {
+        let (_directory, host) = host(&[]);
+        let findings = absent(&host, &Config::default(), "permission denied", true);
+        assert_eq!(findings.len(), 1);
+        assert_eq!(findings[0].verdict, Verdict::Unknown);
+    }
+
+    #[test]
+    fn where_state_would_be_kept_is_looked_at() {
+        let (_directory, mut host) = host(&[("/var/lib/ros2probe/x", ""), ("/file", "")]);
+        let of =
+            |host: &Host, choice| state_directory(host, &choice).map(|finding| finding.verdict);
+        let at = |path: &str| StateChoice::At(path.into());
+        assert_eq!(of(&host, StateChoice::Off), None);
+        assert_eq!(of(&host, at("/nowhere")), Some(Verdict::Note));
+        assert_eq!(of(&host, at("/file")), Some(Verdict::Problem));
+        host.user_id = 0;
+        assert_eq!(of(&host, StateChoice::Auto), Some(Verdict::Ok));
+        host.user_id = 4_000_000;
+        assert_eq!(of(&host, StateChoice::Auto), Some(Verdict::Note));
+    }
+
+    #[test]
+    fn a_wrong_configuration_is_a_problem_with_its_first_mistake() {
+        let finding = misconfigured(Path::new("/etc/x.yaml"), "x:1: bad\nx:2: worse");
+        assert_eq!(finding.verdict, Verdict::Problem);
+        assert_eq!(
+            finding.sentence,
+            "the configuration is wrong: x:1: bad (and 1 more)"
+        );
+    }
+}

@@ -1,0 +1,431 @@
+//! Receive buffers of sockets and memory for IP reassembly, against the messages that were seen and
+//! those that died there.
+//!
+//! What is recommended is computed: two of the largest messages in a socket's buffer, for one is
+//! still being read when the next comes; sixteen in reassembly, where what lacks a fragment stays for
+//! as long as `ipfrag_time`. The kernel counts its own overhead, and gives twice what is asked for.
+
+use super::answers::{Answers, Measurement, Topic};
+use super::finding::{Area, Finding, Verdict};
+use super::host::{Files, Host, Unread};
+
+const AREA: Area = Area::Buffers;
+const RECEIVE_MAX: Sysctl = Sysctl("net.core.rmem_max");
+const RECEIVE_DEFAULT: Sysctl = Sysctl("net.core.rmem_default");
+const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
+    (
+        Sysctl("net.ipv4.ipfrag_high_thresh"),
+        Sysctl("net.ipv4.ipfrag_time"),
+    ),
+    (
+        Sysctl("net.ipv6.ip6frag_high_thresh"),
+        Sysctl("net.ipv6.ip6frag_time"),
+    ),
+];
+const MEBIBYTE: u64 = 1 << 20;
+/// Larger messages travel in several datagrams or in IP fragments.
+const LARGE: u64 = 64 << 10;
+/// Where no message was measured: what a camera or a lidar needs, in round numbers.
+const USUAL: u64 = 4 * MEBIBYTE;
+const MESSAGES_IN_BUFFER: u64 = 2;
+const MESSAGES_IN_REASSEMBLY: u64 = 16;
+/// Lost messages out of which somebody should do something today.
+const MANY: f64 = 0.01;
+/// Topics that are named.
+const NAMED: usize = 3;
+
+/// A kernel parameter.
+#[derive(Clone, Copy, Debug)]
+struct Sysctl(&'static str);
+
+/// The largest messages that were measured.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Largest {
+    bytes: u64,
+    topic: String,
+}
+
+/// All of it.
+#[must_use]
+pub fn check(host: &Host, answers: Option<&Answers>) -> Vec<Finding> {
+    let topics = answers.map_or(&[][..], |answers| &answers.topics.topics);
+    let largest = largest(topics);
+    let mut findings = vec![receive(&host.files, largest.as_ref())];
+    findings.extend(lost(
+        topics,
+        "socket_losses",
+        "in full socket buffers",
+        |topic| topic.received.map_or(0, |received| received.lost_in_socket_buffer_messages),
+        || {
+            let bytes = wanted(largest.as_ref(), MESSAGES_IN_BUFFER);
+            vec![
+                RECEIVE_DEFAULT.set(bytes),
+                RECEIVE_MAX.set(bytes),
+                format!("<Internal><SocketReceiveBufferSize min=\"{bytes}B\"/></Internal>    # Cyclone DDS, in CYCLONEDDS_URI"),
+            ]
+        },
+    ));
+    let is_large = largest
+        .as_ref()
+        .is_some_and(|largest| largest.bytes > LARGE);
+    findings.extend(reassembly(
+        &host.files,
+        largest.as_ref().filter(|_| is_large),
+    ));
+    findings.extend(lost(
+        topics,
+        "reassembly_losses",
+        "in IP reassembly, for want of a fragment",
+        |topic| {
+            topic
+                .received
+                .map_or(0, |received| received.lost_in_reassembly_messages)
+        },
+        || {
+            let [(memory, time), _] = REASSEMBLY;
+            vec![memory.set(128 * MEBIBYTE), time.set(3)]
+        },
+    ));
+    findings
+}
+
+/// By mean size: of what a topic carries, sizes differ little.
+fn largest(topics: &[Topic]) -> Option<Largest> {
+    let mean = |measured: &Measurement| measured.bytes.checked_div(measured.messages);
+    let of_topic = |topic: &Topic| {
+        let writers = topic
+            .publishers
+            .iter()
+            .filter_map(|each| each.measurement.as_ref());
+        let all = writers.chain(topic.measurement.as_ref());
+        all.filter_map(mean).max()
+    };
+    let sizes = topics
+        .iter()
+        .filter_map(|topic| Some((of_topic(topic)?, topic)));
+    let (bytes, topic) = sizes.max_by_key(|(bytes, _)| *bytes)?;
+    let topic = topic.name.clone();
+    Some(Largest { bytes, topic })
+}
+
+/// Room for so many messages, in whole mebibytes.
+fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
+    let bytes = largest.map_or(USUAL, |largest| largest.bytes);
+    bytes
+        .saturating_mul(messages)
+        .max(1)
+        .div_ceil(MEBIBYTE)
+        .saturating_mul(MEBIBYTE)
+}
+
+fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
+    let say = |verdict, sentence: String| Finding::new(AREA, "receive", verdict, sentence);
+    let (most, default) = (RECEIVE_MAX.read(files), RECEIVE_DEFAULT.read(files));
+    let finding = match &most {
+        Err(error) => {
+            let sentence =
+                format!("how large receive buffers of sockets may be is not known: {error}");
+            say(Verdict::Unknown, sentence)
+                .remedy("sysctl net.core.rmem_max    # on the host itself")
+        }
+        Ok(most) => {
+            let wanted = wanted(largest, MESSAGES_IN_BUFFER);
+            let (verdict, words) = match largest {
+                None if *most >= wanted => (
+                    Verdict::Ok,
+                    "enough for usual point clouds and images".to_owned(),
+                ),
+                None => (
+                    Verdict::Note,
+                    "point clouds and images of some MB need more".to_owned(),
+                ),
+                Some(largest) if *most >= largest.bytes.saturating_mul(MESSAGES_IN_BUFFER) => (
+                    Verdict::Ok,
+                    format!(
+                        "enough for two messages of {} ({})",
+                        largest.topic,
+                        size(largest.bytes)
+                    ),
+                ),
+                Some(largest) => (
+                    Verdict::Warning,
+                    format!(
+                        "two messages of {} ({} each) do not fit: a burst is lost at a busy subscriber",
+                        largest.topic,
+                        size(largest.bytes)
+                    ),
+                ),
+            };
+            let sentence = format!("a socket may buffer {}: {words}", size(*most));
+            let finding = say(verdict, sentence);
+            if verdict == Verdict::Ok {
+                finding
+            } else {
+                finding.remedy(RECEIVE_MAX.set(wanted)).remedy(format!(
+                    "{}    # Fast DDS takes the default, Cyclone DDS asks for 1 MiB",
+                    RECEIVE_DEFAULT.line(wanted)
+                ))
+            }
+        }
+    };
+    RECEIVE_DEFAULT.show(RECEIVE_MAX.show(finding, &most), &default)
+}
+
+fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    for (number, (memory, time)) in (0..).zip(REASSEMBLY) {
+        let (bytes, seconds) = (memory.read(files), time.read(files));
+        let check = if number == 0 {
+            "reassembly"
+        } else {
+            "reassembly_ipv6"
+        };
+        let say = |verdict, sentence: String| Finding::new(AREA, check, verdict, sentence);
+        let Ok(most) = bytes else {
+            // Without IPv6 there is none of it.
+            if number == 0 {
+                let sentence = "how much memory IP reassembly may take is not known".to_owned();
+                let finding =
+                    say(Verdict::Unknown, sentence).remedy(format!("sysctl {}", memory.0));
+                findings.push(memory.show(finding, &bytes));
+            }
+            continue;
+        };
+        let wanted = wanted(largest, MESSAGES_IN_REASSEMBLY);
+        let version = if number == 0 { "IPv4" } else { "IPv6" };
+        let finding = match largest {
+            Some(largest) if most < wanted => {
+                let sentence = format!(
+                    "reassembly of {version} may take {}: with lost fragments of messages as large \
+                     as those of {} ({}) it is full for {} s at a time",
+                    size(most),
+                    largest.topic,
+                    size(largest.bytes),
+                    seconds
+                        .as_ref()
+                        .map_or_else(|_| "30".to_owned(), u64::to_string),
+                );
+                say(
+                    if number == 0 {
+                        Verdict::Note
+                    } else {
+                        Verdict::Ok
+                    },
+                    sentence,
+                )
+                .remedy(memory.set(wanted))
+                .remedy(time.set(3))
+            }
+            _ => say(
+                Verdict::Ok,
+                format!("reassembly of {version} may take {}", size(most)),
+            ),
+        };
+        findings.push(time.show(memory.show(finding, &bytes), &seconds));
+    }
+    findings
+}
+
+/// Messages that died in one way.
+fn lost(
+    topics: &[Topic],
+    check: &'static str,
+    place: &str,
+    count: impl Fn(&Topic) -> u64,
+    remedies: impl Fn() -> Vec<String>,
+) -> Option<Finding> {
+    let mut lossy: Vec<_> = topics.iter().filter(|topic| count(topic) > 0).collect();
+    if lossy.is_empty() {
+        return None;
+    }
+    lossy.sort_by_key(|topic| std::cmp::Reverse(count(topic)));
+    let ratio = |topic: &Topic| {
+        let received = topic.received.map_or(0, |received| received.messages);
+        ratio(count(topic), received)
+    };
+    let worst = lossy.iter().map(|topic| ratio(topic)).fold(0.0, f64::max);
+    let verdict = if worst >= MANY {
+        Verdict::Problem
+    } else {
+        Verdict::Warning
+    };
+    let named: Vec<_> = lossy
+        .iter()
+        .take(NAMED)
+        .map(|topic| {
+            format!(
+                "{} {} ({:.1} %)",
+                topic.name,
+                count(topic),
+                100.0 * ratio(topic)
+            )
+        })
+        .collect();
+    let sum: u64 = lossy.iter().map(|topic| count(topic)).sum();
+    let sentence = format!("{sum} messages died {place}: {}", named.join(", "));
+    let mut finding = Finding::new(AREA, check, verdict, sentence);
+    finding = finding.seen(sum.to_string(), "GET /topics received");
+    finding.remedies = remedies();
+    Some(finding)
+}
+
+impl Sysctl {
+    fn path(self) -> String {
+        format!("/proc/sys/{}", self.0.replace('.', "/"))
+    }
+
+    fn read(self, files: &Files) -> Result<u64, Unread> {
+        files.number(&self.path())
+    }
+
+    fn line(self, value: u64) -> String {
+        format!("sudo sysctl -w {}={value}", self.0)
+    }
+
+    /// The command, and where its line has to stand to last.
+    fn set(self, value: u64) -> String {
+        format!(
+            "{}    # to last: /etc/sysctl.d/60-ros.conf",
+            self.line(value)
+        )
+    }
+
+    fn show(self, finding: Finding, value: &Result<u64, Unread>) -> Finding {
+        let value = match value {
+            Ok(value) => value.to_string(),
+            Err(error) => error.to_string(),
+        };
+        finding.seen(value, self.path())
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a ratio for people")]
+fn ratio(lost: u64, received: u64) -> f64 {
+    lost as f64 / lost.saturating_add(received).max(1) as f64
+}
+
+/// As people say it.
+#[expect(clippy::cast_precision_loss, reason = "a size for people")]
+fn size(bytes: u64) -> String {
+    let bytes = bytes as f64;
+    match bytes {
+        bytes if bytes < 1e3 => format!("{bytes:.0} B"),
+        bytes if bytes < 1e6 => format!("{:.0} KB", bytes / 1e3),
+        bytes if bytes < 1e9 => format!("{:.1} MB", bytes / 1e6),
+        bytes => format!("{:.1} GB", bytes / 1e9),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::host::tests::host;
+    use super::*;
+
+    const USUALLY: [(&str, &str); 6] = [
+        ("/proc/sys/net/core/rmem_max", "212992\n"),
+        ("/proc/sys/net/core/rmem_default", "212992\n"),
+        ("/proc/sys/net/ipv4/ipfrag_high_thresh", "4194304\n"),
+        ("/proc/sys/net/ipv4/ipfrag_time", "30\n"),
+        ("/proc/sys/net/ipv6/ip6frag_high_thresh", "4194304\n"),
+        ("/proc/sys/net/ipv6/ip6frag_time", "60\n"),
+    ];
+
+    fn found(files: &[(&str, &str)], topics: &str) -> Vec<Finding> {
+        let (_directory, host) = host(files);
+        let topics = serde_json::from_str(&format!(r#"{{"topics":[{topics}]}}"#)).unwrap();
+        let answers = Answers {
+            topics,
+            ..Answers::default()
+        };
+        check(&host, Some(&answers))
+    }
+
+    fn find<'a>(findings: &'a [Finding], check: &str) -> &'a Finding {
+        let found = findings.iter().find(|finding| finding.check == check);
+        found.unwrap_or_else(|| panic!("no {check} in {findings:?}"))
+    }
+
+    const CLOUD: &str = r#"{"name":"/points","measurement":{"messages":100,"bytes":272000000}}"#;
+
+    #[test]
+    fn what_a_point_cloud_takes_is_computed() {
+        let findings = found(&USUALLY, CLOUD);
+        let receive = find(&findings, "receive");
+        assert_eq!(receive.verdict, Verdict::Warning);
+        assert!(
+            receive.sentence.contains("/points (2.7 MB each)"),
+            "{}",
+            receive.sentence
+        );
+        // Twice 2.72 MB in whole mebibytes.
+        assert!(receive.remedies[0].starts_with("sudo sysctl -w net.core.rmem_max=6291456 "));
+        let reassembly = find(&findings, "reassembly");
+        assert_eq!(reassembly.verdict, Verdict::Note);
+        assert!(
+            reassembly.remedies[0].contains("ipfrag_high_thresh=44040192"),
+            "{:?}",
+            reassembly.remedies
+        );
+        let mut enough = USUALLY;
+        enough[0].1 = "8388608";
+        enough[2].1 = "134217728";
+        let findings = found(&enough, CLOUD);
+        assert_eq!(find(&findings, "receive").verdict, Verdict::Ok);
+        assert_eq!(find(&findings, "reassembly").verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn small_messages_need_nothing_and_unmeasured_ones_are_noted() {
+        let small =
+            r#"{"name":"/imu","publishers":[{"measurement":{"messages":10,"bytes":3200}}]}"#;
+        let findings = found(&USUALLY, small);
+        assert!(
+            findings.iter().all(|each| each.verdict == Verdict::Ok),
+            "{findings:?}"
+        );
+        let findings = found(&USUALLY, "");
+        assert_eq!(find(&findings, "receive").verdict, Verdict::Note);
+        assert!(find(&findings, "receive").remedies[0].contains("rmem_max=8388608"));
+    }
+
+    #[test]
+    fn what_died_in_a_buffer_is_a_warning_and_much_of_it_a_problem() {
+        let topic = |lost: u64| {
+            format!(
+                r#"{{"name":"/points","received":{{"messages":1000,
+                "lost_in_socket_buffer_messages":{lost},"lost_in_reassembly_messages":{lost}}}}}"#
+            )
+        };
+        let findings = found(&USUALLY, &topic(2));
+        assert_eq!(find(&findings, "socket_losses").verdict, Verdict::Warning);
+        let findings = found(&USUALLY, &topic(50));
+        let lost = find(&findings, "socket_losses");
+        assert_eq!(lost.verdict, Verdict::Problem);
+        assert!(
+            lost.sentence.contains("/points 50 (4.8 %)"),
+            "{}",
+            lost.sentence
+        );
+        assert!(
+            lost.remedies
+                .iter()
+                .any(|remedy| remedy.contains("SocketReceiveBufferSize"))
+        );
+        let lost = find(&findings, "reassembly_losses");
+        assert!(lost.remedies[1].contains("net.ipv4.ipfrag_time=3"));
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_unknown_with_the_command() {
+        let (_directory, host) = host(&[]);
+        let findings = check(&host, None);
+        assert_eq!(findings.len(), 2);
+        for finding in findings {
+            assert_eq!(finding.verdict, Verdict::Unknown);
+            assert!(
+                finding.remedies[0].starts_with("sysctl net."),
+                "{finding:?}"
+            );
+        }
+    }
+}

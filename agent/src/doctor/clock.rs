@@ -1,0 +1,145 @@
+//! The clock: whether times of this host may be compared with those of others.
+
+use super::finding::{Area, Finding, Verdict};
+use super::host::Host;
+
+const AREA: Area = Area::Clock;
+/// Who keeps clocks.
+const KEEPERS: [&str; 7] = [
+    "chronyd",
+    "ntpd",
+    "systemd-timesyn",
+    "ptp4l",
+    "phc2sys",
+    "ntpd-rs",
+    "openntpd",
+];
+/// Above this many microseconds latency between hosts says little.
+const COARSE: i64 = 10_000;
+
+/// All of it.
+#[must_use]
+pub fn check(host: &Host) -> Vec<Finding> {
+    let keepers = keepers(host);
+    let say = |verdict, sentence: String| Finding::new(AREA, "synchronised", verdict, sentence);
+    let kept = match keepers.as_slice() {
+        [] => "nobody that is known keeps it".to_owned(),
+        names => format!("kept by {}", names.join(", ")),
+    };
+    let finding = match &host.clock {
+        Err(error) => say(
+            Verdict::Unknown,
+            format!("the kernel does not tell whether the clock is synchronised; {kept}"),
+        )
+        .seen(error, "adjtimex(2)")
+        .remedy("timedatectl    # or: chronyc tracking"),
+        Ok(state) => {
+            let (estimated, maximum) = (
+                milliseconds(state.estimated_error),
+                milliseconds(state.maximum_error),
+            );
+            let finding = if !state.synchronised {
+                let sentence = format!(
+                    "the clock is not synchronised ({kept}): latency within this host is right, \
+                     between hosts it is wrong by as much as their clocks are apart"
+                );
+                say(Verdict::Warning, sentence).remedy(
+                    "sudo apt install chrony    # on every host; for microseconds: linuxptp",
+                )
+            } else if state.maximum_error > COARSE && state.estimated_error > COARSE {
+                let sentence = format!(
+                    "the clock is synchronised to {estimated} ms ({kept}): shorter latencies \
+                     between hosts say nothing"
+                );
+                say(Verdict::Note, sentence)
+                    .remedy("chronyc tracking    # or ptp, for microseconds")
+            } else {
+                let sentence = format!(
+                    "the clock is synchronised, estimated error {estimated} ms, at most {maximum} ms \
+                     ({kept})"
+                );
+                say(Verdict::Ok, sentence)
+            };
+            finding.seen(
+                format!(
+                    "synchronised {}, error {estimated} ms estimated, {maximum} ms at most",
+                    state.synchronised
+                ),
+                "adjtimex(2)",
+            )
+        }
+    };
+    vec![finding.seen(kept, "/proc/<pid>/comm")]
+}
+
+fn keepers(host: &Host) -> Vec<&'static str> {
+    let mut found: Vec<_> = host
+        .files
+        .processes()
+        .into_iter()
+        .filter_map(|id| {
+            let name = host.files.text(&format!("/proc/{id}/comm")).ok()?;
+            KEEPERS.into_iter().find(|keeper| *keeper == name)
+        })
+        .collect();
+    found.sort_unstable();
+    found.dedup();
+    found
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "microseconds to be read by people"
+)]
+fn milliseconds(microseconds: i64) -> String {
+    let milliseconds = microseconds as f64 / 1000.0;
+    if milliseconds < 10.0 {
+        format!("{milliseconds:.2}")
+    } else {
+        format!("{milliseconds:.0}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::host::ClockState;
+    use super::super::host::tests::host;
+    use super::*;
+
+    fn found(clock: Result<ClockState, String>) -> Finding {
+        let (_directory, mut host) =
+            host(&[("/proc/5/comm", "chronyd\n"), ("/proc/6/comm", "sshd\n")]);
+        host.clock = clock;
+        check(&host).remove(0)
+    }
+
+    fn state(synchronised: bool, estimated_error: i64, maximum_error: i64) -> ClockState {
+        ClockState {
+            synchronised,
+            estimated_error,
+            maximum_error,
+        }
+    }
+
+    #[test]
+    fn a_good_clock_is_said_with_its_error_and_its_keeper() {
+        let good = found(Ok(state(true, 120, 3_400)));
+        assert_eq!(good.verdict, Verdict::Ok);
+        assert_eq!(
+            good.sentence,
+            "the clock is synchronised, estimated error 0.12 ms, at most 3.40 ms (kept by chronyd)"
+        );
+    }
+
+    #[test]
+    fn a_coarse_a_free_and_an_unknown_clock_are_told_apart() {
+        assert_eq!(
+            found(Ok(state(true, 50_000, 90_000))).verdict,
+            Verdict::Note
+        );
+        assert_eq!(found(Ok(state(false, 0, 0))).verdict, Verdict::Warning);
+        let unknown = found(Err("not permitted".to_owned()));
+        assert_eq!(unknown.verdict, Verdict::Unknown);
+        assert!(!unknown.remedies.is_empty());
+    }
+}

@@ -1,0 +1,147 @@
+//! What a check says: one sentence, what it rests on, what to do. Nothing here looks at anything.
+
+use serde::Serialize;
+
+/// How one thing is, from good to bad.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// As it should be.
+    Ok,
+    /// Good to know: what will not be shown, and by what choice.
+    Note,
+    /// It could not be looked at.
+    Unknown,
+    /// It costs something: an answer will be wrong or missing.
+    Warning,
+    /// It is broken.
+    Problem,
+}
+
+/// What a check is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Area {
+    /// The agent itself.
+    Agent,
+    /// What it can see here.
+    Sight,
+    /// What the kernel has.
+    Kernel,
+    /// What this shell and the agent may do.
+    Privileges,
+    /// Network interfaces.
+    Interfaces,
+    /// ROS variables of this shell.
+    Shell,
+    /// ROS processes of this host.
+    Processes,
+    /// What the agent found.
+    Graph,
+    /// Buffers of sockets and of IP reassembly.
+    Buffers,
+    /// The clock.
+    Clock,
+}
+
+/// The result of one check.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// What it is about.
+    pub area: Area,
+    /// The check's name, the same on every host.
+    pub check: &'static str,
+    /// How it is.
+    pub verdict: Verdict,
+    /// In plain words.
+    pub sentence: String,
+    /// What that rests on.
+    pub evidence: Vec<Evidence>,
+    /// What to do: commands and lines of the configuration, each by itself.
+    pub remedies: Vec<String>,
+}
+
+/// A value that was read.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Evidence {
+    /// The value, or why there is none.
+    pub value: String,
+    /// Where it was read: a file, a path of the control API, a system call.
+    pub from: String,
+}
+
+impl Area {
+    /// Its heading.
+    #[must_use]
+    pub const fn title(self) -> &'static str {
+        match self {
+            Self::Agent => "Agent",
+            Self::Sight => "What it sees",
+            Self::Kernel => "Kernel",
+            Self::Privileges => "Privileges",
+            Self::Interfaces => "Interfaces",
+            Self::Shell => "ROS in this shell",
+            Self::Processes => "ROS processes",
+            Self::Graph => "Graph",
+            Self::Buffers => "Buffers",
+            Self::Clock => "Clock",
+        }
+    }
+}
+
+impl Verdict {
+    /// All, from bad to good.
+    pub const ALL: [Self; 5] = [
+        Self::Problem,
+        Self::Warning,
+        Self::Unknown,
+        Self::Note,
+        Self::Ok,
+    ];
+
+    /// As it is printed.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Note => "note",
+            Self::Unknown => "unknown",
+            Self::Warning => "warning",
+            Self::Problem => "problem",
+        }
+    }
+}
+
+impl Finding {
+    /// Without evidence and remedies so far.
+    pub fn new(
+        area: Area,
+        check: &'static str,
+        verdict: Verdict,
+        sentence: impl Into<String>,
+    ) -> Self {
+        Self {
+            area,
+            check,
+            verdict,
+            sentence: sentence.into(),
+            evidence: Vec::new(),
+            remedies: Vec::new(),
+        }
+    }
+
+    /// Rests on this too.
+    #[must_use]
+    pub fn seen(mut self, value: impl Into<String>, from: impl Into<String>) -> Self {
+        let (value, from) = (value.into(), from.into());
+        self.evidence.push(Evidence { value, from });
+        self
+    }
+
+    /// This helps.
+    #[must_use]
+    pub fn remedy(mut self, remedy: impl Into<String>) -> Self {
+        self.remedies.push(remedy.into());
+        self
+    }
+}

@@ -1,0 +1,407 @@
+//! What the agent found, as far as it bears on what it can show: who is there, whose names are
+//! lacking, and which topics go by ways that nobody, or nobody whole, can see.
+
+use std::collections::BTreeMap;
+
+use super::answers::{Answers, Participant, Topic};
+use super::finding::{Area, Finding, Verdict};
+
+const AREA: Area = Area::Graph;
+/// Topics that are named.
+const NAMED: usize = 3;
+
+/// All of it. `processes`: how many ROS processes were found on the agent's host, where that was
+/// looked at.
+#[must_use]
+pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
+    let participants = &answers.participants.participants;
+    let mut findings = vec![overview(
+        participants,
+        processes,
+        answers.topics.topics.len(),
+    )];
+    findings.extend(names(participants));
+    findings.extend(restored(participants));
+    findings.extend(unknown_writers(answers));
+    findings.extend(secured(participants));
+    findings.extend(aside(answers));
+    findings.extend(mismatches(&answers.topics.topics));
+    findings
+}
+
+fn overview(participants: &[Participant], processes: Option<usize>, topics: usize) -> Finding {
+    let say = |verdict, sentence: String| {
+        let finding = Finding::new(AREA, "participants", verdict, sentence);
+        finding.seen(participants.len().to_string(), "GET /participants")
+    };
+    if participants.is_empty() {
+        return match processes {
+            Some(count @ 1..) => say(
+                Verdict::Problem,
+                format!("the agent sees no participant, though {count} ROS processes run here"),
+            )
+            .remedy(
+                "rp doctor --verbose    # source, control group and interfaces above; RMW below",
+            ),
+            _ => say(
+                Verdict::Note,
+                "the agent sees no participant: nothing speaks DDS".to_owned(),
+            ),
+        };
+    }
+    let mut domains: BTreeMap<u32, BTreeMap<&str, usize>> = BTreeMap::new();
+    for participant in participants {
+        let vendors = domains.entry(participant.domain_id).or_default();
+        *vendors.entry(&participant.vendor).or_default() += 1;
+    }
+    let domains: Vec<_> = domains
+        .iter()
+        .map(|(domain, vendors)| {
+            let vendors: Vec<_> = vendors
+                .iter()
+                .map(|(vendor, count)| format!("{count} {vendor}"))
+                .collect();
+            format!("domain {domain}: {}", vendors.join(", "))
+        })
+        .collect();
+    say(
+        Verdict::Ok,
+        format!(
+            "{}, {}; {}",
+            many(participants.len(), "participant"),
+            many(topics, "topic"),
+            domains.join("; ")
+        ),
+    )
+}
+
+/// Those that were there before the agent.
+fn names(participants: &[Participant]) -> Option<Finding> {
+    let is_nameless = |each: &&Participant| {
+        let has_nothing = each.writers == 0 && each.readers == 0;
+        !each.secured && (has_nothing || each.enclave.is_some() && each.nodes.is_empty())
+    };
+    let count = participants.iter().filter(is_nameless).count();
+    if count == 0 {
+        return None;
+    }
+    let sentence = format!(
+        "of {} neither topics nor nodes, or no nodes, are known: that is said once, and the agent \
+         started later",
+        many(count, "participant")
+    );
+    let finding = Finding::new(AREA, "names", Verdict::Warning, sentence);
+    let finding = finding.seen(count.to_string(), "GET /participants");
+    Some(finding.remedy(
+        "sudo rp discover --all --dry-run    # then without --dry-run: a few packets to each",
+    ))
+}
+
+fn restored(participants: &[Participant]) -> Option<Finding> {
+    let count = participants.iter().filter(|each| each.restored).count();
+    if count == 0 {
+        return None;
+    }
+    let sentence = format!(
+        "{} known from before the agent's start and not heard since; gone when the lease ends",
+        many(count, "participant")
+    );
+    let finding = Finding::new(AREA, "restored", Verdict::Note, sentence);
+    Some(finding.seen(count.to_string(), "GET /participants"))
+}
+
+fn unknown_writers(answers: &Answers) -> Option<Finding> {
+    let writers = &answers.participants.unknown_writers;
+    let first = writers.first()?;
+    let sentence = format!(
+        "{} without a known announcement: the topic is not known, only that something is sent",
+        match writers.len() {
+            1 => "1 writer sends".to_owned(),
+            count => format!("{count} writers send"),
+        }
+    );
+    let finding = Finding::new(AREA, "unknown_writers", Verdict::Warning, sentence);
+    let finding = finding.seen(
+        format!("{}: {}", writers.len(), first.guid),
+        "GET /participants",
+    );
+    Some(finding.remedy("sudo rp discover --all    # asks their participants to repeat it"))
+}
+
+fn secured(participants: &[Participant]) -> Option<Finding> {
+    let count = participants.iter().filter(|each| each.secured).count();
+    if count == 0 {
+        return None;
+    }
+    let sentence = format!(
+        "{} with DDS security: what is encrypted stays unseen, and so are their topics and nodes \
+         where discovery is",
+        many(count, "participant")
+    );
+    let finding = Finding::new(AREA, "secured", Verdict::Note, sentence);
+    let finding = finding.seen(count.to_string(), "GET /participants secured");
+    Some(
+        finding
+            .remedy("discovery_protection_kind: NONE    # in the governance file, to see topics"),
+    )
+}
+
+/// Topics of which no pair of endpoints uses the network.
+fn aside(answers: &Answers) -> Vec<Finding> {
+    let able = |ability: &str| {
+        let mut abilities = answers.health.abilities.iter();
+        abilities.any(|each| each.able && each.ability == ability)
+    };
+    let of = |way: &str| -> Vec<&Topic> {
+        let topics = answers.topics.topics.iter();
+        topics
+            .filter(|topic| !topic.vanished && way_aside(topic) == Some(way))
+            .collect()
+    };
+    let mut findings = Vec::new();
+    let mut say = |check, verdict, topics: &[&Topic], words: &str, remedy: Option<&str>| {
+        if topics.is_empty() {
+            return;
+        }
+        let sentence = format!(
+            "{} {words}: {}",
+            many(topics.len(), "topic"),
+            listed(topics)
+        );
+        let finding = Finding::new(AREA, check, verdict, sentence);
+        let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
+        findings.push(match remedy {
+            Some(remedy) => finding.remedy(remedy),
+            None => finding,
+        });
+    };
+    let shared = of("shared_memory");
+    if able("shared_memory_exact") {
+        let words = "by Fast DDS's shared memory only, each message seen";
+        say("shared_memory", Verdict::Ok, &shared, words, None);
+    } else if able("shared_memory") {
+        let words = "by Fast DDS's shared memory only, where samples are seen";
+        let remedy = "capture: {shm: {exact: uprobe}}    # every message; touches the senders";
+        say("shared_memory", Verdict::Note, &shared, words, Some(remedy));
+    } else {
+        let words = "by Fast DDS's shared memory only, which is not looked at";
+        let remedy = "capture: {shm: {mode: auto}}";
+        say(
+            "shared_memory",
+            Verdict::Warning,
+            &shared,
+            words,
+            Some(remedy),
+        );
+    }
+    let words = "by Fast DDS's data sharing only, which nobody can see";
+    let remedy =
+        "<data_sharing><kind>OFF</kind></data_sharing>    # in the profile of writer or reader";
+    say(
+        "data_sharing",
+        Verdict::Warning,
+        &of("data_sharing"),
+        words,
+        Some(remedy),
+    );
+    let words = "by iceoryx only, which nobody can see";
+    let remedy = "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI";
+    say(
+        "iceoryx",
+        Verdict::Warning,
+        &of("iceoryx"),
+        words,
+        Some(remedy),
+    );
+    let words = "within one process only, which nobody can see";
+    say(
+        "same_process",
+        Verdict::Note,
+        &of("same_process"),
+        words,
+        None,
+    );
+    findings
+}
+
+/// The way that most pairs use, where none uses the network.
+fn way_aside(topic: &Topic) -> Option<&str> {
+    if topic
+        .passages
+        .iter()
+        .any(|passage| passage.passage == "network")
+    {
+        return None;
+    }
+    let most = topic.passages.iter().max_by_key(|passage| passage.pairs)?;
+    Some(&most.passage)
+}
+
+/// Endpoints that should talk and do not.
+fn mismatches(topics: &[Topic]) -> Vec<Finding> {
+    const KINDS: [(&str, &str, &str); 3] = [
+        (
+            "qos_incompatible",
+            "with publishers and subscribers whose QoS do not fit",
+            "rp topic info --verbose TOPIC    # compare reliability and durability",
+        ),
+        (
+            "type_conflict",
+            "with several types, which do not talk",
+            "rp topic info --verbose TOPIC    # whose type is the wrong one",
+        ),
+        (
+            "type_hash_conflict",
+            "with several definitions of one type, which misread each other",
+            "build all nodes with the same version of the interface package",
+        ),
+    ];
+    let find = |(kind, words, remedy): (&'static str, &str, &str)| {
+        let has = |topic: &&Topic| topic.diagnoses.iter().any(|each| each.kind == kind);
+        let found: Vec<_> = topics.iter().filter(has).collect();
+        if found.is_empty() {
+            return None;
+        }
+        let sentence = format!("{} {words}: {}", many(found.len(), "topic"), listed(&found));
+        let finding = Finding::new(AREA, kind, Verdict::Warning, sentence);
+        let finding = finding.seen(found.len().to_string(), "GET /topics diagnoses");
+        Some(finding.remedy(remedy))
+    };
+    KINDS.into_iter().filter_map(find).collect()
+}
+
+fn listed(topics: &[&Topic]) -> String {
+    let names: Vec<_> = topics
+        .iter()
+        .take(NAMED)
+        .map(|topic| topic.name.as_str())
+        .collect();
+    let names = names.join(", ");
+    match topics.len().saturating_sub(NAMED) {
+        0 => names,
+        more => format!("{names} and {more} more"),
+    }
+}
+
+fn many(count: usize, what: &str) -> String {
+    match count {
+        1 => format!("1 {what}"),
+        _ => format!("{count} {what}s"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn answers(participants: &str, topics: &str, ability: &str) -> Answers {
+        let health = format!(r#"{{"abilities":[{{"ability":"{ability}","able":true}}]}}"#);
+        Answers {
+            health: serde_json::from_str(&health).unwrap(),
+            participants: serde_json::from_str(participants).unwrap(),
+            topics: serde_json::from_str(&format!(r#"{{"topics":[{topics}]}}"#)).unwrap(),
+            ..Answers::default()
+        }
+    }
+
+    fn verdict(findings: &[Finding], check: &str) -> Option<Verdict> {
+        let found = findings.iter().find(|finding| finding.check == check);
+        found.map(|finding| finding.verdict)
+    }
+
+    const WELL: &str = r#"{"participants":[
+        {"domain_id":0,"vendor":"eProsima Fast DDS","enclave":"/","nodes":["/a"],"writers":1},
+        {"domain_id":0,"vendor":"eProsima Fast DDS","enclave":"/","nodes":["/b"],"writers":1},
+        {"domain_id":7,"vendor":"Eclipse Cyclone DDS","readers":2}]}"#;
+
+    #[test]
+    fn a_graph_that_is_known_is_one_line() {
+        let findings = check(&answers(WELL, "", ""), None);
+        assert_eq!(findings.len(), 1);
+        assert_eq!(
+            findings[0].sentence,
+            "3 participants, 0 topics; domain 0: 2 eProsima Fast DDS; domain 7: 1 Eclipse Cyclone DDS"
+        );
+    }
+
+    #[test]
+    fn nobody_is_a_problem_only_where_somebody_should_be() {
+        let nobody = answers("{}", "", "");
+        assert_eq!(check(&nobody, None)[0].verdict, Verdict::Note);
+        assert_eq!(check(&nobody, Some(0))[0].verdict, Verdict::Note);
+        assert_eq!(check(&nobody, Some(2))[0].verdict, Verdict::Problem);
+    }
+
+    #[test]
+    fn what_the_agent_came_too_late_for_is_said_with_the_command() {
+        let late = r#"{"participants":[
+            {"enclave":"/","nodes":[],"writers":3},
+            {"enclave":"/","nodes":["/a"],"writers":3,"restored":true},
+            {"secured":true}],
+            "unknown_writers":[{"guid":"0102"}]}"#;
+        let findings = check(&answers(late, "", ""), None);
+        let names = findings.iter().find(|each| each.check == "names").unwrap();
+        assert!(
+            names.sentence.starts_with("of 1 participant "),
+            "{}",
+            names.sentence
+        );
+        assert!(names.remedies[0].starts_with("sudo rp discover --all"));
+        assert_eq!(verdict(&findings, "restored"), Some(Verdict::Note));
+        assert_eq!(
+            verdict(&findings, "unknown_writers"),
+            Some(Verdict::Warning)
+        );
+        assert_eq!(verdict(&findings, "secured"), Some(Verdict::Note));
+    }
+
+    #[test]
+    fn topics_beside_the_network_are_told_by_their_way() {
+        let topic =
+            |name: &str, passages: &str| format!(r#"{{"name":"{name}","passages":[{passages}]}}"#);
+        let pairs = |way: &str| format!(r#"{{"passage":"{way}","pairs":2}}"#);
+        let of = |way: &str, ability: &str| {
+            check(&answers(WELL, &topic("/x", &pairs(way)), ability), None)
+        };
+        let way = "shared_memory";
+        assert_eq!(verdict(&of(way, ""), way), Some(Verdict::Warning));
+        assert_eq!(verdict(&of(way, "shared_memory"), way), Some(Verdict::Note));
+        assert_eq!(
+            verdict(&of(way, "shared_memory_exact"), way),
+            Some(Verdict::Ok)
+        );
+        assert_eq!(
+            verdict(&of("data_sharing", ""), "data_sharing"),
+            Some(Verdict::Warning)
+        );
+        assert_eq!(
+            verdict(&of("iceoryx", ""), "iceoryx"),
+            Some(Verdict::Warning)
+        );
+        assert_eq!(
+            verdict(&of("same_process", ""), "same_process"),
+            Some(Verdict::Note)
+        );
+        // One pair over the network is enough for the messages to be counted.
+        let both = format!("{},{}", pairs("network"), pairs("data_sharing"));
+        let findings = check(&answers(WELL, &topic("/x", &both), ""), None);
+        assert_eq!(findings.len(), 1);
+    }
+
+    #[test]
+    fn endpoints_that_do_not_fit_are_named_by_topic() {
+        let topics = r#"{"name":"/a","diagnoses":[{"kind":"qos_incompatible"},{"kind":"unheard_publisher"}]},
+            {"name":"/b","diagnoses":[{"kind":"qos_incompatible"}]},{"name":"/c"}"#;
+        let findings = check(&answers(WELL, topics, ""), None);
+        let finding = findings
+            .iter()
+            .find(|each| each.check == "qos_incompatible")
+            .unwrap();
+        assert!(
+            finding.sentence.ends_with("do not fit: /a, /b"),
+            "{}",
+            finding.sentence
+        );
+        assert_eq!(findings.len(), 2);
+    }
+}

@@ -1,0 +1,336 @@
+//! Network interfaces: what DDS can use them for, and which of them the agent looks at.
+
+use super::answers::Health;
+use super::finding::{Area, Finding, Verdict};
+use super::host::Host;
+
+const AREA: Area = Area::Interfaces;
+const PLACE: &str = "/sys/class/net";
+/// `man 7 netdevice`.
+const UP: u32 = 0x1;
+const LOOPBACK: u32 = 0x8;
+const MULTICAST: u32 = 0x1000;
+/// Interfaces that are listed by name; a host of containers has hundreds.
+const LISTED: usize = 6;
+/// Cyclone DDS's fragments with all headers: below this every one of them is fragmented once more.
+const SMALL_MTU: u32 = 1400;
+
+/// One of them.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Interface {
+    name: String,
+    flags: u32,
+    mtu: u32,
+    carrier: bool,
+}
+
+/// All of them. `localhost`: some ROS process is to talk to its own host only.
+#[must_use]
+pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Finding> {
+    let names = match host.files.names(PLACE) {
+        Ok(names) => names,
+        Err(error) => {
+            let sentence = "network interfaces are not known";
+            let finding = Finding::new(AREA, "interfaces", Verdict::Unknown, sentence);
+            return vec![finding.seen(error.to_string(), PLACE).remedy("ip link")];
+        }
+    };
+    let all: Vec<_> = names.iter().filter_map(|name| read(host, name)).collect();
+    let mut findings = vec![overview(&all)];
+    findings.extend(loopback(&all, localhost));
+    let used = || all.iter().filter(|each| each.is_used());
+    let mute: Vec<_> = used().filter(|each| each.flags & MULTICAST == 0).collect();
+    if !mute.is_empty() {
+        let names = list(&mute);
+        let sentence = format!(
+            "no multicast on {names}: participants behind it are found only where they are named \
+             (ROS_STATIC_PEERS, a discovery server)"
+        );
+        let mut finding = Finding::new(AREA, "multicast", Verdict::Warning, sentence);
+        for each in mute.iter().take(LISTED) {
+            finding = finding
+                .seen(
+                    format!("{:#x}", each.flags),
+                    format!("{PLACE}/{}/flags", each.name),
+                )
+                .remedy(format!("sudo ip link set {} multicast on", each.name));
+        }
+        findings.push(finding);
+    }
+    let small: Vec<_> = used().filter(|each| each.mtu < SMALL_MTU).collect();
+    if !small.is_empty() {
+        let sentence = format!(
+            "packets on {} are small: every datagram of a large message is cut into IP fragments, \
+             and one that is lost costs the message",
+            list(&small)
+        );
+        let mut finding = Finding::new(AREA, "mtu", Verdict::Note, sentence);
+        for each in small.iter().take(LISTED) {
+            let from = format!("{PLACE}/{}/mtu", each.name);
+            finding = finding.seen(each.mtu.to_string(), from);
+        }
+        let remedy =
+            "CYCLONEDDS_URI: General/FragmentSize, or in Fast DDS maxMessageSize, below the MTU";
+        findings.push(finding.remedy(remedy));
+    }
+    findings.extend(agent.map(looked_at));
+    findings
+}
+
+fn read(host: &Host, name: &str) -> Option<Interface> {
+    let flags = host.files.text(&format!("{PLACE}/{name}/flags")).ok()?;
+    let flags = u32::from_str_radix(flags.strip_prefix("0x")?, 16).ok()?;
+    let state = host.files.text(&format!("{PLACE}/{name}/operstate"));
+    Some(Interface {
+        name: name.to_owned(),
+        flags,
+        mtu: host
+            .files
+            .number(&format!("{PLACE}/{name}/mtu"))
+            .unwrap_or(0),
+        carrier: state.is_ok_and(|state| state != "down" && state != "lowerlayerdown"),
+    })
+}
+
+impl Interface {
+    fn is_up(&self) -> bool {
+        self.flags & UP != 0 && self.carrier
+    }
+
+    /// To reach others by.
+    fn is_used(&self) -> bool {
+        self.is_up() && self.flags & LOOPBACK == 0
+    }
+}
+
+fn overview(all: &[Interface]) -> Finding {
+    let say = |verdict, sentence: String| {
+        Finding::new(AREA, "interfaces", verdict, sentence).seen(all.len().to_string(), PLACE)
+    };
+    let used: Vec<_> = all.iter().filter(|each| each.is_used()).collect();
+    if used.is_empty() {
+        let sentence = "no interface but loopback is up: only this host's own nodes can be seen";
+        return say(Verdict::Note, sentence.to_owned()).remedy("ip link");
+    }
+    let named: Vec<_> = used
+        .iter()
+        .take(LISTED)
+        .map(|each| format!("{} (MTU {})", each.name, each.mtu))
+        .collect();
+    let more = used.len().saturating_sub(LISTED);
+    let more = if more > 0 {
+        format!(" and {more} more")
+    } else {
+        String::new()
+    };
+    let mut finding = say(Verdict::Ok, format!("up: {}{more}", named.join(", ")));
+    let down: Vec<_> = all.iter().filter(|each| !each.is_up()).collect();
+    if !down.is_empty() {
+        finding.sentence = format!("{}; down: {}", finding.sentence, list(&down));
+    }
+    finding
+}
+
+fn loopback(all: &[Interface], localhost: bool) -> Option<Finding> {
+    let loopback = all.iter().find(|each| each.flags & LOOPBACK != 0)?;
+    let say = |verdict, sentence: String| {
+        let from = format!("{PLACE}/{}/flags", loopback.name);
+        Finding::new(AREA, "loopback", verdict, sentence)
+            .seen(format!("{:#x}", loopback.flags), from)
+    };
+    let name = &loopback.name;
+    Some(if loopback.flags & UP == 0 {
+        let sentence = format!("{name} is down: nodes of this host that talk by it do not");
+        say(Verdict::Problem, sentence).remedy(format!("sudo ip link set {name} up"))
+    } else if loopback.flags & MULTICAST != 0 {
+        say(Verdict::Ok, format!("{name} is up, with multicast"))
+    } else if localhost {
+        let sentence = format!(
+            "{name} has no multicast, and nodes here are limited to it: some implementations \
+             (Cyclone DDS) then find each other only by the addresses they try in turn"
+        );
+        say(Verdict::Note, sentence).remedy(format!("sudo ip link set {name} multicast on"))
+    } else {
+        say(
+            Verdict::Ok,
+            format!("{name} is up, without multicast as usual"),
+        )
+    })
+}
+
+fn looked_at(agent: &Health) -> Finding {
+    let names: Vec<_> = agent
+        .interfaces
+        .iter()
+        .map(|each| each.interface.as_str())
+        .collect();
+    let sentence = match agent.source.as_str() {
+        "host"
+            if names
+                .iter()
+                .all(|name| matches!(*name, "sockets" | "processes")) =>
+        {
+            "the agent looks at the sockets, whatever interface they use".to_owned()
+        }
+        "host" => format!("the agent looks at the sockets and at {}", join(&names)),
+        _ if names.iter().all(|name| *name == "any") => {
+            "the agent looks at every interface, and had no RTPS packet so far".to_owned()
+        }
+        _ => format!("the agent had RTPS packets from {}", join(&names)),
+    };
+    let mut finding = Finding::new(AREA, "looked_at", Verdict::Ok, sentence);
+    for each in agent.interfaces.iter().take(LISTED) {
+        if let Some(packets) = each.packets {
+            let value = format!("{}: {packets} packets", each.interface);
+            finding = finding.seen(value, "GET /health interfaces");
+        }
+    }
+    finding
+}
+
+fn join(names: &[&str]) -> String {
+    let named = names
+        .iter()
+        .filter(|name| !matches!(**name, "sockets" | "any" | "processes"));
+    let named: Vec<_> = named.take(LISTED).copied().collect();
+    named.join(", ")
+}
+
+fn list(interfaces: &[&Interface]) -> String {
+    let mut names: Vec<_> = interfaces.iter().map(|each| each.name.as_str()).collect();
+    let more = names.len().saturating_sub(LISTED);
+    names.truncate(LISTED);
+    match more {
+        0 => names.join(", "),
+        more => format!("{} and {more} more", names.join(", ")),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::host::tests::host;
+    use super::*;
+
+    /// Name, flags, MTU, state.
+    fn found(interfaces: &[(&str, &str, &str, &str)], localhost: bool) -> Vec<Finding> {
+        let mut files = Vec::new();
+        for (name, flags, mtu, state) in interfaces {
+            for (file, text) in [("flags", flags), ("mtu", mtu), ("operstate", state)] {
+                files.push((format!("{PLACE}/{name}/{file}"), format!("{text}\n")));
+            }
+        }
+        let files: Vec<_> = files
+            .iter()
+            .map(|(path, text)| (path.as_str(), text.as_str()))
+            .collect();
+        let (_directory, host) = host(&files);
+        check(&host, None, localhost)
+    }
+
+    fn verdict(findings: &[Finding], check: &str) -> Option<Verdict> {
+        let found = findings.iter().find(|finding| finding.check == check);
+        found.map(|finding| finding.verdict)
+    }
+
+    const LO: (&str, &str, &str, &str) = ("lo", "0x9", "65536", "unknown");
+    const ETH: (&str, &str, &str, &str) = ("eth0", "0x1003", "1500", "up");
+
+    #[test]
+    fn an_ordinary_host_is_fine() {
+        let findings = found(&[LO, ETH, ("docker0", "0x1003", "1500", "down")], false);
+        assert!(
+            findings.iter().all(|each| each.verdict == Verdict::Ok),
+            "{findings:?}"
+        );
+        assert_eq!(findings[0].sentence, "up: eth0 (MTU 1500); down: docker0");
+    }
+
+    #[test]
+    fn what_multicast_does_not_reach_is_named_with_the_command() {
+        let findings = found(&[LO, ETH, ("tun0", "0x11", "1500", "unknown")], false);
+        let finding = findings
+            .iter()
+            .find(|each| each.check == "multicast")
+            .unwrap();
+        assert_eq!(finding.verdict, Verdict::Warning);
+        assert_eq!(finding.remedies, ["sudo ip link set tun0 multicast on"]);
+        assert_eq!(verdict(&found(&[LO, ETH], false), "multicast"), None);
+    }
+
+    #[test]
+    fn loopback_matters_to_those_who_are_limited_to_it() {
+        assert_eq!(
+            verdict(&found(&[LO, ETH], false), "loopback"),
+            Some(Verdict::Ok)
+        );
+        assert_eq!(
+            verdict(&found(&[LO, ETH], true), "loopback"),
+            Some(Verdict::Note)
+        );
+        let with = ("lo", "0x1009", "65536", "unknown");
+        assert_eq!(
+            verdict(&found(&[with, ETH], true), "loopback"),
+            Some(Verdict::Ok)
+        );
+        let down = ("lo", "0x8", "65536", "down");
+        assert_eq!(
+            verdict(&found(&[down, ETH], false), "loopback"),
+            Some(Verdict::Problem)
+        );
+    }
+
+    #[test]
+    fn a_host_alone_and_a_tunnel_of_small_packets_are_noted() {
+        assert_eq!(
+            verdict(&found(&[LO], false), "interfaces"),
+            Some(Verdict::Note)
+        );
+        let tunnel = ("wg0", "0x10d1", "1280", "unknown");
+        assert_eq!(
+            verdict(&found(&[LO, tunnel], false), "mtu"),
+            Some(Verdict::Note)
+        );
+        let (_directory, host) = host(&[]);
+        assert_eq!(
+            verdict(&check(&host, None, false), "interfaces"),
+            Some(Verdict::Unknown)
+        );
+    }
+
+    #[test]
+    fn where_the_agent_looks_is_said() {
+        let agent: Health = serde_json::from_str(
+            r#"{"source":"host","interfaces":[{"interface":"sockets","packets":7}]}"#,
+        )
+        .unwrap();
+        assert!(
+            looked_at(&agent)
+                .sentence
+                .contains("at the sockets, whatever")
+        );
+        let agent: Health = serde_json::from_str(
+            r#"{"source":"wire","interfaces":[{"interface":"any"},{"interface":"eth0","packets":7}]}"#,
+        )
+        .unwrap();
+        assert_eq!(
+            looked_at(&agent).sentence,
+            "the agent had RTPS packets from eth0"
+        );
+    }
+
+    #[test]
+    fn a_host_of_many_containers_gets_a_short_line() {
+        let names: Vec<String> = (0..300).map(|number| format!("veth{number:03}")).collect();
+        let all: Vec<_> = names
+            .iter()
+            .map(|name| (name.as_str(), "0x1003", "1500", "up"))
+            .collect();
+        let findings = found(&all, false);
+        assert!(
+            findings[0].sentence.ends_with("and 294 more"),
+            "{}",
+            findings[0].sentence
+        );
+        assert!(findings[0].sentence.len() < 200);
+    }
+}

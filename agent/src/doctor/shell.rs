@@ -1,0 +1,494 @@
+//! The ROS environment of this shell: what nodes and tools started from it will do, and what of that
+//! the agent cannot see.
+
+use super::finding::{Area, Finding, Verdict};
+use super::host::{Host, Unread};
+use super::variables::{Range, Variables};
+
+const AREA: Area = Area::Shell;
+const FROM: &str = "this shell";
+const PORTS: &str = "/proc/sys/net/ipv4/ip_local_port_range";
+/// RTPS 2.5, 9.6.2.3: ports of a domain begin here, so many apart.
+const PORT_BASE: u32 = 7400;
+const DOMAIN_GAIN: u32 = 250;
+/// How far from there those of fifty participants on one host reach: 11, and two for each.
+const PORTS_OF_FIFTY: u32 = 11 + 2 * 49;
+/// Bytes of a profile that are read.
+const MAX_PROFILE: u64 = 256 << 10;
+
+/// All of it.
+#[must_use]
+pub fn check(host: &Host) -> Vec<Finding> {
+    let variables = Variables::of(&host.environment);
+    if !variables.is_ros() {
+        return vec![none(host)];
+    }
+    let mut findings = vec![domain(host, &variables), implementation(&variables)];
+    findings.push(range(&variables));
+    findings.extend(server(&variables));
+    findings.extend(transports(&variables));
+    findings.extend(profiles(host, &variables));
+    findings.extend(cyclone(host, &variables));
+    findings.extend(security(&variables));
+    findings
+}
+
+fn none(host: &Host) -> Finding {
+    let is_sudo = host.environment.contains_key("SUDO_USER");
+    let finding = Finding::new(
+        AREA,
+        "environment",
+        Verdict::Note,
+        if is_sudo {
+            "no ROS variables: sudo does not pass them on, so the shell's own are not known"
+        } else {
+            "no ROS is set up in this shell, which the agent does not need"
+        },
+    );
+    let finding = finding.seen("none", FROM);
+    if is_sudo {
+        finding.remedy("sudo -E rp doctor")
+    } else {
+        finding.remedy(
+            "source /opt/ros/$ROS_DISTRO/setup.bash    # to compare this shell with the nodes",
+        )
+    }
+}
+
+fn domain(host: &Host, variables: &Variables) -> Finding {
+    let say = |verdict, sentence: String| Finding::new(AREA, "domain", verdict, sentence);
+    let shown = variables
+        .shown("ROS_DOMAIN_ID")
+        .unwrap_or_else(|| "not set".to_owned());
+    let finding = match variables.domain() {
+        Err(text) => say(
+            Verdict::Problem,
+            format!("`{text}` is no domain: nodes of this shell do not start"),
+        )
+        .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
+        Ok(domain) => match ephemeral(host) {
+            Some((first, last)) if overlaps(domain, first, last) => say(
+                Verdict::Warning,
+                format!(
+                    "the ports of domain {domain} are among those ({first} to {last}) that the \
+                     kernel gives to anybody: a node may find its port taken"
+                ),
+            )
+            .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
+            _ => say(Verdict::Ok, format!("domain {domain}")),
+        },
+    };
+    finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
+}
+
+/// Ports that the kernel gives to whoever wants any.
+fn ephemeral(host: &Host) -> Option<(u32, u32)> {
+    let text = host.files.text(PORTS).ok()?;
+    let mut numbers = text.split_whitespace().map(str::parse);
+    Some((numbers.next()?.ok()?, numbers.next()?.ok()?))
+}
+
+fn overlaps(domain: u32, first: u32, last: u32) -> bool {
+    let begin = PORT_BASE + DOMAIN_GAIN * domain;
+    let end = begin + PORTS_OF_FIFTY;
+    begin <= last && end >= first
+}
+
+fn implementation(variables: &Variables) -> Finding {
+    let say = |verdict, sentence: String| Finding::new(AREA, "rmw", verdict, sentence);
+    let name = variables.shown("RMW_IMPLEMENTATION");
+    let finding = match name.as_deref() {
+        None => say(
+            Verdict::Ok,
+            "the default implementation of ROS (Fast DDS)".to_owned(),
+        ),
+        Some(name @ ("rmw_fastrtps_cpp" | "rmw_fastrtps_dynamic_cpp" | "rmw_cyclonedds_cpp")) => {
+            say(Verdict::Ok, name.to_owned())
+        }
+        Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => say(
+            Verdict::Note,
+            format!("{name}: what it sends through its own shared memory stays invisible"),
+        ),
+        Some(name) if name.starts_with("rmw_zenoh") => say(
+            Verdict::Warning,
+            format!("{name} is no DDS: of its nodes nothing will be seen"),
+        )
+        .remedy(
+            "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # or another one that speaks RTPS",
+        ),
+        Some(name) => say(
+            Verdict::Note,
+            format!("{name}: seen as far as it speaks RTPS over UDP"),
+        ),
+    };
+    let shown = name.unwrap_or_else(|| "not set".to_owned());
+    finding.seen(shown, format!("RMW_IMPLEMENTATION, {FROM}"))
+}
+
+fn range(variables: &Variables) -> Finding {
+    let say = |verdict, sentence: &str| Finding::new(AREA, "range", verdict, sentence);
+    let peers = variables.shown("ROS_STATIC_PEERS");
+    let mut finding = match variables.range() {
+        Range::Subnet => say(Verdict::Ok, "nodes look for others in the subnet"),
+        Range::System => say(
+            Verdict::Ok,
+            "nodes look for others as the implementation is configured",
+        ),
+        Range::Localhost => say(
+            Verdict::Note,
+            "nodes of this shell talk to this host only: robots elsewhere do not see them",
+        )
+        .remedy("unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
+        Range::Off => say(
+            Verdict::Warning,
+            "nodes of this shell look for nobody: discovery is off",
+        )
+        .remedy("export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
+        Range::Wrong(_) => say(
+            Verdict::Warning,
+            "ROS_AUTOMATIC_DISCOVERY_RANGE has no value that ROS knows: it takes LOCALHOST",
+        )
+        .remedy(
+            "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # or LOCALHOST, OFF, SYSTEM_DEFAULT",
+        ),
+    };
+    if variables.is_localhost_only()
+        && (peers.is_some() || variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE").is_some())
+    {
+        finding.sentence.push_str(
+            "; ROS_LOCALHOST_ONLY makes ROS ignore ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS",
+        );
+        finding.verdict = finding.verdict.max(Verdict::Warning);
+    } else if let Some(peers) = &peers {
+        finding.sentence = format!("{}, and ask {peers}", finding.sentence);
+    }
+    for name in [
+        "ROS_LOCALHOST_ONLY",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "ROS_STATIC_PEERS",
+    ] {
+        let value = variables
+            .shown(name)
+            .unwrap_or_else(|| "not set".to_owned());
+        finding = finding.seen(value, format!("{name}, {FROM}"));
+    }
+    finding
+}
+
+fn server(variables: &Variables) -> Option<Finding> {
+    let server = variables.shown("ROS_DISCOVERY_SERVER")?;
+    let sentence = format!(
+        "nodes are introduced by the discovery server at {server}: the agent sees what its own \
+         host's nodes and the server say here, not what they say elsewhere"
+    );
+    let finding = Finding::new(AREA, "discovery_server", Verdict::Note, sentence);
+    let finding = finding.seen(server, format!("ROS_DISCOVERY_SERVER, {FROM}"));
+    Some(
+        finding.remedy(
+            "export ROS_SUPER_CLIENT=TRUE    # for ros2 tools, which see nothing otherwise",
+        ),
+    )
+}
+
+/// Of Fast DDS.
+fn transports(variables: &Variables) -> Option<Finding> {
+    let name = "FASTDDS_BUILTIN_TRANSPORTS";
+    let value = variables.shown(name)?;
+    let say = |verdict, sentence: String| Finding::new(AREA, "transports", verdict, sentence);
+    let kind = value.split(['?', '&']).next().unwrap_or_default();
+    let finding = match kind {
+        "LARGE_DATA" | "LARGE_DATAv6" | "P2P" => say(
+            Verdict::Warning,
+            format!("with {kind} Fast DDS sends messages by TCP, which the agent does not read"),
+        )
+        .remedy("export FASTDDS_BUILTIN_TRANSPORTS=DEFAULT"),
+        "SHM" => say(
+            Verdict::Note,
+            "nodes of this shell use shared memory alone: samples are seen, and other hosts do not \
+             see them"
+                .to_owned(),
+        ),
+        _ => say(Verdict::Ok, format!("Fast DDS uses the transports {kind}")),
+    };
+    Some(finding.seen(value, format!("{name}, {FROM}")))
+}
+
+fn profiles(host: &Host, variables: &Variables) -> Vec<Finding> {
+    let names = [
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+    ];
+    let set = names
+        .into_iter()
+        .filter_map(|name| Some((name, variables.get(name)?)));
+    set.map(|(name, path)| {
+        let say = |verdict, sentence: String| {
+            let shown = variables.shown(name).unwrap_or_default();
+            Finding::new(AREA, "profiles", verdict, sentence).seen(shown, format!("{name}, {FROM}"))
+        };
+        match read(host, path) {
+            Err(error) => say(
+                Verdict::Warning,
+                format!(
+                    "Fast DDS's profiles cannot be read: {error}; nodes then run with its defaults"
+                ),
+            )
+            .remedy(format!("unset {name}    # or correct it")),
+            Ok(bytes) => {
+                let text = String::from_utf8_lossy(&bytes);
+                if text.contains("TCPv4") || text.contains("TCPv6") || text.contains("LARGE_DATA") {
+                    say(
+                        Verdict::Warning,
+                        "Fast DDS's profiles name TCP, which the agent does not read".to_owned(),
+                    )
+                    .remedy("use UDPv4 in the profile's transport descriptors")
+                } else {
+                    say(Verdict::Ok, "Fast DDS's profiles are there".to_owned())
+                }
+            }
+        }
+    })
+    .collect()
+}
+
+/// A file that a variable names, from where this shell is.
+fn read(host: &Host, path: &str) -> Result<Vec<u8>, Unread> {
+    let path = std::path::absolute(path)?;
+    host.files.bytes(&path.to_string_lossy(), MAX_PROFILE)
+}
+
+fn cyclone(host: &Host, variables: &Variables) -> Option<Finding> {
+    let name = "CYCLONEDDS_URI";
+    let value = variables.get(name)?;
+    let shown = variables.shown(name)?;
+    let say = |verdict, sentence: String| {
+        Finding::new(AREA, "cyclonedds", verdict, sentence)
+            .seen(shown.clone(), format!("{name}, {FROM}"))
+    };
+    let mut text = String::new();
+    // Files and pieces of XML, with commas between them.
+    for part in value.split(',').map(str::trim) {
+        let named = part.strip_prefix("file://");
+        let Some(path) = named.or(part.starts_with('/').then_some(part)) else {
+            text.push_str(part);
+            continue;
+        };
+        match read(host, path) {
+            Ok(bytes) => text.push_str(&String::from_utf8_lossy(&bytes)),
+            Err(error) => {
+                let sentence = format!(
+                    "Cyclone DDS's configuration cannot be read: {error}; its nodes do not start"
+                );
+                let verdict = Verdict::Problem;
+                return Some(
+                    say(verdict, sentence).remedy("unset CYCLONEDDS_URI    # or correct it"),
+                );
+            }
+        }
+    }
+    let text: String = text.split_whitespace().collect();
+    let shared = text.split("<SharedMemory>").nth(1).unwrap_or_default();
+    let is_on = |text: &str| {
+        text.split_once("<Enable>")
+            .is_some_and(|(_, rest)| rest.starts_with("true"))
+    };
+    Some(if is_on(shared) || text.contains("PubSubMessageExchange") {
+        say(
+            Verdict::Warning,
+            "Cyclone DDS uses iceoryx between processes of this host, which the agent cannot see"
+                .to_owned(),
+        )
+        .remedy("<SharedMemory><Enable>false</Enable></SharedMemory>")
+    } else {
+        say(
+            Verdict::Ok,
+            "Cyclone DDS has a configuration of its own".to_owned(),
+        )
+    })
+}
+
+fn security(variables: &Variables) -> Option<Finding> {
+    let names = [
+        "ROS_SECURITY_ENABLE",
+        "ROS_SECURITY_STRATEGY",
+        "ROS_SECURITY_KEYSTORE",
+        "ROS_SECURITY_ENCLAVE_OVERRIDE",
+    ];
+    names.iter().find(|name| variables.get(name).is_some())?;
+    let (verdict, sentence) = if variables.is_secured() {
+        (
+            Verdict::Note,
+            "DDS security is on: participants are seen; names, rates and messages are not where \
+             they are encrypted",
+        )
+    } else {
+        (
+            Verdict::Ok,
+            "DDS security is set up and off (ROS_SECURITY_ENABLE is not `true`)",
+        )
+    };
+    let mut finding = Finding::new(AREA, "security", verdict, sentence);
+    for name in names {
+        if let Some(value) = variables.shown(name) {
+            finding = finding.seen(value, format!("{name}, {FROM}"));
+        }
+    }
+    Some(finding)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::host::tests::host;
+    use super::*;
+
+    const FILES: [(&str, &str); 4] = [
+        (PORTS, "32768\t60999\n"),
+        (
+            "/home/cyclone.xml",
+            "<CycloneDDS><Domain><SharedMemory>\n <Enable>true</Enable>",
+        ),
+        ("/home/fast.xml", "<profiles/>"),
+        ("/home/tcp.xml", "<type>TCPv4</type>"),
+    ];
+
+    fn found(variables: &[(&str, &str)]) -> Vec<Finding> {
+        let (_directory, mut host) = host(&FILES);
+        host.environment = variables
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), (*value).to_owned()))
+            .collect();
+        check(&host)
+    }
+
+    #[track_caller]
+    fn gives(name: &str, value: &str, check: &str, verdict: Verdict) {
+        let findings = found(&[("ROS_DISTRO", "jazzy"), (name, value)]);
+        let finding = findings.iter().find(|finding| finding.check == check);
+        let finding = finding.unwrap_or_else(|| panic!("{findings:?}"));
+        assert_eq!(finding.verdict, verdict, "{finding:?}");
+        assert!(
+            finding
+                .evidence
+                .iter()
+                .any(|each| each.from.starts_with(name)),
+            "{finding:?}"
+        );
+    }
+
+    #[test]
+    fn a_shell_without_ros_needs_nothing_and_sudo_is_named() {
+        assert_eq!(found(&[])[0].verdict, Verdict::Note);
+        assert_eq!(
+            found(&[("SUDO_USER", "me")])[0].remedies,
+            ["sudo -E rp doctor"]
+        );
+    }
+
+    #[test]
+    fn an_ordinary_shell_is_fine() {
+        let findings = found(&[
+            ("ROS_DISTRO", "jazzy"),
+            ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp"),
+        ]);
+        assert!(
+            findings.iter().all(|each| each.verdict == Verdict::Ok),
+            "{findings:?}"
+        );
+        assert_eq!(findings.len(), 3);
+    }
+
+    #[test]
+    fn domains_without_ports_of_their_own_are_told_apart_from_good_ones() {
+        for (domain, verdict) in [
+            ("0", Verdict::Ok),
+            ("101", Verdict::Ok),
+            ("102", Verdict::Warning),
+            ("214", Verdict::Warning),
+            ("215", Verdict::Ok),
+            ("232", Verdict::Ok),
+            ("233", Verdict::Problem),
+            ("x", Verdict::Problem),
+        ] {
+            gives("ROS_DOMAIN_ID", domain, "domain", verdict);
+        }
+    }
+
+    #[test]
+    fn each_variable_has_its_consequence() {
+        let (note, warning) = (Verdict::Note, Verdict::Warning);
+        gives("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw", warning);
+        gives("RMW_IMPLEMENTATION", "rmw_connextdds", "rmw", note);
+        gives("RMW_IMPLEMENTATION", "rmw_of_mine", "rmw", note);
+        gives("ROS_LOCALHOST_ONLY", "1", "range", note);
+        gives("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF", "range", warning);
+        gives("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCAL", "range", warning);
+        gives("ROS_STATIC_PEERS", "10.0.0.9", "range", Verdict::Ok);
+        gives(
+            "ROS_DISCOVERY_SERVER",
+            "10.0.0.1:11811",
+            "discovery_server",
+            note,
+        );
+        gives(
+            "FASTDDS_BUILTIN_TRANSPORTS",
+            "LARGE_DATA?max_msg_size=1MB",
+            "transports",
+            warning,
+        );
+        gives(
+            "FASTDDS_BUILTIN_TRANSPORTS",
+            "UDPv4",
+            "transports",
+            Verdict::Ok,
+        );
+        gives(
+            "FASTRTPS_DEFAULT_PROFILES_FILE",
+            "/home/none.xml",
+            "profiles",
+            warning,
+        );
+        gives(
+            "FASTRTPS_DEFAULT_PROFILES_FILE",
+            "/home/fast.xml",
+            "profiles",
+            Verdict::Ok,
+        );
+        gives(
+            "FASTDDS_DEFAULT_PROFILES_FILE",
+            "/home/tcp.xml",
+            "profiles",
+            warning,
+        );
+        gives(
+            "CYCLONEDDS_URI",
+            "file:///home/cyclone.xml",
+            "cyclonedds",
+            warning,
+        );
+        gives(
+            "CYCLONEDDS_URI",
+            "file:///home/none.xml",
+            "cyclonedds",
+            Verdict::Problem,
+        );
+        gives("CYCLONEDDS_URI", "<General/>", "cyclonedds", Verdict::Ok);
+        gives("ROS_SECURITY_ENABLE", "true", "security", note);
+        gives(
+            "ROS_SECURITY_KEYSTORE",
+            "/home/keys",
+            "security",
+            Verdict::Ok,
+        );
+    }
+
+    #[test]
+    fn what_the_old_variable_makes_ros_ignore_is_said() {
+        let findings = found(&[
+            ("ROS_LOCALHOST_ONLY", "1"),
+            ("ROS_STATIC_PEERS", "10.0.0.9"),
+        ]);
+        let finding = findings.iter().find(|each| each.check == "range").unwrap();
+        assert_eq!(finding.verdict, Verdict::Warning);
+        assert!(finding.sentence.contains("ignore"), "{}", finding.sentence);
+    }
+}
