@@ -1,12 +1,15 @@
 //! The command line: a module for each noun, and what all verbs share. A verb asks an agent, has
 //! the answer put into words, and prints; it decides nothing else.
 
+mod action;
 mod discover;
 mod doctor;
 mod interrupt;
+mod node;
 mod output;
 mod rates;
 mod run;
+mod service;
 mod shared;
 mod topic;
 
@@ -53,6 +56,12 @@ pub(crate) enum Command {
 pub(crate) enum Question {
     /// What topics there are and what comes by them, as `ros2 topic` says
     Topic(topic::Topic),
+    /// What nodes there are and what they do, as `ros2 node` says
+    Node(node::Node),
+    /// What services there are, as `ros2 service` says
+    Service(service::Service),
+    /// What actions there are, as `ros2 action` says
+    Action(action::Action),
     /// Say what this host will show and what not, and what to do about it
     Doctor(doctor::Doctor),
 }
@@ -65,6 +74,9 @@ impl Question {
         }
         match self {
             Self::Topic(topic) => topic.ask(),
+            Self::Node(node) => node.ask(),
+            Self::Service(service) => service.ask(),
+            Self::Action(action) => action.ask(),
             Self::Doctor(doctor) => doctor.ask(),
         }
     }
@@ -73,7 +85,9 @@ impl Question {
     fn interrupted(&self) -> Option<u8> {
         match self {
             Self::Topic(topic) => Some(topic.interrupted()),
-            Self::Doctor(_) => Some(interrupt::INTERRUPTED),
+            Self::Node(_) | Self::Service(_) | Self::Action(_) | Self::Doctor(_) => {
+                Some(interrupt::INTERRUPTED)
+            }
         }
     }
 }

@@ -1,10 +1,16 @@
 //! What the verbs of the graph share: options that the original has and that change nothing here,
-//! and asking for names.
+//! and asking for names and for one thing by its name.
+
+use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Args;
-use ros2probe::client::{Agent, Target};
-use ros2probe::ros2::facts::Names;
+use ros2probe::client::{Agent, ClientError, Target, encoded};
+use ros2probe::ros2::Refused;
+use ros2probe::ros2::facts::{Names, Node, Topic};
+use serde::de::DeserializeOwned;
+
+use super::{Output, Said};
 
 /// Options that concern the original's own node; accepted, so that scripts go on working.
 #[derive(Args, Clone, Debug, Default)]
@@ -40,15 +46,52 @@ pub(crate) struct Matching {
     qos_liveliness_lease_duration_seconds: Option<String>,
 }
 
-/// All names in the target's domain, also hidden ones. Where there is nothing but in other domains,
-/// stderr says so once.
-pub(crate) fn names(target: &Target) -> Result<Names> {
-    let domain_id = target.domain()?;
-    let agent = Agent::reach(target)?;
-    names_of(&agent, domain_id)
+/// One domain of an agent.
+#[derive(Debug)]
+pub(crate) struct Graph {
+    agent: Agent,
+    domain_id: u32,
 }
 
-/// As [`names`], of an agent that is known already.
+impl Graph {
+    pub(crate) fn reach(target: &Target) -> Result<Self> {
+        let domain_id = target.domain()?;
+        let agent = Agent::reach(target)?;
+        Ok(Self { agent, domain_id })
+    }
+
+    /// All names, as [`names_of`] has them.
+    pub(crate) fn names(&self) -> Result<Names> {
+        names_of(&self.agent, self.domain_id)
+    }
+
+    /// The topic of this name, if there is one.
+    pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic>> {
+        self.thing("topics", name, "no-such-topic")
+    }
+
+    /// The node of this name, if there is one, with all that is hidden.
+    pub(crate) fn node(&self, name: &str) -> Result<Option<Node>> {
+        self.thing("nodes", name, "no-such-node")
+    }
+
+    fn thing<T: DeserializeOwned>(&self, noun: &str, name: &str, code: &str) -> Result<Option<T>> {
+        let Some(name) = name.strip_prefix('/').filter(|name| !name.is_empty()) else {
+            return Ok(None);
+        };
+        let hidden = if noun == "nodes" { "&hidden=true" } else { "" };
+        let (name, domain_id) = (encoded(name), self.domain_id);
+        let path = format!("/{noun}/{name}?domain_id={domain_id}{hidden}");
+        match self.agent.get(&path) {
+            Ok(found) => Ok(Some(found)),
+            Err(error @ ClientError::Refused(_)) if error.is(code) => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+}
+
+/// All names in a domain, also hidden ones. Where there is nothing but in other domains, stderr says
+/// so once.
 pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
     let names: Names = agent.get(&format!("/names?domain_id={domain_id}&hidden=true"))?;
     let others = names.domains.iter().filter(|other| **other != domain_id);
@@ -60,4 +103,23 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
         );
     }
     Ok(names)
+}
+
+/// Prints what there is to say.
+pub(crate) fn say(text: &str) -> Result<ExitCode> {
+    Output::new().write(text)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// As [`say`]; a refusal goes to stderr.
+pub(crate) fn answer(text: Result<String, Refused>) -> Result<ExitCode> {
+    say(&text.map_err(|refused| Said(refused.0))?)
+}
+
+/// As [`say`]; where there is nothing, the exit code says so alone.
+pub(crate) fn say_or_fail(text: Option<&str>) -> Result<ExitCode> {
+    match text {
+        Some(text) => say(text),
+        None => Ok(ExitCode::FAILURE),
+    }
 }

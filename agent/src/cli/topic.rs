@@ -5,12 +5,12 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use ros2probe::client::Target;
+use ros2probe::ros2::facts::{Names, TopicName};
 use ros2probe::ros2::topic;
 
-use super::Output;
 use super::interrupt::INTERRUPTED;
 use super::rates::{Bandwidth, Delay, Hz};
-use super::shared::{Spinning, names};
+use super::shared::{Graph, Spinning, answer, say, say_or_fail};
 
 /// `rp topic VERB`.
 #[derive(Args, Debug)]
@@ -26,6 +26,12 @@ pub(crate) struct Topic {
 enum Verb {
     /// Print a list of topics
     List(List),
+    /// Print a topic's type and who is at its ends
+    Info(Info),
+    /// Print a topic's type
+    Type(Type),
+    /// Print topics of a type
+    Find(Find),
     /// Print how often messages come
     Hz(Hz),
     /// Print how many bytes a second come
@@ -54,6 +60,45 @@ struct List {
     target: Target,
 }
 
+#[derive(Args, Debug)]
+struct Info {
+    /// Name of the topic, as /chatter
+    topic_name: String,
+    /// Also print each end with its node, GID and quality of service
+    #[arg(short = 'v', long)]
+    verbose: bool,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Type {
+    /// Name of the topic, as /chatter
+    topic_name: String,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Find {
+    /// The type, as std_msgs/msg/String
+    topic_type: String,
+    /// Only print how many topics there are
+    #[arg(short = 'c', long)]
+    count_topics: bool,
+    /// Consider hidden topics as well
+    #[arg(long)]
+    include_hidden_topics: bool,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
 impl Topic {
     /// With which code Ctrl-C ends it.
     pub(crate) fn interrupted(&self) -> u8 {
@@ -69,6 +114,9 @@ impl Topic {
         match self.verb {
             None => super::help(&["topic"]),
             Some(Verb::List(list)) => list.ask(hidden),
+            Some(Verb::Info(info)) => info.ask(),
+            Some(Verb::Type(kind)) => kind.ask(hidden),
+            Some(Verb::Find(find)) => find.ask(hidden),
             Some(Verb::Hz(hz)) => hz.ask(hidden),
             Some(Verb::Bw(bandwidth)) => bandwidth.ask(hidden),
             Some(Verb::Delay(delay)) => delay.ask(hidden),
@@ -78,15 +126,46 @@ impl Topic {
 
 impl List {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
-        let hidden = hidden || self.include_hidden_topics;
-        let names = names(&self.target)?;
-        let topics = names.topics.iter().filter(|topic| hidden || !topic.hidden);
+        let names = Graph::reach(&self.target)?.names()?;
         let options = topic::List {
             show_types: self.show_types,
             count: self.count_topics,
             verbose: self.verbose,
         };
-        Output::new().write(&topic::list(topics, options))?;
-        Ok(ExitCode::SUCCESS)
+        let topics = shown(&names, hidden || self.include_hidden_topics);
+        say(&topic::list(topics, options))
     }
+}
+
+impl Info {
+    fn ask(self) -> Result<ExitCode> {
+        let topic = Graph::reach(&self.target)?.topic(&self.topic_name)?;
+        let (name, dialect) = (&self.topic_name, self.target.dialect());
+        answer(topic::info(name, topic.as_ref(), self.verbose, dialect))
+    }
+}
+
+impl Type {
+    fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let names = Graph::reach(&self.target)?.names()?;
+        let topics = shown(&names, hidden).map(typed);
+        say_or_fail(topic::type_of(&self.topic_name, topics).as_deref())
+    }
+}
+
+impl Find {
+    fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let names = Graph::reach(&self.target)?.names()?;
+        let topics = shown(&names, hidden || self.include_hidden_topics).map(typed);
+        say(&topic::find(&self.topic_type, topics, self.count_topics))
+    }
+}
+
+fn shown(names: &Names, hidden: bool) -> impl Iterator<Item = &TopicName> {
+    let topics = names.topics.iter();
+    topics.filter(move |topic| hidden || !topic.hidden)
+}
+
+fn typed(topic: &TopicName) -> (&str, &[String]) {
+    (&topic.name, &topic.types)
 }

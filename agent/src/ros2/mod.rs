@@ -3,11 +3,15 @@
 //!
 //! Pure: facts in, text out. Nothing here asks an agent, reads a clock or prints.
 
+pub mod action;
 mod dialect;
+mod endpoint;
 pub mod facts;
 pub mod name;
+pub mod node;
 pub mod rates;
 mod refusal;
+pub mod service;
 pub mod topic;
 
 pub use dialect::Dialect;

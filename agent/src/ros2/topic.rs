@@ -1,8 +1,9 @@
-//! `ros2 topic`: list.
+//! `ros2 topic`: `list`, `info`, `type` and `find`.
 
 use std::fmt::Write as _;
 
-use super::facts::TopicName;
+use super::facts::{Topic, TopicName};
+use super::{Dialect, Refused, endpoint};
 
 /// Options of `topic list`.
 #[derive(Clone, Copy, Debug, Default)]
@@ -39,6 +40,72 @@ pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName>, options: List) -> S
         }
     }
     text
+}
+
+/// `topic info`; `None` where there is no such topic.
+///
+/// # Errors
+/// There is none.
+pub fn info(
+    name: &str,
+    topic: Option<&Topic>,
+    verbose: bool,
+    dialect: Dialect,
+) -> Result<String, Refused> {
+    let there = topic.filter(|topic| {
+        topic.name == name && !(topic.publishers.is_empty() && topic.subscriptions.is_empty())
+    });
+    let topic = there.ok_or_else(|| Refused(format!("Unknown topic '{name}'")))?;
+    let end = if verbose { "\n\n" } else { "\n" };
+    let mut text = format!("Type: {}{end}", types(&topic.message_types));
+    for (count, kind, endpoints) in [
+        ("Publisher count", "PUBLISHER", &topic.publishers),
+        ("Subscription count", "SUBSCRIPTION", &topic.subscriptions),
+    ] {
+        let _ = write!(text, "{count}: {}{end}", endpoints.len());
+        if verbose {
+            let mut endpoints: Vec<_> = endpoints.iter().collect();
+            endpoints.sort_unstable_by_key(|endpoint| &endpoint.guid);
+            for endpoint in endpoints {
+                text.push_str(&endpoint::block(endpoint, kind, dialect));
+                text.push('\n');
+            }
+        }
+    }
+    Ok(text)
+}
+
+/// One type as it is, several as a Python list.
+fn types(types: &[String]) -> String {
+    match types {
+        [only] => only.clone(),
+        several => format!("['{}']", several.join("', '")),
+    }
+}
+
+/// `topic type` and `service type` and `action type`: one to a line; `None` where there is none,
+/// which is said by the exit code alone.
+#[must_use]
+pub fn type_of<'a>(
+    name: &str,
+    mut all: impl Iterator<Item = (&'a str, &'a [String])>,
+) -> Option<String> {
+    let (_, types) = all.find(|(each, _)| *each == name)?;
+    Some(types.iter().map(|each| format!("{each}\n")).collect())
+}
+
+/// `topic find` and `service find` and `action find`: names one to a line, or how many.
+#[must_use]
+pub fn find<'a>(
+    wanted: &str,
+    all: impl Iterator<Item = (&'a str, &'a [String])>,
+    count: bool,
+) -> String {
+    let found = all.filter(|(_, types)| types.iter().any(|each| each == wanted));
+    if count {
+        return format!("{}\n", found.count());
+    }
+    found.map(|(name, _)| format!("{name}\n")).collect()
 }
 
 fn section<'a>(
@@ -92,5 +159,84 @@ mod tests {
             * /chatter [std_msgs/msg/String] 1 subscriber\n\n";
         assert_eq!(said(false, false, true), verbose);
         assert_eq!(list([].iter(), List::default()), "");
+    }
+
+    fn topic(types: &[&str]) -> Topic {
+        Topic {
+            name: "/chatter".to_owned(),
+            message_types: types.iter().map(|each| (*each).to_owned()).collect(),
+            publishers: ["02.03", "01.03"].map(endpoint_of).into(),
+            subscriptions: Vec::new(),
+        }
+    }
+
+    fn endpoint_of(guid: &str) -> super::super::facts::Endpoint {
+        super::super::facts::Endpoint {
+            guid: guid.to_owned(),
+            ..Default::default()
+        }
+    }
+
+    #[test]
+    fn info_counts_and_verbose_info_shows_endpoints_by_gid() {
+        let topic = topic(&["std_msgs/msg/String"]);
+        let said = |verbose| info("/chatter", Some(&topic), verbose, Dialect::Jazzy).unwrap();
+        assert_eq!(
+            said(false),
+            "Type: std_msgs/msg/String\nPublisher count: 2\nSubscription count: 0\n"
+        );
+        let verbose = said(true);
+        let head = "Type: std_msgs/msg/String\n\nPublisher count: 2\n\nNode name: _CREATED_BY_";
+        assert!(verbose.starts_with(head), "{verbose}");
+        assert!(
+            verbose.ends_with("Infinite\n\nSubscription count: 0\n\n"),
+            "{verbose}"
+        );
+        assert!(
+            verbose.find("GID: 01.03\n") < verbose.find("GID: 02.03\n"),
+            "{verbose}"
+        );
+    }
+
+    #[test]
+    fn several_types_are_a_list_of_python() {
+        let topic = topic(&["a/msg/X", "b/msg/Y"]);
+        let said = info("/chatter", Some(&topic), false, Dialect::Humble).unwrap();
+        assert!(said.starts_with("Type: ['a/msg/X', 'b/msg/Y']\n"), "{said}");
+    }
+
+    #[test]
+    fn a_topic_without_ends_or_under_another_name_is_unknown() {
+        let gone = Topic {
+            publishers: Vec::new(),
+            ..topic(&["a/msg/X"])
+        };
+        for (name, found) in [
+            ("/x", None),
+            ("chatter", Some(&topic(&[]))),
+            ("/chatter", Some(&gone)),
+        ] {
+            let refused = info(name, found, true, Dialect::Jazzy).unwrap_err();
+            assert_eq!(refused.0, format!("Unknown topic '{name}'"));
+        }
+    }
+
+    #[test]
+    fn types_are_found_by_name_and_names_by_type() {
+        let topics = topics();
+        let all = || {
+            topics
+                .iter()
+                .map(|topic| (topic.name.as_str(), topic.types.as_slice()))
+        };
+        assert_eq!(type_of("/rosout", all()).unwrap(), "std_msgs/msg/String\n");
+        assert_eq!(type_of("rosout", all()), None);
+        assert_eq!(
+            find("std_msgs/msg/String", all(), false),
+            "/chatter\n/rosout\n"
+        );
+        assert_eq!(find("std_msgs/msg/String", all(), true), "2\n");
+        assert_eq!(find("std_msgs/String", all(), false), "");
+        assert_eq!(find("std_msgs/String", all(), true), "0\n");
     }
 }

@@ -20,6 +20,8 @@ pub(super) struct EndpointView<'a> {
     guid: Guid,
     /// Its node, when `ros_discovery_info` told.
     node: Option<&'a str>,
+    /// ROS enclave of its participant; null means it is no ROS participant.
+    enclave: Option<&'a str>,
     /// ROS type.
     message_type: &'a str,
     /// RIHS01 hash; null where it is not announced (Humble).
@@ -76,6 +78,7 @@ impl<'a> EndpointView<'a> {
         Self {
             guid: facts.guid,
             node: facts.node.as_deref(),
+            enclave: participant.and_then(|participant| participant.enclave.as_deref()),
             message_type: &facts.message_type,
             type_hash: facts.type_hash.as_deref(),
             vendor: participant.map(|participant| participant.vendor.as_str()),

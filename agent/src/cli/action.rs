@@ -1,0 +1,128 @@
+//! `rp action`.
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+use ros2probe::client::Target;
+use ros2probe::ros2::facts::Named;
+use ros2probe::ros2::{action, topic};
+
+use super::shared::{Graph, say, say_or_fail};
+
+/// `rp action VERB`.
+#[derive(Args, Debug)]
+pub(crate) struct Action {
+    #[command(subcommand)]
+    verb: Option<Verb>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    /// Print a list of actions
+    List(List),
+    /// Print who serves and who calls an action
+    Info(Info),
+    /// Print an action's type
+    Type(Type),
+    /// Print actions of a type
+    Find(Find),
+}
+
+#[derive(Args, Debug)]
+struct List {
+    /// Also print the actions' types
+    #[arg(short = 't', long)]
+    show_types: bool,
+    /// Only print how many actions there are
+    #[arg(short = 'c', long)]
+    count_actions: bool,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Info {
+    /// Name of the action, as /fibonacci
+    action_name: String,
+    /// Also print the action's type
+    #[arg(short = 't', long)]
+    show_types: bool,
+    /// Only print how many serve and call it
+    #[arg(short = 'c', long)]
+    count: bool,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Type {
+    /// Name of the action, as /fibonacci
+    action_name: String,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Find {
+    /// The type, as example_interfaces/action/Fibonacci
+    action_type: String,
+    /// Only print how many actions there are
+    #[arg(short = 'c', long)]
+    count_actions: bool,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Action {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        match self.verb {
+            None => super::help(&["action"]),
+            Some(Verb::List(list)) => list.ask(),
+            Some(Verb::Info(info)) => info.ask(),
+            Some(Verb::Type(kind)) => kind.ask(),
+            Some(Verb::Find(find)) => find.ask(),
+        }
+    }
+}
+
+impl List {
+    fn ask(self) -> Result<ExitCode> {
+        let actions = actions(&self.target)?.into_iter();
+        say(&action::list(actions, self.show_types, self.count_actions))
+    }
+}
+
+impl Info {
+    fn ask(self) -> Result<ExitCode> {
+        let name = &self.action_name;
+        let feedback = Graph::reach(&self.target)?.topic(&action::feedback_of(name))?;
+        let text = action::info(name, feedback.as_ref(), self.show_types, self.count);
+        say(&text)
+    }
+}
+
+impl Type {
+    fn ask(self) -> Result<ExitCode> {
+        let actions = actions(&self.target)?;
+        let kind = topic::type_of(&self.action_name, actions.iter().map(typed));
+        say_or_fail(kind.as_deref())
+    }
+}
+
+impl Find {
+    fn ask(self) -> Result<ExitCode> {
+        let actions = actions(&self.target)?;
+        let typed = actions.iter().map(typed);
+        say(&topic::find(&self.action_type, typed, self.count_actions))
+    }
+}
+
+fn actions(target: &Target) -> Result<Vec<Named>> {
+    let names = Graph::reach(target)?.names()?;
+    Ok(action::of_topics(&names.topics).collect())
+}
+
+fn typed(action: &Named) -> (&str, &[String]) {
+    (&action.name, &action.types)
+}

@@ -1,0 +1,148 @@
+//! `rp service`.
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+use ros2probe::client::Target;
+use ros2probe::ros2::facts::{Names, ServiceName};
+use ros2probe::ros2::{service, topic};
+
+use super::shared::{Graph, Spinning, answer, say, say_or_fail};
+
+/// `rp service VERB`.
+#[derive(Args, Debug)]
+pub(crate) struct Service {
+    /// Consider hidden services as well
+    #[arg(long)]
+    include_hidden_services: bool,
+    #[command(subcommand)]
+    verb: Option<Verb>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    /// Print a list of services
+    List(List),
+    /// Print a service's type
+    Type(Type),
+    /// Print services of a type
+    Find(Find),
+    /// Print a service's type and how many serve and call it
+    Info(Info),
+}
+
+#[derive(Args, Debug)]
+struct List {
+    /// Also print the services' types
+    #[arg(short = 't', long)]
+    show_types: bool,
+    /// Only print how many services there are
+    #[arg(short = 'c', long)]
+    count_services: bool,
+    /// Consider hidden services as well
+    #[arg(long)]
+    include_hidden_services: bool,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Type {
+    /// Name of the service, as /talker/list_parameters
+    service_name: String,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Find {
+    /// The type, as rcl_interfaces/srv/ListParameters
+    service_type: String,
+    /// Only print how many services there are
+    #[arg(short = 'c', long)]
+    count_services: bool,
+    /// Consider hidden services as well
+    #[arg(long)]
+    include_hidden_services: bool,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Args, Debug)]
+struct Info {
+    /// Name of the service, as /talker/list_parameters
+    service_name: String,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Service {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let hidden = self.include_hidden_services;
+        match self.verb {
+            None => super::help(&["service"]),
+            Some(Verb::List(list)) => list.ask(hidden),
+            Some(Verb::Type(kind)) => kind.ask(hidden),
+            Some(Verb::Find(find)) => find.ask(hidden),
+            Some(Verb::Info(info)) => info.ask(hidden),
+        }
+    }
+}
+
+impl List {
+    fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let names = Graph::reach(&self.target)?.names()?;
+        let options = service::List {
+            show_types: self.show_types,
+            count: self.count_services,
+        };
+        let services = shown(&names, hidden || self.include_hidden_services);
+        say(&service::list(services, options))
+    }
+}
+
+impl Type {
+    fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let names = Graph::reach(&self.target)?.names()?;
+        let services = shown(&names, hidden).map(typed);
+        say_or_fail(topic::type_of(&self.service_name, services).as_deref())
+    }
+}
+
+impl Find {
+    fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let names = Graph::reach(&self.target)?.names()?;
+        let services = shown(&names, hidden || self.include_hidden_services).map(typed);
+        say(&topic::find(
+            &self.service_type,
+            services,
+            self.count_services,
+        ))
+    }
+}
+
+impl Info {
+    fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let names = Graph::reach(&self.target)?.names()?;
+        let services = shown(&names, hidden);
+        answer(service::info(
+            &self.service_name,
+            services,
+            self.target.dialect(),
+        ))
+    }
+}
+
+fn shown(names: &Names, hidden: bool) -> impl Iterator<Item = &ServiceName> {
+    let services = names.services.iter();
+    services.filter(move |service| hidden || !service.hidden)
+}
+
+fn typed(service: &ServiceName) -> (&str, &[String]) {
+    (&service.name, &service.types)
+}

@@ -1,0 +1,167 @@
+//! `ros2 action`: `list` and `info`; `type` and `find` are those of topics. An action is what has a
+//! topic of feedback, as the original sees it.
+
+use std::fmt::Write as _;
+
+use super::facts::{Endpoint, Named, Topic, TopicName};
+
+/// What an action's name is followed by.
+const FEEDBACK: &str = "/_action/feedback";
+/// What its type is followed by.
+const MESSAGE: &str = "_FeedbackMessage";
+
+/// The topic by which an action is known.
+#[must_use]
+pub fn feedback_of(name: &str) -> String {
+    format!("{name}{FEEDBACK}")
+}
+
+/// Actions among topics, hidden ones included.
+pub fn of_topics(topics: &[TopicName]) -> impl Iterator<Item = Named> {
+    let actions = topics.iter();
+    actions.filter_map(|topic| of_name(&topic.name, &topic.types))
+}
+
+/// Actions by the topics of feedback that a node has.
+pub(super) fn of_feedback(topics: &[Named]) -> Vec<Named> {
+    let actions = topics.iter();
+    actions
+        .filter_map(|topic| of_name(&topic.name, &topic.types))
+        .collect()
+}
+
+fn of_name(name: &str, types: &[String]) -> Option<Named> {
+    let name = name.strip_suffix(FEEDBACK)?.to_owned();
+    let types = types.iter().filter_map(|each| each.strip_suffix(MESSAGE));
+    let types: Vec<_> = types.map(str::to_owned).collect();
+    (!types.is_empty()).then_some(Named { name, types })
+}
+
+/// `action list`.
+#[must_use]
+pub fn list(actions: impl Iterator<Item = Named>, show_types: bool, count: bool) -> String {
+    if count {
+        return format!("{}\n", actions.count());
+    }
+    let mut text = String::new();
+    for action in actions {
+        let _ = if show_types {
+            writeln!(text, "{} [{}]", action.name, action.types.join(", "))
+        } else {
+            writeln!(text, "{}", action.name)
+        };
+    }
+    text
+}
+
+/// `action info`, by the action's topic of feedback where there is one.
+#[must_use]
+pub fn info(name: &str, feedback: Option<&Topic>, show_types: bool, count: bool) -> String {
+    let mut text = format!("Action: {name}\n");
+    let ends: [(&str, &[Endpoint]); 2] = match feedback {
+        Some(topic) => [
+            ("clients", &topic.subscriptions),
+            ("servers", &topic.publishers),
+        ],
+        None => [("clients", &[]), ("servers", &[])],
+    };
+    for (title, endpoints) in ends {
+        let nodes = nodes(endpoints);
+        let _ = writeln!(text, "Action {title}: {}", nodes.len());
+        if count {
+            continue;
+        }
+        for (node, types) in nodes {
+            let _ = if show_types {
+                writeln!(text, "    {node} [{}]", types.join(", "))
+            } else {
+                writeln!(text, "    {node}")
+            };
+        }
+    }
+    text
+}
+
+/// Each node once with its types, in the order of GIDs. Who has no node is none for the original.
+fn nodes(endpoints: &[Endpoint]) -> Vec<(&str, Vec<&str>)> {
+    let mut endpoints: Vec<_> = endpoints.iter().collect();
+    endpoints.sort_unstable_by_key(|endpoint| &endpoint.guid);
+    let mut nodes: Vec<(&str, Vec<&str>)> = Vec::new();
+    for endpoint in endpoints {
+        let (Some(node), Some(kind)) = (
+            endpoint.node.as_deref(),
+            endpoint.message_type.strip_suffix(MESSAGE),
+        ) else {
+            continue;
+        };
+        match nodes.iter_mut().find(|(name, _)| *name == node) {
+            Some((_, types)) if types.contains(&kind) => {}
+            Some((_, types)) => types.push(kind),
+            None => nodes.push((node, vec![kind])),
+        }
+    }
+    nodes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topic(name: &str, kind: &str) -> TopicName {
+        TopicName {
+            name: name.to_owned(),
+            types: vec![kind.to_owned()],
+            ..TopicName::default()
+        }
+    }
+
+    fn actions() -> impl Iterator<Item = Named> {
+        of_topics(&[
+            topic("/chatter", "std_msgs/msg/String"),
+            topic("/fib/_action/feedback", "a/action/Fib_FeedbackMessage"),
+            topic("/fib/_action/status", "action_msgs/msg/GoalStatusArray"),
+            topic("/not/_action/feedback", "a/msg/Other"),
+        ])
+        .collect::<Vec<_>>()
+        .into_iter()
+    }
+
+    #[test]
+    fn an_action_is_what_has_feedback() {
+        assert_eq!(list(actions(), false, false), "/fib\n");
+        assert_eq!(list(actions(), true, false), "/fib [a/action/Fib]\n");
+        assert_eq!(list(actions(), true, true), "1\n");
+    }
+
+    #[test]
+    fn info_names_nodes_with_their_namespace_once() {
+        let end = |guid: &str, node: Option<&str>| Endpoint {
+            guid: guid.to_owned(),
+            node: node.map(str::to_owned),
+            message_type: "a/action/Fib_FeedbackMessage".to_owned(),
+            ..Endpoint::default()
+        };
+        let feedback = Topic {
+            name: feedback_of("/fib"),
+            publishers: vec![end("02", Some("/robot1/server"))],
+            subscriptions: vec![
+                end("04", None),
+                end("03", Some("/b")),
+                end("01", Some("/a/a")),
+                end("05", Some("/b")),
+            ],
+            ..Topic::default()
+        };
+        let said = |types, count| info("/fib", Some(&feedback), types, count);
+        assert_eq!(
+            said(false, false),
+            "Action: /fib\nAction clients: 2\n    /a/a\n    /b\nAction servers: 1\n    \
+             /robot1/server\n"
+        );
+        assert!(said(true, false).ends_with("    /robot1/server [a/action/Fib]\n"));
+        let counts = "Action: /fib\nAction clients: 2\nAction servers: 1\n";
+        assert_eq!(said(true, true), counts);
+        let none = "Action: /nope\nAction clients: 0\nAction servers: 0\n";
+        assert_eq!(info("/nope", None, false, false), none);
+    }
+}

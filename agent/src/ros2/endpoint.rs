@@ -1,0 +1,149 @@
+//! One writer or reader in `topic info -v`.
+
+use std::fmt::Write as _;
+
+use super::Dialect;
+use super::facts::{Endpoint, Qos};
+
+/// What the original calls the node of an endpoint that its participant has not told of yet.
+const UNKNOWN: [&str; 2] = ["_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"];
+/// Likewise of a participant that is no ROS one.
+const BARE: [&str; 2] = ["_CREATED_BY_BARE_DDS_APP_"; 2];
+/// A GID of Humble has room for more than a GUID.
+const PADDING: usize = 8;
+
+/// The block, without the empty line behind it.
+#[must_use]
+pub fn block(endpoint: &Endpoint, kind: &str, dialect: Dialect) -> String {
+    let mut text = String::new();
+    let [name, namespace] = node(endpoint);
+    let _ = writeln!(text, "Node name: {name}");
+    let _ = writeln!(text, "Node namespace: {namespace}");
+    let _ = writeln!(text, "Topic type: {}", endpoint.message_type);
+    if dialect > Dialect::Humble {
+        let hash = endpoint.type_hash.as_deref().unwrap_or("INVALID");
+        let _ = writeln!(text, "Topic type hash: {hash}");
+    }
+    let _ = writeln!(text, "Endpoint type: {kind}");
+    let _ = writeln!(text, "GID: {}", gid(&endpoint.guid, dialect));
+    let _ = writeln!(text, "QoS profile:");
+    qos(&mut text, &endpoint.qos, "  ");
+    text
+}
+
+/// Name and namespace of its node.
+fn node(endpoint: &Endpoint) -> [&str; 2] {
+    match (&endpoint.node, &endpoint.enclave) {
+        (Some(node), _) => match node.rsplit_once('/') {
+            Some(("", name)) => [name, "/"],
+            Some((namespace, name)) => [name, namespace],
+            None => [node, "/"],
+        },
+        (None, Some(_)) => UNKNOWN,
+        (None, None) => BARE,
+    }
+}
+
+/// Bytes with points between.
+fn gid(guid: &str, dialect: Dialect) -> String {
+    let digits: Vec<char> = guid.chars().filter(|digit| *digit != '.').collect();
+    let mut bytes: Vec<String> = digits.chunks(2).map(|byte| byte.iter().collect()).collect();
+    if dialect == Dialect::Humble {
+        bytes.extend(std::iter::repeat_n("00".to_owned(), PADDING));
+    }
+    bytes.join(".")
+}
+
+fn qos(text: &mut String, qos: &Qos, indent: &str) {
+    let lines = [
+        ("Reliability", qos.reliability.clone()),
+        ("History (Depth)", qos.history.clone()),
+        ("Durability", qos.durability.clone()),
+        ("Lifespan", duration(qos.lifespan_seconds)),
+        ("Deadline", duration(qos.deadline_seconds)),
+        ("Liveliness", qos.liveliness.clone()),
+        (
+            "Liveliness lease duration",
+            duration(qos.liveliness_lease_seconds),
+        ),
+    ];
+    for (key, value) in lines {
+        let _ = writeln!(text, "{indent}{key}: {value}");
+    }
+}
+
+fn duration(seconds: Option<f64>) -> String {
+    match seconds {
+        None => "Infinite".to_owned(),
+        Some(seconds) => format!("{:.0} nanoseconds", seconds * 1e9),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn endpoint() -> Endpoint {
+        Endpoint {
+            guid: "010f8b216e5c3a0200000000.00001203".to_owned(),
+            node: Some("/robot1/talker".to_owned()),
+            enclave: Some("/".to_owned()),
+            message_type: "std_msgs/msg/String".to_owned(),
+            type_hash: Some("RIHS01_df".to_owned()),
+            qos: Qos {
+                reliability: "RELIABLE".to_owned(),
+                durability: "TRANSIENT_LOCAL".to_owned(),
+                history: "KEEP_LAST (10)".to_owned(),
+                deadline_seconds: None,
+                lifespan_seconds: Some(10.0),
+                liveliness: "AUTOMATIC".to_owned(),
+                liveliness_lease_seconds: None,
+            },
+        }
+    }
+
+    #[test]
+    fn a_block_is_that_of_the_distribution() {
+        let qos = "QoS profile:\n  Reliability: RELIABLE\n  History (Depth): KEEP_LAST (10)\n  \
+            Durability: TRANSIENT_LOCAL\n  Lifespan: 10000000000 nanoseconds\n  \
+            Deadline: Infinite\n  Liveliness: AUTOMATIC\n  Liveliness lease duration: Infinite\n";
+        let head = "Node name: talker\nNode namespace: /robot1\nTopic type: std_msgs/msg/String\n";
+        let gid = "01.0f.8b.21.6e.5c.3a.02.00.00.00.00.00.00.12.03";
+        assert_eq!(
+            block(&endpoint(), "PUBLISHER", Dialect::Humble),
+            format!("{head}Endpoint type: PUBLISHER\nGID: {gid}.00.00.00.00.00.00.00.00\n{qos}")
+        );
+        for dialect in [Dialect::Jazzy, Dialect::Kilted, Dialect::Rolling] {
+            assert_eq!(
+                block(&endpoint(), "SUBSCRIPTION", dialect),
+                format!(
+                    "{head}Topic type hash: RIHS01_df\nEndpoint type: SUBSCRIPTION\nGID: {gid}\n\
+                     {qos}"
+                )
+            );
+        }
+        let unhashed = Endpoint {
+            type_hash: None,
+            ..endpoint()
+        };
+        assert!(
+            block(&unhashed, "PUBLISHER", Dialect::Jazzy).contains("Topic type hash: INVALID\n")
+        );
+    }
+
+    #[test]
+    fn a_node_that_is_not_known_has_the_placeholder_of_its_participant() {
+        let named = |name: Option<&str>, enclave: Option<&str>| {
+            let endpoint = Endpoint {
+                node: name.map(str::to_owned),
+                enclave: enclave.map(str::to_owned),
+                ..endpoint()
+            };
+            node(&endpoint).map(str::to_owned)
+        };
+        assert_eq!(named(Some("/talker"), None), ["talker", "/"]);
+        assert_eq!(named(Some("/a/b/talker"), None), ["talker", "/a/b"]);
+        assert_eq!(named(None, Some("/")), UNKNOWN);
+        assert_eq!(named(None, None), BARE);
+    }
+}

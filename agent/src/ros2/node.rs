@@ -1,0 +1,168 @@
+//! `ros2 node`: `list` and `info`.
+
+use std::fmt::Write as _;
+
+use super::Refused;
+use super::action;
+use super::facts::{Named, Node, NodeName, is_hidden, is_hidden_node};
+
+/// What goes to stdout, and a warning for stderr.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Told {
+    /// For stdout.
+    pub text: String,
+    /// For stderr, where there is reason.
+    pub warning: Option<String>,
+}
+
+/// `node list`.
+#[must_use]
+pub fn list(nodes: &[NodeName], all: bool, count: bool) -> Told {
+    let shown = || {
+        let shown = nodes
+            .iter()
+            .filter(|node| all || !is_hidden_node(&node.name));
+        shown.flat_map(|node| std::iter::repeat_n(node.name.as_str(), node.instances))
+    };
+    let text = if count {
+        format!("{}\n", shown().count())
+    } else {
+        shown().map(|name| format!("{name}\n")).collect()
+    };
+    let is_doubled = nodes
+        .iter()
+        .any(|node| node.instances > 1 && (all || !is_hidden_node(&node.name)));
+    let warning = is_doubled.then(|| {
+        "WARNING: Be aware that there are nodes in the graph that share an exact name, which can \
+         have unintended side effects."
+            .to_owned()
+    });
+    Told { text, warning }
+}
+
+/// `node info`; `None` where there is no such node.
+///
+/// # Errors
+/// There is none, or it is hidden and hidden ones are not wanted.
+pub fn info(name: &str, node: Option<&Node>, hidden: bool) -> Result<Told, Refused> {
+    let node = node.filter(|node| node.name == name && (hidden || !is_hidden_node(name)));
+    let node = node.ok_or_else(|| Refused(format!("Unable to find node '{name}'")))?;
+    let mut text = format!("{name}\n");
+    let sections: [(&str, &[Named]); 6] = [
+        ("Subscribers", &node.subscriptions),
+        ("Publishers", &node.publishers),
+        ("Service Servers", &node.services),
+        ("Service Clients", &node.clients),
+        ("Action Servers", &action::of_feedback(&node.publishers)),
+        ("Action Clients", &action::of_feedback(&node.subscriptions)),
+    ];
+    for (title, entries) in sections {
+        let _ = writeln!(text, "  {title}:");
+        let shown = entries
+            .iter()
+            .filter(|entry| hidden || !is_hidden(&entry.name));
+        let lines: Vec<_> = shown
+            .map(|entry| format!("    {}: {}\n", entry.name, entry.types.join(", ")))
+            .collect();
+        if lines.is_empty() {
+            text.push('\n');
+        }
+        text.extend(lines);
+    }
+    let count = node.instances.len();
+    let warning = (count > 1).then(|| {
+        format!(
+            "There are {count} nodes in the graph with the exact name \"{name}\". You are seeing \
+             information about all of them."
+        )
+    });
+    Ok(Told { text, warning })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::facts::Instance;
+    use super::*;
+
+    fn names(nodes: &[(&str, usize)]) -> Vec<NodeName> {
+        let node = |(name, instances): &(&str, usize)| NodeName {
+            name: (*name).to_owned(),
+            instances: *instances,
+        };
+        nodes.iter().map(node).collect()
+    }
+
+    #[test]
+    fn a_list_keeps_doubles_and_warns_of_them() {
+        let nodes = names(&[("/_ros2cli_1", 1), ("/_robot/lidar", 1), ("/talker", 2)]);
+        let told = list(&nodes, false, false);
+        assert_eq!(told.text, "/_robot/lidar\n/talker\n/talker\n");
+        assert!(
+            told.warning
+                .unwrap()
+                .starts_with("WARNING: Be aware that there are nodes")
+        );
+        assert_eq!(list(&nodes, true, true).text, "4\n");
+        let single = list(&names(&[("/talker", 1)]), false, false);
+        assert_eq!((single.text.as_str(), single.warning), ("/talker\n", None));
+        assert_eq!(list(&[], false, false).text, "");
+    }
+
+    fn named(names: &[(&str, &str)]) -> Vec<Named> {
+        let entry = |(name, types): &(&str, &str)| Named {
+            name: (*name).to_owned(),
+            types: vec![(*types).to_owned()],
+        };
+        names.iter().map(entry).collect()
+    }
+
+    fn node(name: &str, instances: usize) -> Node {
+        Node {
+            name: name.to_owned(),
+            instances: vec![Instance {}; instances],
+            publishers: named(&[
+                ("/fib/_action/feedback", "a/action/Fib_FeedbackMessage"),
+                ("/rosout", "rcl_interfaces/msg/Log"),
+            ]),
+            services: named(&[("/fib/_action/send_goal", "a/action/Fib_SendGoal")]),
+            ..Node::default()
+        }
+    }
+
+    #[test]
+    fn an_empty_section_is_one_empty_line_and_hidden_names_are_left_out() {
+        let talker = node("/talker", 1);
+        let told = info("/talker", Some(&talker), false).unwrap();
+        assert_eq!(
+            told.text,
+            "/talker\n  Subscribers:\n\n  Publishers:\n    /rosout: rcl_interfaces/msg/Log\n  \
+             Service Servers:\n\n  Service Clients:\n\n  Action Servers:\n    /fib: a/action/Fib\n  \
+             Action Clients:\n\n"
+        );
+        assert_eq!(told.warning, None);
+        let told = info("/talker", Some(&talker), true).unwrap();
+        assert!(
+            told.text
+                .contains("    /fib/_action/send_goal: a/action/Fib_SendGoal\n")
+        );
+    }
+
+    #[test]
+    fn who_is_not_there_or_hidden_is_not_found() {
+        let hidden = node("/_ros2cli_1", 1);
+        let said = |name, node, all| info(name, node, all);
+        let refused = said("/_ros2cli_1", Some(&hidden), false).unwrap_err();
+        assert_eq!(refused.0, "Unable to find node '/_ros2cli_1'");
+        assert!(said("/_ros2cli_1", Some(&hidden), true).is_ok());
+        assert!(said("_ros2cli_1", Some(&hidden), true).is_err());
+        assert!(said("/nope", None, true).is_err());
+        let warning = said("/talker", Some(&node("/talker", 2)), false)
+            .unwrap()
+            .warning;
+        assert!(
+            warning
+                .unwrap()
+                .starts_with("There are 2 nodes in the graph with the exact name")
+        );
+    }
+}
