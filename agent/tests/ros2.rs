@@ -1,8 +1,15 @@
 //! `rp topic`, `rp node`, `rp service` and `rp action`: the text of the original, from an agent and
 //! from a capture, and how they behave among other tools.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test may panic"
+)]
 
 mod local_agent;
+#[path = "ros2/rates.rs"]
+mod rates;
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpListener;

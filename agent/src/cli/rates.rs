@@ -165,7 +165,7 @@ fn measure(
         let query = format!("topic={}", names.join(","));
         (Rates::of(quantity, dialect, window, named), query)
     };
-    let agent = Agent::reach(target)?;
+    let agent = Agent::reach_stream(target)?;
     let path = format!("/samples?{query}&domain_id={domain_id}");
     let mut lines = agent.stream(&path)?;
     let mut output = Output::new();
