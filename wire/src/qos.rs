@@ -91,6 +91,16 @@ pub struct History {
     pub depth: i32,
 }
 
+/// As ROS says it: `KEEP_LAST (10)`, `KEEP_ALL`.
+impl fmt::Display for History {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.kind {
+            HistoryKind::KEEP_LAST => write!(f, "{} ({})", self.kind, self.depth),
+            kind => write!(f, "{kind}"),
+        }
+    }
+}
+
 /// How changes to several instances are presented together.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Presentation {

@@ -45,6 +45,11 @@ impl<'a> Lines<'a> {
         }
     }
 
+    /// Who says it.
+    pub(super) const fn agent(&self) -> &'a Agent {
+        self.agent
+    }
+
     /// Waits for a line; `None` when the agent hung up.
     ///
     /// # Errors

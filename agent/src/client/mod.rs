@@ -8,6 +8,7 @@
 mod error;
 mod lines;
 mod replayed;
+mod samples;
 mod target;
 mod way;
 
@@ -26,6 +27,7 @@ use tokio::time::timeout;
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
 use replayed::Stop;
+pub use samples::{Got, Samples};
 pub use target::{Target, Unfit};
 use way::Way;
 
@@ -135,6 +137,16 @@ impl Agent {
         })
     }
 
+    /// A line or an answer, read.
+    fn decoded<T: DeserializeOwned>(&self, path: &str, text: &[u8]) -> Result<T, ClientError> {
+        serde_json::from_slice(text).map_err(|source| self.way.unreadable(path, source))
+    }
+
+    /// It ended before it said anything.
+    fn hung_up(&self, path: &str) -> ClientError {
+        self.way.broke(format!("{path} ended before it began"))
+    }
+
     /// Where it is, for people.
     #[must_use]
     pub fn place(&self) -> String {
@@ -155,7 +167,7 @@ impl Agent {
             let patience = timeout(PATIENCE, exchange).await;
             patience.unwrap_or_else(|_| Err(self.way.slow()))
         })?;
-        serde_json::from_slice(&answer).map_err(|source| self.way.unreadable(path, source))
+        self.decoded(path, &answer)
     }
 
     async fn send(

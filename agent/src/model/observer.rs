@@ -26,7 +26,7 @@ use super::header::begins_with_header;
 use super::interest::Interest;
 use super::journal::Journal;
 use super::passage::{lacks_names, may_share_memory};
-use super::payloads::{self, Given, Payloads};
+use super::payloads::{self, Given, Offered, Payloads};
 use super::pieces::Pieces;
 use super::profiler::{Profiler, Sighting};
 use super::rate::Slot;
@@ -761,6 +761,10 @@ impl Observer {
                             name: Arc::clone(&topic.naming.name),
                             dds_name: Arc::clone(&topic.naming.dds_name),
                             message_type: Arc::clone(&endpoint.message_type),
+                            offered: Some(Arc::new(Offered {
+                                type_hash: endpoint.type_hash,
+                                qos: endpoint.qos.clone(),
+                            })),
                         };
                         self.payloads.want(guid, topic, wished, now);
                     }

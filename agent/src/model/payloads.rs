@@ -8,6 +8,8 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
+use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::assembly::Assembly;
@@ -31,6 +33,17 @@ pub struct Topic {
     pub dds_name: Arc<str>,
     /// ROS name of the type, as in `sensor_msgs/msg/PointCloud2`.
     pub message_type: Arc<str>,
+    /// What the writer announced.
+    pub offered: Option<Arc<Offered>>,
+}
+
+/// What a writer announced with its topic.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Offered {
+    /// RIHS01 hash of its type; not before Iron.
+    pub type_hash: Option<TypeHash>,
+    /// Quality of service.
+    pub qos: Qos,
 }
 
 /// One message. Immutable, shared by all who want it.

@@ -7,7 +7,6 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::TypeHash;
-use ros2probe_wire::qos::HistoryKind;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{Duration, EntityId, Guid, Timestamp};
 
@@ -194,19 +193,13 @@ fn endpoint_facts(
     measurement: Option<Box<Measurement>>,
 ) -> EndpointFacts {
     let qos = &endpoint.qos;
-    let history = match qos.history {
-        None => "UNKNOWN".to_owned(),
-        Some(history) if history.kind == HistoryKind::KEEP_LAST => {
-            format!("{} ({})", history.kind, history.depth)
-        }
-        Some(history) => history.kind.to_string(),
-    };
+    let history = qos.history;
     EndpointFacts {
         guid,
         node: node.map(ToOwned::to_owned),
         reliability: qos.reliability.to_string(),
         durability: qos.durability.to_string(),
-        history,
+        history: history.map_or_else(|| "UNKNOWN".to_owned(), |history| history.to_string()),
         deadline_nanoseconds: nanoseconds(qos.deadline),
         lifespan_nanoseconds: nanoseconds(qos.lifespan),
         liveliness: qos.liveliness.to_string(),

@@ -7,8 +7,12 @@ mod announced;
 mod filter;
 mod recorder;
 mod report;
+mod ring;
+mod session;
 
 pub use announced::Announced;
 pub use filter::{Asked, Candidate, Filter, FilterError};
 pub use recorder::{Ended, Recorder, Sources};
 pub use report::{MissingRun, Report, TopicReport};
+pub use ring::Ring;
+pub use session::{Order, record};

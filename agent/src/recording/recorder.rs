@@ -5,14 +5,19 @@
 //! taken before is in the bag, and what is not is counted.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::Arc;
 
+use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::announced::Announced;
 use super::filter::{Candidate, Filter};
 use super::report::Report;
-use crate::bag::{Error, Schema, Summary, TopicDescription, TopicId, Writer};
-use crate::model::payloads::Sample;
+use super::ring::Ring;
+use crate::bag::{
+    Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
+};
+use crate::model::payloads::{Offered, Sample};
 use crate::subscriptions::{Item, Topic};
 
 const SECOND: u64 = 1_000_000_000;
@@ -40,6 +45,8 @@ pub struct Recorder {
     topics: HashMap<String, Place>,
     report: Report,
     paused: bool,
+    /// In snapshot mode: samples that wait for being asked for.
+    ring: Option<Ring>,
     flushed: Timestamp,
     synced: Timestamp,
 }
@@ -54,9 +61,11 @@ enum Place {
 
 struct Taken {
     id: TopicId,
-    message_type: String,
+    description: TopicDescription,
+    /// Of each publisher by its GUID, for the description.
+    offered: BTreeMap<String, Qos>,
     /// Number of the first recorded sample of each writer.
-    first: BTreeMap<Guid, u64>,
+    first: HashMap<Guid, u64>,
 }
 
 /// What became of a recording.
@@ -81,9 +90,31 @@ impl Recorder {
             topics: HashMap::new(),
             report: Report::default(),
             paused: false,
+            ring: None,
             flushed: Timestamp(0),
             synced: Timestamp(0),
         }
+    }
+
+    /// Keeps the last samples in memory and writes them when [`Self::snapshot`] asks for them.
+    #[must_use]
+    pub fn waiting_in(self, ring: Ring) -> Self {
+        Self {
+            ring: Some(ring),
+            ..self
+        }
+    }
+
+    /// Writes what waits in memory; nothing where it does not wait.
+    ///
+    /// # Errors
+    /// The storage takes no more.
+    pub fn snapshot(&mut self) -> Result<(), Error> {
+        let waiting: Vec<_> = self.ring.iter_mut().flat_map(Ring::drain).collect();
+        for sample in waiting {
+            self.write(&sample)?;
+        }
+        self.writer.flush()
     }
 
     /// What it has so far.
@@ -117,12 +148,32 @@ impl Recorder {
         self.writer.split()
     }
 
+    /// Complete files that are to be compressed, by another thread.
+    pub fn take_compressions(&mut self) -> Vec<FileCompression> {
+        self.writer.take_file_compressions()
+    }
+
+    /// One of them is.
+    ///
+    /// # Errors
+    /// The storage takes no more.
+    pub fn compressed(&mut self, done: &Compressed) -> Result<(), Error> {
+        self.writer.compressed(done)
+    }
+
     /// Takes a topic into the bag that may never have a message; `name` as discovery knows it.
     ///
     /// # Errors
     /// The storage takes no more.
     pub fn declare(&mut self, name: &str, message_type: &str) -> Result<(), Error> {
-        self.place(name, message_type, false).map(drop)
+        if !self.topics.contains_key(name) {
+            let place = self.decide(name, message_type, None, false)?;
+            // One that is left out may yet be published.
+            if matches!(place, Place::Taken(_)) {
+                self.topics.insert(name.to_owned(), place);
+            }
+        }
+        Ok(())
     }
 
     /// Takes what the subscription gives.
@@ -131,13 +182,17 @@ impl Recorder {
     /// The storage takes no more; [`Self::finish`] completes the bag all the same.
     pub fn take(&mut self, item: &Item) -> Result<(), Error> {
         match item {
-            Item::Sample(sample) => self.sample(sample),
+            Item::Sample(sample) if sample.payload.is_none() => Ok(()),
+            Item::Sample(sample) => match &mut self.ring {
+                Some(ring) if !self.paused => {
+                    ring.push(Arc::clone(sample));
+                    Ok(())
+                }
+                _ => self.write(sample),
+            },
             Item::Clock(now) => self.clock(*now),
             Item::Missed(missed) => {
-                let Topic {
-                    name, message_type, ..
-                } = &*missed.topic;
-                if !self.paused && self.place(name, message_type, true)?.is_some() {
+                if !self.paused && self.place(&missed.topic)?.is_some() {
                     self.report.missed(missed);
                 }
                 Ok(())
@@ -167,7 +222,7 @@ impl Recorder {
         }
     }
 
-    fn sample(&mut self, sample: &Sample) -> Result<(), Error> {
+    fn write(&mut self, sample: &Sample) -> Result<(), Error> {
         let Some(payload) = &sample.payload else {
             return Ok(());
         };
@@ -178,19 +233,15 @@ impl Recorder {
             }
             return Ok(());
         }
-        let Some(taken) = self.place(&topic.name, &topic.message_type, true)? else {
+        let Some(taken) = self.place(topic)? else {
             return Ok(());
         };
         let id = taken.id;
-        let writers = taken.first.len();
-        if writers < WRITERS {
-            let first = taken.first.entry(sample.writer).or_insert(u64::MAX);
+        if let Some(first) = taken.first.get_mut(&sample.writer) {
             *first = sample.sequence_number.min(*first);
-        }
-        if writers > 0 && taken.first.len() > writers {
-            // One more publisher, perhaps with other QoS.
-            let announced = (self.sources.announced)(&topic.name);
-            self.describe(&topic.name, &topic.message_type, &announced)?;
+        } else if taken.first.len() < WRITERS {
+            taken.first.insert(sample.writer, sample.sequence_number);
+            self.introduce(topic, sample.writer)?;
         }
         let sent = sample.source_timestamp.unwrap_or(sample.time);
         self.writer
@@ -219,70 +270,100 @@ impl Recorder {
         !matches!(self.topics.get(name), Some(Place::LeftOut))
     }
 
-    /// The topic's place in the bag; `None` where it is not recorded.
-    fn place(
-        &mut self,
-        name: &str,
-        message_type: &str,
-        seen: bool,
-    ) -> Result<Option<&mut Taken>, Error> {
-        if !self.topics.contains_key(name) {
-            let place = self.decide(name, message_type, seen)?;
-            if !seen && matches!(place, Place::LeftOut) {
-                // It may yet be published.
-                return Ok(None);
-            }
-            self.topics.insert(name.to_owned(), place);
+    /// The place of a topic of which something came; `None` where it is not recorded.
+    fn place(&mut self, topic: &Topic) -> Result<Option<&mut Taken>, Error> {
+        let Topic {
+            name, message_type, ..
+        } = topic;
+        if !self.topics.contains_key(&**name) {
+            let place = self.decide(name, message_type, topic.offered.as_deref(), true)?;
+            self.topics.insert(name.to_string(), place);
         }
-        let Some(Place::Taken(taken)) = self.topics.get_mut(name) else {
+        let Some(Place::Taken(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
         };
-        if taken.message_type != message_type {
-            if !self.report.left_out.iter().any(|left_out| left_out == name) {
-                self.report.left_out.push(name.to_owned());
+        // A loss may be told before the first message, and without a type.
+        if !message_type.is_empty() && taken.description.type_name != **message_type {
+            if !self
+                .report
+                .left_out
+                .iter()
+                .any(|left_out| **left_out == **name)
+            {
+                self.report.left_out.push(name.to_string());
             }
             return Ok(None);
         }
         Ok(Some(taken))
     }
 
-    fn decide(&mut self, name: &str, message_type: &str, seen: bool) -> Result<Place, Error> {
-        let announced = (self.sources.announced)(name);
+    fn decide(
+        &mut self,
+        name: &str,
+        message_type: &str,
+        offered: Option<&Offered>,
+        came: bool,
+    ) -> Result<Place, Error> {
+        // What the writer announced comes with its messages; the rest has to be asked for.
+        let announced = match offered {
+            Some(_) if !self.filter.asked().ignore_leaf_topics => Announced::default(),
+            _ => (self.sources.announced)(name),
+        };
+        let known = announced
+            .message_types
+            .first()
+            .filter(|_| message_type.is_empty());
+        let message_type = known.map_or(message_type, String::as_str);
         let types = [message_type.to_owned()];
         let candidate = Candidate {
             name,
             types: &types,
-            published: seen || !announced.publishers.is_empty(),
+            published: came || !announced.publishers.is_empty(),
             subscribed: !announced.subscriptions.is_empty(),
         };
         if !self.filter.takes(&candidate) {
             return Ok(Place::LeftOut);
         }
-        let id = self.describe(name, message_type, &announced)?;
+        let type_hash = offered.and_then(|offered| offered.type_hash.as_ref());
+        let type_hash = type_hash.map(ToString::to_string);
+        let type_hash = type_hash.or_else(|| announced.type_hashes.first().cloned());
+        let publishers = announced.publishers.iter();
+        let offered: BTreeMap<_, _> = publishers
+            .map(|publisher| (publisher.guid.clone(), publisher.qos.qos()))
+            .collect();
+        let description = TopicDescription {
+            name: name.to_owned(),
+            type_name: message_type.to_owned(),
+            schema: (self.sources.schema)(message_type, type_hash.as_deref()),
+            type_hash,
+            publishers: offered.values().cloned().collect(),
+        };
+        // Before its first message comes its description: with that of its writer.
+        let id = self.writer.topic(description.clone())?;
         self.report.topic(name);
         Ok(Place::Taken(Taken {
             id,
-            message_type: message_type.to_owned(),
-            first: BTreeMap::new(),
+            description,
+            offered,
+            first: HashMap::new(),
         }))
     }
 
-    fn describe(
-        &mut self,
-        name: &str,
-        message_type: &str,
-        announced: &Announced,
-    ) -> Result<TopicId, Error> {
-        let hash = announced.type_hashes.first().cloned();
-        let schema = (self.sources.schema)(message_type, hash.as_deref());
-        let publishers = announced.publishers.iter();
-        self.writer.topic(TopicDescription {
-            name: name.to_owned(),
-            type_name: message_type.to_owned(),
-            type_hash: hash,
-            publishers: publishers.map(|publisher| publisher.qos.qos()).collect(),
-            schema,
-        })
+    /// Describes a topic again when a writer is new that offers something.
+    fn introduce(&mut self, topic: &Topic, writer: Guid) -> Result<(), Error> {
+        let (Some(offered), Some(Place::Taken(taken))) =
+            (&topic.offered, self.topics.get_mut(&*topic.name))
+        else {
+            return Ok(());
+        };
+        let before = taken
+            .offered
+            .insert(writer.to_string(), offered.qos.clone());
+        if before.is_some_and(|before| before == offered.qos) {
+            return Ok(());
+        }
+        taken.description.publishers = taken.offered.values().cloned().collect();
+        self.writer.topic(taken.description.clone()).map(drop)
     }
 
     /// Publishers that keep samples for late joiners, of which the first ones are not in the bag.
@@ -322,8 +403,6 @@ impl std::fmt::Debug for Recorder {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;
@@ -348,6 +427,7 @@ mod tests {
             name: name.into(),
             dds_name: format!("rt{name}").into(),
             message_type: message_type.into(),
+            offered: None,
         })
     }
 

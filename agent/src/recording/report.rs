@@ -189,6 +189,7 @@ mod tests {
                 name: "/points".into(),
                 dds_name: "rt/points".into(),
                 message_type: "sensor_msgs/msg/PointCloud2".into(),
+                offered: None,
             }),
             writer: Guid::default(),
             first,

@@ -4,12 +4,15 @@
 //! sample's line is followed by as many raw bytes as it says, and then the next line. Times are
 //! nanoseconds since the Unix epoch.
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::qos::{Durability, History, HistoryKind, Liveliness, Qos, Reliability, Role};
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Duration, Timestamp};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::Item;
-use crate::model::payloads::{Missed, MissedReason, Sample, Topic};
+use crate::model::payloads::{Missed, MissedReason, Offered, Sample, Topic};
 
 /// Media type of a stream without payloads.
 pub const LINES: &str = "application/x-ndjson";
@@ -17,7 +20,7 @@ pub const LINES: &str = "application/x-ndjson";
 pub const SAMPLES: &str = "application/vnd.ros2probe.samples";
 
 /// One line.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 #[schema(as = SampleLine)]
 pub enum Line {
@@ -53,7 +56,7 @@ pub struct OpenTopic {
 }
 
 /// A message, told once.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SampleFacts {
     /// ROS name of its topic.
     #[schema(example = "/points")]
@@ -79,6 +82,41 @@ pub struct SampleFacts {
     pub size: u32,
     /// So many raw bytes follow this line; null where payloads were not asked for.
     pub payload_bytes: Option<u32>,
+    /// What the writer announced: with the first of its messages, where payloads were asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    pub offered: Option<OfferedFacts>,
+}
+
+/// What a writer announced.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+#[schema(as = Offered)]
+pub struct OfferedFacts {
+    /// RIHS01 hash of the type; null where it is not announced (Humble).
+    pub type_hash: Option<String>,
+    /// Quality of service.
+    pub qos: QosFacts,
+}
+
+/// Quality of service in ROS's words; durations are null when they are infinite.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+#[schema(as = OfferedQos)]
+pub struct QosFacts {
+    /// `RELIABLE` or `BEST_EFFORT`.
+    pub reliability: String,
+    /// `VOLATILE`, `TRANSIENT_LOCAL`, ...
+    pub durability: String,
+    /// `UNKNOWN` where the implementation does not say.
+    #[schema(example = "KEEP_LAST (10)")]
+    pub history: String,
+    /// Longest time between two messages.
+    pub deadline_seconds: Option<f64>,
+    /// Age at which messages become void.
+    pub lifespan_seconds: Option<f64>,
+    /// Who says that the writer is alive.
+    pub liveliness: String,
+    /// Time within which that is said.
+    pub liveliness_lease_seconds: Option<f64>,
 }
 
 /// How far the stream has come.
@@ -165,6 +203,7 @@ impl From<&Sample> for SampleFacts {
             header_stamp_ns: sample.header_stamp.map(stamp),
             size: sample.size,
             payload_bytes: sample.payload.as_ref().map(len),
+            offered: None,
         }
     }
 }
@@ -185,6 +224,113 @@ impl From<&Missed> for MissedFacts {
             },
         }
     }
+}
+
+impl From<&Offered> for OfferedFacts {
+    fn from(offered: &Offered) -> Self {
+        Self {
+            type_hash: offered.type_hash.as_ref().map(ToString::to_string),
+            qos: QosFacts::from(&offered.qos),
+        }
+    }
+}
+
+impl OfferedFacts {
+    /// As discovery told.
+    #[must_use]
+    pub fn offered(&self) -> Offered {
+        Offered {
+            type_hash: self.type_hash.as_deref().and_then(TypeHash::parse),
+            qos: self.qos.qos(),
+        }
+    }
+}
+
+impl From<&Qos> for QosFacts {
+    fn from(qos: &Qos) -> Self {
+        let finite = |duration| match duration {
+            Duration::Finite(nanoseconds) => Some(seconds(nanoseconds)),
+            Duration::Infinite => None,
+        };
+        Self {
+            reliability: qos.reliability.to_string(),
+            durability: qos.durability.to_string(),
+            history: match qos.history {
+                None => "UNKNOWN".to_owned(),
+                Some(history) => history.to_string(),
+            },
+            deadline_seconds: finite(qos.deadline),
+            lifespan_seconds: finite(qos.lifespan),
+            liveliness: qos.liveliness.to_string(),
+            liveliness_lease_seconds: finite(qos.liveliness_lease),
+        }
+    }
+}
+
+impl QosFacts {
+    /// As policies; what has no word stays unknown.
+    #[must_use]
+    pub fn qos(&self) -> Qos {
+        let unknown = u32::MAX;
+        Qos {
+            reliability: match self.reliability.as_str() {
+                "RELIABLE" => Reliability::RELIABLE,
+                "BEST_EFFORT" => Reliability::BEST_EFFORT,
+                _ => Reliability(unknown),
+            },
+            durability: durability(&self.durability),
+            history: history(&self.history),
+            deadline: duration(self.deadline_seconds),
+            lifespan: duration(self.lifespan_seconds),
+            liveliness: match self.liveliness.as_str() {
+                "AUTOMATIC" => Liveliness::AUTOMATIC,
+                "MANUAL_BY_PARTICIPANT" => Liveliness::MANUAL_BY_PARTICIPANT,
+                "MANUAL_BY_TOPIC" => Liveliness::MANUAL_BY_TOPIC,
+                _ => Liveliness(unknown),
+            },
+            liveliness_lease: duration(self.liveliness_lease_seconds),
+            ..Qos::defaults(Role::Writer, VendorId([0, 0]))
+        }
+    }
+}
+
+fn durability(word: &str) -> Durability {
+    match word {
+        "VOLATILE" => Durability::VOLATILE,
+        "TRANSIENT_LOCAL" => Durability::TRANSIENT_LOCAL,
+        "TRANSIENT" => Durability::TRANSIENT,
+        "PERSISTENT" => Durability::PERSISTENT,
+        _ => Durability(u32::MAX),
+    }
+}
+
+fn history(words: &str) -> Option<History> {
+    if words == "KEEP_ALL" {
+        let kind = HistoryKind::KEEP_ALL;
+        return Some(History { kind, depth: 0 });
+    }
+    let depth = words.strip_prefix("KEEP_LAST (")?.strip_suffix(')')?;
+    Some(History {
+        kind: HistoryKind::KEEP_LAST,
+        depth: depth.parse().ok()?,
+    })
+}
+
+fn duration(seconds: Option<f64>) -> Duration {
+    let Some(seconds) = seconds else {
+        return Duration::Infinite;
+    };
+    let duration = std::time::Duration::try_from_secs_f64(seconds).ok();
+    let nanoseconds = duration.and_then(|duration| u64::try_from(duration.as_nanos()).ok());
+    nanoseconds.map_or(Duration::Infinite, Duration::Finite)
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "durations of QoS are given in milliseconds"
+)]
+pub(crate) fn seconds(nanoseconds: u64) -> f64 {
+    nanoseconds as f64 / 1e9
 }
 
 fn nanoseconds(time: Timestamp) -> i64 {
@@ -225,5 +371,26 @@ mod tests {
             assert_eq!(serde_json::to_string(&line).unwrap(), text);
             assert_eq!(serde_json::from_str::<Line>(text).unwrap(), line);
         }
+    }
+
+    #[test]
+    fn quality_of_service_survives_being_told() {
+        let qos = Qos {
+            reliability: Reliability::BEST_EFFORT,
+            durability: Durability::TRANSIENT_LOCAL,
+            history: history("KEEP_LAST (5)"),
+            deadline: Duration::Finite(100_000_000),
+            ..Qos::defaults(Role::Writer, VendorId([0, 0]))
+        };
+        let facts = QosFacts::from(&qos);
+        assert_eq!(
+            (facts.history.as_str(), facts.lifespan_seconds),
+            ("KEEP_LAST (5)", None)
+        );
+        assert_eq!(facts.qos(), qos);
+        assert_eq!(history("KEEP_LAST (x)"), None);
+        assert_eq!(history("KEEP_ALL").unwrap().kind, HistoryKind::KEEP_ALL);
+        assert_eq!(duration(Some(-1.0)), Duration::Infinite);
+        assert_eq!(durability("?").name(), None);
     }
 }

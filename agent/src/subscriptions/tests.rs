@@ -35,6 +35,7 @@ fn sample(number: u64, payload: Option<usize>) -> Arc<Sample> {
             name: "/points".into(),
             dds_name: "rt/points".into(),
             message_type: "a/msg/B".into(),
+            offered: None,
         }),
         time: Timestamp(number),
         writer: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3])),

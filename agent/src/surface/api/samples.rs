@@ -4,6 +4,7 @@
 //! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
 //! and is told, on a replay it is waited for. It holds nobody else up.
 
+use std::collections::HashSet;
 use std::convert::Infallible;
 use std::time::Duration;
 
@@ -13,6 +14,7 @@ use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use futures_util::stream;
+use ros2probe_wire::Guid;
 use serde::Deserialize;
 use tokio_util::sync::CancellationToken;
 use utoipa::IntoParams;
@@ -24,7 +26,7 @@ use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use crate::config::watch::MAX_DOMAIN;
 use crate::model::snapshot::Snapshot;
-use crate::subscriptions::line::{LINES, Line, Open, OpenTopic, SAMPLES};
+use crate::subscriptions::line::{LINES, Line, OfferedFacts, Open, OpenTopic, SAMPLES};
 use crate::subscriptions::{
     Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
 };
@@ -32,6 +34,8 @@ use crate::surface::SourceKind;
 
 /// Names and globs in one request.
 const MAX_PATTERNS: usize = 256;
+/// Writers that are introduced to one client.
+const WRITERS: usize = 65_536;
 /// Lines made into one piece of the answer.
 const BATCH_BYTES: usize = 16 * 1024;
 /// Room for arrivals, a few thousand; and for messages with their bytes.
@@ -75,6 +79,8 @@ struct Stream {
     /// Payload that goes out next, behind its line.
     payload: Option<Bytes>,
     first: Option<Line>,
+    /// Writers of which it was told what they announced.
+    introduced: HashSet<Guid>,
     ended: bool,
 }
 
@@ -149,6 +155,7 @@ async fn samples(
         stop: context.stop.clone(),
         payload: None,
         first: Some(first),
+        introduced: HashSet::new(),
         ended: false,
     };
     let stream = stream::unfold(stream, |mut stream| async {
@@ -175,7 +182,7 @@ impl Stream {
                 None if !lines.is_empty() => break,
                 None => self.wait().await,
             };
-            write(&mut lines, &Line::from(&item));
+            write(&mut lines, &self.told(&item));
             match item {
                 Item::Sample(sample) => self.payload.clone_from(&sample.payload),
                 Item::End(_) => self.ended = true,
@@ -183,6 +190,20 @@ impl Stream {
             }
         }
         (!lines.is_empty()).then(|| lines.into())
+    }
+
+    /// The line for it; with what the writer announced where it is the writer's first.
+    fn told(&mut self, item: &Item) -> Line {
+        let mut line = Line::from(item);
+        if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
+            && sample.payload.is_some()
+            && let Some(offered) = &sample.topic.offered
+            && self.introduced.len() < WRITERS
+            && self.introduced.insert(sample.writer)
+        {
+            facts.offered = Some(OfferedFacts::from(&**offered));
+        }
+        line
     }
 
     async fn wait(&mut self) -> Item {
