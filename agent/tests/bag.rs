@@ -6,6 +6,11 @@
     reason = "a test that meets the unexpected has failed"
 )]
 
+#[path = "bags/cut.rs"]
+mod cut;
+#[path = "bags/real.rs"]
+mod real;
+
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;

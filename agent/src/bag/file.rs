@@ -7,16 +7,18 @@
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
-use std::io::{self, Write as _};
+use std::io::{self, Read as _, Seek as _, Write as _};
 use std::os::fd::AsRawFd as _;
 use std::path::{Path, PathBuf};
 
 use flate2::Crc;
 
+use super::Compression;
 use super::mcap::{
     self, Channel, Chunk, ChunkIndex, Footer, Message, Metadata, Opcode, Schema, Statistics,
 };
 use super::options::Storage;
+use super::read::Scan;
 
 /// What a file's header names as its writer.
 pub(super) const LIBRARY: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
@@ -83,6 +85,63 @@ impl FileWriter {
         writer.reserve(0)?;
         writer.append(&[&begin])?;
         writer.write_metadata(metadata)?;
+        Ok(writer)
+    }
+
+    /// Begins `path` with what is whole of `source`, to be gone on with and finished.
+    pub(super) fn resume(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Self> {
+        source.rewind()?;
+        let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        let copied = io::copy(&mut source.take(scan.end), &mut file)?;
+        if copied != scan.end {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        let contents = &scan.contents;
+        let (start, end) = contents.times.unwrap_or_default();
+        let mut writer = Self {
+            path: path.to_owned(),
+            file,
+            storage: Storage {
+                chunked: !scan.chunks.is_empty() || contents.counts.is_empty(),
+                compression: Compression::None,
+                ..Storage::default()
+            },
+            position: copied,
+            data_crc: None,
+            pending: Pending::default(),
+            schemas: contents.schemas.clone(),
+            channels: contents.channels.clone(),
+            chunk_indexes: Vec::new(),
+            metadata: scan.metadata_places.clone(),
+            statistics: Statistics {
+                message_count: contents.counts.values().sum(),
+                metadata_count: u32::try_from(scan.metadata_places.len()).unwrap_or(u32::MAX),
+                chunk_count: u32::try_from(scan.chunks.len()).unwrap_or(u32::MAX),
+                start,
+                end,
+                channel_message_counts: contents.counts.clone(),
+                ..Statistics::default()
+            },
+            reserves: true,
+        };
+        let (last, before) = match scan.chunks.split_last() {
+            Some((last, before)) => (Some(last.clone()), before),
+            None => (None, &[][..]),
+        };
+        before
+            .iter()
+            .for_each(|chunk| chunk.write(&mut writer.chunk_indexes));
+        if let Some(mut last) = last {
+            let mut indexes = Vec::new();
+            for (channel, entries) in &scan.last_chunk_index {
+                let offset = writer.position + indexes.len() as u64;
+                last.message_indexes.insert(*channel, offset);
+                mcap::message_index(&mut indexes, *channel, entries);
+            }
+            last.message_indexes_length += indexes.len() as u64;
+            writer.append(&[&indexes])?;
+            last.write(&mut writer.chunk_indexes);
+        }
         Ok(writer)
     }
 
@@ -184,7 +243,7 @@ impl FileWriter {
     /// Bytes in the file, and those that wait as far as their size is known.
     pub(super) fn expected_bytes(&self) -> u64 {
         match self.storage.compression {
-            super::Compression::None => self.position + self.pending.records.len() as u64,
+            Compression::None => self.position + self.pending.records.len() as u64,
             _ => self.position,
         }
     }
@@ -321,7 +380,6 @@ impl FileWriter {
 
     /// Back to the last whole record.
     fn cut(&mut self) -> io::Result<()> {
-        use std::io::Seek as _;
         self.file.set_len(self.position)?;
         self.file.seek(io::SeekFrom::Start(self.position)).map(drop)
     }

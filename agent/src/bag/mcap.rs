@@ -405,6 +405,29 @@ pub fn metadata_index(out: &mut Vec<u8>, offset: u64, length: u64, name: &str) {
     });
 }
 
+/// Offset and length, from the content of such a record.
+#[must_use]
+pub fn read_metadata_index(content: &[u8]) -> Option<(u64, u64)> {
+    let mut cursor = Cursor(content);
+    Some((cursor.u64()?, cursor.u64()?))
+}
+
+/// The profile, from the first record's content.
+#[must_use]
+pub fn read_header(content: &[u8]) -> Option<String> {
+    Cursor(content).text().map(str::to_owned)
+}
+
+/// Compression and what is there of the records, from a chunk's content that was cut.
+#[must_use]
+pub fn cut_chunk(content: &[u8]) -> Option<(&str, &[u8])> {
+    let mut cursor = Cursor(content);
+    cursor.take(8 * 3 + 4)?;
+    let compression = cursor.text()?;
+    cursor.u64()?;
+    Some((compression, cursor.0))
+}
+
 /// Appends where the summary has its records of one kind.
 pub fn summary_offset(out: &mut Vec<u8>, group: Opcode, start: u64, length: u64) {
     record(out, Opcode::SUMMARY_OFFSET, |out| {

@@ -10,10 +10,13 @@ use std::path::{Path, PathBuf};
 
 pub mod compression;
 mod file;
+pub mod info;
 pub mod mcap;
 pub mod metadata;
 pub mod options;
 pub mod qos;
+pub mod read;
+pub mod reindex;
 mod writer;
 
 pub use compression::Compression;

@@ -554,6 +554,15 @@ impl Writer {
 }
 
 impl FileCompression {
+    /// For a file that is complete already.
+    pub(super) fn of(path: &Path, compression: Compression) -> Self {
+        Self {
+            path: path.to_owned(),
+            compression,
+            index: 0,
+        }
+    }
+
     /// Compresses the file beside itself, then removes it. Takes long; needs room for both.
     pub fn run(&self) -> Result<Compressed, Error> {
         let into = with_suffix(&self.path, self.compression.name());
@@ -690,7 +699,7 @@ pub(super) fn write_metadata(
     })
 }
 
-fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+pub(super) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(".");
     name.push(suffix);

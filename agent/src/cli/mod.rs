@@ -2,6 +2,7 @@
 //! the answer put into words, and prints; it decides nothing else.
 
 mod action;
+mod bag;
 mod discover;
 mod doctor;
 mod interrupt;
@@ -54,6 +55,8 @@ pub(crate) enum Command {
 /// What an agent, or a capture, is asked.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Question {
+    /// Recordings on disk, as `ros2 bag` makes and reads them
+    Bag(bag::Bag),
     /// What topics there are and what comes by them, as `ros2 topic` says
     Topic(topic::Topic),
     /// What nodes there are and what they do, as `ros2 node` says
@@ -73,6 +76,7 @@ impl Question {
             interrupt::listen(code)?;
         }
         match self {
+            Self::Bag(bag) => bag.ask(),
             Self::Topic(topic) => topic.ask(),
             Self::Node(node) => node.ask(),
             Self::Service(service) => service.ask(),
@@ -84,6 +88,7 @@ impl Question {
     /// The exit code when Ctrl-C ends it at once; `None` for what wants to end by itself.
     fn interrupted(&self) -> Option<u8> {
         match self {
+            Self::Bag(_) => Some(interrupt::INTERRUPTED),
             Self::Topic(topic) => Some(topic.interrupted()),
             Self::Node(_) | Self::Service(_) | Self::Action(_) | Self::Doctor(_) => {
                 Some(interrupt::INTERRUPTED)

@@ -1,0 +1,463 @@
+//! Reading MCAP files: by their summary, or record by record where there is none.
+//!
+//! A file that was never finished is read as far as its records go, into the chunk that was cut.
+//! Memory is bounded by the largest record. Nothing is believed to be there that is not, and
+//! nothing is written.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufReader, Read, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use super::Compression;
+use super::mcap::{
+    self, Channel, Chunk, ChunkIndex, Footer, Message, Metadata, Opcode, RECORD_HEADER, Schema,
+    Statistics,
+};
+
+/// No record is longer: a length beyond this is damage.
+const MAX_RECORD: u64 = 1 << 30;
+/// A chunk holds no more than this.
+const MAX_CHUNK: u64 = 1 << 30;
+
+/// What a file holds.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Contents {
+    /// `ros2`.
+    pub profile: String,
+    /// All, by number.
+    pub schemas: BTreeMap<u16, Schema>,
+    /// All, by number.
+    pub channels: BTreeMap<u16, Channel>,
+    /// Messages of each channel.
+    pub counts: BTreeMap<u16, u64>,
+    /// Earliest and latest log time.
+    pub times: Option<(u64, u64)>,
+    /// In order.
+    pub metadata: Vec<Metadata>,
+}
+
+/// What a file is found to be, record by record.
+#[derive(Clone, PartialEq, Eq, Debug, Default)]
+pub struct Scan {
+    /// What it holds; messages of a cut chunk are in [`Self::cut`] only.
+    pub contents: Contents,
+    /// Bytes of each channel's messages.
+    pub sizes: BTreeMap<u16, u64>,
+    /// The data section ends as it should.
+    pub is_ended: bool,
+    /// Where the data section's last whole record ends.
+    pub end: u64,
+    /// Its chunks, as an index would have them.
+    pub chunks: Vec<ChunkIndex>,
+    /// Offset and length of metadata records.
+    pub metadata_places: Vec<(u64, u64)>,
+    /// What the last chunk's missing indexes would say, where the file ends before them.
+    pub last_chunk_index: BTreeMap<u16, Vec<(u64, u64)>>,
+    /// Records at the beginning of a chunk that was cut, whole ones only.
+    pub cut: Vec<u8>,
+    /// Chunks that cannot be looked into.
+    pub unreadable_chunks: u64,
+}
+
+/// Why a file cannot be read at all.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// It is not there, or not allowed, or broken.
+    #[error("cannot read {}", path.display())]
+    Io {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// It begins otherwise.
+    #[error("{} is not an MCAP file", .0.display())]
+    NotMcap(PathBuf),
+}
+
+impl Contents {
+    /// From the summary at the file's end; `None` where it has none that says all.
+    pub fn of_summary(path: &Path) -> Result<Option<Self>, ReadError> {
+        let wrong = |source| ReadError::Io {
+            path: path.to_owned(),
+            source,
+        };
+        let mut file = File::open(path).map_err(wrong)?;
+        let mut magic = [0; mcap::MAGIC.len()];
+        if file.read_exact(&mut magic).is_err() || magic != mcap::MAGIC {
+            return Err(ReadError::NotMcap(path.to_owned()));
+        }
+        read_summary(&mut file).map_err(wrong)
+    }
+
+    /// From the summary, or else from all records.
+    pub fn of_file(path: &Path) -> Result<Self, ReadError> {
+        if compression(path) == Compression::None
+            && let Some(contents) = Self::of_summary(path)?
+        {
+            return Ok(contents);
+        }
+        let mut scan = scan(path, &mut |_, _| {})?;
+        let cut = std::mem::take(&mut scan.cut);
+        take_chunk(&cut, &mut scan, &mut |_, _| {});
+        Ok(scan.contents)
+    }
+
+    pub(super) fn take(&mut self, opcode: Opcode, content: &[u8]) {
+        match opcode {
+            Opcode::SCHEMA => {
+                if let Some(schema) = Schema::read(content) {
+                    self.schemas.insert(schema.id, schema);
+                }
+            }
+            Opcode::CHANNEL => {
+                if let Some(channel) = Channel::read(content) {
+                    self.channels.insert(channel.id, channel);
+                }
+            }
+            Opcode::METADATA => self.metadata.extend(Metadata::read(content)),
+            _ => {}
+        }
+    }
+
+    fn count(&mut self, message: &Message<'_>) {
+        *self.counts.entry(message.channel_id).or_default() += 1;
+        let at = message.log_time;
+        let (start, end) = self.times.unwrap_or((at, at));
+        self.times = Some((start.min(at), end.max(at)));
+    }
+}
+
+fn read_summary(file: &mut File) -> io::Result<Option<Contents>> {
+    let length = file.metadata()?.len();
+    let tail = (Footer::LENGTH + mcap::MAGIC.len()) as u64;
+    if length < tail {
+        return Ok(None);
+    }
+    let bytes = read_at(file, length - tail, tail)?;
+    let footer = match mcap::next_record(&bytes) {
+        Some((Opcode::FOOTER, content, rest)) if rest == mcap::MAGIC => Footer::read(content),
+        _ => None,
+    };
+    let Some(footer) = footer.filter(|footer| (1..=length - tail).contains(&footer.summary_start))
+    else {
+        return Ok(None);
+    };
+    let summary_length = length - tail - footer.summary_start;
+    if summary_length > MAX_RECORD {
+        return Ok(None);
+    }
+    let summary = read_at(file, footer.summary_start, summary_length)?;
+    let mut contents = Contents::default();
+    let mut statistics = None;
+    let mut metadata = Vec::new();
+    let mut rest = summary.as_slice();
+    while let Some((opcode, content, after)) = mcap::next_record(rest) {
+        rest = after;
+        match opcode {
+            Opcode::STATISTICS => statistics = Statistics::read(content),
+            Opcode::METADATA_INDEX => metadata.extend(mcap::read_metadata_index(content)),
+            _ => contents.take(opcode, content),
+        }
+    }
+    let Some(statistics) = statistics.filter(|_| rest.is_empty()) else {
+        return Ok(None);
+    };
+    let times = (statistics.start, statistics.end);
+    contents.times = (statistics.message_count > 0).then_some(times);
+    contents.counts = statistics.channel_message_counts;
+    for (offset, record_length) in metadata {
+        if offset
+            .checked_add(record_length)
+            .is_some_and(|end| end <= length)
+            && record_length <= MAX_RECORD
+            && let Some((Opcode::METADATA, content, _)) =
+                mcap::next_record(&read_at(file, offset, record_length)?)
+        {
+            contents.take(Opcode::METADATA, content);
+        }
+    }
+    Ok(Some(contents))
+}
+
+fn read_at(file: &mut File, offset: u64, length: u64) -> io::Result<Vec<u8>> {
+    file.seek(SeekFrom::Start(offset))?;
+    let mut bytes = Vec::new();
+    file.take(length).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// What is called for every message, with what is known of its channel by then.
+pub type Each<'a> = dyn FnMut(&Message<'_>, &Contents) + 'a;
+
+/// Reads a file record by record, `.zstd` and `.lz4` decompressed.
+pub fn scan(path: &Path, each: &mut Each<'_>) -> Result<Scan, ReadError> {
+    let wrong = |source| ReadError::Io {
+        path: path.to_owned(),
+        source,
+    };
+    let file = File::open(path).map_err(wrong)?;
+    let reader = compression(path).reader(BufReader::with_capacity(1 << 16, file));
+    let mut records = Records {
+        reader: reader.map_err(wrong)?,
+        position: 0,
+    };
+    let mut magic = Vec::new();
+    records
+        .read(mcap::MAGIC.len() as u64, &mut magic)
+        .map_err(wrong)?;
+    if magic != mcap::MAGIC {
+        return Err(ReadError::NotMcap(path.to_owned()));
+    }
+    scan_records(&mut records, each).map_err(wrong)
+}
+
+/// Of the whole file, by its name.
+pub(super) fn compression(path: &Path) -> Compression {
+    let suffix = path.extension().and_then(|suffix| suffix.to_str());
+    suffix.and_then(Compression::named).unwrap_or_default()
+}
+
+fn scan_records(records: &mut Records<'_>, each: &mut Each<'_>) -> io::Result<Scan> {
+    let mut scan = Scan {
+        end: records.position,
+        ..Scan::default()
+    };
+    // Indexes of the last chunk, until the next record of another kind.
+    let mut indexed: Option<Indexed> = None;
+    let mut content = Vec::new();
+    loop {
+        let start = records.position;
+        let whole = records.next(&mut content)?;
+        let opcode = match whole {
+            Next::Whole(opcode) => opcode,
+            Next::Cut(Opcode::CHUNK) => {
+                finish_chunk(indexed.take(), &mut scan, false);
+                scan.cut = whole_records(&content);
+                return Ok(scan);
+            }
+            Next::Cut(_) | Next::End => {
+                finish_chunk(indexed.take(), &mut scan, true);
+                return Ok(scan);
+            }
+        };
+        if opcode == Opcode::MESSAGE_INDEX
+            && let Some(indexed) = &mut indexed
+            && let Some(channel) = content.first_chunk().copied().map(u16::from_le_bytes)
+        {
+            indexed.offsets.insert(channel, start);
+            indexed.length += records.position - start;
+            scan.end = records.position;
+            continue;
+        }
+        // Where nothing was written to, after the loss of power, zeros may stand.
+        let at_end = matches!(opcode, Opcode(0) | Opcode::DATA_END | Opcode::FOOTER);
+        finish_chunk(indexed.take(), &mut scan, at_end);
+        match opcode {
+            Opcode::CHUNK => {
+                let Some(chunk) = Chunk::read(&content) else {
+                    return Ok(scan);
+                };
+                let index = look_into(&chunk, &mut scan, each);
+                indexed = Some(Indexed {
+                    chunk: ChunkIndex {
+                        start: chunk.start,
+                        end: chunk.end,
+                        offset: start,
+                        length: records.position - start,
+                        message_indexes: BTreeMap::new(),
+                        message_indexes_length: 0,
+                        compression: chunk.compression.to_owned(),
+                        compressed_size: chunk.records.len() as u64,
+                        uncompressed_size: chunk.uncompressed_size,
+                    },
+                    offsets: BTreeMap::new(),
+                    length: 0,
+                    index,
+                });
+            }
+            Opcode::MESSAGE => {
+                if let Some(message) = Message::read(&content) {
+                    take_message(&message, &mut scan, each);
+                }
+            }
+            Opcode::METADATA => {
+                scan.metadata_places.push((start, records.position - start));
+                scan.contents.take(opcode, &content);
+            }
+            Opcode::DATA_END => {
+                scan.is_ended = true;
+                return Ok(scan);
+            }
+            Opcode::HEADER => {
+                scan.contents.profile = mcap::read_header(&content).unwrap_or_default();
+            }
+            // Not in a data section: whatever follows is no record either.
+            Opcode(0) | Opcode::FOOTER => return Ok(scan),
+            _ => scan.contents.take(opcode, &content),
+        }
+        scan.end = records.position;
+    }
+}
+
+/// A chunk whose message indexes are being read.
+struct Indexed {
+    chunk: ChunkIndex,
+    offsets: BTreeMap<u16, u64>,
+    length: u64,
+    /// What they should say.
+    index: BTreeMap<u16, Vec<(u64, u64)>>,
+}
+
+/// `at_end`: the file ends here, and indexes that are missing can still be written.
+fn finish_chunk(indexed: Option<Indexed>, scan: &mut Scan, at_end: bool) {
+    let Some(mut indexed) = indexed else {
+        return;
+    };
+    if at_end && indexed.offsets.len() < indexed.index.len() {
+        // All of them again, behind the chunk.
+        scan.end = indexed.chunk.offset + indexed.chunk.length;
+        scan.last_chunk_index = indexed.index;
+    } else {
+        indexed.chunk.message_indexes = indexed.offsets;
+        indexed.chunk.message_indexes_length = indexed.length;
+    }
+    scan.chunks.push(indexed.chunk);
+}
+
+fn look_into(
+    chunk: &Chunk<'_>,
+    scan: &mut Scan,
+    each: &mut Each<'_>,
+) -> BTreeMap<u16, Vec<(u64, u64)>> {
+    let limit = chunk.uncompressed_size.min(MAX_CHUNK);
+    let records = match Compression::named(chunk.compression) {
+        Some(Compression::None) => return take_chunk(chunk.records, scan, each),
+        Some(compression) => compression.decompressed(chunk.records, limit),
+        None => Err(io::ErrorKind::Unsupported.into()),
+    };
+    match records {
+        Ok(records) => take_chunk(&records, scan, each),
+        Err(_) => {
+            scan.unreadable_chunks += 1;
+            BTreeMap::new()
+        }
+    }
+}
+
+/// Takes a chunk's records, and says what its message indexes are.
+fn take_chunk(
+    records: &[u8],
+    scan: &mut Scan,
+    each: &mut Each<'_>,
+) -> BTreeMap<u16, Vec<(u64, u64)>> {
+    let mut index: BTreeMap<u16, Vec<(u64, u64)>> = BTreeMap::new();
+    let mut rest = records;
+    while let Some((opcode, content, after)) = mcap::next_record(rest) {
+        let offset = (records.len() - rest.len()) as u64;
+        rest = after;
+        if opcode != Opcode::MESSAGE {
+            scan.contents.take(opcode, content);
+        } else if let Some(message) = Message::read(content) {
+            let entries = index.entry(message.channel_id).or_default();
+            entries.push((message.log_time, offset));
+            take_message(&message, scan, each);
+        }
+    }
+    if !rest.is_empty() {
+        scan.unreadable_chunks += 1;
+    }
+    index
+}
+
+fn take_message(message: &Message<'_>, scan: &mut Scan, each: &mut Each<'_>) {
+    scan.contents.count(message);
+    *scan.sizes.entry(message.channel_id).or_default() += message.data.len() as u64;
+    each(message, &scan.contents);
+}
+
+/// The whole records at the beginning of a chunk's record that was cut.
+fn whole_records(content: &[u8]) -> Vec<u8> {
+    let Some((compression, records)) = mcap::cut_chunk(content) else {
+        return Vec::new();
+    };
+    let mut bytes = Vec::new();
+    match Compression::named(compression) {
+        Some(Compression::None) => bytes.extend_from_slice(records),
+        Some(compression) => {
+            if let Ok(reader) = compression.reader(records) {
+                // Up to where it was cut, which is an error here.
+                let _ = reader.take(MAX_CHUNK).read_to_end(&mut bytes);
+            }
+        }
+        None => {}
+    }
+    let mut rest = bytes.as_slice();
+    while let Some((Opcode::SCHEMA | Opcode::CHANNEL | Opcode::MESSAGE, _, after)) =
+        mcap::next_record(rest)
+    {
+        rest = after;
+    }
+    let whole = bytes.len() - rest.len();
+    bytes.truncate(whole);
+    bytes
+}
+
+/// Records one after the other.
+struct Records<'a> {
+    reader: Box<dyn Read + 'a>,
+    position: u64,
+}
+
+enum Next {
+    Whole(Opcode),
+    /// The file ends within it; what is there of its content was read.
+    Cut(Opcode),
+    End,
+}
+
+impl Records<'_> {
+    fn next(&mut self, content: &mut Vec<u8>) -> io::Result<Next> {
+        content.clear();
+        let mut head = Vec::new();
+        self.read(RECORD_HEADER as u64, &mut head)?;
+        let Some((opcode, length)) = head.split_first() else {
+            return Ok(Next::End);
+        };
+        let opcode = Opcode(*opcode);
+        let Some(length) = length.first_chunk().copied().map(u64::from_le_bytes) else {
+            return Ok(Next::Cut(Opcode(0)));
+        };
+        if length > MAX_RECORD {
+            return Ok(Next::Cut(Opcode(0)));
+        }
+        let read = self.read(length, content)?;
+        Ok(if read == length {
+            Next::Whole(opcode)
+        } else {
+            Next::Cut(opcode)
+        })
+    }
+
+    /// Reads at most this much: allocated as it comes. A compressed stream that was cut just ends.
+    fn read(&mut self, length: u64, into: &mut Vec<u8>) -> io::Result<u64> {
+        let before = into.len();
+        let result = (&mut self.reader).take(length).read_to_end(into);
+        let read = (into.len() - before) as u64;
+        self.position += read;
+        match result {
+            Err(error)
+                if !matches!(
+                    error.kind(),
+                    io::ErrorKind::UnexpectedEof
+                        | io::ErrorKind::Other
+                        | io::ErrorKind::InvalidData
+                ) =>
+            {
+                Err(error)
+            }
+            _ => Ok(read),
+        }
+    }
+}

@@ -1,0 +1,387 @@
+//! Making a bag whole again: files that were never finished get their summary, metadata.yaml is
+//! made from the files.
+//!
+//! A file is rewritten beside itself and takes its place when it is on the disk; whatever of it is
+//! no whole record is kept in a file of its own. What is complete is not touched, and what is no
+//! MCAP file is left alone and said.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::fs::{self, File};
+use std::io::{self, Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use super::file::FileWriter;
+use super::mcap::{self, Message, Opcode};
+use super::metadata::{self, Metadata, Topic};
+use super::read::{self, Contents, ReadError, Scan};
+use super::writer::{Durability, FileCompression, with_suffix, write_metadata};
+use super::{Compression, Error, info};
+
+/// What was found and done.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Report {
+    /// Each file, in order.
+    pub files: Vec<FileReport>,
+    /// What metadata.yaml says now.
+    pub metadata: Metadata,
+}
+
+/// One file.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct FileReport {
+    /// Its name.
+    pub name: String,
+    /// In it now.
+    pub messages: u64,
+    /// How it was found.
+    pub found: Found,
+}
+
+/// How a file was found.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Found {
+    /// With its summary: not touched.
+    Complete,
+    /// Without: completed.
+    Unfinished {
+        /// Of these messages, so many were in a chunk that was cut.
+        salvaged: u64,
+        /// Bytes that were no whole record.
+        cut: u64,
+        /// Where those lie, if they were not only zeros.
+        kept: Option<String>,
+        /// Chunks that cannot be looked into; they are still there.
+        unreadable_chunks: u64,
+    },
+    /// Not one: left alone, and not in metadata.yaml.
+    NotMcap,
+}
+
+/// Why nothing, or not everything, was done.
+#[derive(Debug, thiserror::Error)]
+pub enum ReindexError {
+    /// Nothing to make a bag of.
+    #[error("No storage files found for reindexing in {}", .0.display())]
+    NoFiles(PathBuf),
+    /// Another storage.
+    #[error("{} is in the sqlite3 storage, which rp does not read: use `ros2 bag reindex`", .0.display())]
+    Sqlite3(PathBuf),
+    /// A file cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// A file cannot be written; the one it was made of is as it was.
+    #[error(transparent)]
+    Write(#[from] Error),
+}
+
+/// Completes all files of a bag and writes its metadata.yaml.
+pub fn reindex(directory: &Path) -> Result<Report, ReindexError> {
+    let mut names = files(directory)?;
+    let before = fs::read_to_string(directory.join(metadata::FILE_NAME)).ok();
+    let before = before.and_then(|text| Metadata::read(&text).ok());
+    let compression = names.iter().map(|name| read::compression(Path::new(name)));
+    let compression = compression.max_by_key(|compression| *compression != Compression::None);
+    let compression = compression.unwrap_or_default();
+    let mut reports = Vec::new();
+    let mut parts = Vec::new();
+    for name in &mut names {
+        let path = directory.join(&*name);
+        let (found, contents) = complete(&path)?;
+        if let Some(contents) = &contents
+            && compression != Compression::None
+            && read::compression(&path) == Compression::None
+            && found != Found::NotMcap
+        {
+            // In a bag all files are compressed, or none is.
+            FileCompression::of(&path, compression).run()?;
+            name.push('.');
+            name.push_str(compression.name());
+            parts.push((name.clone(), contents.clone()));
+        } else if let Some(contents) = &contents {
+            parts.push((name.clone(), contents.clone()));
+        }
+        reports.push(FileReport {
+            name: name.clone(),
+            messages: contents.map_or(0, |contents| contents.counts.values().sum()),
+            found,
+        });
+    }
+    let metadata = metadata_of(&parts, before, compression, &reports);
+    write_metadata(directory, &metadata, Durability::Power)?;
+    Ok(Report {
+        files: reports,
+        metadata,
+    })
+}
+
+/// Names of a bag's files by their number.
+fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
+    let wrong = |source| ReadError::Io {
+        path: directory.to_owned(),
+        source,
+    };
+    let mut names = Vec::new();
+    let mut is_sqlite3 = false;
+    for entry in fs::read_dir(directory).map_err(wrong)? {
+        let name = entry.map_err(wrong)?.file_name();
+        let Some(name) = name.to_str() else {
+            continue;
+        };
+        is_sqlite3 |= name.ends_with(".db3");
+        if [".mcap", ".mcap.zstd", ".mcap.lz4"]
+            .iter()
+            .any(|suffix| name.ends_with(suffix))
+        {
+            names.push(name.to_owned());
+        }
+    }
+    // One that was killed between compressing a file and removing it left both.
+    let all = names.clone();
+    names.retain(|name| {
+        let is_compressed = |suffix| all.contains(&format!("{name}.{suffix}"));
+        !is_compressed("zstd") && !is_compressed("lz4")
+    });
+    names.sort_by_cached_key(|name| (number(name), name.clone()));
+    if names.is_empty() {
+        return Err(match is_sqlite3 {
+            true => ReindexError::Sqlite3(directory.to_owned()),
+            false => ReindexError::NoFiles(directory.to_owned()),
+        });
+    }
+    Ok(names)
+}
+
+/// `12` of `bag_12.mcap`; what has none comes first.
+fn number(name: &str) -> Option<u64> {
+    let (stem, _) = name.split_once(".mcap")?;
+    stem.rsplit_once('_')?.1.parse().ok()
+}
+
+fn complete(path: &Path) -> Result<(Found, Option<Contents>), ReindexError> {
+    if read::compression(path) == Compression::None {
+        match Contents::of_summary(path) {
+            Err(ReadError::NotMcap(_)) => return Ok((Found::NotMcap, None)),
+            Err(error) => return Err(error.into()),
+            Ok(Some(contents)) => return Ok((Found::Complete, Some(contents))),
+            Ok(None) => {}
+        }
+        let scan = read::scan(path, &mut |_, _| {})?;
+        let written = |error| Error::writing(path, error);
+        let found = rewrite(path, &scan).map_err(written)?;
+        let contents = Contents::of_summary(path)?;
+        return Ok((found, contents));
+    }
+    match read::scan(path, &mut |_, _| {}) {
+        Err(ReadError::NotMcap(_)) => Ok((Found::NotMcap, None)),
+        Err(error) => Err(error.into()),
+        Ok(scan) => Ok((Found::Complete, Some(scan.contents))),
+    }
+}
+
+fn rewrite(path: &Path, scan: &Scan) -> io::Result<Found> {
+    let part = with_suffix(path, "part");
+    remove(&part)?;
+    let done = write_part(path, &part, scan);
+    if done.is_err() {
+        let _ = fs::remove_file(&part);
+    }
+    done
+}
+
+fn write_part(path: &Path, part: &Path, scan: &Scan) -> io::Result<Found> {
+    let mut source = File::open(path)?;
+    let mut writer = FileWriter::resume(part, &mut source, scan)?;
+    let mut salvaged = 0;
+    let mut known = scan.contents.clone();
+    let mut rest = scan.cut.as_slice();
+    while let Some((opcode, content, after)) = mcap::next_record(rest) {
+        rest = after;
+        if opcode != Opcode::MESSAGE {
+            known.take(opcode, content);
+            continue;
+        }
+        let message = Message::read(content);
+        let definition = message
+            .as_ref()
+            .and_then(|message| definition(&known, message));
+        if let (Some(message), Some(definition)) = (message, definition) {
+            writer.write(&message, || definition)?;
+            salvaged += 1;
+        }
+    }
+    let cut = cut_bytes(&mut source, scan)?;
+    writer.finish(std::iter::empty())?;
+    writer.sync()?;
+    let kept = keep_aside(path, &mut source, scan)?;
+    fs::rename(part, path)?;
+    Ok(Found::Unfinished {
+        salvaged,
+        cut,
+        kept,
+        unreadable_chunks: scan.unreadable_chunks,
+    })
+}
+
+fn definition(known: &Contents, message: &Message<'_>) -> Option<(mcap::Schema, mcap::Channel)> {
+    let channel = known.channels.get(&message.channel_id)?;
+    let schema = known.schemas.get(&channel.schema_id)?;
+    Some((schema.clone(), channel.clone()))
+}
+
+/// Bytes behind the last whole record that were a record once.
+fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
+    let length = source.metadata()?.len();
+    if scan.is_ended || is_zero(source, scan.end)? {
+        return Ok(0);
+    }
+    Ok(length - scan.end)
+}
+
+/// Copies what is no whole record beside the file: it may be of use to somebody.
+fn keep_aside(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<String>> {
+    if cut_bytes(source, scan)? == 0 {
+        return Ok(None);
+    }
+    let rest = with_suffix(path, "rest");
+    remove(&rest)?;
+    let mut file = File::options().write(true).create_new(true).open(&rest)?;
+    source.seek(SeekFrom::Start(scan.end))?;
+    io::copy(source, &mut file)?;
+    file.sync_data()?;
+    Ok(rest
+        .file_name()
+        .and_then(|name| name.to_str())
+        .map(str::to_owned))
+}
+
+fn is_zero(source: &mut File, from: u64) -> io::Result<bool> {
+    source.seek(SeekFrom::Start(from))?;
+    let mut buffer = vec![0; 1 << 16];
+    loop {
+        let read = source.read(&mut buffer)?;
+        if read == 0 {
+            return Ok(true);
+        }
+        if buffer.iter().take(read).any(|byte| *byte != 0) {
+            return Ok(false);
+        }
+    }
+}
+
+fn remove(path: &Path) -> io::Result<()> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(error),
+        _ => Ok(()),
+    }
+}
+
+fn metadata_of(
+    parts: &[(String, Contents)],
+    before: Option<Metadata>,
+    compression: Compression,
+    reports: &[FileReport],
+) -> Metadata {
+    let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
+    let mut files = Vec::new();
+    let mut said: Option<Metadata> = before;
+    let mut times: Option<(u64, u64)> = None;
+    for (name, contents) in parts {
+        let suffix = format!(".{}", compression.name());
+        let path = name.strip_suffix(&suffix).unwrap_or(name);
+        let mut part = info::of_contents(contents, path);
+        files.append(&mut part.files);
+        if let Some((start, end)) = contents.times {
+            let (first, last) = times.unwrap_or((start, end));
+            times = Some((first.min(start), last.max(end)));
+        }
+        for topic in &part.topics {
+            let known = topics.entry(topic.name.clone()).or_insert_with(|| Topic {
+                message_count: 0,
+                ..topic.clone()
+            });
+            // Of a topic without messages a later file may know more.
+            if known.message_count == 0 {
+                *known = Topic {
+                    message_count: 0,
+                    ..topic.clone()
+                };
+            }
+            known.message_count += topic.message_count;
+        }
+        said.get_or_insert(part);
+    }
+    let is_named = |topic: &Topic| {
+        let history = topic.offered_qos_profiles.strip_prefix("- history: ");
+        history.is_some_and(|history| history.starts_with(|c: char| c.is_ascii_alphabetic()))
+    };
+    let version = match &said {
+        _ if topics.values().any(is_named) => 9,
+        Some(said) => said.version.max(5),
+        None => 5,
+    };
+    let mut custom_data = said
+        .as_ref()
+        .map(|said| said.custom_data.clone())
+        .unwrap_or_default();
+    for report in reports {
+        if report.found != Found::Complete {
+            custom_data.insert(
+                format!("ros2probe.reindexed {}", report.name),
+                report.to_string(),
+            );
+        }
+    }
+    Metadata {
+        version,
+        storage_identifier: "mcap".to_owned(),
+        duration: times.map_or(0, |(start, end)| end - start),
+        starting_time: times.map_or(metadata::NO_START, |(start, _)| start),
+        message_count: topics.values().map(|topic| topic.message_count).sum(),
+        topics: topics.into_values().collect(),
+        compression_format: compression.name().to_owned(),
+        compression_mode: match compression {
+            Compression::None => String::new(),
+            Compression::Lz4 | Compression::Zstd => "FILE".to_owned(),
+        },
+        relative_file_paths: parts.iter().map(|(name, _)| name.clone()).collect(),
+        files,
+        custom_data,
+        ros_distro: said.map(|said| said.ros_distro).unwrap_or_default(),
+    }
+}
+
+impl fmt::Display for FileReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            name,
+            messages,
+            found,
+        } = self;
+        match found {
+            Found::Complete => write!(f, "{name}: complete, {messages} messages"),
+            Found::NotMcap => write!(
+                f,
+                "{name}: not an MCAP file, left as it is and out of the bag"
+            ),
+            Found::Unfinished {
+                salvaged,
+                cut,
+                kept,
+                unreadable_chunks,
+            } => {
+                write!(f, "{name}: was not finished, is now, {messages} messages")?;
+                if *salvaged > 0 {
+                    write!(f, ", {salvaged} of them from a chunk that was cut")?;
+                }
+                if *unreadable_chunks > 0 {
+                    write!(f, ", {unreadable_chunks} chunks cannot be looked into")?;
+                }
+                match kept {
+                    Some(kept) => write!(f, ", {cut} bytes were no whole record: kept in {kept}"),
+                    None => Ok(()),
+                }
+            }
+        }
+    }
+}
