@@ -59,3 +59,8 @@ fn shared_memory_survives() {
 fn configurations_survive() {
     run("fuzz/seeds/configuration", entry::configuration);
 }
+
+#[test]
+fn definitions_survive() {
+    run("fuzz/seeds/definition", entry::definition);
+}

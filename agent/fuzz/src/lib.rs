@@ -13,6 +13,7 @@ use ros2probe::capture::shm::port::Port;
 use ros2probe::capture::shm::segment::{Buffer, Message};
 use ros2probe::capture::shm::verdict::Judge;
 use ros2probe::config::Config;
+use ros2probe::message::{Definition, MessageType};
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, Packet, Payload};
@@ -126,6 +127,36 @@ pub fn configuration(bytes: &[u8]) {
             }
             assert!(mistakes.report("file").lines().count() >= 1);
         }
+    }
+}
+
+/// A message definition: as each kind of file, and as a bag's schema.
+pub fn definition(bytes: &[u8]) {
+    let Ok(text) = std::str::from_utf8(bytes) else {
+        return;
+    };
+    let lines = text.split(['\r', '\n']).count();
+    for name in ["a/msg/B", "a/srv/B", "a/action/B"] {
+        let name = || name.parse().expect("a type's name");
+        if let Err(mistake) = Definition::parse(name(), text) {
+            assert!((1..=lines).contains(&mistake.line), "{mistake} of {lines}");
+        }
+        match Definition::parse_idl(name(), text) {
+            // Its text stands for the same.
+            Ok(read) => assert_eq!(Definition::parse(name(), &read.text), Ok(read)),
+            Err(mistake) => assert!((1..=lines).contains(&mistake.line), "{mistake} of {lines}"),
+        }
+    }
+    let root = "a/msg/B".parse().expect("a type's name");
+    if let Ok(read) = MessageType::parse(&root, text) {
+        for structure in read.structures() {
+            assert!(read.structure(&structure.name).is_some());
+            assert!(structure.fields.len() <= text.len());
+        }
+        let (encoding, written) = read.schema_text();
+        assert_eq!(encoding, "ros2msg");
+        let again = MessageType::parse(&root, &written).expect("what was read");
+        assert_eq!(again.type_hash(), read.type_hash());
     }
 }
 

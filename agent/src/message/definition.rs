@@ -5,10 +5,11 @@
 //! kept but in the text: neither is on the wire nor part of the type hash.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::fmt;
-use std::str::FromStr;
 use std::sync::Arc;
 
+use super::idl;
+use super::implied::implied;
+pub use super::name::{Kind, NotATypeName, TypeName};
 use super::parse::{self, ParseError};
 
 /// How deep types may be nested.
@@ -17,161 +18,6 @@ pub const MAX_DEPTH: usize = 32;
 pub const MAX_TYPES: usize = 1024;
 /// How much text may define one type, all its parts together.
 pub const MAX_TEXT: usize = 4 << 20;
-/// How long a package's or a type's name may be: both are names of files.
-const MAX_NAME: usize = 200;
-
-/// What kind of file a type is defined in.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Kind {
-    /// An `.action` file.
-    Action,
-    /// A `.msg` file.
-    Message,
-    /// A `.srv` file.
-    Service,
-}
-
-impl Kind {
-    /// As it stands in a type's name; also the file's extension and its directory.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Action => "action",
-            Self::Message => "msg",
-            Self::Service => "srv",
-        }
-    }
-}
-
-/// A type's full name: `sensor_msgs/msg/Imu`. Ordered as its text is.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct TypeName {
-    package: Arc<str>,
-    kind: Kind,
-    name: Arc<str>,
-}
-
-/// Why a text is no type's name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("not a type's name: it has to look like std_msgs/msg/String")]
-pub struct NotATypeName;
-
-impl TypeName {
-    /// From its parts, which have to be identifiers.
-    pub fn new(package: &str, kind: Kind, name: &str) -> Result<Self, NotATypeName> {
-        if !is_identifier(package) || !is_identifier(name) {
-            return Err(NotATypeName);
-        }
-        Ok(Self {
-            package: package.into(),
-            kind,
-            name: name.into(),
-        })
-    }
-
-    /// `sensor_msgs`.
-    pub fn package(&self) -> &str {
-        &self.package
-    }
-
-    /// What kind of file it is defined in.
-    pub fn kind(&self) -> Kind {
-        self.kind
-    }
-
-    /// `Imu`.
-    pub fn name(&self) -> &str {
-        &self.name
-    }
-
-    /// Another type of the same file: this one's name and an ending.
-    pub(super) fn with_suffix(&self, suffix: &str) -> Self {
-        Self {
-            package: self.package.clone(),
-            kind: self.kind,
-            name: format!("{}{suffix}", self.name).into(),
-        }
-    }
-
-    /// The types whose file may define this one: its own, and those whose name with one of the
-    /// endings that services and actions have gives this name.
-    pub(super) fn files(&self) -> Vec<Self> {
-        const SERVICE: [&str; 3] = ["_Request", "_Response", "_Event"];
-        const ACTION: [&str; 12] = [
-            "_SendGoal_Request",
-            "_SendGoal_Response",
-            "_SendGoal_Event",
-            "_GetResult_Request",
-            "_GetResult_Response",
-            "_GetResult_Event",
-            "_SendGoal",
-            "_GetResult",
-            "_FeedbackMessage",
-            "_Goal",
-            "_Result",
-            "_Feedback",
-        ];
-        let endings: &[&str] = match self.kind {
-            Kind::Message => &[],
-            Kind::Service => &SERVICE,
-            Kind::Action => &ACTION,
-        };
-        let mut found = vec![self.clone()];
-        for ending in endings {
-            if let Some(name) = self.name.strip_suffix(ending)
-                && !name.is_empty()
-            {
-                found.push(Self {
-                    name: name.into(),
-                    ..self.clone()
-                });
-                break;
-            }
-        }
-        found
-    }
-}
-
-impl FromStr for TypeName {
-    type Err = NotATypeName;
-
-    fn from_str(text: &str) -> Result<Self, NotATypeName> {
-        let mut parts = text.split('/');
-        let (Some(package), Some(kind), Some(name), None) =
-            (parts.next(), parts.next(), parts.next(), parts.next())
-        else {
-            return Err(NotATypeName);
-        };
-        let kind = match kind {
-            "action" => Kind::Action,
-            "msg" => Kind::Message,
-            "srv" => Kind::Service,
-            _ => return Err(NotATypeName),
-        };
-        Self::new(package, kind, name)
-    }
-}
-
-impl fmt::Display for TypeName {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(
-            formatter,
-            "{}/{}/{}",
-            self.package,
-            self.kind.as_str(),
-            self.name
-        )
-    }
-}
-
-/// Whether a name of a package, type or field can be this.
-pub(super) fn is_identifier(text: &str) -> bool {
-    text.len() <= MAX_NAME
-        && text.starts_with(|first: char| first.is_ascii_alphabetic())
-        && text
-            .bytes()
-            .all(|byte| byte.is_ascii_alphanumeric() || byte == b'_')
-}
-
 /// One member of a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Field {
@@ -254,7 +100,7 @@ pub struct Structure {
 pub struct Definition {
     /// The type it is named after.
     pub name: TypeName,
-    /// The file, as it was read; for an `.idl` file the `.msg` text that means the same.
+    /// The file as it was read; for an `.idl` file the `.msg` text that means the same.
     pub text: Arc<str>,
     pub(super) structures: Vec<Arc<Structure>>,
     /// The messages that the text itself names.
@@ -266,6 +112,11 @@ impl Definition {
     pub fn parse(name: TypeName, text: &str) -> Result<Self, ParseError> {
         let structures = parse::file(&name, text)?;
         Ok(Self::new(name, text.into(), structures))
+    }
+
+    /// Reads an `.idl` file of the kind that the name is of.
+    pub fn parse_idl(name: TypeName, text: &str) -> Result<Self, ParseError> {
+        idl::definition(name, text)
     }
 
     pub(super) fn new(name: TypeName, text: Arc<str>, written: Vec<Structure>) -> Self {
@@ -286,105 +137,6 @@ impl Definition {
             uses,
         }
     }
-}
-
-/// The types that a service or an action has besides what its file spells out, as
-/// `rosidl_parser` composes them.
-fn implied(name: &TypeName) -> Vec<Structure> {
-    let mut structures = Vec::new();
-    match name.kind() {
-        Kind::Message => {}
-        Kind::Service => service(name, &mut structures),
-        Kind::Action => {
-            let nested = |suffix: &str| Element::Nested(name.with_suffix(suffix));
-            let goal_id = || single("goal_id", known("unique_identifier_msgs", "UUID"));
-            let mut push = |suffix: &str, fields: Vec<Field>| {
-                structures.push(Structure {
-                    name: name.with_suffix(suffix),
-                    fields,
-                });
-            };
-            push(
-                "_SendGoal_Request",
-                vec![goal_id(), single("goal", nested("_Goal"))],
-            );
-            push(
-                "_SendGoal_Response",
-                vec![
-                    single("accepted", Element::Bool),
-                    single("stamp", known("builtin_interfaces", "Time")),
-                ],
-            );
-            push("_GetResult_Request", vec![goal_id()]);
-            push(
-                "_GetResult_Response",
-                vec![
-                    single("status", Element::Int8),
-                    single("result", nested("_Result")),
-                ],
-            );
-            push(
-                "_FeedbackMessage",
-                vec![goal_id(), single("feedback", nested("_Feedback"))],
-            );
-            push(
-                "",
-                vec![
-                    single("goal", nested("_Goal")),
-                    single("result", nested("_Result")),
-                    single("feedback", nested("_Feedback")),
-                    single("send_goal_service", nested("_SendGoal")),
-                    single("get_result_service", nested("_GetResult")),
-                    single("feedback_message", nested("_FeedbackMessage")),
-                ],
-            );
-            service(&name.with_suffix("_SendGoal"), &mut structures);
-            service(&name.with_suffix("_GetResult"), &mut structures);
-        }
-    }
-    structures
-}
-
-/// A service's event and the service itself, of which only the hash is ever seen.
-fn service(name: &TypeName, structures: &mut Vec<Structure>) {
-    let nested = |suffix: &str| Element::Nested(name.with_suffix(suffix));
-    let one_at_most = |member: &str, suffix: &str| Field {
-        name: member.to_owned(),
-        element: nested(suffix),
-        shape: Shape::Bounded(1),
-    };
-    structures.push(Structure {
-        name: name.with_suffix("_Event"),
-        fields: vec![
-            single("info", known("service_msgs", "ServiceEventInfo")),
-            one_at_most("request", "_Request"),
-            one_at_most("response", "_Response"),
-        ],
-    });
-    structures.push(Structure {
-        name: name.clone(),
-        fields: vec![
-            single("request_message", nested("_Request")),
-            single("response_message", nested("_Response")),
-            single("event_message", nested("_Event")),
-        ],
-    });
-}
-
-fn single(name: &str, element: Element) -> Field {
-    Field {
-        name: name.to_owned(),
-        element,
-        shape: Shape::Single,
-    }
-}
-
-fn known(package: &str, name: &str) -> Element {
-    Element::Nested(TypeName {
-        package: package.into(),
-        kind: Kind::Message,
-        name: name.into(),
-    })
 }
 
 /// A type and all that it is made of.
@@ -570,55 +322,6 @@ mod tests {
 
     fn name(text: &str) -> TypeName {
         text.parse().unwrap()
-    }
-
-    #[test]
-    fn names_are_three_identifiers() {
-        for text in [
-            "std_msgs/msg/String",
-            "a/srv/B_Request",
-            "a/action/B_FeedbackMessage",
-        ] {
-            assert_eq!(name(text).to_string(), text);
-        }
-        for text in [
-            "",
-            "String",
-            "std_msgs/String",
-            "std_msgs/msg/",
-            "/msg/A",
-            "a/msg/B/c",
-            "a/idl/B",
-            "../msg/B",
-            "a/msg/../../etc",
-            "a/msg/B.C",
-            "a/msg/1",
-            "a/msg/Ä",
-        ] {
-            assert_eq!(text.parse::<TypeName>(), Err(NotATypeName), "{text}");
-        }
-        assert!(
-            format!("a/msg/B{}", "b".repeat(MAX_NAME))
-                .parse::<TypeName>()
-                .is_err()
-        );
-    }
-
-    #[test]
-    fn names_are_ordered_as_their_text_is() {
-        let texts = [
-            "a/action/Z",
-            "a/msg/B",
-            "a/msg/B_Event",
-            "a/srv/A",
-            "ab/msg/A",
-            "a_b/msg/A",
-        ];
-        let mut names = texts.map(name);
-        let mut sorted = texts;
-        names.sort();
-        sorted.sort_unstable();
-        assert_eq!(names.map(|name| name.to_string()), sorted);
     }
 
     #[test]

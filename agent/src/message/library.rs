@@ -4,32 +4,25 @@
 //! Two machines may have different definitions of one name. Where discovery announces a type's hash
 //! the definition has to agree with it, whatever place it is from; a wrong one is never used.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::ffi::OsStr;
-use std::fs::{File, OpenOptions};
-use std::io::{self, Read as _};
-use std::os::unix::fs::OpenOptionsExt as _;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::definition::{Definition, MessageType, NotClosed, TypeName};
-use super::embedded;
-use super::parse::{MAX_TEXT, ParseError, Problem};
+use super::definition::{MessageType, NotClosed, TypeName};
+use super::parse::ParseError;
+use super::place::Place;
+use super::search::Search;
 use crate::ros2::Dialect;
 
 /// Where ROS is installed, one directory for each distribution.
 const INSTALLED: &str = "/opt/ros";
 /// How many places are looked at: a workspace that is installed package by package has hundreds.
-const MAX_PLACES: usize = 1024;
+pub(super) const MAX_PLACES: usize = 1024;
 /// How many types are kept, and how much text.
 const MAX_KEPT: usize = 1024;
 const MAX_KEPT_TEXT: usize = 32 << 20;
-/// How often a type is put together at most until it has the announced hash.
-const MAX_TRIES: usize = 256;
-/// How many times one search asks the file system whether a file is there.
-const MAX_ASKED: usize = 1 << 18;
-/// How much text a search holds.
-const MAX_HELD: usize = 16 << 20;
 /// The only version of type hashes there is.
 const HASH: &str = "RIHS01_";
 
@@ -92,16 +85,6 @@ fn installed(directory: &Path, dialect: Dialect) -> Vec<PathBuf> {
 pub struct Library {
     places: Vec<Place>,
     kept: Mutex<Kept>,
-}
-
-#[derive(Debug)]
-enum Place {
-    /// Named by the user.
-    Directory(PathBuf),
-    /// An installed ROS.
-    Prefix(PathBuf),
-    /// In the program.
-    Embedded(Dialect),
 }
 
 #[derive(Debug, Default)]
@@ -260,289 +243,13 @@ impl Library {
     }
 }
 
-/// What a file holds, if it is still there.
-type Read = Result<Option<Arc<Definition>>, NotFound>;
-
-/// One search for one type.
-struct Search<'a> {
-    places: &'a [Place],
-    root: &'a TypeName,
-    /// Which places have a file, and how often they were asked.
-    having: HashMap<TypeName, Vec<usize>>,
-    asked: usize,
-    /// What was read, by place and file, and how much text that is.
-    read: HashMap<(usize, TypeName), Read>,
-    held: usize,
-}
-
-impl<'a> Search<'a> {
-    fn new(places: &'a [Place], root: &'a TypeName) -> Self {
-        let (having, read) = Default::default();
-        Self {
-            places,
-            root,
-            having,
-            asked: 0,
-            read,
-            held: 0,
-        }
-    }
-
-    /// The first type that can be put together, or that agrees with the hash. Usually all parts are
-    /// of one place and those behind it; a workspace that lies over another ROS than the nodes'
-    /// needs the type from the one and the rest from the other.
-    fn run(&mut self, announced: Option<&str>) -> Result<MessageType, NotFound> {
-        let mut firsts = BTreeSet::new();
-        for file in self.root.files() {
-            firsts.extend(self.places_of(&file)?);
-        }
-        let Some(announced) = announced else {
-            let Some(first) = firsts.first() else {
-                return Err(self.nowhere(self.root.clone()));
-            };
-            // Nothing says that what comes later is right: it is not guessed.
-            return self.assemble(*first, *first);
-        };
-        let mut tries: Vec<_> = firsts.iter().map(|first| (*first, *first)).collect();
-        let (mut next, mut failure, mut another) = (0, None, None);
-        while let Some((first, second)) = tries.get(next).copied().filter(|_| next < MAX_TRIES) {
-            next += 1;
-            match self
-                .assemble(first, second)
-                .map(|found| (found.type_hash(), found))
-            {
-                Ok((hash, found)) if hash == announced => return Ok(found),
-                Ok((hash, _)) => _ = another.get_or_insert((first, hash)),
-                Err(reason) => _ = failure.get_or_insert(reason),
-            }
-            if next == firsts.len() {
-                let seconds: BTreeSet<_> = self.having.values().flatten().copied().collect();
-                let mixed = firsts
-                    .iter()
-                    .flat_map(|first| seconds.iter().map(move |second| (*first, *second)));
-                tries.extend(
-                    mixed
-                        .filter(|(first, second)| first != second)
-                        .take(MAX_TRIES),
-                );
-            }
-        }
-        if let Some((place, found)) = another {
-            let place = self
-                .places
-                .get(place)
-                .map(Place::describe)
-                .unwrap_or_default();
-            let (name, announced) = (self.root.clone(), announced.to_owned());
-            return Err(NotFound::Another {
-                name,
-                place,
-                found,
-                announced,
-            });
-        }
-        Err(failure.unwrap_or_else(|| self.nowhere(self.root.clone())))
-    }
-
-    fn nowhere(&self, missing: TypeName) -> NotFound {
-        NotFound::Nowhere {
-            missing,
-            root: self.root.clone(),
-        }
-    }
-
-    /// The type with each part from `first` if it is there, then `second` and what is behind it, at
-    /// last from what is before it.
-    fn assemble(&mut self, first: usize, second: usize) -> Result<MessageType, NotFound> {
-        let root = self.root.clone();
-        let rank = |place: usize| match place {
-            _ if place == first => 0,
-            _ if place >= second => 1 + place - second,
-            _ => 1 + MAX_PLACES + place,
-        };
-        let found = MessageType::assemble(&root, |file| {
-            let mut places = self.places_of(file).map_err(Failure::Known)?;
-            places.sort_by_key(|place| rank(*place));
-            for place in places {
-                if let Some(found) = self.definition(place, file).map_err(Failure::Known)? {
-                    return Ok(Some(found));
-                }
-            }
-            Ok(None)
-        });
-        found.map_err(|failure| match failure {
-            Failure::Known(failure) => failure,
-            Failure::NotClosed(NotClosed::Missing(missing)) => self.nowhere(missing),
-            Failure::NotClosed(reason) => NotFound::Refused { root, reason },
-        })
-    }
-
-    /// The places that have a file, readable or not.
-    fn places_of(&mut self, file: &TypeName) -> Result<Vec<usize>, NotFound> {
-        if let Some(known) = self.having.get(file) {
-            return Ok(known.clone());
-        }
-        self.asked += self.places.len();
-        if self.asked > MAX_ASKED {
-            let (root, reason) = (self.root.clone(), NotClosed::TooMany);
-            return Err(NotFound::Refused { root, reason });
-        }
-        let places = self.places.iter().enumerate();
-        let having: Vec<_> = places
-            .filter(|(_, place)| place.has(file))
-            .map(|(index, _)| index)
-            .collect();
-        self.having.insert(file.clone(), having.clone());
-        Ok(having)
-    }
-
-    fn definition(&mut self, place: usize, file: &TypeName) -> Read {
-        let key = (place, file.clone());
-        if let Some(known) = self.read.get(&key) {
-            return known.clone();
-        }
-        let found = match self.places.get(place) {
-            Some(place) => place.read(file).map(|found| found.map(Arc::new)),
-            None => Ok(None),
-        };
-        if self.held > MAX_HELD {
-            self.read.clear();
-            self.held = 0;
-        }
-        self.held += found
-            .iter()
-            .flatten()
-            .map(|found| found.text.len())
-            .sum::<usize>();
-        self.read.insert(key, found.clone());
-        found
-    }
-}
-
-/// Why parts could not be put together.
-enum Failure {
-    /// What was found of one.
-    Known(NotFound),
-    NotClosed(NotClosed),
-}
-
-impl From<NotClosed> for Failure {
-    fn from(reason: NotClosed) -> Self {
-        Self::NotClosed(reason)
-    }
-}
-
-impl Place {
-    fn describe(&self) -> String {
-        match self {
-            Self::Directory(path) | Self::Prefix(path) => format!("in {}", path.display()),
-            Self::Embedded(_) => "that comes with ros2probe".to_owned(),
-        }
-    }
-
-    fn has(&self, name: &TypeName) -> bool {
-        match self {
-            Self::Embedded(dialect) => embedded::find(name, *dialect).is_some(),
-            Self::Directory(_) | Self::Prefix(_) => self.file(name).is_some(),
-        }
-    }
-
-    /// The file that defines a type; also one that cannot be read, which has to be told.
-    fn file(&self, name: &TypeName) -> Option<PathBuf> {
-        let kind = name.kind().as_str();
-        let below = Path::new(name.package())
-            .join(kind)
-            .join(format!("{}.{kind}", name.name()));
-        let candidates = match self {
-            Self::Embedded(_) => Vec::new(),
-            Self::Directory(path) => vec![path.join(&below), path.join("share").join(&below)],
-            Self::Prefix(path) => vec![path.join("share").join(&below)],
-        };
-        candidates
-            .into_iter()
-            .find(|path| match std::fs::metadata(path) {
-                Ok(_) => true,
-                Err(error) => !is_absent(&error),
-            })
-    }
-
-    fn read(&self, name: &TypeName) -> Result<Option<Definition>, NotFound> {
-        let (path, text) = match self {
-            Self::Embedded(dialect) => match embedded::find(name, *dialect) {
-                Some(text) => (PathBuf::from(name.to_string()), text.to_owned()),
-                None => return Ok(None),
-            },
-            Self::Directory(_) | Self::Prefix(_) => {
-                let Some(path) = self.file(name) else {
-                    return Ok(None);
-                };
-                let Some(text) = read(&path)? else {
-                    return Ok(None);
-                };
-                (path, text)
-            }
-        };
-        let definition = Definition::parse(name.clone(), &text);
-        definition
-            .map(Some)
-            .map_err(|mistake| NotFound::Mistake { path, mistake })
-    }
-}
-
-fn is_absent(error: &io::Error) -> bool {
-    matches!(
-        error.kind(),
-        io::ErrorKind::NotFound | io::ErrorKind::NotADirectory
-    )
-}
-
-/// A file's text, if it is there. Never waits: what is no regular file is refused.
-fn read(path: &Path) -> Result<Option<String>, NotFound> {
-    let unreadable = |source: io::Error| NotFound::Unreadable {
-        path: path.to_owned(),
-        source: Arc::new(source),
-    };
-    let mistake = |line, problem| NotFound::Mistake {
-        path: path.to_owned(),
-        mistake: ParseError { line, problem },
-    };
-    let mut options = OpenOptions::new();
-    let file: File = match options.read(true).custom_flags(libc::O_NONBLOCK).open(path) {
-        Ok(file) => file,
-        Err(error) if is_absent(&error) => return Ok(None),
-        Err(error) => return Err(unreadable(error)),
-    };
-    if !file.metadata().map_err(unreadable)?.is_file() {
-        return Err(unreadable(io::Error::new(
-            io::ErrorKind::InvalidInput,
-            "not a regular file",
-        )));
-    }
-    let mut bytes = Vec::new();
-    file.take(MAX_TEXT as u64 + 1)
-        .read_to_end(&mut bytes)
-        .map_err(unreadable)?;
-    if bytes.len() > MAX_TEXT {
-        return Err(mistake(1, Problem::TooLong));
-    }
-    String::from_utf8(bytes).map(Some).map_err(|error| {
-        let good = error.utf8_error().valid_up_to();
-        let lines = error
-            .as_bytes()
-            .iter()
-            .take(good)
-            .filter(|byte| **byte == b'\n')
-            .count();
-        mistake(lines + 1, Problem::NotText)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use std::fs;
 
     use tempfile::TempDir;
 
+    use super::super::parse::MAX_TEXT;
     use super::*;
 
     /// An installed ROS with these files: `a/msg/B.msg` and its text.
@@ -733,6 +440,36 @@ mod tests {
         fs::write(&path, vec![b'#'; MAX_TEXT + 1]).unwrap();
         let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
         assert!(failure.to_string().contains("longer than"), "{failure}");
+    }
+
+    #[test]
+    fn an_idl_file_counts_where_it_is_alone() {
+        let idl =
+            "module a { module msg { struct B { long long x; std_msgs::msg::Header y; }; }; };";
+        let here = prefix(&[
+            ("a/msg/B.idl", idl),
+            ("a/msg/C.msg", "B b"),
+            ("a/msg/C.idl", "none"),
+        ]);
+        let found = library(&[&here]).find("a/msg/C", None).unwrap();
+        let text = found.schema_text().1;
+        assert!(
+            text.contains("MSG: a/B\nint64 x\nstd_msgs/Header y\n"),
+            "{text}"
+        );
+        assert_eq!(
+            MessageType::parse(&found.root, &text).unwrap().type_hash(),
+            found.type_hash()
+        );
+        let broken = prefix(&[("a/msg/B.idl", "module a {\nunion U;")]);
+        let failure = library(&[&broken])
+            .find("a/msg/B", None)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            failure.ends_with("B.idl: line 2: `union` is not supported"),
+            "{failure}"
+        );
     }
 
     #[test]

@@ -6,14 +6,15 @@
 
 use std::collections::BTreeSet;
 
-use super::definition::{Element, Field, Kind, Shape, Structure, TypeName, is_identifier};
+use super::definition::{Element, Field, Kind, Shape, Structure, TypeName};
+use super::name::is_identifier;
 
 /// The longest file that is read: the longest in use have 30 kB.
 pub(super) const MAX_TEXT: usize = 1 << 18;
 /// How many members a type may have.
 pub(super) const MAX_FIELDS: usize = 4096;
 /// Between a service's request and response, and the parts of an action.
-const SEPARATOR: &str = "---";
+pub(super) const SEPARATOR: &str = "---";
 
 /// Why a definition cannot be read, and where.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -55,6 +56,9 @@ pub enum Problem {
     /// An annotation that changes what is on the wire.
     #[error("`{0}` is not supported")]
     Unsupported(String),
+    /// A word or sign that has to be there.
+    #[error("`{0}` is missing")]
+    Missing(String),
     /// Too many members.
     #[error("more than {MAX_FIELDS} fields")]
     TooMany,
@@ -77,11 +81,7 @@ pub(super) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseE
         });
     }
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-    let parts: &[&str] = match name.kind() {
-        Kind::Message => &[""],
-        Kind::Service => &["_Request", "_Response"],
-        Kind::Action => &["_Goal", "_Result", "_Feedback"],
-    };
+    let parts = parts(name.kind());
     let mut parts_left = parts.iter();
     let mut current = match parts_left.next() {
         Some(part) => Members::of(name, part),
@@ -116,6 +116,15 @@ pub(super) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseE
         });
     }
     Ok(structures)
+}
+
+/// How the names of the types that a file spells out end.
+pub(super) fn parts(kind: Kind) -> &'static [&'static str] {
+    match kind {
+        Kind::Message => &[""],
+        Kind::Service => &["_Request", "_Response"],
+        Kind::Action => &["_Goal", "_Result", "_Feedback"],
+    }
 }
 
 /// The members of the part that is being read.

@@ -175,6 +175,17 @@ fn message(text: &str) -> Option<TypeName> {
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+    use std::io::Read as _;
+    use std::path::Path;
+
+    use flate2::read::GzDecoder;
+    use proptest::collection::vec;
+    use proptest::option;
+    use proptest::prelude::*;
+    use proptest::sample::select;
+
+    use super::super::{Field, Library, Sources};
     use super::*;
 
     const STAMPED: &str = "\
@@ -222,5 +233,167 @@ uint32 nanosec
             let error = MessageType::parse(&"a/msg/A".parse().unwrap(), &text).unwrap_err();
             assert_eq!(error, SchemaError::Heading { line: 3 }, "{heading}");
         }
+    }
+
+    /// What a real bag has: its files, one after the other, with their comments.
+    fn real() -> Vec<(String, String)> {
+        let bag =
+            "../../shared/fixtures/cyclonedds/bag-record-2ns/bag_default/bag_default_0.mcap.gz";
+        let bag = Path::new(env!("CARGO_MANIFEST_DIR")).join(bag);
+        // Not in a clone.
+        let Ok(file) = File::open(bag) else {
+            return Vec::new();
+        };
+        let mut bytes = Vec::new();
+        GzDecoder::new(file).read_to_end(&mut bytes).unwrap();
+        let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+        let text = |data: &[u8]| String::from_utf8(data.to_vec()).unwrap();
+        summary
+            .schemas
+            .values()
+            .map(|one| (one.name.clone(), text(&one.data)))
+            .collect()
+    }
+
+    #[test]
+    fn a_real_bags_schema_is_written_byte_for_byte_from_its_files() {
+        for (name, expected) in real() {
+            let root: TypeName = name.parse().unwrap();
+            let installed = tempfile::tempdir().unwrap();
+            for (name, text) in parts(&root, &expected).unwrap() {
+                let package = installed
+                    .path()
+                    .join("share")
+                    .join(name.package())
+                    .join("msg");
+                std::fs::create_dir_all(&package).unwrap();
+                // The line before the next heading belongs to the heading.
+                let is_last = expected.ends_with(text);
+                let text = if is_last {
+                    text
+                } else {
+                    text.strip_suffix('\n').unwrap()
+                };
+                std::fs::write(package.join(format!("{}.msg", name.name())), text).unwrap();
+            }
+            let prefixes = vec![installed.path().to_owned()];
+            let library = Library::new(Sources {
+                prefixes,
+                ..Sources::default()
+            });
+            let found = library.find(&name, None).unwrap();
+            assert_eq!(found.schema_text(), (ENCODING, expected), "{name}");
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_read_again(structure in structure(), more in structure()) {
+            let text = members(&structure);
+            let read = Definition::parse(structure.name.clone(), &text).unwrap();
+            prop_assert_eq!(&*read.structures[0], &structure);
+            // The same as a part of another.
+            let root = "a/msg/Root".parse().unwrap();
+            let text = format!("B b\n{}{LINE}\nMSG: a/B\n{}", members(&more), members(&structure));
+            if let Ok(read) = MessageType::parse(&root, &text) {
+                let again = MessageType::parse(&root, &read.schema_text().1).unwrap();
+                prop_assert_eq!(again.type_hash(), read.type_hash());
+            }
+        }
+
+        #[test]
+        fn any_text_is_read_or_refused(words in vec(select(WORDS), 0..60)) {
+            let text = words.join(" ");
+            for name in ["a/msg/B", "a/srv/B", "a/action/B"] {
+                let name = || name.parse::<TypeName>().unwrap();
+                let _ = Definition::parse(name(), &text);
+                if let Ok(read) = Definition::parse_idl(name(), &text) {
+                    prop_assert_eq!(Definition::parse(name(), &read.text).unwrap(), read);
+                }
+            }
+            let root = "a/msg/B".parse().unwrap();
+            if let Ok(read) = MessageType::parse(&root, &text) {
+                let again = MessageType::parse(&root, &read.schema_text().1).unwrap();
+                prop_assert_eq!(again.type_hash(), read.type_hash());
+            }
+        }
+    }
+
+    /// What definitions are made of, in any order.
+    const WORDS: &[&str] = &[
+        "\n",
+        "\n",
+        "\n",
+        "int8",
+        "x",
+        "y",
+        "string<=5",
+        "[<=3]",
+        "B",
+        "a/C",
+        "=",
+        "1",
+        "#",
+        "---",
+        "@key",
+        LINE,
+        "MSG: a/C",
+        "module a { module msg {",
+        "struct B {",
+        "};",
+        "};",
+        "long",
+        ";",
+        "sequence<",
+        ">",
+        "<",
+        "[",
+        "]",
+        "typedef",
+        "const",
+        "\"",
+        "'",
+        "/*",
+        "*/",
+        "::",
+        "é",
+        "(",
+        ")",
+    ];
+
+    fn structure() -> impl Strategy<Value = Structure> {
+        let element = prop_oneof![
+            Just(Element::Bool),
+            Just(Element::Byte),
+            Just(Element::Char),
+            Just(Element::Int16),
+            Just(Element::UInt64),
+            Just(Element::Float32),
+            option::of(1_u32..).prop_map(|bound| Element::String { bound }),
+            option::of(1_u32..).prop_map(|bound| Element::WString { bound }),
+            Just(Element::Nested("b/msg/Other".parse().unwrap())),
+            Just(Element::Nested("a/msg/Same".parse().unwrap())),
+        ];
+        let shape = prop_oneof![
+            Just(Shape::Single),
+            Just(Shape::Unbounded),
+            (1_u32..).prop_map(Shape::Array),
+            (1_u32..).prop_map(Shape::Bounded),
+        ];
+        vec(("[a-z][a-z0-9_]{0,8}", element, shape), 0..12).prop_map(|fields| {
+            let mut names = BTreeSet::new();
+            let fields = fields
+                .into_iter()
+                .filter(|(name, _, _)| names.insert(name.clone()))
+                .map(|(name, element, shape)| Field {
+                    name,
+                    element,
+                    shape,
+                });
+            Structure {
+                name: "a/msg/B".parse().unwrap(),
+                fields: fields.collect(),
+            }
+        })
     }
 }
