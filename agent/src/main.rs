@@ -47,6 +47,8 @@ fn main() -> ExitCode {
         Some(Command::Run(options)) => done(run(options)),
         Some(Command::CheckConfig { file }) => done(check_config(&file)),
         Some(Command::Discover(options)) => done(ask::discover(&options)),
+        Some(Command::Completions(completions)) => completions.print(),
+        Some(Command::Man(manual)) => manual.print(),
         Some(Command::Ask(question)) => question.ask(),
     };
     ended.unwrap_or_else(|error| {

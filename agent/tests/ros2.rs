@@ -7,9 +7,13 @@
     reason = "a test may panic"
 )]
 
+#[path = "ros2/graph.rs"]
+mod graph;
 mod local_agent;
 #[path = "ros2/rates.rs"]
 mod rates;
+#[path = "ros2/tools.rs"]
+mod tools;
 
 use std::io::{Read as _, Write as _};
 use std::net::TcpListener;

@@ -9,6 +9,7 @@ mod interrupt;
 mod node;
 mod output;
 mod rates;
+mod reference;
 mod run;
 mod service;
 mod shared;
@@ -48,6 +49,10 @@ pub(crate) enum Command {
     },
     /// Ask running participants to repeat their announcements: the only command that sends
     Discover(Discover),
+    /// Print completions for a shell
+    Completions(reference::Completions),
+    /// Print or write man pages
+    Man(reference::Manual),
     #[command(flatten)]
     Ask(Question),
 }
@@ -111,10 +116,38 @@ pub(crate) fn help(names: &[&str]) -> Result<ExitCode> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
 
     #[test]
     fn the_command_line_is_consistent() {
         Arguments::command().debug_assert();
+    }
+
+    /// What docs/ros2cli-differences.md says is refused.
+    const REFUSED: [(&str, &str); 1] = [("topic hz", "--filter")];
+
+    #[test]
+    fn every_option_of_the_original_is_accepted() {
+        let options = include_str!("../../tests/fixtures/cli/options.json");
+        let options: BTreeMap<String, Vec<String>> = serde_json::from_str(options).unwrap();
+        assert!(options.contains_key("topic list"));
+        let mut root = Arguments::command();
+        root.build();
+        for (verb, names) in options.into_iter().filter(|(verb, _)| verb != "topic echo") {
+            let words = verb.split(' ');
+            let found = words.fold(Some(&root), |found, word| found?.find_subcommand(word));
+            let command = found.unwrap_or_else(|| panic!("there is no `rp {verb}`"));
+            for name in names {
+                let is_called = |argument: &clap::Arg| match name.strip_prefix("--") {
+                    Some(long) => argument.get_long() == Some(long),
+                    None => argument.get_short() == name.chars().nth(1),
+                };
+                let is_there = command.get_arguments().any(is_called);
+                let is_refused = REFUSED.contains(&(verb.as_str(), name.as_str()));
+                assert_eq!(is_there, !is_refused, "`rp {verb}` {name}");
+            }
+        }
     }
 }
