@@ -187,7 +187,7 @@ fn measure(
                     header_stamp: sample.header_stamp_ns,
                 };
                 let appeared = rates.appeared(&sample.topic, &[sample.message_type]);
-                appeared.and_then(|()| rates.arrived(&sample.topic, &arrival))
+                appeared.and_then(|()| rates.arrived(&sample.topic, arrival))
             }
             Line::Clock(clock) => {
                 rates.clock(clock.time_ns);
@@ -200,8 +200,13 @@ fn measure(
                 }
                 Ok(())
             }
-            Line::End(end) if end.reason == END_OF_CAPTURE => break,
-            Line::End(_) => return Err(Said("the agent has ended".to_owned()).into()),
+            Line::End(end) => {
+                rates.finish();
+                match end.reason.as_str() {
+                    END_OF_CAPTURE => Err(End::Idle),
+                    _ => Err(End::Refused(Refused("rp: the agent has ended".to_owned()))),
+                }
+            }
         };
         let text = rates.take();
         if !text.out.is_empty() {

@@ -28,6 +28,8 @@ const NANOSECOND: f64 = 1e-9;
 const CLEAR: &str = "\x1b[H\x1b[2J\n";
 /// A clock that jumped further has been set: the seconds between are not made up for.
 const LONGEST_JUMP: i64 = 3600 * SECOND;
+/// So many messages wait for the clock at most; it comes ten times a second.
+const WAITING: usize = 65_536;
 
 /// What is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,6 +51,8 @@ pub struct Rates {
     all: bool,
     topics: Vec<Watched>,
     places: HashMap<String, usize>,
+    /// Messages that the clock has not passed, with the places of their topics.
+    waiting: Vec<(Arrival, usize)>,
     /// When the next report of every second is due.
     next: Option<i64>,
     said: Said,
@@ -132,6 +136,7 @@ impl Rates {
             all,
             topics: Vec::new(),
             places: HashMap::new(),
+            waiting: Vec::new(),
             next: None,
             said: Said::default(),
         }
@@ -221,42 +226,82 @@ impl Rates {
         Ok(())
     }
 
-    /// A message of a topic.
+    /// A message of a topic. It counts once the clock has passed it: messages by different ways,
+    /// as by network and by shared memory, are told in no order.
     ///
     /// # Errors
     /// When its delay is asked for and it has no header.
-    pub fn arrived(&mut self, name: &str, arrival: &Arrival) -> Result<(), End> {
-        self.clock(arrival.time);
-        let reported_at_message = self.reported_at_message();
-        let Some(watched) = self
-            .places
-            .get(name)
-            .and_then(|at| self.topics.get_mut(*at))
+    pub fn arrived(&mut self, name: &str, arrival: Arrival) -> Result<(), End> {
+        let Some(place) = self.places.get(name).copied() else {
+            return Ok(());
+        };
+        let Some(message_type) = self
+            .topics
+            .get(place)
+            .and_then(|one| one.message_type.as_ref())
         else {
             return Ok(());
         };
-        let Some(message_type) = &watched.message_type else {
-            return Ok(());
-        };
-        match &mut watched.series {
-            Series::Rate(intervals) => {
-                intervals.arrived(arrival.time);
-                if reported_at_message && let Some(rate) = intervals.report_at_message() {
-                    self.said.out.push_str(&rate.lines());
-                }
-            }
-            Series::Bandwidth(sizes) => sizes.arrived(arrival.time, arrival.size),
-            Series::Delay(ages) => match arrival.header_stamp {
-                Some(stamp) => ages.arrived(arrival.time, stamp),
-                None if begins_with_header(message_type) || self.all => {}
-                None => return Err(End::Refused(Refused("msg does not have header".to_owned()))),
-            },
+        let has_header = || self.all || begins_with_header(message_type);
+        if self.quantity == Quantity::Delay && arrival.header_stamp.is_none() && !has_header() {
+            return Err(End::Refused(Refused("msg does not have header".to_owned())));
         }
+        if self.waiting.len() >= WAITING {
+            self.settle(arrival.time);
+        }
+        self.waiting.push((arrival, place));
         Ok(())
     }
 
     /// Everything before this time was given.
     pub fn clock(&mut self, now: i64) {
+        self.settle(now);
+        self.tick(now);
+    }
+
+    /// Nothing more is given.
+    pub fn finish(&mut self) {
+        self.settle(i64::MAX);
+    }
+
+    /// Counts the messages up to this time in their order.
+    fn settle(&mut self, until: i64) {
+        self.waiting.sort_by_key(|(arrival, _)| arrival.time);
+        let passed = self
+            .waiting
+            .partition_point(|(arrival, _)| arrival.time <= until);
+        let later = self.waiting.split_off(passed);
+        for (arrival, place) in mem::replace(&mut self.waiting, later) {
+            self.tick(arrival.time);
+            self.count(&arrival, place);
+        }
+    }
+
+    fn count(&mut self, arrival: &Arrival, place: usize) {
+        let reported_at_message = self.reported_at_message();
+        match self
+            .topics
+            .get_mut(place)
+            .map(|watched| &mut watched.series)
+        {
+            Some(Series::Rate(intervals)) => {
+                intervals.arrived(arrival.time);
+                if reported_at_message && let Some(rate) = intervals.report_at_message() {
+                    self.said.out.push_str(&rate.lines());
+                }
+            }
+            Some(Series::Bandwidth(sizes)) => sizes.arrived(arrival.time, arrival.size),
+            Some(Series::Delay(ages)) => {
+                if let Some(stamp) = arrival.header_stamp {
+                    ages.arrived(arrival.time, stamp);
+                }
+            }
+            None => {}
+        }
+    }
+
+    /// Reports every second up to this one that is due.
+    fn tick(&mut self, now: i64) {
         if self.reported_at_message() || self.topics.iter().all(|one| one.message_type.is_none()) {
             return;
         }

@@ -61,7 +61,8 @@ fn messages(rates: &mut Rates, name: &str, times: impl IntoIterator<Item = i64>)
             size: 100,
             header_stamp,
         };
-        rates.arrived(name, &arrival).unwrap();
+        rates.arrived(name, arrival).unwrap();
+        rates.clock(at(time));
     }
     rates.take().out
 }
@@ -202,7 +203,7 @@ fn bandwidths_of_several_topics_each_have_their_unit() {
             size: 4096,
             header_stamp: None,
         };
-        rates.arrived("/b", &arrival).unwrap();
+        rates.arrived("/b", arrival).unwrap();
     }
     rates.clock(at(1000));
     let expected = "\
@@ -267,7 +268,29 @@ fn a_delay_needs_a_header() {
         header_stamp: None,
     };
     let expected = Err(End::Refused(Refused("msg does not have header".to_owned())));
-    assert_eq!(rates.arrived("/chatter", &arrival), expected);
+    assert_eq!(rates.arrived("/chatter", arrival), expected);
+    assert_eq!(rates.take().out, "");
+}
+
+#[test]
+fn messages_count_in_the_order_of_their_times() {
+    let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/imu"]));
+    rates.opened(&present(&[("/imu", IMU)])).unwrap();
+    // One writer is heard at once, the other 50 ms later.
+    for time in [
+        0, 200, 100, 400, 300, 600, 500, 800, 700, 1000, 900, 1200, 1100, 1400,
+    ] {
+        let arrival = Arrival {
+            time: at(time),
+            size: 100,
+            header_stamp: None,
+        };
+        rates.arrived("/imu", arrival).unwrap();
+        rates.clock(at(time - 100));
+    }
+    let text = "average rate: 10.000\n\tmin: 0.100s max: 0.100s std dev: 0.00000s window: 11\n";
+    assert_eq!(rates.take().out, text);
+    rates.finish();
     assert_eq!(rates.take().out, "");
 }
 
