@@ -121,6 +121,27 @@ fn an_agent_on_a_replay_is_asked_by_its_socket_and_from_elsewhere() {
     assert_eq!(there["subject"], agent.api.to_string());
 }
 
+#[test]
+fn of_a_capture_its_graph_is_told_and_nothing_else() {
+    let capture = local_agent::capture();
+    let capture = capture.to_str().unwrap();
+    let report = asked(&["--replay", capture, "--until", "+8"]);
+    assert_eq!(report["subject"], capture);
+    let findings = report["findings"].as_array().unwrap();
+    assert!(
+        findings.iter().all(|finding| finding["area"] == "graph"),
+        "{report:#}"
+    );
+    let nobody = ["doctor", "--json", "--replay", capture, "--domain", "7"];
+    let nobody = rp().args(nobody).output().unwrap();
+    let report = self::report(&nobody);
+    assert_eq!(
+        verdict(&report, "graph", "participants"),
+        "note",
+        "{report:#}"
+    );
+}
+
 /// A report in which the graph is known.
 fn asked(arguments: &[&str]) -> Value {
     let deadline = Instant::now() + PATIENCE;

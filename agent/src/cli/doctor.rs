@@ -12,7 +12,7 @@ use ros2probe::doctor::answers::Answers;
 use ros2probe::doctor::host::Host;
 use ros2probe::doctor::report::Report;
 use ros2probe::doctor::text::{Style, text};
-use ros2probe::doctor::{Configured, Reach, examine, examine_remote};
+use ros2probe::doctor::{Configured, Reach, examine, examine_capture, examine_remote};
 
 use super::{DEFAULT_CONFIG, Output};
 
@@ -23,7 +23,8 @@ It looks at the kernel, privileges, interfaces, ROS variables and processes, buf
 this host, and asks the agent, if one runs, for what it sees. It changes nothing. Where no agent runs
 and it may, it loads the agent's kernel programs for a moment to see whether the kernel takes them.
 What this user may not look at is `unknown`, with the command that looks: mostly `sudo rp doctor`.
-With --host it tells about that agent and its graph alone.
+With --host it tells about that agent and its graph alone, with --replay about the capture's graph.
+Without --domain every domain is told about, whatever ROS_DOMAIN_ID says.
 Verdicts: ok, note (by choice, or good to know), unknown, warning (something will be missing or
 wrong), problem (broken). A line with `>` is what to do: a command, or a line of the configuration.
 Exit codes: 0 no problem (warnings are none), 1 a problem, or no answer with --host, 2 wrong usage.
@@ -31,7 +32,8 @@ Exit codes: 0 no problem (warnings are none), 1 a problem, or no answer with --h
 Examples:
   sudo rp doctor                        all of it
   rp doctor --json | jq -r '.findings[] | select(.verdict == \"problem\").sentence'
-  rp doctor --host robot2 --token-file ~/robot2.token")]
+  rp doctor --host robot2 --token-file ~/robot2.token
+  rp doctor --replay robot.pcap.gz")]
 pub(crate) struct Doctor {
     /// Print JSON: one object, for fleets
     #[arg(long)]
@@ -48,9 +50,13 @@ pub(crate) struct Doctor {
 
 impl Doctor {
     pub(crate) fn ask(self) -> Result<ExitCode> {
-        let report = if self.target.host.is_some() {
+        let report = if self.target.host.is_some() || self.target.replay.is_some() {
             let agent = Agent::reach(&self.target)?;
-            examine_remote(&Answers::ask(&agent)?, &agent.place())
+            let answers = Answers::ask(&agent, self.target.domain_id)?;
+            match self.target.replay {
+                Some(_) => examine_capture(&answers, &agent.place()),
+                None => examine_remote(&answers, &agent.place()),
+            }
         } else {
             let configured = configured(self.config.as_deref())?;
             examine(&Host::read(), &configured, &reach(&self.target))
@@ -78,7 +84,10 @@ impl Doctor {
 
 /// The agent on this host, if one is to be had.
 fn reach(target: &Target) -> Reach {
-    let asked = Agent::reach(target).and_then(|agent| Ok((Answers::ask(&agent)?, agent.place())));
+    let asked = Agent::reach(target).and_then(|agent| {
+        let answers = Answers::ask(&agent, target.domain_id)?;
+        Ok((answers, agent.place()))
+    });
     match asked {
         Ok((answers, place)) => Reach::Answered(Box::new(answers), place),
         Err(error @ ClientError::Denied { .. }) => Reach::Denied(error.to_string()),

@@ -143,8 +143,8 @@ fn losses(health: &Health) -> Vec<Finding> {
                 format!("{count} {what} were lost in a full ring: counts are lower bounds");
             Finding::new(AREA, check, Verdict::Warning, sentence)
                 .seen(count.to_string(), format!("{FROM} {check}"))
-                .remedy(format!(
-                    "capture: {{{ring}: BYTES}}    # twice what it is, and more CPU for the agent"
+                .configure(format!(
+                    "capture: {{{ring}: BYTES}}    # twice what it is, a power of two"
                 ))
         })
         .collect();
@@ -168,14 +168,17 @@ fn evictions(health: &Health) -> Vec<Finding> {
                 "its table of {} was full at {}: {} entries were given up",
                 table.table, table.limit, table.evictions
             );
-            Finding::new(AREA, "evictions", Verdict::Warning, sentence)
-                .seen(
-                    table.evictions.to_string(),
-                    format!("{FROM} tables {}", table.table),
-                )
-                .remedy(
-                    "limits: {...}    # raise that one; a storm of forged writers does this too",
-                )
+            let finding = Finding::new(AREA, "evictions", Verdict::Warning, sentence).seen(
+                table.evictions.to_string(),
+                format!("{FROM} tables {}", table.table),
+            );
+            match limit(&table.table) {
+                Some(key) => finding.configure(format!(
+                    "limits: {{{key}: {}}}    # a storm of forged writers does this too",
+                    table.limit.saturating_mul(2)
+                )),
+                None => finding,
+            }
         })
         .collect();
     if health.topics_rejected > 0 {
@@ -188,9 +191,22 @@ fn evictions(health: &Health) -> Vec<Finding> {
             health.topics_rejected.to_string(),
             format!("{FROM} topics_rejected"),
         );
-        findings.push(finding.remedy("limits: {topics: N}    # or fewer watches"));
+        findings.push(finding.configure("limits: {topics: N}    # or fewer watches"));
     }
     findings
+}
+
+/// The key of a table's limit; most have none.
+fn limit(table: &str) -> Option<&'static str> {
+    const KEYS: [(&str, &str); 5] = [
+        ("participants", "participants"),
+        ("endpoints", "endpoints"),
+        ("topics", "topics"),
+        ("unknown_writers", "unknown_writers"),
+        ("reassembly", "reassembly_bytes"),
+    ];
+    let found = KEYS.iter().find(|(name, _)| *name == table);
+    found.map(|(_, key)| *key)
 }
 
 fn watches(answers: &Answers) -> Finding {
@@ -202,7 +218,7 @@ fn watches(answers: &Answers) -> Finding {
     if watches.is_empty() {
         let sentence = "nothing is watched: the graph is known, no topic is measured";
         return say(Verdict::Note, sentence.to_owned())
-            .remedy("watch: ['/**']    # or: curl -X POST localhost:17401/watch/TOPIC");
+            .configure("watch: ['/**']    # or: curl -X POST localhost:17401/watch/TOPIC");
     }
     let idle: Vec<_> = watches
         .iter()
@@ -265,10 +281,7 @@ fn busy(key: &str, address: SocketAddr) -> Finding {
     let finding = finding.seen(port.to_string(), SOCKETS.join(", "));
     finding
         .remedy(format!("sudo ss -ltnp 'sport = :{port}'    # who"))
-        .remedy(format!(
-            "{}    # another one",
-            key.replace('.', ": {") + ": 127.0.0.1:PORT}"
-        ))
+        .configure(key.replace('.', ": {") + ": 127.0.0.1:PORT}    # another one")
 }
 
 fn listening(host: &Host) -> Vec<u16> {
@@ -299,7 +312,7 @@ fn state_directory(host: &Host, choice: &StateChoice) -> Option<Finding> {
             Verdict::Problem,
             format!("{path} is no directory: an agent cannot keep what it knows"),
         )
-        .remedy(format!(
+        .configure(format!(
             "state_directory: {path}    # must name a directory"
         )),
         Ok(directory) => {
@@ -395,6 +408,10 @@ mod tests {
         ] {
             assert_eq!(verdict(&findings, check), Some(expected), "{check}");
         }
+        let full = findings.iter().find(|each| each.check == "evictions");
+        let remedy = &full.unwrap().remedies[0].line;
+        assert_eq!(remedy, "limits: {endpoints: 20}");
+        assert!(Config::parse(remedy.as_bytes()).is_ok());
         assert_eq!(verdict(&findings, "dropped_datagrams"), None);
         assert_eq!(
             findings
@@ -425,8 +442,8 @@ mod tests {
         assert_eq!(busy.len(), 1);
         assert!(busy[0].sentence.contains("17400"), "{}", busy[0].sentence);
         assert_eq!(
-            busy[0].remedies[1],
-            "metrics: {listen: 127.0.0.1:PORT}    # another one"
+            busy[0].remedies[1].line,
+            "metrics: {listen: 127.0.0.1:PORT}"
         );
         assert_eq!(verdict(&findings, "reachable"), Some(Verdict::Warning));
     }

@@ -19,15 +19,16 @@ pub struct Answers {
 }
 
 impl Answers {
-    /// Asks an agent.
+    /// Asks an agent, about one domain or all of them.
     ///
     /// # Errors
     /// It is gone, or does not answer what an agent answers.
-    pub fn ask(agent: &Agent) -> Result<Self, ClientError> {
+    pub fn ask(agent: &Agent, domain_id: Option<u32>) -> Result<Self, ClientError> {
+        let within = domain_id.map_or_else(String::new, |domain| format!("?domain_id={domain}"));
         Ok(Self {
             health: agent.get("/health")?,
-            participants: agent.get("/participants")?,
-            topics: agent.get("/topics")?,
+            participants: agent.get(&format!("/participants{within}"))?,
+            topics: agent.get(&format!("/topics{within}"))?,
             watches: agent.get("/watch")?,
         })
     }

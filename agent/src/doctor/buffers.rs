@@ -55,14 +55,20 @@ pub fn check(host: &Host, answers: Option<&Answers>) -> Vec<Finding> {
         topics,
         "socket_losses",
         "in full socket buffers",
-        |topic| topic.received.map_or(0, |received| received.lost_in_socket_buffer_messages),
-        || {
+        |topic| {
+            topic
+                .received
+                .map_or(0, |received| received.lost_in_socket_buffer_messages)
+        },
+        |finding| {
             let bytes = wanted(largest.as_ref(), MESSAGES_IN_BUFFER);
-            vec![
-                RECEIVE_DEFAULT.set(bytes),
-                RECEIVE_MAX.set(bytes),
-                format!("<Internal><SocketReceiveBufferSize min=\"{bytes}B\"/></Internal>    # Cyclone DDS, in CYCLONEDDS_URI"),
-            ]
+            finding
+                .remedy(RECEIVE_DEFAULT.set(bytes))
+                .remedy(RECEIVE_MAX.set(bytes))
+                .elsewhere(format!(
+                    "<Internal><SocketReceiveBufferSize min=\"{bytes}B\"/></Internal>    # in \
+                     CYCLONEDDS_URI"
+                ))
         },
     ));
     let is_large = largest
@@ -81,9 +87,11 @@ pub fn check(host: &Host, answers: Option<&Answers>) -> Vec<Finding> {
                 .received
                 .map_or(0, |received| received.lost_in_reassembly_messages)
         },
-        || {
+        |finding| {
             let [(memory, time), _] = REASSEMBLY;
-            vec![memory.set(128 * MEBIBYTE), time.set(3)]
+            finding
+                .remedy(memory.set(128 * MEBIBYTE))
+                .remedy(time.set(3))
         },
     ));
     findings
@@ -232,7 +240,7 @@ fn lost(
     check: &'static str,
     place: &str,
     count: impl Fn(&Topic) -> u64,
-    remedies: impl Fn() -> Vec<String>,
+    helped: impl Fn(Finding) -> Finding,
 ) -> Option<Finding> {
     let mut lossy: Vec<_> = topics.iter().filter(|topic| count(topic) > 0).collect();
     if lossy.is_empty() {
@@ -263,10 +271,9 @@ fn lost(
         .collect();
     let sum: u64 = lossy.iter().map(|topic| count(topic)).sum();
     let sentence = format!("{sum} messages died {place}: {}", named.join(", "));
-    let mut finding = Finding::new(AREA, check, verdict, sentence);
-    finding = finding.seen(sum.to_string(), "GET /topics received");
-    finding.remedies = remedies();
-    Some(finding)
+    let finding = Finding::new(AREA, check, verdict, sentence);
+    let finding = finding.seen(sum.to_string(), "GET /topics received");
+    Some(helped(finding))
 }
 
 impl Sysctl {
@@ -358,11 +365,17 @@ mod tests {
             receive.sentence
         );
         // Twice 2.72 MB in whole mebibytes.
-        assert!(receive.remedies[0].starts_with("sudo sysctl -w net.core.rmem_max=6291456 "));
+        assert!(
+            receive.remedies[0]
+                .line
+                .starts_with("sudo sysctl -w net.core.rmem_max=6291456")
+        );
         let reassembly = find(&findings, "reassembly");
         assert_eq!(reassembly.verdict, Verdict::Note);
         assert!(
-            reassembly.remedies[0].contains("ipfrag_high_thresh=44040192"),
+            reassembly.remedies[0]
+                .line
+                .contains("ipfrag_high_thresh=44040192"),
             "{:?}",
             reassembly.remedies
         );
@@ -385,7 +398,11 @@ mod tests {
         );
         let findings = found(&USUALLY, "");
         assert_eq!(find(&findings, "receive").verdict, Verdict::Note);
-        assert!(find(&findings, "receive").remedies[0].contains("rmem_max=8388608"));
+        assert!(
+            find(&findings, "receive").remedies[0]
+                .line
+                .contains("rmem_max=8388608")
+        );
     }
 
     #[test]
@@ -409,10 +426,10 @@ mod tests {
         assert!(
             lost.remedies
                 .iter()
-                .any(|remedy| remedy.contains("SocketReceiveBufferSize"))
+                .any(|remedy| remedy.line.contains("SocketReceiveBufferSize"))
         );
         let lost = find(&findings, "reassembly_losses");
-        assert!(lost.remedies[1].contains("net.ipv4.ipfrag_time=3"));
+        assert!(lost.remedies[1].line.contains("net.ipv4.ipfrag_time=3"));
     }
 
     #[test]
@@ -423,7 +440,7 @@ mod tests {
         for finding in findings {
             assert_eq!(finding.verdict, Verdict::Unknown);
             assert!(
-                finding.remedies[0].starts_with("sysctl net."),
+                finding.remedies[0].line.starts_with("sysctl net."),
                 "{finding:?}"
             );
         }

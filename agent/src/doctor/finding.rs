@@ -57,8 +57,8 @@ pub struct Finding {
     pub sentence: String,
     /// What that rests on.
     pub evidence: Vec<Evidence>,
-    /// What to do: commands and lines of the configuration, each by itself.
-    pub remedies: Vec<String>,
+    /// What to do, each by itself.
+    pub remedies: Vec<Remedy>,
 }
 
 /// A value that was read.
@@ -68,6 +68,30 @@ pub struct Evidence {
     pub value: String,
     /// Where it was read: a file, a path of the control API, a system call.
     pub from: String,
+}
+
+/// One thing that helps.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Remedy {
+    /// Where the line goes.
+    pub kind: Place,
+    /// To be pasted there; what is in capitals is to be filled in.
+    pub line: String,
+    /// What to know of it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub comment: Option<String>,
+}
+
+/// Where a remedy goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Place {
+    /// A shell.
+    Command,
+    /// The agent's configuration file.
+    Configuration,
+    /// Settings of somebody else, which the comment names.
+    Elsewhere,
 }
 
 impl Area {
@@ -138,10 +162,34 @@ impl Finding {
         self
     }
 
-    /// This helps.
+    /// This command helps. Four spaces and `#` begin a comment, here and below.
     #[must_use]
-    pub fn remedy(mut self, remedy: impl Into<String>) -> Self {
-        self.remedies.push(remedy.into());
+    pub fn remedy(self, line: impl Into<String>) -> Self {
+        self.with(Place::Command, line.into())
+    }
+
+    /// This in the agent's configuration helps.
+    #[must_use]
+    pub fn configure(self, line: impl Into<String>) -> Self {
+        self.with(Place::Configuration, line.into())
+    }
+
+    /// This helps, where the comment says.
+    #[must_use]
+    pub fn elsewhere(self, line: impl Into<String>) -> Self {
+        self.with(Place::Elsewhere, line.into())
+    }
+
+    fn with(mut self, kind: Place, line: String) -> Self {
+        let (line, comment) = match line.split_once("    # ") {
+            Some((line, comment)) => (line.to_owned(), Some(comment.to_owned())),
+            None => (line, None),
+        };
+        self.remedies.push(Remedy {
+            kind,
+            line,
+            comment,
+        });
         self
     }
 }

@@ -7,6 +7,9 @@ use super::answers::{Answers, Participant, Topic};
 use super::finding::{Area, Finding, Verdict};
 
 const AREA: Area = Area::Graph;
+/// Adds what helps.
+type Helps = fn(Finding) -> Finding;
+
 /// Topics that are named.
 const NAMED: usize = 3;
 
@@ -141,8 +144,9 @@ fn secured(participants: &[Participant]) -> Option<Finding> {
     let finding = Finding::new(AREA, "secured", Verdict::Note, sentence);
     let finding = finding.seen(count.to_string(), "GET /participants secured");
     Some(
-        finding
-            .remedy("discovery_protection_kind: NONE    # in the governance file, to see topics"),
+        finding.elsewhere(
+            "discovery_protection_kind: NONE    # in the governance file, to see topics",
+        ),
     )
 }
 
@@ -159,7 +163,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             .collect()
     };
     let mut findings = Vec::new();
-    let mut say = |check, verdict, topics: &[&Topic], words: &str, remedy: Option<&str>| {
+    let mut say = |check, verdict, topics: &[&Topic], words: &str, remedy: Option<Helps>| {
         if topics.is_empty() {
             return;
         }
@@ -171,7 +175,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         let finding = Finding::new(AREA, check, verdict, sentence);
         let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
         findings.push(match remedy {
-            Some(remedy) => finding.remedy(remedy),
+            Some(helps) => helps(finding),
             None => finding,
         });
     };
@@ -181,44 +185,54 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         say("shared_memory", Verdict::Ok, &shared, words, None);
     } else if able("shared_memory") {
         let words = "by Fast DDS's shared memory only, where samples are seen";
-        let remedy = "capture: {shm: {exact: uprobe}}    # every message; touches the senders";
-        say("shared_memory", Verdict::Note, &shared, words, Some(remedy));
+        say(
+            "shared_memory",
+            Verdict::Note,
+            &shared,
+            words,
+            Some(|finding| {
+                finding.configure(
+                    "capture: {shm: {exact: uprobe}}    # every message; touches the senders",
+                )
+            }),
+        );
     } else {
         let words = "by Fast DDS's shared memory only, which is not looked at";
-        let remedy = "capture: {shm: {mode: auto}}";
         say(
             "shared_memory",
             Verdict::Warning,
             &shared,
             words,
-            Some(remedy),
+            Some(|finding| finding.configure("capture: {shm: {mode: auto}}")),
         );
     }
-    let words = "by Fast DDS's data sharing only, which nobody can see";
-    let remedy =
-        "<data_sharing><kind>OFF</kind></data_sharing>    # in the profile of writer or reader";
     say(
         "data_sharing",
         Verdict::Warning,
         &of("data_sharing"),
-        words,
-        Some(remedy),
+        "by Fast DDS's data sharing only, which nobody can see",
+        Some(|finding| {
+            finding.elsewhere(
+                "<data_sharing><kind>OFF</kind></data_sharing>    # Fast DDS's profile of the writer",
+            )
+        }),
     );
-    let words = "by iceoryx only, which nobody can see";
-    let remedy = "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI";
     say(
         "iceoryx",
         Verdict::Warning,
         &of("iceoryx"),
-        words,
-        Some(remedy),
+        "by iceoryx only, which nobody can see",
+        Some(|finding| {
+            finding.elsewhere(
+                "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI",
+            )
+        }),
     );
-    let words = "within one process only, which nobody can see";
     say(
         "same_process",
         Verdict::Note,
         &of("same_process"),
-        words,
+        "within one process only, which nobody can see",
         None,
     );
     findings
@@ -253,7 +267,7 @@ fn mismatches(topics: &[Topic]) -> Vec<Finding> {
         (
             "type_hash_conflict",
             "with several definitions of one type, which misread each other",
-            "build all nodes with the same version of the interface package",
+            "colcon build    # all nodes, with the same version of the interface package",
         ),
     ];
     let find = |(kind, words, remedy): (&'static str, &str, &str)| {
@@ -346,7 +360,7 @@ mod tests {
             "{}",
             names.sentence
         );
-        assert!(names.remedies[0].starts_with("sudo rp discover --all"));
+        assert!(names.remedies[0].line.starts_with("sudo rp discover --all"));
         assert_eq!(verdict(&findings, "restored"), Some(Verdict::Note));
         assert_eq!(
             verdict(&findings, "unknown_writers"),

@@ -69,9 +69,9 @@ pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Findin
             let from = format!("{PLACE}/{}/mtu", each.name);
             finding = finding.seen(each.mtu.to_string(), from);
         }
-        let remedy =
-            "CYCLONEDDS_URI: General/FragmentSize, or in Fast DDS maxMessageSize, below the MTU";
-        findings.push(finding.remedy(remedy));
+        let remedy = "<General><FragmentSize>1200B</FragmentSize></General>    # in CYCLONEDDS_URI; in \
+                      Fast DDS's profile maxMessageSize";
+        findings.push(finding.elsewhere(remedy));
     }
     findings.extend(agent.map(looked_at));
     findings
@@ -253,7 +253,10 @@ mod tests {
             .find(|each| each.check == "multicast")
             .unwrap();
         assert_eq!(finding.verdict, Verdict::Warning);
-        assert_eq!(finding.remedies, ["sudo ip link set tun0 multicast on"]);
+        assert_eq!(
+            finding.remedies[0].line,
+            "sudo ip link set tun0 multicast on"
+        );
         assert_eq!(verdict(&found(&[LO, ETH], false), "multicast"), None);
     }
 

@@ -76,7 +76,7 @@ fn types(host: &Host) -> Finding {
                     messages that died in reassembly, are not to be had";
     Finding::new(AREA, "types", Verdict::Warning, sentence)
         .seen("not there", TYPES)
-        .remedy("CONFIG_DEBUG_INFO_BTF=y    # in the kernel's configuration")
+        .elsewhere("CONFIG_DEBUG_INFO_BTF=y    # in the kernel's configuration")
 }
 
 fn compiler(host: &Host) -> Finding {
@@ -145,7 +145,9 @@ fn lockdown(host: &Host) -> Option<Finding> {
     };
     let finding = Finding::new(AREA, "lockdown", verdict, sentence).seen(text, LOCKDOWN);
     Some(match verdict {
-        Verdict::Warning => finding.remedy("lockdown=integrity    # on the kernel's command line"),
+        Verdict::Warning => {
+            finding.elsewhere("lockdown=integrity    # on the kernel's command line")
+        }
         _ => finding,
     })
 }
@@ -170,7 +172,7 @@ fn control_groups(host: &Host) -> Finding {
             format!("{point} shows a part of the control groups: sockets of other containers stay \
                      invisible"),
         )
-        .remedy("docker run --cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro ...    # hostPath in Kubernetes"),
+        .elsewhere("--cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro    # docker run; hostPath in Kubernetes"),
         Err(HierarchyError::Open { source, .. }) => say(
             Verdict::Unknown,
             format!("the control groups at {point} cannot be opened: {source}"),

@@ -81,7 +81,7 @@ fn of_agent(health: &Health) -> Finding {
         let sentence =
             format!("the agent lacks CAP_BPF and cannot change what it looks at; it has {held}");
         return say(Verdict::Warning, sentence)
-            .remedy("AmbientCapabilities=CAP_NET_ADMIN CAP_NET_RAW CAP_BPF CAP_PERFMON    # systemctl edit ros2probe");
+            .elsewhere("AmbientCapabilities=CAP_NET_ADMIN CAP_NET_RAW CAP_BPF CAP_PERFMON    # systemctl edit ros2probe");
     }
     say(
         Verdict::Ok,
@@ -106,7 +106,7 @@ fn containers(answers: &Answers) -> Option<Finding> {
     let sentence = "ROS runs in containers here, and the agent may not look at their shared memory";
     let finding = Finding::new(AREA, "containers", Verdict::Warning, sentence);
     let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
-    Some(finding.remedy(
+    Some(finding.elsewhere(
         "AmbientCapabilities=CAP_SYS_PTRACE    # and CapabilityBoundingSet, with systemctl edit ros2probe",
     ))
 }
@@ -124,7 +124,7 @@ fn probes(host: &Host, settings: &CaptureSettings) -> Option<Finding> {
     let sentence = format!("capture.shm.exact needs {missing}, which this shell does not have");
     let finding = Finding::new(AREA, "probes", Verdict::Note, sentence);
     let finding = finding.seen(&missing, "CapEff, this process");
-    Some(finding.remedy(
+    Some(finding.elsewhere(
         "AmbientCapabilities=CAP_SYS_ADMIN CAP_SYS_PTRACE    # and SystemCallFilter=perf_event_open, with systemctl edit ros2probe",
     ))
 }
@@ -241,7 +241,7 @@ mod tests {
             finding
                 .remedies
                 .iter()
-                .any(|remedy| remedy.starts_with("sudo setcap "))
+                .any(|remedy| remedy.line.starts_with("sudo setcap "))
         );
         assert_eq!(own(&host, &settings, true).verdict, Verdict::Ok);
         host.capabilities =

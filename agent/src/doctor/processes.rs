@@ -460,7 +460,7 @@ mod tests {
             .iter()
             .find(|each| each.check == "shell_domain")
             .unwrap();
-        assert_eq!(finding.remedies, ["export ROS_DOMAIN_ID=3"]);
+        assert_eq!(finding.remedies[0].line, "export ROS_DOMAIN_ID=3");
         let same = found(&one, &[("ROS_DOMAIN_ID", "3")]);
         assert_eq!(sentence(&same, "shell_domain"), None);
         // Nothing is said of a shell that is none of ROS.

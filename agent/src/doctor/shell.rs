@@ -241,7 +241,7 @@ fn profiles(host: &Host, variables: &Variables) -> Vec<Finding> {
                         Verdict::Warning,
                         "Fast DDS's profiles name TCP, which the agent does not read".to_owned(),
                     )
-                    .remedy("use UDPv4 in the profile's transport descriptors")
+                    .elsewhere("<type>UDPv4</type>    # in the transport descriptors of that file")
                 } else {
                     say(Verdict::Ok, "Fast DDS's profiles are there".to_owned())
                 }
@@ -298,7 +298,7 @@ fn cyclone(host: &Host, variables: &Variables) -> Option<Finding> {
             "Cyclone DDS uses iceoryx between processes of this host, which the agent cannot see"
                 .to_owned(),
         )
-        .remedy("<SharedMemory><Enable>false</Enable></SharedMemory>")
+        .elsewhere("<SharedMemory><Enable>false</Enable></SharedMemory>")
     } else {
         say(
             Verdict::Ok,
@@ -379,8 +379,8 @@ mod tests {
     fn a_shell_without_ros_needs_nothing_and_sudo_is_named() {
         assert_eq!(found(&[])[0].verdict, Verdict::Note);
         assert_eq!(
-            found(&[("SUDO_USER", "me")])[0].remedies,
-            ["sudo -E rp doctor"]
+            found(&[("SUDO_USER", "me")])[0].remedies[0].line,
+            "sudo -E rp doctor"
         );
     }
 

@@ -118,14 +118,14 @@ fn source(sight: &Sight) -> Finding {
                      apart and losses have no cause: {reason}"
             ),
         )
-        .remedy("capture: {source: host}    # fails with the reason instead of making do"),
+        .configure("capture: {source: host}    # fails with the reason instead of making do"),
         ("wire", None) => say(
             Verdict::Note,
             "the agent looks at the interfaces, as it was told to: subscribers cannot be told \
              apart and losses have no cause"
                 .to_owned(),
         )
-        .remedy("capture: {source: auto}"),
+        .configure("capture: {source: auto}"),
         (source, _) => say(Verdict::Note, format!("packets come from a {source}")),
     };
     finding.seen(&sight.source, sight.from)
@@ -172,9 +172,7 @@ fn lacking(sight: &Sight, ability: Ability) -> Option<Finding> {
         Ability::Containers => (
             Verdict::Note,
             "only sockets of one control group: other containers stay invisible".to_owned(),
-            Some(
-                "capture: {cgroup: null}    # and the host's /sys/fs/cgroup, if this is a container",
-            ),
+            Some("capture: {cgroup: null}    # and in a container the host's /sys/fs/cgroup"),
         ),
         Ability::Forwarded => (
             Verdict::Note,
@@ -201,14 +199,16 @@ fn lacking(sight: &Sight, ability: Ability) -> Option<Finding> {
     let finding = Finding::new(AREA, ability.label(), verdict, sentence);
     let finding = finding.seen(reason.unwrap_or("0"), sight.from);
     Some(match remedy {
-        Some(remedy) => finding.remedy(remedy),
+        Some(remedy) => finding.configure(remedy),
         None => finding,
     })
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::finding::Place;
     use super::*;
+    use crate::config::Config;
 
     fn host(able: &[Ability]) -> Sight {
         Sight {
@@ -271,6 +271,26 @@ mod tests {
     }
 
     #[test]
+    fn what_is_to_be_configured_can_be() {
+        let mut configured = 0;
+        for source in ["host", "wire"] {
+            let sight = Sight {
+                source: source.to_owned(),
+                ..Sight::default()
+            };
+            for finding in check(&sight) {
+                for remedy in finding.remedies {
+                    assert_eq!(remedy.kind, Place::Configuration, "{remedy:?}");
+                    let parsed = Config::parse(remedy.line.as_bytes());
+                    assert!(parsed.is_ok(), "{}: {parsed:?}", remedy.line);
+                    configured += 1;
+                }
+            }
+        }
+        assert!(configured > 5, "{configured}");
+    }
+
+    #[test]
     fn an_agent_of_another_version_may_have_abilities_that_are_not_known() {
         let health: Health = serde_json::from_str(
             r#"{"source":"host","abilities":[{"ability":"x","able":true},
@@ -286,7 +306,7 @@ mod tests {
     fn without_a_trial_there_is_the_command_that_makes_one() {
         let findings = untried("CAP_BPF is missing");
         assert_eq!(findings[0].verdict, Verdict::Unknown);
-        assert_eq!(findings[0].remedies, ["sudo rp doctor"]);
+        assert_eq!(findings[0].remedies[0].line, "sudo rp doctor");
         assert_eq!(failed("x")[0].verdict, Verdict::Problem);
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! What comes from the network or from other processes reaches the terminal escaped.
 
-use super::finding::{Finding, Verdict};
+use super::finding::{Finding, Place, Remedy, Verdict};
 use super::report::Report;
 
 const WIDTH: usize = 80;
@@ -10,6 +10,8 @@ const WIDTH: usize = 80;
 const INDENT: usize = 11;
 /// Lines of evidence of one finding, unless all of it is wanted.
 const EVIDENCE: usize = 3;
+/// Where the configuration is.
+const FILE: &str = "in /etc/ros2probe/ros2probe.yaml";
 /// Letters of one value.
 const MAX_VALUE: usize = 200;
 
@@ -68,7 +70,7 @@ impl Page {
         }
         if finding.verdict != Verdict::Ok {
             for remedy in &finding.remedies {
-                self.remedy(&plain(remedy));
+                self.remedy(remedy);
             }
         }
     }
@@ -95,18 +97,27 @@ impl Page {
     }
 
     /// A command is not broken, for it is to be pasted; a long comment goes above it.
-    fn remedy(&mut self, remedy: &str) {
-        let fits = INDENT + 2 + remedy.chars().count() <= WIDTH;
-        match remedy.split_once("    # ") {
-            Some((command, comment)) if !fits => {
+    fn remedy(&mut self, remedy: &Remedy) {
+        let line = plain(&remedy.line);
+        let own = remedy.comment.as_deref().map(plain);
+        let comment = match (remedy.kind, own) {
+            (Place::Configuration, None) => Some(FILE.to_owned()),
+            (Place::Configuration, Some(own)) => Some(format!("{FILE}; {own}")),
+            (Place::Command | Place::Elsewhere, own) => own,
+        };
+        let mut short = String::new();
+        if let Some(comment) = comment {
+            let both = format!("{line}    # {comment}");
+            if INDENT + 2 + both.chars().count() <= WIDTH {
+                short = self.painted(DIM, &format!("    # {comment}"));
+            } else {
                 for line in wrapped(&format!("# {comment}")) {
                     let line = self.painted(DIM, &line);
                     self.line(&format!("{:INDENT$}{line}", ""));
                 }
-                self.line(&format!("{:INDENT$}> {command}", ""));
             }
-            _ => self.line(&format!("{:INDENT$}> {remedy}", "")),
         }
+        self.line(&format!("{:INDENT$}> {line}{short}", ""));
     }
 
     fn painted(&self, code: &str, text: &str) -> String {
