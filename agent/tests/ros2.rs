@@ -45,17 +45,28 @@ fn fails_with(output: &Output, part: &str) {
 }
 
 #[test]
-fn a_running_agent_answers() {
-    let agent = LocalAgent::start(&["--speed", "max"]);
+fn a_running_agent_answers_what_its_capture_answers() {
+    let capture = graph::own().join("graph.pcap.gz");
+    let mut agent = LocalAgent::start_on(&capture, &["--speed", "max"]);
+    agent.wait_for_log("the capture has ended");
+    let capture = capture.to_str().unwrap();
     let host = agent.api.to_string();
-    let names = || {
-        let listed = run(&["topic", "list", "-t", "--host", &host]);
-        assert_eq!(listed.status.code(), Some(0), "{}", stderr(&listed));
-        stdout(&listed)
-    };
-    let deadline = std::time::Instant::now() + local_agent::PATIENCE;
-    while !names().contains("/rosout [rcl_interfaces/msg/Log]\n") {
-        assert!(std::time::Instant::now() < deadline, "{}", names());
+    for words in [
+        "topic list -v",
+        "topic info -v /rosout",
+        "topic find std_msgs/msg/String",
+        "node list -a",
+        "node info --include-hidden /robot1/sensor_node",
+        "node info /nope",
+        "service list -t",
+        "service info /robot1/add_two_ints",
+        "action info -t /robot1/fibonacci",
+        "action type /nope",
+    ] {
+        let words: Vec<&str> = words.split(' ').collect();
+        let asked = run(&[&words[..], &["--host", &host]].concat());
+        let replayed = run(&[&words[..], &["--replay", capture]].concat());
+        assert_eq!(asked, replayed, "{words:?}");
     }
     let elsewhere = run(&["topic", "list", "--host", &host, "--domain", "7"]);
     assert_eq!(
@@ -67,6 +78,42 @@ fn a_running_agent_answers() {
         "{}",
         stderr(&elsewhere)
     );
+}
+
+#[test]
+fn a_token_or_the_socket_opens_an_agent() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = |name: &str, text: &str| {
+        let path = directory.path().join(name);
+        std::fs::write(&path, text).unwrap();
+        path.to_str().unwrap().to_owned()
+    };
+    let token = file("token", "0123456789abcdef\n");
+    let wrong = file("wrong", "0123456789abcdeg\n");
+    let socket = directory.path().join("api.sock");
+    let socket = socket.to_str().unwrap();
+    let settings = format!("api: {{token_file: {token}, socket: {socket}}}\n");
+    let config = file("ros2probe.yaml", &settings);
+    let agent = LocalAgent::start(&["--config", &config, "--speed", "max"]);
+    let host = agent.api.to_string();
+    let list = |words: &[&str]| run(&[&["topic", "list"], words].concat());
+    for words in [
+        &["--host", &host, "--token-file", &token][..],
+        &["--socket", socket],
+    ] {
+        let listed = list(words);
+        assert_eq!(listed.status.code(), Some(0), "{}", stderr(&listed));
+    }
+    fails_with(&list(&["--host", &host]), "ROS2PROBE_TOKEN_FILE");
+    let wrong = list(&["--host", &host, "--token-file", &wrong]);
+    fails_with(&wrong, "does not accept this token");
+    let mut rp = rp();
+    rp.env("ROS2PROBE_TOKEN_FILE", &token);
+    let listed = rp
+        .args(["topic", "list", "--host", &host])
+        .output()
+        .unwrap();
+    assert_eq!(listed.status.code(), Some(0), "{}", stderr(&listed));
 }
 
 /// Answers every connection with these bytes.

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::{run, stderr, stdout};
 
-fn own() -> PathBuf {
+pub fn own() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/cli")
 }
 
