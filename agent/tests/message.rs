@@ -12,9 +12,9 @@ mod forms;
 #[path = "message/golden.rs"]
 mod golden;
 
-use golden::{cases, definitions};
+use golden::{cases, library};
 use ros2probe::message::yaml::{self, Style};
-use ros2probe::message::{Limits, Shown, csv, decode};
+use ros2probe::message::{Decoded, Limits, Shown, csv, decode};
 
 /// What `ros2 topic echo` shows of arrays and strings unless told otherwise.
 const ECHO: Shown = Shown {
@@ -26,11 +26,9 @@ const ECHO: Shown = Shown {
 #[test]
 fn every_golden_payload_prints_as_the_original_prints_it() {
     let mut count = 0;
-    for case in cases()
-        .into_iter()
-        .filter(|case| case.message_type.starts_with("test_msgs"))
-    {
-        let message_type = definitions(&case.message_type);
+    let library = library();
+    for case in cases() {
+        let message_type = library.find(&case.message_type, None).unwrap();
         let decoded = decode(&message_type, &case.payload, &Limits::default());
         let decoded = decoded.unwrap_or_else(|error| panic!("{case}: {error}"));
         let message = &decoded.message;
@@ -53,7 +51,7 @@ fn every_golden_payload_prints_as_the_original_prints_it() {
         );
         count += 1;
     }
-    assert_eq!(count, 62);
+    assert_eq!(count, 154);
 }
 
 /// What Python, PyYAML and numpy print (`data/python/forms.py`).
@@ -71,4 +69,47 @@ fn strings_numbers_and_arrays_print_as_python_prints_them() {
     }
     assert_eq!(kinds, [1500, 601, 500]);
     assert_eq!(wrong, 0);
+}
+
+/// Whatever is cut off or changed: an answer, and the same one whether elements are kept or not.
+#[test]
+fn damaged_payloads_are_read_or_refused_and_never_more() {
+    let library = library();
+    let few = Limits {
+        kept: 2,
+        ..Limits::default()
+    };
+    for mut case in cases() {
+        case.payload.truncate(600);
+        let message_type = library.find(&case.message_type, None).unwrap();
+        let read = |payload: &[u8]| {
+            let all = decode(&message_type, payload, &Limits::default());
+            let some = decode(&message_type, payload, &few);
+            if let Ok(decoded) = &all {
+                assert!(
+                    csv::line(&decoded.message, &ECHO).len() <= payload.len() * 40,
+                    "{case}"
+                );
+                let _ = yaml::document(&decoded.message, &ECHO, Style::Flow);
+            }
+            let trailing = |decoded: &Decoded<'_>| decoded.oddities.trailing;
+            assert_eq!(
+                all.as_ref().map(trailing),
+                some.as_ref().map(trailing),
+                "{case}"
+            );
+        };
+        for length in 0..case.payload.len() {
+            read(&case.payload[..length]);
+        }
+        let mut payload = case.payload.clone();
+        for position in 0..payload.len().min(250) {
+            let byte = payload[position];
+            for changed in [0xff, byte ^ 0x01] {
+                payload[position] = changed;
+                read(&payload);
+            }
+            payload[position] = byte;
+        }
+    }
 }

@@ -7,6 +7,8 @@
     reason = "a test may panic"
 )]
 
+#[path = "ros2/echo.rs"]
+mod echo;
 #[path = "ros2/graph.rs"]
 mod graph;
 mod local_agent;

@@ -8,6 +8,7 @@ use ros2probe::client::Target;
 use ros2probe::ros2::facts::Named;
 use ros2probe::ros2::{action, topic};
 
+use super::events::ActionEcho;
 use super::shared::{Graph, say, say_or_fail};
 
 /// `rp action VERB`.
@@ -27,6 +28,8 @@ enum Verb {
     Type(Type),
     /// Print actions of a type
     Find(Find),
+    /// Print goals, results, feedback and states of an action
+    Echo(ActionEcho),
 }
 
 #[derive(Args, Debug)]
@@ -82,6 +85,7 @@ impl Action {
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Type(kind)) => kind.ask(),
             Some(Verb::Find(find)) => find.ask(),
+            Some(Verb::Echo(echo)) => echo.ask(),
         }
     }
 }

@@ -1,9 +1,11 @@
 //! `rp topic hz`, `bw` and `delay`: interest in topics for as long as the verb runs, and what comes
 //! of it put into words. How it is reported is decided elsewhere, by the stream's own clock.
 
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
+use bytes::Bytes;
 use clap::Args;
 use clap::error::ErrorKind;
 use ros2probe::client::{Agent, Target, encoded};
@@ -12,6 +14,7 @@ use ros2probe::ros2::rates::{Arrival, End, Named, Quantity, Rates};
 use ros2probe::ros2::{Dialect, Refused};
 use ros2probe::subscriptions::line::{Line, Reason};
 
+use super::follow::{Sieve, library};
 use super::interrupt::INTERRUPTED;
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
@@ -31,6 +34,13 @@ pub(crate) struct Hz {
     /// Calculate from so many of the newest intervals
     #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
     window: usize,
+    /// Count only messages for which this expression over `m`, the message, is true: as for
+    /// `rp topic echo`
+    #[arg(long, value_name = "EXPR")]
+    filter: Option<String>,
+    /// Directory that has definitions as package/msg/Type.msg, for --filter; may be repeated
+    #[arg(long, value_name = "DIR")]
+    definitions: Vec<PathBuf>,
     /// Accepted without effect: messages are always timed by the clock of the capture
     #[arg(long)]
     wall_time: bool,
@@ -84,12 +94,17 @@ struct Options {
 
 impl Hz {
     pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let target = &self.options.target;
+        let library = || library(target, self.definitions);
+        let sieve = self.filter.map(|filter| Sieve::new(&filter, library()));
+        let sieve = sieve.transpose()?;
         measure(
             Quantity::Rate,
             self.window,
             self.topics,
-            &self.options.target,
+            target,
             hidden,
+            sieve,
         )
     }
 
@@ -107,6 +122,7 @@ impl Bandwidth {
             self.topics,
             &self.options.target,
             hidden,
+            None,
         )
     }
 
@@ -124,6 +140,7 @@ impl Delay {
             self.topics,
             &self.options.target,
             hidden,
+            None,
         )
     }
 }
@@ -143,6 +160,7 @@ fn measure(
     topics: Topics,
     target: &Target,
     hidden: bool,
+    mut sieve: Option<Sieve>,
 ) -> Result<ExitCode> {
     let dialect = target.dialect();
     let domain_id = target.domain()?;
@@ -166,7 +184,8 @@ fn measure(
         (Rates::of(quantity, dialect, window, named), query)
     };
     let agent = Agent::reach_stream(target)?;
-    let path = format!("/samples?{query}&domain_id={domain_id}");
+    let payload = sieve.is_some();
+    let path = format!("/samples?{query}&domain_id={domain_id}&payload={payload}");
     let mut lines = agent.stream(&path)?;
     let mut output = Output::new();
     while let Some(line) = lines.line()? {
@@ -186,8 +205,22 @@ fn measure(
                     size: sample.size,
                     header_stamp: sample.header_stamp_ns,
                 };
+                let payload = match sample.payload_bytes {
+                    Some(length) => lines.bytes(usize::try_from(length)?)?,
+                    None => Bytes::new(),
+                };
+                let passes = match &mut sieve {
+                    Some(sieve) => sieve.passes(&sample, &payload)?,
+                    None => true,
+                };
                 let appeared = rates.appeared(&sample.topic, &[sample.message_type]);
-                appeared.and_then(|()| rates.arrived(&sample.topic, arrival))
+                appeared.and_then(|()| {
+                    if passes {
+                        rates.arrived(&sample.topic, arrival)
+                    } else {
+                        Ok(())
+                    }
+                })
             }
             Line::Clock(clock) => {
                 rates.clock(clock.time_ns);

@@ -8,6 +8,7 @@ use ros2probe::client::Target;
 use ros2probe::ros2::facts::{Names, ServiceName};
 use ros2probe::ros2::{service, topic};
 
+use super::events::ServiceEcho;
 use super::shared::{Graph, Spinning, answer, say, say_or_fail};
 
 /// `rp service VERB`.
@@ -30,6 +31,8 @@ enum Verb {
     Find(Find),
     /// Print a service's type and how many serve and call it
     Info(Info),
+    /// Print what a service's introspection tells of its requests and responses
+    Echo(ServiceEcho),
 }
 
 #[derive(Args, Debug)]
@@ -90,6 +93,7 @@ impl Service {
             Some(Verb::Type(kind)) => kind.ask(hidden),
             Some(Verb::Find(find)) => find.ask(hidden),
             Some(Verb::Info(info)) => info.ask(hidden),
+            Some(Verb::Echo(echo)) => echo.ask(),
         }
     }
 }

@@ -46,6 +46,21 @@ pub(crate) struct Matching {
     qos_liveliness_lease_duration_seconds: Option<String>,
 }
 
+impl Matching {
+    /// Any was given that keeps the original from looking at what publishers offer.
+    pub(crate) fn any(&self) -> bool {
+        let given = [
+            &self.qos_depth,
+            &self.qos_history,
+            &self.qos_reliability,
+            &self.qos_durability,
+            &self.qos_liveliness,
+            &self.qos_liveliness_lease_duration_seconds,
+        ];
+        given.into_iter().any(Option::is_some)
+    }
+}
+
 /// One domain of an agent.
 #[derive(Debug)]
 pub(crate) struct Graph {

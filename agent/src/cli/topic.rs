@@ -8,6 +8,7 @@ use ros2probe::client::Target;
 use ros2probe::ros2::facts::{Names, TopicName};
 use ros2probe::ros2::topic;
 
+use super::echo::Echo;
 use super::interrupt::INTERRUPTED;
 use super::rates::{Bandwidth, Delay, Hz};
 use super::shared::{Graph, Spinning, answer, say, say_or_fail};
@@ -32,6 +33,8 @@ enum Verb {
     Type(Type),
     /// Print topics of a type
     Find(Find),
+    /// Print messages as they come
+    Echo(Box<Echo>),
     /// Print how often messages come
     Hz(Hz),
     /// Print how many bytes a second come
@@ -117,6 +120,7 @@ impl Topic {
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Type(kind)) => kind.ask(hidden),
             Some(Verb::Find(find)) => find.ask(hidden),
+            Some(Verb::Echo(echo)) => echo.ask(),
             Some(Verb::Hz(hz)) => hz.ask(hidden),
             Some(Verb::Bw(bandwidth)) => bandwidth.ask(hidden),
             Some(Verb::Delay(delay)) => delay.ask(hidden),

@@ -5,6 +5,7 @@
 
 pub mod action;
 mod dialect;
+pub mod echo;
 mod endpoint;
 pub mod facts;
 pub mod name;

@@ -4,10 +4,10 @@ use std::fmt;
 use std::fs::File;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use flate2::read::MultiGzDecoder;
-use ros2probe::message::MessageType;
+use ros2probe::message::{Library, Sources};
+use ros2probe::ros2::Dialect;
 use serde::Deserialize;
 
 const FILES: [&str; 2] = [
@@ -74,48 +74,12 @@ pub fn bytes(hex: &str) -> Vec<u8> {
         .map(|pair| digit(pair[0]) << 4 | digit(pair[1]))
         .collect()
 }
-pub fn definitions(name: &str) -> Arc<MessageType> {
-    let dir = data().join("definitions");
-    let mut text = String::new();
-    let short = |n: &str| n.replace("/msg/", "/");
-    text.push_str(&std::fs::read_to_string(dir.join(format!("{name}.msg"))).unwrap());
-    let mut done = vec![short(name)];
-    let mut i = 0;
-    let mut wanted: Vec<String> = Vec::new();
-    let mut last = text.clone();
-    loop {
-        let pkg = if i == 0 {
-            short(name)
-        } else {
-            wanted[i - 1].clone()
-        };
-        let pkg = pkg.split('/').next().unwrap().to_owned();
-        for l in last.lines() {
-            let l = l.split('#').next().unwrap();
-            let Some(t) = l.split_whitespace().next() else {
-                continue;
-            };
-            let t = t.split('[').next().unwrap();
-            let t = if t.contains('/') {
-                t.to_owned()
-            } else if t.starts_with(|c: char| c.is_uppercase()) {
-                format!("{pkg}/{t}")
-            } else {
-                continue;
-            };
-            if !done.contains(&t) {
-                done.push(t.clone());
-                wanted.push(t);
-            }
-        }
-        if i == wanted.len() {
-            break;
-        }
-        let (p, n) = wanted[i].split_once('/').unwrap();
-        last = std::fs::read_to_string(dir.join(p).join("msg").join(format!("{n}.msg")))
-            .unwrap_or_else(|_| panic!("no {p}/{n}"));
-        text.push_str(&format!("\n{}\nMSG: {p}/{n}\n{last}", "=".repeat(80)));
-        i += 1;
-    }
-    Arc::new(MessageType::parse(&name.parse().unwrap(), &text).unwrap())
+
+/// Those of `test_msgs` are here; all others come with the program.
+pub fn library() -> Library {
+    Library::new(Sources {
+        directories: vec![data().join("definitions")],
+        prefixes: Vec::new(),
+        dialect: Dialect::Humble,
+    })
 }

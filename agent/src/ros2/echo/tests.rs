@@ -1,0 +1,207 @@
+use super::*;
+use crate::ros2::facts::Qos;
+
+const SCHEMA: &str = "Header header\nfloat32[] ranges\nfloat64[3] k\nHeader[] more\nstring name\n
+================================================================================
+MSG: a/Header\nint32 sec\nstring frame_id";
+
+fn payload() -> Vec<u8> {
+    let mut bytes = vec![0, 1, 0, 0];
+    bytes.extend(b"\x05\0\0\0\x05\0\0\0odom\0\0\0\0\x02\0\0\0");
+    bytes.extend(1_f32.to_le_bytes());
+    bytes.extend(0.1_f32.to_le_bytes());
+    bytes.extend([0; 4]);
+    for value in [1.5_f64, 0.0, 100.25] {
+        bytes.extend(value.to_le_bytes());
+    }
+    bytes.extend(b"\x01\0\0\0\x06\0\0\0\x02\0\0\0x\0\0\0\x05\0\0\0name\0");
+    bytes
+}
+
+fn sample() -> SampleFacts {
+    SampleFacts {
+        topic: "/a".to_owned(),
+        domain_id: 0,
+        message_type: "a/msg/B".to_owned(),
+        time_ns: 2_000_000_001,
+        writer: "01.02".to_owned(),
+        sequence_number: 9,
+        source_timestamp_ns: Some(1_999_999_999),
+        header_stamp_ns: None,
+        size: 8,
+        payload_bytes: Some(8),
+        offered: None,
+    }
+}
+
+fn message_type() -> MessageType {
+    MessageType::parse(&"a/msg/B".parse().unwrap(), SCHEMA).unwrap()
+}
+
+fn echo(options: Options) -> Result<Option<String>, Refused> {
+    let mut echo = Echo::new(options);
+    let told = echo.message(&sample(), Some(&message_type()), &payload())?;
+    assert_eq!(told.err, "");
+    Ok(told.out)
+}
+
+fn fields(paths: &[&str]) -> Options {
+    let fields = paths.iter().map(|path| path.parse().unwrap()).collect();
+    Options {
+        fields,
+        ..Options::default()
+    }
+}
+
+#[test]
+fn fields_print_as_yaml_or_as_python() {
+    for (path, text) in [
+        ("header", "sec: 5\nframe_id: odom\n---\n"),
+        ("header.frame_id", "odom\n---\n"),
+        ("header.sec", "5\n---\n"),
+        ("ranges", "array('f', [1.0, 0.10000000149011612])\n---\n"),
+        ("k", "[  1.5    0.   100.25]\n---\n"),
+        ("k.[2]", "100.25\n---\n"),
+        ("ranges[1]", "0.10000000149011612\n---\n"),
+        ("more", "[a.msg.Header(sec=6, frame_id='x')]\n---\n"),
+        ("more.0.frame_id", "x\n---\n"),
+        ("more.[0]", "sec: 6\nframe_id: x\n---\n"),
+    ] {
+        assert_eq!(echo(fields(&[path])), Ok(Some(text.to_owned())), "{path}");
+    }
+    let several = echo(fields(&["header.sec", "more.0", "name"]));
+    assert_eq!(
+        several.unwrap().unwrap(),
+        "5\nsec: 6\nframe_id: x\nname\n---\n"
+    );
+}
+
+#[test]
+fn fields_that_are_not_there_are_refused_in_the_originals_words() {
+    for (path, reason) in [
+        ("x", "'B' object has no attribute 'x'"),
+        ("header.x", "'Header' object has no attribute 'x'"),
+        ("name.x", "'str' object has no attribute 'x'"),
+        ("ranges.x", "'array.array' object has no attribute 'x'"),
+        ("k.x", "'numpy.ndarray' object has no attribute 'x'"),
+        ("more.1", "list index out of range"),
+        ("header.0", "'Header' object is not subscriptable"),
+    ] {
+        let refused = echo(fields(&[path])).unwrap_err();
+        assert_eq!(refused.0, format!("Invalid field '{path}': {reason}"));
+    }
+    for path in ["", ".", "..", "a[", "a[x]", "a[0"] {
+        let refused = path.parse::<FieldPath>().unwrap_err();
+        assert_eq!(refused.0, format!("Invalid field value '{path}'"));
+    }
+}
+
+#[test]
+fn what_is_known_of_a_message_stands_before_it() {
+    let mut options = fields(&["header"]);
+    options.include_info = true;
+    let document = "publication_sequence_number: 9\nreceived_timestamp: 2000000001\n\
+        reception_sequence_number: null\nsource_timestamp: 1999999999\n---\n\
+        sec: 5\nframe_id: odom\n---\n";
+    assert_eq!(echo(options.clone()).unwrap().unwrap(), document);
+    options.csv = true;
+    let line = "1999999999,2000000001,9,None,5,odom\n";
+    assert_eq!(echo(options.clone()).unwrap().unwrap(), line);
+    options.fields = vec!["header.sec".parse().unwrap()];
+    let around = "---Got new message, message info:---\n{'source_timestamp': 1999999999, \
+        'received_timestamp': 2000000001, 'publication_sequence_number': 9, \
+        'reception_sequence_number': None}\n---Message data:---\n5\n---\n";
+    assert_eq!(echo(options.clone()).unwrap().unwrap(), around);
+    options.include_info = false;
+    options.dialect = Dialect::Humble;
+    assert_eq!(echo(options).unwrap().unwrap(), "5\n");
+}
+
+#[test]
+fn a_filter_sees_the_selected_field() {
+    let mut options = fields(&["header"]);
+    options.filter = Some(Filter::parse("m.sec == 5").unwrap());
+    assert!(echo(options.clone()).unwrap().is_some());
+    options.fields.clear();
+    assert_eq!(
+        echo(options.clone()).unwrap_err().0,
+        "filter, column 2: 'B' object has no attribute 'sec'"
+    );
+    options.filter = Some(Filter::parse("len(m) > 1000").unwrap());
+    options.raw = true;
+    assert_eq!(echo(options.clone()), Ok(None));
+    options.filter = None;
+    let raw = echo(options).unwrap().unwrap();
+    assert!(raw.starts_with("b'\\x00\\x01\\x00\\x00\\x05"), "{raw}");
+    assert!(raw.ends_with("name\\x00'\n---\n"), "{raw}");
+}
+
+#[test]
+fn a_writer_whose_messages_cannot_be_read_is_named_once() {
+    let mut echo = Echo::new(Options::default());
+    let message_type = message_type();
+    let mut tell = |payload: &[u8]| {
+        let told = echo.message(&sample(), Some(&message_type), payload);
+        told.unwrap()
+    };
+    let first = tell(&payload()[..30]);
+    assert_eq!(first.out, None);
+    assert!(
+        first
+            .err
+            .starts_with("rp: /a of writer 01.02: a message is no a/msg/B: "),
+        "{first:?}"
+    );
+    assert_eq!(tell(&[]), Told::default());
+    assert!(tell(&payload()).out.is_some());
+    assert_eq!(echo.unreadable(), 2);
+}
+
+#[test]
+fn events_have_names_in_both_styles() {
+    let event = "a/Info info\nuint8[] request\n
+================================================================================
+MSG: a/Info\nuint8 event_type\nint64 sequence_number";
+    let message_type = MessageType::parse(&"a/msg/B".parse().unwrap(), event).unwrap();
+    let mut payload = vec![0, 1, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0];
+    payload.extend([7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+    let print = |style, csv, interface| {
+        let options = Options {
+            style,
+            csv,
+            ..Options::default()
+        };
+        let told = Echo::new(options).event(&sample(), &message_type, &payload, interface);
+        told.out.unwrap()
+    };
+    assert_eq!(
+        print(Style::Block, false, None),
+        "info:\n  event_type: RESPONSE_SENT\n  sequence_number: 7\nrequest: []\n---\n"
+    );
+    assert_eq!(
+        print(Style::Flow, false, Some("GOAL_SERVICE")),
+        "interface: GOAL_SERVICE\n\
+         {info: {event_type: RESPONSE_SENT, sequence_number: 7}, request: []}\n---\n"
+    );
+    assert_eq!(print(Style::Block, true, None), "2,7,\n");
+}
+
+#[test]
+fn publishers_that_differ_are_told() {
+    let publisher = |reliability: &str, durability: &str| Endpoint {
+        qos: Qos {
+            reliability: reliability.to_owned(),
+            durability: durability.to_owned(),
+            ..Qos::default()
+        },
+        ..Endpoint::default()
+    };
+    let reliable = publisher("RELIABLE", "VOLATILE");
+    assert_eq!(mixed_offers(&[reliable.clone(), reliable.clone()]), "");
+    let mixed = mixed_offers(&[reliable, publisher("BEST_EFFORT", "VOLATILE")]);
+    assert_eq!(
+        mixed,
+        "Some, but not all, publishers are offering QoSReliabilityPolicy.RELIABLE. Falling back to \
+         QoSReliabilityPolicy.BEST_EFFORT as it will connect to all publishers\n"
+    );
+}
