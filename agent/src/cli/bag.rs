@@ -10,6 +10,8 @@ use ros2probe::bag::info::{self, Sort};
 use ros2probe::bag::reindex::{self, Found};
 use ros2probe::ros2::Dialect;
 
+use super::interrupt::INTERRUPTED;
+use super::record::Record;
 use super::{Arguments, Output, Said};
 
 /// `rp bag VERB`.
@@ -21,6 +23,8 @@ pub(crate) struct Bag {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
+    /// Record messages into a bag
+    Record(Box<Record>),
     /// Print information about a bag
     Info(Info),
     /// Make a bag whole again: files that were never finished, and metadata.yaml
@@ -68,9 +72,18 @@ enum Storage {
 }
 
 impl Bag {
+    /// With which code Ctrl-C ends it at once; a recording is completed first.
+    pub(crate) const fn interrupted(&self) -> Option<u8> {
+        match self.verb {
+            Some(Verb::Record(_)) => None,
+            _ => Some(INTERRUPTED),
+        }
+    }
+
     pub(crate) fn ask(self) -> Result<ExitCode> {
         match self.verb {
             None => super::help(&["bag"]),
+            Some(Verb::Record(record)) => record.ask(),
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Reindex(reindex)) => reindex.ask(),
         }

@@ -13,6 +13,7 @@ mod node;
 mod output;
 mod rates;
 mod reference;
+mod record;
 mod run;
 mod service;
 mod shared;
@@ -96,7 +97,7 @@ impl Question {
     /// The exit code when Ctrl-C ends it at once; `None` for what wants to end by itself.
     fn interrupted(&self) -> Option<u8> {
         match self {
-            Self::Bag(_) => Some(interrupt::INTERRUPTED),
+            Self::Bag(bag) => bag.interrupted(),
             Self::Topic(topic) => Some(topic.interrupted()),
             Self::Node(_) | Self::Service(_) | Self::Action(_) | Self::Doctor(_) => {
                 Some(interrupt::INTERRUPTED)

@@ -117,7 +117,7 @@ impl<'a> Samples<'a> {
             return Arc::clone(known);
         }
         let message_type = Some(facts.message_type.as_str());
-        let offered = facts.offered.as_ref();
+        let offered = facts.offered.as_deref();
         let topic = self.topic(facts.domain_id, &facts.topic, message_type, offered);
         if self.writers.len() < WRITERS {
             self.writers

@@ -3,9 +3,12 @@
 //! The question is asked again whenever the graph changes, so that topics that come later are taken,
 //! too. Topics of service events are a service's: topics' options do not reach them.
 
+use std::collections::HashSet;
+
 use regex::Regex;
 use serde::{Deserialize, Serialize};
 
+use crate::client::encoded;
 use crate::subscriptions::{Choice, ChoiceError, Selection};
 
 /// The end of the name of a service's event topic.
@@ -69,6 +72,7 @@ pub struct Filter {
     asked: Asked,
     regex: Option<Regex>,
     exclude_regex: Option<Regex>,
+    only: Option<HashSet<String>>,
 }
 
 /// Why nothing can be chosen like this.
@@ -142,6 +146,7 @@ impl Filter {
             asked,
             regex,
             exclude_regex,
+            only: None,
         })
     }
 
@@ -184,6 +189,50 @@ impl Filter {
         })
     }
 
+    /// The same as a query of the API's `/samples`, with so much room for what waits.
+    #[must_use]
+    pub fn query(&self, domain_id: u32, queue_bytes: u64) -> String {
+        let asked = &self.asked;
+        let event = |service: &String| format!("{service}{SERVICE_EVENT}");
+        let list = |names: &[String], services: &[String]| {
+            let names = names.iter().cloned().chain(services.iter().map(event));
+            names.collect::<Vec<_>>().join(",")
+        };
+        let every_event = asked.all_services || asked.regex.is_some();
+        let events = every_event.then(|| EVERY_SERVICE_EVENT.to_owned());
+        let regex = asked.regex.as_ref().map(|regex| format!("(?:{regex})"));
+        let regex: Vec<String> = regex.into_iter().chain(events).collect();
+        let all = asked.all_topics || !asked.topic_types.is_empty();
+        let hidden = asked.include_hidden_topics || every_event;
+        let mut query = format!("domain_id={domain_id}&queue_bytes={queue_bytes}");
+        query.push_str(&format!("&all={all}&hidden={hidden}"));
+        let texts = [
+            ("topic", list(&asked.topics, &asked.services)),
+            ("regex", regex.join("|")),
+            (
+                "exclude",
+                list(&asked.exclude_topics, &asked.exclude_services),
+            ),
+            (
+                "exclude_regex",
+                asked.exclude_regex.clone().unwrap_or_default(),
+            ),
+        ];
+        for (key, text) in texts.into_iter().filter(|(_, text)| !text.is_empty()) {
+            query.push_str(&format!("&{key}={}", encoded(&text)));
+        }
+        query
+    }
+
+    /// Of those it takes, only these topics.
+    #[must_use]
+    pub fn only(self, names: &[String]) -> Self {
+        Self {
+            only: Some(names.iter().cloned().collect()),
+            ..self
+        }
+    }
+
     /// Whether `topic` is to be recorded.
     #[must_use]
     pub fn takes(&self, topic: &Candidate<'_>) -> bool {
@@ -192,7 +241,10 @@ impl Filter {
             let expression = expression.as_ref();
             expression.is_some_and(|expression| expression.is_match(name))
         };
-        if found(&self.exclude_regex, topic.name) {
+        let only = self.only.as_ref();
+        if found(&self.exclude_regex, topic.name)
+            || only.is_some_and(|only| !only.contains(topic.name))
+        {
             return false;
         }
         if let Some(service) = topic.name.strip_suffix(SERVICE_EVENT) {
@@ -372,5 +424,37 @@ mod tests {
             ..Asked::default()
         };
         assert!(error(long).ends_with("longer than 1024 bytes"));
+    }
+
+    #[test]
+    fn what_is_asked_of_an_agent_is_no_less_than_what_is_taken() {
+        let asked = Asked {
+            topics: strings(&["/a", "/b"]),
+            services: strings(&["/add"]),
+            regex: Some("^/c&d".to_owned()),
+            exclude_topics: strings(&["/x"]),
+            ..Asked::default()
+        };
+        assert_eq!(
+            Filter::new(asked).unwrap().query(3, 100),
+            "domain_id=3&queue_bytes=100&all=false&hidden=true\
+             &topic=/a%2C/b%2C/add/_service_event\
+             &regex=%28%3F%3A%5E/c%26d%29%7C/_service_event%24&exclude=/x"
+        );
+        let all = Filter::new(Asked::everything()).unwrap();
+        assert_eq!(
+            all.query(0, 1),
+            "domain_id=0&queue_bytes=1&all=true&hidden=false"
+        );
+        let only = all.only(&strings(&["/a"]));
+        let takes = |name| {
+            only.takes(&Candidate {
+                name,
+                types: &[],
+                published: true,
+                subscribed: true,
+            })
+        };
+        assert!(takes("/a") && !takes("/b"));
     }
 }

@@ -30,19 +30,24 @@ const SYNC: u64 = 5 * SECOND;
 const WRITERS: usize = 256;
 
 /// Where a recorder learns what it does not see in samples.
-pub struct Sources {
+pub struct Sources<'a> {
     /// What is announced of a topic at the moment.
-    pub announced: Box<dyn FnMut(&str) -> Announced + Send>,
+    pub announced: Box<dyn FnMut(&str) -> Announced + Send + 'a>,
     /// How messages of a type look; the type and its announced hash.
-    pub schema: Box<dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send>,
+    pub schema: Box<Schemas<'a>>,
 }
 
+/// The schema of a type, by its name and announced hash.
+pub type Schemas<'a> = dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send + 'a;
+
 /// A bag in the making.
-pub struct Recorder {
+pub struct Recorder<'a> {
     writer: Writer,
     filter: Filter,
-    sources: Sources,
+    sources: Sources<'a>,
     topics: HashMap<String, Place>,
+    /// Of those, the ones in the bag.
+    order: Vec<String>,
     report: Report,
     paused: bool,
     /// In snapshot mode: samples that wait for being asked for.
@@ -54,7 +59,7 @@ pub struct Recorder {
 /// What was decided for a topic.
 enum Place {
     /// It is in the bag.
-    Taken(Taken),
+    Taken(Box<Taken>),
     /// The filter does not take it.
     LeftOut,
 }
@@ -79,15 +84,16 @@ pub struct Ended {
     pub error: Option<Error>,
 }
 
-impl Recorder {
+impl<'a> Recorder<'a> {
     /// Records what `filter` takes into `writer`'s bag.
     #[must_use]
-    pub fn new(writer: Writer, filter: Filter, sources: Sources) -> Self {
+    pub fn new(writer: Writer, filter: Filter, sources: Sources<'a>) -> Self {
         Self {
             writer,
             filter,
             sources,
             topics: HashMap::new(),
+            order: Vec::new(),
             report: Report::default(),
             paused: false,
             ring: None,
@@ -121,6 +127,11 @@ impl Recorder {
     #[must_use]
     pub const fn report(&self) -> &Report {
         &self.report
+    }
+
+    /// Topics in the bag, in the order in which they came into it.
+    pub fn topics(&self) -> impl Iterator<Item = &str> {
+        self.order.iter().map(String::as_str)
     }
 
     /// The bag so far.
@@ -341,12 +352,13 @@ impl Recorder {
         // Before its first message comes its description: with that of its writer.
         let id = self.writer.topic(description.clone())?;
         self.report.topic(name);
-        Ok(Place::Taken(Taken {
+        self.order.push(name.to_owned());
+        Ok(Place::Taken(Box::new(Taken {
             id,
             description,
             offered,
             first: HashMap::new(),
-        }))
+        })))
     }
 
     /// Describes a topic again when a writer is new that offers something.
@@ -392,7 +404,7 @@ impl Recorder {
     }
 }
 
-impl std::fmt::Debug for Recorder {
+impl std::fmt::Debug for Recorder<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Recorder")
             .field("writer", &self.writer)
@@ -453,7 +465,7 @@ mod tests {
         serde_json::from_str(&json).unwrap()
     }
 
-    fn recorder(directory: &std::path::Path, asked: Asked) -> Recorder {
+    fn recorder(directory: &std::path::Path, asked: Asked) -> Recorder<'static> {
         let sources = Sources {
             announced: Box::new(|name| match name {
                 "/tf_static" => keepers(),

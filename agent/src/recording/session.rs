@@ -48,10 +48,10 @@ struct Compressing {
 /// Records until it ends; the second value is why the source did, if it broke. `tell` hears of the
 /// recorder now and then, and whenever an order was carried out.
 pub fn record<E>(
-    mut recorder: Recorder,
+    mut recorder: Recorder<'_>,
     mut next: impl FnMut(Duration) -> Result<Got, E>,
     orders: &Receiver<Order>,
-    mut tell: impl FnMut(&Recorder),
+    mut tell: impl FnMut(&Recorder<'_>),
 ) -> (Ended, Option<E>) {
     let mut compressing = Compressing::default();
     let mut stopping: Option<(Timestamp, Instant)> = None;
@@ -94,6 +94,7 @@ pub fn record<E>(
             _ => {}
         }
     };
+    tell(&recorder);
     let compressed = compressing.finish(&mut recorder);
     let refused = refused.or(compressed.err());
     (recorder.finish(refused), broke)
@@ -105,7 +106,7 @@ enum Carried {
     Stop,
 }
 
-fn carry_out(orders: &Receiver<Order>, recorder: &mut Recorder) -> Result<Carried, Error> {
+fn carry_out(orders: &Receiver<Order>, recorder: &mut Recorder<'_>) -> Result<Carried, Error> {
     let mut carried = Carried::Nothing;
     loop {
         match orders.try_recv() {
@@ -124,7 +125,7 @@ fn carry_out(orders: &Receiver<Order>, recorder: &mut Recorder) -> Result<Carrie
 
 impl Compressing {
     /// Takes over what is done, and begins with what waits.
-    fn look(&mut self, recorder: &mut Recorder) -> Result<(), Error> {
+    fn look(&mut self, recorder: &mut Recorder<'_>) -> Result<(), Error> {
         if self
             .thread
             .as_ref()
@@ -144,7 +145,7 @@ impl Compressing {
     }
 
     /// Waits for what is under way.
-    fn finish(&mut self, recorder: &mut Recorder) -> Result<(), Error> {
+    fn finish(&mut self, recorder: &mut Recorder<'_>) -> Result<(), Error> {
         let Some(done) = self.thread.take().and_then(|thread| thread.join().ok()) else {
             return Ok(());
         };

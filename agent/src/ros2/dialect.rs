@@ -18,6 +18,17 @@ pub enum Dialect {
 }
 
 impl Dialect {
+    /// As `ROS_DISTRO` spells it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Humble => "humble",
+            Self::Jazzy => "jazzy",
+            Self::Kilted => "kilted",
+            Self::Rolling => "rolling",
+        }
+    }
+
     /// Of `ROS_DISTRO`; `None` for one that is not known.
     #[must_use]
     pub fn of_distro(name: &str) -> Option<Self> {

@@ -85,7 +85,7 @@ pub struct SampleFacts {
     /// What the writer announced: with the first of its messages, where payloads were asked for.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
-    pub offered: Option<OfferedFacts>,
+    pub offered: Option<Box<OfferedFacts>>,
 }
 
 /// What a writer announced.

@@ -41,6 +41,7 @@ const BATCH_BYTES: usize = 16 * 1024;
 /// Room for arrivals, a few thousand; and for messages with their bytes.
 const ARRIVALS_BYTES: usize = 1 << 20;
 const PAYLOADS_BYTES: usize = 16 << 20;
+const LEAST_BYTES: usize = 64 << 10;
 /// How long a stream waits with its first line for the capture to know what is wanted.
 const PATIENCE: Duration = Duration::from_secs(2);
 
@@ -70,6 +71,10 @@ struct Wanted {
     domain_id: Option<u32>,
     /// Whether the bytes of the messages are wanted.
     payload: bool,
+    /// Bytes that may wait for this client before the oldest messages are dropped, as far as
+    /// `limits.payload_bytes` allows: all streams together.
+    #[param(minimum = 65536)]
+    queue_bytes: Option<usize>,
 }
 
 /// One client's stream.
@@ -125,6 +130,7 @@ async fn samples(
     } else {
         (Depth::Arrivals, ARRIVALS_BYTES, LINES)
     };
+    let queue_bytes = wanted.queue_bytes.unwrap_or(queue_bytes).max(LEAST_BYTES);
     let request = Request {
         topics: selection(&wanted)?,
         domain_id,
@@ -201,7 +207,7 @@ impl Stream {
             && self.introduced.len() < WRITERS
             && self.introduced.insert(sample.writer)
         {
-            facts.offered = Some(OfferedFacts::from(&**offered));
+            facts.offered = Some(Box::new(OfferedFacts::from(&**offered)));
         }
         line
     }

@@ -1,0 +1,507 @@
+//! `rp bag record`: a bag written by this process, with its rights and where it was started, out of
+//! what an agent gives. Says on stderr what the original says there.
+
+use std::collections::BTreeMap;
+use std::io::{self, IsTerminal as _, Read as _};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::mpsc::{Sender, channel};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context as _, Result, anyhow, bail};
+use clap::Args;
+use jiff::Zoned;
+use ros2probe::bag::{self, Form, Options, Schema, Storage, Writer};
+use ros2probe::client::{Agent, Samples, Target, encoded};
+use ros2probe::message::{Library, Sources as Places};
+use ros2probe::recording::{
+    Announced, Asked, Ended, Filter, Order, Recorder, Ring, Sources, record,
+};
+use ros2probe::ros2::Dialect;
+use ros2probe::ros2::name::full_name;
+use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::Said;
+use super::interrupt::INTERRUPTED;
+
+/// Room for messages that wait for the storage, as the original's cache.
+const CACHE: u64 = 100 << 20;
+const SPACE: u8 = b' ';
+
+/// `rp bag record`.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Nothing on the network tells that there is a recording: messages are copied, not subscribed to. What
+was never whole on the wire is not in the bag and is named at the end, and in the bag's metadata.
+Space pauses and resumes. SIGUSR1 writes what waits in --snapshot-mode. Ctrl-C ends the recording.
+
+Examples:
+  rp bag record -a                                      every topic
+  rp bag record /tf /tf_static -e '^/camera/' -o drive  some
+  rp bag record -a --replay robot.pcap -o drive         out of a capture")]
+pub(crate) struct Record {
+    /// Topics to record
+    #[arg(value_name = "TOPIC")]
+    positional: Vec<String>,
+    /// Topics to record
+    #[arg(long, value_name = "TOPIC", num_args = 1..)]
+    topics: Vec<String>,
+    /// Services whose events to record
+    #[arg(long, value_name = "SERVICE", num_args = 1..)]
+    services: Vec<String>,
+    /// Types of which to record all topics
+    #[arg(long, value_name = "TYPE", num_args = 1..)]
+    topic_types: Vec<String>,
+    /// Record all topics; from Jazzy on all services, too
+    #[arg(long, short = 'a')]
+    all: bool,
+    /// Record all topics
+    #[arg(long)]
+    all_topics: bool,
+    /// Record the events of all services
+    #[arg(long)]
+    all_services: bool,
+    /// Record topics and services in whose name this regular expression is found
+    #[arg(long, short = 'e')]
+    regex: Option<String>,
+    /// Not those in whose name this regular expression is found
+    #[arg(long, short = 'x', visible_alias = "exclude", value_name = "REGEX")]
+    exclude_regex: Option<String>,
+    /// Not these topics
+    #[arg(long, value_name = "TOPIC", num_args = 1..)]
+    exclude_topics: Vec<String>,
+    /// No topics of these types
+    #[arg(long, value_name = "TYPE", num_args = 1..)]
+    exclude_topic_types: Vec<String>,
+    /// Not the events of these services
+    #[arg(long, value_name = "SERVICE", num_args = 1..)]
+    exclude_services: Vec<String>,
+    /// Declare topics in the bag that nobody publishes
+    #[arg(long)]
+    include_unpublished_topics: bool,
+    /// Record hidden topics as well
+    #[arg(long)]
+    include_hidden_topics: bool,
+    /// Leave out topics that nobody subscribes to
+    #[arg(long)]
+    ignore_leaf_topics: bool,
+    /// Record only topics that are there at the start
+    #[arg(long)]
+    no_discovery: bool,
+    /// Directory to make [default: rosbag2_ and the time, here]
+    #[arg(long, short = 'o', value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// Storage of the bag: mcap
+    #[arg(long, short = 's', default_value = "mcap")]
+    storage: String,
+    /// Split when a file reaches so many bytes; 0 = never
+    #[arg(long, short = 'b', value_name = "BYTES", default_value_t = 0)]
+    max_bag_size: u64,
+    /// Split when a file reaches so many seconds; 0 = never
+    #[arg(long, short = 'd', value_name = "SECONDS", default_value_t = 0)]
+    max_bag_duration: u64,
+    /// Bytes of messages that may wait for the storage, as far as the agent allows; what finds no
+    /// room is dropped, counted and named
+    #[arg(long, value_name = "BYTES", default_value_t = CACHE)]
+    max_cache_size: u64,
+    /// Compress whole files once they are complete: file
+    #[arg(long, value_name = "none|file", default_value = "none")]
+    compression_mode: String,
+    /// How: zstd or lz4
+    #[arg(long, value_name = "FORMAT", default_value = "")]
+    compression_format: String,
+    /// How MCAP files are written: none, fastwrite, zstd_fast or zstd_small
+    #[arg(long, value_name = "PRESET", default_value = "")]
+    storage_preset_profile: String,
+    /// YAML file with settings of the storage; goes before the preset
+    #[arg(long, value_name = "FILE")]
+    storage_config_file: Option<PathBuf>,
+    /// Also written into metadata.yaml
+    #[arg(long, value_name = "KEY=VALUE", num_args = 1.., value_parser = pair)]
+    custom_data: Vec<(String, String)>,
+    /// Keep the last messages in memory, up to --max-cache-size, and write them on SIGUSR1
+    #[arg(long)]
+    snapshot_mode: bool,
+    /// Begin paused
+    #[arg(long)]
+    start_paused: bool,
+    /// Directory with message definitions; may be repeated
+    #[arg(long, value_name = "DIR")]
+    definitions: Vec<PathBuf>,
+    #[command(flatten)]
+    unused: Unused,
+    #[command(flatten)]
+    target: Target,
+}
+
+/// Options of the original that change nothing here.
+#[derive(Args, Debug)]
+struct Unused {
+    /// Accepted without effect, as are other options of subscriptions and threads
+    #[arg(long, short = 'p', value_name = "MS")]
+    polling_interval: Option<String>,
+    #[arg(long, hide = true)]
+    qos_profile_overrides_path: Option<String>,
+    #[arg(long, short = 'f', hide = true)]
+    serialization_format: Option<String>,
+    #[arg(long, hide = true)]
+    use_sim_time: bool,
+    #[arg(long, hide = true)]
+    node_name: Option<String>,
+    #[arg(long, hide = true)]
+    log_level: Option<String>,
+    #[arg(long, hide = true)]
+    compression_queue_size: Option<String>,
+    #[arg(long, hide = true)]
+    compression_threads: Option<String>,
+    #[arg(long, hide = true)]
+    compression_threads_priority: Option<String>,
+}
+
+/// Standard input without lines and echo, until it is dropped.
+struct Keys(Termios);
+
+impl Record {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let dialect = self.target.dialect();
+        let filter = Filter::new(self.asked(dialect)?).map_err(|error| refused(&error))?;
+        let options = self.options()?;
+        let domain_id = self.target.domain()?;
+        let directory = self.output.clone().unwrap_or_else(|| default_name().into());
+        if directory.exists() {
+            return Err(Said(format!(
+                "[ERROR] [ros2bag]: Output folder '{}' already exists.",
+                directory.display()
+            ))
+            .into());
+        }
+        let agent = Agent::reach_stream(&self.target)?;
+        let query = filter.query(domain_id, self.max_cache_size);
+        let mut samples = Samples::open(&agent, &query)?;
+        let filter = if self.no_discovery {
+            let opened = samples.opened().topics.iter();
+            let there: Vec<_> = opened.map(|topic| topic.topic.clone()).collect();
+            filter.only(&there)
+        } else {
+            filter
+        };
+        let places = Places::new(
+            self.definitions.clone(),
+            std::env::var_os("AMENT_PREFIX_PATH").as_deref(),
+            dialect,
+        );
+        let library = Library::new(places);
+        let asked = &agent;
+        let sources = Sources {
+            announced: Box::new(move |name| announced(asked, domain_id, name)),
+            schema: Box::new(move |name, hash| schema(&library, name, hash)),
+        };
+        let writer = Writer::create(&directory, options)?;
+        let mut recorder = Recorder::new(writer, filter, sources);
+        if self.snapshot_mode {
+            let room = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
+            recorder = recorder.waiting_in(Ring::new(room, None));
+        }
+        recorder.pause(self.start_paused);
+        for topic in &samples.opened().topics {
+            if let Some(message_type) = topic.types.first() {
+                recorder.declare(&topic.topic, message_type)?;
+            }
+        }
+        let (give, orders) = channel();
+        listen(give.clone())?;
+        let keys = Keys::take();
+        match &keys {
+            Some(_) => {
+                log("INFO", "Press SPACE for pausing/resuming");
+                read_keys(give);
+            }
+            None => eprintln!("stdin is not a terminal device. Keyboard handling disabled."),
+        }
+        log("INFO", "Listening for topics...");
+        let paused = "Waiting for recording: Press SPACE to start.";
+        log(
+            "INFO",
+            if self.start_paused {
+                paused
+            } else {
+                "Recording..."
+            },
+        );
+        let mut said = Told::new();
+        let next = |patience: Duration| samples.next_within(patience);
+        let (ended, broke) = record(recorder, next, &orders, |recorder| said.tell(recorder));
+        drop(keys);
+        said.finish();
+        let code = report(&ended);
+        match broke {
+            Some(error) => Err(error.into()),
+            None => Ok(code),
+        }
+    }
+
+    fn asked(&self, dialect: Dialect) -> Result<Asked> {
+        let full = |names: &[String]| -> Result<Vec<String>> {
+            let names = names.iter().map(|name| full_name(name));
+            let names: Result<_, _> = names.collect();
+            names.map_err(|refused| Said(refused.0).into())
+        };
+        let mut topics = full(&self.positional)?;
+        topics.extend(full(&self.topics)?);
+        Ok(Asked {
+            topics,
+            all_topics: self.all || self.all_topics,
+            topic_types: self.topic_types.clone(),
+            services: full(&self.services)?,
+            all_services: self.all_services || (self.all && dialect > Dialect::Humble),
+            regex: self.regex.clone(),
+            exclude_regex: self.exclude_regex.clone(),
+            exclude_topics: full(&self.exclude_topics)?,
+            exclude_topic_types: self.exclude_topic_types.clone(),
+            exclude_services: full(&self.exclude_services)?,
+            include_hidden_topics: self.include_hidden_topics,
+            include_unpublished_topics: self.include_unpublished_topics,
+            ignore_leaf_topics: self.ignore_leaf_topics,
+        })
+    }
+
+    fn options(&self) -> Result<Options> {
+        if self.storage != "mcap" {
+            bail!(
+                "the storage `{}` is not written here: mcap is",
+                self.storage
+            );
+        }
+        let format = self.unused.serialization_format.as_deref();
+        if let Some(format) = format.filter(|format| !matches!(*format, "" | "cdr")) {
+            bail!("the serialization format `{format}` is not written here: cdr is");
+        }
+        let mut storage = Storage::preset(&self.storage_preset_profile)?;
+        if let Some(path) = &self.storage_config_file {
+            let text = std::fs::read_to_string(path);
+            let text = text.with_context(|| format!("cannot read {}", path.display()))?;
+            storage = storage.overlaid(&text)?;
+        }
+        let distro = self.target.distro.map(Dialect::name);
+        let seconds = Some(self.max_bag_duration).filter(|seconds| *seconds > 0);
+        let (mode, format) = (&self.compression_mode, &self.compression_format);
+        Ok(Options {
+            form: distro.map_or_else(Form::default, Form::of),
+            ros_distro: distro.map_or_else(installed, str::to_owned),
+            storage,
+            file_compression: bag::options::file_compression(mode, format)?,
+            max_file_bytes: bag::options::max_file_bytes(self.max_bag_size)?,
+            max_file_duration: seconds.map(Duration::from_secs),
+            custom_data: self.custom_data.iter().cloned().collect::<BTreeMap<_, _>>(),
+        })
+    }
+}
+
+impl Keys {
+    fn take() -> Option<Self> {
+        let stdin = io::stdin();
+        if !stdin.is_terminal() {
+            return None;
+        }
+        let before = tcgetattr(&stdin).ok()?;
+        let mut now = before.clone();
+        now.local_modes
+            .remove(LocalModes::ICANON | LocalModes::ECHO);
+        tcsetattr(&stdin, OptionalActions::Now, &now).ok()?;
+        Some(Self(before))
+    }
+}
+
+impl Drop for Keys {
+    fn drop(&mut self) {
+        // Nobody could be told that it failed.
+        let _ = tcsetattr(io::stdin(), OptionalActions::Now, &self.0);
+    }
+}
+
+/// What was said of a recording so far.
+struct Told {
+    topics: usize,
+    files: usize,
+    paused: Option<bool>,
+    progress: bool,
+}
+
+impl Told {
+    fn new() -> Self {
+        Self {
+            topics: 0,
+            files: 1,
+            paused: None,
+            progress: io::stderr().is_terminal(),
+        }
+    }
+
+    fn tell(&mut self, recorder: &Recorder<'_>) {
+        let report = recorder.report();
+        if report.topics.len() > self.topics {
+            self.clear();
+            for name in recorder.topics().skip(self.topics) {
+                log("INFO", &format!("Subscribed to topic '{name}'"));
+            }
+            self.topics = report.topics.len();
+        }
+        let (paused, files) = (recorder.is_paused(), recorder.writer().files());
+        if self.paused.is_some_and(|before| before != paused) {
+            self.clear();
+            let text = if paused {
+                "Pausing recording."
+            } else {
+                "Resuming recording."
+            };
+            log("INFO", text);
+        }
+        self.paused = Some(paused);
+        if files > self.files {
+            self.clear();
+            log("INFO", &format!("Recording into file {}", files - 1));
+            self.files = files;
+        }
+        if self.progress {
+            let missing = match report.missing {
+                0 => String::new(),
+                missing => format!(", {missing} missing"),
+            };
+            let megabytes = report.bytes / 1_000_000;
+            eprint!(
+                "\r{} messages, {megabytes} MB{missing}\x1b[K",
+                report.messages
+            );
+        }
+    }
+
+    fn clear(&self) {
+        if self.progress {
+            eprint!("\r\x1b[K");
+        }
+    }
+
+    fn finish(&self) {
+        self.clear();
+    }
+}
+
+/// What is in the bag and what is not; 1 where the storage refused something.
+fn report(ended: &Ended) -> ExitCode {
+    for line in ended.report.shortfalls() {
+        log("WARN", &line);
+    }
+    if let Some(error) = &ended.error {
+        // With its causes.
+        let error = format!("{:#}", anyhow!(error.to_string()));
+        log(
+            "ERROR",
+            &format!("{error}: the recording ends here, what came before is whole"),
+        );
+    }
+    if let Some(summary) = &ended.summary {
+        let (messages, directory) = (summary.messages, summary.directory.display());
+        log("INFO", &format!("{messages} messages in {directory}"));
+    }
+    log("INFO", "Recording stopped");
+    match ended.error {
+        None => ExitCode::SUCCESS,
+        Some(_) => ExitCode::FAILURE,
+    }
+}
+
+fn refused(error: &ros2probe::recording::FilterError) -> anyhow::Error {
+    Said(format!("{error}")).into()
+}
+
+/// What is announced of a topic; nothing where the agent does not know it, or is gone.
+fn announced(agent: &Agent, domain_id: u32, name: &str) -> Announced {
+    let path = format!("/topics{}?domain_id={domain_id}", encoded(name));
+    agent.get(&path).unwrap_or_default()
+}
+
+fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schema> {
+    let found = library.find(name, hash).ok()?;
+    let (encoding, text) = found.schema_text();
+    Some(Schema {
+        encoding: encoding.to_owned(),
+        text,
+    })
+}
+
+/// Whose distribution this is, as far as the shell says.
+fn installed() -> String {
+    std::env::var("ROS_DISTRO").unwrap_or_default()
+}
+
+/// Local time, as the original names its directories.
+fn default_name() -> String {
+    Zoned::now()
+        .strftime("rosbag2_%Y_%m_%d-%H_%M_%S")
+        .to_string()
+}
+
+/// A line as the original logs it.
+fn log(level: &str, text: &str) {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    let now = now.unwrap_or_default();
+    let (seconds, nanoseconds) = (now.as_secs(), now.subsec_nanos());
+    eprintln!("[{level}] [{seconds}.{nanoseconds:09}] [rosbag2_recorder]: {text}");
+}
+
+fn pair(text: &str) -> Result<(String, String), String> {
+    let (key, value) = text.split_once('=').ok_or("must be KEY=VALUE")?;
+    Ok((key.to_owned(), value.to_owned()))
+}
+
+/// Ctrl-C and SIGTERM end the recording, again at once; SIGUSR1 writes what waits.
+fn listen(give: Sender<Order>) -> io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_io()
+        .build()?;
+    let mut signals = {
+        let _entered = runtime.enter();
+        let kinds = [
+            SignalKind::interrupt(),
+            SignalKind::terminate(),
+            SignalKind::user_defined1(),
+        ];
+        let [interrupt, terminate, user] = kinds.map(signal);
+        (interrupt?, terminate?, user?)
+    };
+    let wait = async move {
+        let mut stopping = false;
+        loop {
+            let order = tokio::select! {
+                _ = signals.0.recv() => Order::Stop,
+                _ = signals.1.recv() => Order::Stop,
+                _ = signals.2.recv() => Order::Snapshot,
+            };
+            if order == Order::Stop && std::mem::replace(&mut stopping, true) {
+                std::process::exit(INTERRUPTED.into());
+            }
+            // Nobody takes orders any more when it has ended by itself.
+            let _ = give.send(order);
+        }
+    };
+    let thread = std::thread::Builder::new().name("signals".to_owned());
+    thread.spawn(move || runtime.block_on(wait)).map(drop)
+}
+
+fn read_keys(give: Sender<Order>) {
+    let read = move || {
+        for byte in io::stdin().lock().bytes() {
+            match byte {
+                Ok(SPACE) => {
+                    let _ = give.send(Order::Toggle);
+                }
+                Ok(_) => {}
+                Err(_) => return,
+            }
+        }
+    };
+    let thread = std::thread::Builder::new().name("keys".to_owned());
+    // Without it there are no keys, which costs a convenience.
+    let _ = thread.spawn(read);
+}
