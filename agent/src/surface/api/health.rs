@@ -1,5 +1,6 @@
 //! `GET /health`: whether the agent sees the robot, and how well.
 
+use std::sync::LazyLock;
 use std::time::{Instant, SystemTime};
 
 use axum::Json;
@@ -12,7 +13,11 @@ use utoipa_axum::routes;
 use super::Context;
 use crate::privilege;
 use crate::surface::agent_facts::{Ability, AgentFacts};
+use crate::surface::otlp::Host;
 use crate::surface::process::Process;
+
+/// Read once: a robot is not renamed while its agent runs.
+static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
 
 /// How the agent is.
 #[derive(Debug, Serialize, ToSchema)]
@@ -23,10 +28,16 @@ pub(super) struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     reason: Option<String>,
+    /// Name of its host.
+    host: Option<String>,
     /// Version of the agent.
     version: &'static str,
     /// Where it looks: `host`, `wire` or `replay`.
     source: &'static str,
+    /// The replay has come to the end of its capture: nothing changes any more.
+    finished: bool,
+    /// Age of what is known; null while nothing is.
+    age_seconds: Option<f64>,
     /// Watches in force, of every origin.
     watches: usize,
     /// Watches that clients add outlive the agent: there is a state directory that can be written.
@@ -37,6 +48,10 @@ pub(super) struct Health {
     dropped_records: u64,
     /// Datagrams captured at the host's sockets that were lost likewise.
     dropped_datagrams: u64,
+    /// Datagrams that the kernel programs could not look at.
+    contended_datagrams: u64,
+    /// Senders whose announcement was missed: their topics have no name.
+    unknown_writers: usize,
     /// Topics that a watch matched but `limits.topics` kept from being measured.
     topics_rejected: u64,
     /// Why it does not look where it would see more.
@@ -112,22 +127,29 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn health(State(context): State<Context>) -> Json<Health> {
     let state = context.board.state();
-    let ready = state.ready(Instant::now());
+    let instant = Instant::now();
+    let ready = state.ready(instant);
     let (agent, snapshot) = (&state.agent, state.snapshot.as_ref());
     let interfaces = agent.interfaces.iter();
     let tables = snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
+    let age = instant.saturating_duration_since(agent.at);
     let started = Process::read().start_time;
     let now = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
     Json(Health {
         ready: ready.is_ok(),
         reason: ready.err(),
+        host: HOST.clone(),
         version: env!("CARGO_PKG_VERSION"),
         source: agent.source.label(),
+        finished: agent.finished,
+        age_seconds: snapshot.map(|_| age.as_secs_f64()),
         watches: context.watches.in_force().entries().len(),
         watches_kept: context.watches.is_kept(),
         dropped_packets: interfaces.clone().filter_map(|each| each.dropped).sum(),
         dropped_records: agent.records_dropped,
         dropped_datagrams: agent.pieces_dropped,
+        contended_datagrams: agent.contended,
+        unknown_writers: snapshot.map_or(0, |snapshot| snapshot.unknown_writers.len()),
         topics_rejected: snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
         source_reason: agent.source_reason.clone(),
         abilities: abilities(agent),

@@ -77,6 +77,26 @@ pub(super) struct Distribution {
     maximum_seconds: f64,
 }
 
+/// Part of a histogram.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Bucket)]
+pub(super) struct BucketView {
+    /// Values are at most this, and above the one before; null for those above all bounds.
+    upper_seconds: Option<f64>,
+    /// How many.
+    count: u64,
+}
+
+/// The buckets of a histogram; none while it is empty.
+pub(super) fn buckets(values: &Histogram) -> Vec<BucketView> {
+    let buckets = values.buckets().filter(|_| values.count() > 0);
+    let bucket = |(upper, count): (f64, u64)| BucketView {
+        upper_seconds: upper.is_finite().then_some(upper),
+        count,
+    };
+    buckets.map(bucket).collect()
+}
+
 /// What became of messages on their way.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Delivered)]
@@ -243,6 +263,18 @@ mod tests {
             (0.0015, 40.0)
         );
         assert!(Distribution::of(&Histogram::default()).is_none());
+    }
+
+    #[test]
+    fn buckets_add_up_and_the_last_has_no_bound() {
+        let mut values = Histogram::default();
+        assert!(buckets(&values).is_empty());
+        values.observe(0.0015);
+        values.observe(40.0);
+        let shown = buckets(&values);
+        assert_eq!(shown.iter().map(|bucket| bucket.count).sum::<u64>(), 2);
+        let last = shown.last().unwrap();
+        assert_eq!((last.upper_seconds, last.count), (None, 1));
     }
 
     #[test]

@@ -15,12 +15,13 @@ use super::Context;
 use super::endpoint::{EndpointView, text, texts};
 use super::finding::FindingView;
 use super::index::{Index, Watching};
-use super::measured::{BreakdownView, DeliveredView, MeasurementView};
+use super::measured::{BreakdownView, BucketView, DeliveredView, MeasurementView, buckets};
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Domain, Scope, only};
 use super::silence::{Circumstances, ReasonView};
+use super::watch::ExpectationsView;
 use crate::model::snapshot::{AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts};
 use crate::surface::board::State as BoardState;
 use crate::watches::InForce;
@@ -85,6 +86,10 @@ struct TopicView<'a> {
 struct TopicDetails<'a> {
     #[serde(flatten)]
     topic: TopicView<'a>,
+    /// Times between consecutive messages of one writer, in buckets.
+    interarrival_buckets: Vec<BucketView>,
+    /// Times from the writer's timestamp to the capture, in buckets.
+    latency_buckets: Vec<BucketView>,
     /// Every receiver and destination of its writers.
     deliveries: Vec<DeliveryView<'a>>,
     /// Every reliable reader that acknowledges.
@@ -117,6 +122,9 @@ struct WatchingView<'a> {
     state: &'static str,
     /// Expectations that are broken.
     violations: &'a [&'static str],
+    /// What it expects of the topic.
+    #[serde(flatten)]
+    expectations: ExpectationsView,
 }
 
 /// One writer's messages to one receiver, or to a destination where they leave.
@@ -325,8 +333,11 @@ impl<'a> Desk<'a> {
 
     fn details(&self, facts: &'a TopicFacts) -> TopicDetails<'a> {
         let acknowledgements = facts.acknowledgements.iter();
+        let measured = facts.measurement.as_deref();
         TopicDetails {
             topic: self.topic(facts),
+            interarrival_buckets: measured.map_or_else(Vec::new, |it| buckets(&it.interarrival)),
+            latency_buckets: measured.map_or_else(Vec::new, |it| buckets(&it.source_latency)),
             deliveries: facts.deliveries.iter().map(Into::into).collect(),
             acknowledgements: acknowledgements.map(Into::into).collect(),
         }
@@ -340,6 +351,8 @@ impl<'a> Desk<'a> {
             origin: entry.map(|entry| entry.origin.label()),
             state: topic.state.label(),
             violations: &topic.violations,
+            expectations: entry
+                .map_or_else(Default::default, |entry| (&entry.watch.expectations).into()),
         }
     }
 }

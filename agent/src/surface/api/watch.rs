@@ -60,7 +60,7 @@ struct WatchView {
 
 /// What should hold for each topic; what is left out is not expected.
 #[derive(Clone, Copy, Debug, Default, Serialize, ToSchema)]
-struct ExpectationsView {
+pub(super) struct ExpectationsView {
     /// At least this many messages a second.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
@@ -505,14 +505,20 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
         state: stage,
         per_subscriber: watch.per_subscriber,
         trace: watch.trace,
-        expectations: ExpectationsView {
-            min_rate_hz: watch.expectations.min_rate_hz,
-            max_rate_hz: watch.expectations.max_rate_hz,
-            max_loss_ratio: watch.expectations.max_loss_ratio,
-            max_latency_ms: watch.expectations.max_latency_ms,
-            max_silence_s: watch.expectations.max_silence_s,
-        },
+        expectations: (&watch.expectations).into(),
         topics,
+    }
+}
+
+impl From<&Expectations> for ExpectationsView {
+    fn from(expectations: &Expectations) -> Self {
+        Self {
+            min_rate_hz: expectations.min_rate_hz,
+            max_rate_hz: expectations.max_rate_hz,
+            max_loss_ratio: expectations.max_loss_ratio,
+            max_latency_ms: expectations.max_latency_ms,
+            max_silence_s: expectations.max_silence_s,
+        }
     }
 }
 
