@@ -19,4 +19,5 @@ pub mod run;
 pub mod state;
 pub mod subscriptions;
 pub mod surface;
+pub mod top;
 pub mod watches;

@@ -1,0 +1,527 @@
+//! What `rp top` shows and how keys change it: keys and facts come in, the model and a few wishes
+//! go out. It draws nothing, asks nobody and reads no clock.
+
+use std::collections::{BTreeMap, HashMap};
+use std::time::{Duration, Instant};
+
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+
+use super::facts::{Event, Health, Lagged, Topic, Topics};
+use super::news::News;
+use super::row::{Column, Key, Past, Row, Standing, shown_name};
+use super::text::safe;
+
+/// What is dropped is called recent for this long.
+const RECENT: Duration = Duration::from_secs(30);
+/// How long an answer to a key stays on the screen.
+const SAID: Duration = Duration::from_secs(8);
+
+/// What comes from the agent.
+#[derive(Debug)]
+pub enum Fact {
+    /// All topics.
+    Topics(Box<Topics>),
+    /// How the agent is.
+    Health(Box<Health>),
+    /// The selected topic with every detail; `None` when there is no such topic any more.
+    Details(Key, Option<Box<Topic>>),
+    /// Something happened.
+    Event(Box<Event>),
+    /// Events are missing.
+    Lagged(Lagged),
+    /// The agent does not answer, and why.
+    Gone(String),
+    /// What became of a wish.
+    Said(String),
+    /// Topics that are measured because this program asks for it.
+    Measured(BTreeMap<Key, Hold>),
+}
+
+/// How this program has a topic measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Hold {
+    /// Until it ends.
+    Here,
+    /// Also after that.
+    Kept,
+}
+
+/// What the program should do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Wish {
+    /// End.
+    Quit,
+    /// Details of this topic from now on.
+    Select(Option<Key>),
+    /// Also hidden topics.
+    Hidden(bool),
+    /// Have it measured, or no longer.
+    Toggle(Key, String),
+    /// Have it measured also after the end.
+    Keep(Key, String),
+}
+
+/// A part of the screen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Pane {
+    /// The table.
+    #[default]
+    Topics,
+    /// The selected topic.
+    Details,
+    /// What happens.
+    Events,
+}
+
+/// Which topics are shown.
+#[derive(Clone, Debug, Default)]
+pub struct Filter {
+    /// Part of the name, the type or the state.
+    pub text: String,
+    /// Only those with problems.
+    pub problems: bool,
+    /// Only those that are measured.
+    pub measured: bool,
+}
+
+impl Filter {
+    /// Whether it leaves anything out.
+    #[must_use]
+    pub fn is_set(&self) -> bool {
+        !self.text.is_empty() || self.problems || self.measured
+    }
+
+    fn admits(&self, row: &Row) -> bool {
+        let text = self.text.to_lowercase();
+        let has = |field: &str| field.to_lowercase().contains(&text);
+        (text.is_empty() || has(&row.name) || has(&row.message_type) || has(&row.state()))
+            && (!self.problems || !row.problems.is_empty())
+            && (!self.measured || row.is_measured)
+    }
+}
+
+/// All that is shown.
+#[derive(Debug, Default)]
+pub struct App {
+    /// Only this domain is asked for.
+    pub domain_id: Option<u32>,
+    /// Where the agent is, where it does not say its host.
+    pub place: String,
+    /// By what the table is sorted.
+    pub sort: Column,
+    /// The other way round.
+    pub reverse: bool,
+    /// Which topics are shown.
+    pub filter: Filter,
+    /// The filter's text as it was before it is edited; `None` while it is not.
+    pub editing: Option<String>,
+    /// Which pane the arrows move.
+    pub focus: Pane,
+    /// The details are open.
+    pub details_open: bool,
+    /// The events are open.
+    pub events_open: bool,
+    /// The pane in focus has the whole screen.
+    pub zoomed: bool,
+    /// The keys are explained.
+    pub help: bool,
+    /// Hidden topics are asked for.
+    pub hidden: bool,
+    /// Every topic, sorted.
+    rows: Vec<Row>,
+    /// Places in `rows` of those that are shown.
+    shown: Vec<usize>,
+    /// Facts of the selected topic.
+    pub details: Option<Box<Topic>>,
+    /// The topic that is selected.
+    pub selected: Option<Key>,
+    /// The latest events.
+    pub news: News,
+    /// First line of the details that is shown.
+    pub details_scroll: usize,
+    /// How many of the latest events are below the pane.
+    pub events_back: usize,
+    /// First topic that is shown.
+    pub offset: usize,
+    /// How many lines each pane has, as it was drawn last.
+    pub heights: Heights,
+    /// How the agent is, and when it said so.
+    pub health: Option<(Health, Instant)>,
+    /// When it does not answer: since when, and why.
+    pub gone: Option<(Instant, String)>,
+    /// When topics were told last.
+    pub updated: Option<Instant>,
+    /// When more was dropped than before.
+    dropped_at: Option<Instant>,
+    past: HashMap<Key, Past>,
+    /// Topics that are measured for this program.
+    pub holds: BTreeMap<Key, Hold>,
+    said: Option<(Instant, String)>,
+}
+
+/// Lines of each pane.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Heights {
+    /// Of the table, without its heading.
+    pub topics: usize,
+    /// Of the details.
+    pub details: usize,
+    /// How many the details would need.
+    pub details_needed: usize,
+    /// Of the events.
+    pub events: usize,
+}
+
+impl App {
+    /// Topics in the table, in their order.
+    pub fn shown(&self) -> impl ExactSizeIterator<Item = &Row> {
+        self.shown
+            .iter()
+            .filter_map(|at| self.rows.get(*at))
+            .collect::<Vec<_>>()
+            .into_iter()
+    }
+
+    /// Every topic that is known.
+    #[must_use]
+    pub fn rows(&self) -> &[Row] {
+        &self.rows
+    }
+
+    /// The place of the selected topic in the table.
+    #[must_use]
+    pub fn place_of_selected(&self) -> Option<usize> {
+        let selected = self.selected.as_ref()?;
+        let mut rows = self.shown();
+        rows.position(|row| row.key == *selected)
+    }
+
+    /// The answer to the last key, while it is news.
+    #[must_use]
+    pub fn said(&self, now: Instant) -> Option<&str> {
+        let (at, text) = self.said.as_ref()?;
+        (now.saturating_duration_since(*at) < SAID).then_some(text.as_str())
+    }
+
+    /// Whether anything was dropped lately.
+    #[must_use]
+    pub fn is_dropping(&self, now: Instant) -> bool {
+        let dropped_at = self.dropped_at;
+        dropped_at.is_some_and(|at| now.saturating_duration_since(at) < RECENT)
+    }
+
+    /// Age of what is shown; `None` while nothing is.
+    #[must_use]
+    pub fn age(&self, now: Instant) -> Option<Duration> {
+        let told = now.saturating_duration_since(self.updated?);
+        let health = self.health.as_ref();
+        let before = health.and_then(|(health, _)| health.age_seconds);
+        let before = before.filter(|age| (0.0..1e9).contains(age));
+        Some(told + Duration::from_secs_f64(before.unwrap_or_default()))
+    }
+
+    /// Takes in what the agent says.
+    pub fn take(&mut self, fact: Fact, now: Instant) -> Vec<Wish> {
+        match fact {
+            Fact::Topics(topics) => {
+                (self.updated, self.gone) = (Some(now), None);
+                return self.take_topics(&topics, now);
+            }
+            Fact::Health(health) => {
+                let before = self
+                    .health
+                    .as_ref()
+                    .map(|(health, _)| health.dropped.total());
+                if before.is_some_and(|before| health.dropped.total() > before) {
+                    self.dropped_at = Some(now);
+                }
+                self.health = Some((*health, now));
+            }
+            Fact::Details(key, topic) if self.selected.as_ref() == Some(&key) => {
+                self.details = topic;
+            }
+            Fact::Details(..) => {}
+            Fact::Event(event) => {
+                let before = self.news.shown().count();
+                self.news.add(&event, self.domain_id);
+                self.stay(before);
+            }
+            Fact::Lagged(lagged) => {
+                let before = self.news.shown().count();
+                self.news.lag(&lagged);
+                self.stay(before);
+            }
+            Fact::Gone(why) => {
+                let since = self.gone.as_ref().map_or(now, |(since, _)| *since);
+                self.gone = Some((since, safe(&why)));
+            }
+            Fact::Said(text) => self.said = Some((now, safe(&text))),
+            Fact::Measured(holds) => self.holds = holds,
+        }
+        Vec::new()
+    }
+
+    /// Who scrolled back keeps what is on the screen.
+    fn stay(&mut self, before: usize) {
+        if self.events_back > 0 {
+            let more = self.news.shown().count().saturating_sub(before);
+            self.events_back += more;
+        }
+    }
+
+    fn take_topics(&mut self, topics: &Topics, now: Instant) -> Vec<Wish> {
+        let mut past = std::mem::take(&mut self.past);
+        let rows = topics.topics.iter().map(|topic| {
+            let key = Key {
+                domain_id: topic.domain_id,
+                dds_name: topic.dds_name.clone(),
+            };
+            let mut own = past.remove(&key).unwrap_or_default();
+            let row = Row::new(topic, &mut own, now);
+            self.past.insert(key, own);
+            row
+        });
+        self.rows = rows.collect();
+        self.arrange()
+    }
+
+    /// Sorts and filters; the selected topic stays selected, else the one in its place is.
+    pub fn arrange(&mut self) -> Vec<Wish> {
+        let place = self.place_of_selected().unwrap_or(0);
+        let (sort, reverse) = (self.sort, self.reverse);
+        self.rows
+            .sort_by(|one, other| sort.order(reverse, one, other));
+        let rows = self.rows.iter().enumerate();
+        let shown = rows.filter(|(_, row)| self.filter.admits(row));
+        self.shown = shown.map(|(at, _)| at).collect();
+        if self.place_of_selected().is_some() {
+            self.scroll();
+            return Vec::new();
+        }
+        self.select(place)
+    }
+
+    fn select(&mut self, place: usize) -> Vec<Wish> {
+        let last = self.shown.len().saturating_sub(1);
+        let row = self.shown().nth(place.min(last));
+        let key = row.map(|row| row.key.clone());
+        if key == self.selected {
+            self.scroll();
+            return Vec::new();
+        }
+        self.selected.clone_from(&key);
+        self.details = None;
+        self.details_scroll = 0;
+        self.scroll();
+        vec![Wish::Select(key)]
+    }
+
+    /// Keeps the selected topic on the screen, which has had [`Heights`] at last.
+    pub fn scroll(&mut self) {
+        let height = self.heights.topics.max(1);
+        let place = self.place_of_selected().unwrap_or(0);
+        let last = self.shown.len().saturating_sub(height);
+        let lowest = place.saturating_sub(height - 1);
+        self.offset = self.offset.clamp(lowest, place.max(lowest)).min(last);
+        let needed = self.heights.details_needed;
+        let last = needed.saturating_sub(self.heights.details.max(1));
+        self.details_scroll = self.details_scroll.min(last);
+        let events = self.news.shown().count();
+        let last = events.saturating_sub(self.heights.events.max(1));
+        self.events_back = self.events_back.min(last);
+    }
+
+    /// What a key does.
+    pub fn key(&mut self, key: KeyEvent) -> Vec<Wish> {
+        if key.kind == KeyEventKind::Release {
+            return Vec::new();
+        }
+        let control = key.modifiers.contains(KeyModifiers::CONTROL);
+        if control && matches!(key.code, KeyCode::Char('c' | 'C')) {
+            return vec![Wish::Quit];
+        }
+        if self.help {
+            self.help = false;
+            return match key.code {
+                KeyCode::Char('q') => vec![Wish::Quit],
+                _ => Vec::new(),
+            };
+        }
+        if self.editing.is_some() {
+            return self.edit(key.code, control);
+        }
+        match key.code {
+            KeyCode::Char('b') if control => self.go_by(-self.page()),
+            KeyCode::Char('f') if control => self.go_by(self.page()),
+            KeyCode::Char('u') if control => self.go_by(-self.page() / 2),
+            KeyCode::Char('d') if control => self.go_by(self.page() / 2),
+            KeyCode::Char(_) if control => Vec::new(),
+            KeyCode::Char('q') => vec![Wish::Quit],
+            KeyCode::Char('?') | KeyCode::F(1) => {
+                self.help = true;
+                Vec::new()
+            }
+            KeyCode::Up | KeyCode::Char('k') => self.go_by(-1),
+            KeyCode::Down | KeyCode::Char('j') => self.go_by(1),
+            KeyCode::PageUp => self.go_by(-self.page()),
+            KeyCode::PageDown | KeyCode::Char(' ') => self.go_by(self.page()),
+            KeyCode::Home | KeyCode::Char('g') => self.go_by(isize::MIN),
+            KeyCode::End | KeyCode::Char('G') => self.go_by(isize::MAX),
+            KeyCode::Char('w' | 'W') => self.measure(key.code),
+            code => self.switch(code),
+        }
+    }
+
+    /// Keys that change what is shown.
+    fn switch(&mut self, code: KeyCode) -> Vec<Wish> {
+        match code {
+            KeyCode::Enter | KeyCode::Char('d') => {
+                self.details_open = !self.details_open;
+                self.details_scroll = 0;
+                self.settle(Pane::Details, self.details_open);
+            }
+            KeyCode::Char('e') => {
+                self.events_open = !self.events_open;
+                self.events_back = 0;
+                self.settle(Pane::Events, self.events_open);
+            }
+            KeyCode::Char('v') => {
+                self.news.only_warnings = !self.news.only_warnings;
+                self.events_back = 0;
+            }
+            KeyCode::Tab => self.focus_next(),
+            KeyCode::Char('z') => self.zoomed = !self.zoomed,
+            KeyCode::Esc => self.back(),
+            KeyCode::Char('/') => {
+                self.editing = Some(self.filter.text.clone());
+                return Vec::new();
+            }
+            KeyCode::Char('p') => self.filter.problems = !self.filter.problems,
+            KeyCode::Char('m') => self.filter.measured = !self.filter.measured,
+            KeyCode::Char('h') => {
+                self.hidden = !self.hidden;
+                return vec![Wish::Hidden(self.hidden)];
+            }
+            KeyCode::Char('s' | '>') => self.sort_by(1),
+            KeyCode::Char('<') => self.sort_by(Column::ALL.len() - 1),
+            KeyCode::Char('r') => self.reverse = !self.reverse,
+            KeyCode::Char(digit @ '1'..='8') => {
+                let place = digit as usize - '1' as usize;
+                if let Some(column) = Column::ALL.get(place) {
+                    (self.sort, self.reverse) = (*column, false);
+                }
+            }
+            _ => return Vec::new(),
+        }
+        self.arrange()
+    }
+
+    fn edit(&mut self, code: KeyCode, control: bool) -> Vec<Wish> {
+        match code {
+            KeyCode::Enter => self.editing = None,
+            KeyCode::Esc => self.filter.text = self.editing.take().unwrap_or_default(),
+            KeyCode::Backspace => drop(self.filter.text.pop()),
+            KeyCode::Char('u') if control => self.filter.text.clear(),
+            KeyCode::Char(' '..='~') if control => return Vec::new(),
+            KeyCode::Char(character @ ' '..='~') => self.filter.text.push(character),
+            KeyCode::Up => return self.go_by(-1),
+            KeyCode::Down => return self.go_by(1),
+            _ => return Vec::new(),
+        }
+        self.arrange()
+    }
+
+    fn measure(&mut self, code: KeyCode) -> Vec<Wish> {
+        let selected = self.selected.as_ref();
+        let row = self.rows.iter().find(|row| Some(&row.key) == selected);
+        let Some(row) = row.filter(|row| row.standing != Standing::Gone) else {
+            return Vec::new();
+        };
+        let (key, name) = (row.key.clone(), row.name.clone());
+        vec![match code {
+            KeyCode::Char('W') => Wish::Keep(key, name),
+            _ => Wish::Toggle(key, name),
+        }]
+    }
+
+    fn sort_by(&mut self, further: usize) {
+        let here = Column::ALL.iter().position(|column| *column == self.sort);
+        let next = (here.unwrap_or(0) + further) % Column::ALL.len();
+        self.sort = Column::ALL.get(next).copied().unwrap_or_default();
+        self.reverse = false;
+    }
+
+    /// A pane that opens is in focus, one that closes is not.
+    fn settle(&mut self, pane: Pane, is_open: bool) {
+        match is_open {
+            true if self.zoomed => self.focus = pane,
+            false if self.focus == pane => (self.focus, self.zoomed) = (Pane::Topics, false),
+            _ => {}
+        }
+    }
+
+    fn focus_next(&mut self) {
+        let open = [
+            (Pane::Topics, true),
+            (Pane::Details, self.details_open),
+            (Pane::Events, self.events_open),
+        ];
+        let open = open.into_iter().filter(|(_, is_open)| *is_open);
+        let open: Vec<_> = open.map(|(pane, _)| pane).collect();
+        let here = open.iter().position(|pane| *pane == self.focus);
+        let next = here.map_or(0, |here| (here + 1) % open.len());
+        self.focus = open.get(next).copied().unwrap_or_default();
+    }
+
+    /// One step out: of the zoom, the focus, the details, the filter.
+    fn back(&mut self) {
+        if self.zoomed {
+            self.zoomed = false;
+        } else if self.focus != Pane::Topics {
+            self.focus = Pane::Topics;
+        } else if self.details_open {
+            self.details_open = false;
+        } else if self.filter.is_set() {
+            self.filter = Filter::default();
+        }
+    }
+
+    fn page(&self) -> isize {
+        let height = match self.focus {
+            Pane::Topics => self.heights.topics,
+            Pane::Details => self.heights.details,
+            Pane::Events => self.heights.events,
+        };
+        isize::try_from(height.saturating_sub(1).max(1)).unwrap_or(1)
+    }
+
+    fn go_by(&mut self, steps: isize) -> Vec<Wish> {
+        match self.focus {
+            Pane::Topics => {
+                let place = self.place_of_selected().unwrap_or(0);
+                return self.select(place.saturating_add_signed(steps));
+            }
+            Pane::Details => {
+                self.details_scroll = self.details_scroll.saturating_add_signed(steps);
+            }
+            Pane::Events => {
+                let steps = steps.checked_neg().unwrap_or(isize::MAX);
+                self.events_back = self.events_back.saturating_add_signed(steps);
+            }
+        }
+        self.scroll();
+        Vec::new()
+    }
+
+    /// What the details are headed by.
+    #[must_use]
+    pub fn selected_name(&self) -> Option<String> {
+        let details = self.details.as_ref().map(|topic| shown_name(topic));
+        let selected = self.selected.as_ref();
+        let row = || self.rows.iter().find(|row| Some(&row.key) == selected);
+        details.or_else(|| row().map(|row| row.name.clone()))
+    }
+}
+
+#[cfg(test)]
+mod tests;

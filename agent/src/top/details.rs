@@ -1,0 +1,501 @@
+//! The details of one topic as lines: what is expected, what is wrong and why, how its messages come,
+//! and what each writer and each subscriber has to do with it.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Map, Value};
+
+use super::facts::{Bucket, Delivered, Distribution, Endpoint, Measurement, Topic, Watching};
+use super::look::{Kind, Look};
+use super::news::shown;
+use super::row::{is_measured, shown_name};
+use super::text::{beginning, bound, bytes, counted, end, rate, ratio, safe, seconds};
+
+/// Receivers and destinations that no reader is known for.
+const MAX_OTHERS: usize = 16;
+/// Columns of a node's name.
+const NODE: usize = 24;
+
+/// A line and what it is.
+pub type Styled = (String, Kind);
+
+/// All lines; longer ones are cut where they are drawn.
+#[must_use]
+pub fn lines(topic: &Topic, width: usize, look: Look) -> Vec<Styled> {
+    let mut lines = Vec::new();
+    let types: Vec<_> = topic.message_types.iter().map(|it| safe(it)).collect();
+    let head = format!(
+        "{}  {}  domain {}",
+        shown_name(topic),
+        types.join(", "),
+        topic.domain_id
+    );
+    lines.push((head, Kind::Plain));
+    for watch in &topic.watches {
+        lines.push(expectation(watch));
+    }
+    measured(topic, &mut lines);
+    for finding in &topic.diagnoses {
+        lines.push((format!("! {}", diagnosis(finding, topic)), Kind::Problem));
+    }
+    for reason in &topic.reasons {
+        let kind = match reason.code.as_str() {
+            "not_watched" | "quiet" | "no_subscriber" | "no_publisher" => Kind::Plain,
+            _ => Kind::Problem,
+        };
+        lines.push((format!("why: {}", safe(&reason.detail)), kind));
+    }
+    if topic.passages.iter().any(|it| it.passage != "network") {
+        let ways = topic.passages.iter();
+        let ways = ways.map(|it| format!("{} {}", it.pairs, safe(&it.passage)));
+        let ways: Vec<_> = ways.collect();
+        let line = format!("pairs of publisher and subscriber by: {}", ways.join(", "));
+        lines.push((line, Kind::Plain));
+    }
+    histograms(topic, width, look, &mut lines);
+    publishers(topic, look, &mut lines);
+    subscribers(topic, look, &mut lines);
+    others(topic, look, &mut lines);
+    lines
+}
+
+fn expectation(watch: &Watching) -> Styled {
+    let mut expected = Vec::new();
+    match (watch.min_rate_hz, watch.max_rate_hz) {
+        (Some(least), Some(most)) => {
+            expected.push(format!("{} to {} Hz", bound(least), bound(most)));
+        }
+        (Some(least), None) => expected.push(format!("at least {} Hz", bound(least))),
+        (None, Some(most)) => expected.push(format!("at most {} Hz", bound(most))),
+        (None, None) => {}
+    }
+    let most = [
+        ("loss", watch.max_loss_ratio.map(ratio)),
+        ("latency", watch.max_latency_ms.map(|it| seconds(it / 1e3))),
+        ("silence", watch.max_silence_s.map(seconds)),
+    ];
+    for (what, most) in most {
+        expected.extend(most.map(|most| format!("{what} at most {most}")));
+    }
+    if expected.is_empty() {
+        expected.push("nothing expected".to_owned());
+    }
+    let origin = match watch.origin.as_deref() {
+        Some("config") => " (configuration)",
+        Some("command_line") => " (command line)",
+        Some("api") => " (added)",
+        _ => "",
+    };
+    let broken: Vec<_> = watch.violations.iter().map(|it| safe(it)).collect();
+    let state = match (watch.state.as_str(), broken.is_empty()) {
+        (state, true) => safe(state),
+        (state, false) => format!("{}: {}", safe(state), broken.join(", ")),
+    };
+    let is_broken = matches!(watch.state.as_str(), "violated" | "silent");
+    let line = format!(
+        "{} watched as {}{origin}, {}: {state}",
+        if is_broken { '!' } else { '-' },
+        safe(&watch.watch),
+        expected.join(", "),
+    );
+    (
+        line,
+        if is_broken {
+            Kind::Problem
+        } else {
+            Kind::Plain
+        },
+    )
+}
+
+fn measured(topic: &Topic, lines: &mut Vec<Styled>) {
+    let Some(counted) = topic.measurement.as_ref() else {
+        lines.push((
+            "not measured: press w to count its messages".to_owned(),
+            Kind::Plain,
+        ));
+        return;
+    };
+    if !is_measured(topic) && !topic.publishers.is_empty() {
+        let line = "measured no longer: what follows is of before; press w to go on";
+        lines.push((line.to_owned(), Kind::Plain));
+    }
+    lines.push((counts(counted), Kind::Plain));
+    if let Some(received) = &topic.received {
+        let line = format!("receivers here: {}", delivered(received));
+        let kind = if received.lost_messages > 0 {
+            Kind::Problem
+        } else {
+            Kind::Plain
+        };
+        lines.push((line, kind));
+    }
+    if let Some(sampled) = counted.sampled {
+        let line = format!(
+            "shared memory is looked at now and then: {} of {} messages were seen",
+            sampled.seen_messages, sampled.existing_messages
+        );
+        lines.push((line, Kind::Plain));
+    }
+    if counted.negative_latency_messages > 0 {
+        let line = format!(
+            "clocks are apart: {} messages are stamped after they came",
+            counted.negative_latency_messages
+        );
+        lines.push((line, Kind::Problem));
+    }
+}
+
+fn counts(counted: &Measurement) -> String {
+    let all = counted.messages + counted.lost_messages;
+    let mut line = format!(
+        "since it is measured: {} of {all} messages, {}",
+        counted.messages,
+        bytes(as_real(counted.bytes))
+    );
+    let rest = [
+        ("lost", counted.lost_messages),
+        ("of these in part", counted.incomplete_messages),
+        ("sent again", counted.recovered_messages),
+        ("seen again", counted.duplicate_messages),
+    ];
+    for (what, count) in rest {
+        if count > 0 || what == "lost" {
+            line.push_str(&format!(", {count} {what}"));
+        }
+    }
+    line
+}
+
+fn delivered(it: &Delivered) -> String {
+    let line = format!("{} came, {} lost", it.messages, it.lost_messages);
+    match causes(it) {
+        causes if causes.is_empty() => line,
+        causes => format!("{line} ({causes})"),
+    }
+}
+
+/// Where messages were lost.
+fn causes(it: &Delivered) -> String {
+    let causes = [
+        ("before this host", it.lost_before_host_messages),
+        ("in reassembly", it.lost_in_reassembly_messages),
+        ("in full socket buffers", it.lost_in_socket_buffer_messages),
+        ("cause not known yet", it.pending_messages),
+    ];
+    let causes = causes.iter().filter(|(_, count)| *count > 0);
+    let causes: Vec<_> = causes
+        .map(|(cause, count)| format!("{count} {cause}"))
+        .collect();
+    causes.join(", ")
+}
+
+fn diagnosis(finding: &Map<String, Value>, topic: &Topic) -> String {
+    let value = |key: &str| finding.get(key).map(shown).unwrap_or_default();
+    let who = |key: &str| {
+        let guid = finding.get(key).and_then(Value::as_str).unwrap_or_default();
+        let mut all = topic.publishers.iter().chain(&topic.subscriptions);
+        let node = all
+            .find(|it| it.guid == guid)
+            .and_then(|it| it.node.as_deref());
+        safe(node.unwrap_or(guid))
+    };
+    match value("kind").as_str() {
+        "qos_incompatible" => format!(
+            "{} offers less than {} requests: {}",
+            who("writer"),
+            who("reader"),
+            value("policies")
+        ),
+        "type_conflict" => format!(
+            "endpoints of different types do not talk: {}",
+            value("types")
+        ),
+        "type_hash_conflict" => format!(
+            "definitions of {} differ: {}",
+            value("message_type"),
+            value("hashes")
+        ),
+        "unheard_publisher" => {
+            format!(
+                "{} publishes and nobody matches: {}",
+                who("writer"),
+                value("reason")
+            )
+        }
+        "unfed_subscriber" => {
+            format!(
+                "{} subscribes and nobody matches: {}",
+                who("reader"),
+                value("reason")
+            )
+        }
+        _ => {
+            let all = finding.iter();
+            let all = all.map(|(key, value)| format!("{}={}", safe(key), shown(value)));
+            all.collect::<Vec<_>>().join(" ")
+        }
+    }
+}
+
+fn histograms(topic: &Topic, width: usize, look: Look, lines: &mut Vec<Styled>) {
+    let measured = topic.measurement.as_ref();
+    let title = |what: &str, it: Option<Distribution>| {
+        it.map(|it| {
+            format!(
+                "{what}: median {}, p99 {}, {} to {}",
+                seconds(it.p50_seconds),
+                seconds(it.p99_seconds),
+                seconds(it.minimum_seconds),
+                seconds(it.maximum_seconds)
+            )
+        })
+    };
+    let between = title("between messages", measured.and_then(|it| it.interarrival));
+    let latency = title("latency", measured.and_then(|it| it.latency));
+    let both = [
+        (between, &topic.interarrival_buckets),
+        (latency, &topic.latency_buckets),
+    ];
+    let both = both.into_iter().filter_map(|(title, buckets)| {
+        let title = title?;
+        Some((title, buckets))
+    });
+    let both: Vec<_> = both.collect();
+    let half = width.saturating_sub(3) / 2;
+    if let ([(left, left_buckets), (right, right_buckets)], true) = (both.as_slice(), half >= 48) {
+        let cut = look.cut();
+        let join = |left: &str, right: &str| {
+            format!(
+                "{:<half$}   {}",
+                beginning(left, half, cut),
+                beginning(right, half, cut)
+            )
+        };
+        lines.push((join(left, right), Kind::Heading));
+        let (left, right) = (
+            bars(left_buckets, half, look),
+            bars(right_buckets, half, look),
+        );
+        for at in 0..left.len().max(right.len()) {
+            let line = |lines: &[String]| lines.get(at).cloned().unwrap_or_default();
+            lines.push((join(&line(&left), &line(&right)), Kind::Plain));
+        }
+        return;
+    }
+    for (title, buckets) in both {
+        lines.push((title, Kind::Heading));
+        let bars = bars(buckets, width, look);
+        lines.extend(bars.into_iter().map(|bar| (bar, Kind::Plain)));
+    }
+}
+
+/// A line for each bucket, from the first to the last that is not empty.
+#[must_use]
+pub fn bars(buckets: &[Bucket], width: usize, look: Look) -> Vec<String> {
+    let is_filled = |bucket: &Bucket| bucket.count > 0;
+    let first = buckets.iter().position(is_filled).unwrap_or(0);
+    let behind = buckets.iter().rposition(is_filled).map_or(0, |at| at + 1);
+    let most = buckets.iter().map(|it| it.count).max().unwrap_or(0).max(1);
+    let filled = buckets.get(first..behind).unwrap_or_default();
+    let digits = most.to_string().len();
+    let room = width.saturating_sub(digits + 12).min(60);
+    let line = |bucket: &Bucket| {
+        let bound = match bucket.upper_seconds {
+            Some(upper) => format!("<= {:>5}", seconds(upper)),
+            None => "   more ".to_owned(),
+        };
+        let part = as_real(bucket.count) / as_real(most);
+        format!(
+            "  {bound} {:>digits$} {}",
+            bucket.count,
+            look.bar(part, room)
+        )
+    };
+    filled.iter().map(line).collect()
+}
+
+fn publishers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
+    if topic.publishers.is_empty() {
+        return;
+    }
+    let title = counted(topic.publishers.len() as u64, "publisher");
+    let heading = format!(
+        "{title:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  QOS",
+        "HZ", "B/S", "LOST", "MED", "P99"
+    );
+    lines.push((heading, Kind::Heading));
+    for writer in &topic.publishers {
+        let measured = writer.measurement.as_ref();
+        let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
+        let latency = measured.and_then(|it| it.latency);
+        let line = format!(
+            "{:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  {}",
+            node(writer, look),
+            known(measured.map(|it| rate(it.rate_hertz))),
+            known(measured.map(|it| bytes(it.bandwidth_bytes_per_second))),
+            known(measured.map(|it| it.lost_messages.to_string())),
+            known(latency.map(|it| seconds(it.p50_seconds))),
+            known(latency.map(|it| seconds(it.p99_seconds))),
+            qos(writer, topic),
+        );
+        let is_losing = measured.is_some_and(|it| it.lost_messages > 0);
+        lines.push((
+            line,
+            if is_losing {
+                Kind::Problem
+            } else {
+                Kind::Plain
+            },
+        ));
+    }
+}
+
+fn subscribers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
+    if topic.subscriptions.is_empty() {
+        return;
+    }
+    let title = counted(topic.subscriptions.len() as u64, "subscriber");
+    let heading = format!(
+        "{title:<NODE$} {:>7} {:>6} {:>6}  QOS",
+        "CAME", "LOST", "BEHIND"
+    );
+    lines.push((heading, Kind::Heading));
+    for reader in &topic.subscriptions {
+        let mut sum: Option<Delivered> = None;
+        let own = |readers: &[String]| readers.contains(&reader.guid);
+        for delivery in &topic.deliveries {
+            if delivery.direction == "received" && own(&delivery.readers) {
+                add(sum.get_or_insert_default(), &delivery.delivered);
+            }
+        }
+        let acknowledged = topic.acknowledgements.iter();
+        let mut acknowledged = acknowledged.filter(|it| it.reader == reader.guid);
+        let behind = acknowledged.next().map(|first| {
+            acknowledged.fold(first.missing_messages, |most, it| {
+                most.max(it.missing_messages)
+            })
+        });
+        let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
+        let line = format!(
+            "{:<NODE$} {:>7} {:>6} {:>6}  {}",
+            node(reader, look),
+            known(sum.map(|it| it.messages.to_string())),
+            known(sum.map(|it| it.lost_messages.to_string())),
+            known(behind.map(|it| it.to_string())),
+            qos(reader, topic),
+        );
+        let lost = sum.filter(|it| it.lost_messages > 0);
+        let kind = if lost.is_some() {
+            Kind::Problem
+        } else {
+            Kind::Plain
+        };
+        lines.push((line, kind));
+        lines.extend(lost.map(|lost| (format!("  lost: {}", causes(&lost)), kind)));
+    }
+}
+
+/// Where messages arrive without a reader that is known, and where they leave to.
+fn others(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
+    let mut others: BTreeMap<String, Delivered> = BTreeMap::new();
+    for delivery in &topic.deliveries {
+        let to = match (delivery.direction.as_str(), &delivery.process) {
+            ("received", _) if !delivery.readers.is_empty() => continue,
+            ("received", Some(process)) => {
+                let id = delivery
+                    .process_id
+                    .map_or_else(String::new, |id| format!(" {id}"));
+                format!("in {}{id}", safe(process))
+            }
+            ("received", None) => format!("at {}", safe(&delivery.destination)),
+            _ => format!("to {}", safe(&delivery.destination)),
+        };
+        add(others.entry(to).or_default(), &delivery.delivered);
+    }
+    if others.is_empty() {
+        return;
+    }
+    let heading = format!("{:<NODE$} {:>7} {:>6}", "other ways", "CAME", "LOST");
+    lines.push((heading, Kind::Heading));
+    for (to, it) in others.iter().take(MAX_OTHERS) {
+        let to = beginning(to, NODE, look.cut());
+        let line = format!("{to:<NODE$} {:>7} {:>6}", it.messages, it.lost_messages);
+        lines.push((line, Kind::Plain));
+    }
+    if let Some(more) = others
+        .len()
+        .checked_sub(MAX_OTHERS)
+        .filter(|more| *more > 0)
+    {
+        lines.push((format!("and {more} more"), Kind::Faint));
+    }
+}
+
+fn add(sum: &mut Delivered, one: &Delivered) {
+    sum.messages += one.messages;
+    sum.lost_messages += one.lost_messages;
+    sum.lost_before_host_messages += one.lost_before_host_messages;
+    sum.lost_in_reassembly_messages += one.lost_in_reassembly_messages;
+    sum.lost_in_socket_buffer_messages += one.lost_in_socket_buffer_messages;
+    sum.pending_messages += one.pending_messages;
+}
+
+fn node(endpoint: &Endpoint, look: Look) -> String {
+    let name = safe(endpoint.node.as_deref().unwrap_or(&endpoint.guid));
+    end(&name, NODE, look.cut())
+}
+
+fn qos(endpoint: &Endpoint, topic: &Topic) -> String {
+    let qos = &endpoint.qos;
+    let parts = [&qos.reliability, &qos.durability, &qos.history];
+    let parts = parts.into_iter().filter(|part| !part.is_empty());
+    let mut parts: Vec<_> = parts.map(|part| safe(part)).collect();
+    if let Some(deadline) = qos.deadline_seconds {
+        parts.push(format!("deadline {}", seconds(deadline)));
+    }
+    parts.extend(
+        endpoint
+            .vendor
+            .as_deref()
+            .map(|vendor| format!("({})", safe(vendor))),
+    );
+    if topic.message_types.len() > 1 {
+        parts.push(safe(&endpoint.message_type));
+    }
+    parts.join(" ")
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
+fn as_real(count: u64) -> f64 {
+    count as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_histogram_leaves_out_what_is_empty_on_both_ends() {
+        let bucket = |upper_seconds, count| Bucket {
+            upper_seconds,
+            count,
+        };
+        let buckets = [
+            bucket(Some(0.001), 0),
+            bucket(Some(0.005), 120),
+            bucket(Some(0.01), 0),
+            bucket(None, 3),
+        ];
+        assert_eq!(
+            bars(&buckets, 30, Look::default()),
+            [
+                "  <= 5.0ms 120 ###############",
+                "  <=  10ms   0 ",
+                "     more    3 #",
+            ]
+        );
+        assert!(bars(&buckets[..1], 30, Look::default()).is_empty());
+        assert!(bars(&[], 30, Look::default()).is_empty());
+    }
+}

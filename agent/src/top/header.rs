@@ -1,0 +1,196 @@
+//! The lines on top: which robot, how its agent is, and above all what the agent does not see. It
+//! never looks healthy while the agent is blind.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use super::app::App;
+use super::details::Styled;
+use super::look::{Kind, Look};
+use super::row::Standing;
+use super::text::{counted, safe};
+
+/// What is shown should not be older: the agent itself calls this stale.
+const FRESH: Duration = Duration::from_secs(5);
+
+/// At most `most` lines.
+#[must_use]
+pub fn lines(app: &App, width: usize, most: usize, look: Look, now: Instant) -> Vec<Styled> {
+    let mut lines = vec![
+        (robot(app, width, now), Kind::Heading),
+        (agent(app), Kind::Plain),
+    ];
+    let mut warnings = warnings(app, now);
+    let room = most.saturating_sub(lines.len()).max(1);
+    if warnings.len() > room {
+        let more = warnings.len() - room;
+        warnings.truncate(room);
+        if let Some((last, _)) = warnings.last_mut() {
+            last.push_str(&format!(" {} {more} more", look.cut()));
+        }
+    }
+    lines.extend(warnings);
+    lines
+}
+
+/// `rp top  robot1  domain 0  24 topics, 20 measured, 3 with problems      0.4 s old`.
+fn robot(app: &App, width: usize, now: Instant) -> String {
+    let host = app
+        .health
+        .as_ref()
+        .and_then(|(health, _)| health.host.clone());
+    let host = safe(&host.unwrap_or_else(|| app.place.clone()));
+    let domains: BTreeSet<_> = app.rows().iter().map(|row| row.key.domain_id).collect();
+    let domains = match (app.domain_id, domains.len()) {
+        (Some(domain_id), _) => format!("domain {domain_id}"),
+        (None, 0) => "no domain".to_owned(),
+        (None, count) => {
+            let ids: Vec<_> = domains.iter().map(ToString::to_string).collect();
+            format!(
+                "domain{} {}",
+                if count == 1 { "" } else { "s" },
+                ids.join(",")
+            )
+        }
+    };
+    let count = |is_counted: fn(&super::row::Row) -> bool| {
+        app.rows().iter().filter(|row| is_counted(row)).count()
+    };
+    let problems = count(|row| !row.problems.is_empty());
+    let left = format!(
+        "rp top  {host}  {domains}  {}, {} measured, {problems} with problems",
+        counted(app.rows().len() as u64, "topic"),
+        count(|row| row.is_measured),
+    );
+    let age = match app.age(now) {
+        None => "no data".to_owned(),
+        Some(age) => format!("{:.1} s old", age.as_secs_f64()),
+    };
+    let room = width.saturating_sub(left.chars().count());
+    if room > age.len() {
+        return format!("{left}{age:>room$}");
+    }
+    format!("{age}  {left}")
+}
+
+/// How the agent is, and how the table is made.
+fn agent(app: &App) -> String {
+    let state = match (&app.health, &app.gone) {
+        (_, Some(_)) => "AGENT GONE".to_owned(),
+        (None, None) => "asking the agent".to_owned(),
+        (Some((health, _)), None) if !health.ready => "AGENT NOT READY".to_owned(),
+        (Some((health, _)), None) => {
+            let source = match health.source.as_str() {
+                "host" => "sees this host's sockets",
+                "wire" => "sees this host's interfaces",
+                "replay" if health.finished => "has replayed its capture to the end",
+                "replay" => "replays a capture",
+                _ => "ready",
+            };
+            format!("agent {source}")
+        }
+    };
+    let mut line = format!("{state}; sorted by {}", app.sort.label());
+    if app.reverse {
+        line.push_str(", reversed");
+    }
+    if app.filter.is_set() {
+        let mut only = Vec::new();
+        if app.filter.problems {
+            only.push("problems".to_owned());
+        }
+        if app.filter.measured {
+            only.push("measured".to_owned());
+        }
+        if !app.filter.text.is_empty() {
+            only.push(format!("\"{}\"", safe(&app.filter.text)));
+        }
+        line.push_str(&format!(
+            "; only {}: {} shown",
+            only.join(", "),
+            app.shown().len()
+        ));
+    }
+    if app.hidden {
+        line.push_str("; hidden ones too");
+    }
+    line
+}
+
+fn warnings(app: &App, now: Instant) -> Vec<Styled> {
+    let mut warnings = Vec::new();
+    let mut warn = |text: String| warnings.push((format!("! {text}"), Kind::Problem));
+    if let Some((since, why)) = &app.gone {
+        let since = now.saturating_duration_since(*since).as_secs();
+        warn(format!("agent gone for {since} s, retrying: {why}"));
+    }
+    if let Some(age) = app.age(now).filter(|age| *age > FRESH)
+        && !app
+            .health
+            .as_ref()
+            .is_some_and(|(health, _)| health.finished && app.gone.is_none())
+    {
+        warn(format!("what is shown is {} s old", age.as_secs()));
+    }
+    let Some((health, _)) = &app.health else {
+        return warnings;
+    };
+    if !health.ready {
+        let why = health.reason.as_deref().unwrap_or("it does not say why");
+        warn(format!("the agent does not see the robot: {}", safe(why)));
+    }
+    if health.dropped.total() > 0 {
+        let dropped = health.dropped;
+        let what = [
+            (dropped.packets, "packets"),
+            (dropped.records, "records"),
+            (dropped.datagrams, "datagrams"),
+            (dropped.contended, "contended"),
+        ];
+        let what = what.iter().filter(|(count, _)| *count > 0);
+        let what: Vec<_> = what
+            .map(|(count, what)| format!("{count} {what}"))
+            .collect();
+        let when = if app.is_dropping(now) {
+            "dropping now"
+        } else {
+            "dropped"
+        };
+        warn(format!(
+            "{when}: {}; counts are lower bounds",
+            what.join(", ")
+        ));
+    }
+    let unseen = app
+        .rows()
+        .iter()
+        .filter(|row| row.standing == Standing::Unseen);
+    let unseen = unseen.count() as u64;
+    if unseen > 0 {
+        warn(format!(
+            "{} cannot be seen: Enter says why",
+            counted(unseen, "topic")
+        ));
+    }
+    if health.unknown_writers > 0 {
+        let writers = counted(health.unknown_writers, "writer");
+        warn(format!(
+            "{writers} without a name: `rp discover` asks for them"
+        ));
+    }
+    if health.rejected_topics > 0 {
+        let topics = counted(health.rejected_topics, "watched topic");
+        warn(format!("{topics} not measured: limits.topics is reached"));
+    }
+    if health.table_evictions > 0 {
+        let entries = counted(health.table_evictions, "table entry");
+        warn(format!(
+            "{} given up: a table is full",
+            entries.replace("entrys", "entries")
+        ));
+    }
+    if let Some(reason) = &health.source_reason {
+        warn(format!("sees less than it could: {}", safe(reason)));
+    }
+    warnings
+}

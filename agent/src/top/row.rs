@@ -1,0 +1,506 @@
+//! One line of the table: what is shown of a topic, what is wrong with it, and how lines are sorted.
+//! Made from the agent's facts and those of some seconds ago; it computes nothing the agent knows.
+
+use std::cmp::Ordering;
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use super::facts::{Delivered, Topic};
+use super::text::safe;
+
+/// Losses in the table are of this time, so that an old loss does not hide a new one.
+const WINDOW: Duration = Duration::from_secs(30);
+/// Least time between two notes of the counters.
+const STEP: Duration = Duration::from_millis(900);
+
+/// A topic of one domain.
+#[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Key {
+    /// Its domain.
+    pub domain_id: u32,
+    /// Its DDS name, as the agent writes it.
+    pub dds_name: String,
+}
+
+/// How a topic stands, the worst first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Standing {
+    /// An expectation is broken.
+    Violated,
+    /// Published, and nothing comes.
+    Silent,
+    /// Watched by its name, and nobody publishes.
+    NotPublished,
+    /// Messages cannot be seen, for a reason that is known.
+    Unseen,
+    /// Published to nobody.
+    NoSubscriber,
+    /// Measured without expectations, and nothing came lately.
+    Quiet,
+    /// Messages flow, and as expected.
+    Ok,
+    /// Nobody asked for it to be measured.
+    Unwatched,
+    /// Its last endpoint has gone.
+    Gone,
+}
+
+impl Standing {
+    /// In the table.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Violated => "violated",
+            Self::Silent => "silent",
+            Self::NotPublished => "no pub",
+            Self::Unseen => "unseen",
+            Self::NoSubscriber => "no sub",
+            Self::Quiet => "quiet",
+            Self::Ok => "ok",
+            Self::Unwatched => "unwatched",
+            Self::Gone => "gone",
+        }
+    }
+}
+
+/// One topic in the table. Names are safe to show.
+#[derive(Clone, Debug)]
+pub struct Row {
+    /// Which.
+    pub key: Key,
+    /// ROS name.
+    pub name: String,
+    /// ROS types.
+    pub message_type: String,
+    /// Messages are counted.
+    pub is_measured: bool,
+    /// Messages a second.
+    pub rate: Option<f64>,
+    /// Least and most that is expected.
+    pub wanted: (Option<f64>, Option<f64>),
+    /// Payload bytes a second.
+    pub bandwidth: Option<f64>,
+    /// Lost of those that were sent: by the writers or on the way to a receiver, whichever is worse.
+    pub loss: Option<f64>,
+    /// Half of the messages took longer.
+    pub median: Option<f64>,
+    /// One of a hundred messages took longer.
+    pub p99: Option<f64>,
+    /// How many writers.
+    pub publishers: usize,
+    /// How many readers.
+    pub subscriptions: usize,
+    /// How it stands.
+    pub standing: Standing,
+    /// What somebody should look at, in a word each.
+    pub problems: Vec<&'static str>,
+}
+
+/// The counters that losses are made of.
+#[derive(Clone, Copy, Debug, Default)]
+struct Counters {
+    sent: (u64, u64),
+    delivered: (u64, u64),
+}
+
+/// Counters of the last [`WINDOW`].
+#[derive(Clone, Debug, Default)]
+pub struct Past {
+    notes: VecDeque<(Instant, Counters)>,
+}
+
+impl Past {
+    /// Lost of those that were sent lately; where nothing was lately, ever. And whether any was lost
+    /// lately.
+    fn loss(&mut self, topic: &Topic, now: Instant) -> (Option<f64>, bool) {
+        let latest = Counters::of(topic);
+        let first = self.notes.front().map(|(_, counters)| *counters);
+        let lately = first.and_then(|first| latest.since(first));
+        let is_lost = lately.is_some_and(|(_, lost)| lost);
+        let is_due = self.notes.back().is_none_or(|(at, _)| now - *at >= STEP);
+        if is_due {
+            self.notes.push_back((now, latest));
+            while self.notes.front().is_some_and(|(at, _)| now - *at > WINDOW) {
+                self.notes.pop_front();
+            }
+        }
+        let ever = || latest.since(Counters::default());
+        let (ratio, _) = match lately.or_else(ever) {
+            Some((ratio, lost)) => (Some(ratio), lost),
+            None => (None, false),
+        };
+        (ratio, is_lost)
+    }
+}
+
+impl Counters {
+    fn of(topic: &Topic) -> Self {
+        let measured = topic.measurement.as_ref();
+        let received = topic.received.as_ref();
+        let delivered = |it: &Delivered| (it.messages, it.lost_messages);
+        Self {
+            sent: measured.map_or((0, 0), |it| (it.messages, it.lost_messages)),
+            delivered: received.map_or((0, 0), delivered),
+        }
+    }
+
+    /// The worse of both ratios, and whether anything was lost; `None` while nothing was sent, or
+    /// when the counters began anew.
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "a ratio of counts far below 2^52"
+    )]
+    fn since(self, first: Self) -> Option<(f64, bool)> {
+        let ratio = |now: (u64, u64), then: (u64, u64)| {
+            let came = now.0.checked_sub(then.0)?;
+            let lost = now.1.checked_sub(then.1)?;
+            (came + lost > 0).then(|| lost as f64 / (came + lost) as f64)
+        };
+        let sent = ratio(self.sent, first.sent);
+        let delivered = ratio(self.delivered, first.delivered);
+        let worse = sent.into_iter().chain(delivered).reduce(f64::max)?;
+        Some((worse, worse > 0.0))
+    }
+}
+
+impl Row {
+    /// What is shown of `topic`.
+    #[must_use]
+    pub fn new(topic: &Topic, past: &mut Past, now: Instant) -> Self {
+        let is_measured = is_measured(topic);
+        let measured = topic.measurement.as_ref().filter(|_| is_measured);
+        let (loss, is_losing) = match measured {
+            Some(_) => past.loss(topic, now),
+            None => (None, false),
+        };
+        let latency = measured.and_then(|it| it.latency.or(it.header_latency));
+        let standing = standing(topic, is_measured);
+        let types: Vec<_> = topic.message_types.iter().map(|it| safe(it)).collect();
+        Self {
+            key: Key {
+                domain_id: topic.domain_id,
+                dds_name: topic.dds_name.clone(),
+            },
+            name: shown_name(topic),
+            message_type: types.join(", "),
+            is_measured,
+            rate: measured.map(|it| it.rate_hertz),
+            wanted: wanted(topic),
+            bandwidth: measured.map(|it| it.bandwidth_bytes_per_second),
+            loss,
+            median: latency.map(|it| it.p50_seconds),
+            p99: latency.map(|it| it.p99_seconds),
+            publishers: topic.publishers.len(),
+            subscriptions: topic.subscriptions.len(),
+            standing,
+            problems: problems(topic, standing, is_losing),
+        }
+    }
+
+    /// The state in words: what is wrong, else how it stands.
+    #[must_use]
+    pub fn state(&self) -> String {
+        if self.problems.is_empty() {
+            return self.standing.label().to_owned();
+        }
+        let says_more = matches!(self.standing, Standing::Unwatched | Standing::NoSubscriber);
+        let standing = says_more.then(|| self.standing.label());
+        let words = self.problems.iter().copied().chain(standing);
+        format!("!{}", words.collect::<Vec<_>>().join(","))
+    }
+}
+
+/// The name people know it by: of a service's topics that is the DDS name.
+#[must_use]
+pub fn shown_name(topic: &Topic) -> String {
+    match topic.kind.as_str() {
+        "service_request" | "service_reply" => safe(&topic.dds_name),
+        _ => safe(&topic.name),
+    }
+}
+
+/// Whether messages are counted now; numbers stay when that ends.
+#[must_use]
+pub fn is_measured(topic: &Topic) -> bool {
+    let mut publishers = topic.publishers.iter();
+    topic.measurement.is_some()
+        && (!topic.watches.is_empty() || publishers.any(|it| it.measurement.is_some()))
+}
+
+/// The tightest of all that is expected of its rate.
+fn wanted(topic: &Topic) -> (Option<f64>, Option<f64>) {
+    let watches = || topic.watches.iter();
+    (
+        watches().filter_map(|it| it.min_rate_hz).reduce(f64::max),
+        watches().filter_map(|it| it.max_rate_hz).reduce(f64::min),
+    )
+}
+
+fn standing(topic: &Topic, is_measured: bool) -> Standing {
+    if topic.vanished {
+        return Standing::Gone;
+    }
+    let has = |state: &str| topic.watches.iter().any(|watch| watch.state == state);
+    let is_blind = topic.reasons.iter().any(|reason| {
+        matches!(
+            reason.code.as_str(),
+            "encrypted"
+                | "shared_memory"
+                | "data_sharing"
+                | "same_process"
+                | "iceoryx"
+                | "outside_view"
+                | "watch_rejected"
+        )
+    });
+    let flows = topic
+        .measurement
+        .as_ref()
+        .is_some_and(|it| it.rate_hertz > 0.0);
+    match () {
+        () if has("violated") => Standing::Violated,
+        () if is_blind && !flows => Standing::Unseen,
+        () if !is_measured => Standing::Unwatched,
+        () if has("silent") => Standing::Silent,
+        () if has("not_published") || topic.publishers.is_empty() => Standing::NotPublished,
+        () if topic.subscriptions.is_empty() && !flows => Standing::NoSubscriber,
+        () if !flows => Standing::Quiet,
+        () => Standing::Ok,
+    }
+}
+
+fn problems(topic: &Topic, standing: Standing, is_losing: bool) -> Vec<&'static str> {
+    let mut problems = Vec::new();
+    let mut say = |word| {
+        if !problems.contains(&word) {
+            problems.push(word);
+        }
+    };
+    for violation in topic.watches.iter().flat_map(|watch| &watch.violations) {
+        say(match violation.as_str() {
+            "min_rate_hz" => "slow",
+            "max_rate_hz" => "fast",
+            "max_loss_ratio" => "loss",
+            "max_latency_ms" => "late",
+            "max_silence_s" => "silent",
+            _ => "violated",
+        });
+    }
+    match standing {
+        Standing::Violated if topic.watches.iter().all(|it| it.violations.is_empty()) => {
+            say("violated");
+        }
+        Standing::Silent => say("silent"),
+        Standing::Unseen => say("unseen"),
+        // Subscribers without a publisher are usual; who named the topic expects one.
+        Standing::NotPublished if topic.watches.iter().any(|it| !it.watch.contains('*')) => {
+            say("no pub");
+        }
+        _ => {}
+    }
+    if is_losing {
+        say("loss");
+    }
+    for finding in &topic.diagnoses {
+        match finding.get("kind").and_then(Value::as_str) {
+            Some("qos_incompatible") => say("qos"),
+            Some("type_conflict") => say("type"),
+            Some("type_hash_conflict") => say("hash"),
+            // Usual: a tool that publishes for whoever may come.
+            Some("unheard_publisher" | "unfed_subscriber") | None => {}
+            Some(_) => say("graph"),
+        }
+    }
+    problems
+}
+
+/// By what the table is sorted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Column {
+    /// Name, then domain.
+    #[default]
+    Name,
+    /// Rate, the highest first.
+    Rate,
+    /// Bandwidth, the highest first.
+    Bandwidth,
+    /// Loss, the worst first.
+    Loss,
+    /// 99th percentile of latency, the worst first.
+    Latency,
+    /// Publishers, most first.
+    Publishers,
+    /// Subscribers, most first.
+    Subscribers,
+    /// Problems first.
+    State,
+}
+
+impl Column {
+    /// In the table's order.
+    pub const ALL: [Self; 8] = [
+        Self::Name,
+        Self::Rate,
+        Self::Bandwidth,
+        Self::Loss,
+        Self::Latency,
+        Self::Publishers,
+        Self::Subscribers,
+        Self::State,
+    ];
+
+    /// In words.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Name => "name",
+            Self::Rate => "rate",
+            Self::Bandwidth => "bandwidth",
+            Self::Loss => "loss",
+            Self::Latency => "latency",
+            Self::Publishers => "publishers",
+            Self::Subscribers => "subscribers",
+            Self::State => "state",
+        }
+    }
+
+    /// Which of two topics comes first; what is not known comes last, also in `reverse`.
+    #[must_use]
+    pub fn order(self, reverse: bool, one: &Row, other: &Row) -> Ordering {
+        let turn = |order: Ordering| if reverse { order.reverse() } else { order };
+        let names = || (&one.name, &one.key).cmp(&(&other.name, &other.key));
+        let known = |one: Option<f64>, other: Option<f64>| match (one, other) {
+            (Some(one), Some(other)) => turn(other.total_cmp(&one)),
+            (one, other) => other.is_some().cmp(&one.is_some()),
+        };
+        let order = match self {
+            Self::Name => turn(names()),
+            Self::Rate => known(one.rate, other.rate),
+            Self::Bandwidth => known(one.bandwidth, other.bandwidth),
+            Self::Loss => known(one.loss, other.loss),
+            Self::Latency => known(one.p99, other.p99),
+            Self::Publishers => turn(other.publishers.cmp(&one.publishers)),
+            Self::Subscribers => turn(other.subscriptions.cmp(&one.subscriptions)),
+            Self::State => turn(
+                (one.problems.is_empty(), one.standing)
+                    .cmp(&(other.problems.is_empty(), other.standing)),
+            ),
+        };
+        order.then_with(names)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn topic(json: serde_json::Value) -> Topic {
+        serde_json::from_value(json).unwrap()
+    }
+
+    fn row(json: serde_json::Value) -> Row {
+        Row::new(&topic(json), &mut Past::default(), Instant::now())
+    }
+
+    #[test]
+    fn a_topic_that_is_not_measured_has_no_numbers() {
+        let both = json!([{"measurement": null}]);
+        let unwatched = row(json!({"publishers": both, "subscriptions": both}));
+        assert_eq!(
+            (unwatched.rate, unwatched.loss, unwatched.state()),
+            (None, None, "unwatched".to_owned())
+        );
+        // What was counted before is kept by the agent and is no rate of 0.
+        let before = row(json!({
+            "publishers": both, "measurement": {"messages": 9, "rate_hertz": 0.0}
+        }));
+        assert_eq!((before.rate, before.is_measured), (None, false));
+    }
+
+    #[test]
+    fn the_state_names_what_is_wrong() {
+        let measured = json!({"messages": 9, "rate_hertz": 9.0});
+        let one = json!([{"measurement": measured}]);
+        let state = |watches: Value, diagnoses: Value| {
+            let row = row(json!({
+                "publishers": one, "subscriptions": one, "measurement": measured,
+                "watches": watches, "diagnoses": diagnoses,
+            }));
+            row.state()
+        };
+        assert_eq!(state(json!([]), json!([])), "ok");
+        let slow = json!([{"state": "violated", "violations": ["min_rate_hz", "max_latency_ms"]}]);
+        assert_eq!(state(slow, json!([])), "!slow,late");
+        let qos = json!([{"kind": "qos_incompatible"}, {"kind": "unheard_publisher"}]);
+        assert_eq!(state(json!([{"state": "ok"}]), qos), "!qos");
+        assert_eq!(state(json!([{"state": "silent"}]), json!([])), "!silent");
+    }
+
+    #[test]
+    fn what_cannot_be_seen_is_not_called_quiet() {
+        let quiet = json!({"messages": 0, "rate_hertz": 0.0});
+        let one = json!([{"measurement": quiet}]);
+        let state = |code: &str| {
+            let reasons = json!([{"code": code, "detail": ""}]);
+            let row = row(json!({
+                "publishers": one, "subscriptions": one, "measurement": quiet,
+                "reasons": reasons,
+            }));
+            row.state()
+        };
+        assert_eq!(state("quiet"), "quiet");
+        for code in ["data_sharing", "encrypted", "outside_view", "same_process"] {
+            assert_eq!(state(code), "!unseen", "{code}");
+        }
+    }
+
+    #[test]
+    fn a_loss_counts_while_it_is_new_and_whoever_suffers_it() {
+        let start = Instant::now();
+        let at = |seconds: u64| start + Duration::from_secs(seconds);
+        let facts = |messages: u64, lost: u64, undelivered: u64| {
+            topic(json!({
+                "publishers": [{"measurement": {}}],
+                "measurement": {"messages": messages, "lost_messages": lost, "rate_hertz": 1.0},
+                "received": {"messages": messages - undelivered, "lost_messages": undelivered},
+            }))
+        };
+        let mut past = Past::default();
+        let mut seen = |seconds: u64, facts: &Topic| {
+            let row = Row::new(facts, &mut past, at(seconds));
+            (row.loss, row.problems)
+        };
+        // What was lost before it was looked at is shown and is no news.
+        assert_eq!(seen(0, &facts(100, 100, 0)), (Some(0.5), vec![]));
+        assert_eq!(seen(1, &facts(200, 100, 0)), (Some(0.0), vec![]));
+        let (loss, problems) = seen(2, &facts(280, 120, 50));
+        assert_eq!(problems, ["loss"]);
+        assert!((loss.unwrap() - 50.0 / 180.0).abs() < 1e-9, "{loss:?}");
+        for second in 3..40 {
+            seen(second, &facts(280 + second, 120, 50));
+        }
+        assert_eq!(seen(40, &facts(400, 120, 50)), (Some(0.0), vec![]));
+        // The agent was started again.
+        assert_eq!(seen(41, &facts(10, 0, 0)), (Some(0.0), vec![]));
+    }
+
+    #[test]
+    fn what_is_not_known_is_sorted_last_either_way() {
+        let rows = [Some(1.0), None, Some(3.0)].map(|rate| {
+            let mut row = row(json!({"name": format!("/{rate:?}")}));
+            row.rate = rate;
+            row
+        });
+        let sorted = |reverse: bool| {
+            let mut rows: Vec<_> = rows.iter().collect();
+            rows.sort_by(|one, other| Column::Rate.order(reverse, one, other));
+            rows.iter().map(|row| row.rate).collect::<Vec<_>>()
+        };
+        assert_eq!(sorted(false), [Some(3.0), Some(1.0), None]);
+        assert_eq!(sorted(true), [Some(1.0), Some(3.0), None]);
+    }
+}

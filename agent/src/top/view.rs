@@ -1,0 +1,277 @@
+//! The screen: header, panes, footer, drawn from the model and nothing else.
+
+use std::time::Instant;
+
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::style::Modifier;
+use ratatui::text::{Line, Span};
+
+use super::app::{App, Heights, Hold, Pane};
+use super::details::{self, Styled};
+use super::header;
+use super::help;
+use super::look::{Kind, Look};
+use super::table::Table;
+use super::text::{beginning, safe};
+
+/// Smaller than this, nothing can be read.
+pub const LEAST: (u16, u16) = (40, 8);
+/// Columns in front of each topic: selected, and measured for this program.
+const MARKS: usize = 2;
+
+/// Draws the screen and tells the model how much of it there is.
+pub fn draw(app: &mut App, frame: &mut Frame<'_>, look: Look, now: Instant) {
+    let area = frame.area();
+    if area.width < LEAST.0 || area.height < LEAST.1 {
+        let (width, height) = LEAST;
+        let text = format!("rp top needs {width}x{height}");
+        put(frame, area, 0, &text, look, Kind::Plain);
+        return;
+    }
+    if app.help {
+        write(frame, area, &help::lines(), look, 0);
+        return;
+    }
+    let most = usize::from(area.height / 4).max(3);
+    let header = header::lines(app, usize::from(area.width), most, look, now);
+    write(frame, area, &header, look, 0);
+    let top = u16::try_from(header.len()).unwrap_or(u16::MAX);
+    let body = Rect {
+        y: area.y + top,
+        height: area.height.saturating_sub(top + 1),
+        ..area
+    };
+    let panes = Panes::of(app, body);
+    app.heights = panes.heights();
+    let details = match (panes.details, &app.details) {
+        (None, _) => Vec::new(),
+        (Some(area), Some(topic)) => details::lines(topic, usize::from(area.width), look),
+        (Some(_), None) => vec![("...".to_owned(), Kind::Faint)],
+    };
+    app.heights.details_needed = details.len();
+    app.scroll();
+    if let Some(area) = panes.topics {
+        topics(app, frame, area, look);
+    }
+    if let Some(area) = panes.details {
+        let name = app.selected_name();
+        let name = name.unwrap_or_else(|| "no topic selected".to_owned());
+        let shown = app.details_scroll + app.heights.details;
+        let title = match details.len() > app.heights.details {
+            true => format!("{name} ({}/{})", shown.min(details.len()), details.len()),
+            false => name,
+        };
+        rule(frame, area, &title, app.focus == Pane::Details, look);
+        write(frame, below(area), &details, look, app.details_scroll);
+    }
+    if let Some(area) = panes.events {
+        events(app, frame, area, look);
+    }
+    footer(app, frame, area, look, now);
+}
+
+/// Where the panes are; each has a line of its own on top.
+#[derive(Clone, Copy, Debug, Default)]
+struct Panes {
+    topics: Option<Rect>,
+    details: Option<Rect>,
+    events: Option<Rect>,
+}
+
+impl Panes {
+    fn of(app: &App, body: Rect) -> Self {
+        let mut panes = Self::default();
+        if app.zoomed {
+            match app.focus {
+                Pane::Topics => panes.topics = Some(body),
+                Pane::Details => panes.details = Some(body),
+                Pane::Events => panes.events = Some(body),
+            }
+            return panes;
+        }
+        let mut left = body;
+        let mut cut = |height: u16| {
+            left.height -= height;
+            Rect {
+                y: left.y + left.height,
+                height,
+                ..left
+            }
+        };
+        if app.events_open && body.height >= 8 {
+            panes.events = Some(cut((body.height / 4).clamp(4, 12)));
+        }
+        let rest = body.height - panes.events.map_or(0, |area| area.height);
+        if app.details_open && rest >= 6 {
+            panes.details = Some(cut(rest * 3 / 5));
+        }
+        panes.topics = Some(left);
+        panes
+    }
+
+    fn heights(&self) -> Heights {
+        let height = |area: Option<Rect>| area.map_or(0, |area| usize::from(below(area).height));
+        Heights {
+            topics: height(self.topics),
+            details: height(self.details),
+            details_needed: 0,
+            events: height(self.events),
+        }
+    }
+}
+
+fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
+    let width = usize::from(area.width) - MARKS;
+    let rows: Vec<_> = app.shown().collect();
+    let table = Table::plan(width, rows.iter().copied(), look.cut());
+    let (heading, sorted) = table.heading(app.sort);
+    let heading = format!("{:MARKS$}{heading}", "");
+    put(frame, area, 0, &heading, look, Kind::Heading);
+    if let Some((at, width)) = sorted {
+        let column = |at: usize| u16::try_from(at).unwrap_or(u16::MAX);
+        let area = Rect {
+            x: area.x + column(MARKS + at),
+            width: column(width),
+            height: 1,
+            ..area
+        };
+        let area = area.intersection(frame.area());
+        frame.buffer_mut().set_style(area, Modifier::UNDERLINED);
+    }
+    let body = below(area);
+    if rows.is_empty() {
+        put(frame, body, 0, nothing(app), look, Kind::Plain);
+    }
+    let visible = rows.iter().skip(app.offset).zip(0..body.height);
+    for (row, at) in visible {
+        let is_selected = app.selected.as_ref() == Some(&row.key);
+        let hold = match app.holds.get(&row.key) {
+            None => ' ',
+            Some(Hold::Here) => '+',
+            Some(Hold::Kept) => '=',
+        };
+        let mark = if is_selected { '>' } else { ' ' };
+        let line = format!("{mark}{hold}{}", table.line(row));
+        let kind = match (is_selected, row.problems.is_empty(), row.is_measured) {
+            (true, ..) => Kind::Selected,
+            (false, false, _) => Kind::Problem,
+            (false, true, false) => Kind::Faint,
+            (false, true, true) => Kind::Plain,
+        };
+        put(frame, body, at, &line, look, kind);
+    }
+}
+
+/// Why the table is empty.
+fn nothing(app: &App) -> &'static str {
+    match (app.updated, app.rows().is_empty()) {
+        (None, _) => "  waiting for the agent",
+        (Some(_), true) => "  no topics yet",
+        (Some(_), false) => "  the filter leaves nothing: Esc clears it",
+    }
+}
+
+fn events(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
+    let body = below(area);
+    let lines: Vec<_> = app.news.shown().collect();
+    let behind = lines.len().saturating_sub(app.events_back);
+    let first = behind.saturating_sub(usize::from(body.height));
+    let mut title = match app.news.only_warnings {
+        true => "events: warnings only".to_owned(),
+        false => "events".to_owned(),
+    };
+    if app.events_back > 0 {
+        title.push_str(&format!(" ({} newer below)", app.events_back));
+    }
+    rule(frame, area, &title, app.focus == Pane::Events, look);
+    if lines.is_empty() {
+        put(frame, body, 0, "nothing happened yet", look, Kind::Faint);
+    }
+    let shown = lines.get(first..behind).unwrap_or_default();
+    for (line, at) in shown.iter().zip(0..body.height) {
+        let kind = if line.is_warning {
+            Kind::Problem
+        } else {
+            Kind::Plain
+        };
+        put(frame, body, at, &line.text, look, kind);
+    }
+}
+
+fn footer(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look, now: Instant) {
+    let last = area.height.saturating_sub(1);
+    if app.editing.is_some() {
+        let text = format!("/{}", safe(&app.filter.text));
+        put(frame, area, last, &text, look, Kind::Plain);
+        let column = u16::try_from(text.len()).unwrap_or(u16::MAX);
+        let x = area.x + column.min(area.width.saturating_sub(1));
+        frame.set_cursor_position((x, area.y + last));
+        return;
+    }
+    if let Some(said) = app.said(now) {
+        put(frame, area, last, said, look, Kind::Heading);
+        return;
+    }
+    let keys = match app.focus {
+        Pane::Topics => {
+            "q quit  ? help  / filter  s sort  Enter details  e events  w measure  p problems"
+        }
+        _ => "q quit  ? help  Tab next pane  arrows scroll  z whole screen  Esc back",
+    };
+    put(frame, area, last, keys, look, Kind::Faint);
+}
+
+/// The line on top of a pane.
+fn rule(frame: &mut Frame<'_>, area: Rect, title: &str, is_focused: bool, look: Look) {
+    let line = look.rule(is_focused);
+    let width = usize::from(area.width);
+    let title = beginning(title, width.saturating_sub(6), look.cut());
+    let text = format!("{line}{line} {title} ");
+    let rest = width.saturating_sub(text.chars().count());
+    let text: String = text
+        .chars()
+        .chain(std::iter::repeat_n(line, rest))
+        .collect();
+    let kind = if is_focused {
+        Kind::Heading
+    } else {
+        Kind::Plain
+    };
+    put(frame, area, 0, &text, look, kind);
+}
+
+const fn below(area: Rect) -> Rect {
+    let height = area.height.saturating_sub(1);
+    Rect {
+        y: area.y + (area.height - height),
+        height,
+        ..area
+    }
+}
+
+/// As many lines as there is room for, from `first` on.
+fn write(frame: &mut Frame<'_>, area: Rect, lines: &[Styled], look: Look, first: usize) {
+    for ((text, kind), at) in lines.iter().skip(first).zip(0..area.height) {
+        put(frame, area, at, text, look, *kind);
+    }
+}
+
+/// One line, cut where the area ends.
+fn put(frame: &mut Frame<'_>, area: Rect, at: u16, text: &str, look: Look, kind: Kind) {
+    if at >= area.height {
+        return;
+    }
+    let width = usize::from(area.width);
+    let mut text = beginning(text.trim_end(), width, look.cut());
+    if kind == Kind::Selected {
+        text = format!("{text:<width$}");
+    }
+    let line = Line::from(Span::styled(text, look.style(kind)));
+    frame
+        .buffer_mut()
+        .set_line(area.x, area.y + at, &line, area.width);
+}
+
+#[cfg(test)]
+mod tests;
