@@ -17,6 +17,7 @@ mod record;
 mod run;
 mod service;
 mod shared;
+mod top;
 mod topic;
 
 use std::path::PathBuf;
@@ -76,6 +77,8 @@ pub(crate) enum Question {
     Action(action::Action),
     /// Say what this host will show and what not, and what to do about it
     Doctor(doctor::Doctor),
+    /// Show a robot's topics live in the terminal: rates, losses, latencies, what is wrong
+    Top(top::Top),
 }
 
 impl Question {
@@ -91,6 +94,7 @@ impl Question {
             Self::Service(service) => service.ask(),
             Self::Action(action) => action.ask(),
             Self::Doctor(doctor) => doctor.ask(),
+            Self::Top(top) => top.ask(),
         }
     }
 
@@ -102,6 +106,8 @@ impl Question {
             Self::Node(_) | Self::Service(_) | Self::Action(_) | Self::Doctor(_) => {
                 Some(interrupt::INTERRUPTED)
             }
+            // Gives the terminal back first.
+            Self::Top(_) => None,
         }
     }
 }

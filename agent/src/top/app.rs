@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
+use super::Options;
 use super::facts::{Event, Health, Lagged, Topic, Topics};
 use super::news::News;
 use super::row::{Column, Key, Past, Row, Standing, shown_name};
@@ -173,8 +174,26 @@ pub struct Heights {
 }
 
 impl App {
+    /// Nothing is known yet of the agent at `place`.
+    #[must_use]
+    pub fn new(options: &Options, place: String) -> Self {
+        Self {
+            domain_id: options.domain_id,
+            place,
+            sort: options.sort,
+            reverse: options.reverse,
+            filter: Filter {
+                text: options.filter.clone(),
+                problems: options.problems,
+                measured: false,
+            },
+            hidden: options.hidden,
+            ..Self::default()
+        }
+    }
+
     /// Topics in the table, in their order.
-    pub fn shown(&self) -> impl ExactSizeIterator<Item = &Row> {
+    pub fn shown(&self) -> impl ExactSizeIterator<Item = &Row> + Clone {
         self.shown
             .iter()
             .filter_map(|at| self.rows.get(*at))

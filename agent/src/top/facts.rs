@@ -15,7 +15,6 @@ pub struct Topics {
 /// One topic; deliveries, acknowledgements and buckets only from `GET /topics/{topic}`.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Topic {
     pub domain_id: u32,
     pub name: String,
@@ -39,7 +38,6 @@ pub struct Topic {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Endpoint {
     pub guid: String,
     pub node: Option<String>,
@@ -51,7 +49,6 @@ pub struct Endpoint {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Qos {
     pub reliability: String,
     pub durability: String,
@@ -61,7 +58,6 @@ pub struct Qos {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Watching {
     pub watch: String,
     pub origin: Option<String>,
@@ -76,7 +72,6 @@ pub struct Watching {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Measurement {
     pub messages: u64,
     pub bytes: u64,
@@ -95,7 +90,6 @@ pub struct Measurement {
 
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Sampled {
     pub seen_messages: u64,
     pub existing_messages: u64,
@@ -103,7 +97,6 @@ pub struct Sampled {
 
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Distribution {
     pub count: u64,
     pub mean_seconds: f64,
@@ -115,7 +108,6 @@ pub struct Distribution {
 
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Bucket {
     pub upper_seconds: Option<f64>,
     pub count: u64,
@@ -123,7 +115,6 @@ pub struct Bucket {
 
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Delivered {
     pub messages: u64,
     pub lost_messages: u64,
@@ -136,7 +127,6 @@ pub struct Delivered {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Delivery {
     pub writer: String,
     pub direction: String,
@@ -150,7 +140,6 @@ pub struct Delivery {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Acknowledgement {
     pub reader: String,
     pub missing_messages: u64,
@@ -159,7 +148,6 @@ pub struct Acknowledgement {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Passage {
     pub passage: String,
     pub pairs: u64,
@@ -167,7 +155,6 @@ pub struct Passage {
 
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Reason {
     pub code: String,
     pub detail: String,
@@ -176,7 +163,6 @@ pub struct Reason {
 /// `GET /health`.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Health {
     pub ready: bool,
     pub reason: Option<String>,
@@ -194,7 +180,6 @@ pub struct Health {
 
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Dropped {
     pub packets: u64,
     pub records: u64,
@@ -216,7 +201,6 @@ impl Dropped {
 /// One message of `GET /events`.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Event {
     pub time: String,
     pub name: String,
@@ -227,7 +211,6 @@ pub struct Event {
 /// The `data` of a message `lagged`.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-#[expect(missing_docs, reason = "the API's document has them")]
 pub struct Lagged {
     pub missed: Option<u64>,
     pub reason: String,

@@ -81,8 +81,8 @@ fn agent(app: &App) -> String {
         (Some((health, _)), None) if !health.ready => "AGENT NOT READY".to_owned(),
         (Some((health, _)), None) => {
             let source = match health.source.as_str() {
-                "host" => "sees this host's sockets",
-                "wire" => "sees this host's interfaces",
+                "host" => "sees the host's sockets",
+                "wire" => "sees the host's interfaces",
                 "replay" if health.finished => "has replayed its capture to the end",
                 "replay" => "replays a capture",
                 _ => "ready",

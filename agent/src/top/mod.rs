@@ -1,16 +1,135 @@
-//! `rp top`: a live table of topics in a terminal.
+//! `rp top`: a live table of topics in a terminal, or once as text.
 //!
 //! It shows what the agent's API says and decides nothing by itself. Names from the network reach the
-//! terminal escaped (`text`); the terminal is given back clean however it ends (`terminal`).
+//! terminal escaped (`text`); the terminal is given back clean however it ends (`terminal`). Topics
+//! that it has measured are measured no longer once it has gone, unless somebody wanted that.
 
-pub mod app;
-pub mod details;
-pub mod facts;
+mod app;
+mod details;
+mod facts;
+mod feed;
 mod header;
 mod help;
-pub mod look;
+mod holds;
+mod look;
 mod news;
-pub mod row;
+mod row;
+mod server_sent;
 mod table;
-pub mod text;
-pub mod view;
+mod terminal;
+mod text;
+mod view;
+
+use std::io;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::time::{Duration, Instant};
+
+use crate::client::{Agent, ClientError};
+use app::{App, Fact, Wish};
+use feed::{Feed, Input};
+use look::Look;
+pub use row::Column;
+use table::Table;
+use terminal::Screen;
+
+/// The screen is drawn anew after this time, for the age of what is shown.
+const TICK: Duration = Duration::from_millis(500);
+/// Between two drawings, whatever comes; keys are answered at once.
+const CALM: Duration = Duration::from_millis(100);
+/// Lines of the header in text that nobody scrolls.
+const MAX_HEADER: usize = 16;
+
+/// What is shown at first.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// Only this domain.
+    pub domain_id: Option<u32>,
+    /// By what the table is sorted.
+    pub sort: Column,
+    /// The other way round.
+    pub reverse: bool,
+    /// Only topics with this in name, type or state.
+    pub filter: String,
+    /// Only topics with problems.
+    pub problems: bool,
+    /// Also hidden topics.
+    pub hidden: bool,
+}
+
+/// The table as text: as it is now, all columns, as wide as they are.
+///
+/// # Errors
+/// The agent is gone or refuses.
+pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
+    let (health, topics) = feed::ask(agent, options.domain_id, options.hidden)?;
+    let (mut app, now) = (App::new(options, agent.place()), Instant::now());
+    app.take(Fact::Health(Box::new(health)), now);
+    app.take(Fact::Topics(Box::new(topics)), now);
+    let look = Look::default();
+    let table = Table::whole(app.shown(), look.cut());
+    let (heading, _) = table.heading(app.sort);
+    let mut text = String::new();
+    let header = header::lines(&app, 0, MAX_HEADER, look, now);
+    let header = header.into_iter().map(|(line, _)| line);
+    let rows = app.shown().map(|row| table.line(row));
+    for line in header.chain([heading]).chain(rows) {
+        text.push_str(line.trim_end());
+        text.push('\n');
+    }
+    Ok(text)
+}
+
+/// The table in the terminal, asked for anew every `interval`, until somebody ends it; the exit code.
+///
+/// # Errors
+/// There is no terminal, or no thread can be started.
+pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u8> {
+    let look = Look::of(|name| std::env::var(name).ok());
+    let mut app = App::new(options, agent.place());
+    let mut screen = Screen::open()?;
+    let (inputs, input) = channel();
+    terminal::listen_to_signals(inputs.clone())?;
+    terminal::listen(inputs.clone())?;
+    let feed = Feed::start(agent, options.domain_id, interval, &inputs)?;
+    if options.hidden {
+        feed.wish(Wish::Hidden(true));
+    }
+    loop {
+        let draw =
+            |frame: &mut ratatui::Frame<'_>| view::draw(&mut app, frame, look, Instant::now());
+        screen.terminal().draw(draw)?;
+        if let Some(code) = take_in(&mut app, &feed, &input) {
+            return Ok(code);
+        }
+    }
+}
+
+/// Waits for what changes the screen and takes it in; the exit code when that was the end.
+fn take_in(app: &mut App, feed: &Feed, input: &Receiver<Input>) -> Option<u8> {
+    let begun = Instant::now();
+    let mut is_news = false;
+    loop {
+        let patience = if is_news { CALM } else { TICK };
+        let next = match input.recv_timeout(patience.saturating_sub(begun.elapsed())) {
+            Ok(next) => next,
+            Err(RecvTimeoutError::Timeout) => return None,
+            Err(RecvTimeoutError::Disconnected) => return Some(1),
+        };
+        let (wishes, is_urgent) = match next {
+            Input::End(code) => return Some(code),
+            Input::Key(key) => (app.key(key), true),
+            Input::Resized => (Vec::new(), true),
+            Input::Fact(fact) => (app.take(fact, Instant::now()), false),
+        };
+        for wish in wishes {
+            if wish == Wish::Quit {
+                return Some(0);
+            }
+            feed.wish(wish);
+        }
+        if is_urgent {
+            return None;
+        }
+        is_news = true;
+    }
+}

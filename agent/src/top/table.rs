@@ -182,6 +182,22 @@ impl Table {
         }
     }
 
+    /// Every column as wide as it needs to be.
+    pub fn whole<'a>(rows: impl Iterator<Item = &'a Row> + Clone, cut: char) -> Self {
+        let is_expected = rows.clone().any(|row| row.wanted != (None, None));
+        let fields = Field::ORDER.into_iter();
+        let fields = fields.filter(|field| *field != Field::Wanted || is_expected);
+        let sized = fields.map(|field| {
+            let lengths = rows.clone().map(|row| field.value(row).chars().count());
+            let width = lengths.max().unwrap_or(0).max(field.label().len());
+            (field, width)
+        });
+        Self {
+            columns: sized.collect(),
+            cut,
+        }
+    }
+
     /// The heading, and where in it the sorted column stands.
     #[must_use]
     pub fn heading(&self, sort: Column) -> (String, Option<(usize, usize)>) {

@@ -239,7 +239,7 @@ fn an_agent_that_is_blind_or_gone_never_looks_healthy() {
     let at = |seconds: u64| start + Duration::from_secs(seconds);
     let mut shown = app(start);
     let text = screen(&mut shown, (80, 24), ASCII, at(1));
-    assert!(text.contains("agent sees this host's sockets"), "{text}");
+    assert!(text.contains("agent sees the host's sockets"), "{text}");
     assert!(text.contains("! 1 topic cannot be seen"), "{text}");
 
     shown.take(health(json!({"dropped": {"records": 7}})), at(1));

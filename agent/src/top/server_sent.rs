@@ -1,0 +1,68 @@
+//! Server-sent events, read line by line (WHATWG HTML, 9.2.6).
+
+/// One message.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Message {
+    /// What it is.
+    pub event: String,
+    /// What it says.
+    pub data: String,
+}
+
+/// Puts lines together to messages. The client bounds lines; a message has one of data here.
+#[derive(Debug, Default)]
+pub struct Messages {
+    next: Message,
+    /// Where to go on after a break.
+    pub last_id: Option<String>,
+}
+
+impl Messages {
+    /// Takes in one line, without its end.
+    pub fn line(&mut self, line: &[u8]) -> Option<Message> {
+        let line = String::from_utf8_lossy(line);
+        let line = line.trim_end_matches('\r');
+        if line.is_empty() {
+            let message = std::mem::take(&mut self.next);
+            return (!message.data.is_empty()).then_some(message);
+        }
+        let (field, value) = line.split_once(':').unwrap_or((line, ""));
+        let value = value.strip_prefix(' ').unwrap_or(value);
+        match field {
+            "event" => value.clone_into(&mut self.next.event),
+            "data" => value.clone_into(&mut self.next.data),
+            "id" if !value.is_empty() => self.last_id = Some(value.to_owned()),
+            _ => {}
+        }
+        None
+    }
+
+    /// The connection broke: what was begun will come again.
+    pub fn cut(&mut self) {
+        self.next = Message::default();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn messages_end_with_an_empty_line_and_ids_outlive_them() {
+        let mut messages = Messages::default();
+        let stream = ": ros2probe\nretry: 2000\nid: 5-0\n\nevent: a.b\nid: 5-1\ndata: {\"x\": \"y: z\"}\n\n:\n\nevent: cut";
+        let all: Vec<_> = stream
+            .lines()
+            .filter_map(|line| messages.line(line.as_bytes()))
+            .collect();
+        let expected = Message {
+            event: "a.b".to_owned(),
+            data: r#"{"x": "y: z"}"#.to_owned(),
+        };
+        assert_eq!(all, [expected]);
+        assert_eq!(messages.last_id.as_deref(), Some("5-1"));
+        messages.cut();
+        assert_eq!(messages.line(b"data: 1"), None);
+        assert_eq!(messages.line(b"").unwrap().event, "");
+    }
+}

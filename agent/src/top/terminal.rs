@@ -1,0 +1,142 @@
+//! The terminal while it is ours: raw, on its alternate screen, and given back as it was, also after
+//! a panic of any thread.
+
+use std::io::{self, BufWriter, IsTerminal as _, Stdout, Write as _};
+use std::panic;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::Sender;
+use std::thread;
+
+use ratatui::Terminal;
+use ratatui::backend::CrosstermBackend;
+use ratatui::crossterm::event::{self, Event};
+use ratatui::crossterm::terminal::{
+    EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+};
+use ratatui::crossterm::{cursor, execute};
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::feed::Input;
+
+/// What the exit code of a panic is.
+const PANICKED: i32 = 101;
+/// What a shell adds to a signal's number.
+const SIGNALLED: u8 = 128;
+
+/// The terminal is ours.
+static TAKEN: AtomicBool = AtomicBool::new(false);
+
+/// The terminal, until this is dropped.
+#[derive(Debug)]
+pub struct Screen {
+    terminal: Terminal<CrosstermBackend<BufWriter<Stdout>>>,
+}
+
+impl Screen {
+    /// Takes the terminal.
+    ///
+    /// # Errors
+    /// There is none, or it cannot be had.
+    pub fn open() -> io::Result<Self> {
+        if !io::stdout().is_terminal() {
+            let reason = "rp top needs a terminal; `rp top --once` prints the table and ends";
+            return Err(io::Error::new(io::ErrorKind::Unsupported, reason));
+        }
+        let before = panic::take_hook();
+        panic::set_hook(Box::new(move |panic| {
+            give_back();
+            before(panic);
+            // A thread that reads is gone: what is shown would be old for ever.
+            std::process::exit(PANICKED);
+        }));
+        TAKEN.store(true, Ordering::Relaxed);
+        let taken = enable_raw_mode()
+            .and_then(|()| execute!(io::stdout(), EnterAlternateScreen, cursor::Hide))
+            .and_then(|()| Terminal::new(CrosstermBackend::new(BufWriter::new(io::stdout()))));
+        match taken {
+            Ok(terminal) => Ok(Self { terminal }),
+            Err(error) => {
+                give_back();
+                Err(error)
+            }
+        }
+    }
+
+    /// Where to draw.
+    pub const fn terminal(&mut self) -> &mut Terminal<CrosstermBackend<BufWriter<Stdout>>> {
+        &mut self.terminal
+    }
+}
+
+impl Drop for Screen {
+    fn drop(&mut self) {
+        give_back();
+    }
+}
+
+/// Leaves the terminal as it was. What cannot be done any more, as on a line that was hung up, is
+/// left out.
+fn give_back() {
+    if TAKEN.swap(false, Ordering::Relaxed) {
+        let _ = disable_raw_mode();
+        let _ = execute!(io::stdout(), LeaveAlternateScreen, cursor::Show);
+        let _ = io::stdout().flush();
+    }
+}
+
+/// Passes on keys and sizes.
+///
+/// # Errors
+/// No thread can be started.
+pub fn listen(inputs: Sender<Input>) -> io::Result<()> {
+    let thread = thread::Builder::new().name("keys".to_owned());
+    let read = move || {
+        loop {
+            let input = match event::read() {
+                Ok(Event::Key(key)) => Input::Key(key),
+                Ok(Event::Resize(..)) => Input::Resized,
+                Ok(_) => continue,
+                // The terminal is gone.
+                Err(_) => Input::End(1),
+            };
+            let is_over = matches!(input, Input::End(_));
+            if inputs.send(input).is_err() || is_over {
+                return;
+            }
+        }
+    };
+    thread.spawn(read).map(drop)
+}
+
+/// Passes on the signals that ask a program to end.
+///
+/// # Errors
+/// Signals cannot be listened to.
+pub fn listen_to_signals(inputs: Sender<Input>) -> io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_io()
+        .build()?;
+    let kinds = [
+        SignalKind::hangup(),
+        SignalKind::interrupt(),
+        SignalKind::terminate(),
+    ];
+    let [mut hangup, mut interrupt, mut terminate] = {
+        let _entered = runtime.enter();
+        let [hangup, interrupt, terminate] = kinds.map(signal);
+        [hangup?, interrupt?, terminate?]
+    };
+    let wait = move || {
+        let kind = runtime.block_on(async {
+            tokio::select! {
+                _ = hangup.recv() => SignalKind::hangup(),
+                _ = interrupt.recv() => SignalKind::interrupt(),
+                _ = terminate.recv() => SignalKind::terminate(),
+            }
+        });
+        let number = u8::try_from(kind.as_raw_value()).unwrap_or_default();
+        let _ = inputs.send(Input::End(SIGNALLED.saturating_add(number)));
+    };
+    let thread = thread::Builder::new().name("signals".to_owned());
+    thread.spawn(wait).map(drop)
+}
