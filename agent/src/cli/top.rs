@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use anyhow::Result;
 use clap::Args;
+use ros2probe::capture::pcap::Speed;
 use ros2probe::client::{Agent, Target};
 use ros2probe::top::{self, Column, Options};
 
@@ -22,7 +23,8 @@ Topics that are not watched are not measured: w has the selected one measured un
 Examples:
   rp top                                  what the robot's topics do, live
   rp top --sort loss --filter camera
-  ssh robot rp top --once --problems      one table as text")]
+  ssh robot rp top --once --problems      one table as text
+  rp top --replay robot.pcap.gz           the same from a capture")]
 pub(crate) struct Top {
     /// Print one table as text and end; needs no terminal
     #[arg(long, visible_alias = "batch")]
@@ -51,6 +53,14 @@ pub(crate) struct Top {
     #[arg(long, value_name = "SECONDS", default_value = "1", value_parser = interval,
         conflicts_with = "once")]
     interval: Duration,
+    /// How fast to replay a capture: a factor, or `max`
+    #[arg(
+        long,
+        value_name = "N|max",
+        requires = "replay",
+        conflicts_with = "once"
+    )]
+    speed: Option<Speed>,
     #[command(flatten)]
     target: Target,
 }
@@ -65,7 +75,8 @@ impl Top {
             problems: self.problems,
             hidden: self.hidden,
         };
-        let agent = Agent::reach(&self.target)?;
+        let speed = self.speed.unwrap_or(Speed::Times(1.0));
+        let agent = Agent::reach_measured(&self.target, (!self.once).then_some(speed))?;
         if self.once {
             Output::new().write(&top::once(&agent, &options)?)?;
             return Ok(ExitCode::SUCCESS);

@@ -24,6 +24,7 @@ use serde::de::DeserializeOwned;
 use tokio::runtime::Runtime;
 use tokio::time::timeout;
 
+use crate::capture::pcap::Speed;
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
 use replayed::Stop;
@@ -60,6 +61,15 @@ impl Agent {
     /// As [`Self::reach`].
     pub fn reach_stream(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Stop::AtBeginning)
+    }
+
+    /// As [`Self::reach`], but all topics of a capture are measured, and it goes on at `speed`, where
+    /// one is given, while it is asked.
+    ///
+    /// # Errors
+    /// As [`Self::reach`].
+    pub fn reach_measured(target: &Target, speed: Option<Speed>) -> Result<Self, ClientError> {
+        Self::find(target, speed.map_or(Stop::AtEndMeasured, Stop::Never))
     }
 
     fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {

@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{ClientError, Target};
 use crate::capture::pcap::Speed;
-use crate::config::Config;
+use crate::config::{Config, Watch};
 use crate::model::observer::{self, Observer};
 use crate::model::reassembly::Limits;
 use crate::run::replay::{Replay, Waiter, rest};
@@ -24,12 +24,16 @@ use crate::watches::Watches;
 const PIPE: usize = 1 << 20;
 
 /// How far a capture is replayed before anything is asked.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Stop {
     /// To the end.
     AtEnd,
+    /// To the end, with every topic measured.
+    AtEndMeasured,
     /// To where messages are wanted from.
     AtBeginning,
+    /// Not at all: it goes on while it is asked, with every topic measured.
+    Never(Speed),
 }
 
 /// A capture with an agent of its own.
@@ -58,9 +62,17 @@ impl Replayed {
             path: capture.to_path_buf(),
             source,
         };
-        let replay = Replay::open(capture, Speed::Max, limits).map_err(failed)?;
+        let speed = match stop {
+            Stop::Never(speed) => speed,
+            _ => Speed::Max,
+        };
+        let replay = Replay::open(capture, speed, limits).map_err(failed)?;
         let mut replay = replay.until(target.until);
         let mut waiter = None;
+        let is_live = matches!(stop, Stop::Never(_));
+        if is_live {
+            replay = replay.quiet();
+        }
         if stop == Stop::AtBeginning {
             let (rest, other) = rest(target.from);
             replay = replay.resting(rest);
@@ -68,7 +80,11 @@ impl Replayed {
         }
         let source = Source::Replay(Box::new(replay));
         let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
-        let watches = Watches::new(Arc::clone(&board), Vec::new(), Vec::new());
+        let watched = match stop {
+            Stop::AtEndMeasured | Stop::Never(_) => Watch::named("/**").into_iter().collect(),
+            Stop::AtEnd | Stop::AtBeginning => Vec::new(),
+        };
+        let watches = Watches::new(Arc::clone(&board), Vec::new(), watched);
         let watches = watches.map_err(|error| ClientError::Runtime {
             source: std::io::Error::other(error),
         })?;
@@ -91,7 +107,10 @@ impl Replayed {
         );
         let (tell, ended) = oneshot::channel();
         let work = move || {
-            if let Err(error) = run.run() {
+            // Where it is live, the screen is somebody else's, who sees that nothing comes any more.
+            if let Err(error) = run.run()
+                && !is_live
+            {
                 eprintln!("rp: {:#}", anyhow::Error::from(error));
             }
             let _ = tell.send(());
@@ -110,6 +129,7 @@ impl Replayed {
         };
         tokio::spawn(api::serve_in_process(opened, context));
         match &mut waiter {
+            None if is_live => {}
             None => drop(ended.await),
             Some(waiter) => waiter.rests().await,
         }

@@ -120,6 +120,15 @@ impl Replay {
         Self { until, ..self }
     }
 
+    /// Tells nobody how far it is: the terminal is used for something else.
+    #[must_use]
+    pub fn quiet(self) -> Self {
+        Self {
+            progress: None,
+            ..self
+        }
+    }
+
     /// Waits at some moment until it is told to go on.
     #[must_use]
     pub fn resting(self, rest: Rest) -> Self {

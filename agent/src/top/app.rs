@@ -193,12 +193,11 @@ impl App {
     }
 
     /// Topics in the table, in their order.
-    pub fn shown(&self) -> impl ExactSizeIterator<Item = &Row> + Clone {
-        self.shown
-            .iter()
-            .filter_map(|at| self.rows.get(*at))
-            .collect::<Vec<_>>()
-            .into_iter()
+    pub fn shown(&self) -> impl ExactSizeIterator<Item = &Row> {
+        // Places are made with the rows.
+        let rows = |at: &usize| self.rows.get(*at);
+        let shown: Vec<_> = self.shown.iter().filter_map(rows).collect();
+        shown.into_iter()
     }
 
     /// Every topic that is known.
@@ -247,11 +246,8 @@ impl App {
                 return self.take_topics(&topics, now);
             }
             Fact::Health(health) => {
-                let before = self
-                    .health
-                    .as_ref()
-                    .map(|(health, _)| health.dropped.total());
-                if before.is_some_and(|before| health.dropped.total() > before) {
+                let before = self.health.as_ref().map(|(health, _)| health.dropped());
+                if before.is_some_and(|before| health.dropped() > before) {
                     self.dropped_at = Some(now);
                 }
                 self.health = Some((*health, now));

@@ -172,29 +172,39 @@ pub struct Health {
     pub source_reason: Option<String>,
     pub finished: bool,
     pub age_seconds: Option<f64>,
-    pub dropped: Dropped,
+    pub dropped_packets: u64,
+    pub dropped_records: u64,
+    pub dropped_datagrams: u64,
+    pub contended_datagrams: u64,
     pub unknown_writers: u64,
-    pub rejected_topics: u64,
-    pub table_evictions: u64,
+    pub topics_rejected: u64,
+    pub tables: Vec<Table>,
+    pub abilities: Vec<Ability>,
 }
 
-#[derive(Clone, Copy, Debug, Default, Deserialize)]
+#[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
-pub struct Dropped {
-    pub packets: u64,
-    pub records: u64,
-    pub datagrams: u64,
-    pub contended: u64,
+pub struct Table {
+    pub table: String,
+    pub evictions: u64,
 }
 
-impl Dropped {
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Ability {
+    pub ability: String,
+    pub able: bool,
+    pub reason: Option<String>,
+}
+
+impl Health {
     /// Everything that was not looked at.
     #[must_use]
-    pub const fn total(self) -> u64 {
-        self.packets
-            .saturating_add(self.records)
-            .saturating_add(self.datagrams)
-            .saturating_add(self.contended)
+    pub const fn dropped(&self) -> u64 {
+        self.dropped_packets
+            .saturating_add(self.dropped_records)
+            .saturating_add(self.dropped_datagrams)
+            .saturating_add(self.contended_datagrams)
     }
 }
 

@@ -13,7 +13,7 @@ use super::text::{counted, safe};
 /// What is shown should not be older: the agent itself calls this stale.
 const FRESH: Duration = Duration::from_secs(5);
 
-/// At most `most` lines.
+/// At most `most` lines; a width of 0 is as wide as they are.
 #[must_use]
 pub fn lines(app: &App, width: usize, most: usize, look: Look, now: Instant) -> Vec<Styled> {
     let mut lines = vec![
@@ -38,6 +38,7 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
     let host = app
         .health
         .as_ref()
+        .filter(|(health, _)| health.source != "replay")
         .and_then(|(health, _)| health.host.clone());
     let host = safe(&host.unwrap_or_else(|| app.place.clone()));
     let domains: BTreeSet<_> = app.rows().iter().map(|row| row.key.domain_id).collect();
@@ -66,6 +67,9 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
         None => "no data".to_owned(),
         Some(age) => format!("{:.1} s old", age.as_secs_f64()),
     };
+    if width == 0 {
+        return format!("{left}, {age}");
+    }
     let room = width.saturating_sub(left.chars().count());
     if room > age.len() {
         return format!("{left}{age:>room$}");
@@ -139,13 +143,12 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
         let why = health.reason.as_deref().unwrap_or("it does not say why");
         warn(format!("the agent does not see the robot: {}", safe(why)));
     }
-    if health.dropped.total() > 0 {
-        let dropped = health.dropped;
+    if health.dropped() > 0 {
         let what = [
-            (dropped.packets, "packets"),
-            (dropped.records, "records"),
-            (dropped.datagrams, "datagrams"),
-            (dropped.contended, "contended"),
+            (health.dropped_packets, "packets"),
+            (health.dropped_records, "records"),
+            (health.dropped_datagrams, "datagrams"),
+            (health.contended_datagrams, "contended datagrams"),
         ];
         let what = what.iter().filter(|(count, _)| *count > 0);
         let what: Vec<_> = what
@@ -178,19 +181,27 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
             "{writers} without a name: `rp discover` asks for them"
         ));
     }
-    if health.rejected_topics > 0 {
-        let topics = counted(health.rejected_topics, "watched topic");
+    if health.topics_rejected > 0 {
+        let topics = counted(health.topics_rejected, "watched topic");
         warn(format!("{topics} not measured: limits.topics is reached"));
     }
-    if health.table_evictions > 0 {
-        let entries = counted(health.table_evictions, "table entry");
+    for table in health.tables.iter().filter(|table| table.evictions > 0) {
+        let (count, name) = (table.evictions, safe(&table.table));
         warn(format!(
-            "{} given up: a table is full",
-            entries.replace("entrys", "entries")
+            "the table of {name} is full: {count} given up (limits)"
         ));
     }
     if let Some(reason) = &health.source_reason {
         warn(format!("sees less than it could: {}", safe(reason)));
+    }
+    for blind in health.abilities.iter().filter(|ability| !ability.able) {
+        if let Some(reason) = &blind.reason {
+            warn(format!(
+                "blind for {}: {}",
+                safe(&blind.ability),
+                safe(reason)
+            ));
+        }
     }
     warnings
 }

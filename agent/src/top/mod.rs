@@ -66,12 +66,13 @@ pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
     app.take(Fact::Health(Box::new(health)), now);
     app.take(Fact::Topics(Box::new(topics)), now);
     let look = Look::default();
-    let table = Table::whole(app.shown(), look.cut());
+    let rows: Vec<_> = app.shown().collect();
+    let table = Table::whole(&rows, look.cut());
     let (heading, _) = table.heading(app.sort);
     let mut text = String::new();
     let header = header::lines(&app, 0, MAX_HEADER, look, now);
     let header = header.into_iter().map(|(line, _)| line);
-    let rows = app.shown().map(|row| table.line(row));
+    let rows = rows.iter().map(|row| table.line(row));
     for line in header.chain([heading]).chain(rows) {
         text.push_str(line.trim_end());
         text.push('\n');

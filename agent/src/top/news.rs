@@ -40,17 +40,30 @@ impl News {
         text.push_str(&safe(
             event.name.strip_prefix("ros2.").unwrap_or(&event.name),
         ));
-        let first = ["topic", "ros_node", "what", "watch", "reason", "error"];
+        let first = ["topic", "ros_node", "what", "watch", "error"];
+        let last = [
+            "endpoint",
+            "participant",
+            "participants",
+            "reader",
+            "writer",
+        ];
         for key in first {
             if let Some(value) = event.attributes.get(key) {
                 text.push(' ');
                 text.push_str(&shown(value));
             }
         }
-        for (key, value) in &event.attributes {
-            let is_noise = matches!(key.as_str(), "domain_id" | "kind" | "message_type");
-            if !is_noise && !first.contains(&key.as_str()) {
-                text.push_str(&format!(" {}={}", safe(key), shown(value)));
+        // Identities are long and say least.
+        for is_identity in [false, true] {
+            for (key, value) in &event.attributes {
+                let key = key.as_str();
+                let is_noise = matches!(key, "domain_id" | "kind" | "message_type");
+                let value = shown(value);
+                let is_said = first.contains(&key) || is_noise || value.is_empty();
+                if !is_said && last.contains(&key) == is_identity {
+                    text.push_str(&format!(" {}={value}", safe(key)));
+                }
             }
         }
         self.push(Line {

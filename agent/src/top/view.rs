@@ -124,7 +124,7 @@ impl Panes {
 fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
     let width = usize::from(area.width) - MARKS;
     let rows: Vec<_> = app.shown().collect();
-    let table = Table::plan(width, rows.iter().copied(), look.cut());
+    let table = Table::plan(width, &rows, look.cut());
     let (heading, sorted) = table.heading(app.sort);
     let heading = format!("{:MARKS$}{heading}", "");
     put(frame, area, 0, &heading, look, Kind::Heading);

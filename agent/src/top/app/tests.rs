@@ -2,7 +2,7 @@ use serde_json::{Value, json};
 
 use super::*;
 
-fn topics(json: Value) -> Fact {
+fn topics(json: &Value) -> Fact {
     Fact::Topics(Box::new(
         serde_json::from_value(json!({"topics": json})).unwrap(),
     ))
@@ -31,7 +31,7 @@ fn app() -> App {
     let mut app = App::default();
     app.heights.topics = 10;
     assert_eq!(
-        app.take(topics(all), Instant::now()),
+        app.take(topics(&all), Instant::now()),
         [Wish::Select(key("/a"))]
     );
     app
@@ -127,11 +127,11 @@ fn the_selection_follows_its_topic_and_asks_for_details_once() {
     // It goes: the one in its place is selected.
     let left = json!([{"name": "/c", "dds_name": "rt/c"}]);
     assert_eq!(
-        app.take(topics(left), Instant::now()),
+        app.take(topics(&left), Instant::now()),
         [Wish::Select(key("/c"))]
     );
     assert_eq!(
-        app.take(topics(json!([])), Instant::now()),
+        app.take(topics(&json!([])), Instant::now()),
         [Wish::Select(None)]
     );
 }
@@ -158,7 +158,7 @@ fn w_and_capital_w_ask_for_the_selected_topic() {
         [Wish::Toggle(key.clone(), name.clone())]
     );
     assert_eq!(keys(&mut app, "W"), [Wish::Keep(key, name)]);
-    app.take(topics(json!([])), Instant::now());
+    app.take(topics(&json!([])), Instant::now());
     assert_eq!(keys(&mut app, "wW"), []);
 }
 

@@ -111,7 +111,7 @@ pub(in crate::top) fn robot() -> Topics {
     serde_json::from_value(topics).unwrap()
 }
 
-fn health(more: Value) -> Fact {
+fn health(more: &Value) -> Fact {
     let mut health = json!({
         "ready": true, "host": "robot1", "version": "0.1.0", "source": "host", "age_seconds": 0.2,
     });
@@ -121,7 +121,7 @@ fn health(more: Value) -> Fact {
     Fact::Health(Box::new(health))
 }
 
-fn event(time: &str, name: &str, severity: &str, attributes: Value) -> Fact {
+fn event(time: &str, name: &str, severity: &str, attributes: &Value) -> Fact {
     let event = json!({
         "time": format!("2026-11-20T{time}.000000000Z"), "name": name, "severity": severity,
         "attributes": attributes,
@@ -131,27 +131,27 @@ fn event(time: &str, name: &str, severity: &str, attributes: Value) -> Fact {
 
 fn app(start: Instant) -> App {
     let mut app = App::default();
-    app.take(health(json!({})), start);
+    app.take(health(&json!({})), start);
     app.take(Fact::Topics(Box::new(robot())), start);
     for fact in [
         event(
             "14:02:07",
             "ros2.node.discovered",
             "INFO",
-            json!({"domain_id": 0, "ros_node": "/robot1/viewer", "participant": "02.0"}),
+            &json!({"domain_id": 0, "ros_node": "/robot1/viewer", "participant": "02.0"}),
         ),
         event(
             "14:02:09",
             "ros2.qos.incompatible",
             "WARN",
-            json!({"topic": "/robot1/camera/front/left/image_raw/compressed",
+            &json!({"topic": "/robot1/camera/front/left/image_raw/compressed",
                 "policies": ["reliability"]}),
         ),
         event(
             "14:02:11",
             "ros2.message.lost",
             "WARN",
-            json!({"topic": "rt/\u{1b}[2J", "count": 3}),
+            &json!({"topic": "rt/\u{1b}[2J", "count": 3}),
         ),
     ] {
         app.take(fact, start);
@@ -242,7 +242,7 @@ fn an_agent_that_is_blind_or_gone_never_looks_healthy() {
     assert!(text.contains("agent sees the host's sockets"), "{text}");
     assert!(text.contains("! 1 topic cannot be seen"), "{text}");
 
-    shown.take(health(json!({"dropped": {"records": 7}})), at(1));
+    shown.take(health(&json!({"dropped_records": 7})), at(1));
     let text = screen(&mut shown, (80, 24), ASCII, at(1));
     assert!(text.contains("! dropping now: 7 records"), "{text}");
     let text = screen(&mut shown, (80, 24), ASCII, at(60));
@@ -250,7 +250,7 @@ fn an_agent_that_is_blind_or_gone_never_looks_healthy() {
     assert!(text.contains("! what is shown is 60 s old"), "{text}");
 
     let blind = json!({"ready": false, "reason": "the capture has made no progress for 9 s"});
-    shown.take(health(blind), at(1));
+    shown.take(health(&blind), at(1));
     let text = screen(&mut shown, (80, 24), ASCII, at(1));
     assert!(text.contains("AGENT NOT READY"), "{text}");
     assert!(text.contains("no progress for 9 s"), "{text}");
