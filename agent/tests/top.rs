@@ -57,7 +57,7 @@ fn it_draws_reacts_to_keys_and_gives_the_terminal_back() {
     top.press("\r");
     top.wait_for("between messages: median");
     top.press("e");
-    top.wait_for("endpoint.discovered");
+    top.wait_for("INFO  participant.lost");
     top.resize(30, 5);
     top.wait_for("rp top needs 40x8");
     top.resize(120, 40);

@@ -63,9 +63,16 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
         counted(app.rows().len() as u64, "topic"),
         count(|row| row.is_measured),
     );
-    let age = match app.age(now) {
+    let is_over = app
+        .health
+        .as_ref()
+        .is_some_and(|(health, _)| health.finished);
+    let age = match app.age(now).map(|age| age.as_secs_f64()) {
         None => "no data".to_owned(),
-        Some(age) => format!("{:.1} s old", age.as_secs_f64()),
+        // Nothing is newer than the end of a capture.
+        Some(_) if is_over && app.gone.is_none() => "at its end".to_owned(),
+        Some(age) if age >= 100.0 => format!("{age:.0} s old"),
+        Some(age) => format!("{age:.1} s old"),
     };
     if width == 0 {
         return format!("{left}, {age}");

@@ -151,7 +151,11 @@ impl Table {
             field.width() + more
         };
         let name = grown(Field::Name, longest(Field::Name), &mut left);
-        let state = grown(Field::State, longest(Field::State).min(MAX_STATE), &mut left);
+        let state = grown(
+            Field::State,
+            longest(Field::State).min(MAX_STATE),
+            &mut left,
+        );
         let mut message_type = 0;
         if left > Field::Type.width() {
             left -= Field::Type.width() + 1;
@@ -286,8 +290,8 @@ mod tests {
         assert_eq!(
             [heading.trim_end(), table.line(&rows[0]).trim_end()],
             [
-                "TOPIC                      HZ  WANTED    B/S  LOSS   MED   P99   P/S STATE",
-                "/camera/image            10.0  9.5-11   9.2M    0% 1.2ms  15ms   1/1 ok",
+                "TOPIC                    HZ  WANTED    B/S  LOSS   MED   P99   P/S STATE",
+                "/camera/image          10.0  9.5-11   9.2M    0% 1.2ms  15ms   1/1 ok",
             ]
         );
     }
