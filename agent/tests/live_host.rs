@@ -168,7 +168,6 @@ fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Re
         ("agent", "ready"),
         ("sight", "source"),
         ("kernel", "version"),
-        ("interfaces", "looked_at"),
         ("graph", "participants"),
     ] {
         assert_eq!(find(area, check)?["verdict"], "ok", "{report:#}");

@@ -6,6 +6,8 @@ use super::host::Host;
 
 const AREA: Area = Area::Interfaces;
 const PLACE: &str = "/sys/class/net";
+/// Of this process's network namespace, whatever is mounted.
+const OWN: &str = "/proc/self/net/dev";
 /// `man 7 netdevice`.
 const UP: u32 = 0x1;
 const LOOPBACK: u32 = 0x8;
@@ -35,6 +37,9 @@ pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Findin
             return vec![finding.seen(error.to_string(), PLACE).remedy("ip link")];
         }
     };
+    if let Some(finding) = elsewhere(host, &names) {
+        return vec![finding];
+    }
     let all: Vec<_> = names.iter().filter_map(|name| read(host, name)).collect();
     let mut findings = vec![overview(&all)];
     findings.extend(loopback(&all, localhost));
@@ -75,6 +80,33 @@ pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Findin
     }
     findings.extend(agent.map(looked_at));
     findings
+}
+
+/// `/sys` shows the network namespace in which it was mounted, which need not be this one.
+fn elsewhere(host: &Host, names: &[String]) -> Option<Finding> {
+    let table = host.files.text(OWN).ok()?;
+    let own = table
+        .lines()
+        .filter_map(|line| Some(line.split_once(':')?.0.trim()));
+    let foreign = own
+        .clone()
+        .find(|name| !names.iter().any(|known| known == name));
+    let foreign = foreign.or_else(|| {
+        let others = names
+            .iter()
+            .find(|name| !own.clone().any(|known| known == name.as_str()));
+        // Of bonding it also has a file there.
+        others
+            .map(String::as_str)
+            .filter(|name| *name != "bonding_masters")
+    })?;
+    let sentence = "/sys shows the interfaces of another network namespace than this one";
+    let finding = Finding::new(AREA, "interfaces", Verdict::Unknown, sentence);
+    let finding = finding.seen(
+        format!("{foreign} in one of them"),
+        format!("{OWN}, {PLACE}"),
+    );
+    Some(finding.remedy("ip -details link    # or: sudo ip netns exec NAME rp doctor"))
 }
 
 fn read(host: &Host, name: &str) -> Option<Interface> {
@@ -280,6 +312,26 @@ mod tests {
             verdict(&found(&[down, ETH], false), "loopback"),
             Some(Verdict::Problem)
         );
+    }
+
+    #[test]
+    fn interfaces_of_another_namespace_are_not_taken_for_this_one_s() {
+        let table = "Inter-| Receive\n face |bytes\n    lo: 0 0\n  eth9: 1 2\n";
+        let of = |interfaces: &[(&str, &str)]| {
+            let mut files = vec![(OWN, table)];
+            files.extend(interfaces);
+            let (_directory, host) = host(&files);
+            verdict(&check(&host, None, false), "interfaces")
+        };
+        let lo = ("/sys/class/net/lo/flags", "0x9");
+        let eth = ("/sys/class/net/eth9/flags", "0x1003");
+        let up = ("/sys/class/net/eth9/operstate", "up");
+        let bonding = ("/sys/class/net/bonding_masters", "");
+        assert_eq!(of(&[lo, eth, up]), Some(Verdict::Ok));
+        assert_eq!(of(&[lo, eth, up, bonding]), Some(Verdict::Ok));
+        assert_eq!(of(&[lo]), Some(Verdict::Unknown));
+        let other = ("/sys/class/net/eth0/flags", "0x1003");
+        assert_eq!(of(&[lo, eth, up, other]), Some(Verdict::Unknown));
     }
 
     #[test]

@@ -51,7 +51,8 @@ impl Processes {
         for participant in known.into_iter().flat_map(|known| &known.participants) {
             // Of those with a socket here the number is the process's, and no announced one.
             if let (Some(id), Some(_)) = (participant.process_id, &participant.cgroup) {
-                domains.insert(id, participant.domain_id);
+                let node = participant.nodes.first().cloned();
+                domains.insert(id, (participant.domain_id, node));
             }
         }
         let mut processes = Self::default();
@@ -61,7 +62,17 @@ impl Processes {
                 // A thread of the kernel, or a process that has ended.
                 continue;
             }
-            let domain_id = domains.get(&id).copied();
+            let (domain_id, node) = match domains.remove(&id) {
+                Some((domain_id, node)) => (Some(domain_id), node),
+                None => (None, None),
+            };
+            let command = match node {
+                Some(node) => format!("{command} {node}")
+                    .chars()
+                    .take(MAX_COMMAND)
+                    .collect(),
+                None => command,
+            };
             match look(host, id, command, domain_id) {
                 Ok(Some(_)) if processes.found.len() >= MAX_PROCESSES => break,
                 Ok(Some(process)) => processes.found.push(process),
@@ -476,13 +487,14 @@ mod tests {
         ]);
         assert_eq!(Processes::find(&host, None).count(), 0);
         let known: Participants = serde_json::from_str(
-            r#"{"participants":[{"domain_id":4,"process_id":21,"cgroup":"/robot"},
+            r#"{"participants":[{"domain_id":4,"process_id":21,"cgroup":"/robot","nodes":["/arm","/hand"]},
             {"domain_id":5,"process_id":22}]}"#,
         )
         .unwrap();
         let processes = Processes::find(&host, Some(&known));
         assert_eq!(processes.count(), 1);
         assert_eq!(processes.found[0].domain(), "domain 4");
+        assert_eq!(processes.found[0].name(), "robot /arm (21)");
     }
 
     #[test]

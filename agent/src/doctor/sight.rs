@@ -107,8 +107,7 @@ fn source(sight: &Sight) -> Finding {
     let finding = match (sight.source.as_str(), &sight.source_reason) {
         ("host", _) => say(
             Verdict::Ok,
-            "the agent looks at the sockets of this host: whole messages, in all containers \
-             at once"
+            "the agent looks at the sockets of this host: whole messages, each subscriber apart"
                 .to_owned(),
         ),
         ("wire", Some(reason)) => say(
