@@ -10,7 +10,7 @@ use clap::Args;
 use clap::error::ErrorKind;
 use ros2probe::client::{Agent, Target, encoded};
 use ros2probe::ros2::name::full_name;
-use ros2probe::ros2::rates::{Arrival, End, Named, Quantity, Rates};
+use ros2probe::ros2::rates::{Arrival, End, Named, Origin, Quantity, Rates};
 use ros2probe::ros2::{Dialect, Refused};
 use ros2probe::subscriptions::line::{Line, Reason};
 
@@ -214,12 +214,17 @@ fn measure(
                     None => true,
                 };
                 let appeared = rates.appeared(&sample.topic, &[sample.message_type]);
-                appeared.and_then(|()| {
-                    if passes {
-                        rates.arrived(&sample.topic, arrival)
-                    } else {
-                        Ok(())
+                appeared.and_then(|()| match passes {
+                    false => Ok(()),
+                    // Whether those that were not seen would pass is not known.
+                    true if sample.sampled && sieve.is_none() => {
+                        let origin = Origin {
+                            writer: &sample.writer,
+                            number: sample.sequence_number,
+                        };
+                        rates.sampled(&sample.topic, arrival, origin)
                     }
+                    true => rates.arrived(&sample.topic, arrival),
                 })
             }
             Line::Clock(clock) => {

@@ -169,6 +169,7 @@ fn sample(topic: Arc<Topic>, facts: &SampleFacts, payload: bytes::Bytes) -> Samp
         source_timestamp: facts.source_timestamp_ns.map(time),
         header_stamp: facts.header_stamp_ns.and_then(stamp),
         size: facts.size,
+        sampled: facts.sampled,
         payload: Some(payload),
     }
 }

@@ -63,6 +63,9 @@ pub struct Sample {
     pub header_stamp: Option<(i32, u32)>,
     /// Bytes of the serialized payload, encapsulation and padding included.
     pub size: u32,
+    /// Seen in shared memory, where not every message is seen: the numbers before it that were not
+    /// given may have been sent all the same.
+    pub sampled: bool,
     /// Those bytes, encapsulation included; `None` where only arrivals were asked for.
     pub payload: Option<Bytes>,
 }
@@ -240,6 +243,7 @@ impl Payloads {
                 source_timestamp: counted.source.timestamp(),
                 header_stamp: counted.stamp,
                 size: u32::try_from(counted.bytes).unwrap_or(u32::MAX),
+                sampled: counted.sampled,
                 payload,
             })),
         };

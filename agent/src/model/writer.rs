@@ -64,6 +64,8 @@ pub struct Counted {
     pub at: Timestamp,
     /// Time of its first one.
     pub began: Timestamp,
+    /// It was seen where not every message is seen.
+    pub sampled: bool,
 }
 
 /// One measured writer.
@@ -332,6 +334,7 @@ impl Writer {
                     stamp: whole.stamp.filter(|_| self.traits.has_header),
                     at: now,
                     began: whole.began,
+                    sampled: false,
                 });
             }
             Outcome::Whole(_) => {}
@@ -418,6 +421,7 @@ impl Writer {
                 stamp: stamp.filter(|_| self.traits.has_header),
                 at: now,
                 began: now,
+                sampled: true,
             });
         }
         None

@@ -452,6 +452,7 @@ mod tests {
             source_timestamp: Some(Timestamp(number)),
             header_stamp: None,
             size: 12,
+            sampled: false,
             payload: Some(vec![0, 1, 0, 0, 4, 0, 0, 0, b'a', b'b', b'c', 0].into()),
         }))
     }

@@ -121,6 +121,7 @@ mod tests {
             source_timestamp: None,
             header_stamp: None,
             size: 0,
+            sampled: false,
             payload: Some(vec![0; bytes].into()),
         })
     }

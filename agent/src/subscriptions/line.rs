@@ -80,6 +80,10 @@ pub struct SampleFacts {
     pub header_stamp_ns: Option<i64>,
     /// Bytes of the serialized message, encapsulation and padding included.
     pub size: u32,
+    /// Present and true where it was seen in shared memory by looking now and then: the numbers
+    /// before it that were not told may have been sent all the same.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub sampled: bool,
     /// So many raw bytes follow this line; null where payloads were not asked for.
     pub payload_bytes: Option<u32>,
     /// What the writer announced: with the first of its messages, where payloads were asked for.
@@ -202,6 +206,7 @@ impl From<&Sample> for SampleFacts {
             source_timestamp_ns: sample.source_timestamp.map(nanoseconds),
             header_stamp_ns: sample.header_stamp.map(stamp),
             size: sample.size,
+            sampled: sample.sampled,
             payload_bytes: sample.payload.as_ref().map(len),
             offered: None,
         }

@@ -43,6 +43,7 @@ fn sample(number: u64, payload: Option<usize>) -> Arc<Sample> {
         source_timestamp: None,
         header_stamp: None,
         size: 10_000,
+        sampled: false,
         payload: payload.map(|len| vec![7; len].into()),
     })
 }

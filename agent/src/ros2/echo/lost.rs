@@ -141,6 +141,7 @@ mod tests {
             source_timestamp_ns: None,
             header_stamp_ns: None,
             size: 8,
+            sampled: false,
             payload_bytes: None,
             offered: None,
         }

@@ -29,6 +29,7 @@ fn sample() -> SampleFacts {
         source_timestamp_ns: Some(1_999_999_999),
         header_stamp_ns: None,
         size: 8,
+        sampled: false,
         payload_bytes: Some(8),
         offered: None,
     }

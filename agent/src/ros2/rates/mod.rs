@@ -30,6 +30,8 @@ const CLEAR: &str = "\x1b[H\x1b[2J\n";
 const LONGEST_JUMP: i64 = 3600 * SECOND;
 /// So many messages wait for the clock at most; it comes ten times a second.
 const WAITING: usize = 65_536;
+/// A larger step in the numbers is another beginning.
+const MAX_UNSEEN: u64 = 10_000;
 
 /// What is asked for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,6 +55,8 @@ pub struct Rates {
     places: HashMap<String, usize>,
     /// Messages that the clock has not passed, with the places of their topics.
     waiting: Vec<(Arrival, usize)>,
+    /// Number and time of the newest message of each writer of which not every one is seen.
+    last_sampled: HashMap<String, (u64, i64)>,
     /// When the next report of every second is due.
     next: Option<i64>,
     said: Said,
@@ -96,11 +100,22 @@ pub struct Arrival {
     pub header_stamp: Option<i64>,
 }
 
+/// Who wrote a message, and its number among those of this writer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Origin<'a> {
+    /// GUID.
+    pub writer: &'a str,
+    /// From 1.
+    pub number: u64,
+}
+
 #[derive(Debug)]
 struct Watched {
     topic: Named,
     /// Nothing as long as the topic is not there.
     message_type: Option<String>,
+    /// Not every message is seen.
+    sampled: bool,
     series: Series,
 }
 
@@ -137,6 +152,7 @@ impl Rates {
             topics: Vec::new(),
             places: HashMap::new(),
             waiting: Vec::new(),
+            last_sampled: HashMap::new(),
             next: None,
             said: Said::default(),
         }
@@ -259,6 +275,43 @@ impl Rates {
         self.tick(now);
     }
 
+    /// As [`Self::arrived`], where not every message is seen: those with the numbers between this
+    /// one and the last of its writer count as well, at times between theirs.
+    ///
+    /// # Errors
+    /// As [`Self::arrived`].
+    pub fn sampled(&mut self, name: &str, arrival: Arrival, origin: Origin<'_>) -> Result<(), End> {
+        let Some(place) = self.places.get(name).copied() else {
+            return Ok(());
+        };
+        let newest = (origin.number, arrival.time);
+        let last = self.last_sampled.insert(origin.writer.to_owned(), newest);
+        let (number, mut time) = last.unwrap_or(newest);
+        let between = origin.number.saturating_sub(number).saturating_sub(1);
+        let topic = self.topics.get_mut(place);
+        if let Some(watched) = topic.filter(|_| (1..=MAX_UNSEEN).contains(&between)) {
+            if !mem::replace(&mut watched.sampled, true) {
+                let _ = writeln!(
+                    self.said.err,
+                    "rp: {name} goes through shared memory, where not every message is seen: \
+                     those between are counted by their numbers, their times are estimates"
+                );
+            }
+            let steps = i64::try_from(between + 1).unwrap_or(i64::MAX);
+            let step = arrival.time.saturating_sub(time) / steps;
+            for _ in 0..between {
+                time = time.saturating_add(step);
+                let unseen = Arrival {
+                    time,
+                    header_stamp: None,
+                    ..arrival
+                };
+                self.waiting.push((unseen, place));
+            }
+        }
+        self.arrived(name, arrival)
+    }
+
     /// Nothing more is given.
     pub fn finish(&mut self) {
         self.settle(i64::MAX);
@@ -341,6 +394,7 @@ impl Rates {
         self.topics.push(Watched {
             topic,
             message_type: None,
+            sampled: false,
             series,
         });
     }

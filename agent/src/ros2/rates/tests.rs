@@ -295,6 +295,36 @@ fn messages_count_in_the_order_of_their_times() {
 }
 
 #[test]
+fn what_is_not_seen_in_shared_memory_counts_by_its_numbers() {
+    let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/imu"]));
+    rates.opened(&present(&[("/imu", IMU)])).unwrap();
+    // Ten a second are sent, of which a third is seen.
+    for step in 0..8 {
+        let time = step * 300;
+        let arrival = Arrival {
+            time: at(time),
+            size: 100,
+            header_stamp: None,
+        };
+        let number = 7 + 3 * u64::try_from(step).unwrap();
+        let origin = Origin {
+            writer: "01",
+            number,
+        };
+        rates.sampled("/imu", arrival, origin).unwrap();
+        rates.clock(at(time));
+    }
+    let said = rates.take();
+    let report = "\tmin: 0.100s max: 0.100s std dev: 0.00000s window: ";
+    let report = |window| format!("average rate: 10.000\n{report}{window}\n");
+    assert_eq!(said.out, report(11) + &report(21));
+    assert_eq!(
+        said.err.matches("/imu goes through shared memory").count(),
+        1
+    );
+}
+
+#[test]
 fn a_clock_that_was_set_is_no_flood_and_no_silence() {
     let mut rates = Rates::of(Quantity::Bandwidth, Dialect::Humble, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
