@@ -64,3 +64,8 @@ fn configurations_survive() {
 fn definitions_survive() {
     run("fuzz/seeds/definition", entry::definition);
 }
+
+#[test]
+fn messages_survive() {
+    run("fuzz/seeds/message", entry::message);
+}

@@ -1,12 +1,12 @@
-//! `rp topic hz`, `bw` and `delay` on a robot whose machine is busy: right where subscribers are not,
-//! and gone without a trace, however they end.
+//! `rp topic hz`, `bw`, `delay` and `echo` on a robot whose machine is busy: right where subscribers
+//! are not, and gone without a trace, however they end.
 
 mod harness;
 
 use std::hint::spin_loop;
 use std::io::{BufRead as _, BufReader};
 use std::os::unix::process::ExitStatusExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -16,6 +16,7 @@ use anyhow::{Context as _, Result, ensure};
 use harness::agent::Agent;
 use harness::network::Namespace;
 use harness::peer::{Peer, Role, Stack, Stream};
+use harness::usage::Usage;
 use harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -23,21 +24,15 @@ const RATE: f64 = 200.0;
 /// Of what is said and of what is true.
 const TOLERANCE: f64 = 0.1;
 
+/// One after the other: both keep the machine busy.
+static TURN: Mutex<()> = Mutex::new(());
+
 #[test]
 fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
-    let configuration = directory.path().join("ros2probe.yaml");
-    let socket = directory.path().join("api.sock");
-    let text = format!(
-        "capture: {{source: host, cgroup: {}, shm: {{mode: off}}}}\nwatch: []\n\
-         state_directory: {}\napi: {{socket: {}}}\n",
-        host.cgroup().display(),
-        directory.path().display(),
-        socket.display()
-    );
-    std::fs::write(&configuration, text)?;
-    let agent = Agent::start(&host, env!("CARGO_BIN_EXE_rp"), &configuration)?;
+    let (agent, socket) = agent(&host, directory.path())?;
     let stream = Stream::small(100_000);
     let subscriber = Peer::start(&host, Stack::Cyclone, Role::Subscriber, &stream, &["/ekf"])?;
     let mut publisher = Peer::start(&host, Stack::Cyclone, Role::Publisher, &stream, &["/imu"])?;
@@ -109,20 +104,112 @@ fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<
     for client in [hz, all, bandwidth, delay] {
         drop(client);
     }
-    // Nobody wants it any more: it goes on, and nobody counts. Had one of the ten left its interest
-    // behind, somebody would.
-    wait_until("the topic is let go", || {
-        let counted = |agent: &Agent<'_>| -> Result<f64> {
-            let labels = [("topic", "/imu")];
-            Ok(agent.scrape()?.sum("ros2_topic_messages_total", &labels))
-        };
-        let before = counted(&agent)?;
-        ensure!(before > 1000.0, "{before} messages were counted");
-        std::thread::sleep(Duration::from_secs(2));
-        Ok(counted(&agent)? <= before)
-    })?;
+    let_go(&agent, "/imu", 1000.0)?;
     ensure!(publisher.log()?.sequences("pub").len() as f64 > sent.len() as f64 + RATE);
     Ok(())
+}
+
+/// An agent that watches nothing by itself, and its socket.
+fn agent<'a>(host: &'a Namespace, directory: &Path) -> Result<(Agent<'a>, PathBuf)> {
+    let configuration = directory.join("ros2probe.yaml");
+    let socket = directory.join("api.sock");
+    let text = format!(
+        "capture: {{source: host, cgroup: {}, shm: {{mode: off}}}}\nwatch: []\n\
+         state_directory: {}\napi: {{socket: {}}}\n",
+        host.cgroup().display(),
+        directory.display(),
+        socket.display()
+    );
+    std::fs::write(&configuration, text)?;
+    let agent = Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)?;
+    Ok((agent, socket))
+}
+
+/// Point clouds of 2.72 MB, 20 a second: 54 MB a second go from the agent to who echoes them.
+#[test]
+fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()> {
+    const SIZE: usize = 2_720_000;
+    const AGENT: u64 = 160 << 20;
+    const CLIENT: u64 = 64 << 20;
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let (agent, socket) = agent(&host, directory.path())?;
+    let stream = Stream {
+        reliable: true,
+        ..Stream::point_cloud(SIZE, 100_000)
+    };
+    let _subscriber = Peer::start(&host, Stack::Cyclone, Role::Subscriber, &stream, &["/map"])?;
+    let mut publisher = Peer::start(&host, Stack::Cyclone, Role::Publisher, &stream, &["/lidar"])?;
+    publisher.wait_matched()?;
+    agent.scrape_until("published", |scrape| {
+        scrape.sum("ros2_topic_publishers", &[("topic", "/points")]) > 0.0
+    })?;
+    let hz = Client::start(&socket, "hz /points")?;
+    let mut echo = Client::start(&socket, "echo /points")?;
+    publisher.go()?;
+    let shown = || -> usize {
+        let printed = echo.printed();
+        printed
+            .iter()
+            .filter(|line| *line == "row_step: 2719947")
+            .count()
+    };
+    let (mut of_agent, mut of_client) = (0, 0);
+    let mut spent = Usage::of(echo.child.id())?;
+    let before = (shown(), Instant::now(), spent);
+    wait_until("a hundred clouds are shown", || {
+        of_agent = of_agent.max(Usage::of(agent.process.pid())?.pss);
+        spent = Usage::of(echo.child.id())?;
+        of_client = of_client.max(spent.pss);
+        Ok(shown() >= 100)
+    })?;
+    eprintln!(
+        "agent {} MB, client {} MB and {:.2} CPU s for {} clouds in {:.1} s",
+        of_agent >> 20,
+        of_client >> 20,
+        spent.since(&before.2).cpu.as_secs_f64(),
+        shown() - before.0,
+        before.1.elapsed().as_secs_f64()
+    );
+    ensure!(of_agent < AGENT, "the agent took {of_agent} bytes");
+    ensure!(of_client < CLIENT, "the client took {of_client} bytes");
+
+    // Whoever is killed closes nothing by itself, and is not waited for.
+    echo.child.kill()?;
+    echo.child.wait()?;
+    let log = publisher.log()?.0;
+    let sent: Vec<u64> = log
+        .iter()
+        .filter(|event| event.ev == "pub")
+        .map(|event| event.t)
+        .collect();
+    hz.reports(4)?;
+    let (first, last) = (sent.first(), sent.last());
+    let (first, last) = (first.context("nothing sent")?, last.context("nothing")?);
+    let true_rate = (sent.len() - 1) as f64 / ((last - first) as f64 / 1e9);
+    let said = hz.last("average rate: ");
+    ensure!(
+        (said - true_rate).abs() <= true_rate / 20.0,
+        "{said} of {true_rate}"
+    );
+    drop(hz);
+    let_go(&agent, "/points", 50.0)
+}
+
+/// Nobody wants the topic any more: it goes on, and nobody counts. Had a client left its interest
+/// behind, somebody would.
+fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
+    wait_until("the topic is let go", || {
+        let counted = || -> Result<f64> {
+            let labels = [("topic", topic)];
+            Ok(agent.scrape()?.sum("ros2_topic_messages_total", &labels))
+        };
+        let before = counted()?;
+        ensure!(before > least, "{before} messages were counted");
+        std::thread::sleep(Duration::from_secs(2));
+        Ok(counted()? <= before)
+    })
 }
 
 /// Ends when its reader has gone, without a word, as any program does.

@@ -13,8 +13,9 @@ mod forms;
 mod golden;
 
 use golden::{cases, library};
+use ros2probe::message::value::{Items, Scalar};
 use ros2probe::message::yaml::{self, Style};
-use ros2probe::message::{Decoded, Limits, Shown, csv, decode};
+use ros2probe::message::{Decoded, Limits, Shown, Value, csv, decode};
 
 /// What `ros2 topic echo` shows of arrays and strings unless told otherwise.
 const ECHO: Shown = Shown {
@@ -111,5 +112,61 @@ fn damaged_payloads_are_read_or_refused_and_never_more() {
             }
             payload[position] = byte;
         }
+    }
+}
+
+/// The second oracle: PyPI `rosbags`, which has no `wstring`.
+#[test]
+fn rosbags_reads_the_same_values() {
+    let library = library();
+    let mut lines = String::new();
+    let mut expected = Vec::new();
+    for case in cases() {
+        if case.message_type.ends_with("/WStrings") {
+            continue;
+        }
+        let message_type = library.find(&case.message_type, None).unwrap();
+        let decoded = decode(&message_type, &case.payload, &Limits::default()).unwrap();
+        // rosbags refuses what is behind the last field.
+        let length = case.payload.len() - decoded.oddities.trailing;
+        let payload = golden::hex(&case.payload[..length]);
+        lines.push_str(&serde_json::to_string(&(&case.message_type, payload)).unwrap());
+        lines.push('\n');
+        expected.push((case.to_string(), plain(&Value::Message(decoded.message))));
+    }
+    let found = golden::rosbags(&lines);
+    let found: Vec<serde_json::Value> = found
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!(found.len(), expected.len());
+    for ((name, expected), found) in expected.into_iter().zip(found) {
+        assert_eq!(expected, found, "{name}");
+    }
+}
+
+/// As `read.py` writes it.
+fn plain(value: &Value<'_>) -> serde_json::Value {
+    let scalar = |scalar: Scalar| match scalar {
+        Scalar::Bool(value) => value.into(),
+        // rosbags takes an octet for a signed number.
+        Scalar::Byte(byte) => byte.cast_signed().into(),
+        Scalar::Int(number) => number.into(),
+        Scalar::UInt(number) => number.into(),
+        Scalar::Float32(number) => format!("f{:016x}", f64::from(number).to_bits()).into(),
+        Scalar::Float64(number) => format!("f{:016x}", number.to_bits()).into(),
+    };
+    match value {
+        Value::Scalar(value) => scalar(*value),
+        Value::Text(text) => text.as_ref().into(),
+        Value::Message(message) => message.values.iter().map(plain).collect(),
+        Value::Array(array) => match &array.items {
+            Items::Scalars(scalars) => scalars.iter().map(scalar).collect(),
+            Items::Texts(texts) => texts.iter().map(|text| text.as_ref()).collect(),
+            Items::Messages(messages) => messages
+                .iter()
+                .map(|message| plain(&Value::Message(message.clone())))
+                .collect(),
+        },
     }
 }

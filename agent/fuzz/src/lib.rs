@@ -5,6 +5,7 @@
 //! nothing delivered that was not there, an end, and an end that stays.
 
 use std::io::Cursor;
+use std::sync::LazyLock;
 
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::ring::block::Frames;
@@ -13,7 +14,7 @@ use ros2probe::capture::shm::port::Port;
 use ros2probe::capture::shm::segment::{Buffer, Message};
 use ros2probe::capture::shm::verdict::Judge;
 use ros2probe::config::Config;
-use ros2probe::message::{Definition, MessageType};
+use ros2probe::message::{Decoded, Definition, MessageType, Shown, csv, decode, yaml};
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, Packet, Payload};
@@ -157,6 +158,84 @@ pub fn definition(bytes: &[u8]) {
         assert_eq!(encoding, "ros2msg");
         let again = MessageType::parse(&root, &written).expect("what was read");
         assert_eq!(again.type_hash(), read.type_hash());
+    }
+}
+
+/// The types that payloads are read as; the first byte chooses one.
+static TYPES: LazyLock<Vec<MessageType>> = LazyLock::new(|| {
+    macro_rules! text {
+        ($name:literal) => {
+            include_str!(concat!(
+                "../../tests/data/definitions/test_msgs/msg/",
+                $name,
+                ".msg"
+            ))
+        };
+    }
+    let parts = [
+        ("BasicTypes", text!("BasicTypes")),
+        ("Constants", text!("Constants")),
+        ("Defaults", text!("Defaults")),
+        ("Arrays", text!("Arrays")),
+        ("BoundedSequences", text!("BoundedSequences")),
+        ("UnboundedSequences", text!("UnboundedSequences")),
+    ];
+    let line = "=".repeat(80);
+    let parts: String = parts
+        .iter()
+        .map(|(name, text)| format!("\n{line}\nMSG: test_msgs/{name}\n{text}"))
+        .collect();
+    let roots = [
+        text!("MultiNested"),
+        text!("UnboundedSequences"),
+        text!("BoundedSequences"),
+        text!("Arrays"),
+        text!("Strings"),
+        text!("WStrings"),
+        text!("Nested"),
+        text!("Empty"),
+    ];
+    let root = "fuzz/msg/Root".parse().expect("a name");
+    let types = roots
+        .iter()
+        .map(|text| MessageType::parse(&root, &format!("{text}{parts}")));
+    types.collect::<Result<_, _>>().expect("definitions")
+});
+
+/// A payload: read whole and in part, and printed.
+pub fn message(bytes: &[u8]) {
+    // Far more text comes of few octets than there are: an octet is a line.
+    const LONGEST: usize = 64;
+    let Some((choice, payload)) = bytes.split_first() else {
+        return;
+    };
+    let Some(message_type) = TYPES.get(usize::from(*choice) % TYPES.len()) else {
+        return;
+    };
+    let whole = decode(message_type, payload, &decode::Limits::default());
+    let part = decode::Limits {
+        kept: 2,
+        ..Default::default()
+    };
+    let part = decode(message_type, payload, &part);
+    let trailing = |decoded: &Decoded<'_>| decoded.oddities.trailing;
+    assert_eq!(whole.as_ref().map(trailing), part.as_ref().map(trailing));
+    let Ok(Decoded { message, .. }) = &whole else {
+        return;
+    };
+    let all = Shown::default();
+    let line = csv::line(message, &all);
+    assert!(line.len() <= (payload.len() + 64) * LONGEST);
+    for style in [yaml::Style::Block, yaml::Style::Flow] {
+        let document = yaml::document(message, &all, style);
+        assert!(document.ends_with('\n') && document.len() <= (payload.len() + 64) * LONGEST);
+    }
+    let few = Shown {
+        truncate: Some(2),
+        ..all
+    };
+    if let Ok(part) = &part {
+        assert_eq!(csv::line(&part.message, &few), csv::line(message, &few));
     }
 }
 

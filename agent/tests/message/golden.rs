@@ -2,8 +2,9 @@
 
 use std::fmt;
 use std::fs::File;
-use std::io::Read as _;
+use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 
 use flate2::read::MultiGzDecoder;
 use ros2probe::message::{Library, Sources};
@@ -82,4 +83,28 @@ pub fn library() -> Library {
         prefixes: Vec::new(),
         dialect: Dialect::Humble,
     })
+}
+
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// What rosbags makes of lines of types and payloads.
+pub fn rosbags(lines: &str) -> String {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let python = here.join("../target/tools/bags/bin/python");
+    let mut child = Command::new(&python)
+        .arg(here.join("tests/message/read.py"))
+        .arg(data().join("definitions"))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap_or_else(|error| panic!("{}: {error}; run `make prerequisites`", python.display()));
+    let mut input = child.stdin.take().unwrap();
+    let lines = lines.to_owned();
+    let writer = std::thread::spawn(move || input.write_all(lines.as_bytes()));
+    let output = child.wait_with_output().unwrap();
+    writer.join().unwrap().unwrap();
+    assert!(output.status.success());
+    String::from_utf8(output.stdout).unwrap()
 }
