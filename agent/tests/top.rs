@@ -94,6 +94,19 @@ fn a_signal_ends_it_cleanly_and_so_does_control_c_when_the_agent_is_gone() {
 }
 
 #[test]
+fn a_signal_ends_it_also_when_the_terminal_takes_nothing() {
+    let agent = agent();
+    let mut top = top(&agent, &["--interval", "0.1"]);
+    top.wait_for(TOPIC);
+    top.stop_output();
+    top.press("e?");
+    std::thread::sleep(Duration::from_millis(300));
+    top.signal("-TERM");
+    assert_eq!(top.ends(), Some(143));
+    top.assert_settings_given_back();
+}
+
+#[test]
 fn an_agent_that_comes_back_is_found_again() {
     let directory = tempfile::tempdir().unwrap();
     let socket = directory.path().join("api.sock");

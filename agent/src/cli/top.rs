@@ -9,7 +9,7 @@ use ros2probe::capture::pcap::Speed;
 use ros2probe::client::{Agent, Target};
 use ros2probe::top::{self, Column, Options};
 
-use super::Output;
+use super::{Output, Said};
 
 /// Longest pause between two looks.
 const MAX_INTERVAL: f64 = 3600.0;
@@ -75,6 +75,10 @@ impl Top {
             problems: self.problems,
             hidden: self.hidden,
         };
+        if self.target.from.is_some() {
+            let said = "rp: rp top shows a capture from its beginning on: leave out --from";
+            return Err(Said(said.to_owned()).into());
+        }
         let speed = self.speed.unwrap_or(Speed::Times(1.0));
         let agent = Agent::reach_measured(&self.target, (!self.once).then_some(speed))?;
         if self.once {

@@ -3,7 +3,7 @@
 
 use std::io;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -56,7 +56,7 @@ struct Poll {
     hidden: bool,
     selected: Option<Key>,
     holds: Holds,
-    inputs: Sender<Input>,
+    inputs: SyncSender<Input>,
 }
 
 impl Feed {
@@ -68,7 +68,7 @@ impl Feed {
         agent: Agent,
         domain_id: Option<u32>,
         interval: Duration,
-        inputs: &Sender<Input>,
+        inputs: &SyncSender<Input>,
     ) -> io::Result<Self> {
         let agent = Arc::new(agent);
         let (asks, asked) = std::sync::mpsc::channel();
@@ -195,7 +195,7 @@ impl Poll {
 }
 
 /// Follows the agent's events from the oldest it has, through every break.
-fn follow_events(agent: &Agent, inputs: &Sender<Input>) {
+fn follow_events(agent: &Agent, inputs: &SyncSender<Input>) {
     let mut messages = Messages::default();
     let mut is_refused = false;
     loop {

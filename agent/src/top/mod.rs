@@ -21,7 +21,7 @@ mod text;
 mod view;
 
 use std::io;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 use crate::client::{Agent, ClientError};
@@ -36,6 +36,8 @@ use terminal::Screen;
 const TICK: Duration = Duration::from_millis(500);
 /// Between two drawings, whatever comes; keys are answered at once.
 const CALM: Duration = Duration::from_millis(100);
+/// Keys and facts that wait for a terminal that takes its time; who has more to say waits, too.
+const MAX_WAITING: usize = 64;
 /// Lines of the header in text that nobody scrolls.
 const MAX_HEADER: usize = 16;
 
@@ -88,7 +90,7 @@ pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u
     let look = Look::of(|name| std::env::var(name).ok());
     let mut app = App::new(options, agent.place());
     let mut screen = Screen::open()?;
-    let (inputs, input) = channel();
+    let (inputs, input) = sync_channel(MAX_WAITING);
     terminal::listen_to_signals(inputs.clone())?;
     terminal::listen(inputs.clone())?;
     let feed = Feed::start(agent, options.domain_id, interval, &inputs)?;

@@ -4,8 +4,9 @@
 use std::io::{self, BufWriter, IsTerminal as _, Stdout, Write as _};
 use std::panic;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::Sender;
+use std::sync::mpsc::SyncSender;
 use std::thread;
+use std::time::Duration;
 
 use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
@@ -22,6 +23,9 @@ use super::feed::Input;
 const PANICKED: i32 = 101;
 /// What a shell adds to a signal's number.
 const SIGNALLED: u8 = 128;
+
+/// How long drawing may take before a signal ends the program without it.
+const PATIENCE: Duration = Duration::from_secs(2);
 
 /// The terminal is ours.
 static TAKEN: AtomicBool = AtomicBool::new(false);
@@ -88,7 +92,7 @@ fn give_back() {
 ///
 /// # Errors
 /// No thread can be started.
-pub fn listen(inputs: Sender<Input>) -> io::Result<()> {
+pub fn listen(inputs: SyncSender<Input>) -> io::Result<()> {
     let thread = thread::Builder::new().name("keys".to_owned());
     let read = move || {
         loop {
@@ -112,7 +116,7 @@ pub fn listen(inputs: Sender<Input>) -> io::Result<()> {
 ///
 /// # Errors
 /// Signals cannot be listened to.
-pub fn listen_to_signals(inputs: Sender<Input>) -> io::Result<()> {
+pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .build()?;
@@ -135,7 +139,12 @@ pub fn listen_to_signals(inputs: Sender<Input>) -> io::Result<()> {
             }
         });
         let number = u8::try_from(kind.as_raw_value()).unwrap_or_default();
-        let _ = inputs.send(Input::End(SIGNALLED.saturating_add(number)));
+        let code = SIGNALLED.saturating_add(number);
+        let _ = inputs.try_send(Input::End(code));
+        thread::sleep(PATIENCE);
+        // The terminal takes nothing, and drawing waits for it: only its settings can be put back.
+        let _ = disable_raw_mode();
+        std::process::exit(code.into());
     };
     let thread = thread::Builder::new().name("signals".to_owned());
     thread.spawn(wait).map(drop)

@@ -93,6 +93,13 @@ impl Terminal {
         self.screen = Screen::new(width.into(), height.into());
     }
 
+    /// From now on the terminal takes no output, as one on a line that hangs.
+    pub fn stop_output(&self) {
+        // SAFETY: the descriptor is open; nothing else is passed.
+        let stopped = unsafe { libc::tcflow(self.slave.as_raw_fd(), libc::TCOOFF) };
+        assert_eq!(stopped, 0, "tcflow: {}", std::io::Error::last_os_error());
+    }
+
     pub fn signal(&self, name: &str) {
         let id = self.child.id().to_string();
         assert!(
@@ -133,11 +140,16 @@ impl Terminal {
         }
     }
 
-    /// The terminal is as it was: settings, screen and cursor.
-    pub fn assert_given_back(&self) {
+    /// The terminal's settings are as they were.
+    pub fn assert_settings_given_back(&self) {
         let now = settings(&self.slave);
         let flags = |it: &libc::termios| (it.c_iflag, it.c_oflag, it.c_cflag, it.c_lflag, it.c_cc);
         assert_eq!(flags(&now), flags(&self.before));
+    }
+
+    /// The terminal is as it was: settings, screen and cursor.
+    pub fn assert_given_back(&self) {
+        self.assert_settings_given_back();
         let text = String::from_utf8_lossy(&self.all);
         for (taken, given_back) in [("\x1b[?1049h", "\x1b[?1049l"), ("\x1b[?25l", "\x1b[?25h")] {
             let (taken, given_back) = (text.rfind(taken), text.rfind(given_back));
