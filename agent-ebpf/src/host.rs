@@ -93,10 +93,20 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         return None;
     }
     scratch.walk.record.datagram = 0;
-    let capture = verdict::whole(skb, slot) != 0;
+    let mut capture = verdict::whole(skb, slot) != 0;
     let (socket, token) = (scratch.walk.record.socket, scratch.walk.record.datagram);
     if token == 0 {
         return None;
+    }
+    if capture {
+        scratch.count = 0;
+        if pieces::capture(skb, slot) != 0 {
+            note(scratch);
+        } else {
+            // User space is too slow for all of it: then what it counts for goes alone.
+            capture = false;
+            verdict::meter(skb, slot);
+        }
     }
     if at == hook::INGRESS
         && let Some(last) = last()
@@ -108,12 +118,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         // What the program knows as its context is the packet itself.
         last.buffer = skb as u64;
     }
-    if capture {
-        scratch.count = 0;
-        if pieces::capture(skb, slot) != 0 {
-            note(scratch);
-        }
-    } else if scratch.count == 0 {
+    if !capture && scratch.count == 0 {
         return None;
     }
     if scratch.met == socket {

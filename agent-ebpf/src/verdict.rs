@@ -71,6 +71,28 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
+/// Walks a datagram again that should have gone to user space and found no room, as one that was
+/// captured just before: what is of interest of it becomes records.
+#[unsafe(no_mangle)]
+#[inline(never)]
+pub extern "C" fn meter(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(scratch) = scratch(slot) else {
+        return 0;
+    };
+    let base = scratch.packet.body + 8;
+    let Some([_magic, _version, source @ ..]): Option<[u32; 5]> = load(skb, base) else {
+        return 0;
+    };
+    scratch.count = 0;
+    scratch.unknown = 0;
+    scratch.repeated = 1;
+    let len = scratch.walk.datagram_len;
+    scratch.walk.begin(source, len);
+    run(skb, base, len, slot);
+    flush(scratch.count, 0, slot);
+    0
+}
+
 /// Reads the UDP and RTPS headers of the packet at hand and starts the walk; `None` when it is not
 /// RTPS.
 #[inline(always)]

@@ -112,7 +112,8 @@ fn run(options: cli::Run) -> Result<()> {
     let stop = CancellationToken::new();
     let caps = Caps {
         subscriptions: config.limits.subscriptions,
-        bytes: config.limits.payload_bytes,
+        // The other half is for what is put together.
+        bytes: config.limits.payload_bytes / 2,
     };
     let subscriptions = Subscriptions::new(Arc::clone(&board), caps, stop.clone());
     let subscriptions = Arc::new(subscriptions);

@@ -78,7 +78,7 @@ impl PointCloud2 {
             is_bigendian: false,
             point_step,
             row_step,
-            data: Bytes(vec![0x5a; data_size]),
+            data: Bytes((0..data_size).map(pattern).collect()),
             is_dense: true,
         }
     }
@@ -107,6 +107,13 @@ impl PointCloud2 {
     pub(crate) fn serialized_size(&self) -> usize {
         self.data.0.len() + POINT_CLOUD_OVERHEAD
     }
+}
+
+/// What points are filled with: every place can be told from its neighbours, and every fragment
+/// from another. As `pattern` in `agent/tests/peers/peer.hpp`.
+fn pattern(place: usize) -> u8 {
+    let [low, ..] = (place * 7 + (place >> 8) * 13 + (place >> 16)).to_le_bytes();
+    low
 }
 
 /// `sensor_msgs/PointField`

@@ -169,9 +169,16 @@ impl Intake {
                 continue;
             };
             self.datagrams += 1;
-            if piece.time > before && self.fresh.len() < MAX_FRESH {
-                self.fresh.push_back((piece, bytes.into_owned()));
-            } else {
+            if piece.time <= before && self.fresh.is_empty() {
+                take_in_datagram(&piece, &bytes, clocks, &mut self.order, observer);
+                continue;
+            }
+            // Behind those that wait: one that overtook them would let a sample count by the copies
+            // of fragments whose bytes are still there.
+            self.fresh.push_back((piece, bytes.into_owned()));
+            while self.fresh.len() > MAX_FRESH
+                && let Some((piece, bytes)) = self.fresh.pop_front()
+            {
                 take_in_datagram(&piece, &bytes, clocks, &mut self.order, observer);
             }
         }

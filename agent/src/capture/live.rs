@@ -38,6 +38,9 @@ const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
 /// How long news from the host hook is gathered: a node that starts announces its endpoints one by
 /// one, and each round costs.
 const GATHER: Duration = Duration::from_millis(10);
+/// Likewise while whole samples are captured: they fill the ring, a point cloud in a few
+/// milliseconds.
+const GATHER_PAYLOADS: Duration = Duration::from_millis(2);
 const SECOND: u64 = 1_000_000_000;
 const TENTH: u64 = SECOND / 10;
 
@@ -203,7 +206,11 @@ impl LiveSource {
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
         if (self.host.is_some() || self.exact.is_some()) && woken {
             // News seldom comes alone. What nobody was woken for has had its time.
-            std::thread::sleep(GATHER);
+            std::thread::sleep(if observer.wants_payloads() {
+                GATHER_PAYLOADS
+            } else {
+                GATHER
+            });
         }
         let clocks = Clocks::read();
         self.refill(clocks.monotonic);

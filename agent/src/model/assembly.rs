@@ -88,7 +88,7 @@ impl Assembly {
         let Some(part) = self.parts.get_mut(&key) else {
             return;
         };
-        // Fragments of a writer that contradicts itself are of no use; a DATA is all there is.
+        // Fragments of a writer that contradicts itself are of no use.
         if part.size != size || part.fragment_size != fragment_size {
             return;
         }

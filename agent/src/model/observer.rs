@@ -214,6 +214,12 @@ impl Observer {
         self.payloads.take()
     }
 
+    /// Whether somebody wants samples whole.
+    #[must_use]
+    pub const fn wants_payloads(&self) -> bool {
+        self.payloads.wants_any_bytes()
+    }
+
     /// So much waits to be given that it should be taken before more comes.
     #[must_use]
     pub const fn has_much_to_give(&self) -> bool {

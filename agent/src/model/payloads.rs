@@ -176,6 +176,12 @@ impl Payloads {
         (bytes + self.given_bytes, limit, evictions + self.refused)
     }
 
+    /// Whether the bytes of anybody's samples are wanted.
+    #[must_use]
+    pub const fn wants_any_bytes(&self) -> bool {
+        self.deep > 0
+    }
+
     /// Whether the bytes of this writer's samples are wanted.
     #[must_use]
     pub fn wants_bytes(&self, writer: Guid) -> bool {

@@ -199,6 +199,7 @@ impl Run {
             follow(live, &mut self.followed, &snapshot);
         }
         let mut facts = self.source.facts();
+        facts.subscriptions = self.subscriptions.facts();
         if let Some(keeper) = &mut self.keeper {
             let (revision, now) = (self.observer.memory_revision(), Instant::now());
             if keeper.wants(revision, now) {

@@ -115,7 +115,7 @@ pub struct Subscription {
 }
 
 /// What the subscriptions cost and lose.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Facts {
     /// Open ones.
     pub open: usize,
@@ -123,8 +123,8 @@ pub struct Facts {
     pub refused: u64,
     /// Samples put into queues so far, for each reader.
     pub given: u64,
-    /// Samples not given so far, for each reader, by the reason's label.
-    pub missed: Vec<(&'static str, u64)>,
+    /// Samples not given so far, for each reader, in the order of [`MissedReason::ALL`].
+    pub missed: [u64; MissedReason::ALL.len()],
     /// Bytes that wait in queues.
     pub queued_bytes: usize,
 }
@@ -178,14 +178,12 @@ impl Subscriptions {
     /// What they cost and lose.
     #[must_use]
     pub fn facts(&self) -> Facts {
-        let missed = MissedReason::ALL.into_iter().zip(&self.missed);
+        let missed = self.missed.each_ref();
         Facts {
             open: self.channels.load().len(),
             refused: self.refused.load(Ordering::Relaxed),
             given: self.given.load(Ordering::Relaxed),
-            missed: missed
-                .map(|(reason, count)| (reason.label(), count.load(Ordering::Relaxed)))
-                .collect(),
+            missed: missed.map(|count| count.load(Ordering::Relaxed)),
             queued_bytes: self.queued.load(Ordering::Relaxed),
         }
     }

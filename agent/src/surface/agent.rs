@@ -12,6 +12,7 @@ use super::otlp::{Exports, Outcome, Reason};
 use super::page::{Label, Page};
 use super::process::Process;
 use super::robot::Rows;
+use crate::model::payloads::MissedReason;
 
 /// What runs, where its packets come from, and whether it sees.
 pub(super) fn identity(page: &mut Page<'_>, state: &State, now: Instant) -> fmt::Result {
@@ -187,6 +188,19 @@ pub(super) fn surface(
         &metric::RELOAD_TIMESTAMP,
         since_epoch.unwrap_or_default().as_secs_f64(),
     )
+}
+
+/// Who gets messages one by one.
+pub(super) fn subscriptions(page: &mut Page<'_>, state: &State) -> fmt::Result {
+    let facts = &state.agent.subscriptions;
+    page.single(&metric::SUBSCRIPTIONS, facts.open)?;
+    page.single(&metric::SUBSCRIPTIONS_REFUSED, facts.refused)?;
+    page.single(&metric::SAMPLES_GIVEN, facts.given)?;
+    page.family(&metric::SAMPLES_MISSED, |family| {
+        let mut missed = MissedReason::ALL.into_iter().zip(facts.missed);
+        missed.try_for_each(|(reason, count)| family.sample(&[Label::Text(reason.label())], count))
+    })?;
+    page.single(&metric::SAMPLES_QUEUED, facts.queued_bytes)
 }
 
 /// Events, told and not told.

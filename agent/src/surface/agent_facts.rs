@@ -4,6 +4,7 @@
 use std::time::Instant;
 
 use crate::state::StateFacts;
+use crate::subscriptions;
 
 /// One moment of the agent.
 #[derive(Clone, Debug)]
@@ -48,6 +49,8 @@ pub struct AgentFacts {
     /// Libraries whose processes' messages into shared memory are to be seen one by one, if that was
     /// asked for.
     pub exact: Vec<ExactFacts>,
+    /// Who gets messages one by one.
+    pub subscriptions: subscriptions::Facts,
 }
 
 /// One library of exact mode.
@@ -141,6 +144,7 @@ impl AgentFacts {
             state: None,
             shared_memory: None,
             exact: Vec::new(),
+            subscriptions: subscriptions::Facts::default(),
         }
     }
 }

@@ -34,6 +34,7 @@ pub(super) fn walk(page: &mut Page<'_>, board: &Board, previous: Duration) -> fm
     agent::model(page, &state, &rows, deliveries.hidden)?;
     agent::surface(page, &state, board.reload(), previous, now)?;
     agent::kept(page, &state)?;
+    agent::subscriptions(page, &state)?;
     agent::events(page, board.events())?;
     agent::exports(page, board.exports())?;
     agent::process(page)

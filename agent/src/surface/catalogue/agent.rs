@@ -191,6 +191,33 @@ pub(in crate::surface) const OTLP_DROPPED: Metric = Metric::counter(
     "Data points, log records and spans that were not delivered: overflow (no room here), superseded (by newer points while the endpoint was away), refused, rejected (in part) or shutdown.",
 );
 
+pub(in crate::surface) const SUBSCRIPTIONS: Metric = Metric::gauge(
+    "ros2probe_subscriptions",
+    &[],
+    "Clients that get messages one by one, and recordings, up to limits.subscriptions.",
+);
+pub(in crate::surface) const SUBSCRIPTIONS_REFUSED: Metric = Metric::counter(
+    "ros2probe_subscriptions_refused_total",
+    &[],
+    "Clients and recordings refused because of that cap.",
+);
+pub(in crate::surface) const SAMPLES_GIVEN: Metric = Metric::counter(
+    "ros2probe_given_messages_total",
+    &[],
+    "Messages put into the queues of subscriptions, each for each.",
+);
+pub(in crate::surface) const SAMPLES_MISSED: Metric = Metric::counter(
+    "ros2probe_missed_messages_total",
+    &["reason"],
+    "Messages that a subscription did not get, and was told so: incomplete (fragments were never seen), not_captured (their bytes were lost on the way to the agent, or found no room), queue_full (the reader was too slow).",
+);
+pub(in crate::surface) const SAMPLES_QUEUED: Metric = Metric::gauge(
+    "ros2probe_queued_bytes",
+    &[],
+    "Bytes of messages that wait in the queues of subscriptions, half of limits.payload_bytes at most; what is put together is in the table payloads.",
+)
+.unit("bytes");
+
 pub(in crate::surface) const EVENTS: Metric =
     Metric::counter("ros2probe_events_total", &["name"], "Events told, by name.");
 pub(in crate::surface) const EVENTS_DROPPED: Metric = Metric::counter(

@@ -225,7 +225,8 @@ int main(int argc, char** argv) {
       checked(dds_get_publication_matched_status(endpoint, &status), "cannot read the status");
       return static_cast<int>(status.current_count);
     });
-    std::vector<uint8_t> data(options.data_size(), 0x5a);
+    std::vector<uint8_t> data(options.data_size());
+    for (size_t place = 0; place < data.size(); place++) data[place] = peer::pattern(place);
     char frame_id[] = "lidar";
     layout_PointCloud2 cloud = {};
     cloud.header.frame_id = frame_id;

@@ -99,7 +99,7 @@ Payload point_cloud(size_t data_size) {
   cdr.u32(1);
   cdr.u32(static_cast<uint32_t>(data_size));
   cdr.u32(static_cast<uint32_t>(data_size));
-  cdr.bytes.insert(cdr.bytes.end(), data_size, 0x5a);
+  for (size_t place = 0; place < data_size; place++) cdr.bytes.push_back(peer::pattern(place));
   cdr.bytes.push_back(1);
   return cdr.bytes;
 }
