@@ -12,6 +12,9 @@ use super::{Agent, ClientError};
 /// Longer than any line.
 const MAX_LINE: usize = 1 << 20;
 
+/// More raw bytes than any message has.
+const MAX_BYTES: usize = 1 << 30;
+
 /// What an agent goes on saying.
 #[derive(Debug)]
 pub struct Lines<'a> {
@@ -76,9 +79,12 @@ impl<'a> Lines<'a> {
     /// Exactly this many bytes that follow the line which was read last.
     ///
     /// # Errors
-    /// The stream ends before.
+    /// The stream ends before, or no message is so long.
     pub fn bytes(&mut self, count: usize) -> Result<Bytes, ClientError> {
         let agent = self.agent;
+        if count > MAX_BYTES {
+            return Err(agent.way.not_an_agent());
+        }
         agent.runtime.block_on(async {
             while self.buffer.len() < count {
                 if !self.fill().await? {

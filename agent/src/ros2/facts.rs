@@ -1,6 +1,9 @@
-//! What the text is made of, as the agent's API says it. Fields that no text needs are left out.
+//! What the text is made of, as the agent's API says it. Fields that no text needs are left out, and
+//! control characters are escaped: names come from whoever is on the network, and go to a terminal.
 
-use serde::Deserialize;
+use std::borrow::Cow;
+
+use serde::{Deserialize, Deserializer};
 
 /// `/names`.
 #[derive(Clone, Debug, Default, Deserialize)]
@@ -19,6 +22,7 @@ pub struct Names {
 #[derive(Clone, Debug, Default, Deserialize)]
 pub struct NodeName {
     /// Fully qualified.
+    #[serde(deserialize_with = "plain")]
     pub name: String,
     /// Nodes that bear it.
     pub instances: usize,
@@ -28,10 +32,12 @@ pub struct NodeName {
 #[derive(Clone, Debug, Default, Deserialize)]
 pub struct TopicName {
     /// ROS name.
+    #[serde(deserialize_with = "plain")]
     pub name: String,
     /// Hidden by ROS convention.
     pub hidden: bool,
     /// ROS types, sorted.
+    #[serde(deserialize_with = "plain_list")]
     pub types: Vec<String>,
     /// Writers.
     pub publishers: usize,
@@ -43,10 +49,12 @@ pub struct TopicName {
 #[derive(Clone, Debug, Default, Deserialize)]
 pub struct ServiceName {
     /// ROS name.
+    #[serde(deserialize_with = "plain")]
     pub name: String,
     /// Hidden by ROS convention.
     pub hidden: bool,
     /// ROS types, sorted.
+    #[serde(deserialize_with = "plain_list")]
     pub types: Vec<String>,
     /// Readers of requests.
     pub request_readers: usize,
@@ -68,8 +76,10 @@ impl Names {
 #[derive(Clone, Debug, Default, Deserialize)]
 pub struct Topic {
     /// ROS name.
+    #[serde(deserialize_with = "plain")]
     pub name: String,
     /// ROS types, sorted.
+    #[serde(deserialize_with = "plain_list")]
     pub message_types: Vec<String>,
     /// Writers.
     pub publishers: Vec<Endpoint>,
@@ -81,14 +91,18 @@ pub struct Topic {
 #[derive(Clone, Debug, Default, Deserialize)]
 pub struct Endpoint {
     /// 24 and 8 hexadecimal digits with a point between.
+    #[serde(deserialize_with = "plain")]
     pub guid: String,
     /// Its node, when that is known.
+    #[serde(default, deserialize_with = "plain_option")]
     pub node: Option<String>,
     /// Its participant's enclave; `None` where it is no ROS participant.
     pub enclave: Option<String>,
     /// ROS type.
+    #[serde(deserialize_with = "plain")]
     pub message_type: String,
     /// RIHS01 hash, when announced.
+    #[serde(default, deserialize_with = "plain_option")]
     pub type_hash: Option<String>,
     /// Quality of service.
     pub qos: Qos,
@@ -117,6 +131,7 @@ pub struct Qos {
 #[derive(Clone, Debug, Default, Deserialize)]
 pub struct Node {
     /// Fully qualified.
+    #[serde(deserialize_with = "plain")]
     pub name: String,
     /// Each node of the name.
     pub instances: Vec<Instance>,
@@ -138,8 +153,10 @@ pub struct Instance {}
 #[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
 pub struct Named {
     /// ROS name.
+    #[serde(deserialize_with = "plain")]
     pub name: String,
     /// ROS types, sorted.
+    #[serde(deserialize_with = "plain_list")]
     pub types: Vec<String>,
 }
 
@@ -155,4 +172,55 @@ pub fn is_hidden_node(name: &str) -> bool {
     name.rsplit('/')
         .next()
         .is_some_and(|name| name.starts_with('_'))
+}
+
+fn plain<'de, D: Deserializer<'de>>(from: D) -> Result<String, D::Error> {
+    Ok(escaped(Cow::deserialize(from)?))
+}
+
+fn plain_list<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<String>, D::Error> {
+    let list: Vec<Cow<'_, str>> = Vec::deserialize(from)?;
+    Ok(list.into_iter().map(escaped).collect())
+}
+
+fn plain_option<'de, D: Deserializer<'de>>(from: D) -> Result<Option<String>, D::Error> {
+    let text: Option<Cow<'_, str>> = Option::deserialize(from)?;
+    Ok(text.map(escaped))
+}
+
+fn escaped(text: Cow<'_, str>) -> String {
+    if !text.contains(char::is_control) {
+        return text.into_owned();
+    }
+    let mut plain = String::with_capacity(text.len());
+    for each in text.chars() {
+        if each.is_control() {
+            plain.extend(each.escape_default());
+        } else {
+            plain.push(each);
+        }
+    }
+    plain
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_name_reaches_a_terminal_with_control_characters() {
+        let node = r#"{"name": "/\u001b[2J\n/é", "instances": 1}"#;
+        let node: NodeName = serde_json::from_str(node).unwrap();
+        assert_eq!(node.name, "/\\u{1b}[2J\\n/é");
+        let topic = r#"{"name": "/a", "hidden": false, "types": ["a/msg/\u009b1mB"],
+            "publishers": 1, "subscriptions": 0}"#;
+        let topic: TopicName = serde_json::from_str(topic).unwrap();
+        assert_eq!(topic.types, ["a/msg/\\u{9b}1mB"]);
+    }
+
+    #[test]
+    fn a_node_is_hidden_by_its_own_name_alone() {
+        assert!(is_hidden("/fib/_action/status") && is_hidden("/_a/b") && !is_hidden("/a_/b"));
+        assert!(is_hidden_node("/a/_ros2cli_1") && !is_hidden_node("/_a/b"));
+    }
 }
