@@ -8,6 +8,7 @@
 )]
 
 mod local_agent;
+#[allow(dead_code, reason = "shared with a test of the terminal alone")]
 mod pseudo_terminal;
 
 use std::time::{Duration, Instant};

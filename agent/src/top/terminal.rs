@@ -149,3 +149,46 @@ pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
     let thread = thread::Builder::new().name("signals".to_owned());
     thread.spawn(wait).map(drop)
 }
+
+#[cfg(test)]
+#[allow(dead_code, reason = "shared with the test of the program")]
+#[path = "../../tests/pseudo_terminal/mod.rs"]
+mod pseudo_terminal;
+
+#[cfg(test)]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    /// What [`a_panic_of_any_thread_gives_the_terminal_back`] starts.
+    const PANICS: &str = "top::terminal::tests::panics_on_a_screen";
+
+    #[test]
+    #[ignore = "started by another test, on a terminal of its own"]
+    fn panics_on_a_screen() {
+        // Whoever runs all tests has no such terminal.
+        if std::env::var_os("PANICS_ON_A_SCREEN").is_some() {
+            let _screen = Screen::open().unwrap();
+            let reader = thread::spawn(|| panic!("the reason"));
+            let _ = reader.join();
+            thread::sleep(PATIENCE);
+        }
+    }
+
+    #[test]
+    fn a_panic_of_any_thread_gives_the_terminal_back() {
+        let mut command = Command::new(std::env::current_exe().unwrap());
+        command
+            .args(["--exact", PANICS, "--ignored", "--nocapture"])
+            .env("PANICS_ON_A_SCREEN", "1")
+            .env("TERM", "xterm");
+        let mut terminal = pseudo_terminal::Terminal::start(&mut command);
+        assert_eq!(terminal.ends(), Some(PANICKED));
+        terminal.assert_settings_given_back();
+        let written = terminal.written();
+        let (_, after) = written.rsplit_once("\x1b[?1049l").unwrap();
+        assert!(after.contains("the reason"), "{written:?}");
+        assert!(after.contains("\x1b[?25h"), "{written:?}");
+    }
+}

@@ -140,6 +140,11 @@ impl Terminal {
         }
     }
 
+    /// All that was written so far.
+    pub fn written(&self) -> String {
+        String::from_utf8_lossy(&self.all).into_owned()
+    }
+
     /// The terminal's settings are as they were.
     pub fn assert_settings_given_back(&self) {
         let now = settings(&self.slave);
@@ -150,7 +155,7 @@ impl Terminal {
     /// The terminal is as it was: settings, screen and cursor.
     pub fn assert_given_back(&self) {
         self.assert_settings_given_back();
-        let text = String::from_utf8_lossy(&self.all);
+        let text = self.written();
         for (taken, given_back) in [("\x1b[?1049h", "\x1b[?1049l"), ("\x1b[?25l", "\x1b[?25h")] {
             let (taken, given_back) = (text.rfind(taken), text.rfind(given_back));
             assert!(taken.is_some() && taken < given_back, "{text:?}");
