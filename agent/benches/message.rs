@@ -12,8 +12,8 @@ const CLOUD: usize = 644_000;
 
 /// Nothing but zeros after the encapsulation is an Imu with an empty frame.
 fn imu() -> Vec<u8> {
-    let mut payload = vec![0; IMU];
-    payload[1] = 1;
+    let mut payload = vec![0, 1, 0, 0];
+    payload.resize(IMU, 0);
     payload
 }
 
