@@ -29,7 +29,7 @@ enum Verb {
     /// Print actions of a type
     Find(Find),
     /// Print goals, results, feedback and states of an action
-    Echo(ActionEcho),
+    Echo(Box<ActionEcho>),
 }
 
 #[derive(Args, Debug)]

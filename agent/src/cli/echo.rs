@@ -12,7 +12,7 @@ use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
 use ros2probe::ros2::facts::Topic;
 use ros2probe::ros2::name::full_name;
 
-use super::follow::{Came, Printing, Types, Went, follow, topic};
+use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic, visible};
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
@@ -144,12 +144,12 @@ impl Echo {
                             let message_type = if raw { None } else { types.of(sample) };
                             let told = echo.message(sample, message_type.as_deref(), &payload);
                             let told = told.map_err(said)?;
-                            eprint!("{}", told.err);
+                            eprint!("{}", visible(&told.err));
                             if let Some(message) = told.out {
                                 if self.clear {
                                     output.write(CLEAR)?;
                                 }
-                                output.write(&message)?;
+                                output.write(&for_stdout(message))?;
                                 is_enough = self.once;
                             }
                         }

@@ -9,7 +9,7 @@ use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, Echo};
 use ros2probe::ros2::name::full_name;
 
-use super::follow::{Came, Printing, Types, Went, follow, topic};
+use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic, visible};
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
@@ -173,8 +173,8 @@ fn print(
             let part = topics.iter().find(|(_, name)| *name == sample.topic);
             let part = part.and_then(|(part, _)| *part);
             let told = echo.event(sample, &message_type, &payload, part);
-            eprint!("{}", told.err);
-            output.write(&told.out.unwrap_or_default())?;
+            eprint!("{}", visible(&told.err));
+            output.write(&for_stdout(told.out.unwrap_or_default()))?;
         }
         Ok(Went::On)
     })?;

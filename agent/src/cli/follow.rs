@@ -1,6 +1,7 @@
 //! The messages of topics with their bytes and types, for what is printed of them one by one.
 
 use std::collections::HashMap;
+use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -18,8 +19,6 @@ use super::Said;
 
 /// How a replay ends.
 const END_OF_CAPTURE: &str = "end of capture";
-/// Longer than any message that an agent keeps.
-const MAX_PAYLOAD: u32 = 1 << 30;
 /// Writers whose types are remembered.
 const MAX_WRITERS: usize = 1024;
 
@@ -90,6 +89,29 @@ pub(crate) enum Came<'a> {
     Clock,
 }
 
+/// What messages say, for stdout: as it is for programs, without control characters for a terminal,
+/// which they could command. YAML has none by itself.
+pub(crate) fn for_stdout(text: String) -> String {
+    if std::io::stdout().is_terminal() {
+        visible(&text)
+    } else {
+        text
+    }
+}
+
+/// Control characters but line ends and tabs as escapes.
+pub(crate) fn visible(text: &str) -> String {
+    let mut visible = String::with_capacity(text.len());
+    for each in text.chars() {
+        if each.is_control() && !matches!(each, '\n' | '\t') {
+            visible.extend(each.escape_default());
+        } else {
+            visible.push(each);
+        }
+    }
+    visible
+}
+
 /// How a stream went on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Went {
@@ -118,9 +140,6 @@ pub(crate) fn follow(
             Line::Open(_) => Went::On,
             Line::Sample(sample) => {
                 let length = sample.payload_bytes.unwrap_or(0);
-                if length > MAX_PAYLOAD {
-                    return Err(Said(format!("a message of {length} bytes is too long")).into());
-                }
                 let payload = lines.bytes(usize::try_from(length)?)?;
                 now = now.max(Some(sample.time_ns));
                 visit(Came::Message(&sample, payload), sample.time_ns)?
@@ -148,7 +167,7 @@ pub(crate) fn follow(
 
 /// What was on the wire and is not shown is said on stderr.
 fn hint(missed: &MissedFacts) {
-    let MissedFacts { samples, topic, .. } = missed;
+    let (samples, topic) = (missed.samples, visible(&missed.topic));
     match missed.reason {
         Reason::QueueFull => {
             eprintln!("rp: {samples} messages of {topic} are not shown: too slow here");
@@ -205,7 +224,7 @@ impl Types {
             Err(error) => {
                 let text = whole(&error);
                 if !self.undefined.contains(&text) && self.undefined.len() < MAX_WRITERS {
-                    eprintln!("rp: {}: {text}", sample.topic);
+                    eprintln!("rp: {}", visible(&format!("{}: {text}", sample.topic)));
                     self.undefined.push(text);
                 }
                 None
@@ -248,7 +267,11 @@ impl Sieve {
             }
             Err(error) => {
                 if !std::mem::replace(&mut self.is_told, true) {
-                    eprintln!("rp: {} of writer {}: {error}", sample.topic, sample.writer);
+                    let SampleFacts { topic, writer, .. } = sample;
+                    eprintln!(
+                        "rp: {}",
+                        visible(&format!("{topic} of writer {writer}: {error}"))
+                    );
                 }
                 Ok(false)
             }
@@ -266,4 +289,15 @@ fn whole(error: &dyn std::error::Error) -> String {
         source = cause.source();
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::visible;
+
+    #[test]
+    fn no_message_commands_a_terminal() {
+        let text = "a\tb\u{1b}[2J\u{9b}1m\u{7}\n\u{e9}";
+        assert_eq!(visible(text), "a\tb\\u{1b}[2J\\u{9b}1m\\u{7}\n\u{e9}");
+    }
 }

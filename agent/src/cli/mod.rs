@@ -65,6 +65,7 @@ pub(crate) enum Command {
 
 /// What an agent, or a capture, is asked.
 #[derive(Debug, Subcommand)]
+#[expect(clippy::large_enum_variant, reason = "there is one")]
 pub(crate) enum Question {
     /// Recordings on disk, as `ros2 bag` makes and reads them
     Bag(bag::Bag),

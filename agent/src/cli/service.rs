@@ -32,7 +32,7 @@ enum Verb {
     /// Print a service's type and how many serve and call it
     Info(Info),
     /// Print what a service's introspection tells of its requests and responses
-    Echo(ServiceEcho),
+    Echo(Box<ServiceEcho>),
 }
 
 #[derive(Args, Debug)]
