@@ -1,9 +1,8 @@
 //! The queue between the capture thread and one reader, bounded in bytes.
 //!
-//! The capture thread holds its lock for the time of a push, the reader for that of a pop. It knows
-//! nothing of topics: what is put into it is for its reader.
+//! The capture thread holds its lock for the time of a push, the reader for that of a pop. What is
+//! put into it is for its reader: it chooses no topics.
 
-use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -12,6 +11,7 @@ use ros2probe_wire::Timestamp;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
+use super::backlog::Backlog;
 use super::{Depth, Item, Overflow, Request, Selection};
 use crate::model::payloads::{Missed, MissedReason, Sample};
 use crate::model::selection::Wish;
@@ -50,23 +50,14 @@ struct Terms {
 
 #[derive(Debug, Default)]
 struct Queue {
-    entries: VecDeque<Entry>,
-    bytes: usize,
-    /// Samples dropped since the reader was last told: they lie before all entries.
+    waiting: Backlog,
+    /// Samples dropped since the reader was last told.
     dropped: Vec<Missed>,
     /// Of those, how many are not counted yet.
     uncounted: u64,
     end: Option<&'static str>,
     /// The reader has gone.
     closed: bool,
-}
-
-#[derive(Debug)]
-struct Entry {
-    item: Item,
-    bytes: usize,
-    /// Given back when the entry goes.
-    _charge: Option<Arc<Charge>>,
 }
 
 /// Bytes that count in the sum of all queues for as long as this lives.
@@ -168,7 +159,7 @@ impl Channel {
     /// Tells of samples that will not be given.
     pub(super) fn miss(&self, missed: Missed, stop: &CancellationToken) {
         let mut queue = self.wait_for_room(OVERHEAD, stop);
-        if let Some(Item::Missed(last)) = queue.entries.back_mut().map(|entry| &mut entry.item)
+        if let Some(Item::Missed(last)) = queue.waiting.last_mut()
             && follows(last, &missed)
         {
             last.last = missed.last;
@@ -181,7 +172,7 @@ impl Channel {
     /// Everything up to `now` is in the queue.
     pub(super) fn clock(&self, now: Timestamp, stop: &CancellationToken) {
         let mut queue = self.wait_for_room(OVERHEAD, stop);
-        if let Some(Item::Clock(last)) = queue.entries.back_mut().map(|entry| &mut entry.item)
+        if let Some(Item::Clock(last)) = queue.waiting.last_mut()
             && self.request.overflow == Overflow::DropOldest
         {
             *last = now.max(*last);
@@ -200,8 +191,7 @@ impl Channel {
     pub(super) fn close(&self) {
         let mut queue = self.lock();
         queue.closed = true;
-        queue.entries = VecDeque::new();
-        queue.bytes = 0;
+        queue.waiting = Backlog::default();
         drop(queue);
         self.changed.notify_all();
     }
@@ -220,7 +210,7 @@ impl Channel {
         }
     }
 
-    /// Takes the oldest entry that is more than a time.
+    /// Takes what can be missed best.
     pub(super) fn drop_oldest(&self) {
         let mut queue = self.lock();
         self.drop_one(&mut queue);
@@ -273,13 +263,12 @@ impl Channel {
         if let Some(missed) = queue.dropped.pop() {
             return Some(Item::Missed(missed));
         }
-        if let Some(entry) = queue.entries.pop_front() {
-            queue.bytes -= entry.bytes;
-            self.bytes.store(queue.bytes, Ordering::Relaxed);
+        if let Some(item) = queue.waiting.pop() {
+            self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
             if self.request.overflow == Overflow::Wait {
                 self.changed.notify_all();
             }
-            return Some(entry.item);
+            return Some(item);
         }
         let reason = queue.end.filter(|_| !queue.closed)?;
         queue.closed = true;
@@ -290,8 +279,8 @@ impl Channel {
     fn wait_for_room(&self, bytes: usize, stop: &CancellationToken) -> MutexGuard<'_, Queue> {
         let mut queue = self.lock();
         while self.request.overflow == Overflow::Wait
-            && queue.bytes > 0
-            && queue.bytes + bytes > self.request.queue_bytes
+            && queue.waiting.bytes() > 0
+            && queue.waiting.bytes() + bytes > self.request.queue_bytes
             && !queue.closed
             && !stop.is_cancelled()
         {
@@ -306,27 +295,21 @@ impl Channel {
         if queue.closed {
             return;
         }
-        queue.entries.push_back(Entry {
-            item,
-            bytes,
-            _charge: charge,
-        });
-        queue.bytes += bytes;
-        self.bytes.store(queue.bytes, Ordering::Relaxed);
+        queue.waiting.push(item, bytes, charge);
+        self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
         while self.request.overflow == Overflow::DropOldest
-            && queue.bytes > self.request.queue_bytes
+            && queue.waiting.bytes() > self.request.queue_bytes
             && self.drop_one(queue)
         {}
     }
 
-    /// Drops the oldest entry; `false` when there is none.
+    /// Drops an entry; `false` when there is none.
     fn drop_one(&self, queue: &mut Queue) -> bool {
-        let Some(entry) = queue.entries.pop_front() else {
+        let Some(item) = queue.waiting.sacrifice() else {
             return false;
         };
-        queue.bytes -= entry.bytes;
-        self.bytes.store(queue.bytes, Ordering::Relaxed);
-        match entry.item {
+        self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
+        match item {
             Item::Sample(sample) => {
                 queue.uncounted += 1;
                 queue.note_dropped(Missed {

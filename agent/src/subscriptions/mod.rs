@@ -2,9 +2,10 @@
 //! subscription opens interest in topics for as long as it lives; dropping it closes the interest.
 //!
 //! Between the capture thread and each reader lies a queue, bounded in bytes, all of them together
-//! as well. A reader that is slow loses the oldest samples and is told how many, or, on a replay,
-//! is waited for. The capture of a live host never waits.
+//! as well. A reader that is slow loses the oldest samples of the topics that hold most of its queue
+//! and is told how many, or, on a replay, is waited for. The capture of a live host never waits.
 
+mod backlog;
 mod channel;
 pub mod line;
 
@@ -36,7 +37,7 @@ pub struct Caps {
 /// What becomes of samples for which a queue has no room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Overflow {
-    /// The oldest ones go, and the reader is told.
+    /// The oldest of the topic that holds most bytes go, and the reader is told.
     DropOldest,
     /// The source waits for the reader. For replays alone.
     Wait,
@@ -272,7 +273,7 @@ impl Subscriptions {
         self.make_room(channels);
     }
 
-    /// Takes the oldest samples from the longest queues until all together keep their cap.
+    /// Takes samples from the longest queues until all together keep their cap.
     fn make_room(&self, channels: &[Arc<Channel>]) {
         while self.queued.load(Ordering::Relaxed) > self.caps.bytes {
             let longest = channels.iter().max_by_key(|channel| channel.droppable());

@@ -1,3 +1,5 @@
+use std::collections::BTreeMap;
+
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use super::*;
@@ -29,11 +31,15 @@ fn request(depth: Depth, queue_bytes: usize, overflow: Overflow) -> Request {
 }
 
 fn sample(number: u64, payload: Option<usize>) -> Arc<Sample> {
+    sample_of("points", number, payload)
+}
+
+fn sample_of(topic: &str, number: u64, payload: Option<usize>) -> Arc<Sample> {
     Arc::new(Sample {
         topic: Arc::new(Topic {
             domain_id: 0,
-            name: "/points".into(),
-            dds_name: "rt/points".into(),
+            name: format!("/{topic}").into(),
+            dds_name: format!("rt/{topic}").into(),
             message_type: "a/msg/B".into(),
             offered: None,
         }),
@@ -49,9 +55,13 @@ fn sample(number: u64, payload: Option<usize>) -> Arc<Sample> {
 }
 
 fn given(to: &[u64], number: u64, payload: Option<usize>) -> Given {
+    given_of("points", to, number, payload)
+}
+
+fn given_of(topic: &str, to: &[u64], number: u64, payload: Option<usize>) -> Given {
     Given {
         to: to.into(),
-        news: News::Sample(sample(number, payload)),
+        news: News::Sample(sample_of(topic, number, payload)),
     }
 }
 
@@ -103,6 +113,56 @@ fn a_slow_reader_loses_the_oldest_and_is_told_before_what_is_left() {
     assert_eq!(numbers(&mut slow), [7, 8, 9, 10]);
     assert_eq!(all.facts().missed, [0, 0, 6]);
     assert_eq!(all.facts().queued_bytes, 0);
+}
+
+#[test]
+fn a_full_queue_loses_the_oldest_of_the_topic_that_holds_most_of_it() {
+    let all = subscriptions(caps());
+    let mut slow = all
+        .open(request(Depth::Payloads, 20_000, Overflow::DropOldest))
+        .unwrap();
+    for number in 1..=10 {
+        let clouds = given(&[1], number, Some(4000));
+        let small = given_of("tf", &[1], number, Some(100));
+        all.deliver(vec![small, clouds], Some(Timestamp(number)));
+    }
+    let mut left: BTreeMap<String, Vec<u64>> = BTreeMap::new();
+    let mut dropped = Vec::new();
+    while let Some(item) = slow.try_next() {
+        match item {
+            Item::Sample(sample) => left
+                .entry(sample.topic.name.to_string())
+                .or_default()
+                .push(sample.sequence_number),
+            Item::Missed(missed) => dropped.push(missed),
+            // The last time says what the others said.
+            Item::Clock(now) => assert_eq!(now, Timestamp(10)),
+            Item::End(reason) => panic!("{reason}"),
+        }
+    }
+    assert_eq!(left["/tf"], (1..=10).collect::<Vec<_>>());
+    assert_eq!(left["/points"], [8, 9, 10]);
+    let [dropped] = &dropped[..] else {
+        panic!("{dropped:?}");
+    };
+    assert_eq!(&*dropped.topic.name, "/points");
+    assert_eq!((dropped.first, dropped.last, dropped.samples), (1, 7, 7));
+    assert_eq!(all.facts().queued_bytes, 0);
+}
+
+#[test]
+fn one_message_larger_than_the_queue_takes_nothing_else_with_it() {
+    let all = subscriptions(caps());
+    let mut slow = all
+        .open(request(Depth::Payloads, 2000, Overflow::DropOldest))
+        .unwrap();
+    all.deliver(vec![given_of("tf", &[1], 1, Some(100))], None);
+    all.deliver(vec![given(&[1], 1, Some(5000))], None);
+    let Some(Item::Missed(missed)) = slow.try_next() else {
+        panic!("nothing was told");
+    };
+    assert_eq!((&*missed.topic.name, missed.samples), ("/points", 1));
+    assert_eq!(numbers(&mut slow), [1]);
 }
 
 #[test]

@@ -71,8 +71,8 @@ struct Wanted {
     domain_id: Option<u32>,
     /// Whether the bytes of the messages are wanted.
     payload: bool,
-    /// Bytes that may wait for this client before the oldest messages are dropped, as far as
-    /// `limits.payload_bytes` allows: all streams together.
+    /// Bytes that may wait for this client, as far as `limits.payload_bytes` allows for all streams
+    /// together. Then the oldest message of the topic that holds most of them is dropped.
     #[param(minimum = 65536)]
     queue_bytes: Option<usize>,
 }

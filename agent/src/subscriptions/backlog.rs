@@ -1,0 +1,124 @@
+//! What waits for one reader, in the order in which it came, and by topic.
+//!
+//! Where room is short, the oldest sample of the topic that holds most bytes goes first: a few point
+//! clouds rather than every `/tf`. Times go before any sample, since a later one says as much. It
+//! knows no limit of its own and counts no loss.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::sync::Arc;
+
+use super::Item;
+use super::channel::Charge;
+
+/// Entries by their place in the order of coming.
+#[derive(Debug, Default)]
+pub(super) struct Backlog {
+    entries: BTreeMap<u64, Entry>,
+    /// Places given so far.
+    places: u64,
+    bytes: usize,
+    topics: HashMap<Key, Held>,
+    /// Places of what is of no topic.
+    times: VecDeque<u64>,
+}
+
+#[derive(Debug)]
+struct Entry {
+    item: Item,
+    bytes: usize,
+    /// Given back when the entry goes.
+    _charge: Option<Arc<Charge>>,
+}
+
+/// Domain and DDS name: writers of one topic stand together.
+type Key = (u32, Arc<str>);
+
+/// What waits of one topic; never empty.
+#[derive(Debug, Default)]
+struct Held {
+    places: VecDeque<u64>,
+    bytes: usize,
+}
+
+impl Backlog {
+    /// Bytes that wait.
+    pub(super) const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    pub(super) fn push(&mut self, item: Item, bytes: usize, charge: Option<Arc<Charge>>) {
+        let place = self.places;
+        self.places += 1;
+        self.bytes += bytes;
+        match key(&item) {
+            Some(key) => {
+                let held = self.topics.entry(key).or_default();
+                held.places.push_back(place);
+                held.bytes += bytes;
+            }
+            None => self.times.push_back(place),
+        }
+        let entry = Entry {
+            item,
+            bytes,
+            _charge: charge,
+        };
+        self.entries.insert(place, entry);
+    }
+
+    /// What came last. Its topic and its size must stay.
+    pub(super) fn last_mut(&mut self) -> Option<&mut Item> {
+        let last = self.entries.last_entry()?;
+        Some(&mut last.into_mut().item)
+    }
+
+    /// Takes what came first.
+    pub(super) fn pop(&mut self) -> Option<Item> {
+        let place = *self.entries.first_key_value()?.0;
+        self.remove(place)
+    }
+
+    /// Takes what can be missed best.
+    pub(super) fn sacrifice(&mut self) -> Option<Item> {
+        let time = self.times.front().copied();
+        let place = time.or_else(|| {
+            // Among equals the one that waits longest.
+            let rank = |held: &&Held| (held.bytes, Reverse(held.places.front().copied()));
+            self.topics
+                .values()
+                .max_by_key(rank)?
+                .places
+                .front()
+                .copied()
+        })?;
+        self.remove(place)
+    }
+
+    /// Takes the first of all or of its topic.
+    fn remove(&mut self, place: u64) -> Option<Item> {
+        let entry = self.entries.remove(&place)?;
+        self.bytes -= entry.bytes;
+        let Some(key) = key(&entry.item) else {
+            self.times.pop_front();
+            return Some(entry.item);
+        };
+        if let Some(held) = self.topics.get_mut(&key) {
+            held.places.pop_front();
+            held.bytes -= entry.bytes;
+            if held.places.is_empty() {
+                self.topics.remove(&key);
+            }
+        }
+        Some(entry.item)
+    }
+}
+
+fn key(item: &Item) -> Option<Key> {
+    let topic = match item {
+        Item::Sample(sample) => &sample.topic,
+        Item::Missed(missed) => &missed.topic,
+        Item::Clock(_) | Item::End(_) => return None,
+    };
+    Some((topic.domain_id, Arc::clone(&topic.dds_name)))
+}
