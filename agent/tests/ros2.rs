@@ -163,6 +163,27 @@ fn who_cannot_be_asked_is_said_in_one_line() {
 }
 
 #[test]
+fn the_environment_names_domain_and_distribution_and_the_command_line_goes_before() {
+    let capture = graph::own().join("graph.pcap.gz");
+    let info = |distro: &str, domain: &str, further: &[&str]| {
+        let mut rp = rp();
+        rp.env("ROS_DISTRO", distro).env("ROS_DOMAIN_ID", domain);
+        rp.args(["topic", "info", "-v", "/chatter", "--replay"]);
+        rp.arg(&capture).args(further).output().unwrap()
+    };
+    let has_hash = |output: &Output| stdout(output).contains("\nTopic type hash: ");
+    assert!(!has_hash(&info("humble", "0", &[])));
+    assert!(has_hash(&info("humble", "", &["--distro", "lyrical"])));
+    assert!(has_hash(&info("unheard-of", "", &[])));
+    assert_eq!(
+        stderr(&info("jazzy", "3", &[])),
+        "Unknown topic '/chatter'\n"
+    );
+    assert!(has_hash(&info("jazzy", "3", &["--domain", "0"])));
+    fails_with(&info("jazzy", "three", &[]), "ROS_DOMAIN_ID is `three`");
+}
+
+#[test]
 fn a_command_without_a_verb_prints_its_help() {
     for arguments in [&[][..], &["topic"]] {
         let output = run(arguments);

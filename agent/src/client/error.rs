@@ -192,4 +192,20 @@ mod tests {
             assert_eq!(Refusal::read(404, foreign), None);
         }
     }
+
+    #[test]
+    fn without_an_agent_one_line_says_how_to_start_one_and_how_to_do_without() {
+        let said = ClientError::NoAgent.to_string();
+        assert!(!said.contains('\n'), "{said}");
+        for way in ["systemctl start ros2probe", "sudo rp run", "--replay FILE"] {
+            assert!(said.contains(way), "{said}");
+        }
+    }
+
+    #[test]
+    fn a_reason_is_without_the_number_of_the_system() {
+        let refused = io::Error::from_raw_os_error(111);
+        assert_eq!(because(&refused), "connection refused");
+        assert_eq!(because(&io::Error::other("Name unknown")), "name unknown");
+    }
 }
