@@ -16,9 +16,12 @@ use clap::Parser as _;
 use ros2probe::capture::live::LiveSource;
 use ros2probe::capture::pcap::Speed;
 use ros2probe::config::{Config, ConfigError};
+use ros2probe::message::{Library, Sources as Places};
 use ros2probe::model::observer::{self, Observer};
 use ros2probe::model::reassembly::Limits;
 use ros2probe::privilege::{self, Missing};
+use ros2probe::recording::{Recordings, Snapshots};
+use ros2probe::ros2::Dialect;
 use ros2probe::run::replay::Replay;
 use ros2probe::run::{Run, Source};
 use ros2probe::state::{Keeper, StateDirectory};
@@ -94,6 +97,7 @@ fn run(options: cli::Run) -> Result<()> {
         Source::Live(_) => memory::open(&config.state_directory),
         Source::Replay(_) => None,
     };
+    let recordings_directory = memory::recordings(&config.recordings.directory, state.as_deref());
     let known = state.as_deref().and_then(memory::load);
     if let Some(state) = &state
         && let Err(error) = watches.restore(memory::load_watches(state))
@@ -133,6 +137,21 @@ fn run(options: cli::Run) -> Result<()> {
     };
     let keeper = state.map(keep).transpose();
     let keeper = keeper.context("cannot start the threads that keep state")?;
+    let library = Library::new(Places::new(
+        Vec::new(),
+        std::env::var_os("AMENT_PREFIX_PATH").as_deref(),
+        Dialect::default(),
+    ));
+    let recordings = Arc::new(Recordings::new(
+        recordings_directory,
+        caps.bytes / 2,
+        Arc::clone(&board),
+        Arc::clone(&subscriptions),
+        Arc::new(library),
+    ));
+    let snapshots = Snapshots::start(&config.recordings.snapshots, &recordings, &board)
+        .context("recordings.snapshots")?;
+    let snapshots = Arc::new(snapshots);
     let run = Run::new(
         source,
         observer,
@@ -156,6 +175,8 @@ fn run(options: cli::Run) -> Result<()> {
         board: Arc::clone(&board),
         watches: Arc::clone(&watches),
         subscriptions,
+        recordings: Arc::clone(&recordings),
+        snapshots: Arc::clone(&snapshots),
         reloader,
         stop: stop.clone(),
     };
@@ -177,6 +198,8 @@ fn run(options: cli::Run) -> Result<()> {
         context,
     };
     let ended = runtime.block_on(supervisor.run(run, surfaces, options.report));
+    snapshots.finish();
+    recordings.finish();
     watches.finish();
     ended?;
     if options.report {

@@ -1,7 +1,7 @@
 //! Where state is kept, as the configuration or the service manager says, and what was found there.
 //! Whatever is wrong with it is said in the log: an agent without memory still observes.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::anyhow;
@@ -14,6 +14,8 @@ use ros2probe::watches::{self, Kept};
 const DEFAULT: &str = "/var/lib/ros2probe";
 /// Set by the service manager.
 const VARIABLE: &str = "STATE_DIRECTORY";
+/// In the state directory.
+const RECORDINGS: &str = "recordings";
 
 /// The directory to use; `None` = none.
 pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
@@ -35,6 +37,15 @@ pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
             );
             None
         }
+    }
+}
+
+/// Where bags go; `None` = nowhere. Made when the first one is.
+pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -> Option<PathBuf> {
+    match choice {
+        StateChoice::Off => None,
+        StateChoice::At(path) => Some(path.clone()),
+        StateChoice::Auto => Some(state?.path().join(RECORDINGS)),
     }
 }
 

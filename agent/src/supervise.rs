@@ -58,6 +58,8 @@ struct Signals {
     terminate: Signal,
     interrupt: Signal,
     hangup: Signal,
+    /// Writes what the snapshots keep.
+    snapshot: Signal,
 }
 
 /// The working thread and the news of its end.
@@ -77,6 +79,7 @@ impl Supervisor {
             serving.spawn(metrics.serve(self.stop.clone()));
         }
         surfaces.control.serve(&surfaces.context, &mut serving)?;
+        let snapshots = Arc::clone(&surfaces.context.snapshots);
         drop(surfaces.context);
         let mut watchdog = Watchdog::new();
         let mut tick = ticks(STARTING_TICK);
@@ -89,6 +92,7 @@ impl Supervisor {
                 _ = signals.hangup.recv() => {
                     let _ = self.reload();
                 }
+                _ = signals.snapshot.recv() => snapshots.write_all(),
                 Some(answer) = self.reloads.next() => {
                     // Who asked may have gone.
                     let _ = answer.send(self.reload());
@@ -211,6 +215,7 @@ impl Signals {
             terminate: signal(SignalKind::terminate())?,
             interrupt: signal(SignalKind::interrupt())?,
             hangup: signal(SignalKind::hangup())?,
+            snapshot: signal(SignalKind::user_defined1())?,
         })
     }
 }

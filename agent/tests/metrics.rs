@@ -17,7 +17,9 @@ use ros2probe::model::snapshot::{
 use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe::surface::events;
 use ros2probe::surface::otlp::Signal;
-use ros2probe::surface::{Ability, AgentFacts, Board, Exposition, Format, Settings, SourceKind};
+use ros2probe::surface::{
+    Ability, AgentFacts, Board, Exposition, Format, Settings, SnapshotFigures, SourceKind,
+};
 
 fn settings() -> Settings {
     let expectations = Expectations {
@@ -40,6 +42,9 @@ fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
     let board = Arc::new(Board::new(SourceKind::Wire, settings));
     board.publish(snapshot, sample_robot::agent());
     board.exports().enable(Signal::Metrics);
+    board
+        .recordings()
+        .snapshot("incident", SnapshotFigures::default());
     Exposition::new(board).render(format).unwrap()
 }
 

@@ -11,8 +11,10 @@ use tokio_util::sync::CancellationToken;
 use super::{ClientError, Target};
 use crate::capture::pcap::Speed;
 use crate::config::{Config, Watch};
+use crate::message::{Library, Sources};
 use crate::model::observer::{self, Observer};
 use crate::model::reassembly::Limits;
+use crate::recording::Recordings;
 use crate::run::replay::{Replay, Waiter, rest};
 use crate::run::{Run, Source};
 use crate::subscriptions::{Caps, Subscriptions};
@@ -118,12 +120,22 @@ impl Replayed {
         let thread = std::thread::Builder::new().name("replay".to_owned());
         let thread = thread.spawn(work);
         thread.map_err(|source| ClientError::Runtime { source })?;
+        // A capture is recorded by `rp bag record`, not by the agent that replays it.
+        let recordings = Arc::new(Recordings::new(
+            None,
+            caps.bytes,
+            Arc::clone(&board),
+            Arc::clone(&subscriptions),
+            Arc::new(Library::new(Sources::default())),
+        ));
         let (pipes, opened) = mpsc::unbounded_channel();
         let (reloader, _) = reload::channel();
         let context = api::Context {
             board,
             watches,
             subscriptions,
+            recordings,
+            snapshots: Arc::default(),
             reloader,
             stop: token.clone(),
         };

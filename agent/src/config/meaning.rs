@@ -11,17 +11,20 @@ use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::shape::{
-    ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, WatchEntryShape, WatchShape,
+    ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
+    WatchShape,
 };
 use super::watch::{Expectations, Watch, check_pattern};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
-    ShmSettings, SocketChoice, SourceChoice, StateChoice,
+    RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
 };
 use crate::surface::otlp::endpoint;
 
 /// A watchlist that long should be globs.
 const MAX_WATCHES: usize = 1_000;
+/// Each keeps memory and a thread.
+const MAX_SNAPSHOTS: usize = 8;
 
 /// The whole way from bytes to a configuration.
 pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
@@ -100,9 +103,43 @@ impl Reader {
             metrics: metrics(shape.metrics.unwrap_or_default()),
             api: self.api(shape.api.unwrap_or_default()),
             otlp: otlp(shape.otlp.unwrap_or_default()),
+            recordings: self.recordings(shape.recordings.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
             state_directory: state(&shape.state_directory),
             log: shape.log,
+        }
+    }
+
+    fn recordings(&mut self, shape: RecordingsShape) -> RecordingSettings {
+        let shapes = shape.snapshots.unwrap_or_default();
+        if shapes.len() > MAX_SNAPSHOTS {
+            let message = format!(
+                "has {} entries, at most {MAX_SNAPSHOTS} are allowed",
+                shapes.len()
+            );
+            self.wrong("recordings.snapshots", message);
+        }
+        let mut snapshots: Vec<SnapshotSettings> = Vec::new();
+        for (index, shape) in shapes.into_iter().enumerate() {
+            let key = format!("recordings.snapshots[{index}]");
+            if snapshots.iter().any(|other| other.name == shape.name) {
+                self.wrong(&format!("{key}.name"), "is another snapshot's already");
+            }
+            if shape.topics.is_empty() {
+                self.wrong(&format!("{key}.topics"), "names no topic");
+            }
+            snapshots.push(SnapshotSettings {
+                name: shape.name,
+                topics: shape.topics,
+                domain_id: shape.domain,
+                span: Duration::from_secs(shape.seconds),
+                max_bytes: shape.max_bytes,
+                on_violation: shape.on_violation,
+            });
+        }
+        RecordingSettings {
+            directory: state(&shape.directory),
+            snapshots,
         }
     }
 
@@ -255,7 +292,9 @@ impl Reader {
 /// What text at this key must be, where any text will not do.
 pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
     match without_indices(key).as_str() {
-        "watch[]" | "watch[].topic" => check_pattern(text).map_err(|error| error.to_string()),
+        "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => {
+            check_pattern(text).map_err(|error| error.to_string())
+        }
         "capture.interfaces.include[]"
         | "capture.interfaces.exclude[]"
         | "capture.mirror_interfaces[]" => {
@@ -274,6 +313,9 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         }
         "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
             Err("must be an absolute path, as in `/var/lib/ros2probe`, `auto` or `off`".to_owned())
+        }
+        "recordings.directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/data/bags`, `auto` or `off`".to_owned())
         }
         "api.socket" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
             "must be an absolute path, as in `/run/ros2probe/api.sock`, `auto` or `off`".to_owned(),

@@ -40,6 +40,8 @@ pub struct Config {
     pub api: ApiSettings,
     /// What is pushed to an OpenTelemetry receiver.
     pub otlp: OtlpSettings,
+    /// What the agent records.
+    pub recordings: RecordingSettings,
     /// How long a topic without endpoints is still reported.
     pub topic_grace: Duration,
     /// Where what discovery knows is kept for the next start.
@@ -186,6 +188,32 @@ pub enum SocketChoice {
     At(PathBuf),
 }
 
+/// What the agent records into bags.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RecordingSettings {
+    /// Where bags are written.
+    pub directory: StateChoice,
+    /// The last seconds of topics, kept in memory.
+    pub snapshots: Vec<SnapshotSettings>,
+}
+
+/// The last seconds of some topics.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SnapshotSettings {
+    /// Names its bags.
+    pub name: String,
+    /// Names and globs.
+    pub topics: Vec<String>,
+    /// Their domain.
+    pub domain_id: u32,
+    /// Nothing older is kept.
+    pub span: Duration,
+    /// Nor more bytes.
+    pub max_bytes: usize,
+    /// Written when an expectation is violated.
+    pub on_violation: bool,
+}
+
 /// What is pushed to an OpenTelemetry receiver; `None` = the standard variable decides, or a default.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct OtlpSettings {
@@ -326,6 +354,7 @@ impl Config {
             ),
             ("api", self.api != new.api),
             ("otlp", self.otlp != new.otlp),
+            ("recordings", self.recordings != new.recordings),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             (
                 "state_directory",
@@ -385,6 +414,7 @@ impl Default for Config {
                 token_file: None,
             },
             otlp: OtlpSettings::default(),
+            recordings: RecordingSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
             state_directory: StateChoice::default(),
             log: Level::default(),
@@ -435,6 +465,18 @@ mod defaults {
 
     pub(super) const fn topic_grace_s() -> u64 {
         600
+    }
+
+    pub(super) const fn snapshot_seconds() -> u64 {
+        10
+    }
+
+    pub(super) const fn snapshot_bytes() -> usize {
+        16 << 20
+    }
+
+    pub(super) const fn on_violation() -> bool {
+        true
     }
 
     pub(super) fn state_directory() -> String {

@@ -29,6 +29,9 @@ pub(super) struct ConfigShape {
     /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. What is not
     /// written here the standard `OTEL_*` variables decide.
     pub(super) otlp: Option<OtlpShape>,
+    /// Bags that the agent writes: on request (`POST /recordings`), and of the last seconds before
+    /// an incident.
+    pub(super) recordings: Option<RecordingsShape>,
     /// How long a topic without endpoints is still reported, in seconds.
     #[schemars(range(min = 0, max = 604_800))]
     #[serde(default = "defaults::topic_grace_s")]
@@ -211,6 +214,53 @@ impl Default for ApiShape {
             listen: defaults::API.to_owned(),
             socket: "auto".to_owned(),
             token_file: None,
+        }
+    }
+}
+
+/// Bags that the agent writes.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct RecordingsShape {
+    /// Where: an absolute path to a directory, `off`, or `auto`: `recordings` in the state directory.
+    pub(super) directory: String,
+    /// Topics of which the last seconds are kept in memory, and written when something happens.
+    pub(super) snapshots: Option<Vec<SnapshotShape>>,
+}
+
+/// The last seconds of some topics.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SnapshotShape {
+    /// Names its bags.
+    #[schemars(regex(pattern = r"^[A-Za-z0-9_-]{1,64}$"))]
+    pub(super) name: String,
+    /// ROS names or globs.
+    pub(super) topics: Vec<String>,
+    /// Of this domain.
+    #[schemars(range(min = 0, max = 232))]
+    #[serde(default)]
+    pub(super) domain: u32,
+    /// How many seconds are kept.
+    #[schemars(range(min = 1, max = 600))]
+    #[serde(default = "defaults::snapshot_seconds")]
+    pub(super) seconds: u64,
+    /// How much memory that may take; what does not fit is counted.
+    #[schemars(range(min = 65_536, max = 4_294_967_296_u64))]
+    #[serde(default = "defaults::snapshot_bytes")]
+    pub(super) max_bytes: usize,
+    /// Whether it is written when an expectation of a watch is violated.
+    #[serde(default = "defaults::on_violation")]
+    pub(super) on_violation: bool,
+}
+
+impl Default for RecordingsShape {
+    fn default() -> Self {
+        Self {
+            directory: "auto".to_owned(),
+            snapshots: None,
         }
     }
 }

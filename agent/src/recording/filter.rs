@@ -7,6 +7,7 @@ use std::collections::HashSet;
 
 use regex::Regex;
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 use crate::client::encoded;
 use crate::subscriptions::{Choice, ChoiceError, Selection};
@@ -22,8 +23,9 @@ const MAX_EXPRESSION: usize = 1024;
 const MAX_COMPILED: usize = 256 * 1024;
 
 /// What was asked for; empty asks for nothing.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
+#[schema(as = RecordedTopics)]
 pub struct Asked {
     /// These topics, by ROS name.
     pub topics: Vec<String>,

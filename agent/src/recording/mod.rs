@@ -1,18 +1,23 @@
 //! Recordings: which topics, what of them is in the bag, and what is not.
 //!
 //! A recording takes samples from a subscription, as a stream of the API does: nothing on the
-//! network tells that there is one. How a bag looks on disk is the business of [`crate::bag`].
+//! network tells that there is one. The agent writes some itself (`service`), and the last seconds
+//! before an incident (`snapshot`). How a bag looks on disk is the business of [`crate::bag`].
 
 mod announced;
 mod filter;
 mod recorder;
 mod report;
 mod ring;
+mod service;
 mod session;
+mod snapshot;
 
 pub use announced::Announced;
 pub use filter::{Asked, Candidate, Filter, FilterError};
 pub use recorder::{Ended, Recorder, Sources};
 pub use report::{MissingRun, Report, TopicReport};
 pub use ring::Ring;
+pub use service::{Recording, Recordings, Refusal, Stage, Status, Wanted, default_name, schema};
 pub use session::{Order, record};
+pub use snapshot::{Snapshots, Written};

@@ -82,6 +82,17 @@ impl Ring {
         }
     }
 
+    /// All of them, oldest first.
+    pub fn iter(&self) -> impl Iterator<Item = &Arc<Sample>> {
+        self.samples.iter()
+    }
+
+    /// Forgets all of them.
+    pub fn clear(&mut self) {
+        self.samples.clear();
+        self.bytes = 0;
+    }
+
     /// Gives all of them away, oldest first.
     pub fn drain(&mut self) -> impl Iterator<Item = Arc<Sample>> + use<> {
         self.bytes = 0;

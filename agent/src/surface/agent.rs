@@ -2,6 +2,7 @@
 //! own process (`process_*`).
 
 use std::fmt;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
@@ -11,6 +12,7 @@ use super::events::EventLog;
 use super::otlp::{Exports, Outcome, Reason};
 use super::page::{Label, Page};
 use super::process::Process;
+use super::recording_facts::{RecordingFigures, SnapshotFigures};
 use super::robot::Rows;
 use crate::model::payloads::MissedReason;
 
@@ -212,6 +214,36 @@ pub(super) fn events(page: &mut Page<'_>, log: &EventLog) -> fmt::Result {
         page.family(metric, |family| {
             let mut counts = counts.into_iter();
             counts.try_for_each(|(label, count)| family.sample(&[Label::Text(label)], count))
+        })?;
+    }
+    Ok(())
+}
+
+/// Bags that the agent writes, and what snapshots keep.
+pub(super) fn recordings(page: &mut Page<'_>, figures: &RecordingFigures) -> fmt::Result {
+    let counts = [
+        (&metric::RECORDINGS, &figures.active),
+        (&metric::RECORDED_MESSAGES, &figures.messages),
+        (&metric::RECORDED_BYTES, &figures.bytes),
+        (&metric::RECORDINGS_MISSING, &figures.missing),
+    ];
+    for (metric, count) in counts {
+        page.single(metric, count.load(Ordering::Relaxed))?;
+    }
+    let snapshots = figures.snapshots();
+    type Read = fn(&SnapshotFigures) -> u64;
+    let families: [(_, Read); 5] = [
+        (&metric::SNAPSHOT_MESSAGES, |figures| figures.messages),
+        (&metric::SNAPSHOT_BYTES, |figures| figures.bytes),
+        (&metric::SNAPSHOT_CROWDED_OUT, |figures| figures.crowded_out),
+        (&metric::SNAPSHOTS_WRITTEN, |figures| figures.written),
+        (&metric::SNAPSHOTS_FAILED, |figures| figures.failed),
+    ];
+    for (metric, read) in families {
+        page.family(metric, |family| {
+            let mut snapshots = snapshots.iter();
+            snapshots
+                .try_for_each(|(name, figures)| family.sample(&[Label::Text(name)], read(figures)))
         })?;
     }
     Ok(())

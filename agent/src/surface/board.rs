@@ -16,6 +16,7 @@ use tokio::sync::Notify;
 use super::agent_facts::{AgentFacts, SourceKind};
 use super::events::{AgentEvent, EventLog};
 use super::otlp::{Exports, Reason, Signal, SpanQueue};
+use super::recording_facts::RecordingFigures;
 use crate::config::{Config, Watch};
 use crate::model::snapshot::Snapshot;
 use crate::model::trace::Spans;
@@ -32,6 +33,7 @@ pub struct Board {
     events: Arc<EventLog>,
     exports: Exports,
     spans: SpanQueue,
+    recordings: RecordingFigures,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
     bell: Option<Bell>,
@@ -110,6 +112,7 @@ impl Board {
             events: Arc::new(events),
             exports: Exports::default(),
             spans: SpanQueue::default(),
+            recordings: RecordingFigures::default(),
             asked: AtomicBool::new(false),
             // Without one, askers wait until the capture thread looks by itself.
             bell: Bell::new().ok(),
@@ -228,6 +231,12 @@ impl Board {
             self.exports
                 .count_dropped(Signal::Traces, Reason::Overflow, refused + lost);
         }
+    }
+
+    /// What recordings have done.
+    #[must_use]
+    pub const fn recordings(&self) -> &RecordingFigures {
+        &self.recordings
     }
 
     /// Spans that wait for being exported.

@@ -16,6 +16,7 @@ pub mod http;
 pub mod otlp;
 mod page;
 mod process;
+pub mod recording_facts;
 mod robot;
 #[cfg(feature = "tls")]
 mod tls;
@@ -28,3 +29,4 @@ pub use agent_facts::{
 pub use board::{Board, Settings, State};
 pub use events::{AgentEvent, EventLog};
 pub use exposition::{Exposition, Format};
+pub use recording_facts::{RecordingFigures, SnapshotFigures};

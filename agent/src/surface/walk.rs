@@ -36,6 +36,7 @@ pub(super) fn walk(page: &mut Page<'_>, board: &Board, previous: Duration) -> fm
     agent::kept(page, &state)?;
     agent::subscriptions(page, &state)?;
     agent::events(page, board.events())?;
+    agent::recordings(page, board.recordings())?;
     agent::exports(page, board.exports())?;
     agent::process(page)
 }

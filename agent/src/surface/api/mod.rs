@@ -4,6 +4,7 @@
 //! A module for each noun gives its routes; what every request has to pass is in `security`.
 
 mod actions;
+mod body;
 mod endpoint;
 mod events;
 mod finding;
@@ -20,6 +21,7 @@ mod participants;
 mod party;
 mod pipe;
 pub mod problem;
+mod recordings;
 pub mod reload;
 mod samples;
 mod scope;
@@ -27,6 +29,7 @@ mod security;
 mod server;
 mod services;
 mod silence;
+mod snapshots;
 mod topics;
 mod watch;
 
@@ -40,6 +43,7 @@ use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::board::{Board, State};
+use crate::recording::{Recordings, Snapshots};
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
 pub use openapi::document;
@@ -61,6 +65,10 @@ pub struct Context {
     pub watches: Arc<Watches>,
     /// Who gets messages one by one.
     pub subscriptions: Arc<Subscriptions>,
+    /// Bags that the agent writes.
+    pub recordings: Arc<Recordings>,
+    /// The last seconds of some topics.
+    pub snapshots: Arc<Snapshots>,
     /// Has the configuration read again.
     pub reloader: Reloader,
     /// Ends streams when the agent ends.
@@ -81,6 +89,8 @@ fn nouns() -> OpenApiRouter<Context> {
         .merge(watch::routes())
         .merge(events::routes())
         .merge(samples::routes())
+        .merge(recordings::routes())
+        .merge(snapshots::routes())
         .merge(topics::routes())
         .merge(nodes::routes())
         .merge(services::routes())

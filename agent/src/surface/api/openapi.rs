@@ -39,6 +39,7 @@ const COMMON: [(&str, &str); 6] = [
         (name = "watch", description = "What is measured, changed while the agent runs."),
         (name = "events", description = "What happens, as it happens."),
         (name = "samples", description = "Messages of topics, one by one, as they come."),
+        (name = "recordings", description = "Bags that the agent writes."),
         (name = "graph", description = "What is known of the robot."),
         (name = "agent", description = "The agent itself."),
     )

@@ -57,6 +57,18 @@ pub enum Code {
     TooManyStreams,
     /// As many subscriptions are open as may.
     TooManySubscriptions,
+    /// No such recording.
+    NoSuchRecording,
+    /// No such snapshot.
+    NoSuchSnapshot,
+    /// There is one of that name.
+    RecordingExists,
+    /// As many recordings as may are under way.
+    TooManyRecordings,
+    /// The configuration names no directory for them.
+    NoPlaceForRecordings,
+    /// A bag cannot be written there.
+    StorageRefuses,
     /// The agent is about to end.
     Ending,
 }
@@ -179,6 +191,36 @@ impl Code {
                 "too-many-subscriptions",
                 StatusCode::SERVICE_UNAVAILABLE,
                 "Too many streams of messages",
+            ),
+            Self::NoSuchRecording => (
+                "no-such-recording",
+                StatusCode::NOT_FOUND,
+                "No such recording",
+            ),
+            Self::NoSuchSnapshot => (
+                "no-such-snapshot",
+                StatusCode::NOT_FOUND,
+                "No such snapshot",
+            ),
+            Self::RecordingExists => (
+                "recording-exists",
+                StatusCode::CONFLICT,
+                "There is one of that name",
+            ),
+            Self::TooManyRecordings => (
+                "too-many-recordings",
+                StatusCode::CONFLICT,
+                "No room for another recording",
+            ),
+            Self::NoPlaceForRecordings => (
+                "no-place-for-recordings",
+                StatusCode::CONFLICT,
+                "The agent has no directory for recordings",
+            ),
+            Self::StorageRefuses => (
+                "storage-refuses",
+                StatusCode::INSUFFICIENT_STORAGE,
+                "The storage does not take it",
             ),
             Self::Ending => (
                 "ending",

@@ -6,22 +6,20 @@
 use std::sync::Arc;
 
 use axum::Json;
-use axum::body::Bytes;
-use axum::extract::rejection::BytesRejection;
-use axum::extract::{DefaultBodyLimit, FromRequest, Request, State};
-use axum::http::header::{CONTENT_TYPE, LOCATION};
-use axum::http::{HeaderMap, StatusCode};
+use axum::extract::{DefaultBodyLimit, State};
+use axum::http::StatusCode;
+use axum::http::header::LOCATION;
 use axum::response::{IntoResponse, Response};
-use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use super::body::Body;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
-use super::security::{MAX_BODY, too_large};
+use super::security::MAX_BODY;
 use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern, check_trace};
 use crate::model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
 use crate::watches::{Done, Entry, Origin, Refused};
@@ -182,9 +180,6 @@ struct Domain {
     domain_id: Option<u32>,
 }
 
-/// The body, which may be missing.
-struct Settings(WatchRequest);
-
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
         .routes(routes!(list))
@@ -256,7 +251,7 @@ async fn add(
     State(context): State<Context>,
     Name(topic): Name,
     Parameters(domain): Parameters<Domain>,
-    Settings(settings): Settings,
+    Body(settings): Body<WatchRequest>,
 ) -> Result<Response, Problem> {
     let watch = watch(topic, domain, settings)?;
     let done = context.watches.add(watch.clone());
@@ -286,7 +281,7 @@ async fn replace(
     State(context): State<Context>,
     Name(topic): Name,
     Parameters(domain): Parameters<Domain>,
-    Settings(settings): Settings,
+    Body(settings): Body<WatchRequest>,
 ) -> Result<Response, Problem> {
     let watch = watch(topic, domain, settings)?;
     let done = context.watches.replace(watch.clone());
@@ -331,51 +326,6 @@ struct TopicParameter {
         example = "camera/front/image_raw"
     )]
     topic: String,
-}
-
-impl<S: Send + Sync> FromRequest<S> for Settings {
-    type Rejection = Problem;
-
-    async fn from_request(request: Request, state: &S) -> Result<Self, Problem> {
-        let is_json = is_json(request.headers());
-        let body = Bytes::from_request(request, state).await;
-        let body = body.map_err(|error| match error {
-            BytesRejection::FailedToBufferBody(error)
-                if error.status() == StatusCode::PAYLOAD_TOO_LARGE =>
-            {
-                too_large()
-            }
-            error => Problem::new(Code::MalformedRequest, error.body_text()),
-        })?;
-        if body.is_empty() {
-            return Ok(Self(WatchRequest::default()));
-        }
-        if !is_json {
-            let detail = "send the body with `Content-Type: application/json`, or none";
-            return Err(Problem::new(Code::UnsupportedMediaType, detail));
-        }
-        let problem = |error: serde_json::Error| {
-            let code = if error.is_data() {
-                Code::InvalidRequest
-            } else {
-                Code::MalformedRequest
-            };
-            Problem::new(code, format!("the body: {error}"))
-        };
-        // serde would take a list for an object.
-        if !body.trim_ascii_start().starts_with(b"{") {
-            serde_json::from_slice::<IgnoredAny>(&body).map_err(problem)?;
-            let detail = "the body must be a JSON object";
-            return Err(Problem::new(Code::InvalidRequest, detail));
-        }
-        serde_json::from_slice(&body).map(Self).map_err(problem)
-    }
-}
-
-fn is_json(headers: &HeaderMap) -> bool {
-    let media = headers.get(CONTENT_TYPE).and_then(|it| it.to_str().ok());
-    let media = media.and_then(|media| media.split(';').next());
-    media.is_some_and(|media| media.trim().eq_ignore_ascii_case("application/json"))
 }
 
 /// What is asked for, checked.

@@ -218,6 +218,53 @@ pub(in crate::surface) const SAMPLES_QUEUED: Metric = Metric::gauge(
 )
 .unit("bytes");
 
+pub(in crate::surface) const RECORDINGS: Metric = Metric::gauge(
+    "ros2probe_recordings",
+    &[],
+    "Bags that the agent is writing.",
+);
+pub(in crate::surface) const RECORDED_MESSAGES: Metric = Metric::counter(
+    "ros2probe_recorded_messages_total",
+    &[],
+    "Messages written into the agent's bags.",
+);
+pub(in crate::surface) const RECORDED_BYTES: Metric = Metric::counter(
+    "ros2probe_recorded_bytes_total",
+    &[],
+    "Bytes of those messages.",
+)
+.unit("bytes");
+pub(in crate::surface) const RECORDINGS_MISSING: Metric = Metric::counter(
+    "ros2probe_recordings_missing_messages_total",
+    &[],
+    "Messages that were sent and are in no bag although they were to be: incomplete on the wire, lost on the way, or dropped because the storage was too slow.",
+);
+pub(in crate::surface) const SNAPSHOT_MESSAGES: Metric = Metric::gauge(
+    "ros2probe_snapshot_messages",
+    &["snapshot"],
+    "Messages that a snapshot keeps in memory.",
+);
+pub(in crate::surface) const SNAPSHOT_BYTES: Metric = Metric::gauge(
+    "ros2probe_snapshot_bytes",
+    &["snapshot"],
+    "Memory that a snapshot takes, up to its max_bytes.",
+)
+.unit("bytes");
+pub(in crate::surface) const SNAPSHOT_CROWDED_OUT: Metric = Metric::counter(
+    "ros2probe_snapshot_crowded_out_messages_total",
+    &["snapshot"],
+    "Messages that were young enough for a snapshot and had to go for want of room: above 0, it is shorter than its seconds.",
+);
+pub(in crate::surface) const SNAPSHOTS_WRITTEN: Metric = Metric::counter(
+    "ros2probe_snapshots_written_total",
+    &["snapshot"],
+    "Bags written of a snapshot.",
+);
+pub(in crate::surface) const SNAPSHOTS_FAILED: Metric = Metric::counter(
+    "ros2probe_snapshots_failed_total",
+    &["snapshot"],
+    "Bags of a snapshot that could not be written.",
+);
 pub(in crate::surface) const EVENTS: Metric =
     Metric::counter("ros2probe_events_total", &["name"], "Events told, by name.");
 pub(in crate::surface) const EVENTS_DROPPED: Metric = Metric::counter(

@@ -76,6 +76,33 @@ pub enum AgentEvent {
         /// Only in this domain.
         domain_id: Option<u32>,
     },
+    /// A recording began.
+    RecordingStarted {
+        /// Its name.
+        recording: String,
+    },
+    /// It ended.
+    RecordingEnded {
+        /// Its name.
+        recording: String,
+        /// Messages in the bag.
+        messages: u64,
+        /// Messages that were sent and are not in it.
+        missing: u64,
+        /// What ended it, if nobody asked.
+        reason: Option<String>,
+    },
+    /// What came before an incident was written, or could not be.
+    SnapshotTaken {
+        /// Its name in the configuration.
+        snapshot: String,
+        /// The bag.
+        recording: String,
+        /// Messages in it.
+        messages: u64,
+        /// Why it was not written.
+        reason: Option<String>,
+    },
     /// Too many of one kind.
     Suppressed {
         /// Name of the events, or what the names have in common and `*`.
@@ -165,6 +192,9 @@ impl Happened {
                 AgentEvent::Seeing { .. } => &table::CAPTURE_SEEING,
                 AgentEvent::Reloaded { .. } => &table::CONFIG_RELOADED,
                 AgentEvent::ReloadFailed { .. } => &table::CONFIG_REFUSED,
+                AgentEvent::RecordingStarted { .. } => &table::RECORDING_STARTED,
+                AgentEvent::RecordingEnded { .. } => &table::RECORDING_ENDED,
+                AgentEvent::SnapshotTaken { .. } => &table::SNAPSHOT_TAKEN,
                 AgentEvent::WatchAdded { .. } => &table::WATCH_ADDED,
                 AgentEvent::WatchRemoved { .. } => &table::WATCH_REMOVED,
                 AgentEvent::Suppressed { .. } => &table::SUPPRESSED,
@@ -182,6 +212,10 @@ impl Happened {
                 finding,
                 Diagnosis::UnheardPublisher { .. } | Diagnosis::UnfedSubscriber { .. }
             ),
+            Self::Agent(
+                AgentEvent::RecordingEnded { reason, .. }
+                | AgentEvent::SnapshotTaken { reason, .. },
+            ) => reason.is_none(),
             _ => false,
         };
         if relieves {
@@ -408,6 +442,29 @@ fn agent(event: &AgentEvent) -> Vec<(&'static str, Option<Value>)> {
         | AgentEvent::WatchRemoved { watch, domain_id } => vec![
             ("watch", Some(text(watch))),
             ("watch_domain_id", domain_id.and_then(number)),
+        ],
+        AgentEvent::RecordingStarted { recording } => vec![("recording", Some(text(recording)))],
+        AgentEvent::RecordingEnded {
+            recording,
+            messages,
+            missing,
+            reason,
+        } => vec![
+            ("recording", Some(text(recording))),
+            ("messages", number(*messages)),
+            ("missing", number(*missing)),
+            ("reason", reason.as_deref().map(text)),
+        ],
+        AgentEvent::SnapshotTaken {
+            snapshot,
+            recording,
+            messages,
+            reason,
+        } => vec![
+            ("snapshot", Some(text(snapshot))),
+            ("recording", Some(text(recording))),
+            ("messages", number(*messages)),
+            ("reason", reason.as_deref().map(text)),
         ],
         AgentEvent::Suppressed { event, count } => {
             vec![("event", Some(text(event))), ("count", number(*count))]

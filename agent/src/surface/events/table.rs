@@ -256,6 +256,26 @@ pub(super) const CONFIG_REFUSED: Definition = Definition::new(
     &["error"],
     "A configuration was refused; the one before stays in force.",
 );
+pub(super) const RECORDING_STARTED: Definition = Definition::new(
+    "ros2probe.recording.started",
+    Severity::Info,
+    &["recording"],
+    "The agent records topics into a bag.",
+);
+pub(super) const RECORDING_ENDED: Definition = Definition::new(
+    "ros2probe.recording.ended",
+    Severity::Error,
+    &["recording", "messages", "missing", "reason"],
+    "A bag is complete; with a reason where the storage took no more.",
+)
+.relief(Severity::Info);
+pub(super) const SNAPSHOT_TAKEN: Definition = Definition::new(
+    "ros2probe.snapshot.taken",
+    Severity::Error,
+    &["snapshot", "recording", "messages", "reason"],
+    "What came before an incident is in a bag; with a reason where it could not be written.",
+)
+.relief(Severity::Info);
 pub(super) const WATCH_ADDED: Definition = Definition::new(
     "ros2probe.watch.added",
     Severity::Info,
@@ -300,6 +320,9 @@ pub const EVENTS: &[Definition] = &[
     CONFIG_REFUSED,
     WATCH_ADDED,
     WATCH_REMOVED,
+    RECORDING_STARTED,
+    RECORDING_ENDED,
+    SNAPSHOT_TAKEN,
     SUPPRESSED,
 ];
 

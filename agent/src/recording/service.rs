@@ -1,0 +1,472 @@
+//! The agent's own recordings: begun and ended by clients, each on a thread of its own, written where
+//! the configuration allows and nowhere else.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, SystemTime};
+
+use jiff::Zoned;
+use tokio::sync::Notify;
+
+use super::announced::Announced;
+use super::filter::{Asked, Filter, FilterError};
+use super::recorder::{Ended, Recorder, Sources};
+use super::report::Report;
+use super::session::{self, Order};
+use crate::bag::{self, Options, Schema, Writer};
+use crate::client::Got;
+use crate::message::Library;
+use crate::subscriptions::{
+    ChoiceError, Depth, Overflow, Refused, Request, Selection, Subscription, Subscriptions,
+};
+use crate::surface::{AgentEvent, Board};
+
+/// Recordings under way at once.
+const RECORDINGS: usize = 4;
+/// Ended ones whose report is kept.
+const ENDED: usize = 16;
+/// Longest name of a recording.
+const NAME: usize = 128;
+
+/// All recordings of an agent.
+#[derive(Debug)]
+pub struct Recordings {
+    /// Where they are written; `None` = nowhere.
+    directory: Option<PathBuf>,
+    queue_bytes: usize,
+    board: Arc<Board>,
+    subscriptions: Arc<Subscriptions>,
+    library: Arc<Library>,
+    list: Mutex<Vec<Arc<Recording>>>,
+}
+
+/// What a client wants to be recorded.
+#[derive(Debug)]
+pub struct Wanted {
+    /// Name of the directory; the time when it is left out.
+    pub name: Option<String>,
+    /// Which topics.
+    pub asked: Asked,
+    /// Of which domain.
+    pub domain_id: u32,
+    /// How it is written.
+    pub options: Options,
+    /// Begins paused.
+    pub paused: bool,
+}
+
+/// One recording.
+#[derive(Debug)]
+pub struct Recording {
+    /// Name of its directory.
+    pub name: String,
+    /// Where it lies.
+    pub directory: PathBuf,
+    /// Of which domain.
+    pub domain_id: u32,
+    /// What is recorded.
+    pub asked: Asked,
+    /// When it began.
+    pub began: SystemTime,
+    status: Mutex<Status>,
+    orders: Mutex<Sender<Order>>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+    over: Notify,
+}
+
+/// How it goes.
+#[derive(Clone, Debug, Default)]
+pub struct Status {
+    /// What it is doing.
+    pub stage: Stage,
+    /// What it has and has not.
+    pub report: Report,
+    /// Bytes of its files.
+    pub file_bytes: u64,
+    /// Files begun.
+    pub files: usize,
+    /// Why it ended, if that was not asked for.
+    pub error: Option<String>,
+}
+
+/// What a recording is doing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Stage {
+    /// Taking what comes.
+    #[default]
+    Recording,
+    /// Letting it go by.
+    Paused,
+    /// The bag is complete.
+    Ended,
+}
+
+/// Why nothing is recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum Refusal {
+    /// There is no place.
+    #[error(
+        "the agent has no place for recordings: set `recordings.directory`, or record with \
+         `rp bag record`"
+    )]
+    NoDirectory,
+    /// No name of a directory.
+    #[error("`{0}` is no name: letters, digits, `_`, `-` and `.`, not first a `.`")]
+    Name(String),
+    /// There is one of that name.
+    #[error("there is a recording `{0}` already")]
+    Exists(String),
+    /// As many as may are under way.
+    #[error("{RECORDINGS} recordings are under way, which is the limit")]
+    TooMany,
+    /// The topics.
+    #[error(transparent)]
+    Filter(#[from] FilterError),
+    /// A topic's name.
+    #[error(transparent)]
+    Choice(#[from] ChoiceError),
+    /// Too many subscriptions.
+    #[error(transparent)]
+    Subscription(#[from] Refused),
+    /// It cannot be written.
+    #[error("{reason}")]
+    Storage {
+        /// With its causes.
+        reason: String,
+    },
+}
+
+impl Recordings {
+    /// None yet. They are written below `directory`, and `queue_bytes` of each may wait for that.
+    #[must_use]
+    pub const fn new(
+        directory: Option<PathBuf>,
+        queue_bytes: usize,
+        board: Arc<Board>,
+        subscriptions: Arc<Subscriptions>,
+        library: Arc<Library>,
+    ) -> Self {
+        Self {
+            directory,
+            queue_bytes,
+            board,
+            subscriptions,
+            library,
+            list: Mutex::new(Vec::new()),
+        }
+    }
+
+    /// Begins one. The subscription is open when this returns; see [`Subscription::in_force`].
+    ///
+    /// # Errors
+    /// It cannot be.
+    pub fn begin(&self, wanted: Wanted) -> Result<Arc<Recording>, Refusal> {
+        let filter = Filter::new(wanted.asked.clone())?;
+        let (name, directory) = self.place(wanted.name)?;
+        let mut list = self.list();
+        let active = list
+            .iter()
+            .filter(|each| each.status().stage != Stage::Ended);
+        if active.count() >= RECORDINGS {
+            return Err(Refusal::TooMany);
+        }
+        let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
+        let writer = Writer::create(&directory, wanted.options);
+        let writer = writer.map_err(|error| refusal(&name, error))?;
+        let sources = self.sources(wanted.domain_id);
+        let mut recorder = Recorder::new(writer, filter, sources);
+        recorder.pause(wanted.paused);
+        let known = self.board.state();
+        for topic in &known.known().topics {
+            let covered = topic.domain_id == wanted.domain_id
+                && subscription.selection().covers(
+                    topic.kind,
+                    &topic.name,
+                    &topic.dds_name,
+                    topic.hidden,
+                );
+            if let Some(message_type) = topic.message_types.first().filter(|_| covered) {
+                let declared = recorder.declare(&topic.name, message_type);
+                declared.map_err(|error| refusal(&name, error))?;
+            }
+        }
+        let (give, orders) = channel();
+        let recording = Arc::new(Recording {
+            name,
+            directory,
+            domain_id: wanted.domain_id,
+            asked: wanted.asked,
+            began: SystemTime::now(),
+            status: Mutex::default(),
+            orders: Mutex::new(give),
+            thread: Mutex::default(),
+            over: Notify::new(),
+        });
+        self.board.events().tell(AgentEvent::RecordingStarted {
+            recording: recording.name.clone(),
+        });
+        let (worker, board) = (Arc::clone(&recording), Arc::clone(&self.board));
+        let work = move || worker.work(recorder, subscription, &orders, &board);
+        let thread = std::thread::Builder::new().name("recording".to_owned());
+        let thread = thread.spawn(work).map_err(|error| Refusal::Storage {
+            reason: format!("no thread for it: {error}"),
+        })?;
+        *recording.lock(&recording.thread) = Some(thread);
+        list.push(Arc::clone(&recording));
+        let mut surplus = list.iter().filter(|each| each.is_over()).count();
+        surplus = surplus.saturating_sub(ENDED);
+        list.retain(|each| {
+            let goes = surplus > 0 && each.is_over();
+            surplus -= usize::from(goes);
+            !goes
+        });
+        Ok(recording)
+    }
+
+    /// All of them, as they began.
+    #[must_use]
+    pub fn all(&self) -> Vec<Arc<Recording>> {
+        self.list().clone()
+    }
+
+    /// The one of this name.
+    #[must_use]
+    pub fn find(&self, name: &str) -> Option<Arc<Recording>> {
+        // The latest, should one have been deleted and begun again.
+        self.list().iter().rfind(|each| each.name == name).cloned()
+    }
+
+    /// Completes all bags, when the agent ends.
+    pub fn finish(&self) {
+        let list = self.all();
+        for recording in &list {
+            recording.order(Order::Stop);
+        }
+        for recording in list {
+            let thread = recording.lock(&recording.thread).take();
+            if let Some(thread) = thread
+                && thread.join().is_err()
+            {
+                tracing::error!(recording = recording.name, "the recording's thread failed");
+            }
+        }
+    }
+
+    /// Where the agent writes.
+    #[must_use]
+    pub fn directory(&self) -> Option<&Path> {
+        self.directory.as_deref()
+    }
+
+    /// Opens what `filter` takes, of one domain.
+    fn subscribe(
+        &self,
+        filter: &Filter,
+        domain_id: u32,
+        name: &str,
+    ) -> Result<Subscription, Refusal> {
+        self.open(filter.selection()?, domain_id, name)
+    }
+
+    /// Opens these topics of one domain.
+    pub(super) fn open(
+        &self,
+        topics: Selection,
+        domain_id: u32,
+        name: &str,
+    ) -> Result<Subscription, Refusal> {
+        Ok(self.subscriptions.open(Request {
+            topics,
+            domain_id: Some(domain_id),
+            depth: Depth::Payloads,
+            queue_bytes: self.queue_bytes,
+            overflow: Overflow::DropOldest,
+            label: format!("recording {name}"),
+        })?)
+    }
+
+    /// What the snapshot and the library know.
+    pub(super) fn sources(&self, domain_id: u32) -> Sources<'static> {
+        let (board, library) = (Arc::clone(&self.board), Arc::clone(&self.library));
+        Sources {
+            announced: Box::new(move |name| {
+                let state = board.state();
+                let mut topics = state.known().topics.iter();
+                let topic = topics.find(|topic| topic.domain_id == domain_id && topic.name == name);
+                topic.map(Announced::from).unwrap_or_default()
+            }),
+            schema: Box::new(move |name, hash| schema(&library, name, hash)),
+        }
+    }
+
+    /// Name and directory, checked.
+    pub(super) fn place(&self, name: Option<String>) -> Result<(String, PathBuf), Refusal> {
+        let Some(directory) = &self.directory else {
+            return Err(Refusal::NoDirectory);
+        };
+        let name = name.unwrap_or_else(default_name);
+        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
+        let is_name = !name.is_empty()
+            && name.len() <= NAME
+            && !name.starts_with('.')
+            && name.chars().all(plain);
+        if !is_name {
+            return Err(Refusal::Name(name.chars().take(NAME).collect()));
+        }
+        let place = directory.join(&name);
+        Ok((name, place))
+    }
+
+    fn list(&self) -> MutexGuard<'_, Vec<Arc<Recording>>> {
+        self.list.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Recording {
+    /// How it goes, at most half a second ago.
+    #[must_use]
+    pub fn status(&self) -> Status {
+        self.lock(&self.status).clone()
+    }
+
+    /// Asks for something; nothing happens where it is over.
+    pub fn order(&self, order: Order) {
+        // Nobody takes orders where it is over.
+        let _ = self.lock(&self.orders).send(order);
+    }
+
+    /// Waits until the bag is complete, but no longer than `patience`.
+    pub async fn over(&self, patience: Duration) -> bool {
+        let wait = async {
+            loop {
+                let over = self.over.notified();
+                if self.is_over() {
+                    return;
+                }
+                over.await;
+            }
+        };
+        tokio::time::timeout(patience, wait).await.is_ok()
+    }
+
+    fn is_over(&self) -> bool {
+        self.lock(&self.status).stage == Stage::Ended
+    }
+
+    fn work(
+        &self,
+        recorder: Recorder<'static>,
+        mut subscription: Subscription,
+        orders: &Receiver<Order>,
+        board: &Board,
+    ) {
+        let next = |patience| {
+            let item = subscription.next_blocking(patience);
+            Ok::<_, std::convert::Infallible>(item.map_or(Got::Nothing, Got::Item))
+        };
+        let figures = board.recordings();
+        figures.active.fetch_add(1, Ordering::Relaxed);
+        let mut counted = (0, 0, 0);
+        let mut count = |report: &Report| {
+            let now = (report.messages, report.bytes, report.missing);
+            figures.add(
+                now.0.saturating_sub(counted.0),
+                now.1.saturating_sub(counted.1),
+                now.2.saturating_sub(counted.2),
+            );
+            counted = now;
+        };
+        let (ended, _) = session::record(recorder, next, orders, |recorder| {
+            count(recorder.report());
+            self.tell(recorder);
+        });
+        count(&ended.report);
+        figures.active.fetch_sub(1, Ordering::Relaxed);
+        drop(subscription);
+        let error = ended.error.as_ref().map(causes);
+        board.events().tell(AgentEvent::RecordingEnded {
+            recording: self.name.clone(),
+            messages: ended.report.messages,
+            missing: ended.report.missing,
+            reason: error.clone(),
+        });
+        self.finish(ended, error);
+    }
+
+    fn tell(&self, recorder: &Recorder<'_>) {
+        let status = Status {
+            stage: if recorder.is_paused() {
+                Stage::Paused
+            } else {
+                Stage::Recording
+            },
+            report: recorder.report().clone(),
+            file_bytes: recorder.writer().bytes(),
+            files: recorder.writer().files(),
+            error: None,
+        };
+        *self.lock(&self.status) = status;
+    }
+
+    fn finish(&self, ended: Ended, error: Option<String>) {
+        let summary = ended.summary.as_ref();
+        let status = Status {
+            stage: Stage::Ended,
+            report: ended.report,
+            file_bytes: summary.map_or(0, |summary| summary.bytes),
+            files: summary.map_or(0, |summary| summary.files.len()),
+            error,
+        };
+        *self.lock(&self.status) = status;
+        self.over.notify_waiters();
+    }
+
+    #[expect(
+        clippy::unused_self,
+        reason = "what is behind a lock here is whole at any moment"
+    )]
+    fn lock<'a, T>(&self, mutex: &'a Mutex<T>) -> MutexGuard<'a, T> {
+        mutex.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// The definition of a type for a bag, where there is one that its hash agrees with.
+pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schema> {
+    let found = library.find(name, hash).ok()?;
+    let (encoding, text) = found.schema_text();
+    Some(Schema {
+        encoding: encoding.to_owned(),
+        text,
+    })
+}
+
+/// Local time, as rosbag2 names its directories.
+#[must_use]
+pub fn default_name() -> String {
+    Zoned::now()
+        .strftime("rosbag2_%Y_%m_%d-%H_%M_%S")
+        .to_string()
+}
+
+pub(super) fn refusal(name: &str, error: bag::Error) -> Refusal {
+    match error {
+        bag::Error::Exists(_) => Refusal::Exists(name.to_owned()),
+        error => Refusal::Storage {
+            reason: causes(&error),
+        },
+    }
+}
+
+/// An error with its causes.
+pub(super) fn causes(error: &bag::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = std::error::Error::source(error);
+    while let Some(next) = cause {
+        text.push_str(&format!(": {next}"));
+        cause = next.source();
+    }
+    text
+}

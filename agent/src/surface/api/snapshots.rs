@@ -1,0 +1,138 @@
+//! `/snapshots`: the last seconds of topics, written when a client asks for it.
+
+use axum::Json;
+use axum::extract::{Path, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::problem::{Code, Problem, ProblemBody};
+use crate::surface::SnapshotFigures;
+
+/// All snapshots.
+#[derive(Debug, Serialize, ToSchema)]
+struct SnapshotList {
+    /// In the configuration's order.
+    snapshots: Vec<SnapshotView>,
+}
+
+/// What is kept of some topics.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Snapshot)]
+struct SnapshotView {
+    /// Its name in the configuration.
+    name: String,
+    /// Names and globs.
+    topics: Vec<String>,
+    /// Their domain.
+    domain_id: u32,
+    /// How much is kept at most.
+    seconds: u64,
+    /// How much memory that may take.
+    max_bytes: usize,
+    /// Whether it is written when an expectation is violated.
+    on_violation: bool,
+    /// Messages in memory.
+    messages: u64,
+    /// Memory they take.
+    bytes: u64,
+    /// Messages that were young enough and had to go for want of room.
+    crowded_out: u64,
+    /// Bags written so far.
+    written: u64,
+    /// Bags that could not be.
+    failed: u64,
+}
+
+/// A bag of a snapshot.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = WrittenSnapshot)]
+struct WrittenView {
+    /// Name of its directory.
+    name: String,
+    /// Where it lies on the robot.
+    directory: String,
+    /// Messages in it.
+    messages: u64,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new()
+        .routes(routes!(list))
+        .routes(routes!(write))
+}
+
+/// All snapshots
+#[utoipa::path(
+    get,
+    path = "/snapshots",
+    tag = "recordings",
+    responses((status = 200, description = "Those of the configuration.", body = SnapshotList))
+)]
+async fn list(State(context): State<Context>) -> Json<SnapshotList> {
+    let figures = context.board.recordings().snapshots();
+    let snapshots = context.snapshots.settings().map(|settings| {
+        let known = figures.iter().find(|(name, _)| *name == settings.name);
+        let SnapshotFigures {
+            messages,
+            bytes,
+            crowded_out,
+            written,
+            failed,
+        } = known.map_or_else(SnapshotFigures::default, |(_, figures)| *figures);
+        SnapshotView {
+            name: settings.name.clone(),
+            topics: settings.topics.clone(),
+            domain_id: settings.domain_id,
+            seconds: settings.span.as_secs(),
+            max_bytes: settings.max_bytes,
+            on_violation: settings.on_violation,
+            messages,
+            bytes,
+            crowded_out,
+            written,
+            failed,
+        }
+    });
+    Json(SnapshotList {
+        snapshots: snapshots.collect(),
+    })
+}
+
+/// Write what a snapshot keeps
+///
+/// What was in memory is in a bag when this answers; memory begins anew.
+#[utoipa::path(
+    post,
+    path = "/snapshots/{name}",
+    tag = "recordings",
+    params(("name" = String, Path, description = "Its name.")),
+    responses(
+        (status = 201, description = "The bag.", body = WrittenView),
+        (status = 404, description = "The configuration has none of that name.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 507, description = "It could not be written, and is still in memory.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn write(
+    State(context): State<Context>,
+    Path(name): Path<String>,
+) -> Result<Response, Problem> {
+    let Some(written) = context.snapshots.write(&name).await else {
+        let name: String = name.chars().take(64).collect();
+        let detail = format!("there is no snapshot `{name}`; GET /snapshots lists them");
+        return Err(Problem::new(Code::NoSuchSnapshot, detail));
+    };
+    let written = written.map_err(|reason| Problem::new(Code::StorageRefuses, reason))?;
+    let view = WrittenView {
+        name: written.name,
+        directory: written.directory.display().to_string(),
+        messages: written.messages,
+    };
+    Ok((StatusCode::CREATED, Json(view)).into_response())
+}

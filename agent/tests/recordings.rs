@@ -1,0 +1,230 @@
+//! Bags that the agent writes, asked for over its API: begun, paused, split and ended; and the last
+//! seconds before an expectation was violated.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test may panic"
+)]
+
+mod local_agent;
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use local_agent::{Answer, LocalAgent, PATIENCE};
+use serde_json::Value;
+
+/// An agent that may write bags, and replays slowly.
+fn agent(directory: &Path, more: &str) -> LocalAgent {
+    let configuration = directory.join("ros2probe.yaml");
+    let bags = directory.join("bags");
+    let text = format!("recordings:\n  directory: {}\n{more}", bags.display());
+    std::fs::write(&configuration, text).unwrap();
+    LocalAgent::start(&[
+        "--speed",
+        "0.5",
+        "--config",
+        configuration.to_str().unwrap(),
+    ])
+}
+
+fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
+    let stream = std::net::TcpStream::connect(api).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let length = body.len();
+    let head = format!(
+        "{method} {path} HTTP/1.1\r\nHost: {api}\r\nContent-Type: application/json\r\n\
+         Content-Length: {length}\r\n"
+    );
+    let Answer { status, body, .. } = local_agent::exchange(stream, &head, body);
+    let body = serde_json::from_str(&body).unwrap_or_else(|error| panic!("{error}: {body}"));
+    (status, body)
+}
+
+/// Asks for the recording until it is as wanted.
+fn wait_for(api: SocketAddr, name: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let (status, recording) = ask(api, "GET", &format!("/recordings/{name}"), "");
+        if status == 200 && wanted(&recording) {
+            return recording;
+        }
+        assert!(Instant::now() < deadline, "{recording}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Sequence numbers in a bag, by topic.
+fn messages(directory: &Path) -> BTreeMap<String, Vec<u32>> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(directory)
+        .unwrap()
+        .map(|file| file.unwrap().path())
+        .filter(|path| {
+            path.extension()
+                .is_some_and(|extension| extension == "mcap")
+        })
+        .collect();
+    files.sort();
+    let mut found = BTreeMap::<_, Vec<_>>::new();
+    for file in files {
+        let bytes = std::fs::read(file).unwrap();
+        for message in mcap::MessageStream::new(&bytes).unwrap() {
+            let message = message.unwrap();
+            let topic = message.channel.topic.clone();
+            found.entry(topic).or_default().push(message.sequence);
+        }
+    }
+    found
+}
+
+#[test]
+fn a_headless_robot_is_told_to_record_and_tells_what_it_has() {
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(directory.path(), "");
+    let api = agent.api;
+
+    let (status, begun) = ask(api, "POST", "/recordings", r#"{"name": "drive"}"#);
+    assert_eq!(
+        (status, &begun["name"]),
+        (201, &Value::from("drive")),
+        "{begun}"
+    );
+    assert_eq!(begun["topics"]["all_topics"], true);
+    let (status, again) = ask(api, "POST", "/recordings", r#"{"name": "drive"}"#);
+    assert_eq!(status, 409, "{again}");
+    let of = |recording: &Value, key: &str| recording["report"][key].as_u64().unwrap();
+    wait_for(api, "drive", |recording| of(recording, "messages") > 5);
+
+    assert_eq!(ask(api, "POST", "/recordings/drive/split", "").0, 202);
+    assert_eq!(ask(api, "POST", "/recordings/drive/pause", "").0, 202);
+    let paused = wait_for(api, "drive", |recording| recording["state"] == "paused");
+    let held = of(&paused, "messages");
+    let resumed = |recording: &Value| {
+        let topics = recording["report"]["topics"].as_object().unwrap();
+        topics
+            .values()
+            .any(|topic| topic["paused"].as_u64() > Some(2))
+    };
+    let paused = wait_for(api, "drive", resumed);
+    assert_eq!(of(&paused, "messages"), held);
+    assert_eq!(ask(api, "POST", "/recordings/drive/resume", "").0, 202);
+    wait_for(api, "drive", |recording| {
+        of(recording, "messages") > held + 3
+    });
+
+    agent.wait_for_metric("ros2probe_recordings", |count| count == 1.0);
+    let (status, ended) = ask(api, "DELETE", "/recordings/drive", "");
+    assert_eq!(
+        (status, &ended["state"]),
+        (200, &Value::from("ended")),
+        "{ended}"
+    );
+    assert_eq!((of(&ended, "missing"), &ended["error"]), (0, &Value::Null));
+    let messages = messages(&directory.path().join("bags/drive"));
+    let counted = messages.values().map(Vec::len).sum::<usize>() as u64;
+    assert_eq!(
+        (counted, ended["files"].as_u64().unwrap() >= 2),
+        (of(&ended, "messages"), true)
+    );
+    for (topic, numbers) in &messages {
+        let mut sorted = numbers.clone();
+        sorted.sort_unstable();
+        sorted.dedup();
+        // The capture has one publisher for each topic.
+        assert_eq!(&sorted, numbers, "{topic}");
+    }
+    let recorded = |count| count == counted as f64;
+    agent.wait_for_metric("ros2probe_recorded_messages_total", recorded);
+    let events = local_agent::request(api, "GET", "/events?after=0&follow=false", "").body;
+    assert!(events.contains("ros2probe.recording.started") && events.contains(r#""missing":0"#));
+    // Asked again, nothing more happens.
+    assert_eq!(ask(api, "DELETE", "/recordings/drive", "").0, 200);
+}
+
+#[test]
+fn a_recording_that_cannot_be_is_refused_and_leaves_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(directory.path(), "");
+    let long = "x".repeat(129);
+    for body in [
+        r#"{"name": "../escape"}"#,
+        r#"{"name": ""}"#,
+        r#"{"name": ".hidden"}"#,
+        r#"{"name": "a/b"}"#,
+        &format!(r#"{{"name": "{long}"}}"#),
+        r#"{"topics": {"topics": ["chatter"]}}"#,
+        r#"{"topics": {"regex": "("}}"#,
+        r#"{"topics": {"exclude_regex": "x"}}"#,
+        r#"{"storage_preset_profile": "fastest"}"#,
+        r#"{"file_compression": "gzip"}"#,
+        r#"{"max_bag_size": 5}"#,
+        r#"{"domain_id": 300}"#,
+        r#"{"no_such_key": 1}"#,
+    ] {
+        let (status, problem) = ask(agent.api, "POST", "/recordings", body);
+        assert_eq!(status, 422, "{body}: {problem}");
+        assert_eq!(
+            problem["type"], "urn:ros2probe:problem:invalid-request",
+            "{body}"
+        );
+    }
+    assert!(!directory.path().join("bags").exists());
+    assert!(!directory.path().join("escape").exists());
+    for path in ["/recordings/none", "/recordings/..%2F", "/snapshots"] {
+        let (status, _) = ask(agent.api, "GET", path, "");
+        assert_eq!(
+            status,
+            if path == "/snapshots" { 200 } else { 404 },
+            "{path}"
+        );
+    }
+    assert_eq!(ask(agent.api, "POST", "/snapshots/none", "").0, 404);
+    drop(agent);
+
+    let nowhere = LocalAgent::start(&["--speed", "0.5"]);
+    let (status, problem) = ask(nowhere.api, "POST", "/recordings", "{}");
+    assert_eq!(status, 409, "{problem}");
+    assert!(
+        problem["detail"]
+            .as_str()
+            .unwrap()
+            .contains("recordings.directory")
+    );
+}
+
+#[test]
+fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
+    let directory = tempfile::tempdir().unwrap();
+    let more = "  snapshots:\n    - {name: incident, topics: ['/**'], seconds: 5}\n\
+                watch: [{topic: '/**', min_rate_hz: 1000000}]\n";
+    let agent = agent(directory.path(), more);
+    agent.wait_for_metric(
+        r#"ros2probe_snapshots_written_total{snapshot="incident"}"#,
+        |count| count >= 1.0,
+    );
+    let bags = directory.path().join("bags");
+    let bag = std::fs::read_dir(&bags).unwrap().next().unwrap().unwrap();
+    assert!(
+        bag.file_name()
+            .to_str()
+            .unwrap()
+            .starts_with("incident_rosbag2_")
+    );
+    assert!(!messages(&bag.path()).is_empty());
+    let events = local_agent::request(agent.api, "GET", "/events?after=0&follow=false", "").body;
+    assert!(events.contains("ros2probe.snapshot.taken"), "{events}");
+
+    // What came since then, for a client that asks; at the same second names would collide.
+    std::thread::sleep(Duration::from_millis(1100));
+    let (status, written) = ask(agent.api, "POST", "/snapshots/incident", "");
+    assert_eq!(status, 201, "{written}");
+    let path = Path::new(written["directory"].as_str().unwrap());
+    let count: usize = messages(path).values().map(Vec::len).sum();
+    assert_eq!(written["messages"], count as u64);
+    let (_, list) = ask(agent.api, "GET", "/snapshots", "");
+    assert_eq!(list["snapshots"][0]["written"], 2, "{list}");
+    assert_eq!(list["snapshots"][0]["failed"], 0, "{list}");
+}
