@@ -8,6 +8,8 @@
 
 #[path = "bags/cut.rs"]
 mod cut;
+#[path = "bags/full.rs"]
+mod full;
 #[path = "bags/real.rs"]
 mod real;
 
