@@ -1,5 +1,5 @@
 //! How fast bags are written: bytes of messages a second, for each preset.
-#![allow(clippy::unwrap_used, reason = "a benchmark may panic")]
+#![expect(clippy::unwrap_used, reason = "a benchmark may panic")]
 
 use std::collections::BTreeMap;
 use std::hint::black_box;
@@ -51,10 +51,8 @@ fn create(directory: &Path, storage: Storage) -> (Writer, TopicId) {
 
 fn write(c: &mut Criterion) {
     let clouds = (cloud(), CLOUDS);
-    let small = (
-        cloud().split_off(4 + 4096).split_off(2_000_000)[..324].to_vec(),
-        100_000,
-    );
+    let imu: Vec<u8> = cloud().into_iter().take(324).collect();
+    let small = (imu, 100_000);
     let lz4 = Storage {
         compression: Compression::Lz4,
         ..Storage::default()

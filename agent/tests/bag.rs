@@ -6,12 +6,17 @@
     reason = "a test that meets the unexpected has failed"
 )]
 
+#[path = "bags/captures.rs"]
+mod captures;
 #[path = "bags/cut.rs"]
 mod cut;
 #[path = "bags/full.rs"]
 mod full;
 #[path = "bags/real.rs"]
 mod real;
+#[path = "fixtures/truth.rs"]
+#[allow(dead_code, reason = "each test file uses its own part")]
+mod truth;
 
 use std::collections::BTreeMap;
 use std::fs;

@@ -10,6 +10,7 @@ use ros2probe::bag::info::{self, Sort};
 use ros2probe::bag::reindex::{self, Found};
 use ros2probe::ros2::Dialect;
 
+use super::convert::Convert;
 use super::interrupt::INTERRUPTED;
 use super::record::Record;
 use super::{Arguments, Output, Said};
@@ -25,6 +26,8 @@ pub(crate) struct Bag {
 enum Verb {
     /// Record messages into a bag
     Record(Box<Record>),
+    /// Make a bag of a capture
+    Convert(Box<Convert>),
     /// Print information about a bag
     Info(Info),
     /// Make a bag whole again: files that were never finished, and metadata.yaml
@@ -75,7 +78,7 @@ impl Bag {
     /// With which code Ctrl-C ends it at once; a recording is completed first.
     pub(crate) const fn interrupted(&self) -> Option<u8> {
         match self.verb {
-            Some(Verb::Record(_)) => None,
+            Some(Verb::Record(_) | Verb::Convert(_)) => None,
             _ => Some(INTERRUPTED),
         }
     }
@@ -84,6 +87,7 @@ impl Bag {
         match self.verb {
             None => super::help(&["bag"]),
             Some(Verb::Record(record)) => record.ask(),
+            Some(Verb::Convert(convert)) => convert.ask(),
             Some(Verb::Info(info)) => info.ask(),
             Some(Verb::Reindex(reindex)) => reindex.ask(),
         }

@@ -3,6 +3,7 @@
 
 mod action;
 mod bag;
+mod convert;
 mod discover;
 mod doctor;
 mod echo;

@@ -163,6 +163,21 @@ struct Unused {
 struct Keys(Termios);
 
 impl Record {
+    /// As `rp bag convert` means it: this capture into this bag, all topics unless some are chosen.
+    pub(crate) fn of_capture(mut self, capture: PathBuf, bag: PathBuf) -> Self {
+        self.all |= self.positional.is_empty()
+            && self.topics.is_empty()
+            && self.services.is_empty()
+            && self.topic_types.is_empty()
+            && self.regex.is_none()
+            && !self.all_topics
+            && !self.all_services;
+        (self.target.host, self.target.socket) = (None, None);
+        self.target.replay = Some(capture);
+        self.output = Some(bag);
+        self
+    }
+
     pub(crate) fn ask(self) -> Result<ExitCode> {
         let dialect = self.target.dialect();
         let filter = Filter::new(self.asked(dialect)?).map_err(|error| refused(&error))?;
