@@ -56,17 +56,20 @@ fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<
     let all = start("hz --all")?;
     let bandwidth = start("bw /imu")?;
     let delay = start("delay /imu")?;
+    open(&agent, 10)?;
     publisher.go()?;
 
     killed.prints("=====")?;
     killed.child.kill()?;
     killed.child.wait()?;
+    open(&agent, 9)?;
     for (client, code) in &mut ended {
         client.reports(3)?;
         let status = client.interrupt()?;
         ensure!(status == Some(*code), "{}: {status:?}", client.name);
     }
     piped_into_head(&socket)?;
+    open(&agent, 4)?;
 
     // The busier the machine, the longer until single delays no longer show.
     wait_until("the rate is said", || {
@@ -210,6 +213,15 @@ fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
         std::thread::sleep(Duration::from_secs(2));
         Ok(counted()? <= before)
     })
+}
+
+/// So many subscriptions are open.
+fn open(agent: &Agent<'_>, wanted: u32) -> Result<()> {
+    let what = format!("{wanted} subscriptions open");
+    let page = agent.scrape_until(&what, |page| {
+        page.value("ros2probe_subscriptions", &[]) == Some(f64::from(wanted))
+    });
+    page.map(drop)
 }
 
 /// Ends when its reader has gone, without a word, as any program does.
