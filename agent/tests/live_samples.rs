@@ -5,6 +5,7 @@
 mod harness;
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::io::Write as _;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -15,6 +16,8 @@ use anyhow::{Context as _, Result, bail, ensure};
 use harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
+use harness::process::Process;
+use harness::usage::Usage;
 use ros2probe::client;
 use ros2probe::client::{Lines, Next};
 use ros2probe::subscriptions::line::{Line, MissedFacts, SampleFacts};
@@ -204,6 +207,11 @@ fn next(lines: &mut Lines<'_>) -> Result<Option<News>> {
     }
 }
 
+/// The binary under test, or another build of it.
+fn program() -> OsString {
+    std::env::var_os("ROS2PROBE_TESTED").unwrap_or_else(|| env!("CARGO_BIN_EXE_rp").into())
+}
+
 struct Observed<'a> {
     agent: Agent<'a>,
     socket: PathBuf,
@@ -218,7 +226,7 @@ impl<'a> Observed<'a> {
         let text = format!("{source}watch: []\napi: {{socket: {}}}\n", socket.display());
         std::fs::write(&configuration, text)?;
         Ok(Self {
-            agent: Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)?,
+            agent: Agent::start(host, program(), &configuration)?,
             socket,
             _directory: directory,
         })
@@ -325,4 +333,86 @@ impl Drop for Reader {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
+}
+
+/// What passes by shared memory is read in the process that sends it, whole.
+#[test]
+fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
+    let host = Namespace::alone()?;
+    let script = "mount -t tmpfs -o size=64m,mode=1777 shm /dev/shm && echo ready && exec cat";
+    let arguments = ["--mount", "sh", "-c", script];
+    let mut keeper = Process::start(&host.on_network(), "unshare", arguments)?;
+    keeper.wait_for("ready", PATIENCE)?;
+    let mut enter = host.on_network();
+    let mounts = format!("--mount=/proc/{}/ns/mnt", keeper.pid());
+    enter.extend(["nsenter".to_owned(), mounts]);
+
+    let cgroup = host.cgroup().display();
+    let exact = format!("capture: {{source: host, cgroup: {cgroup}, shm: {{exact: uprobe}}}}\n");
+    let observed = Observed::start(&host, &exact)?;
+    let stream = Stream {
+        reliable: true,
+        shares_memory: true,
+        ..Stream::point_cloud(60_000, 40)
+    };
+    let launch = |role, node| Peer::launch_behind(&enter, Stack::Fast, role, &stream, &[node]);
+    let mut subscriber = launch(Role::Subscriber, "/listener")?;
+    subscriber.wait_ready()?;
+    let mut publisher = launch(Role::Publisher, "/sensor")?;
+    publisher.wait_ready()?;
+    publisher.wait_matched()?;
+    subscriber.wait_matched()?;
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    publisher.go()?;
+    let pattern: Vec<u8> = (8..stream.size).map(pattern).collect();
+    for number in 0..stream.count {
+        match next(&mut lines)?.context("the stream ended")? {
+            News::Sample(_, payload) => ensure!(check(&payload, &pattern)? == number),
+            News::Missed(missed) => bail!("{number}: {missed:?}"),
+        }
+    }
+    Ok(())
+}
+
+/// What `BENCHMARKS.md` says of streams: `cargo test --release --test live_samples -- --ignored
+/// --nocapture`.
+#[test]
+#[ignore = "takes two minutes and a quiet machine to mean anything"]
+fn what_a_stream_of_point_clouds_costs() -> Result<()> {
+    const WINDOW: Duration = Duration::from_secs(20);
+    for (stack, rate) in [
+        (Stack::Cyclone, 20.0),
+        (Stack::Fast, 20.0),
+        (Stack::Cyclone, 37.0),
+        (Stack::Fast, 37.0),
+    ] {
+        let link = Link::new()?;
+        let observed = Observed::start(&link.robot, &at_the_sockets_of(&link.robot))?;
+        let stream = Stream {
+            rate,
+            ..Stream::point_cloud(2_720_000, (rate * 24.0) as u64)
+        };
+        let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
+        let client = observed.client()?;
+        drop(open(&client, "topic=/points", "/points")?);
+        let _reader = Reader::start(&observed.socket, "/samples?topic=/points&payload=true")?;
+        publisher.go()?;
+        std::thread::sleep(Duration::from_secs(2));
+        let before = Usage::of(observed.agent.process.pid())?;
+        std::thread::sleep(WINDOW);
+        let used = Usage::of(observed.agent.process.pid())?.since(&before);
+        publisher.wait_sent(PATIENCE)?;
+        let label = [("topic", "/points")];
+        let page = observed.agent.settled_scrape("/points", stream.count)?;
+        println!(
+            "{stack:?} 2.72 MB @ {rate} Hz: agent {:.2} s CPU in {WINDOW:?}, PSS {:.1} MB, counted {} of {}, {}",
+            used.cpu.as_secs_f64(),
+            used.pss as f64 / 1e6,
+            page.sum("ros2_topic_messages_total", &label),
+            stream.count,
+            page.doubts(),
+        );
+    }
+    Ok(())
 }

@@ -14,6 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::capture::live::{CaptureError, LiveSource};
 use crate::capture::pcap::PcapError;
+use crate::capture::system::give_back_memory;
 use crate::model::observer::Observer;
 use crate::model::snapshot::Snapshot;
 use crate::state::Keeper;
@@ -181,6 +182,10 @@ impl Run {
             self.observer.set_wishes(Arc::clone(&wishes));
             self.tell_interest();
             self.subscriptions.in_force(&wishes);
+            if wishes.is_empty() {
+                // Those of large messages are gone, and it may be long until somebody asks again.
+                give_back_memory();
+            }
         }
     }
 
