@@ -10,12 +10,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, anyhow, bail};
 use clap::Args;
-use jiff::Zoned;
-use ros2probe::bag::{self, Form, Options, Schema, Storage, Writer};
+use ros2probe::bag::{self, Form, Options, Storage, Writer};
 use ros2probe::client::{Agent, Samples, Target, encoded};
 use ros2probe::message::{Library, Sources as Places};
 use ros2probe::recording::{
-    Announced, Asked, Ended, Filter, Order, Recorder, Ring, Sources, record,
+    Announced, Asked, Ended, Filter, Order, Recorder, Ring, Sources, default_name, record, schema,
 };
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::name::full_name;
@@ -436,25 +435,9 @@ fn announced(agent: &Agent, domain_id: u32, name: &str) -> Announced {
     agent.get(&path).unwrap_or_default()
 }
 
-fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schema> {
-    let found = library.find(name, hash).ok()?;
-    let (encoding, text) = found.schema_text();
-    Some(Schema {
-        encoding: encoding.to_owned(),
-        text,
-    })
-}
-
 /// Whose distribution this is, as far as the shell says.
 fn installed() -> String {
     std::env::var("ROS_DISTRO").unwrap_or_default()
-}
-
-/// Local time, as the original names its directories.
-fn default_name() -> String {
-    Zoned::now()
-        .strftime("rosbag2_%Y_%m_%d-%H_%M_%S")
-        .to_string()
 }
 
 /// A line as the original logs it.
