@@ -1,5 +1,10 @@
 //! `rp doctor`: the real binary as root and as nobody, without an agent and with one on a replay.
-#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test may panic"
+)]
 
 mod local_agent;
 
