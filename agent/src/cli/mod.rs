@@ -146,8 +146,8 @@ mod tests {
         let mut root = Arguments::command();
         root.build();
         for (verb, names) in options {
-            let words = verb.split(' ');
-            let found = words.fold(Some(&root), |found, word| found?.find_subcommand(word));
+            let mut words = verb.split(' ');
+            let found = words.try_fold(&root, |command, word| command.find_subcommand(word));
             let command = found.unwrap_or_else(|| panic!("there is no `rp {verb}`"));
             for name in names {
                 let is_called = |argument: &clap::Arg| match name.strip_prefix("--") {
