@@ -179,3 +179,48 @@ fn only_messages_that_pass_the_filter_are_timed() {
         hz(&[]).starts_with("average rate: 200.0") || hz(&[]).starts_with("average rate: 199.9")
     );
 }
+
+/// Goals of order 4 in three recordings; Jazzy announces type hashes.
+#[test]
+fn an_action_tells_feedback_and_states_with_every_middleware() {
+    let directory = tempfile::tempdir().unwrap();
+    let place = directory.path().join("example_interfaces/action");
+    std::fs::create_dir_all(&place).unwrap();
+    let another = "int64 order\n---\nint64 sum\n---\nint64 sum\n";
+    std::fs::write(place.join("Fibonacci.action"), another).unwrap();
+    let definitions = ["--definitions", directory.path().to_str().unwrap()];
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
+    for software in ["cyclonedds", "fastrtps-udp", "jazzy-cyclonedds"] {
+        let capture = data.join(software).join("lifecycle-2ns/capture.pcap.gz");
+        let command = ["action", "echo", "/robot1/fibonacci", "--csv", "--replay"];
+        let arguments = [&command[..], &[capture.to_str().unwrap()]].concat();
+        let output = run(&arguments);
+        assert_eq!(stderr(&output), "", "{software}");
+        let said = stdout(&output);
+        let lines: Vec<&str> = said.lines().collect();
+        let of = |part: &str| -> Vec<&str> {
+            let pairs = lines.chunks_exact(2);
+            pairs
+                .filter(|pair| pair[0] == format!("interface: {part}"))
+                .map(|pair| pair[1])
+                .collect()
+        };
+        let feedback = of("FEEDBACK_TOPIC");
+        let sequences = [",0,1,1", ",0,1,1,2", ",0,1,1,2,3", ",0,1,1,2,3,5"];
+        assert_eq!(feedback.len(), sequences.len(), "{software}: {said}");
+        for (line, sequence) in feedback.iter().zip(sequences) {
+            let goal = line.strip_suffix(sequence).unwrap();
+            assert_eq!(goal.split(',').count(), 16, "{line}");
+        }
+        let states: Vec<_> = of("STATUS_TOPIC")
+            .iter()
+            .map(|line| line.rsplit(',').next().unwrap().to_owned())
+            .collect();
+        assert_eq!(states, ["2", "4"], "executing, succeeded");
+        // Another definition of the name is not used where the announced hash is not its own.
+        if software == "jazzy-cyclonedds" {
+            let again = run(&[&arguments[..], &definitions].concat());
+            assert_eq!((stdout(&again), stderr(&again).as_str()), (said, ""));
+        }
+    }
+}
