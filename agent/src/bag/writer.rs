@@ -7,7 +7,7 @@
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File, OpenOptions};
-use std::io::Write as _;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use ros2probe_wire::Timestamp;
@@ -301,6 +301,26 @@ impl Writer {
         self.write_metadata_file()
     }
 
+    /// Hands over what waits, or gives it up where the storage takes no more: from then on
+    /// [`Self::unwritten`] is what is lost.
+    pub fn settle(&mut self) {
+        let full = matches!(
+            self.current.as_mut().map(FileWriter::flush),
+            Some(Err(error)) if is_full(&error)
+        );
+        if full {
+            self.give_up_waiting();
+        }
+    }
+
+    /// Messages that were taken and given up, by topic.
+    pub fn unwritten(&self) -> impl Iterator<Item = (&str, u64)> {
+        self.topics.iter().filter_map(|topic| {
+            let messages = self.unwritten.get(&topic.channel_id)?;
+            Some((topic.description.name.as_str(), *messages))
+        })
+    }
+
     /// Completes the bag. `custom_data` stands in metadata.yaml and in the last file: what was lost
     /// or left out belongs there. Where the storage takes no more, what waits is given up, counted in
     /// the summary, and the file completed in the room that was kept for that.
@@ -323,7 +343,7 @@ impl Writer {
             self.compressed(&done)?;
         }
         match self.write_metadata_file() {
-            Err(error) if refused.is_none() => return Err(error),
+            Err(error) if refused.is_none() && self.unwritten.is_empty() => return Err(error),
             _ => {}
         }
         Ok(self.summary())
@@ -551,6 +571,11 @@ impl Writer {
             topics: topics.collect(),
         }
     }
+}
+
+fn is_full(error: &io::Error) -> bool {
+    use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
+    matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
 }
 
 impl FileCompression {

@@ -216,14 +216,22 @@ impl<'a> Recorder<'a> {
     #[must_use]
     pub fn finish(mut self, error: Option<Error>) -> Ended {
         self.note_what_was_sent_before();
+        // Before the report goes into the bag.
+        self.writer.settle();
+        let mut unwritten: HashMap<String, u64> = HashMap::new();
+        for (topic, messages) in self.writer.unwritten() {
+            self.report.unwritten(topic, messages);
+            unwritten.insert(topic.to_owned(), messages);
+        }
         let closed = self.writer.close(self.report.custom_data());
         let (summary, close_error) = match closed {
             Ok(summary) => (Some(summary), None),
             Err(error) => (None, Some(error)),
         };
         for topic in summary.iter().flat_map(|summary| &summary.topics) {
-            if topic.unwritten > 0 {
-                self.report.unwritten(&topic.name, topic.unwritten);
+            let known = unwritten.get(&topic.name).copied().unwrap_or(0);
+            if topic.unwritten > known {
+                self.report.unwritten(&topic.name, topic.unwritten - known);
             }
         }
         Ended {
