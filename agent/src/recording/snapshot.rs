@@ -230,7 +230,15 @@ impl Keeper {
 
     /// What is kept, in a bag of its own; it stays in memory where that fails.
     fn bag(&mut self) -> (String, Result<Written, String>) {
-        let wanted = format!("{}_{}", self.settings.name, default_name());
+        let base = format!("{}_{}", self.settings.name, default_name());
+        let mut wanted = base.clone();
+        let directory = self.recordings.directory();
+        let mut copies = 1;
+        while directory.is_some_and(|directory| directory.join(&wanted).exists()) {
+            // Another one in the same second.
+            copies += 1;
+            wanted = format!("{base}_{copies}");
+        }
         let (name, directory) = match self.recordings.place(Some(wanted.clone())) {
             Ok(place) => place,
             Err(refusal) => return (wanted, Err(refusal.to_string())),
