@@ -9,7 +9,7 @@ use std::fs::{self, File};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{PoisonError, RwLock};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
@@ -27,16 +27,18 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Two lidars of 13 MB/s each, and small topics.
 const CLOUD: usize = 644_000;
 const CLOUDS: u64 = 40;
+/// What fills a small disk.
+const SCAN: usize = 64_000;
 const SMALL: u64 = 600;
 /// Between a message and its way into the file: a second, and what a busy machine needs besides.
 const UNFLUSHED: Duration = Duration::from_secs(5);
 
-/// One after the other: they keep the machine busy.
-static TURN: Mutex<()> = Mutex::new(());
+/// Point clouds take the machine for themselves.
+static MACHINE: RwLock<()> = RwLock::new(());
 
 #[test]
 fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let _alone = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
     let robot = Robot::start(&host, "watch: ['/**']\n", &host.on_network())?;
     let streams = [
@@ -189,7 +191,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
 
 #[test]
 fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<()> {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
     let settings = "watch: [{topic: /imu, max_silence_s: 4}]\n\
                     recordings: {snapshots: [{name: incident, topics: [/imu], seconds: 10}]}\n";
@@ -312,14 +314,14 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
 
 #[test]
 fn a_storage_that_takes_no_more_ends_a_recording_in_order() -> Result<()> {
-    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
     // A disk of 4 MB that only the agent has.
     let mut enter = host.on_network();
     let script = r#"mount -t tmpfs -o size=4m none "$0" && exec "$@""#;
     enter.extend(["unshare", "--mount", "sh", "-c", script].map(str::to_owned));
     let robot = Robot::start_on_disk(&host, "watch: []\n", enter)?;
-    let stream = Stream::point_cloud(64_000, 1_000_000);
+    let stream = Stream::point_cloud(SCAN, 1_000_000);
     let (mut lidar, _subscriber) = robot.pair(&stream)?;
     lidar.go()?;
 
@@ -621,6 +623,7 @@ fn whole(bag: &Path, report: &Value) -> Result<()> {
         "{} in the bag: {report:#}",
         recorded.len()
     );
+    ensure!(report["bytes"] == recorded.len() * SCAN, "{report:#}");
     // Without a gap, but for what is said to be missing.
     ensure!(
         span(&recorded)? <= recorded.len() as u64 + missing(report, "/points"),

@@ -203,13 +203,20 @@ impl FileWriter {
         Ok(())
     }
 
-    /// Forgets what is not in the file, and says how many messages of which channel that was.
-    pub(super) fn discard(&mut self) -> BTreeMap<u16, u64> {
+    /// Forgets what is not in the file, and says how many messages of which channel that was, and
+    /// how many bytes those had.
+    pub(super) fn discard(&mut self) -> BTreeMap<u16, (u64, u64)> {
         let pending = std::mem::take(&mut self.pending);
-        let counts = pending.index.into_iter();
-        counts
-            .map(|(channel, index)| (channel, index.len() as u64))
-            .collect()
+        let length = |offset: u64| {
+            let records = pending.records.get(usize::try_from(offset).ok()?..)?;
+            let (_, content, _) = mcap::next_record(records)?;
+            Some(Message::read(content)?.data.len() as u64)
+        };
+        let counts = pending.index.iter().map(|(channel, index)| {
+            let lengths = index.iter().filter_map(|(_, offset)| length(*offset));
+            (*channel, (index.len() as u64, lengths.sum()))
+        });
+        counts.collect()
     }
 
     /// Writes summary and footer. `channels` are all that are known, also without messages.

@@ -64,8 +64,8 @@ pub struct Writer {
     current: Option<FileWriter>,
     /// Files that wait to be compressed.
     uncompressed: Vec<FileCompression>,
-    /// Taken, but never in a file.
-    unwritten: BTreeMap<u16, u64>,
+    /// Taken, but never in a file: messages and bytes of each channel.
+    unwritten: BTreeMap<u16, (u64, u64)>,
 }
 
 #[derive(Debug)]
@@ -313,11 +313,11 @@ impl Writer {
         }
     }
 
-    /// Messages that were taken and given up, by topic.
-    pub fn unwritten(&self) -> impl Iterator<Item = (&str, u64)> {
+    /// Messages that were taken and given up, by topic, and their bytes.
+    pub fn unwritten(&self) -> impl Iterator<Item = (&str, u64, u64)> {
         self.topics.iter().filter_map(|topic| {
-            let messages = self.unwritten.get(&topic.channel_id)?;
-            Some((topic.description.name.as_str(), *messages))
+            let (messages, bytes) = self.unwritten.get(&topic.channel_id)?;
+            Some((topic.description.name.as_str(), *messages, *bytes))
         })
     }
 
@@ -464,8 +464,10 @@ impl Writer {
 
     fn give_up_waiting(&mut self) {
         if let Some(current) = &mut self.current {
-            for (channel, messages) in current.discard() {
-                *self.unwritten.entry(channel).or_default() += messages;
+            for (channel, (messages, bytes)) in current.discard() {
+                let unwritten = self.unwritten.entry(channel).or_default();
+                unwritten.0 += messages;
+                unwritten.1 += bytes;
             }
         }
     }
@@ -557,7 +559,7 @@ impl Writer {
         let topics = self.topics.iter().map(|topic| TopicSummary {
             name: topic.description.name.clone(),
             messages: topic.messages,
-            unwritten: self.unwritten.get(&topic.channel_id).copied().unwrap_or(0),
+            unwritten: self.unwritten.get(&topic.channel_id).map_or(0, |it| it.0),
         });
         Summary {
             directory: self.directory.clone(),

@@ -218,22 +218,14 @@ impl<'a> Recorder<'a> {
         self.note_what_was_sent_before();
         // Before the report goes into the bag.
         self.writer.settle();
-        let mut unwritten: HashMap<String, u64> = HashMap::new();
-        for (topic, messages) in self.writer.unwritten() {
-            self.report.unwritten(topic, messages);
-            unwritten.insert(topic.to_owned(), messages);
+        for (topic, messages, bytes) in self.writer.unwritten() {
+            self.report.unwritten(topic, messages, bytes);
         }
         let closed = self.writer.close(self.report.custom_data());
         let (summary, close_error) = match closed {
             Ok(summary) => (Some(summary), None),
             Err(error) => (None, Some(error)),
         };
-        for topic in summary.iter().flat_map(|summary| &summary.topics) {
-            let known = unwritten.get(&topic.name).copied().unwrap_or(0);
-            if topic.unwritten > known {
-                self.report.unwritten(&topic.name, topic.unwritten - known);
-            }
-        }
         Ended {
             summary,
             report: self.report,

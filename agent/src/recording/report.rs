@@ -115,11 +115,13 @@ impl Report {
     }
 
     /// Messages that were taken for written are not in the bag after all.
-    pub(super) fn unwritten(&mut self, topic: &str, messages: u64) {
+    pub(super) fn unwritten(&mut self, topic: &str, messages: u64, bytes: u64) {
         self.messages = self.messages.saturating_sub(messages);
+        self.bytes = self.bytes.saturating_sub(bytes);
         self.missing += messages;
         let topic = self.topic(topic);
         topic.messages = topic.messages.saturating_sub(messages);
+        topic.bytes = topic.bytes.saturating_sub(bytes);
         topic.unwritten += messages;
     }
 
@@ -237,8 +239,8 @@ mod tests {
         let mut report = Report::default();
         report.written("/points", 100);
         report.written("/points", 100);
-        report.unwritten("/points", 1);
-        assert_eq!((report.messages, report.missing), (1, 1));
+        report.unwritten("/points", 1, 100);
+        assert_eq!((report.messages, report.bytes, report.missing), (1, 100, 1));
         assert!(report.shortfalls()[0].ends_with("1 not written, the storage took no more"));
         let json = &report.custom_data()[CUSTOM_DATA];
         assert_eq!(serde_json::from_str::<Report>(json).unwrap(), report);
