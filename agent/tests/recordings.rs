@@ -1,11 +1,6 @@
 //! Bags that the agent writes, asked for over its API: begun, paused, split and ended; and the last
 //! seconds before an expectation was violated.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    reason = "a test may panic"
-)]
+#![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
 mod local_agent;
 

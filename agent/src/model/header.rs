@@ -10,7 +10,7 @@ use ros2probe_wire::Timestamp;
 const PLAUSIBLE: u64 = 3_600_000_000_000;
 
 /// Types outside `sensor_msgs` and `geometry_msgs`.
-const OTHERS: [&str; 33] = [
+const OTHERS: [&str; 37] = [
     "ackermann_msgs/msg/AckermannDriveStamped",
     "actionlib_msgs/msg/GoalStatusArray",
     "can_msgs/msg/Frame",
@@ -28,10 +28,13 @@ const OTHERS: [&str; 33] = [
     "mavros_msgs/msg/State",
     "nav2_msgs/msg/Costmap",
     "nav2_msgs/msg/ParticleCloud",
+    "nav_msgs/msg/Goals",
     "nav_msgs/msg/GridCells",
     "nav_msgs/msg/OccupancyGrid",
     "nav_msgs/msg/Odometry",
     "nav_msgs/msg/Path",
+    "nav_msgs/msg/Trajectory",
+    "nav_msgs/msg/TrajectoryPoint",
     "nmea_msgs/msg/Sentence",
     "radar_msgs/msg/RadarScan",
     "radar_msgs/msg/RadarTracks",
@@ -43,6 +46,7 @@ const OTHERS: [&str; 33] = [
     "visualization_msgs/msg/ImageMarker",
     "visualization_msgs/msg/InteractiveMarker",
     "visualization_msgs/msg/InteractiveMarkerFeedback",
+    "visualization_msgs/msg/InteractiveMarkerPose",
     "visualization_msgs/msg/Marker",
 ];
 
