@@ -20,4 +20,5 @@ pub mod state;
 pub mod subscriptions;
 pub mod surface;
 pub mod top;
+pub mod visible;
 pub mod watches;

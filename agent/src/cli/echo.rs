@@ -11,8 +11,9 @@ use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
 use ros2probe::ros2::facts::Topic;
 use ros2probe::ros2::name::full_name;
+use ros2probe::visible::visible_lines;
 
-use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic, visible};
+use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
@@ -144,7 +145,7 @@ impl Echo {
                             let message_type = if raw { None } else { types.of(sample) };
                             let told = echo.message(sample, message_type.as_deref(), &payload);
                             let told = told.map_err(said)?;
-                            eprint!("{}", visible(&told.err));
+                            eprint!("{}", visible_lines(&told.err));
                             if let Some(message) = told.out {
                                 if self.clear {
                                     output.write(CLEAR)?;

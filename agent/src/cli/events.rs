@@ -8,8 +8,9 @@ use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, Echo};
 use ros2probe::ros2::name::full_name;
+use ros2probe::visible::visible_lines;
 
-use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic, visible};
+use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
@@ -173,7 +174,7 @@ fn print(
             let part = topics.iter().find(|(_, name)| *name == sample.topic);
             let part = part.and_then(|(part, _)| *part);
             let told = echo.event(sample, &message_type, &payload, part);
-            eprint!("{}", visible(&told.err));
+            eprint!("{}", visible_lines(&told.err));
             output.write(&for_stdout(told.out.unwrap_or_default()))?;
         }
         Ok(Went::On)

@@ -14,6 +14,7 @@ use ros2probe::message::yaml::Style;
 use ros2probe::message::{Library, Limits, MessageType, Shown, Sources, decode};
 use ros2probe::ros2::facts::Topic;
 use ros2probe::subscriptions::line::{Line, MissedFacts, Reason, SampleFacts};
+use ros2probe::visible::{visible, visible_lines};
 
 use super::Said;
 
@@ -93,23 +94,10 @@ pub(crate) enum Came<'a> {
 /// which they could command. YAML has none by itself.
 pub(crate) fn for_stdout(text: String) -> String {
     if std::io::stdout().is_terminal() {
-        visible(&text)
+        visible_lines(&text).into_owned()
     } else {
         text
     }
-}
-
-/// Control characters but line ends and tabs as escapes.
-pub(crate) fn visible(text: &str) -> String {
-    let mut visible = String::with_capacity(text.len());
-    for each in text.chars() {
-        if each.is_control() && !matches!(each, '\n' | '\t') {
-            visible.extend(each.escape_default());
-        } else {
-            visible.push(each);
-        }
-    }
-    visible
 }
 
 /// How a stream went on.
@@ -224,7 +212,10 @@ impl Types {
             Err(error) => {
                 let text = whole(&error);
                 if !self.undefined.contains(&text) && self.undefined.len() < MAX_WRITERS {
-                    eprintln!("rp: {}", visible(&format!("{}: {text}", sample.topic)));
+                    eprintln!(
+                        "rp: {}",
+                        visible_lines(&format!("{}: {text}", sample.topic))
+                    );
                     self.undefined.push(text);
                 }
                 None
@@ -293,11 +284,11 @@ fn whole(error: &dyn std::error::Error) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::visible;
+    use ros2probe::visible::visible_lines;
 
     #[test]
     fn no_message_commands_a_terminal() {
         let text = "a\tb\u{1b}[2J\u{9b}1m\u{7}\n\u{e9}";
-        assert_eq!(visible(text), "a\tb\\u{1b}[2J\\u{9b}1m\\u{7}\n\u{e9}");
+        assert_eq!(visible_lines(text), "a\tb\\u{1b}[2J\\u{9b}1m\\u{7}\n\u{e9}");
     }
 }

@@ -18,6 +18,7 @@ use ros2probe::recording::{
 };
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::name::full_name;
+use ros2probe::visible::visible;
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -445,6 +446,7 @@ fn log(level: &str, text: &str) {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
     let now = now.unwrap_or_default();
     let (seconds, nanoseconds) = (now.as_secs(), now.subsec_nanos());
+    let text = visible(text);
     eprintln!("[{level}] [{seconds}.{nanoseconds:09}] [rosbag2_recorder]: {text}");
 }
 

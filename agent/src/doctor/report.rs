@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::finding::{Finding, Verdict};
-use super::text::plain;
+use crate::visible::visible;
 
 /// A report.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -51,7 +51,7 @@ impl Report {
             }
         };
         let counts: Vec<_> = Verdict::ALL.into_iter().filter_map(count).collect();
-        let (version, subject) = (self.version, plain(&self.subject));
+        let (version, subject) = (self.version, visible(&self.subject));
         format!("rp doctor {version} on {subject}: {}", counts.join(", "))
     }
 }

@@ -2,8 +2,11 @@
 //!
 //! What comes from the network or from other processes reaches the terminal escaped.
 
+use std::borrow::Cow;
+
 use super::finding::{Finding, Place, Remedy, Verdict};
 use super::report::Report;
+use crate::visible::visible;
 
 const WIDTH: usize = 80;
 /// Before sentences: two spaces, a verdict, a space.
@@ -57,7 +60,7 @@ impl Page {
     fn finding(&mut self, finding: &Finding) {
         let verdict = format!("{:8}", finding.verdict.label());
         let verdict = self.painted(colour(finding.verdict), &verdict);
-        for (number, line) in wrapped(&plain(&finding.sentence)).iter().enumerate() {
+        for (number, line) in wrapped(&visible(&finding.sentence)).iter().enumerate() {
             let start = if number == 0 {
                 verdict.as_str()
             } else {
@@ -82,8 +85,8 @@ impl Page {
             EVIDENCE
         };
         for evidence in finding.evidence.iter().take(shown) {
-            let value: String = plain(&evidence.value).chars().take(MAX_VALUE).collect();
-            let line = format!("{}: {value}", plain(&evidence.from));
+            let value: String = visible(&evidence.value).chars().take(MAX_VALUE).collect();
+            let line = format!("{}: {value}", visible(&evidence.from));
             for line in wrapped(&line) {
                 let line = self.painted(DIM, &line);
                 self.line(&format!("{:INDENT$}{line}", ""));
@@ -98,12 +101,12 @@ impl Page {
 
     /// A command is not broken, for it is to be pasted; a long comment goes above it.
     fn remedy(&mut self, remedy: &Remedy) {
-        let line = plain(&remedy.line);
-        let own = remedy.comment.as_deref().map(plain);
+        let line = visible(&remedy.line);
+        let own = remedy.comment.as_deref().map(visible);
         let comment = match (remedy.kind, own) {
             (Place::Configuration, None) => Some(FILE.to_owned()),
             (Place::Configuration, Some(own)) => Some(format!("{FILE}; {own}")),
-            (Place::Command | Place::Elsewhere, own) => own,
+            (Place::Command | Place::Elsewhere, own) => own.map(Cow::into_owned),
         };
         let mut short = String::new();
         if let Some(comment) = comment {
@@ -142,22 +145,6 @@ const fn colour(verdict: Verdict) -> &'static str {
         Verdict::Warning => "33",
         Verdict::Problem => "1;31",
     }
-}
-
-/// Without anything that a terminal takes for more than a letter: control characters, and those that
-/// turn the direction of what follows.
-#[must_use]
-pub fn plain(text: &str) -> String {
-    let mut plain = String::with_capacity(text.len());
-    for letter in text.chars() {
-        let turns = matches!(letter, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
-        if letter.is_control() || turns {
-            plain.extend(letter.escape_unicode());
-        } else {
-            plain.push(letter);
-        }
-    }
-    plain
 }
 
 /// Lines that fit behind the indentation; a word that does not is left whole unless it is no word of
@@ -253,10 +240,6 @@ Buffers
 
     #[test]
     fn what_a_terminal_would_obey_is_escaped() {
-        assert_eq!(
-            plain("a\x1b[2J\r\u{202e}b\u{9b}é"),
-            "a\\u{1b}[2J\\u{d}\\u{202e}b\\u{9b}é"
-        );
         let hostile = "x\x1b]0;gotcha\x07".repeat(100);
         let finding = Finding::new(Area::Graph, "x", Verdict::Warning, hostile.clone())
             .seen(hostile.clone(), hostile)

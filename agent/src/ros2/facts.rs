@@ -5,6 +5,8 @@ use std::borrow::Cow;
 
 use serde::{Deserialize, Deserializer};
 
+use crate::visible::visible;
+
 /// `/names`.
 #[derive(Clone, Debug, Default, Deserialize)]
 pub struct Names {
@@ -175,32 +177,18 @@ pub fn is_hidden_node(name: &str) -> bool {
 }
 
 fn plain<'de, D: Deserializer<'de>>(from: D) -> Result<String, D::Error> {
-    Ok(escaped(Cow::deserialize(from)?))
+    let text: Cow<'_, str> = Cow::deserialize(from)?;
+    Ok(visible(&text).into_owned())
 }
 
 fn plain_list<'de, D: Deserializer<'de>>(from: D) -> Result<Vec<String>, D::Error> {
     let list: Vec<Cow<'_, str>> = Vec::deserialize(from)?;
-    Ok(list.into_iter().map(escaped).collect())
+    Ok(list.iter().map(|text| visible(text).into_owned()).collect())
 }
 
 fn plain_option<'de, D: Deserializer<'de>>(from: D) -> Result<Option<String>, D::Error> {
     let text: Option<Cow<'_, str>> = Option::deserialize(from)?;
-    Ok(text.map(escaped))
-}
-
-fn escaped(text: Cow<'_, str>) -> String {
-    if !text.contains(char::is_control) {
-        return text.into_owned();
-    }
-    let mut plain = String::with_capacity(text.len());
-    for each in text.chars() {
-        if each.is_control() {
-            plain.extend(each.escape_default());
-        } else {
-            plain.push(each);
-        }
-    }
-    plain
+    Ok(text.map(|text| visible(&text).into_owned()))
 }
 
 #[cfg(test)]
