@@ -143,6 +143,7 @@ fn watchlist(patterns: &[&str]) -> Watchlist {
         expectations: Expectations::default(),
         per_subscriber: false,
         trace: 0.0,
+        retain: ros2probe::config::Retain::None,
     };
     Watchlist::new(patterns.iter().map(watch).collect()).unwrap()
 }
@@ -880,6 +881,7 @@ fn expectations_are_judged_in_the_sources_time() {
         expectations,
         per_subscriber: false,
         trace: 0.0,
+        retain: ros2probe::config::Retain::None,
     };
     world
         .observer

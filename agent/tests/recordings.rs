@@ -14,16 +14,16 @@ use serde_json::Value;
 
 /// An agent that may write bags, and replays slowly.
 fn agent(directory: &Path, more: &str) -> LocalAgent {
+    agent_on(&local_agent::capture(), directory, "0.5", more)
+}
+
+fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalAgent {
     let configuration = directory.join("ros2probe.yaml");
     let bags = directory.join("bags");
     let text = format!("recordings:\n  directory: {}\n{more}", bags.display());
     std::fs::write(&configuration, text).unwrap();
-    LocalAgent::start(&[
-        "--speed",
-        "0.5",
-        "--config",
-        configuration.to_str().unwrap(),
-    ])
+    let configuration = configuration.to_str().unwrap();
+    LocalAgent::start_on(capture, &["--speed", speed, "--config", configuration])
 }
 
 fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
@@ -222,4 +222,29 @@ fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
     let (_, list) = ask(agent.api, "GET", "/snapshots", "");
     assert_eq!(list["snapshots"][0]["written"], 2, "{list}");
     assert_eq!(list["snapshots"][0]["failed"], 0, "{list}");
+}
+
+#[test]
+fn a_late_recording_has_what_was_sent_once_before_it_where_the_watchlist_asks_for_that() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo/capture.pcap.gz");
+    let more = "watch: [{topic: /tf_static, retain: last}]\n";
+    let agent = agent_on(&capture, directory.path(), "10", more);
+    agent.wait_for_metric("ros2probe_retained_bytes", |bytes| bytes > 50.0);
+    // It is sent once in the capture: whoever comes now is too late for it.
+    let body = r#"{"name": "late", "topics": {"topics": ["/tf_static", "/chatter"]}}"#;
+    let (status, begun) = ask(agent.api, "POST", "/recordings", body);
+    assert_eq!(status, 201, "{begun}");
+    wait_for(agent.api, "late", |recording| {
+        recording["report"]["topics"]["/tf_static"]["messages"] == 1
+    });
+    let (status, ended) = ask(agent.api, "DELETE", "/recordings/late", "");
+    assert_eq!(status, 200, "{ended}");
+    assert_eq!(
+        ended["report"]["sent_before"],
+        serde_json::json!([]),
+        "{ended}"
+    );
+    let messages = messages(&directory.path().join("bags/late"));
+    assert_eq!(messages["/tf_static"].len(), 1, "{messages:?}");
 }

@@ -14,7 +14,7 @@ use super::shape::{
     ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
     WatchShape,
 };
-use super::watch::{Expectations, Watch, check_pattern};
+use super::watch::{Expectations, Retain, Watch, check_pattern};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
     RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
@@ -162,6 +162,7 @@ impl Reader {
                     expectations: Expectations::default(),
                     per_subscriber: false,
                     trace: 0.0,
+                    retain: Retain::None,
                 },
                 WatchShape::Entry(entry) => self.entry(&key, *entry),
             };
@@ -197,6 +198,7 @@ impl Reader {
             },
             per_subscriber: entry.per_subscriber,
             trace: entry.trace.unwrap_or_default(),
+            retain: entry.retain,
         }
     }
 

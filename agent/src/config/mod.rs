@@ -20,7 +20,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 pub use mistake::{Mistake, Mistakes, Position};
-pub use watch::{Expectations, PatternError, Watch, Watchlist, check_pattern};
+pub use watch::{Expectations, PatternError, Retain, Watch, Watchlist, check_pattern};
 
 /// A larger file is no configuration.
 const MAX_BYTES: u64 = 1 << 20;

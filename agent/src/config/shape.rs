@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::watch::Retain;
 use super::{Compression, ExactChoice, Level, ShmMode, SourceChoice, defaults};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
@@ -74,6 +75,10 @@ pub(super) struct WatchEntryShape {
     /// a message was on the wire, and when each reliable reader acknowledged it.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub(super) trace: Option<f64>,
+    /// `last`: the last message of each covered transient-local writer is kept in memory, so that
+    /// a recording that begins later has it (`/tf_static`). Captures the covered topics.
+    #[serde(default)]
+    pub(super) retain: Retain,
     /// At least this many messages a second.
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) min_rate_hz: Option<f64>,

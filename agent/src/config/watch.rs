@@ -5,6 +5,9 @@ use std::collections::HashMap;
 use std::sync::Arc;
 
 use globset::{GlobBuilder, GlobSet, GlobSetBuilder};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// One watchlist entry.
 #[derive(Clone, Debug, PartialEq)]
@@ -19,6 +22,21 @@ pub struct Watch {
     pub per_subscriber: bool,
     /// The part of the messages of which spans are told, 0 to 1.
     pub trace: f64,
+    /// What is kept of its messages.
+    pub retain: Retain,
+}
+
+/// What is kept of a topic's messages for recordings that begin later.
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema, ToSchema,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum Retain {
+    /// Nothing.
+    #[default]
+    None,
+    /// The last one of each writer that keeps its own for late joiners (transient local).
+    Last,
 }
 
 /// Limits on a topic; `None` = no opinion.
@@ -76,6 +94,7 @@ impl Watch {
             expectations: Expectations::default(),
             per_subscriber: false,
             trace: 0.0,
+            retain: Retain::None,
         })
     }
 

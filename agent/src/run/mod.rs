@@ -175,6 +175,7 @@ impl Run {
     /// Watches and gives what is asked for since the last look. The kernel knows it before the next packets.
     fn take_watches(&mut self) {
         if let Some(watchlist) = self.watches.take_news() {
+            self.subscriptions.retain(watchlist.watches());
             self.observer.set_watchlist(watchlist);
             self.tell_interest();
         }

@@ -130,6 +130,10 @@ impl Channel {
         }
     }
 
+    pub(super) fn is_in_force(&self) -> bool {
+        self.in_force.load(Ordering::Acquire)
+    }
+
     pub(super) fn set_in_force(&self) {
         if !self.in_force.swap(true, Ordering::Release) {
             self.known.notify_one();

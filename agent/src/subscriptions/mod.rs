@@ -8,6 +8,7 @@
 mod backlog;
 mod channel;
 pub mod line;
+mod retained;
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -17,10 +18,12 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 use ros2probe_wire::Timestamp;
 use tokio_util::sync::CancellationToken;
 
+use crate::config::Watch;
 use crate::model::payloads::{Given, News, Sample};
 use crate::model::selection::Wish;
 use crate::surface::Board;
 use channel::Channel;
+use retained::Retained;
 
 pub use crate::model::payloads::{Missed, MissedReason, Topic};
 pub use crate::model::selection::{Choice, ChoiceError, Depth, Selection};
@@ -87,6 +90,7 @@ pub struct Subscriptions {
     channels: ArcSwap<Vec<Arc<Channel>>>,
     /// Held while `channels` is changed.
     changing: Mutex<Opened>,
+    retained: Mutex<Retained>,
     /// For the capture thread: the latest wishes it has not taken yet.
     news: ArcSwapOption<Vec<Wish>>,
     board: Arc<Board>,
@@ -128,6 +132,8 @@ pub struct Facts {
     pub missed: [u64; MissedReason::ALL.len()],
     /// Bytes that wait in queues.
     pub queued_bytes: usize,
+    /// Bytes of messages that are retained.
+    pub retained_bytes: usize,
 }
 
 impl Subscriptions {
@@ -137,6 +143,7 @@ impl Subscriptions {
         Self {
             channels: ArcSwap::default(),
             changing: Mutex::default(),
+            retained: Mutex::default(),
             news: ArcSwapOption::default(),
             board,
             caps,
@@ -186,6 +193,7 @@ impl Subscriptions {
             given: self.given.load(Ordering::Relaxed),
             missed: missed.map(|count| count.load(Ordering::Relaxed)),
             queued_bytes: self.queued.load(Ordering::Relaxed),
+            retained_bytes: self.retained().bytes(),
         }
     }
 
@@ -201,18 +209,56 @@ impl Subscriptions {
         self.news.swap(None)
     }
 
-    /// For the capture thread: the model and the kernel know these wishes.
+    /// For the capture thread: retains what these watches ask for.
+    pub fn retain(&self, watches: &[Arc<Watch>]) {
+        let changing = self.changing();
+        let mut retained = self.retained();
+        let before = retained.wishes().count();
+        retained.set(watches.iter().map(|watch| &**watch));
+        let is_idle = before == 0 && retained.wishes().count() == 0;
+        drop(retained);
+        if !is_idle {
+            self.change(self.channels.load().to_vec());
+        }
+        drop(changing);
+    }
+
+    /// For the capture thread: the model and the kernel know these wishes. Readers that are new
+    /// among them get first what is retained for them.
     pub fn in_force(&self, wishes: &[Wish]) {
         for channel in self.channels.load().iter() {
-            if wishes.iter().any(|wish| wish.id == channel.id()) {
-                channel.set_in_force();
+            let is_new = !channel.is_in_force();
+            if !is_new || !wishes.iter().any(|wish| wish.id == channel.id()) {
+                continue;
             }
+            if channel.depth() == Depth::Payloads {
+                let known = self.board.state();
+                let topics = || known.known().topics.iter();
+                let is_there = |writer| {
+                    let mut publishers = topics().flat_map(|topic| &topic.publishers);
+                    publishers.any(|publisher| publisher.guid == writer)
+                };
+                let samples = self.retained().for_reader(&channel.wish(), is_there);
+                for sample in samples {
+                    self.given.fetch_add(1, Ordering::Relaxed);
+                    channel.sample(&sample, None, &self.stop);
+                }
+                channel.wake();
+            }
+            channel.set_in_force();
         }
     }
 
     /// For the capture thread: puts what the model gives into the queues, and the time up to which
     /// that is all, if it has gone on.
     pub fn deliver(&self, given: Vec<Given>, clock: Option<Timestamp>) {
+        let mut retained = self.retained();
+        for Given { to, news } in &given {
+            if let News::Sample(sample) = news {
+                retained.keep(to, sample);
+            }
+        }
+        drop(retained);
         let channels = self.channels.load();
         if channels.is_empty() {
             return;
@@ -302,9 +348,16 @@ impl Subscriptions {
 
     /// Others are open from now on. Called while `changing` is held.
     fn change(&self, channels: Vec<Arc<Channel>>) {
-        let wishes = channels.iter().map(|channel| channel.wish()).collect();
+        let wishes = channels.iter().map(|channel| channel.wish());
+        let retained = self.retained();
+        let wishes = wishes.chain(retained.wishes().cloned()).collect();
+        drop(retained);
         self.channels.store(Arc::new(channels));
         self.news.store(Some(Arc::new(wishes)));
+    }
+
+    fn retained(&self) -> std::sync::MutexGuard<'_, Retained> {
+        self.retained.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn changing(&self) -> std::sync::MutexGuard<'_, Opened> {

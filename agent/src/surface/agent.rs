@@ -202,7 +202,8 @@ pub(super) fn subscriptions(page: &mut Page<'_>, state: &State) -> fmt::Result {
         let mut missed = MissedReason::ALL.into_iter().zip(facts.missed);
         missed.try_for_each(|(reason, count)| family.sample(&[Label::Text(reason.label())], count))
     })?;
-    page.single(&metric::SAMPLES_QUEUED, facts.queued_bytes)
+    page.single(&metric::SAMPLES_QUEUED, facts.queued_bytes)?;
+    page.single(&metric::SAMPLES_RETAINED, facts.retained_bytes)
 }
 
 /// Events, told and not told.

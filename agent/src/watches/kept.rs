@@ -13,7 +13,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::MAX_ADDED;
-use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern, check_trace};
+use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
 use crate::state::{Found, StateDirectory};
 
 const FILE: &str = "watches.json";
@@ -54,6 +54,8 @@ struct Line {
     per_subscriber: bool,
     #[serde(default)]
     trace: f64,
+    #[serde(default)]
+    retain: Retain,
     min_rate_hz: Option<f64>,
     max_rate_hz: Option<f64>,
     max_loss_ratio: Option<f64>,
@@ -128,6 +130,7 @@ impl TryFrom<Line> for Watch {
             expectations,
             per_subscriber: line.per_subscriber,
             trace: line.trace,
+            retain: line.retain,
         })
     }
 }
@@ -146,6 +149,7 @@ impl From<&Watch> for Line {
             domain_id: watch.domain_id,
             per_subscriber: watch.per_subscriber,
             trace: watch.trace,
+            retain: watch.retain,
             min_rate_hz,
             max_rate_hz,
             max_loss_ratio,
@@ -260,6 +264,7 @@ mod tests {
             domain_id: Some(5),
             per_subscriber: true,
             trace: 0.5,
+            retain: Retain::Last,
             expectations: Expectations {
                 min_rate_hz: Some(9.5),
                 max_silence_s: Some(1.0),

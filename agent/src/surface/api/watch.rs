@@ -20,7 +20,7 @@ use super::body::Body;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
-use crate::config::watch::{Expectations, MAX_DOMAIN, Watch, check_pattern, check_trace};
+use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
 use crate::model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
 use crate::watches::{Done, Entry, Origin, Refused};
 
@@ -50,6 +50,8 @@ struct WatchView {
     /// The part of the messages of which spans are exported.
     #[schema(minimum = 0, maximum = 1)]
     trace: f64,
+    /// `last`: the last message of each transient-local writer is kept for recordings that begin later.
+    retain: Retain,
     #[serde(flatten)]
     expectations: ExpectationsView,
     /// The topics it covers now, and a name that does not exist yet.
@@ -154,6 +156,8 @@ struct WatchRequest {
     /// The part of each covered topic's messages of which spans are exported, 0 to 1.
     #[schema(minimum = 0, maximum = 1)]
     trace: f64,
+    /// `last`: keep the last message of each transient-local writer for recordings that begin later.
+    retain: Retain,
     /// At least this many messages a second.
     #[schema(minimum = 0, maximum = 1_000_000)]
     min_rate_hz: Option<f64>,
@@ -362,6 +366,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
             expectations,
             per_subscriber: settings.per_subscriber,
             trace,
+            retain: settings.retain,
         }),
         Err(mistake) => invalid(mistake),
     }
@@ -455,6 +460,7 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
         state: stage,
         per_subscriber: watch.per_subscriber,
         trace: watch.trace,
+        retain: watch.retain,
         expectations: (&watch.expectations).into(),
         topics,
     }

@@ -218,6 +218,12 @@ pub(in crate::surface) const SAMPLES_QUEUED: Metric = Metric::gauge(
 )
 .unit("bytes");
 
+pub(in crate::surface) const SAMPLES_RETAINED: Metric = Metric::gauge(
+    "ros2probe_retained_bytes",
+    &[],
+    "Bytes of last messages that are kept for recordings that begin later (watches with retain: last), 4 MiB at most.",
+)
+.unit("bytes");
 pub(in crate::surface) const RECORDINGS: Metric = Metric::gauge(
     "ros2probe_recordings",
     &[],
