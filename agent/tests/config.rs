@@ -129,6 +129,8 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
         "otlp: {compression: zstd}",
         "otlp: {interval_s: 0}",
         "watch: [{topic: /a, trace: 1.5}]",
+        "recordings: {snapshots: [{name: a b, topics: [/a]}]}",
+        "recordings: {snapshots: [{name: ../a, topics: [/a]}]}",
     ] {
         assert!(
             !validator.is_valid(&serde_yaml::from_str(yaml).unwrap()),

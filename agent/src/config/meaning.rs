@@ -316,6 +316,9 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
             Err("must be an absolute path, as in `/var/lib/ros2probe`, `auto` or `off`".to_owned())
         }
+        "recordings.snapshots[].name" if !is_plain(text) => {
+            Err("must be 1 to 64 letters, digits, `_` or `-`: it names directories".to_owned())
+        }
         "recordings.directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
             Err("must be an absolute path, as in `/data/bags`, `auto` or `off`".to_owned())
         }
@@ -350,6 +353,12 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         }
         _ => Ok(()),
     }
+}
+
+/// What a file may be called anywhere.
+fn is_plain(name: &str) -> bool {
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
+    (1..=64).contains(&name.len()) && name.chars().all(plain)
 }
 
 /// `watch[2].topic` as `watch[].topic`.
