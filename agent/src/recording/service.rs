@@ -214,7 +214,7 @@ impl Recordings {
         let thread = thread.spawn(work).map_err(|error| Refusal::Storage {
             reason: format!("no thread for it: {error}"),
         })?;
-        *recording.lock(&recording.thread) = Some(thread);
+        *locked(&recording.thread) = Some(thread);
         list.push(Arc::clone(&recording));
         let mut surplus = list.iter().filter(|each| each.is_over()).count();
         surplus = surplus.saturating_sub(ENDED);
@@ -246,7 +246,7 @@ impl Recordings {
             recording.order(Order::Stop);
         }
         for recording in list {
-            let thread = recording.lock(&recording.thread).take();
+            let thread = locked(&recording.thread).take();
             if let Some(thread) = thread
                 && thread.join().is_err()
             {
@@ -321,7 +321,7 @@ impl Recordings {
     }
 
     fn list(&self) -> MutexGuard<'_, Vec<Arc<Recording>>> {
-        self.list.lock().unwrap_or_else(PoisonError::into_inner)
+        locked(&self.list)
     }
 }
 
@@ -329,13 +329,13 @@ impl Recording {
     /// How it goes, at most half a second ago.
     #[must_use]
     pub fn status(&self) -> Status {
-        self.lock(&self.status).clone()
+        locked(&self.status).clone()
     }
 
     /// Asks for something; nothing happens where it is over.
     pub fn order(&self, order: Order) {
         // Nobody takes orders where it is over.
-        let _ = self.lock(&self.orders).send(order);
+        let _ = locked(&self.orders).send(order);
     }
 
     /// Waits until the bag is complete, but no longer than `patience`.
@@ -353,7 +353,7 @@ impl Recording {
     }
 
     fn is_over(&self) -> bool {
-        self.lock(&self.status).stage == Stage::Ended
+        locked(&self.status).stage == Stage::Ended
     }
 
     fn work(
@@ -408,7 +408,7 @@ impl Recording {
             files: recorder.writer().files(),
             error: None,
         };
-        *self.lock(&self.status) = status;
+        *locked(&self.status) = status;
     }
 
     fn finish(&self, ended: Ended, error: Option<String>) {
@@ -420,17 +420,14 @@ impl Recording {
             files: summary.map_or(0, |summary| summary.files.len()),
             error,
         };
-        *self.lock(&self.status) = status;
+        *locked(&self.status) = status;
         self.over.notify_waiters();
     }
+}
 
-    #[expect(
-        clippy::unused_self,
-        reason = "what is behind a lock here is whole at any moment"
-    )]
-    fn lock<'a, T>(&self, mutex: &'a Mutex<T>) -> MutexGuard<'a, T> {
-        mutex.lock().unwrap_or_else(PoisonError::into_inner)
-    }
+/// What is behind a lock here is whole at any moment.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// The definition of a type for a bag, where there is one that its hash agrees with.
