@@ -1,7 +1,12 @@
 //! The log: events to standard error, in a form the journal keeps well.
 
-use std::io;
+mod lines;
 
+use std::io;
+use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, Mutex};
+
+use lines::Lines;
 use ros2probe::config::Level;
 use tracing_subscriber::filter::{EnvFilter, LevelFilter};
 use tracing_subscriber::layer::SubscriberExt as _;
@@ -14,6 +19,7 @@ pub(crate) struct Log {
     level: reload::Handle<EnvFilter, Registry>,
     /// `RUST_LOG` was given: it stays in force.
     fixed: bool,
+    lost: Arc<AtomicU64>,
 }
 
 impl Log {
@@ -23,7 +29,9 @@ impl Log {
         let (filter, handle) = reload::Layer::new(fixed.clone().unwrap_or_else(|| filter(level)));
         // The journal stamps each line itself.
         let journal = std::env::var_os("JOURNAL_STREAM").is_some();
-        let lines = fmt::layer().with_writer(io::stderr).with_target(false);
+        let lost = Arc::<AtomicU64>::default();
+        let target = Mutex::new(Lines::new(io::stderr(), Arc::clone(&lost)));
+        let lines = fmt::layer().with_writer(target).with_target(false);
         let lines = if journal {
             lines.without_time().boxed()
         } else {
@@ -37,7 +45,13 @@ impl Log {
         Self {
             level: handle,
             fixed: fixed.is_some(),
+            lost,
         }
+    }
+
+    /// Lines that standard error did not take, as they are counted.
+    pub(crate) fn lost_lines(&self) -> Arc<AtomicU64> {
+        Arc::clone(&self.lost)
     }
 
     /// Changes the level.

@@ -7,6 +7,7 @@ mod logging;
 mod memory;
 mod supervise;
 
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -58,7 +59,8 @@ fn main() -> ExitCode {
         if cli::is_broken_pipe(&error) {
             return ExitCode::from(BROKEN_PIPE);
         }
-        eprintln!("{}", message(&error));
+        // Where nobody can be told, the exit code is left.
+        let _ = writeln!(std::io::stderr(), "{}", message(&error));
         exit_code(&error)
     })
 }
@@ -81,7 +83,8 @@ fn run(options: cli::Run) -> Result<()> {
     )?;
     let source = open(&options, &config)?;
     source.announce(&config.capture);
-    let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
+    let board = Board::new(source.kind(), Settings::new(&config));
+    let board = Arc::new(board.counting_lost_lines(log.lost_lines()));
     let watches = Watches::new(Arc::clone(&board), config.watches.clone(), options.watch);
     let watches = Arc::new(watches.context("the watchlist is unusable")?);
     let server = config.metrics.listen.map(|address| {

@@ -11,7 +11,7 @@ use std::io::{self, BufWriter, Read as _, Write as _};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -30,6 +30,8 @@ const NEW_FILE: &str = "discovery.json.new";
 const MAX_BYTES: u64 = 64 << 20;
 /// How often at most the file is written.
 const PERIOD: Duration = Duration::from_secs(3);
+/// How long after a failure the disk is tried again, if nothing has changed.
+const AGAIN: Duration = Duration::from_secs(10);
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 
 /// Where state is kept, to this process alone.
@@ -123,6 +125,8 @@ pub struct Keeper {
 struct Done {
     writes: AtomicU64,
     failures: AtomicU64,
+    /// The last write was one of these.
+    is_failing: AtomicBool,
 }
 
 /// How often state was written.
@@ -135,10 +139,11 @@ pub struct StateFacts {
 }
 
 impl StateDirectory {
-    /// Opens a directory that exists, for this process alone.
+    /// Opens a directory that exists, for this process alone. Whether it can be written is seen when
+    /// it is: what lies in one that is full or read-only is known all the same.
     ///
     /// # Errors
-    /// It does not exist, cannot be written, or another agent uses it.
+    /// It does not exist, cannot be entered, or another agent uses it.
     pub fn open(path: &Path) -> Result<Self, StateError> {
         let unusable = |source| StateError::Unusable {
             path: path.to_path_buf(),
@@ -153,9 +158,10 @@ impl StateDirectory {
             }
             Err(TryLockError::Error(error)) => return Err(unusable(error)),
         }
-        let probe = path.join(NEW_FILE);
-        let written = new_file(&probe).and_then(|_| fs::remove_file(&probe));
-        written.map_err(unusable)?;
+        // Nothing could be found in it otherwise, and nothing be written.
+        fs::metadata(path.join(".")).map_err(unusable)?;
+        // Of an agent that was killed while it wrote.
+        let _ = fs::remove_file(path.join(NEW_FILE));
         Ok(Self {
             path: path.to_path_buf(),
             directory,
@@ -284,8 +290,10 @@ impl Keeper {
     /// Whether it is time to hand over what is known at `revision`.
     #[must_use]
     pub fn wants(&self, revision: u64, now: Instant) -> bool {
+        let is_failing = self.done.is_failing.load(Ordering::Relaxed);
         self.handed.is_none_or(|(handed, at)| {
-            handed != revision && now.saturating_duration_since(at) >= PERIOD
+            let age = now.saturating_duration_since(at);
+            age >= PERIOD && (handed != revision || is_failing && age >= AGAIN)
         })
     }
 
@@ -317,23 +325,22 @@ impl Keeper {
 }
 
 fn keep(directory: &StateDirectory, inbox: &Receiver<Memory>, done: &Done) {
-    let mut failing = false;
     while let Ok(memory) = inbox.recv() {
-        match directory.write(memory) {
+        let written = directory.write(memory);
+        let failed_before = done.is_failing.swap(written.is_err(), Ordering::Relaxed);
+        match written {
             Ok(()) => {
                 done.writes.fetch_add(1, Ordering::Relaxed);
-                if failing {
+                if failed_before {
                     tracing::info!(path = %directory.path.display(), "state is written again");
                 }
-                failing = false;
             }
             Err(error) => {
                 done.failures.fetch_add(1, Ordering::Relaxed);
-                if !failing {
+                if !failed_before {
                     let path = directory.path.display();
                     tracing::error!(%path, %error, "state cannot be written: names would be lost with a restart");
                 }
-                failing = true;
             }
         }
     }
@@ -407,6 +414,17 @@ mod tests {
     }
 
     #[test]
+    fn half_a_file_of_an_agent_that_was_killed_is_neither_believed_nor_kept() {
+        let (place, directory) = directory();
+        directory.write(Memory::default()).unwrap();
+        drop(directory);
+        fs::write(place.path().join(NEW_FILE), "{\"version\":1,\"bo").unwrap();
+        let directory = StateDirectory::open(place.path()).unwrap();
+        assert_eq!(directory.load(), Loaded::Known(Memory::default()));
+        assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
+    }
+
+    #[test]
     fn two_agents_do_not_share_a_directory() {
         let (place, directory) = directory();
         let second = StateDirectory::open(place.path());
@@ -431,6 +449,7 @@ mod tests {
         }
         fs::remove_dir(obstacle).unwrap();
         assert!(!keeper.wants(0, start + 2 * PERIOD), "nothing has changed");
+        assert!(keeper.wants(0, start + AGAIN), "there may be room again");
         assert!(!keeper.wants(1, start + PERIOD / 2), "it is too soon");
         assert!(keeper.wants(1, start + PERIOD));
         assert_eq!(keeper.facts().writes, 0);

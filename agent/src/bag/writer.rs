@@ -165,8 +165,13 @@ impl Writer {
             uncompressed: Vec::new(),
             unwritten: BTreeMap::new(),
         };
-        writer.open_file()?;
-        writer.write_metadata_file()?;
+        let begun = writer.open_file();
+        if let Err(error) = begun.and_then(|()| writer.write_metadata_file()) {
+            // Nothing is in it, and the next try would leave another one on a disk that is full.
+            drop(writer);
+            let _ = fs::remove_dir_all(directory);
+            return Err(error);
+        }
         Ok(writer)
     }
 

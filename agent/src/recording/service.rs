@@ -211,8 +211,17 @@ impl Recordings {
         let (worker, board) = (Arc::clone(&recording), Arc::clone(&self.board));
         let work = move || worker.work(recorder, subscription, &orders, &board);
         let thread = std::thread::Builder::new().name("recording".to_owned());
-        let thread = thread.spawn(work).map_err(|error| Refusal::Storage {
-            reason: format!("no thread for it: {error}"),
+        let thread = thread.spawn(work).map_err(|error| {
+            // The bag was made just now, and nothing is in it.
+            let _ = std::fs::remove_dir_all(&recording.directory);
+            let reason = format!("no thread for it: {error}");
+            self.board.events().tell(AgentEvent::RecordingEnded {
+                recording: recording.name.clone(),
+                messages: 0,
+                missing: 0,
+                reason: Some(reason.clone()),
+            });
+            Refusal::Storage { reason }
         })?;
         *locked(&recording.thread) = Some(thread);
         list.push(Arc::clone(&recording));

@@ -279,11 +279,18 @@ impl Keeper {
                 messages: ended.report.messages,
             })
         };
-        let outcome = write().map_err(|refusal| refusal.to_string());
-        if outcome.is_ok() {
-            self.ring.clear();
+        let outcome = write();
+        match &outcome {
+            Ok(_) => self.ring.clear(),
+            // There was one before this.
+            Err(Refusal::Exists(_)) => {}
+            // All of it is still in memory: what there is of the bag helps nobody, and would be
+            // joined by the next one.
+            Err(_) => {
+                let _ = std::fs::remove_dir_all(&directory);
+            }
         }
-        (name, outcome)
+        (name, outcome.map_err(|refusal| refusal.to_string()))
     }
 
     /// Bytes of the bags of this snapshot that still lie there.

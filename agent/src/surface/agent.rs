@@ -207,7 +207,7 @@ pub(super) fn subscriptions(page: &mut Page<'_>, state: &State) -> fmt::Result {
 }
 
 /// Events, told and not told.
-pub(super) fn events(page: &mut Page<'_>, log: &EventLog) -> fmt::Result {
+pub(super) fn events(page: &mut Page<'_>, log: &EventLog, lost_lines: u64) -> fmt::Result {
     for (metric, counts) in [
         (&metric::EVENTS, log.told()),
         (&metric::EVENTS_DROPPED, log.dropped()),
@@ -217,7 +217,7 @@ pub(super) fn events(page: &mut Page<'_>, log: &EventLog) -> fmt::Result {
             counts.try_for_each(|(label, count)| family.sample(&[Label::Text(label)], count))
         })?;
     }
-    Ok(())
+    page.single(&metric::LOG_LINES_LOST, lost_lines)
 }
 
 /// Bags that the agent writes, and what snapshots keep.

@@ -6,7 +6,7 @@
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -34,6 +34,7 @@ pub struct Board {
     exports: Exports,
     spans: SpanQueue,
     recordings: RecordingFigures,
+    lost_lines: Arc<AtomicU64>,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
     bell: Option<Bell>,
@@ -113,11 +114,24 @@ impl Board {
             exports: Exports::default(),
             spans: SpanQueue::default(),
             recordings: RecordingFigures::default(),
+            lost_lines: Arc::default(),
             asked: AtomicBool::new(false),
             // Without one, askers wait until the capture thread looks by itself.
             bell: Bell::new().ok(),
             news: Notify::new(),
         }
+    }
+
+    /// The same, showing what the log counts.
+    #[must_use]
+    pub fn counting_lost_lines(self, lost_lines: Arc<AtomicU64>) -> Self {
+        Self { lost_lines, ..self }
+    }
+
+    /// Lines of the log that standard error did not take.
+    #[must_use]
+    pub fn lost_lines(&self) -> u64 {
+        self.lost_lines.load(Ordering::Relaxed)
     }
 
     /// Pins a new state.

@@ -35,7 +35,7 @@ pub(super) fn walk(page: &mut Page<'_>, board: &Board, previous: Duration) -> fm
     agent::surface(page, &state, board.reload(), previous, now)?;
     agent::kept(page, &state)?;
     agent::subscriptions(page, &state)?;
-    agent::events(page, board.events())?;
+    agent::events(page, board.events(), board.lost_lines())?;
     agent::recordings(page, board.recordings())?;
     agent::exports(page, board.exports())?;
     agent::process(page)

@@ -68,6 +68,13 @@ fn small_disk() {
     // Nothing stays reserved.
     let again = path.with_file_name("again");
     fs::write(&again, vec![0; 100_000]).unwrap();
+    // A bag that cannot be begun leaves nothing, however often somebody tries.
+    let rest = fs::write(path.with_file_name("rest"), vec![0; 6 << 20]);
+    assert!(rest.is_err());
+    let third = path.with_file_name("third");
+    let error = Writer::create(&third, Options::default()).unwrap_err();
+    assert!(matches!(error, Error::DiskFull { .. }), "{error:?}");
+    assert!(!third.exists());
 }
 
 #[test]

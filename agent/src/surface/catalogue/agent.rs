@@ -278,6 +278,11 @@ pub(in crate::surface) const EVENTS_DROPPED: Metric = Metric::counter(
     &["reason"],
     "Events only counted in a storm, or overwritten before a slow reader came to them: a stream of /events, or the sender of log records.",
 );
+pub(in crate::surface) const LOG_LINES_LOST: Metric = Metric::counter(
+    "ros2probe_log_lines_lost_total",
+    &[],
+    "Lines of the log that standard error did not take, being full, closed or not read.",
+);
 
 // The process, under the names every exporter uses.
 pub(in crate::surface) const PROCESS_CPU: Metric = Metric::counter(

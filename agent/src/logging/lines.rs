@@ -1,0 +1,182 @@
+//! Standard error as a place for log lines that holds nobody up: where it takes no more for a moment,
+//! lines are lost and counted. A journal that hangs, a terminal that is stopped or a full disk behind
+//! a redirection must not stop the capture.
+//!
+//! The descriptor may be shared with other processes, so it stays a blocking one; it is asked before
+//! each piece of a size that a pipe takes as a whole.
+
+use std::io::{self, Write};
+use std::os::fd::AsFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+
+/// A pipe that is ready takes so many bytes without waiting (`PIPE_BUF`).
+const PIECE: usize = 4096;
+/// How long a reader that was quick so far may take.
+const PATIENCE: Timespec = Timespec {
+    tv_sec: 0,
+    tv_nsec: 100_000_000,
+};
+const NONE: Timespec = Timespec {
+    tv_sec: 0,
+    tv_nsec: 0,
+};
+
+/// Where lines go.
+#[derive(Debug)]
+pub(super) struct Lines<W> {
+    target: W,
+    lost: Arc<AtomicU64>,
+    /// Of those, not told yet.
+    untold: u64,
+    /// The last line was lost: the next one does not wait.
+    is_stuck: bool,
+    /// A line was begun and not ended.
+    is_cut: bool,
+}
+
+impl<W: Write + AsFd> Lines<W> {
+    pub(super) const fn new(target: W, lost: Arc<AtomicU64>) -> Self {
+        Self {
+            target,
+            lost,
+            untold: 0,
+            is_stuck: false,
+            is_cut: false,
+        }
+    }
+
+    /// Writes a line as far as that is possible at once.
+    fn line(&mut self, line: &[u8]) -> io::Result<()> {
+        for piece in line.chunks(PIECE) {
+            self.ready()?;
+            self.target.write_all(piece)?;
+            self.is_cut = !piece.ends_with(b"\n");
+        }
+        Ok(())
+    }
+
+    /// What has to be said before the next line.
+    fn catch_up(&mut self) -> io::Result<()> {
+        if self.untold == 0 {
+            return Ok(());
+        }
+        let begin = if self.is_cut { "\n" } else { "" };
+        let text = format!("{begin}{} lines of the log were lost here\n", self.untold);
+        self.line(text.as_bytes())?;
+        self.untold = 0;
+        Ok(())
+    }
+
+    fn ready(&self) -> io::Result<()> {
+        let patience = if self.is_stuck { NONE } else { PATIENCE };
+        let mut target = [PollFd::new(&self.target, PollFlags::OUT)];
+        // What has hung up is ready, too: writing tells.
+        match poll(&mut target, Some(&patience)) {
+            Ok(0) => Err(io::ErrorKind::WouldBlock.into()),
+            Ok(_) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
+    }
+}
+
+impl<W: Write + AsFd> Write for Lines<W> {
+    /// Takes a line; whatever becomes of it is no error of whoever had something to say.
+    fn write(&mut self, line: &[u8]) -> io::Result<usize> {
+        let written = self.catch_up().and_then(|()| self.line(line));
+        self.is_stuck = written.is_err();
+        if self.is_stuck {
+            self.untold += 1;
+            self.lost.fetch_add(1, Ordering::Relaxed);
+        }
+        Ok(line.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs::{File, OpenOptions};
+    use std::io::{PipeReader, Read as _};
+    use std::time::{Duration, Instant};
+
+    use super::*;
+
+    fn lines<W: Write + AsFd>(target: W) -> (Lines<W>, Arc<AtomicU64>) {
+        let lost = Arc::default();
+        (Lines::new(target, Arc::clone(&lost)), lost)
+    }
+
+    fn read(reader: &mut PipeReader, bytes: usize) -> String {
+        let mut text = vec![0; bytes];
+        reader.read_exact(&mut text).unwrap();
+        String::from_utf8(text).unwrap()
+    }
+
+    #[test]
+    fn a_pipe_that_nobody_reads_holds_nobody_up_and_what_it_missed_is_told() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        let (mut lines, lost) = lines(writer);
+        let line = [&[b'x'; 999][..], b"\n"].concat();
+        let began = Instant::now();
+        for _ in 0..1000 {
+            assert_eq!(lines.write(&line).unwrap(), line.len());
+        }
+        // Waited for once.
+        assert!(
+            began.elapsed() < Duration::from_secs(2),
+            "{:?}",
+            began.elapsed()
+        );
+        let missed = lost.load(Ordering::Relaxed);
+        assert!((900..1000).contains(&missed), "{missed}");
+        let taken = 1000 - usize::try_from(missed).unwrap();
+        let text = read(&mut reader, taken * line.len());
+        assert!(text.lines().all(|line| line.len() == 999));
+        lines.write_all(b"here again\n").unwrap();
+        drop(lines);
+        let mut rest = String::new();
+        reader.read_to_string(&mut rest).unwrap();
+        assert_eq!(
+            rest,
+            format!("{missed} lines of the log were lost here\nhere again\n")
+        );
+        assert_eq!(lost.load(Ordering::Relaxed), missed);
+    }
+
+    #[test]
+    fn a_line_that_was_cut_is_ended_before_the_next_one() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        let (mut lines, lost) = lines(writer);
+        lines.write_all(&[b'x'; 1 << 20]).unwrap();
+        assert_eq!(lost.load(Ordering::Relaxed), 1);
+        let mut part = vec![0; 1 << 20];
+        let length = reader.read(&mut part).unwrap();
+        assert!(part[..length].iter().all(|byte| *byte == b'x'));
+        lines.write_all(b"next\n").unwrap();
+        drop(lines);
+        let mut rest = String::new();
+        reader.read_to_string(&mut rest).unwrap();
+        assert_eq!(rest, "\n1 lines of the log were lost here\nnext\n");
+    }
+
+    #[test]
+    fn a_pipe_that_was_closed_and_a_disk_that_is_full_cost_a_counter() {
+        let (reader, writer) = io::pipe().unwrap();
+        drop(reader);
+        let (mut lines, lost) = lines(writer);
+        lines.write_all(b"to nobody\n").unwrap();
+        assert_eq!(lost.load(Ordering::Relaxed), 1);
+
+        let full: File = OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let (mut lines, lost) = self::lines(full);
+        lines.write_all(b"too much\n").unwrap();
+        lines.write_all(b"too much\n").unwrap();
+        assert_eq!(lost.load(Ordering::Relaxed), 2);
+    }
+}
