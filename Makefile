@@ -9,6 +9,8 @@ NEXTEST := $(shell cargo nextest --version >/dev/null 2>&1 && echo yes)
 
 export PATH := $(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
 export LLVM_PREFIX ?= $(if $(wildcard /usr/lib/llvm-22/bin/llvm-strip),/usr/lib/llvm-22,/usr)
+# Comes with Rust and links for both architectures: no cross toolchain.
+export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_MUSL_LINKER := rust-lld
 # The tests make network namespaces: build as the user, run the tests as root.
 ifneq ($(SUDO),)
 export CARGO_TARGET_$(HOST)_RUNNER := $(SUDO) env PATH=$(PATH)
@@ -28,6 +30,7 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	cargo clippy --workspace --all-targets -- -D warnings
 	NIGHTLY=$$(.ci/prerequisites.sh --nightly) agent-ebpf/build.sh --check
 	@$(MAKE) --no-print-directory peers
+	@$(MAKE) --no-print-directory arm
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
 	cargo test --package ros2probe --features tls --test web_config --test otlp_tls --quiet
@@ -43,6 +46,9 @@ run: ## run the agent on this machine with the default configuration (needs root
 
 peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
 	@$(MAKE) --no-print-directory -C agent/tests/peers OUT=$(TARGET)/peers
+
+arm: ## build rp for aarch64, static and unoptimized, which the tests run under qemu
+	CARGO_PROFILE_DEV_DEBUG=0 cargo build --package ros2probe --bin rp --target aarch64-unknown-linux-musl
 
 bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 	@.ci/prerequisites.sh test
@@ -60,7 +66,7 @@ fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
 	done) || exit 1; done
 
-prerequisites: ## install what demo, test, ebpf and fuzz need
-	@.ci/prerequisites.sh demo test ebpf fuzz
+prerequisites: ## install what demo, test, dist, ebpf and fuzz need
+	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test ebpf run peers bench fuzz prerequisites
+.PHONY: help demo test ebpf run peers arm bench fuzz prerequisites

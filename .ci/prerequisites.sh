@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
 #
-#   prerequisites.sh demo|test|ebpf|fuzz...   install what those targets need
+#   prerequisites.sh demo|test|dist|ebpf|fuzz...   install what those targets need
 #   prerequisites.sh types                    install what the dashboards are type-checked with
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
 #
@@ -113,6 +113,33 @@ bags() {
     echo "${versions[*]}" >"$place/versions"
 }
 
+# Runs the aarch64 binary on another machine: called by name, registered with nothing.
+qemu() {
+    [ "$(uname -m)" = aarch64 ] && return
+    command -v qemu-aarch64-static >/dev/null && return
+    [ -x "$tools/usr/bin/qemu-aarch64-static" ] && return
+    refresh
+    available qemu-user-static ||
+        die "package qemu-user-static is in none of this system's sources (on Ubuntu: sudo add-apt-repository universe)"
+    say "unpacking qemu-aarch64-static into target/tools (nothing is installed or registered)"
+    mkdir -p "$tools"
+    (cd "$tools" && apt-get -o APT::Sandbox::User=root download -qq qemu-user-static &&
+        dpkg-deb --fsys-tarfile qemu-user-static_*.deb | tar -x ./usr/bin/qemu-aarch64-static &&
+        rm qemu-user-static_*.deb)
+}
+
+# Standard libraries to link static binaries with; rust-lld, which comes with Rust, links for both.
+musl() {
+    local architecture target
+    for architecture; do
+        target=$architecture-unknown-linux-musl
+        [ -d "$(rustc --print target-libdir --target "$target")" ] && continue
+        command -v rustup >/dev/null || die "rustup is needed to add the Rust target $target"
+        say "adding the Rust target $target"
+        rustup target add "$target"
+    done
+}
+
 rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
@@ -189,7 +216,15 @@ for need; do
         bags
         types
         rust
+        musl aarch64
+        qemu
         ebpf
+        ;;
+    dist)
+        packages gcc libc6-dev
+        rust
+        musl x86_64 aarch64
+        qemu
         ;;
     types) types ;;
     ebpf)
@@ -205,6 +240,6 @@ for need; do
             cargo install cargo-fuzz --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, types, ebpf, fuzz" ;;
+    *) die "prerequisites.sh: $need is none of demo, test, dist, types, ebpf, fuzz" ;;
     esac
 done

@@ -38,6 +38,9 @@ pub enum FilterError {
     /// The kernel refuses BPF to this process.
     #[error("loading the kernel filter is not permitted")]
     NotPermitted(#[source] io::Error),
+    /// There is no such system call.
+    #[error("there is no BPF here: not in this kernel, or not in what emulates this processor")]
+    NoBpf(#[source] io::Error),
     /// The object does not load.
     #[error("the kernel filter does not load")]
     Load(#[source] EbpfError),
@@ -285,9 +288,12 @@ impl Filter {
 impl FilterError {
     /// Tells the operator's problem (no privilege) from ours.
     fn load(error: EbpfError) -> Self {
-        match not_permitted(&error) {
-            Some(error) => Self::NotPermitted(error),
-            None => Self::Load(error),
+        if let Some(error) = not_permitted(&error) {
+            Self::NotPermitted(error)
+        } else if let Some(error) = caused_by(&error, libc::ENOSYS) {
+            Self::NoBpf(error)
+        } else {
+            Self::Load(error)
         }
     }
 
@@ -301,13 +307,17 @@ impl FilterError {
 
 /// The EPERM at the end of an error's chain of causes. EACCES is not it: that is the verifier's no.
 fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error> {
+    caused_by(error, libc::EPERM)
+}
+
+fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<io::Error> {
     let mut cause = Some(error);
     while let Some(error) = cause {
         let code = error
             .downcast_ref::<io::Error>()
             .and_then(io::Error::raw_os_error);
-        if code == Some(libc::EPERM) {
-            return Some(io::Error::from_raw_os_error(libc::EPERM));
+        if code == Some(wanted) {
+            return Some(io::Error::from_raw_os_error(wanted));
         }
         cause = error.source();
     }
@@ -378,7 +388,12 @@ fn preempts_everything() -> bool {
 }
 
 fn ring_size(bytes: u32) -> u32 {
-    bytes.next_power_of_two().max(page_size())
+    ring_size_with(bytes, page_size())
+}
+
+/// The kernel takes a power of two, of whole pages.
+fn ring_size_with(bytes: u32, page: u32) -> u32 {
+    bytes.next_power_of_two().max(page)
 }
 
 fn take<T>(ebpf: &mut Ebpf, name: &'static str) -> Result<T, FilterError>
@@ -412,4 +427,20 @@ fn page_size() -> u32 {
     // SAFETY: sysconf has no preconditions.
     let size = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
     u32::try_from(size).unwrap_or(65_536)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_ring_is_a_power_of_two_of_whole_pages_whatever_a_page_is() {
+        for page in [4096, 16_384, 65_536] {
+            for bytes in [0, 1, 65_536, 65_537, 300_000, 1 << 20] {
+                let size = ring_size_with(bytes, page);
+                assert!(size.is_power_of_two() && size.is_multiple_of(page));
+                assert!(size >= bytes && size / 2 < bytes.max(page));
+            }
+        }
+    }
 }

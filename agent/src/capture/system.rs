@@ -88,7 +88,7 @@ impl DirectoryWatch {
             revents: 0,
         };
         let timeout = libc::timespec {
-            tv_sec: timeout.as_secs().try_into().unwrap_or(libc::time_t::MAX),
+            tv_sec: timeout.as_secs().try_into().unwrap_or(i64::MAX),
             tv_nsec: timeout.subsec_nanos().into(),
         };
         // SAFETY: one entry and the time, both of which outlive the call; no signal mask.
@@ -142,7 +142,9 @@ pub fn run_first(first: bool) -> io::Result<()> {
         true => (libc::SCHED_FIFO, 1),
         false => (libc::SCHED_OTHER, 0),
     };
-    let parameter = libc::sched_param { sched_priority };
+    // SAFETY: numbers alone, for which 0 is a value; musl has more of them than glibc.
+    let mut parameter: libc::sched_param = unsafe { std::mem::zeroed() };
+    parameter.sched_priority = sched_priority;
     // SAFETY: has no preconditions.
     let this_thread = unsafe { libc::pthread_self() };
     // SAFETY: the thread is the calling one; `parameter` outlives the call.

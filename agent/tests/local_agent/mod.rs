@@ -62,7 +62,8 @@ impl LocalAgent {
         Self::replay(&mut rp(), capture, arguments)
     }
 
-    fn replay(command: &mut Command, capture: &Path, arguments: &[&str]) -> Self {
+    /// As [`Self::start_as`], with another capture.
+    pub fn replay(command: &mut Command, capture: &Path, arguments: &[&str]) -> Self {
         let mut child = command
             .args(["run", "--metrics", "127.0.0.1:0", "--api", "127.0.0.1:0"])
             .arg("--replay")

@@ -289,14 +289,25 @@ fn impossible_sizes_are_refused() {
             Err(RingError::Size { .. })
         ));
     }
-    // One byte becomes a page, whatever a page is.
-    let (request, block_size) = request(Settings {
-        block_size: 1,
-        ..SMALL
-    })
-    .unwrap();
-    assert_eq!(request.tp_block_size as usize, block_size);
-    assert!(block_size >= 4096 && block_size.is_power_of_two());
+}
+
+#[test]
+fn blocks_are_whole_pages_whatever_a_page_is() {
+    for page in [4096, 16_384, 65_536] {
+        for (wanted, given) in [(1, page), (page + 1, 2 * page), (BLOCK, BLOCK)] {
+            let settings = Settings {
+                block_size: wanted,
+                ..SMALL
+            };
+            let (request, block_size) = request(settings, page).unwrap();
+            assert_eq!(block_size, given, "{wanted} bytes in pages of {page}");
+            // What packet_set_ring() wants of it.
+            let (size, frame) = (request.tp_block_size, request.tp_frame_size);
+            assert_eq!(size as usize, block_size);
+            assert!(frame > 0 && frame % libc::TPACKET_ALIGNMENT as u32 == 0);
+            assert_eq!(size / frame * request.tp_block_nr, request.tp_frame_nr);
+        }
+    }
 }
 
 #[test]
@@ -310,7 +321,7 @@ fn any_amount_of_memory_makes_a_ring_for_the_largest_frames() {
     ] {
         let settings = Settings::with_memory(memory);
         assert_eq!((settings.block_size, settings.blocks), (block_size, blocks));
-        assert!(request(settings).is_some());
+        assert!(page_bytes().is_some_and(|page| request(settings, page).is_some()));
     }
     in_new_namespace(|| {
         let mut ring = Ring::open(Settings::with_memory(0), None).unwrap();
