@@ -17,7 +17,6 @@ fn scrape(criterion: &mut Criterion) {
     for (name, histograms) in [("counters", false), ("histograms", true)] {
         let settings = Settings {
             histograms,
-            max_topics: 1_000,
             ..Settings::default()
         };
         let board = Arc::new(Board::new(SourceKind::Wire, settings));

@@ -102,10 +102,8 @@ fn run(options: cli::Run) -> Result<()> {
     };
     let recordings_directory = memory::recordings(&config.recordings.directory, state.as_deref());
     let known = state.as_deref().and_then(memory::load);
-    if let Some(state) = &state
-        && let Err(error) = watches.restore(memory::load_watches(state))
-    {
-        tracing::warn!(%error, "the watches that were added cannot be used");
+    if let Some(state) = &state {
+        memory::restore_watches(state, &watches);
     }
     privilege::give_up(&config.capture)?;
     if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {

@@ -8,7 +8,7 @@ use anyhow::anyhow;
 use ros2probe::config::{StateChoice, Watch};
 use ros2probe::model::discovery::Memory;
 use ros2probe::state::{Loaded, StateDirectory};
-use ros2probe::watches::{self, Kept};
+use ros2probe::watches::{self, Kept, Watches};
 
 /// Where the package and the service manager put it.
 const DEFAULT: &str = "/var/lib/ros2probe";
@@ -71,8 +71,19 @@ pub(crate) fn load(directory: &StateDirectory) -> Option<Memory> {
     }
 }
 
-/// What clients of the last agent watched.
-pub(crate) fn load_watches(directory: &StateDirectory) -> Vec<Watch> {
+/// Watches again what clients of the last agent had asked for.
+pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) {
+    match watches.restore(load_watches(directory)) {
+        Ok(0) => {}
+        Ok(left_out) => {
+            let limit = "limits.watches";
+            tracing::warn!(left_out, limit, "not all watches that were added fit in");
+        }
+        Err(error) => tracing::warn!(%error, "the watches that were added cannot be used"),
+    }
+}
+
+fn load_watches(directory: &StateDirectory) -> Vec<Watch> {
     let path = directory.path().display();
     match watches::load(directory) {
         Kept::Nothing => Vec::new(),

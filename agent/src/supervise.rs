@@ -179,8 +179,8 @@ impl Supervisor {
         let in_force = self.watches.in_force();
         self.board.reloaded(Settings {
             watches: in_force.watchlist().watches().to_vec(),
-            // The cap of the tables is the one the agent was started with.
-            max_topics: self.config.limits.topics,
+            // The caps are those the agent was started with.
+            limits: *self.board.limits().caps(),
             ..Settings::new(config)
         });
         let watches = in_force.entries().len();

@@ -12,14 +12,11 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use arc_swap::{ArcSwap, ArcSwapOption};
 
-use crate::config::{Watch, Watchlist};
+use crate::config::{Limit, Watch, Watchlist};
 use crate::state::StateDirectory;
 use crate::surface::{AgentEvent, Board};
 use kept::Keeper;
 pub use kept::{Kept, load};
-
-/// Watches that clients may add; a longer list should be globs.
-pub const MAX_ADDED: usize = 1_000;
 
 /// Who asked for a watch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -74,9 +71,11 @@ pub enum Refused {
     /// No such watch.
     #[error("it is not watched")]
     Unknown,
-    /// There are [`MAX_ADDED`] already.
-    #[error("{MAX_ADDED} watches were added already, use globs")]
-    Full,
+    /// There would be more than may be.
+    #[error(
+        "there would be more than {0} watches, which is limits.watches: use globs, or raise it"
+    )]
+    Full(usize),
     /// The patterns cannot be matched together.
     #[error("the patterns cannot be matched")]
     Pattern(#[from] globset::Error),
@@ -147,12 +146,12 @@ impl Watches {
     /// What the configuration and the command line list.
     ///
     /// # Errors
-    /// When patterns cannot be matched together.
+    /// They are too many, or their patterns cannot be matched together.
     pub fn new(
         board: Arc<Board>,
         configured: Vec<Watch>,
         command_line: Vec<Watch>,
-    ) -> Result<Self, globset::Error> {
+    ) -> Result<Self, Refused> {
         let watches = Self {
             lists: Mutex::default(),
             in_force: ArcSwap::default(),
@@ -167,20 +166,34 @@ impl Watches {
         };
         watches.change(|old| {
             *old = lists;
-            Ok::<_, globset::Error>(())
+            Ok(())
         })?;
         Ok(watches)
     }
 
-    /// Watches again what clients had added before the last agent ended.
+    /// Watches again what clients had added before the last agent ended; how many of them are left
+    /// out, for want of room.
     ///
     /// # Errors
     /// When patterns cannot be matched together; then nothing changes.
-    pub fn restore(&self, watches: Vec<Watch>) -> Result<(), globset::Error> {
+    pub fn restore(&self, watches: Vec<Watch>) -> Result<usize, Refused> {
+        let in_force = self.in_force();
+        let mut room = self.cap().saturating_sub(in_force.entries().len());
+        let asked = watches.len();
+        let fits = |watch: &Watch| {
+            let is_there = in_force.find(&watch.pattern, watch.domain_id).is_some();
+            let fits = is_there || room > 0;
+            room -= usize::from(fits && !is_there);
+            fits
+        };
+        let added: Vec<_> = watches.into_iter().filter(fits).map(Arc::new).collect();
+        let left_out = asked - added.len();
+        self.board.limits().reached(Limit::Watches, left_out);
         self.change(|lists| {
-            lists.added = watches.into_iter().map(Arc::new).collect();
+            lists.added = added;
             Ok(())
-        })
+        })?;
+        Ok(left_out)
     }
 
     /// Keeps what clients add from now on in this directory.
@@ -210,8 +223,9 @@ impl Watches {
     /// The configuration lists these now; what else is watched stays.
     ///
     /// # Errors
-    /// When patterns cannot be matched together; then nothing changes.
-    pub fn configure(&self, watches: Vec<Watch>) -> Result<(), globset::Error> {
+    /// With what else is watched they are too many, or their patterns cannot be matched together;
+    /// then nothing changes.
+    pub fn configure(&self, watches: Vec<Watch>) -> Result<(), Refused> {
         self.change(|lists| {
             lists.configured = watches.into_iter().map(Arc::new).collect();
             Ok(())
@@ -276,6 +290,10 @@ impl Watches {
         self.news.swap(None)
     }
 
+    fn cap(&self) -> usize {
+        self.board.limits().caps().watches
+    }
+
     fn put(&self, watch: Watch, replace: bool) -> Result<Done, Refused> {
         let in_force = self.in_force();
         let old = in_force.find(&watch.pattern, watch.domain_id);
@@ -293,10 +311,8 @@ impl Watches {
             let same = |other: &&mut Arc<Watch>| is_for(other, &watch.pattern, watch.domain_id);
             if let Some(old) = lists.added.iter_mut().find(same) {
                 *old = Arc::clone(&watch);
-            } else if lists.added.len() < MAX_ADDED {
-                lists.added.push(Arc::clone(&watch));
             } else {
-                return Err(Refused::Full);
+                lists.added.push(Arc::clone(&watch));
             }
             Ok(())
         })?;
@@ -311,14 +327,20 @@ impl Watches {
 
     /// Changes the lists, merges them and hands the outcome to whom it concerns; on an error
     /// nothing changes.
-    fn change<E: From<globset::Error>>(
+    fn change(
         &self,
-        change: impl FnOnce(&mut Lists) -> Result<(), E>,
-    ) -> Result<(), E> {
+        change: impl FnOnce(&mut Lists) -> Result<(), Refused>,
+    ) -> Result<(), Refused> {
         let mut lists = self.lists.lock().unwrap_or_else(PoisonError::into_inner);
         let mut new = lists.clone();
         change(&mut new)?;
         let merged = InForce::merge(&new, &self.in_force().watchlist)?;
+        let (count, cap) = (merged.entries.len(), self.cap());
+        if count > cap {
+            self.board.limits().reached(Limit::Watches, count - cap);
+            return Err(Refused::Full(cap));
+        }
+        self.board.limits().set_used(Limit::Watches, count);
         if new.added != lists.added
             && let Some(keeper) = self.keeper.get()
         {

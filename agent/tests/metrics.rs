@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use local_agent::promtool;
 use ros2probe::config::{Expectations, Watch};
+use ros2probe::config::{Limits, limits_markdown};
 use ros2probe::model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
@@ -34,7 +35,7 @@ fn settings() -> Settings {
         })],
         histograms: true,
         per_writer: true,
-        max_topics: 1_000,
+        limits: Limits::default(),
     }
 }
 
@@ -98,6 +99,11 @@ fn the_readme_s_tables_are_those_of_the_sources() {
             "events/table.rs -->\n",
             "<!-- events: end",
             events::markdown(),
+        ),
+        (
+            "config/limits.rs -->\n",
+            "<!-- limits: end",
+            limits_markdown(),
         ),
     ] {
         let (before, rest) = readme.split_once(begin).unwrap();

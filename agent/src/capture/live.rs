@@ -35,6 +35,8 @@ const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 /// Handed out in small portions, so that a storm that comes while we are held up leaves most of the
 /// record ring to the writers we know.
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
+/// A fragmented datagram fits in, however many network namespaces share the cap.
+const LEAST_REASSEMBLY: usize = 1 << 17;
 /// How long news from the host hook is gathered: a node that starts announces its endpoints one by
 /// one, and each round costs.
 const GATHER: Duration = Duration::from_millis(10);
@@ -354,15 +356,22 @@ impl LiveSource {
         host + wires.sum::<u64>()
     }
 
-    /// Bytes held for reassembly.
+    /// Bytes held to put IP fragments together.
     #[must_use]
     pub fn reassembly_bytes(&self) -> usize {
-        let host: usize = self.intakes().map(Intake::waiting_bytes).sum();
-        host + self
-            .wires
-            .iter()
-            .map(WireTap::reassembly_bytes)
-            .sum::<usize>()
+        self.wires.iter().map(WireTap::reassembly_bytes).sum()
+    }
+
+    /// Bytes held to put captured datagrams together that come in pieces.
+    #[must_use]
+    pub fn waiting_bytes(&self) -> usize {
+        self.intakes().map(Intake::waiting_bytes).sum()
+    }
+
+    /// Datagrams given up because there were too many fragments.
+    #[must_use]
+    pub fn reassembly_evicted(&self) -> u64 {
+        self.wires.iter().map(WireTap::reassembly_evicted).sum()
     }
 
     /// What the tap on shared memory says of itself, if there is one.
@@ -514,6 +523,12 @@ fn open_wires(
     limits: Limits,
     selection: Selection,
 ) -> Result<Vec<WireTap>, CaptureError> {
+    // All of them together keep the cap.
+    let share = limits.bytes / (1 + settings.network_namespaces.len());
+    let limits = Limits {
+        bytes: share.max(LEAST_REASSEMBLY),
+        ..limits
+    };
     let wire = WireSettings {
         selection,
         ring_bytes: settings.ring_bytes,

@@ -205,6 +205,12 @@ impl WireTap {
         self.intake.reassembly.bytes()
     }
 
+    /// Datagrams given up for want of room.
+    #[must_use]
+    pub const fn reassembly_evicted(&self) -> u64 {
+        self.intake.reassembly.counters().evicted
+    }
+
     /// Interfaces that the kernel filter could not be told of.
     #[must_use]
     pub const fn refused_interfaces(&self) -> u64 {

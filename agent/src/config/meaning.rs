@@ -21,8 +21,6 @@ use super::{
 };
 use crate::surface::otlp::endpoint;
 
-/// A watchlist that long should be globs.
-const MAX_WATCHES: usize = 1_000;
 /// Each keeps memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
 
@@ -87,18 +85,10 @@ impl Reader {
     }
 
     fn config(&mut self, shape: ConfigShape) -> Config {
-        let limits = shape.limits.unwrap_or_default();
+        let limits = Limits::from(shape.limits.unwrap_or_default());
         Config {
-            watches: self.watches(shape.watch.unwrap_or_default()),
-            limits: Limits {
-                participants: limits.participants,
-                endpoints: limits.endpoints,
-                topics: limits.topics,
-                unknown_writers: limits.unknown_writers,
-                reassembly_bytes: limits.reassembly_bytes,
-                subscriptions: limits.subscriptions,
-                payload_bytes: limits.payload_bytes,
-            },
+            watches: self.watches(shape.watch.unwrap_or_default(), limits.watches),
+            limits,
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(shape.metrics.unwrap_or_default()),
             api: self.api(shape.api.unwrap_or_default()),
@@ -143,10 +133,10 @@ impl Reader {
         }
     }
 
-    fn watches(&mut self, shapes: Vec<WatchShape>) -> Vec<Watch> {
-        if shapes.len() > MAX_WATCHES {
+    fn watches(&mut self, shapes: Vec<WatchShape>, limit: usize) -> Vec<Watch> {
+        if shapes.len() > limit {
             let message = format!(
-                "has {} entries, at most {MAX_WATCHES} are allowed",
+                "has {} entries, at most {limit} are allowed: use globs, or raise limits.watches",
                 shapes.len()
             );
             self.wrong("watch", message);

@@ -4,6 +4,7 @@
 
 mod check;
 mod document;
+mod limits;
 mod meaning;
 mod mistake;
 mod shape;
@@ -19,6 +20,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+pub use limits::{Limit, Limits, Row as LimitRow, markdown as limits_markdown};
 pub use mistake::{Mistake, Mistakes, Position};
 pub use watch::{Expectations, PatternError, Retain, Watch, Watchlist, check_pattern};
 
@@ -30,7 +32,7 @@ const MAX_BYTES: u64 = 1 << 20;
 pub struct Config {
     /// What to measure, in file order.
     pub watches: Vec<Watch>,
-    /// Caps of the model's tables.
+    /// Caps of the agent's tables.
     pub limits: Limits,
     /// Where packets come from.
     pub capture: CaptureSettings,
@@ -48,25 +50,6 @@ pub struct Config {
     pub state_directory: StateChoice,
     /// Least severe level that is logged.
     pub log: Level,
-}
-
-/// Caps of the model's tables.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
-    /// DDS participants.
-    pub participants: usize,
-    /// Writers and readers.
-    pub endpoints: usize,
-    /// Topics that are measured.
-    pub topics: usize,
-    /// Writers that send without a known announcement.
-    pub unknown_writers: usize,
-    /// Bytes held while datagrams are reassembled.
-    pub reassembly_bytes: usize,
-    /// Streams of messages and recordings.
-    pub subscriptions: usize,
-    /// Bytes of messages put together for those and waiting for them.
-    pub payload_bytes: usize,
 }
 
 /// Where packets come from and the memory used for it.
@@ -378,15 +361,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             watches: Vec::new(),
-            limits: Limits {
-                participants: defaults::PARTICIPANTS,
-                endpoints: defaults::ENDPOINTS,
-                topics: defaults::TOPICS,
-                unknown_writers: defaults::UNKNOWN_WRITERS,
-                reassembly_bytes: defaults::REASSEMBLY_BYTES,
-                subscriptions: defaults::SUBSCRIPTIONS,
-                payload_bytes: defaults::PAYLOAD_BYTES,
-            },
+            limits: Limits::default(),
             capture: CaptureSettings {
                 source: SourceChoice::default(),
                 cgroup: None,
@@ -450,13 +425,6 @@ impl Level {
 
 /// What is not written in the file.
 mod defaults {
-    pub(super) const PARTICIPANTS: usize = 1_000;
-    pub(super) const ENDPOINTS: usize = 8_192;
-    pub(super) const TOPICS: usize = 1_000;
-    pub(super) const UNKNOWN_WRITERS: usize = 256;
-    pub(super) const REASSEMBLY_BYTES: usize = 4 << 20;
-    pub(super) const SUBSCRIPTIONS: usize = 32;
-    pub(super) const PAYLOAD_BYTES: usize = 40 << 20;
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
     pub(super) const SHM_CPU_PERCENT: f64 = 1.5;

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::limits::LimitsShape;
 use super::watch::Retain;
 use super::{Compression, ExactChoice, Level, ShmMode, SourceChoice, defaults};
 
@@ -19,7 +20,7 @@ pub(super) struct ConfigShape {
     /// Topics to measure: names (`/points`), globs (`/camera/*/image_raw`, `/**`), or maps with
     /// expectations. Nothing listed: the graph alone is reported. Applied on reload.
     pub(super) watch: Option<Vec<WatchShape>>,
-    /// Caps of the agent's tables; what exceeds them is counted in `ros2probe_table_evictions_total`.
+    /// Caps of the agent's tables; what exceeds them is counted in `ros2probe_limit_reached_total`.
     pub(super) limits: Option<LimitsShape>,
     /// Where packets are taken from and how much memory is used for it.
     pub(super) capture: Option<CaptureShape>,
@@ -94,34 +95,6 @@ pub(super) struct WatchEntryShape {
     /// Longest time without a message, in seconds.
     #[schemars(range(min = 0.001, max = 604_800.0))]
     pub(super) max_silence_s: Option<f64>,
-}
-
-/// Caps of the agent's tables.
-#[derive(Debug, Deserialize, JsonSchema)]
-#[schemars(inline)]
-#[serde(deny_unknown_fields, default)]
-pub(super) struct LimitsShape {
-    /// DDS participants.
-    #[schemars(range(min = 1, max = 100_000))]
-    pub(super) participants: usize,
-    /// Writers and readers.
-    #[schemars(range(min = 1, max = 1_000_000))]
-    pub(super) endpoints: usize,
-    /// Topics that are measured.
-    #[schemars(range(min = 1, max = 100_000))]
-    pub(super) topics: usize,
-    /// Writers that send without a known announcement.
-    #[schemars(range(min = 1, max = 100_000))]
-    pub(super) unknown_writers: usize,
-    /// Bytes held while fragmented datagrams are put together.
-    #[schemars(range(min = 65_536, max = 1_073_741_824))]
-    pub(super) reassembly_bytes: usize,
-    /// Clients that get messages one by one, and recordings, at once.
-    #[schemars(range(min = 1, max = 1_000))]
-    pub(super) subscriptions: usize,
-    /// Bytes of messages that are put together for them, or wait for them to be read.
-    #[schemars(range(min = 1_048_576, max = 17_179_869_184_u64))]
-    pub(super) payload_bytes: usize,
 }
 
 /// Where packets are taken from.
@@ -301,20 +274,6 @@ pub(super) struct OtlpShape {
     pub(super) robot: Option<String>,
     /// Further attributes of the resource, names and values.
     pub(super) attributes: Option<BTreeMap<String, String>>,
-}
-
-impl Default for LimitsShape {
-    fn default() -> Self {
-        Self {
-            participants: defaults::PARTICIPANTS,
-            endpoints: defaults::ENDPOINTS,
-            topics: defaults::TOPICS,
-            unknown_writers: defaults::UNKNOWN_WRITERS,
-            reassembly_bytes: defaults::REASSEMBLY_BYTES,
-            subscriptions: defaults::SUBSCRIPTIONS,
-            payload_bytes: defaults::PAYLOAD_BYTES,
-        }
-    }
 }
 
 impl Default for CaptureShape {

@@ -6,11 +6,11 @@ use std::net::SocketAddr;
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::path::Path;
 
-use super::answers::{Answers, Health};
+use super::answers::{Answers, Health, Limit};
 use super::finding::{Area, Finding, Verdict};
 use super::host::Host;
 use super::privileges::is_installed;
-use crate::config::{Config, StateChoice};
+use crate::config::{self, Config, StateChoice};
 
 const AREA: Area = Area::Agent;
 const FROM: &str = "GET /health";
@@ -30,6 +30,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     let health = &answers.health;
     let mut findings = vec![running(health, place), version(health, own_version)];
     findings.extend(losses(health));
+    findings.extend(limits(health));
     findings.extend(evictions(health));
     findings.push(watches(answers));
     if health.source != "replay" {
@@ -160,8 +161,53 @@ fn losses(health: &Health) -> Vec<Finding> {
     findings
 }
 
+/// Caps of the configuration that are or were reached, each with the line to change.
+fn limits(health: &Health) -> Vec<Finding> {
+    let full = |limit: &&Limit| limit.reached > 0 || (limit.cap > 0 && limit.used >= limit.cap);
+    let full = health.limits.iter().filter(full);
+    full.map(|limit| {
+        let Limit {
+            limit: key,
+            cap,
+            used,
+            reached,
+        } = limit;
+        let now = match used >= cap {
+            true => "is reached",
+            false => "was reached",
+        };
+        let sentence = match reached {
+            0 => format!("limits.{key} {now}: {used} of {cap}, nothing was refused so far"),
+            reached => format!("limits.{key} {now} ({cap}): {reached} refused or given up so far"),
+        };
+        let finding = Finding::new(AREA, "limits", Verdict::Warning, sentence);
+        let finding = finding.seen(
+            format!("{used} used, {reached} refused or given up"),
+            format!("{FROM} limits {key}"),
+        );
+        let most = config::Limit::find(key).map_or(u64::MAX, |limit| limit.row().range.1 as u64);
+        finding.configure(format!(
+            "limits: {{{key}: {}}}    # {}",
+            cap.saturating_mul(2).min(most),
+            match key.as_str() {
+                "participants" | "endpoints" | "unknown_writers" =>
+                    "a storm of forged participants does this too",
+                "topics" | "watches" => "or fewer watches",
+                _ => "memory grows with it: systemctl show ros2probe -p MemoryMax",
+            }
+        ))
+    })
+    .collect()
+}
+
+/// Tables that have no key in the configuration; of an agent that tells no limits, all of them.
 fn evictions(health: &Health) -> Vec<Finding> {
+    let is_told = |table: &str| {
+        let limit = limit(table);
+        limit.is_some_and(|key| health.limits.iter().any(|told| told.limit == key))
+    };
     let full = health.tables.iter().filter(|table| table.evictions > 0);
+    let full = full.filter(|table| !is_told(&table.table));
     let mut findings: Vec<_> = full
         .map(|table| {
             let sentence = format!(
@@ -181,7 +227,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
             }
         })
         .collect();
-    if health.topics_rejected > 0 {
+    if health.topics_rejected > 0 && !is_told("topics") {
         let sentence = format!(
             "{} watched topics are beyond limits.topics and not measured",
             health.topics_rejected
@@ -198,7 +244,9 @@ fn evictions(health: &Health) -> Vec<Finding> {
 
 /// The key of a table's limit; most have none.
 fn limit(table: &str) -> Option<&'static str> {
-    const KEYS: [(&str, &str); 5] = [
+    const KEYS: [(&str, &str); 7] = [
+        ("deliveries", "flows"),
+        ("payloads", "payload_bytes"),
         ("participants", "participants"),
         ("endpoints", "endpoints"),
         ("topics", "topics"),
@@ -420,6 +468,36 @@ mod tests {
                 .count(),
             1
         );
+    }
+
+    #[test]
+    fn a_cap_that_is_or_was_reached_is_a_warning_with_the_line_to_change() {
+        let full = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
+            "topics_rejected":2,"tables":[{"table":"deliveries","limit":10,"evictions":3},
+            {"table":"nodes","limit":5,"evictions":1}],
+            "limits":[{"limit":"topics","cap":10,"used":10,"reached":2},
+            {"limit":"flows","cap":10,"used":4,"reached":3},
+            {"limit":"recordings","cap":100,"used":100,"reached":0},
+            {"limit":"watches","cap":10,"used":9,"reached":0}]}"#;
+        let findings = check(&answers(full, WATCHED), "here", "1.0.0");
+        let of = |check: &str| {
+            let found = findings.iter().filter(|each| each.check == check);
+            found.map(|each| each.sentence.as_str()).collect::<Vec<_>>()
+        };
+        assert_eq!(
+            of("limits"),
+            [
+                "limits.topics is reached (10): 2 refused or given up so far",
+                "limits.flows was reached (10): 3 refused or given up so far",
+                "limits.recordings is reached: 100 of 100, nothing was refused so far",
+            ]
+        );
+        assert_eq!(of("evictions").len(), 1, "told once: {findings:?}");
+        assert!(of("topics_rejected").is_empty());
+        for finding in findings.iter().filter(|each| each.check == "limits") {
+            let line = &finding.remedies[0].line;
+            assert!(Config::parse(line.as_bytes()).is_ok(), "{line}");
+        }
     }
 
     #[test]

@@ -64,6 +64,8 @@ pub struct Health {
     pub interfaces: Vec<Interface>,
     /// Bounded tables.
     pub tables: Vec<Table>,
+    /// Caps of its configuration.
+    pub limits: Vec<Limit>,
     /// Capabilities it kept.
     pub capabilities: Vec<String>,
     /// Its process.
@@ -104,6 +106,20 @@ pub struct Table {
     pub limit: u64,
     /// Given up because of it.
     pub evictions: u64,
+}
+
+/// A cap of the configuration.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Limit {
+    /// Its key.
+    pub limit: String,
+    /// What may be.
+    pub cap: u64,
+    /// What is.
+    pub used: u64,
+    /// Refused or given up because of it.
+    pub reached: u64,
 }
 
 /// All participants.

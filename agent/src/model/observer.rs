@@ -110,6 +110,7 @@ impl Settings {
             endpoints: limits.endpoints,
             topics: limits.topics,
             unknown_writers: limits.unknown_writers,
+            deliveries: limits.flows,
             // The other half is for what waits to be read.
             payload_bytes: limits.payload_bytes / 2,
             ..self

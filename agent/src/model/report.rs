@@ -40,6 +40,7 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
         tables: tables(observer),
         datagrams: observer.datagrams,
         records: observer.records,
+        topics_measured: observer.topics.watched() as u64,
         topics_rejected: observer.topics.rejected,
     }
 }

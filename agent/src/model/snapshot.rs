@@ -46,6 +46,8 @@ pub struct Snapshot {
     pub datagrams: u64,
     /// Records taken in, from the kernel or from user-space walks.
     pub records: u64,
+    /// Topics that are measured, vanished ones included.
+    pub topics_measured: u64,
     /// Topics that the watchlist matched but the cap kept out.
     pub topics_rejected: u64,
 }

@@ -18,14 +18,13 @@ use super::report::Report;
 use super::session::{self, Order};
 use crate::bag::{self, Options, Schema, Writer};
 use crate::client::Got;
+use crate::config::Limit;
 use crate::message::Library;
 use crate::subscriptions::{
     ChoiceError, Depth, Overflow, Refused, Request, Selection, Subscription, Subscriptions,
 };
-use crate::surface::{AgentEvent, Board};
+use crate::surface::{AgentEvent, Board, Place, Places};
 
-/// Recordings under way at once.
-const RECORDINGS: usize = 4;
 /// Ended ones whose report is kept.
 const ENDED: usize = 16;
 /// Longest name of a recording.
@@ -41,6 +40,7 @@ pub struct Recordings {
     subscriptions: Arc<Subscriptions>,
     library: Arc<Library>,
     list: Mutex<Vec<Arc<Recording>>>,
+    places: Arc<Places>,
 }
 
 /// What a client wants to be recorded.
@@ -120,8 +120,8 @@ pub enum Refusal {
     #[error("there is a recording `{0}` already")]
     Exists(String),
     /// As many as may are under way.
-    #[error("{RECORDINGS} recordings are under way, which is the limit")]
-    TooMany,
+    #[error("{0} recordings are under way, which is the limit (limits.recordings)")]
+    TooMany(usize),
     /// The topics.
     #[error(transparent)]
     Filter(#[from] FilterError),
@@ -142,16 +142,18 @@ pub enum Refusal {
 impl Recordings {
     /// None yet. They are written below `directory`, and `queue_bytes` of each may wait for that.
     #[must_use]
-    pub const fn new(
+    pub fn new(
         directory: Option<PathBuf>,
         queue_bytes: usize,
         board: Arc<Board>,
         subscriptions: Arc<Subscriptions>,
         library: Arc<Library>,
     ) -> Self {
+        let places = board.limits().places(Limit::Recordings);
         Self {
             directory,
             queue_bytes,
+            places,
             board,
             subscriptions,
             library,
@@ -167,12 +169,10 @@ impl Recordings {
         let filter = Filter::new(wanted.asked.clone())?;
         let (name, directory) = self.place(wanted.name)?;
         let mut list = self.list();
-        let active = list
-            .iter()
-            .filter(|each| each.status().stage != Stage::Ended);
-        if active.count() >= RECORDINGS {
-            return Err(Refusal::TooMany);
-        }
+        let Some(place) = self.places.take() else {
+            self.board.limits().reached(Limit::Recordings, 1);
+            return Err(Refusal::TooMany(self.places.cap()));
+        };
         let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
         let writer = Writer::create(&directory, wanted.options);
         let writer = writer.map_err(|error| refusal(&name, error))?;
@@ -209,7 +209,7 @@ impl Recordings {
             recording: recording.name.clone(),
         });
         let (worker, board) = (Arc::clone(&recording), Arc::clone(&self.board));
-        let work = move || worker.work(recorder, subscription, &orders, &board);
+        let work = move || worker.work(recorder, subscription, &orders, &board, place);
         let thread = std::thread::Builder::new().name("recording".to_owned());
         let thread = thread.spawn(work).map_err(|error| {
             // The bag was made just now, and nothing is in it.
@@ -371,6 +371,7 @@ impl Recording {
         mut subscription: Subscription,
         orders: &Receiver<Order>,
         board: &Board,
+        place: Place,
     ) {
         let next = |patience| {
             let item = subscription.next_blocking(patience);
@@ -394,7 +395,7 @@ impl Recording {
         });
         count(&ended.report);
         figures.active.fetch_sub(1, Ordering::Relaxed);
-        drop(subscription);
+        drop((subscription, place));
         let error = ended.error.as_ref().map(causes);
         board.events().tell(AgentEvent::RecordingEnded {
             recording: self.name.clone(),

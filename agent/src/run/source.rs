@@ -151,6 +151,7 @@ impl Source {
                     copied_bytes: bytes,
                     incomplete_datagrams: counters.evicted + counters.timed_out,
                     reassembly_bytes: reassembly.bytes() as u64,
+                    reassembly_evicted: counters.evicted,
                     ..AgentFacts::new(SourceKind::Replay, now)
                 }
             }
@@ -207,6 +208,8 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         records_dropped: value(Counter::RecordsLost),
         incomplete_datagrams: live.incomplete_datagrams(),
         reassembly_bytes: live.reassembly_bytes() as u64,
+        reassembly_evicted: live.reassembly_evicted(),
+        pieces_bytes: live.waiting_bytes() as u64,
         refused_updates: live.refused_updates(),
         source_reason: live.without_host().map(str::to_owned),
         abilities: abilities(live),

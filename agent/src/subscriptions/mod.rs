@@ -102,6 +102,7 @@ pub struct Subscriptions {
     given: AtomicU64,
     missed: [AtomicU64; MissedReason::ALL.len()],
     refused: AtomicU64,
+    crowded_out: AtomicU64,
 }
 
 #[derive(Debug, Default)]
@@ -130,6 +131,8 @@ pub struct Facts {
     pub given: u64,
     /// Samples not given so far, for each reader, in the order of [`MissedReason::ALL`].
     pub missed: [u64; MissedReason::ALL.len()],
+    /// Of those, samples that had to go because all queues together were full.
+    pub crowded_out: u64,
     /// Bytes that wait in queues.
     pub queued_bytes: usize,
     /// Bytes of messages that are retained.
@@ -152,6 +155,7 @@ impl Subscriptions {
             given: AtomicU64::new(0),
             missed: Default::default(),
             refused: AtomicU64::new(0),
+            crowded_out: AtomicU64::new(0),
         }
     }
 
@@ -192,6 +196,7 @@ impl Subscriptions {
             refused: self.refused.load(Ordering::Relaxed),
             given: self.given.load(Ordering::Relaxed),
             missed: missed.map(|count| count.load(Ordering::Relaxed)),
+            crowded_out: self.crowded_out.load(Ordering::Relaxed),
             queued_bytes: self.queued.load(Ordering::Relaxed),
             retained_bytes: self.retained().bytes(),
         }
@@ -327,7 +332,9 @@ impl Subscriptions {
                 return;
             };
             longest.drop_oldest();
-            self.count_missed(MissedReason::QueueFull, longest.take_dropped());
+            let dropped = longest.take_dropped();
+            self.crowded_out.fetch_add(dropped, Ordering::Relaxed);
+            self.count_missed(MissedReason::QueueFull, dropped);
         }
     }
 

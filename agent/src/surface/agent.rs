@@ -9,6 +9,7 @@ use super::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
 use super::board::{Reload, State};
 use super::catalogue as metric;
 use super::events::EventLog;
+use super::limit_facts::{LimitFacts, LimitFigures};
 use super::otlp::{Exports, Outcome, Reason};
 use super::page::{Label, Page};
 use super::process::Process;
@@ -66,7 +67,10 @@ pub(super) fn capture(page: &mut Page<'_>, state: &State) -> fmt::Result {
     page.single(&metric::PIECES_DROPPED, agent.pieces_dropped)?;
     page.single(&metric::CONTENDED, agent.contended)?;
     page.single(&metric::INCOMPLETE_DATAGRAMS, agent.incomplete_datagrams)?;
-    page.single(&metric::REASSEMBLY, agent.reassembly_bytes)?;
+    page.single(
+        &metric::REASSEMBLY,
+        agent.reassembly_bytes + agent.pieces_bytes,
+    )?;
     shared_memory(page, agent.shared_memory.as_ref())?;
     page.family(&metric::SHM_EXACT_INFO, |family| {
         agent.exact.iter().try_for_each(|facts| {
@@ -109,6 +113,7 @@ pub(super) fn model(
     state: &State,
     rows: &Rows<'_>,
     hidden_deliveries: usize,
+    limits: &LimitFigures,
 ) -> fmt::Result {
     let snapshot = state.snapshot.as_ref();
     let tables = || snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
@@ -140,6 +145,7 @@ pub(super) fn model(
     page.family(&metric::TABLE_EVICTIONS, |family| {
         tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.evictions))
     })?;
+    self::limits(page, limits, state)?;
     let tracked = rows
         .shown
         .iter()
@@ -152,6 +158,25 @@ pub(super) fn model(
     )?;
     page.single(&metric::TOPICS_HIDDEN, rows.hidden)?;
     page.single(&metric::DELIVERIES_HIDDEN, hidden_deliveries)
+}
+
+/// The caps of the configuration.
+fn limits(page: &mut Page<'_>, figures: &LimitFigures, state: &State) -> fmt::Result {
+    type Read = fn(&LimitFacts) -> u64;
+    let families: [(_, Read); 3] = [
+        (&metric::LIMIT, |facts| facts.cap),
+        (&metric::LIMIT_USED, |facts| facts.used),
+        (&metric::LIMIT_REACHED, |facts| facts.reached),
+    ];
+    for (metric, read) in families {
+        page.family(metric, |family| {
+            let mut facts = figures.facts(state).into_iter();
+            facts.try_for_each(|facts| {
+                family.sample(&[Label::Text(facts.limit.key())], read(&facts))
+            })
+        })?;
+    }
+    Ok(())
 }
 
 /// What is kept for the next start, and what came from the last one.

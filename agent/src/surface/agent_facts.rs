@@ -38,8 +38,12 @@ pub struct AgentFacts {
     pub contended: u64,
     /// Fragmented datagrams that were begun and never became complete.
     pub incomplete_datagrams: u64,
-    /// Bytes held to put fragments together.
+    /// Bytes held to put IP fragments together.
     pub reassembly_bytes: u64,
+    /// Bytes held to put captured datagrams together that come from the sockets in pieces.
+    pub pieces_bytes: u64,
+    /// Datagrams of which fragments were missing and that were given up for want of room.
+    pub reassembly_evicted: u64,
     /// Changes of interest for which the kernel filter had no room.
     pub refused_updates: u64,
     /// What became of the state for the next start; `None` = none is kept.
@@ -140,6 +144,8 @@ impl AgentFacts {
             contended: 0,
             incomplete_datagrams: 0,
             reassembly_bytes: 0,
+            pieces_bytes: 0,
+            reassembly_evicted: 0,
             refused_updates: 0,
             state: None,
             shared_memory: None,

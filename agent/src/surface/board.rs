@@ -15,9 +15,10 @@ use tokio::sync::Notify;
 
 use super::agent_facts::{AgentFacts, SourceKind};
 use super::events::{AgentEvent, EventLog};
+use super::limit_facts::LimitFigures;
 use super::otlp::{Exports, Reason, Signal, SpanQueue};
 use super::recording_facts::RecordingFigures;
-use crate::config::{Config, Watch};
+use crate::config::{Config, Limits, Watch};
 use crate::model::snapshot::Snapshot;
 use crate::model::trace::Spans;
 
@@ -35,6 +36,7 @@ pub struct Board {
     spans: SpanQueue,
     recordings: RecordingFigures,
     lost_lines: Arc<AtomicU64>,
+    limits: LimitFigures,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
     bell: Option<Bell>,
@@ -66,8 +68,8 @@ pub struct Settings {
     pub histograms: bool,
     /// Series per writer.
     pub per_writer: bool,
-    /// Topics shown at most.
-    pub max_topics: usize,
+    /// Caps; those of the start stay in force.
+    pub limits: Limits,
 }
 
 /// How the last reload of the configuration went.
@@ -87,7 +89,7 @@ impl Settings {
             watches: config.watches.iter().cloned().map(Arc::new).collect(),
             histograms: config.metrics.histograms,
             per_writer: config.metrics.per_writer,
-            max_topics: config.limits.topics,
+            limits: config.limits,
         }
     }
 }
@@ -103,6 +105,7 @@ impl Board {
             successful: true,
             last_success: SystemTime::now(),
         };
+        let limits = LimitFigures::new(settings.limits);
         Self {
             state: ArcSwap::from_pointee(State {
                 snapshot: None,
@@ -115,6 +118,7 @@ impl Board {
             spans: SpanQueue::default(),
             recordings: RecordingFigures::default(),
             lost_lines: Arc::default(),
+            limits,
             asked: AtomicBool::new(false),
             // Without one, askers wait until the capture thread looks by itself.
             bell: Bell::new().ok(),
@@ -251,6 +255,12 @@ impl Board {
     #[must_use]
     pub const fn recordings(&self) -> &RecordingFigures {
         &self.recordings
+    }
+
+    /// The caps, and what reached them.
+    #[must_use]
+    pub const fn limits(&self) -> &LimitFigures {
+        &self.limits
     }
 
     /// Spans that wait for being exported.

@@ -1,5 +1,5 @@
 //! A listener that cannot be used up: a limited number of connections, each closed when nothing was
-//! answered on it for a while.
+//! answered on it for a while. Who is one too many is told so at once instead of waiting unanswered.
 
 use std::io;
 use std::pin::Pin;
@@ -8,19 +8,37 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::serve::Listener;
-use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tokio::time::{Sleep, sleep};
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
+use tokio::task::JoinSet;
+use tokio::time::{Sleep, sleep, timeout};
+
+use super::board::Board;
+use super::limit_facts::{Place, Places};
+use crate::config::Limit;
 
 /// A connection to which nothing was answered for so long is closed.
 const IDLE: Duration = Duration::from_secs(75);
 
-/// A listener with a limited number of connections; further ones wait in the kernel's queue.
+/// How long somebody who is turned away may take to read why, and how many may do so at once.
+const FAREWELL: Duration = Duration::from_secs(1);
+const FAREWELLS: usize = 64;
+/// Bytes of a request that are read so that its sender sees the answer to it.
+const REQUEST: u64 = 64 << 10;
+
+/// A listener with a limited number of connections; a further one is told so and closed.
 #[derive(Debug)]
 pub(super) struct Bounded<L> {
     listener: L,
-    permits: Arc<Semaphore>,
+    places: Arc<Places>,
+    board: Arc<Board>,
+    limit: Limit,
+    refusal: Option<Refusal>,
+    leaving: JoinSet<()>,
 }
+
+/// What is answered to who is one too many, whatever was asked.
+#[derive(Clone, Debug)]
+pub(super) struct Refusal(Arc<str>);
 
 /// A connection that ends when nothing was answered on it for [`IDLE`]: requests that trickle in
 /// and readers that do not read cannot hold it.
@@ -28,16 +46,61 @@ pub(super) struct Bounded<L> {
 pub(super) struct Connection<S> {
     stream: S,
     deadline: Pin<Box<Sleep>>,
-    _permit: Option<OwnedSemaphorePermit>,
+    _place: Place,
 }
 
 impl<L> Bounded<L> {
-    /// At most `connections` at a time.
-    pub(super) fn new(listener: L, connections: usize) -> Self {
+    /// At most as many connections at a time as `limit` says, which is counted on `board`. Without
+    /// a refusal a further one is closed without a word.
+    pub(super) fn new(
+        listener: L,
+        board: Arc<Board>,
+        limit: Limit,
+        refusal: Option<Refusal>,
+    ) -> Self {
         Self {
             listener,
-            permits: Arc::new(Semaphore::new(connections)),
+            places: board.limits().places(limit),
+            board,
+            limit,
+            refusal,
+            leaving: JoinSet::new(),
         }
+    }
+
+    /// No place for this one. It is not waited for, nor are many kept that take their time.
+    fn turn_away(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
+        self.board.limits().reached(self.limit, 1);
+        while self.leaving.try_join_next().is_some() {}
+        if let Some(refusal) = self.refusal.clone()
+            && self.leaving.len() < FAREWELLS
+        {
+            self.leaving.spawn(async move {
+                let _ = timeout(FAREWELL, refusal.tell(stream)).await;
+            });
+        }
+    }
+}
+
+impl Refusal {
+    /// 503 with this body.
+    pub(super) fn new(media_type: &str, body: &str) -> Self {
+        let length = body.len();
+        Self(
+            format!(
+                "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {media_type}\r\n\
+                 content-length: {length}\r\nretry-after: 1\r\nconnection: close\r\n\r\n{body}"
+            )
+            .into(),
+        )
+    }
+
+    async fn tell(self, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
+        stream.write_all(self.0.as_bytes()).await?;
+        stream.shutdown().await?;
+        // Closed with something unread, the connection would be reset and the answer perhaps lost.
+        tokio::io::copy(&mut stream.take(REQUEST), &mut tokio::io::sink()).await?;
+        Ok(())
     }
 }
 
@@ -46,17 +109,19 @@ impl<L: Listener> Listener for Bounded<L> {
     type Addr = L::Addr;
 
     async fn accept(&mut self) -> (Self::Io, Self::Addr) {
-        // The semaphore is never closed.
-        let permit = Arc::clone(&self.permits).acquire_owned().await.ok();
-        let (stream, address) = self.listener.accept().await;
-        (
-            Connection {
+        loop {
+            let (stream, address) = self.listener.accept().await;
+            let Some(place) = self.places.take() else {
+                self.turn_away(stream);
+                continue;
+            };
+            let connection = Connection {
                 stream,
                 deadline: Box::pin(sleep(IDLE)),
-                _permit: permit,
-            },
-            address,
-        )
+                _place: place,
+            };
+            return (connection, address);
+        }
     }
 
     fn local_addr(&self) -> io::Result<Self::Addr> {

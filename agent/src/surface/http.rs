@@ -19,14 +19,12 @@ use tokio_util::sync::CancellationToken;
 
 use super::basic_auth::{self, Gate};
 use super::board::Board;
-use super::bounded::Bounded;
+use super::bounded::{Bounded, Refusal};
 use super::exposition::{Exposition, Format};
 #[cfg(feature = "tls")]
 use super::tls::{Acceptor, Tls};
 use super::web_config::{WebConfig, WebConfigError};
-
-/// More scrapers than any robot has.
-const MAX_CONNECTIONS: usize = 32;
+use crate::config::Limit;
 
 const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 <p>Watches the ROS 2 robot on this host from copies of its traffic.
@@ -117,7 +115,21 @@ impl Server {
     /// # Errors
     /// When the runtime cannot take the socket over.
     pub async fn serve(self, stop: CancellationToken) -> io::Result<()> {
-        let listener = Bounded::new(TcpListener::from_std(self.listener)?, MAX_CONNECTIONS);
+        let limit = Limit::MetricsClients;
+        let connections = self.board.limits().caps().get(limit);
+        let full = Refusal::new(
+            "text/plain; charset=utf-8",
+            &format!(
+                "{connections} connections are open, which is the limit (limits.metrics_clients)\n"
+            ),
+        );
+        #[cfg(feature = "tls")]
+        // Who expects a handshake cannot read an answer without one.
+        let full = self.acceptor.is_none().then_some(full);
+        #[cfg(not(feature = "tls"))]
+        let full = Some(full);
+        let listener = TcpListener::from_std(self.listener)?;
+        let listener = Bounded::new(listener, Arc::clone(&self.board), limit, full);
         let stopped = async move { stop.cancelled().await };
         let mut router = router(self.board);
         if let Some(gate) = self.gate {

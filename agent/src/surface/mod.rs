@@ -13,6 +13,7 @@ mod diagnoses;
 pub mod events;
 pub mod exposition;
 pub mod http;
+pub mod limit_facts;
 pub mod otlp;
 mod page;
 mod process;
@@ -29,4 +30,5 @@ pub use agent_facts::{
 pub use board::{Board, Settings, State};
 pub use events::{AgentEvent, EventLog};
 pub use exposition::{Exposition, Format};
+pub use limit_facts::{LimitFacts, LimitFigures, Place, Places};
 pub use recording_facts::{RecordingFigures, SnapshotFigures};

@@ -47,7 +47,7 @@ pub(super) struct Rows<'a> {
 impl<'a> Rows<'a> {
     /// Topics that are measured come first; services and other plumbing are shown when measured.
     pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
-        let max_topics = settings.max_topics;
+        let max_topics = settings.limits.topics;
         let mut rows: BTreeMap<(u32, Cow<'a, str>), Row<'a>> = BTreeMap::new();
         let mut hidden = 0;
         let shown = |facts: &&TopicFacts| {

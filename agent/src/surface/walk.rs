@@ -31,7 +31,7 @@ pub(super) fn walk(page: &mut Page<'_>, board: &Board, previous: Duration) -> fm
     robot::watches(page, snapshot, &settings.watches)?;
     agent::identity(page, &state, now)?;
     agent::capture(page, &state)?;
-    agent::model(page, &state, &rows, deliveries.hidden)?;
+    agent::model(page, &state, &rows, deliveries.hidden, board.limits())?;
     agent::surface(page, &state, board.reload(), previous, now)?;
     agent::kept(page, &state)?;
     agent::subscriptions(page, &state)?;

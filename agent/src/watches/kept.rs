@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::MAX_ADDED;
+use crate::config::Limit;
 use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
 use crate::state::{Found, StateDirectory};
 
@@ -93,7 +93,7 @@ pub fn load(directory: &StateDirectory) -> Kept {
         Found::Unusable { reason, aside } => return Kept::Unusable { reason, aside },
         Found::This(document) => document,
     };
-    let watches = if document.watches.len() > MAX_ADDED {
+    let watches = if document.watches.len() > Limit::Watches.row().range.1 {
         Err(format!("it has {} watches", document.watches.len()))
     } else {
         document.watches.into_iter().map(Watch::try_from).collect()

@@ -93,6 +93,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         }],
         datagrams: 100,
         records: 1_000,
+        topics_measured: 1,
         topics_rejected: 0,
     }
 }

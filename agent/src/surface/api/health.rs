@@ -64,6 +64,8 @@ pub(super) struct Health {
     interfaces: Vec<InterfaceView>,
     /// Bounded tables.
     tables: Vec<TableView>,
+    /// Caps of the configuration.
+    limits: Vec<LimitView>,
     /// Capabilities it holds, after it has given up what it does not need any more.
     capabilities: Vec<String>,
     /// Its process, in its own process namespace.
@@ -112,6 +114,21 @@ struct TableView {
     limit: u64,
     /// Entries given up because of the cap.
     evictions: u64,
+}
+
+/// A cap of the configuration.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Limit)]
+struct LimitView {
+    /// Its key below `limits`.
+    #[schema(value_type = String, example = "topics")]
+    limit: &'static str,
+    /// Entries, connections or bytes that may be.
+    cap: u64,
+    /// That are.
+    used: u64,
+    /// What was refused, or given up to make room, because of it.
+    reached: u64,
 }
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -168,6 +185,17 @@ async fn health(State(context): State<Context>) -> Json<Health> {
                 evictions: table.evictions,
             })
             .collect(),
+        limits: context
+            .board
+            .limits()
+            .facts(&state)
+            .map(|facts| LimitView {
+                limit: facts.limit.key(),
+                cap: facts.cap,
+                used: facts.used,
+                reached: facts.reached,
+            })
+            .into(),
         capabilities: privilege::held(),
         process_id: std::process::id(),
         uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),

@@ -55,6 +55,8 @@ pub enum Code {
     TooManyRequests,
     /// As many clients follow events as may.
     TooManyStreams,
+    /// As many clients are connected as may.
+    TooManyClients,
     /// As many subscriptions are open as may.
     TooManySubscriptions,
     /// No such recording.
@@ -187,6 +189,11 @@ impl Code {
                 StatusCode::SERVICE_UNAVAILABLE,
                 "Too many streams of events",
             ),
+            Self::TooManyClients => (
+                "too-many-clients",
+                StatusCode::SERVICE_UNAVAILABLE,
+                "Too many connections",
+            ),
             Self::TooManySubscriptions => (
                 "too-many-subscriptions",
                 StatusCode::SERVICE_UNAVAILABLE,
@@ -255,21 +262,28 @@ impl Problem {
     }
 }
 
-impl IntoResponse for Problem {
-    fn into_response(self) -> Response {
-        let (code, status, title) = self.code.parts();
-        let body = ProblemBody {
+impl From<Problem> for ProblemBody {
+    fn from(problem: Problem) -> Self {
+        let (code, status, title) = problem.code.parts();
+        Self {
             kind: format!("urn:ros2probe:problem:{code}"),
             title,
             status: status.as_u16(),
-            detail: self.detail.into_owned(),
-            mistakes: self.mistakes,
-        };
+            detail: problem.detail.into_owned(),
+            mistakes: problem.mistakes,
+        }
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let (kind, (_, status, _)) = (self.code, self.code.parts());
+        let body = ProblemBody::from(self);
         let mut response = (status, axum::Json(body)).into_response();
         let headers = response.headers_mut();
         headers.insert(CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE));
         headers.insert(CACHE_CONTROL, HeaderValue::from_static("no-store"));
-        match self.code {
+        match kind {
             Code::Unauthorized => {
                 headers.insert(WWW_AUTHENTICATE, HeaderValue::from_static("Bearer"));
             }

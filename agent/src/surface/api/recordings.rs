@@ -324,7 +324,7 @@ fn wanted(request: RecordingRequest) -> Result<Wanted, Problem> {
 fn problem(refusal: &Refusal) -> Problem {
     let code = match refusal {
         Refusal::Exists(_) => Code::RecordingExists,
-        Refusal::TooMany => Code::TooManyRecordings,
+        Refusal::TooMany(_) => Code::TooManyRecordings,
         Refusal::NoDirectory => Code::NoPlaceForRecordings,
         Refusal::Name(_) | Refusal::Filter(_) | Refusal::Choice(_) => Code::InvalidRequest,
         Refusal::Subscription(_) => Code::TooManySubscriptions,

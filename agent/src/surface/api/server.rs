@@ -14,12 +14,12 @@ use std::sync::Arc;
 use axum::serve::Listener;
 use tokio::task::JoinSet;
 
+use super::problem::{Code, MEDIA_TYPE, Problem, ProblemBody};
 use super::security::{Door, Kind, Token, TokenError};
 use super::{Context, router};
-use crate::surface::bounded::Bounded;
+use crate::config::Limit;
+use crate::surface::bounded::{Bounded, Refusal};
 
-/// More clients than any robot has; some of them hold streams of events.
-const MAX_CONNECTIONS: usize = 64;
 /// Owner and group.
 const SOCKET_MODE: u32 = 0o660;
 /// The group that may use the socket of an agent that was started by root.
@@ -216,9 +216,24 @@ where
 {
     let router = router(&context, Arc::new(Door::new(kind)));
     let stop = context.stop.clone();
-    axum::serve(Bounded::new(listener, MAX_CONNECTIONS), router)
+    let limit = Limit::ApiClients;
+    let full = full(context.board.limits().caps().get(limit));
+    let listener = Bounded::new(listener, Arc::clone(&context.board), limit, Some(full));
+    axum::serve(listener, router)
         .with_graceful_shutdown(async move { stop.cancelled().await })
         .await
+}
+
+/// What a client is told for whom there is no place.
+fn full(connections: usize) -> Refusal {
+    let detail =
+        format!("{connections} connections are open, which is the limit (limits.api_clients)");
+    let problem = ProblemBody::from(Problem::new(Code::TooManyClients, detail));
+    // A problem always is JSON.
+    Refusal::new(
+        MEDIA_TYPE,
+        &serde_json::to_string(&problem).unwrap_or_default(),
+    )
 }
 
 /// The lock lies beside the socket and outlives the agent: a file that is removed would be a lock

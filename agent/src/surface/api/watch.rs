@@ -421,7 +421,7 @@ fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
     let code = match refused {
         Refused::Given { .. } => Code::WatchGiven,
         Refused::Different => Code::WatchDiffers,
-        Refused::Full => Code::TooManyWatches,
+        Refused::Full(_) => Code::TooManyWatches,
         Refused::Unknown | Refused::Pattern(_) => Code::InvalidRequest,
     };
     Problem::new(code, detail)

@@ -72,7 +72,7 @@ pub(in crate::surface) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
 pub(in crate::surface) const REASSEMBLY: Metric = Metric::gauge(
     "ros2probe_reassembly_bytes",
     &[],
-    "Memory held to put captured fragments together, up to limits.reassembly_bytes.",
+    "Memory held to put captured datagrams together: IP fragments up to limits.reassembly_bytes, and pieces from the sockets up to 4 MiB.",
 )
 .unit("bytes");
 pub(in crate::surface) const SHM_OPEN: Metric = Metric::gauge(
@@ -125,6 +125,21 @@ pub(in crate::surface) const TABLE_EVICTIONS: Metric = Metric::counter(
     "ros2probe_table_evictions_total",
     &["table"],
     "Entries given up because of the cap.",
+);
+pub(in crate::surface) const LIMIT: Metric = Metric::gauge(
+    "ros2probe_limit",
+    &["limit"],
+    "Caps of the configuration, by their key below `limits`: entries, connections or bytes.",
+);
+pub(in crate::surface) const LIMIT_USED: Metric = Metric::gauge(
+    "ros2probe_limit_used",
+    &["limit"],
+    "How much of each cap is in use; of api_clients, at the listener that has most.",
+);
+pub(in crate::surface) const LIMIT_REACHED: Metric = Metric::counter(
+    "ros2probe_limit_reached_total",
+    &["limit"],
+    "What was refused, or given up to make room, because of each cap; tables, topics, subscriptions and messages are counted by their own metrics as well.",
 );
 pub(in crate::surface) const TRACKED_TOPICS: Metric = Metric::gauge(
     "ros2probe_tracked_topics",
