@@ -57,6 +57,14 @@ bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 	cargo build --release --package ros2probe --bin rp --example robot --example workloads
 	@$(SUDO) $(TARGET)/release/examples/workloads $(BENCH_OPTIONS)
 
+soak: ## an hour of a changing graph, and faults, on the release build; SOAK_SECONDS=N; results in target/soak (needs root)
+	@.ci/prerequisites.sh test
+	@mkdir -p $(TARGET)/soak && rm -f $(TARGET)/soak/faults.md
+	ROS2PROBE_SOAK=1 ROS2PROBE_SOAK_SECONDS=$(or $(SOAK_SECONDS),3600) cargo test --release \
+	    --package ros2probe --test live_endurance --test live_faults --no-fail-fast -- \
+	    --nocapture --test-threads 1
+	@cat $(TARGET)/soak/faults.md
+
 fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	@.ci/prerequisites.sh fuzz
 	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list); do \
@@ -69,4 +77,4 @@ fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test ebpf run peers arm bench fuzz prerequisites
+.PHONY: help demo test ebpf run peers arm bench soak fuzz prerequisites

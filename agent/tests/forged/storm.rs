@@ -135,6 +135,11 @@ impl Mould {
 pub(crate) struct Dice(u64);
 
 impl Dice {
+    /// The same seed, the same numbers; not zero.
+    pub(crate) fn new(seed: u64) -> Dice {
+        Dice(seed)
+    }
+
     pub(crate) fn roll(&mut self) -> u64 {
         self.0 ^= self.0 << 13;
         self.0 ^= self.0 >> 7;

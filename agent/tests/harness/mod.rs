@@ -20,6 +20,7 @@ pub(crate) mod peer;
 pub(crate) mod process;
 pub(crate) mod prometheus;
 pub(crate) mod snmp;
+pub(crate) mod soak;
 pub(crate) mod switch;
 pub(crate) mod usage;
 pub(crate) mod witness;

@@ -94,6 +94,11 @@ impl Namespace {
         self.cgroup.path()
     }
 
+    /// Runs `make` with this process in the host's cgroup: sockets belong where they were created.
+    pub(crate) fn hold<T>(&self, make: impl FnOnce() -> T) -> Result<T> {
+        self.cgroup.hold(make)
+    }
+
     /// The words that run a command in this host with the host's own `/sys`.
     pub(crate) fn inside(&self) -> Vec<String> {
         let mut words = self.cgroup.inside();
