@@ -16,6 +16,7 @@ use anyhow::{Context as _, Result};
 use clap::Parser as _;
 use ros2probe::capture::live::LiveSource;
 use ros2probe::capture::pcap::Speed;
+use ros2probe::capture::system::give_back_memory;
 use ros2probe::config::{Config, ConfigError};
 use ros2probe::message::{Library, Sources as Places};
 use ros2probe::model::observer::{self, Observer};
@@ -131,6 +132,9 @@ fn run(options: cli::Run) -> Result<()> {
     let mut observer = Observer::new(settings);
     if let (Some(known), Source::Live(live)) = (known, &source) {
         observer.restore(&known, live.clock());
+        drop(known);
+        // Reading it takes several times what stays of it.
+        give_back_memory();
     }
     let keep = |directory: Arc<StateDirectory>| {
         watches.keep_in(Arc::clone(&directory))?;

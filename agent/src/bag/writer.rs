@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Qos;
@@ -41,8 +42,8 @@ pub struct TopicDescription {
 pub struct Schema {
     /// `ros2msg` or `ros2idl`.
     pub encoding: String,
-    /// With everything nested.
-    pub text: String,
+    /// With everything nested; many topics have the same.
+    pub text: Arc<str>,
 }
 
 /// A topic of one [`Writer`].
@@ -167,9 +168,13 @@ impl Writer {
         };
         let begun = writer.open_file();
         if let Err(error) = begun.and_then(|()| writer.write_metadata_file()) {
-            // Nothing is in it, and the next try would leave another one on a disk that is full.
+            // Nothing is in it, and the next try would leave another one. One by one: listing the
+            // directory would take a descriptor, which may be what is lacking.
+            let file = directory.join(writer.file_name(0));
             drop(writer);
-            let _ = fs::remove_dir_all(directory);
+            let _ = fs::remove_file(file);
+            let _ = fs::remove_file(directory.join(metadata::FILE_NAME));
+            let _ = fs::remove_dir(directory);
             return Err(error);
         }
         Ok(writer)
@@ -185,7 +190,7 @@ impl Writer {
     /// said last before the first message stays in all files and in metadata.yaml: readers find a
     /// topic's messages by comparing both (PyPI `rosbags` leaves out what differs). Publishers that
     /// come later are named in the custom data.
-    pub fn topic(&mut self, description: TopicDescription) -> Result<TopicId, Error> {
+    pub fn topic(&mut self, mut description: TopicDescription) -> Result<TopicId, Error> {
         let known = self.by_name.get(&description.name).copied();
         if let Some(known) = known
             && let Some(topic) = self.topics.get_mut(usize::from(known.0))
@@ -214,11 +219,17 @@ impl Writer {
         let index = index.ok_or(Error::TooManyTopics)?;
         let next_schema = u16::try_from(self.schemas.len() + 1);
         let schema = (description.type_name.clone(), description.schema.clone());
-        let schema_id = match self.schemas.get(&schema) {
-            Some(id) => *id,
-            None => next_schema.map_err(|_| Error::TooManyTopics)?,
+        let schema_id = match self.schemas.get_key_value(&schema) {
+            Some(((_, shared), id)) => {
+                description.schema.clone_from(shared);
+                *id
+            }
+            None => {
+                let id = next_schema.map_err(|_| Error::TooManyTopics)?;
+                self.schemas.insert(schema, id);
+                id
+            }
         };
-        self.schemas.insert(schema, schema_id);
         self.by_name
             .insert(description.name.clone(), TopicId(index));
         self.topics.push(Topic {

@@ -342,7 +342,7 @@ impl<'a> Recorder<'a> {
         let offered: BTreeMap<_, _> = publishers
             .map(|publisher| (publisher.guid.clone(), publisher.qos.qos()))
             .collect();
-        let description = TopicDescription {
+        let mut description = TopicDescription {
             name: name.to_owned(),
             type_name: message_type.to_owned(),
             schema: (self.sources.schema)(message_type, type_hash.as_deref()),
@@ -351,6 +351,8 @@ impl<'a> Recorder<'a> {
         };
         // Before its first message comes its description: with that of its writer.
         let id = self.writer.topic(description.clone())?;
+        // The bag has it now.
+        description.schema = None;
         self.report.topic(name);
         self.order.push(name.to_owned());
         Ok(Place::Taken(Box::new(Taken {

@@ -17,6 +17,7 @@ use super::recorder::{Ended, Recorder, Sources};
 use super::report::Report;
 use super::session::{self, Order};
 use crate::bag::{self, Options, Schema, Writer};
+use crate::capture::system::give_back_memory;
 use crate::client::Got;
 use crate::config::Limit;
 use crate::message::Library;
@@ -180,15 +181,16 @@ impl Recordings {
         let mut recorder = Recorder::new(writer, filter, sources);
         recorder.pause(wanted.paused);
         let known = self.board.state();
-        for topic in &known.known().topics {
-            let covered = topic.domain_id == wanted.domain_id
-                && subscription.selection().covers(
-                    topic.kind,
-                    &topic.name,
-                    &topic.dds_name,
-                    topic.hidden,
-                );
-            if let Some(message_type) = topic.message_types.first().filter(|_| covered) {
+        let covered = known.known().topics.iter().filter(|topic| {
+            let (kind, hidden) = (topic.kind, topic.hidden);
+            topic.domain_id == wanted.domain_id
+                && subscription
+                    .selection()
+                    .covers(kind, &topic.name, &topic.dds_name, hidden)
+        });
+        // Messages come of no more than are measured; whoever announces thousands fills no bag.
+        for topic in covered.take(self.board.limits().caps().topics) {
+            if let Some(message_type) = topic.message_types.first() {
                 let declared = recorder.declare(&topic.name, message_type);
                 declared.map_err(|error| refusal(&name, error))?;
             }
@@ -404,6 +406,8 @@ impl Recording {
             reason: error.clone(),
         });
         self.finish(ended, error);
+        // A bag of many topics takes much, and it may be long until the next one.
+        give_back_memory();
     }
 
     fn tell(&self, recorder: &Recorder<'_>) {
@@ -446,7 +450,7 @@ pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schem
     let (encoding, text) = found.schema_text();
     Some(Schema {
         encoding: encoding.to_owned(),
-        text,
+        text: text.into(),
     })
 }
 

@@ -297,7 +297,7 @@ fn records_are_those_that_humble_writes() {
             publishers: vec![publisher],
             schema: Some(Schema {
                 encoding: schema.encoding.clone(),
-                text: String::from_utf8(schema.data.clone()).unwrap(),
+                text: String::from_utf8(schema.data.clone()).unwrap().into(),
             }),
         };
         topics.insert(channel.id, writer.topic(description).unwrap());

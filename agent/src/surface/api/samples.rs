@@ -153,8 +153,9 @@ async fn samples(
         subscription.in_force(PATIENCE).await;
         context.state().await
     };
+    let most = context.board.limits().caps().topics;
     let first = Line::Open(Open {
-        topics: topics(known.known(), subscription.selection(), domain_id),
+        topics: topics(known.known(), subscription.selection(), domain_id, most),
     });
     let stream = Stream {
         subscription,
@@ -258,13 +259,19 @@ fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Pro
     })
 }
 
-/// The topics that are wanted and known.
-fn topics(snapshot: &Snapshot, selection: &Selection, domain_id: Option<u32>) -> Vec<OpenTopic> {
+/// The topics that are wanted and known, no more than can be measured.
+fn topics(
+    snapshot: &Snapshot,
+    selection: &Selection,
+    domain_id: Option<u32>,
+    most: usize,
+) -> Vec<OpenTopic> {
     let topics = snapshot.topics.iter().filter(|topic| {
         domain_id.is_none_or(|wanted| wanted == topic.domain_id)
             && selection.covers(topic.kind, &topic.name, &topic.dds_name, topic.hidden)
     });
     topics
+        .take(most)
         .map(|topic| OpenTopic {
             topic: topic.name.clone(),
             domain_id: topic.domain_id,

@@ -127,6 +127,15 @@ impl Client {
         }
     }
 
+    /// What was under way is given up for something newer. A receiver that never answers may never be
+    /// waited for any longer.
+    pub(super) fn overtaken(&mut self) {
+        self.failed(&Status::deadline_exceeded(
+            "no answer before there was more",
+        ));
+        self.count(Outcome::Failed);
+    }
+
     pub(super) fn count(&self, outcome: Outcome) {
         self.board.exports().count_request(self.signal, outcome);
     }

@@ -10,7 +10,7 @@ use tokio::time::{Instant, timeout, timeout_at};
 use tokio_util::sync::CancellationToken;
 
 use super::client::{Client, Request};
-use super::exports::{Outcome, Reason};
+use super::exports::Reason;
 
 /// For what goes out last, of the two seconds that ending may take.
 const LAST: Duration = Duration::from_millis(1_400);
@@ -66,7 +66,7 @@ impl Outlet {
             () = self.stop.cancelled() => return,
         };
         if !settled {
-            self.client.count(Outcome::Failed);
+            self.client.overtaken();
             self.give_up(Reason::Superseded);
         }
     }
