@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 
 use anyhow::{Result, anyhow};
 
-use super::{Carrier, Talker, data, introduce};
+use super::{Carrier, SAMPLES_WRITER, Talker, data, introduce};
 
 /// Different datagrams of a storm; their GUIDs do not repeat.
 const MOULDS: usize = 3000;
@@ -79,6 +79,42 @@ impl Storm {
         Storm::run(carrier, move |bytes| {
             bytes.clone_from(&crowd[next.next().unwrap_or(0)]);
         })
+    }
+
+    /// Announces writers of messages with much in them: half of them whole, of 50 kB, the others of
+    /// 4 MB, of which one part in a hundred comes.
+    pub(crate) fn of_large_samples(mut carrier: impl Carrier + Send + 'static) -> Result<Storm> {
+        const WRITERS: u32 = 32;
+        let mut talkers = Vec::new();
+        for number in 0..WRITERS {
+            let talker = Talker::new(1_000_000 + number, &format!("/large_{number}"));
+            for message in talker.introduction("large") {
+                carrier.carry(&message)?;
+            }
+            talkers.push(talker);
+        }
+        let mut turn = 0;
+        Ok(Storm::run(carrier, move |bytes| {
+            turn += 1;
+            let talker = &mut talkers[turn % WRITERS as usize];
+            let whole = talker.sample(50_000);
+            if turn.is_multiple_of(2) {
+                *bytes = whole;
+                return;
+            }
+            let mut body = vec![0, 0, 28, 0, 0, 0, 0, 0];
+            body.extend_from_slice(&SAMPLES_WRITER);
+            body.extend_from_slice(&[0; 4]);
+            body.extend_from_slice(&talker.sent().to_le_bytes());
+            // Fragment, how many, their size, that of all.
+            body.extend_from_slice(&1_u32.to_le_bytes());
+            body.extend_from_slice(&1_u16.to_le_bytes());
+            body.extend_from_slice(&40_000_u16.to_le_bytes());
+            body.extend_from_slice(&4_000_000_u32.to_le_bytes());
+            body.resize(body.len() + 40_000, 0x44);
+            *bytes = talker.header();
+            submessage(bytes, 0x16, &body);
+        }))
     }
 
     fn run(

@@ -12,7 +12,9 @@ use anyhow::{Context as _, Result};
 const PROG_LOAD: libc::c_int = 5;
 const PROG_ATTACH: libc::c_int = 8;
 const PROG_GET_FD_BY_ID: libc::c_int = 13;
+const MAP_GET_FD_BY_ID: libc::c_int = 14;
 const PROG_QUERY: libc::c_int = 16;
+const LINK_GET_FD_BY_ID: libc::c_int = 30;
 const CGROUP_SKB: u32 = 8;
 const ALLOW_MULTI: u32 = 2;
 
@@ -22,6 +24,14 @@ const ALLOW_MULTI: u32 = 2;
 pub(crate) enum Direction {
     Ingress = 0,
     Egress = 1,
+}
+
+/// What the kernel holds for a process that asked for it, by its number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Object {
+    Program(u32),
+    Map(u32),
+    Link(u32),
 }
 
 /// How a stranger's program tolerates others.
@@ -88,6 +98,26 @@ pub(crate) fn programs_of(process: u32) -> Result<BTreeSet<u32>> {
     Ok(programs)
 }
 
+/// All objects that a process holds.
+pub(crate) fn objects_of(process: u32) -> Result<BTreeSet<Object>> {
+    let mut objects = BTreeSet::new();
+    for entry in fs::read_dir(format!("/proc/{process}/fdinfo"))? {
+        // A descriptor may be closed meanwhile.
+        let text = fs::read_to_string(entry?.path()).unwrap_or_default();
+        objects.extend(text.lines().filter_map(|line| {
+            let (name, id) = line.split_once(':')?;
+            let id = id.trim().parse().ok()?;
+            Some(match name {
+                "prog_id" => Object::Program(id),
+                "map_id" => Object::Map(id),
+                "link_id" => Object::Link(id),
+                _ => return None,
+            })
+        }));
+    }
+    Ok(objects)
+}
+
 /// How often the kernel left out running one of this process's programs because it was running on
 /// that CPU already.
 pub(crate) fn skipped_runs() -> Result<u64> {
@@ -106,17 +136,27 @@ pub(crate) fn skipped_runs() -> Result<u64> {
 
 /// Whether anything still holds a program.
 pub(crate) fn exists(program: u32) -> Result<bool> {
-    let by_id = ProgramById {
-        id: program,
-        ..ProgramById::default()
+    is_there(Object::Program(program))
+}
+
+/// Whether anything still holds an object.
+pub(crate) fn is_there(object: Object) -> Result<bool> {
+    let (command, id) = match object {
+        Object::Program(id) => (PROG_GET_FD_BY_ID, id),
+        Object::Map(id) => (MAP_GET_FD_BY_ID, id),
+        Object::Link(id) => (LINK_GET_FD_BY_ID, id),
     };
-    match bpf(PROG_GET_FD_BY_ID, &by_id) {
+    let by_id = ObjectById {
+        id,
+        ..ObjectById::default()
+    };
+    match bpf(command, &by_id) {
         Ok(number) => {
             drop(descriptor(number));
             Ok(true)
         }
         Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
-        Err(error) => Err(error).context("cannot ask for a BPF program"),
+        Err(error) => Err(error).with_context(|| format!("cannot ask for {object:?}")),
     }
 }
 
@@ -163,7 +203,7 @@ struct ProgramsToFind {
 
 #[derive(Clone, Copy, Default)]
 #[repr(C)]
-struct ProgramById {
+struct ObjectById {
     id: u32,
     next: u32,
     open_flags: u32,
@@ -172,7 +212,7 @@ struct ProgramById {
 impl Attributes for ProgramToLoad {}
 impl Attributes for ProgramToAttach {}
 impl Attributes for ProgramsToFind {}
-impl Attributes for ProgramById {}
+impl Attributes for ObjectById {}
 
 fn bpf<A: Attributes>(command: libc::c_int, attributes: &A) -> io::Result<i32> {
     let mut attributes = *attributes;
