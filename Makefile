@@ -50,6 +50,14 @@ peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
 arm: ## build rp for aarch64, static and unoptimized, which the tests run under qemu
 	CARGO_PROFILE_DEV_DEBUG=0 cargo build --package ros2probe --bin rp --target aarch64-unknown-linux-musl
 
+dist: ## release both binaries, packages, bills of materials and checksums into target/dist, tested
+	@.ci/prerequisites.sh dist
+	packaging/dist.sh
+	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist --test package
+
+distcheck: ## build what make dist has built again, elsewhere, and compare every byte
+	packaging/dist.sh --again
+
 bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 	@.ci/prerequisites.sh test
 	cargo bench --workspace
@@ -77,4 +85,4 @@ fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test ebpf run peers arm bench soak fuzz prerequisites
+.PHONY: help demo test ebpf run peers arm dist distcheck bench soak fuzz prerequisites

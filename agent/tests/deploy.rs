@@ -237,12 +237,7 @@ fn the_daemon_set_may_do_what_the_unit_may_and_nothing_else() -> Result<()> {
         .iter()
         .map(|name| format!("CAP_{}", name.as_str().unwrap_or_default()))
         .collect();
-    let unit = std::fs::read_to_string(deploy().join("../systemd/ros2probe.service"))?;
-    let bounding = unit
-        .lines()
-        .find_map(|line| line.strip_prefix("CapabilityBoundingSet="));
-    let bounding = bounding.context("the unit bounds nothing")?;
-    let bounding: BTreeSet<String> = bounding.split(' ').map(str::to_owned).collect();
+    let bounding = bounding_set()?;
     ensure!(added == bounding, "DaemonSet {added:?}, unit {bounding:?}");
     Ok(())
 }
@@ -328,6 +323,93 @@ fn the_daemon_set_s_configuration_is_one_and_its_paths_are_mounted() -> Result<(
 }
 
 #[test]
+fn the_image_is_what_make_dist_makes_with_the_unit_s_capabilities_and_without_root() -> Result<()> {
+    let text = std::fs::read_to_string(deploy().join("Dockerfile"))?.replace("\\\n", " ");
+    let of = |instruction: &str| -> Vec<&str> {
+        let lines = text.lines();
+        lines
+            .filter_map(|line| line.strip_prefix(instruction)?.strip_prefix(' '))
+            .collect()
+    };
+    let arguments = of("ARG");
+    ensure!(
+        arguments.contains(&concat!("VERSION=", env!("CARGO_PKG_VERSION"))),
+        "{arguments:?}"
+    );
+    ensure!(arguments.contains(&"ARCHITECTURE=x86_64"), "{arguments:?}");
+    ensure!(
+        of("FROM").last() == Some(&"scratch"),
+        "something else is in the image"
+    );
+    let [user] = of("USER")[..] else {
+        anyhow::bail!("no user")
+    };
+    let ids: Vec<u32> = user.split(':').map(str::parse).collect::<Result<_, _>>()?;
+    ensure!(ids.len() == 2 && !ids.contains(&0), "{user}");
+
+    let ignored = std::fs::read_to_string(deploy().join("Dockerfile.dockerignore"))?;
+    let taken: Vec<&str> = ignored
+        .lines()
+        .filter_map(|line| line.strip_prefix('!'))
+        .collect();
+    let copied: Vec<(&str, &str)> = of("COPY")
+        .iter()
+        .filter_map(|line| line.split_once(' '))
+        .collect();
+    let binary = (
+        "target/dist/rp-${VERSION}-${ARCHITECTURE}",
+        "/image/usr/bin/rp",
+    );
+    let settings = (
+        "config/ros2probe.yaml",
+        "/image/etc/ros2probe/ros2probe.yaml",
+    );
+    ensure!(
+        copied == [binary, settings, ("--from=image", "/image /")],
+        "{copied:?}"
+    );
+    ensure!(taken == ["target/dist/rp-*", settings.0], "{taken:?}");
+    ensure!(deploy().join("..").join(settings.0).exists());
+    ensure!(of("ENTRYPOINT") == [r#"["/usr/bin/rp"]"#]);
+    ensure!(of("CMD") == [r#"["run", "--config", "/etc/ros2probe/ros2probe.yaml"]"#]);
+
+    let set = text
+        .split("setcap ")
+        .nth(1)
+        .and_then(|rest| rest.split("+ep ").next());
+    let set: BTreeSet<String> = set
+        .context("no setcap")?
+        .split(',')
+        .map(str::to_uppercase)
+        .collect();
+    let readme = std::fs::read_to_string(deploy().join("README.md"))?;
+    let run = readme
+        .split("docker run ")
+        .nth(1)
+        .and_then(|rest| rest.split("```").next());
+    let run = run.context("no docker run")?;
+    let added = run
+        .split("--cap-add ")
+        .skip(1)
+        .filter_map(|rest| rest.split(' ').next());
+    let added: BTreeSet<String> = added.map(|name| format!("CAP_{name}")).collect();
+    let unit = bounding_set()?;
+    ensure!(
+        set == unit && added == unit,
+        "file {set:?}, container {added:?}, unit {unit:?}"
+    );
+    for option in [
+        "--network host",
+        "--cgroupns host",
+        "--cap-drop ALL",
+        "/var/lib/ros2probe",
+    ] {
+        ensure!(run.contains(option), "no {option} in {run}");
+    }
+    Ok(())
+}
+
+#[test]
 fn every_file_that_the_documents_link_to_exists() -> Result<()> {
     let root = deploy().join("..");
     for document in ["docs/fleet.md", "deploy/README.md", "dashboards/README.md"] {
@@ -361,6 +443,16 @@ fn documents(file: &str) -> Result<Vec<Value>> {
     let text = std::fs::read_to_string(deploy().join(file))?;
     let documents = serde_yaml::Deserializer::from_str(&text).map(Value::deserialize);
     Ok(documents.collect::<Result<_, _>>()?)
+}
+
+/// What the unit's process may have.
+fn bounding_set() -> Result<BTreeSet<String>> {
+    let unit = std::fs::read_to_string(deploy().join("../systemd/ros2probe.service"))?;
+    let set = unit
+        .lines()
+        .find_map(|line| line.strip_prefix("CapabilityBoundingSet="));
+    let set = set.context("the unit bounds nothing")?;
+    Ok(set.split(' ').map(str::to_owned).collect())
 }
 
 /// The pod of the DaemonSet.

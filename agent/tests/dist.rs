@@ -13,9 +13,12 @@
 mod elf;
 #[path = "dist/program.rs"]
 mod program;
+#[path = "dist/release.rs"]
+mod release;
 
 mod local_agent;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -339,34 +342,31 @@ const DECLARATIONS: [&str; 2] = ["linux-raw-sys", "windows-sys"];
 #[test]
 fn no_c_is_compiled_into_the_binary() {
     for architecture in ["x86_64", "aarch64"] {
-        let output = Command::new(env!("CARGO"))
-            .args(["tree", "--locked", "--offline", "--package", "ros2probe"])
-            .args([
-                "--edges",
-                "normal,build",
-                "--prefix",
-                "none",
-                "--format",
-                "{p}",
-            ])
-            .args(["--target", &format!("{architecture}-unknown-linux-musl")])
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .output()
-            .unwrap();
-        assert!(output.status.success(), "{}", text(&output.stderr));
-        let tree = text(&output.stdout);
-        let crates: Vec<&str> = tree
-            .lines()
-            .filter_map(|line| line.split(' ').next())
-            .collect();
+        let crates = crates(architecture, "normal,build");
         assert!(
-            crates.contains(&"aya") && crates.contains(&"tokio"),
-            "{tree}"
+            crates.contains("aya") && crates.contains("tokio"),
+            "{crates:?}"
         );
-        let of_c = |name: &&&str| {
-            C.contains(name) || name.ends_with("-sys") && !DECLARATIONS.contains(name)
+        let of_c = |name: &&String| {
+            let declares = DECLARATIONS.contains(&name.as_str());
+            C.contains(&name.as_str()) || name.ends_with("-sys") && !declares
         };
         let found: Vec<_> = crates.iter().filter(of_c).collect();
         assert!(found.is_empty(), "{architecture}: {found:?}");
     }
+}
+
+/// Names of what `rp` is built of, along these edges.
+fn crates(architecture: &str, edges: &str) -> BTreeSet<String> {
+    let output = Command::new(env!("CARGO"))
+        .args(["tree", "--locked", "--offline", "--package", "ros2probe"])
+        .args(["--edges", edges, "--prefix", "none", "--format", "{p}"])
+        .args(["--target", &format!("{architecture}-unknown-linux-musl")])
+        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let tree = text(&output.stdout);
+    let names = tree.lines().filter_map(|line| line.split(' ').next());
+    names.map(str::to_owned).collect()
 }

@@ -28,7 +28,8 @@ pub fn all() -> Vec<PathBuf> {
     shipped.chain([own]).collect()
 }
 
-fn directory() -> Option<PathBuf> {
+/// Where release binaries are, if it is them that are looked at.
+pub fn directory() -> Option<PathBuf> {
     std::env::var_os("ROS2PROBE_DIST").map(PathBuf::from)
 }
 

@@ -1,0 +1,96 @@
+//! What `make dist` leaves, if it is that which is looked at (`ROS2PROBE_DIST`).
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::process::Command;
+
+use serde_json::Value;
+
+use super::program::{self, Binary};
+use super::{crates, text};
+
+/// `None`, said, where the tests look at an unoptimized build, of which none of this is true.
+fn released() -> Option<PathBuf> {
+    let directory = program::directory();
+    if directory.is_none() {
+        eprintln!("not checked: `make dist` has this checked");
+    }
+    directory
+}
+
+#[test]
+fn every_file_has_its_checksum() {
+    let Some(directory) = released() else { return };
+    let sums = std::fs::read_to_string(directory.join("SHA256SUMS")).unwrap();
+    let mut summed: BTreeSet<&str> = sums.lines().filter_map(|line| line.get(66..)).collect();
+    let checked = Command::new("sha256sum")
+        .args(["--check", "--strict", "--quiet", "SHA256SUMS"])
+        .current_dir(&directory)
+        .output()
+        .unwrap();
+    assert!(checked.status.success(), "{}", text(&checked.stdout));
+    let version = env!("CARGO_PKG_VERSION");
+    for architecture in ["x86_64", "aarch64"] {
+        for end in ["", ".cdx.json"] {
+            let name = format!("rp-{version}-{architecture}{end}");
+            assert!(summed.remove(name.as_str()), "no {name}: {sums}");
+        }
+    }
+    for architecture in ["amd64", "arm64"] {
+        let name = format!("ros2probe_{version}_{architecture}.deb");
+        assert!(summed.remove(name.as_str()), "no {name}: {sums}");
+    }
+    let generated = |name: &&str| name.starts_with("man/") || name.starts_with("completions/");
+    assert!(
+        summed.iter().all(generated) && summed.len() > 10,
+        "{summed:?}"
+    );
+}
+
+#[test]
+fn no_path_of_the_machine_that_built_it_is_in_a_binary() {
+    if released().is_none() {
+        return;
+    }
+    let home = std::env::var("HOME").unwrap();
+    let here = concat!(env!("CARGO_MANIFEST_DIR"), "/");
+    for Binary { path, .. } in program::shipped() {
+        let bytes = std::fs::read(&path).unwrap();
+        for place in [
+            here,
+            &format!("{home}/.cargo"),
+            &format!("{home}/.rustup"),
+            "registry/src",
+        ] {
+            let found = bytes
+                .windows(place.len())
+                .any(|window| window == place.as_bytes());
+            assert!(!found, "{place} is in {}", path.display());
+        }
+    }
+}
+
+#[test]
+fn the_bill_of_materials_lists_what_is_linked_and_where_it_is_from() {
+    let Some(directory) = released() else { return };
+    for Binary { architecture, .. } in program::shipped() {
+        let name = format!("rp-{}-{architecture}.cdx.json", env!("CARGO_PKG_VERSION"));
+        let bill = std::fs::read_to_string(directory.join(&name)).unwrap();
+        let bill: Value = serde_json::from_str(&bill).unwrap();
+        assert_eq!(bill["bomFormat"], "CycloneDX");
+        let components = bill["components"].as_array().unwrap();
+        let text = |component: &Value, key: &str| component[key].as_str().map(str::to_owned);
+        let listed: BTreeSet<String> = components
+            .iter()
+            .filter_map(|one| text(one, "name"))
+            .collect();
+        let mut linked = crates(architecture, "normal");
+        linked.remove("ros2probe");
+        let missing: Vec<_> = linked.difference(&listed).collect();
+        assert!(missing.is_empty(), "{name}: {missing:?}");
+        for component in components {
+            let from = text(component, "purl").unwrap_or_default();
+            assert!(from.starts_with("pkg:cargo/"), "{component}");
+        }
+    }
+}

@@ -1,0 +1,140 @@
+#!/usr/bin/env bash
+# Builds what is released: static binaries for x86_64 and aarch64, man pages, completions, packages,
+# a bill of materials for each binary and checksums of it all, in target/dist.
+#
+#   packaging/dist.sh           build and check
+#   packaging/dist.sh --again   build a second time, from a copy elsewhere with nothing of this
+#                               machine's but the toolchain and the crates, and compare the checksums
+#
+# The bytes depend on the sources, Cargo.lock and the version of rustc: not on where this is, who
+# runs it, when, or what else is installed. Needs what `.ci/prerequisites.sh dist` installs.
+set -euo pipefail
+root=$(cd "$(dirname "$0")/.." && pwd -P)
+cd "$root"
+
+step() { printf '\n== %s\n' "$*" >&2; }
+die() {
+    printf 'dist: %s\n' "$*" >&2
+    exit 1
+}
+
+# Settings of whoever builds must not change what comes out.
+for variable in $(compgen -e); do
+    case $variable in
+    CARGO_TARGET_DIR | CARGO_BUILD_JOBS) ;;
+    RUSTFLAGS | CARGO_ENCODED_RUSTFLAGS | CARGO_PROFILE_* | CARGO_BUILD_* | CARGO_TARGET_* | CARGO_INCREMENTAL)
+        unset "$variable"
+        ;;
+    esac
+done
+export CARGO_INCREMENTAL=0 LC_ALL=C TZ=UTC
+umask 022
+
+target=$(realpath -m "${CARGO_TARGET_DIR:-target}")
+out=$target/dist
+version=$(sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
+architectures="x86_64 aarch64"
+
+# When the sources were last changed, for the files that carry a time.
+source_date() {
+    git log -1 --format=%ct 2>/dev/null && return
+    local date
+    date=$(sed -n 's/^## .* - \([0-9-]*\)$/\1/p' CHANGELOG.md | head -1)
+    date --date="${date:-2026-01-01}" +%s
+}
+SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(source_date)}
+export SOURCE_DATE_EPOCH
+
+# Paths end up in messages of a panic: give each the same name everywhere.
+flags() {
+    local sysroot commit registry
+    sysroot=$(rustc --print sysroot)
+    commit=$(rustc -vV | sed -n 's/^commit-hash: //p')
+    printf '%s\n' "-Clinker=rust-lld" \
+        "--remap-path-prefix=$root=/ros2probe" "--remap-path-prefix=$target=/ros2probe/target" \
+        "--remap-path-prefix=$sysroot/lib/rustlib/src/rust=/rustc/$commit"
+    for registry in "${CARGO_HOME:-$HOME/.cargo}"/registry/src/*/; do
+        printf '%s\n' "--remap-path-prefix=${registry%/}=/crates"
+    done
+}
+
+binaries() {
+    local architecture started=$SECONDS targets=()
+    for architecture in $architectures; do targets+=(--target "$architecture-unknown-linux-musl"); done
+    CARGO_ENCODED_RUSTFLAGS=$(flags | paste -sd $'\x1f') \
+        cargo build --locked --release --package ros2probe --bin rp "${targets[@]}"
+    printf 'took %s s\n' $((SECONDS - started)) >&2
+    for architecture in $architectures; do
+        install -m 755 "$target/$architecture-unknown-linux-musl/release/rp" "$out/rp-$version-$architecture"
+    done
+}
+
+# A copy of the sources without their history, built with a CARGO_HOME of its own.
+again() {
+    local copy there
+    [ -f "$out/SHA256SUMS" ] || die "there is nothing to compare with: run this without --again first"
+    copy=$(mktemp -d)
+    # shellcheck disable=SC2064
+    trap "rm -rf '$copy'" EXIT
+    there=$copy/elsewhere/with-another-name
+    mkdir -p "$there" "$copy/cargo"
+    git ls-files -z --cached --others --exclude-standard | tar -c --null --files-from=- | tar -x -C "$there"
+    # Where crates come from is the user's.
+    cp "${CARGO_HOME:-$HOME/.cargo}"/config* "$copy/cargo" 2>/dev/null || true
+    step "building again in $there"
+    env -u CARGO_TARGET_DIR CARGO_HOME="$copy/cargo" RUSTUP_HOME="${RUSTUP_HOME:-$HOME/.rustup}" \
+        SOURCE_DATE_EPOCH="$SOURCE_DATE_EPOCH" "$there/packaging/dist.sh"
+    step "both builds compared"
+    diff "$out/SHA256SUMS" "$there/target/dist/SHA256SUMS" || die "the two builds differ"
+    sha256sum "$out/SHA256SUMS" "$there/target/dist/SHA256SUMS"
+}
+
+# What is linked into a binary, as CycloneDX. The tool writes into the tree and names paths of it.
+bill() {
+    local architecture=$1
+    cargo cyclonedx --quiet --manifest-path agent/Cargo.toml --describe binaries --no-build-deps \
+        --format json --spec-version 1.5 --target "$architecture-unknown-linux-musl"
+    sed "s|file://$root|file:///ros2probe|g" agent/rp_bin.cdx.json >"$out/rp-$version-$architecture.cdx.json"
+    rm -f agent/rp_bin.cdx.json
+}
+
+case ${1-} in
+'') ;;
+--again)
+    again
+    exit
+    ;;
+*) die "usage: packaging/dist.sh [--again]" ;;
+esac
+
+step "what is built: ros2probe $version with $(rustc --version), sources of $(date --date="@$SOURCE_DATE_EPOCH" +%F)"
+rm -rf "$out"
+mkdir -p "$out"
+cargo fetch --locked --quiet
+
+step "release binaries for: $architectures (static, musl, linked by rust-lld)"
+binaries
+
+step "manual pages and completions"
+native=$out/rp-$version-$(uname -m)
+mkdir "$out/man" "$out/completions"
+"$native" man "$out/man"
+"$native" completions bash >"$out/completions/rp.bash"
+"$native" completions zsh >"$out/completions/_rp"
+"$native" completions fish >"$out/completions/rp.fish"
+
+step "Debian packages"
+for architecture in $architectures; do
+    case $architecture in
+    x86_64) debian=amd64 ;;
+    aarch64) debian=arm64 ;;
+    esac
+    RP=$native packaging/build.sh "$debian" "$out/rp-$version-$architecture" "$out"
+done
+
+step "bills of materials"
+for architecture in $architectures; do bill "$architecture"; done
+
+step "checksums"
+(cd "$out" && find . -type f ! -name SHA256SUMS -printf '%P\n' | sort | xargs sha256sum >SHA256SUMS)
+find "$out" -maxdepth 1 -type f -printf '%10s %f\n' | sort -k2 >&2
