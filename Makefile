@@ -62,7 +62,8 @@ bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 	@.ci/prerequisites.sh test
 	cargo bench --workspace
 	@$(MAKE) --no-print-directory peers
-	cargo build --release --package ros2probe --bin rp --example robot --example workloads
+	cargo build --release --package ros2probe --bin rp --target $(shell uname -m)-unknown-linux-musl
+	cargo build --release --package ros2probe --example robot --example workloads
 	@$(SUDO) $(TARGET)/release/examples/workloads $(BENCH_OPTIONS)
 
 soak: ## an hour of a changing graph, and faults, on the release build; SOAK_SECONDS=N; results in target/soak (needs root)

@@ -7,6 +7,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow};
+use ros2probe::capture::system::give_back_program;
 use ros2probe::config::{Config, ConfigError};
 use ros2probe::run::{Run, RunError};
 use ros2probe::surface::api;
@@ -267,6 +268,7 @@ impl Watchdog {
         if first {
             self.ready = true;
             tracing::info!("ready");
+            give_back_program();
             let _ = sd_notify::notify(&[NotifyState::Ready]);
         }
         let Some(period) = self.period else {

@@ -3,7 +3,8 @@
 //! the agent and never talks to it; it only behaves as nodes do.
 //!
 //! `lidar`, `base` and `monitor` are the demo's processes; `pub` and `sub` are the test peers and
-//! share their command line and log format with `agent/tests/peers`.
+//! share their command line and log format with `agent/tests/peers`; `talkers` and `listeners` have
+//! many small topics (`crowd`).
 
 use std::fs::File;
 use std::io::{BufRead, Write};
@@ -25,6 +26,7 @@ use serde_json::json;
 
 use crate::messages::{AddTwoIntsRequest, AddTwoIntsResponse, Imu, LaserScan, PointCloud2, Twist};
 
+mod crowd;
 mod messages;
 mod patience;
 
@@ -41,6 +43,9 @@ struct Options {
     size: usize,
     #[arg(long, default_value_t = 20.0)]
     rate: f64,
+    /// Topics of the `talkers` and `listeners` roles
+    #[arg(long, default_value_t = 200)]
+    topics: usize,
     /// Samples to send or to receive before exiting; 0 means until a signal
     #[arg(long, default_value_t = 0)]
     count: u64,
@@ -88,6 +93,10 @@ enum Role {
     Monitor,
     Pub,
     Sub,
+    /// `--topics` topics of an Imu at `--rate`
+    Talkers,
+    /// Subscribes to them
+    Listeners,
 }
 
 #[tokio::main(worker_threads = 2)]
@@ -109,6 +118,8 @@ async fn main() -> Result<()> {
         Role::Monitor => monitor(&context, &stop, interrupted).await?,
         Role::Pub => publish(&context, &options, &stop, &log).await?,
         Role::Sub => subscribe(&context, &options, &stop, &log).await?,
+        Role::Talkers => crowd::talk(&context, options.topics, options.rate, &stop).await?,
+        Role::Listeners => crowd::hear(&context, options.topics, &stop).await?,
     }
     log.write(&json!({"ev": "exit", "t": unix_ns()}));
     Ok(())

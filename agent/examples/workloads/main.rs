@@ -2,9 +2,13 @@
 //! with the agent (host hook, then packet sockets), and with one more Cyclone DDS subscriber in C++
 //! instead, in turns; the table shows the observer's CPU time and memory, and what all of it spent.
 //!
+//! Before that, how small the agent is (`footprint`).
+//!
 //! What holds on a busy machine too (memory, bytes copied, messages counted) is checked, and ends
 //! this with a failure; CPU time is compared with its targets, and only told.
 
+mod caps;
+mod footprint;
 mod report;
 mod window;
 
@@ -15,6 +19,7 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, bail};
 use clap::{Parser, ValueEnum};
 
+use crate::footprint::Footprint;
 use crate::harness::peer::{Stack, Stream};
 use crate::report::{Row, Targets};
 use crate::window::{Observer, Window};
@@ -22,10 +27,17 @@ use crate::window::{Observer, Window};
 #[path = "../../tests/harness/mod.rs"]
 mod harness;
 
+#[path = "../../tests/forged/mod.rs"]
+#[expect(
+    clippy::indexing_slicing,
+    reason = "code of tests, which say by failing what must hold"
+)]
+mod forged;
+
 #[derive(Parser)]
 #[command(about = "Measures what observing costs; needs root for network namespaces")]
 struct Options {
-    /// The agent; `rp` of the same build when left out
+    /// The agent; when left out, the static one that is shipped
     #[arg(long)]
     agent: Option<PathBuf>,
     /// Length of each measurement
@@ -34,7 +46,8 @@ struct Options {
     /// Measurements of each kind; the table shows medians
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     rounds: u16,
-    /// Only workloads whose name contains this
+    /// Only workloads whose name contains this; `footprint` for sizes, start and memory,
+    /// `caps` for the memory of full tables
     #[arg(long, default_value = "")]
     only: String,
     /// Only publishers and subscribers of this DDS
@@ -87,17 +100,26 @@ fn main() -> Result<ExitCode> {
     let options = Options::parse();
     let program = match &options.agent {
         Some(program) => program.clone(),
-        None => peer_directory()?.join("rp"),
+        None => shipped()?,
     };
     if !program.exists() {
         bail!("{} is missing: run `make bench`", program.display());
+    }
+    let mut missed = Vec::new();
+    if "footprint".contains(&options.only) {
+        let length = Duration::from_secs(options.seconds);
+        let footprint = Footprint::measure(&program, length).context("footprint")?;
+        println!("{footprint}");
+        missed.extend(footprint.missed());
+    }
+    if "caps".contains(&options.only) {
+        caps::measure(&program).context("caps")?;
     }
     println!(
         "{} windows of {} s each; CPU seconds are per 20 s; workload = publisher, subscriber, observer and ksoftirqd\n",
         options.rounds, options.seconds
     );
     println!("{}", report::HEAD);
-    let mut missed = Vec::new();
     for workload in WORKLOADS {
         for stack in workload.stacks {
             if !workload.name.contains(&options.only)
@@ -144,13 +166,13 @@ fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options)
     Ok(row)
 }
 
-fn peer_directory() -> Result<PathBuf> {
+/// In the target directory, of this machine's architecture.
+fn shipped() -> Result<PathBuf> {
     let program = std::env::current_exe().context("cannot tell where this program is")?;
-    Ok(program
-        .ancestors()
-        .nth(2)
-        .context("this program is in no directory")?
-        .to_owned())
+    let target = program.ancestors().nth(3);
+    let target = target.context("this program is in no target directory")?;
+    let triple = format!("{}-unknown-linux-musl", std::env::consts::ARCH);
+    Ok(target.join(triple).join("release/rp"))
 }
 
 impl Workload {

@@ -41,6 +41,13 @@ pub(crate) struct Miss {
     pub(crate) fails: bool,
 }
 
+impl Miss {
+    /// On any machine.
+    pub(crate) const fn failing(what: String) -> Miss {
+        Miss { what, fails: true }
+    }
+}
+
 impl Default for Targets {
     fn default() -> Self {
         Targets {

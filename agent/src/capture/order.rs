@@ -19,6 +19,8 @@ use super::system::Clocks;
 /// Records of captured datagrams that may wait: some 2.5 MB. Two thousand fit a datagram that means
 /// harm.
 const MAX_WALKED: usize = 16_384;
+/// Room for records that is kept when none wait; what a burst took beyond is given back.
+const KEPT: usize = 512;
 /// How much later than the word that it was not delivered a captured datagram may be read.
 const LATE_NANOSECONDS: u64 = 1_000_000_000;
 
@@ -101,6 +103,7 @@ impl Order {
         let oldest = kernel.into_iter().chain(walked).chain(no_room).min();
         if oldest.is_none_or(|oldest| oldest > until) {
             self.forget_undelivered(until);
+            self.give_back();
             return None;
         }
         let of_kernel = |mut record: Record| {
@@ -124,6 +127,17 @@ impl Order {
         }
         self.walked.pop_front();
         Some(Next::Walked(record))
+    }
+
+    fn give_back(&mut self) {
+        for records in [&mut self.kernel, &mut self.no_room] {
+            if records.is_empty() && records.capacity() > KEPT {
+                *records = VecDeque::new();
+            }
+        }
+        if self.walked.is_empty() && self.walked.capacity() > KEPT {
+            self.walked = VecDeque::new();
+        }
     }
 
     /// Of the last second, records up to `until` may not have come yet.
@@ -284,6 +298,20 @@ mod tests {
         assert!(order.walked(at, back).is_none());
         let next = order.next(&clocks(90), 10 * MILLISECOND);
         assert!(matches!(next, Some(Next::Walked(_))), "{next:?}");
+    }
+
+    #[test]
+    fn what_a_burst_took_is_given_back_when_it_is_over() {
+        let mut order = Order::default();
+        for number in 0..20_000 {
+            order.kernel(of_the_kernel(number, 1));
+            let (at, record) = captured(number, 1);
+            let _ = order.walked(at, record);
+        }
+        assert!(order.kernel.capacity() >= 20_000);
+        while order.next(&clocks(900), 900 * MILLISECOND).is_some() {}
+        assert!(order.kernel.capacity() <= KEPT);
+        assert!(order.walked.capacity() <= KEPT);
     }
 
     #[test]

@@ -1,12 +1,13 @@
 //! The system calls that live capture needs beside its sockets: waiting, the clocks, free memory.
 
-use std::ffi::CString;
+use std::ffi::{CString, c_void};
 use std::fs::File;
 use std::io::{self, Read as _};
 use std::os::fd::{AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 use std::os::unix::ffi::OsStrExt as _;
 use std::path::Path;
 use std::ptr;
+use std::slice;
 use std::time::Duration;
 
 use libc::c_int;
@@ -14,6 +15,8 @@ use ros2probe_wire::Timestamp;
 
 /// Clock readings that are tried.
 const READINGS: usize = 8;
+/// Bytes of the program's file that are mapped together once it runs.
+const PIECE: u64 = 16 << 10;
 /// Nanoseconds between two clocks that are read at one moment.
 const CLOSE: u64 = 5_000;
 
@@ -155,13 +158,74 @@ pub fn run_first(first: bool) -> io::Result<()> {
 }
 
 /// Gives free memory back to the system. Reading the kernel's types takes some 15 MB that nobody needs
-/// afterwards, and the allocator would keep them for as long as the agent lives.
+/// afterwards, and the allocator of glibc would keep them for as long as the agent lives; that of musl
+/// gives large pieces back by itself.
 pub fn give_back_memory() {
     #[cfg(target_env = "gnu")]
     // SAFETY: has no preconditions and touches free memory only.
     unsafe {
         libc::malloc_trim(0);
     }
+}
+
+/// Lets go of the program's own pages in memory, most of which are needed once, at the start: reading
+/// the configuration, loading the kernel programs. What runs on is mapped again as it is used, from the
+/// page cache, and little else beside it: the kernel maps 64 KiB around a fault, or what is cached in
+/// one piece up to 2 MiB, but nothing beyond a mapping's end. (A debugger's breakpoints are lost by this;
+/// there are none yet when an agent starts.)
+pub fn give_back_program() {
+    // SAFETY: the function is one for this purpose and takes no data.
+    unsafe { libc::dl_iterate_phdr(Some(give_back_segments), ptr::null_mut()) };
+}
+
+/// Called with what is loaded, first the program. Ends after that.
+unsafe extern "C" fn give_back_segments(
+    info: *mut libc::dl_phdr_info,
+    _size: libc::size_t,
+    _data: *mut c_void,
+) -> c_int {
+    // SAFETY: the caller, the C library, hands over what describes one loaded object.
+    let info = unsafe { &*info };
+    // SAFETY: it says where that object's program headers are, and how many.
+    let headers = unsafe { slice::from_raw_parts(info.dlpi_phdr, info.dlpi_phnum.into()) };
+    let page = u64::from(page_size());
+    // What can be written has been changed by the start, and would come back as it was before.
+    let constant = headers
+        .iter()
+        .filter(|header| header.p_type == libc::PT_LOAD && header.p_flags & libc::PF_W == 0);
+    for header in constant {
+        // Whole pages only: the others may belong to what can be written, too.
+        let start = (info.dlpi_addr + header.p_vaddr).next_multiple_of(page);
+        let end = (info.dlpi_addr + header.p_vaddr + header.p_memsz) / page * page;
+        advise(start, end, libc::MADV_DONTNEED);
+        // Every other piece is left out of core dumps (all are), so that each is a mapping of its own.
+        let piece = PIECE.max(page);
+        let mut at = start.next_multiple_of(2 * piece);
+        while at < end {
+            advise(at, end.min(at + piece), libc::MADV_DONTDUMP);
+            at += 2 * piece;
+        }
+    }
+    1
+}
+
+/// Of pages of the program's file that cannot be written.
+fn advise(start: u64, end: u64, advice: c_int) {
+    let (Ok(address), Ok(length)) = (
+        usize::try_from(start),
+        usize::try_from(end.saturating_sub(start)),
+    ) else {
+        return;
+    };
+    let address = ptr::with_exposed_provenance_mut(address);
+    // SAFETY: nobody can have changed these pages: with the next access they are what they were.
+    unsafe { libc::madvise(address, length, advice) };
+}
+
+fn page_size() -> u32 {
+    // SAFETY: sysconf has no preconditions.
+    let size = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
+    u32::try_from(size).unwrap_or(65_536)
 }
 
 /// The kernel filter's clock beside the calendar's, read at one moment.
@@ -254,6 +318,31 @@ mod tests {
         let waited = wait(&descriptors, Duration::from_secs(60)).unwrap();
         assert_eq!(waited, Some(1));
         assert!(start.elapsed() < Duration::from_secs(30));
+    }
+
+    #[test]
+    fn the_program_goes_on_when_its_pages_were_given_back() {
+        let resident = || {
+            let maps = std::fs::read_to_string("/proc/self/smaps").unwrap();
+            let own = std::env::current_exe().unwrap().display().to_string();
+            let mut of_program = false;
+            let mut kilobytes = 0_u64;
+            for line in maps.lines() {
+                if let Some(rest) = line.strip_prefix("Rss:").filter(|_| of_program) {
+                    kilobytes += rest.trim_end_matches("kB").trim().parse::<u64>().unwrap();
+                } else if line.contains('-') && line.contains('/') {
+                    of_program = line.contains(" r-xp ") && line.ends_with(&own);
+                }
+            }
+            kilobytes
+        };
+        let before = resident();
+        give_back_program();
+        let after = resident();
+        assert!(
+            after < before,
+            "{before} kB were there before, {after} after"
+        );
     }
 
     #[test]
