@@ -74,6 +74,20 @@ fn a_host_with_systemd_is_served_until_the_package_is_purged() -> Result<()> {
     let process = host.run("systemctl show --property MainPID --value ros2probe")?;
     is(&format!("stat -c %U /proc/{}", process.trim()), "ros2probe")?;
 
+    // What systemd before 247 is given instead comes to the same.
+    host.run(
+        "mkdir /run/systemd/system/ros2probe.service.d && \
+         cp /usr/share/ros2probe/systemd-before-247.conf /run/systemd/system/ros2probe.service.d/ && \
+         systemctl daemon-reload && systemctl restart ros2probe",
+    )?;
+    is(RUNS, "active")?;
+    let process = host.run("systemctl show --property MainPID --value ros2probe")?;
+    let process = process.trim();
+    is(&format!("stat -c %U /proc/{process}"), "ros2probe")?;
+    let bounds = host.run(&format!("grep CapBnd /proc/{process}/status"))?;
+    ensure!(bounds.trim().ends_with("\t000000c000003000"), "{bounds}");
+    host.run("rm -r /run/systemd/system/ros2probe.service.d && systemctl daemon-reload")?;
+
     // Members of the group are let in by the socket, others by nothing when the address is off.
     host.run(&format!(
         "sed -i 's/^  # listen: 127.0.0.1:17401/  listen: off/' {CONFIG}; systemctl restart ros2probe"

@@ -159,7 +159,7 @@ fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
             false => say(Verdict::Note, "the service ros2probe is not installed"),
         }
         .seen("not there", format!("/etc/systemd/system/{UNIT} and others"))
-        .remedy("sudo cp systemd/ros2probe.service /etc/systemd/system/ && sudo systemctl enable --now ros2probe"));
+        .remedy("sudo apt install ./ros2probe_*.deb    # docs/install.md"));
     };
     let is_running = SERVICES.iter().any(|path| {
         host.files
