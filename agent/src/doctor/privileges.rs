@@ -151,15 +151,20 @@ fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
         .iter()
         .find(|place| host.files.exists(&format!("{place}/{UNIT}")));
     let Some(place) = installed else {
-        return Some(match is_answering {
-            true => say(
-                Verdict::Note,
-                "the agent was started by hand: no service is installed that starts it again",
-            ),
-            false => say(Verdict::Note, "the service ros2probe is not installed"),
-        }
-        .seen("not there", format!("/etc/systemd/system/{UNIT} and others"))
-        .remedy("sudo apt install ./ros2probe_*.deb    # docs/install.md"));
+        return Some(
+            match is_answering {
+                true => say(
+                    Verdict::Note,
+                    "the agent was started by hand: no service is installed that starts it again",
+                ),
+                false => say(Verdict::Note, "the service ros2probe is not installed"),
+            }
+            .seen(
+                "not there",
+                format!("/etc/systemd/system/{UNIT} and others"),
+            )
+            .remedy("sudo apt install ./ros2probe_*.deb    # docs/install.md"),
+        );
     };
     let is_running = SERVICES.iter().any(|path| {
         host.files

@@ -14,7 +14,10 @@ pub(crate) fn given() -> Result<Vec<PathBuf>> {
         return Ok(Vec::new());
     };
     let mut packages = Vec::new();
-    for entry in Path::new(&directory).read_dir().context("ROS2PROBE_PACKAGES")? {
+    for entry in Path::new(&directory)
+        .read_dir()
+        .context("ROS2PROBE_PACKAGES")?
+    {
         let path = entry?.path();
         if path.extension().is_some_and(|extension| extension == "deb") {
             packages.push(path);
