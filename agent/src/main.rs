@@ -102,10 +102,11 @@ fn run(options: cli::Run) -> Result<()> {
         Source::Replay(_) => None,
     };
     let recordings_directory = memory::recordings(&config.recordings.directory, state.as_deref());
-    let known = state.as_deref().and_then(memory::load);
-    if let Some(state) = &state {
-        memory::restore_watches(state, &watches);
-    }
+    let known = state.as_deref().map(memory::load);
+    let (known, keeps_known) = known.unwrap_or_default();
+    let keeps_watches = state
+        .as_deref()
+        .is_some_and(|state| memory::restore_watches(state, &watches));
     privilege::give_up(&config.capture)?;
     if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {
         let watches = watches.in_force().entries().len();
@@ -137,10 +138,12 @@ fn run(options: cli::Run) -> Result<()> {
         give_back_memory();
     }
     let keep = |directory: Arc<StateDirectory>| {
-        watches.keep_in(Arc::clone(&directory))?;
-        Keeper::start(directory)
+        if keeps_watches {
+            watches.keep_in(Arc::clone(&directory))?;
+        }
+        keeps_known.then(|| Keeper::start(directory)).transpose()
     };
-    let keeper = state.map(keep).transpose();
+    let keeper = state.map_or(Ok(None), keep);
     let keeper = keeper.context("cannot start the threads that keep state")?;
     let library = Library::new(Places::new(
         Vec::new(),

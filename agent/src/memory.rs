@@ -7,7 +7,7 @@ use std::sync::Arc;
 use anyhow::anyhow;
 use ros2probe::config::{StateChoice, Watch};
 use ros2probe::model::discovery::Memory;
-use ros2probe::state::{Loaded, StateDirectory};
+use ros2probe::state::{Loaded, Newer, StateDirectory};
 use ros2probe::watches::{self, Kept, Watches};
 
 /// Where the package and the service manager put it.
@@ -49,10 +49,14 @@ pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -
     }
 }
 
-/// What the last agent knew.
-pub(crate) fn load(directory: &StateDirectory) -> Option<Memory> {
+/// What the last agent knew, and whether this one may keep what it knows in its place.
+pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
     let path = directory.path().display();
-    match directory.load() {
+    let known = match directory.load() {
+        Loaded::Newer(newer) => {
+            left_alone(&newer);
+            return (None, false);
+        }
         Loaded::Known(memory) => {
             let participants = memory.participants.len();
             tracing::info!(%path, participants, "known from before, until confirmed");
@@ -68,12 +72,33 @@ pub(crate) fn load(directory: &StateDirectory) -> Option<Memory> {
             tracing::warn!(%path, reason, aside, "the state cannot be used");
             None
         }
-    }
+    };
+    (known, true)
 }
 
-/// Watches again what clients of the last agent had asked for.
-pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) {
-    match watches.restore(load_watches(directory)) {
+/// The operator went back to an older rp, and may go forth again.
+fn left_alone(newer: &Newer) {
+    let Newer {
+        path,
+        version,
+        known,
+    } = newer;
+    tracing::error!(
+        path = %path.display(),
+        version,
+        known,
+        "a newer rp wrote this state: it is left to that one, and this one starts without it and \
+         keeps nothing there; upgrade rp, or remove the file"
+    );
+}
+
+/// Watches again what clients of the last agent had asked for; whether this one may keep in its
+/// place what they ask for.
+pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> bool {
+    let Some(kept) = load_watches(directory) else {
+        return false;
+    };
+    match watches.restore(kept) {
         Ok(0) => {}
         Ok(left_out) => {
             let limit = "limits.watches";
@@ -81,12 +106,18 @@ pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) {
         }
         Err(error) => tracing::warn!(%error, "the watches that were added cannot be used"),
     }
+    true
 }
 
-fn load_watches(directory: &StateDirectory) -> Vec<Watch> {
+/// `None` = those of a newer rp.
+fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
     let path = directory.path().display();
-    match watches::load(directory) {
+    Some(match watches::load(directory) {
         Kept::Nothing => Vec::new(),
+        Kept::Newer(newer) => {
+            left_alone(&newer);
+            return None;
+        }
         Kept::These(watches) => {
             tracing::info!(%path, watches = watches.len(), "watched again, as clients had asked");
             watches
@@ -96,5 +127,5 @@ fn load_watches(directory: &StateDirectory) -> Vec<Watch> {
             tracing::warn!(%path, reason, aside, "the watches that were added cannot be used");
             Vec::new()
         }
-    }
+    })
 }

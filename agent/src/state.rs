@@ -21,8 +21,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::model::discovery::Memory;
 
-/// The form that is written; one that is read with another number is none of ours.
+/// The form that is written. What was added to it so far may be lacking in a file and has a default
+/// then. An agent that does not know a field must not take the file for its own: whatever is added
+/// from now on, or means something else, is a new version with a reader of its own.
 const VERSION: u32 = 1;
+const FORM: Form<Document> = Form {
+    file: FILE,
+    readers: &[(VERSION, from_json)],
+};
 const FILE: &str = "discovery.json";
 /// What a file is called while it is written.
 const NEW_FILE: &str = "discovery.json.new";
@@ -71,6 +77,8 @@ pub enum Loaded {
     AnotherBoot,
     /// Everybody that was there.
     Known(Memory),
+    /// A newer rp wrote it: it is left as it is, and nothing may be written in its place.
+    Newer(Newer),
     /// It cannot be used, for this reason, and now lies there.
     Unusable {
         /// Why.
@@ -80,6 +88,28 @@ pub enum Loaded {
     },
 }
 
+/// A file of the state directory, and every form it ever had.
+pub(crate) struct Form<T: 'static> {
+    /// Its name.
+    pub(crate) file: &'static str,
+    /// What reads each version, the oldest first; the last one is what is written.
+    pub(crate) readers: &'static [(u32, Reader<T>)],
+}
+
+/// Reads a document of one version as what it means today.
+pub(crate) type Reader<T> = fn(&[u8]) -> serde_json::Result<T>;
+
+/// A file that only a newer rp can read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Newer {
+    /// Where it lies.
+    pub path: PathBuf,
+    /// Its version.
+    pub version: u32,
+    /// The newest one that is known here.
+    pub known: u32,
+}
+
 /// What was found in one file.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Found<T> {
@@ -87,6 +117,8 @@ pub(crate) enum Found<T> {
     Nothing,
     /// A document.
     This(T),
+    /// One that only a newer rp can read; it is where it was.
+    Newer(Newer),
     /// It cannot be used, for this reason, and now lies there.
     Unusable {
         /// Why.
@@ -177,16 +209,19 @@ impl StateDirectory {
     /// Reads what the last agent left. What is no state is moved aside.
     #[must_use]
     pub fn load(&self) -> Loaded {
-        match self.read::<Document>(FILE, VERSION) {
+        match self.read(&FORM) {
             Found::Nothing => Loaded::Nothing,
+            Found::Newer(newer) => Loaded::Newer(newer),
             Found::This(document) if document.boot != boot() => Loaded::AnotherBoot,
             Found::This(document) => Loaded::Known(document.memory),
             Found::Unusable { reason, aside } => Loaded::Unusable { reason, aside },
         }
     }
 
-    /// Reads a document of this version. What is none is moved aside.
-    pub(crate) fn read<T: DeserializeOwned>(&self, file: &str, version: u32) -> Found<T> {
+    /// Reads a document of any version that is known. What is none is moved aside; what a newer rp
+    /// wrote stays where that one will look for it.
+    pub(crate) fn read<T>(&self, form: &Form<T>) -> Found<T> {
+        let file = form.file;
         let path = self.path.join(file);
         let mut bytes = Vec::new();
         let read =
@@ -194,22 +229,32 @@ impl StateDirectory {
         match read {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Found::Nothing,
             Err(error) => return self.set_aside(file, error.to_string()),
-            Ok(_) if bytes.len() as u64 > MAX_BYTES => {
-                return self.set_aside(file, format!("it is larger than {MAX_BYTES} bytes"));
-            }
             Ok(_) => {}
         }
-        match serde_json::from_slice::<Version>(&bytes) {
-            Ok(found) if found.version == version => {}
-            Ok(Version { version: other }) => {
-                let reason = format!("it is of version {other}, this agent reads {version}");
-                return self.set_aside(file, reason);
-            }
-            Err(error) => return self.set_aside(file, error.to_string()),
+        let known = form.readers.last().map_or(0, |(version, _)| *version);
+        let is_whole = bytes.len() as u64 <= MAX_BYTES;
+        let version = match serde_json::from_slice::<Version>(&bytes) {
+            Ok(Version { version }) => version,
+            Err(error) => match begins_with_version(&bytes) {
+                // Too large for us, or no JSON any more: that is for the newer one to judge.
+                Some(version) if version > known => version,
+                _ if is_whole => return self.set_aside(file, error.to_string()),
+                _ => return self.set_aside(file, format!("it is larger than {MAX_BYTES} bytes")),
+            },
+        };
+        if version > known {
+            return Found::Newer(Newer {
+                path,
+                version,
+                known,
+            });
         }
-        match serde_json::from_slice(&bytes) {
-            Ok(document) => Found::This(document),
-            Err(error) => self.set_aside(file, error.to_string()),
+        match form.readers.iter().find(|(reads, _)| *reads == version) {
+            Some((_, read)) => match read(&bytes) {
+                Ok(document) => Found::This(document),
+                Err(error) => self.set_aside(file, error.to_string()),
+            },
+            None => self.set_aside(file, format!("there is no version {version} of it")),
         }
     }
 
@@ -245,6 +290,19 @@ impl StateDirectory {
         };
         self.replace(FILE, &document)
     }
+}
+
+/// The form that is written today.
+pub(crate) fn from_json<T: DeserializeOwned>(bytes: &[u8]) -> serde_json::Result<T> {
+    serde_json::from_slice(bytes)
+}
+
+/// What a file says first of itself, whatever follows: every version is written so.
+fn begins_with_version(bytes: &[u8]) -> Option<u32> {
+    let rest = bytes.strip_prefix(b"{\"version\":")?;
+    let digits = rest.iter().take_while(|byte| byte.is_ascii_digit());
+    let digits: Vec<u8> = digits.take(10).copied().collect();
+    std::str::from_utf8(&digits).ok()?.parse().ok()
 }
 
 fn new_file(path: &Path) -> io::Result<File> {
@@ -394,15 +452,103 @@ mod tests {
             fs::write(&file, garbage).unwrap();
             unusable(&directory);
         }
-        fs::write(&file, r#"{"version": 2, "boot": {}, "clouds": []}"#).unwrap();
-        assert_eq!(
-            unusable(&directory),
-            "it is of version 2, this agent reads 1"
-        );
+        fs::write(&file, r#"{"version": 0, "boot": {}, "clouds": []}"#).unwrap();
+        assert_eq!(unusable(&directory), "there is no version 0 of it");
         let aside = fs::read_to_string(place.path().join("discovery.json.corrupt")).unwrap();
         assert!(aside.contains("clouds"));
         directory.write(Memory::default()).unwrap();
         assert_eq!(directory.load(), Loaded::Known(Memory::default()));
+    }
+
+    #[test]
+    fn what_a_newer_one_wrote_stays_where_it_is_also_cut_or_of_another_form() {
+        let (place, directory) = directory();
+        let file = place.path().join(FILE);
+        for (newer, version) in [
+            (&br#"{"version": 2, "boot": {}, "clouds": []}"#[..], 2),
+            (br#"{"clouds": [], "version": 4000000000}"#, 4_000_000_000),
+            (br#"{"version":3,"clouds":["#, 3),
+            (b"{\"version\":3,\0\xff\x7f", 3),
+        ] {
+            fs::write(&file, newer).unwrap();
+            let found = Newer {
+                path: file.clone(),
+                version,
+                known: VERSION,
+            };
+            assert_eq!(directory.load(), Loaded::Newer(found));
+            assert_eq!(fs::read(&file).unwrap(), newer);
+            assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
+        }
+    }
+
+    #[test]
+    fn every_version_is_read_by_its_own_reader_and_the_last_one_is_written() {
+        assert_eq!(
+            FORM.readers.last().map(|(version, _)| *version),
+            Some(VERSION)
+        );
+        #[derive(Debug, Deserialize, PartialEq)]
+        struct Old {
+            degrees: i32,
+        }
+        #[derive(Debug, Deserialize, PartialEq)]
+        struct New {
+            kelvin: i32,
+        }
+        const THERMOMETER: Form<New> = Form {
+            file: FILE,
+            readers: &[
+                (1, |bytes| {
+                    from_json::<Old>(bytes).map(|old| New {
+                        kelvin: old.degrees + 273,
+                    })
+                }),
+                (3, from_json),
+            ],
+        };
+        let (place, directory) = directory();
+        let read = |text: &str| {
+            fs::write(place.path().join(FILE), text).unwrap();
+            directory.read(&THERMOMETER)
+        };
+        let this = |kelvin| Found::This(New { kelvin });
+        assert_eq!(read(r#"{"version": 1, "degrees": 20}"#), this(293));
+        assert_eq!(read(r#"{"version": 3, "kelvin": 20}"#), this(20));
+        for none in [r#"{"version": 2, "kelvin": 20}"#, r#"{"kelvin": 20}"#] {
+            assert!(matches!(read(none), Found::Unusable { .. }), "{none}");
+        }
+        let newer = read(r#"{"version": 4, "entropy": 20}"#);
+        assert!(matches!(
+            newer,
+            Found::Newer(Newer {
+                version: 4,
+                known: 3,
+                ..
+            })
+        ));
+    }
+
+    #[test]
+    fn a_file_of_the_first_agent_is_read() {
+        let (place, directory) = directory();
+        let boot = boot();
+        // As it was before shared memory and what matching asks for were kept.
+        let first = r#"{"version":1,"boot":"BOOT","participants":[{"prefix":"010f0102030405060708090a",
+            "vendor":"010f","domain_id":5,"domain_source":"multicast_port","enclave":"/",
+            "host":"robot","process_name":"lidar","process_id":42,"lease":20000000000,
+            "secured":false,"addresses":{"metatraffic":["10.0.0.1:7410"],"default":[]},
+            "nodes":[{"name":"/lidar","writers":["010f0102030405060708090a00001103"],
+            "readers":[]}],"nodes_from":["010f0102030405060708090a00000403",1],"endpoints":[{
+            "guid":"010f0102030405060708090a00001103","topic":"rt/points",
+            "message_type":"sensor_msgs/msg/PointCloud2","type_hash":null,"reliability":2,
+            "durability":0,"history":[0,10],"deadline":null,"lifespan":null,"liveliness":0,
+            "liveliness_lease":null,"ownership":0,"minimum_separation":0,"partitions":[]}]}]}"#;
+        fs::write(place.path().join(FILE), first.replace("BOOT", &boot)).unwrap();
+        let Loaded::Known(memory) = directory.load() else {
+            panic!("{:?}", directory.load());
+        };
+        assert_eq!(memory.participants.len(), 1);
     }
 
     #[test]

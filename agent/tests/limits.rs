@@ -551,3 +551,72 @@ fn every_limit_of_the_configuration_is_on_the_page_and_in_the_answer_on_health()
     }
     assert_eq!(shown.len(), Limit::ALL.len());
 }
+
+#[test]
+fn the_table_of_fixed_caps_says_what_the_sources_say() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let page = std::fs::read_to_string(root.join("docs/limits.md")).unwrap();
+    let rows: Vec<Vec<&str>> = page
+        .lines()
+        .filter(|line| line.starts_with("| ") && line.contains("` in `"))
+        .map(|line| line.split(" | ").collect())
+        .collect();
+    assert!(rows.len() > 40, "{} rows", rows.len());
+    for row in rows {
+        let value = row[1].trim_matches('`');
+        let (name, path) = row[2].trim_matches('`').split_once("` in `").unwrap();
+        let source = std::fs::read_to_string(root.join(path)).unwrap();
+        let is_said = source.lines().any(|line| {
+            let (left, right) = match line.split_once(" = ") {
+                Some((left, right)) => (left.split(':').next().unwrap_or_default(), right),
+                None => line.split_once(": ").unwrap_or_default(),
+            };
+            left.split(' ').next_back() == Some(name) && right.trim_end_matches([';', ',']) == value
+        });
+        assert!(is_said, "{path}: {name} is not {value}");
+    }
+}
+
+/// What `rp` says and how it ends.
+fn said(arguments: &[&str]) -> (Option<i32>, String) {
+    let output = local_agent::rp().args(arguments).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    (output.status.code(), said)
+}
+
+#[test]
+fn a_configuration_for_a_newer_rp_is_refused_in_one_line_by_check_start_and_reload() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut agent = agent(directory.path(), "");
+    let file = directory.path().join("ros2probe.yaml");
+    let before = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(&file, format!("version: 2\nclouds: all\n{before}")).unwrap();
+    let path = file.to_str().unwrap();
+    let capture = local_agent::capture();
+    let start = [
+        "run",
+        "--config",
+        path,
+        "--replay",
+        capture.to_str().unwrap(),
+    ];
+    for arguments in [&["check-config", path][..], &start] {
+        let (code, said) = said(arguments);
+        assert_eq!(code, Some(78), "{said}");
+        assert_eq!(said.lines().count(), 1, "{said}");
+        for part in [":1:10: version: is 2", "reads up to 1", "upgrade rp"] {
+            assert!(said.contains(part), "{said}");
+        }
+    }
+    agent.signal("-HUP");
+    let line = agent.wait_for_log("the configuration was not reloaded");
+    assert!(line.contains("version: is 2"), "{line}");
+    assert_eq!(ask(agent.api, "GET", "/watch/a", "").0, 200);
+    // One that says its version, and one that says none.
+    for same in [format!("version: 1\n{before}"), before] {
+        std::fs::write(&file, same).unwrap();
+        assert_eq!(said(&["check-config", path]).0, Some(0));
+        agent.signal("-HUP");
+        agent.wait_for_log("the configuration was reloaded");
+    }
+}

@@ -77,10 +77,32 @@ fn watches_come_and_go_with_the_robot_running() -> Result<()> {
     agent.process.terminate()?;
     ensure!(!socket.exists(), "the socket's file stays");
     std::fs::write(&file, "{\"version\": 1, \"watches\": [{}]}")?;
-    let _agent = start()?;
+    let mut agent = start()?;
     let watches = api.ask("GET", "")?.1;
     ensure!(topics(&watches).is_empty(), "{watches}");
     ensure!(state.join("watches.json.corrupt").exists());
+    agent.process.terminate()?;
+
+    // The operator goes back from a newer rp, and forth again.
+    let newer = |name: &str| (state.join(name), format!("{{\"version\":7,\"{name}\":0}}"));
+    let newer = [newer("watches.json"), newer("discovery.json")];
+    for (file, text) in &newer {
+        std::fs::write(file, text)?;
+    }
+    let mut agent = start()?;
+    ensure!(api.ask("POST", "imu")?.0 == 201);
+    let health = get(&host, "http://127.0.0.1:17401/health")?;
+    ensure!(health.contains("\"watches_kept\":false"), "{health}");
+    let seen = |scrape: &Scrape| scrape.sum("ros2_participants", &[]) > 0.0;
+    wait_for(&agent, seen).context("an agent without state sees nothing")?;
+    agent.process.terminate()?;
+    for (file, text) in &newer {
+        ensure!(
+            std::fs::read_to_string(file)? == *text,
+            "{file:?} was touched"
+        );
+        ensure!(!file.with_extension("json.new").exists(), "{file:?}");
+    }
     Ok(())
 }
 

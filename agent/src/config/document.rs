@@ -184,6 +184,18 @@ impl Node {
         }
     }
 
+    /// The whole number that the file names as its version, and where.
+    pub(super) fn version(&self) -> Option<(i128, Position)> {
+        let Content::Map(entries) = &self.content else {
+            return None;
+        };
+        let (_, value) = entries.iter().find(|(key, _)| key.name == "version")?;
+        match value.scalar()? {
+            Scalar::Integer(version) => Some((version, value.position)),
+            _ => None,
+        }
+    }
+
     /// What a scalar stands for; `None` for lists and maps.
     pub(super) fn scalar(&self) -> Option<Scalar> {
         let Content::Scalar { text, plain } = &self.content else {

@@ -58,7 +58,8 @@ pub struct Row {
     pub reached: &'static str,
     /// Which metrics tell more than `ros2probe_limit_reached_total` does.
     pub told_by: &'static str,
-    /// Bytes that one takes at most on a robot with names of usual length; 1 where bytes are counted.
+    /// Bytes that one takes at most on a robot with names of usual length, with two snapshots and two
+    /// pages of metrics that tell of it; 1 where bytes are counted.
     pub bytes: usize,
 }
 
@@ -125,7 +126,7 @@ impl Limit {
                 reached: "one that is not heard any more makes room (for 5 s, if it was there for less \
                           than 2 s, else for 90 s); otherwise the newcomer is left out",
                 told_by: "ros2probe_table_evictions_total",
-                bytes: 2_048,
+                bytes: 2 << 10,
             },
             Self::Endpoints => Row {
                 key: "endpoints",
@@ -135,7 +136,7 @@ impl Limit {
                 reached: "a participant that is not heard any more makes room with all it has; \
                           otherwise the newcomer is left out",
                 told_by: "ros2probe_table_evictions_total",
-                bytes: 3_072,
+                bytes: 5_632,
             },
             Self::Topics => Row {
                 key: "topics",
@@ -145,7 +146,7 @@ impl Limit {
                 reached: "one that has vanished makes room; otherwise the newcomer is listed and not \
                           measured, until there is room",
                 told_by: "ros2probe_topics_rejected_total",
-                bytes: 4_096,
+                bytes: 15 << 10,
             },
             Self::Watches => Row {
                 key: "watches",
@@ -154,7 +155,7 @@ impl Limit {
                 what: "Watches of the configuration, the command line and clients together",
                 reached: "a client's is refused (409), and so is a configuration that lists more",
                 told_by: "",
-                bytes: 1_024,
+                bytes: 1 << 10,
             },
             Self::UnknownWriters => Row {
                 key: "unknown_writers",
@@ -164,7 +165,7 @@ impl Limit {
                 reached: "one that sent less than 10 messages and nothing for 3 s makes room; \
                           otherwise the newcomer is not followed",
                 told_by: "ros2probe_table_evictions_total",
-                bytes: 4_096,
+                bytes: 4 << 10,
             },
             Self::Flows => Row {
                 key: "flows",
@@ -175,7 +176,7 @@ impl Limit {
                 reached: "those that were silent for 10 s make room; until then the newcomer is not \
                           followed, and its topic's own counts stay right",
                 told_by: "ros2probe_table_evictions_total",
-                bytes: 1_536,
+                bytes: 2 << 10,
             },
             Self::ReassemblyBytes => Row {
                 key: "reassembly_bytes",
@@ -193,7 +194,7 @@ impl Limit {
                 what: "Clients that get messages one by one, recordings and snapshots",
                 reached: "the next one is refused (503)",
                 told_by: "ros2probe_subscriptions_refused_total",
-                bytes: 8_192,
+                bytes: 8 << 10,
             },
             Self::PayloadBytes => Row {
                 key: "payload_bytes",
@@ -286,6 +287,10 @@ impl Limits {
             Limit::MetricsClients => self.metrics_clients,
         }
     }
+
+    /// What the agent takes beside them: idle, with its rings and the kernel's maps (14 MiB), what is
+    /// kept of events, and two views of all there is under way.
+    pub const BESIDE: usize = 22 << 20;
 
     /// Bytes that all of them take when they are reached together.
     #[must_use]

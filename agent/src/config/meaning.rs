@@ -45,9 +45,48 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
     if document.is_empty() {
         return Ok(Config::default());
     }
+    let read = reader(&document, &mut mistakes);
+    let Some(read) = read else {
+        return mistakes.none_or(Config::default());
+    };
+    read(source, &document)
+}
+
+/// What reads each version of the file, the oldest first.
+const READERS: &[(u32, Read)] = &[(1, read_1)];
+type Read = fn(&str, &Node) -> Result<Config, Mistakes>;
+
+/// What reads the version that the file names; the first where it names none. Of a newer one nothing
+/// else is said: what it means by its other keys is not known here.
+fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
+    let newest = READERS.last().map_or(0, |(version, _)| *version);
+    let Some((version, position)) = document.version() else {
+        return READERS.first().map(|(_, read)| *read);
+    };
+    let known = READERS
+        .iter()
+        .find(|(known, _)| i128::from(*known) == version);
+    if known.is_none() {
+        let message = if version > i128::from(newest) {
+            format!(
+                "is {version}, this rp {} reads up to {newest}: upgrade rp, or write the file for \
+                 version {newest}",
+                env!("CARGO_PKG_VERSION")
+            )
+        } else {
+            format!("is {version}, must be between 1 and {newest}")
+        };
+        mistakes.add(position, "version", message);
+    }
+    known.map(|(_, read)| *read)
+}
+
+/// Version 1.
+fn read_1(source: &str, document: &Node) -> Result<Config, Mistakes> {
+    let mut mistakes = Mistakes::default();
     let schema = Config::schema();
     let places = document.index(&mut mistakes);
-    check(&document, "", &schema, &schema, &mut mistakes);
+    check(document, "", &schema, &schema, &mut mistakes);
     mistakes = match mistakes.none_or(()) {
         Ok(()) => Mistakes::default(),
         Err(mistakes) => return Err(mistakes),
@@ -565,6 +604,43 @@ otlp:
              f:6:35: otlp.attributes.floor: is a list, must be text"
         );
         assert_eq!(report("otlp: {endpoint: 'off', headers: }"), "");
+    }
+
+    #[test]
+    fn a_version_that_is_known_or_left_out_changes_nothing() {
+        for same in [
+            "version: 1\nlog: debug\n",
+            "log: debug\n",
+            "log: debug\nversion: 1",
+        ] {
+            assert_eq!(
+                parse(same.as_bytes()).unwrap().log.label(),
+                "debug",
+                "{same}"
+            );
+        }
+        assert_eq!(
+            report("version: 0"),
+            "f:1:10: version: is 0, must be between 1 and 1"
+        );
+        assert_eq!(
+            report("version: '1'\nlgo: x"),
+            "f:1:10: version: is the text `1`, must be a whole number\n\
+             f:2:1: lgo: unknown key; did you mean `log`?"
+        );
+    }
+
+    #[test]
+    fn of_a_newer_file_one_line_says_what_to_do() {
+        let newer = "watch: {points: {colour: red}}\nversion: 2\nclouds: 7\n";
+        let version = env!("CARGO_PKG_VERSION");
+        assert_eq!(
+            report(newer),
+            format!(
+                "f:2:10: version: is 2, this rp {version} reads up to 1: upgrade rp, or write the \
+                 file for version 1"
+            )
+        );
     }
 
     #[test]

@@ -17,6 +17,9 @@ use super::{Compression, ExactChoice, Level, ShmMode, SourceChoice, defaults};
 #[schemars(title = "ros2probe configuration")]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct ConfigShape {
+    /// The form of this file; 1 when left out. An rp that does not know it refuses the file.
+    #[schemars(range(min = 1, max = 1))]
+    pub(super) version: Option<u32>,
     /// Topics to measure: names (`/points`), globs (`/camera/*/image_raw`, `/**`), or maps with
     /// expectations. Nothing listed: the graph alone is reported. Applied on reload.
     pub(super) watch: Option<Vec<WatchShape>>,

@@ -295,8 +295,8 @@ fn kept(health: &Health) -> Finding {
         let sentence = "what it knows outlives a restart";
         Finding::new(AREA, "state", Verdict::Ok, sentence)
     } else {
-        let sentence = "it has no state directory that it can write: a restart loses names and added \
-                        watches";
+        let sentence = "it has no state directory that it can write, or finds a newer rp's state there: \
+                        a restart loses names and added watches";
         Finding::new(AREA, "state", Verdict::Warning, sentence)
             .remedy("sudo mkdir -p /var/lib/ros2probe    # or the unit's StateDirectory=ros2probe")
     };

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::State as Extract;
-use axum::http::header::{ACCEPT, CACHE_CONTROL, CONTENT_TYPE};
+use axum::http::header::{ACCEPT, CACHE_CONTROL, CONTENT_TYPE, RETRY_AFTER};
 use axum::http::{HeaderMap, Method, StatusCode};
 use axum::middleware;
 use axum::response::{Html, IntoResponse, Response};
@@ -21,6 +21,7 @@ use super::basic_auth::{self, Gate};
 use super::board::Board;
 use super::bounded::{Bounded, Refusal};
 use super::exposition::{Exposition, Format};
+use super::large::Answers;
 #[cfg(feature = "tls")]
 use super::tls::{Acceptor, Tls};
 use super::web_config::{WebConfig, WebConfigError};
@@ -164,6 +165,9 @@ fn router(board: Arc<Board>) -> Router {
         .with_state(Pages { board, exposition })
 }
 
+/// Pages that are being made and read.
+static PAGES: Answers = Answers::new();
+
 /// The capture thread hears the bell at once, unless it has a flood of packets to read.
 const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
 
@@ -174,6 +178,16 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
         .filter_map(|value| value.to_str().ok())
         .collect();
     let format = Format::negotiate(&accepts.join(","));
+    let Some(turn) = PAGES.turn().await else {
+        pages.board.limits().reached(Limit::MetricsClients, 1);
+        let reason = "others are reading slowly what fills the memory for pages\n";
+        return (
+            StatusCode::SERVICE_UNAVAILABLE,
+            [(RETRY_AFTER, "1")],
+            reason,
+        )
+            .into_response();
+    };
     pages.board.refresh(REFRESH_PATIENCE).await;
     match pages.exposition.render(format) {
         Ok(page) => (
@@ -181,7 +195,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
                 (CONTENT_TYPE, format.content_type()),
                 (CACHE_CONTROL, "no-store"),
             ],
-            page,
+            turn.keep(page.into()),
         )
             .into_response(),
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),

@@ -13,6 +13,7 @@ mod diagnoses;
 pub mod events;
 pub mod exposition;
 pub mod http;
+mod large;
 pub mod limit_facts;
 pub mod otlp;
 mod page;

@@ -14,11 +14,16 @@ use serde::{Deserialize, Serialize};
 
 use crate::config::Limit;
 use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
-use crate::state::{Found, StateDirectory};
+use crate::state::{Form, Found, Newer, StateDirectory, from_json};
 
 const FILE: &str = "watches.json";
-/// The form that is written; one that is read with another number is none of ours.
+/// The form that is written. What was added to it so far may be lacking in a file; what is added
+/// from now on is a new version, for an agent that does not know it would take the file for broken.
 const VERSION: u32 = 1;
+const FORM: Form<Document> = Form {
+    file: FILE,
+    readers: &[(VERSION, from_json)],
+};
 /// Changes that come so close together are written once.
 const TOGETHER: Duration = Duration::from_millis(50);
 /// How long after a failure the disk is tried again.
@@ -31,6 +36,8 @@ pub enum Kept {
     Nothing,
     /// These watches.
     These(Vec<Watch>),
+    /// A newer rp wrote them: they are left as they are, and nothing may be written in their place.
+    Newer(Newer),
     /// It cannot be used, for this reason, and now lies there.
     Unusable {
         /// Why.
@@ -88,8 +95,9 @@ struct Papers {
 /// What clients of the last agent had added. What is no such file is moved aside.
 #[must_use]
 pub fn load(directory: &StateDirectory) -> Kept {
-    let document = match directory.read::<Document>(FILE, VERSION) {
+    let document = match directory.read(&FORM) {
         Found::Nothing => return Kept::Nothing,
+        Found::Newer(newer) => return Kept::Newer(newer),
         Found::Unusable { reason, aside } => return Kept::Unusable { reason, aside },
         Found::This(document) => document,
     };
@@ -102,7 +110,7 @@ pub fn load(directory: &StateDirectory) -> Kept {
         Ok(watches) => Kept::These(watches),
         Err(reason) => match directory.set_aside::<Document>(FILE, reason) {
             Found::Unusable { reason, aside } => Kept::Unusable { reason, aside },
-            Found::Nothing | Found::This(_) => Kept::Nothing,
+            Found::Nothing | Found::This(_) | Found::Newer(_) => Kept::Nothing,
         },
     }
 }
@@ -305,7 +313,8 @@ mod tests {
             whole.replace("/points", "points"),
             whole.replace("9.5", "-1"),
             whole.replace("\"domain_id\":5", "\"domain_id\":5000"),
-            whole.replace("\"version\":1", "\"version\":2"),
+            whole.replace("\"version\":1", "\"version\":0"),
+            whole.replace("\"version\":1,", ""),
             whole.replace("per_subscriber", "for_ever"),
             String::new(),
         ];
@@ -317,6 +326,35 @@ mod tests {
             assert_eq!(fs::read_to_string(aside).unwrap(), text);
             assert_eq!(load(&directory), Kept::Nothing);
         }
+    }
+
+    #[test]
+    fn watches_of_a_newer_agent_are_left_for_it_and_those_of_the_first_one_are_read() {
+        let (place, directory) = directory();
+        let file = place.path().join(FILE);
+        let newer = r#"{"version":2,"watches":[{"topic":"/points","colour":"red"}]}"#;
+        fs::write(&file, newer).unwrap();
+        let found = Newer {
+            path: file.clone(),
+            version: 2,
+            known: VERSION,
+        };
+        assert_eq!(load(&directory), Kept::Newer(found));
+        assert_eq!(fs::read_to_string(&file).unwrap(), newer);
+
+        fs::write(
+            &file,
+            r#"{"version":1,"watches":[{"topic":"/points","domain_id":5,"per_subscriber":true,
+                "min_rate_hz":9.5,"max_rate_hz":null,"max_loss_ratio":null,
+                "max_latency_ms":null,"max_silence_s":1.0}]}"#,
+        )
+        .unwrap();
+        let first = Watch {
+            trace: 0.0,
+            retain: Retain::None,
+            ..watches().remove(0)
+        };
+        assert_eq!(load(&directory), Kept::These(vec![first]));
     }
 
     #[test]

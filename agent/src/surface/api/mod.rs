@@ -37,12 +37,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
-use axum::http::Method;
-use axum::middleware;
+use axum::body::to_bytes;
+use axum::extract::{Request, State as Extract};
+use axum::http::{Method, StatusCode};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse as _, Response};
 use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::board::{Board, State};
+use super::large::Answers;
+use crate::config::Limit;
 use crate::recording::{Recordings, Snapshots};
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
@@ -84,13 +89,26 @@ impl Context {
 }
 
 /// The routes of all nouns and what the document says of them.
-fn nouns() -> OpenApiRouter<Context> {
+fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
+    let turns = |views: OpenApiRouter<Context>| match context {
+        Some(context) => views.layer(middleware::from_fn_with_state(context.clone(), take_turns)),
+        None => views,
+    };
     OpenApiRouter::with_openapi(openapi::head())
         .merge(watch::routes())
         .merge(events::routes())
         .merge(samples::routes())
         .merge(recordings::routes())
         .merge(snapshots::routes())
+        .merge(turns(views()))
+        .merge(health::routes())
+        .merge(reload::routes())
+        .merge(openapi::routes())
+}
+
+/// What tells all there is of something.
+fn views() -> OpenApiRouter<Context> {
+    OpenApiRouter::new()
         .merge(topics::routes())
         .merge(nodes::routes())
         .merge(services::routes())
@@ -98,14 +116,28 @@ fn nouns() -> OpenApiRouter<Context> {
         .merge(participants::routes())
         .merge(graph::routes())
         .merge(names::routes())
-        .merge(health::routes())
-        .merge(reload::routes())
-        .merge(openapi::routes())
+}
+
+/// Views that are being made and read.
+static VIEWS: Answers = Answers::new();
+
+/// Few views at a time: see [`super::large`].
+async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
+    let Some(turn) = VIEWS.turn().await else {
+        context.board.limits().reached(Limit::ApiClients, 1);
+        let detail = "others are reading slowly what fills the memory for views";
+        return Problem::new(Code::TooManyClients, detail).into_response();
+    };
+    let (head, body) = next.run(request).await.into_parts();
+    match to_bytes(body, usize::MAX).await {
+        Ok(bytes) => Response::from_parts(head, turn.keep(bytes).into()),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
 }
 
 /// What answers behind `door`.
 fn router(context: &Context, door: Arc<Door>) -> Router {
-    let (router, _) = nouns().split_for_parts();
+    let (router, _) = nouns(Some(context)).split_for_parts();
     router
         .fallback(async || Problem::new(Code::NotFound, "the paths are listed in /openapi.json"))
         .method_not_allowed_fallback(async |method: Method| {

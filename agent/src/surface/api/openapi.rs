@@ -58,7 +58,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 /// The whole document.
 #[must_use]
 pub fn document() -> utoipa::openapi::OpenApi {
-    let mut document = nouns().into_openapi();
+    let mut document = nouns(None).into_openapi();
     let paths = std::mem::take(&mut document.paths.paths);
     for (path, mut item) in paths {
         operations(&mut item).for_each(complete);
