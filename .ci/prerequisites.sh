@@ -161,13 +161,6 @@ cargo_deb() {
     cargo install cargo-deb --version 3.8.0 --locked --debug --no-default-features
 }
 
-# Writes bills of materials.
-cyclonedx() {
-    command -v cargo-cyclonedx >/dev/null && return
-    say "installing cargo-cyclonedx 0.5.9"
-    cargo install cargo-cyclonedx --version 0.5.9 --locked --debug
-}
-
 rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
@@ -251,10 +244,9 @@ for need; do
         ebpf
         ;;
     dist)
-        packages gcc libc6-dev
+        packages gcc libc6-dev python3
         rust
         musl x86_64 aarch64
-        cyclonedx
         qemu
         debian
         cargo_deb

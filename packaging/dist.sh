@@ -89,52 +89,46 @@ again() {
     sha256sum "$out/SHA256SUMS" "$there/target/dist/SHA256SUMS"
 }
 
-# What is linked into a binary, as CycloneDX. The tool writes into the tree and names paths of it.
-bill() {
-    local architecture=$1
-    cargo cyclonedx --quiet --manifest-path agent/Cargo.toml --describe binaries --no-build-deps \
-        --format json --spec-version 1.5 --target "$architecture-unknown-linux-musl"
-    sed "s|file://$root|file:///ros2probe|g" agent/rp_bin.cdx.json >"$out/rp-$version-$architecture.cdx.json"
-    rm -f agent/rp_bin.cdx.json
+release() {
+    step "what is built: ros2probe $version with $(rustc --version), sources of $(date --date="@$SOURCE_DATE_EPOCH" +%F)"
+    local native debian architecture
+    rm -rf "$out"
+    mkdir -p "$out"
+    cargo fetch --locked --quiet
+
+    step "release binaries for: $architectures (static, musl, linked by rust-lld)"
+    binaries
+
+    step "manual pages and completions"
+    native=$out/rp-$version-$(uname -m)
+    mkdir "$out/man" "$out/completions"
+    "$native" man "$out/man"
+    "$native" completions bash >"$out/completions/rp.bash"
+    "$native" completions zsh >"$out/completions/_rp"
+    "$native" completions fish >"$out/completions/rp.fish"
+
+    step "Debian packages"
+    for architecture in $architectures; do
+        case $architecture in
+        x86_64) debian=amd64 ;;
+        aarch64) debian=arm64 ;;
+        esac
+        RP=$native packaging/build.sh "$debian" "$out/rp-$version-$architecture" "$out"
+    done
+
+    step "bills of materials"
+    for architecture in $architectures; do
+        packaging/bill.py "$architecture" "$out/rp-$version-$architecture" >"$out/rp-$version-$architecture.cdx.json"
+    done
+
+    step "checksums"
+    (cd "$out" && find . -type f ! -name SHA256SUMS -printf '%P\n' | sort | xargs sha256sum >SHA256SUMS)
+    find "$out" -maxdepth 1 -type f -printf '%10s %f\n' | sort -k2 >&2
 }
 
+# All is read before anything is done: this file may change meanwhile.
 case ${1-} in
-'') ;;
---again)
-    again
-    exit
-    ;;
+'') release ;;
+--again) again ;;
 *) die "usage: packaging/dist.sh [--again]" ;;
-esac
-
-step "what is built: ros2probe $version with $(rustc --version), sources of $(date --date="@$SOURCE_DATE_EPOCH" +%F)"
-rm -rf "$out"
-mkdir -p "$out"
-cargo fetch --locked --quiet
-
-step "release binaries for: $architectures (static, musl, linked by rust-lld)"
-binaries
-
-step "manual pages and completions"
-native=$out/rp-$version-$(uname -m)
-mkdir "$out/man" "$out/completions"
-"$native" man "$out/man"
-"$native" completions bash >"$out/completions/rp.bash"
-"$native" completions zsh >"$out/completions/_rp"
-"$native" completions fish >"$out/completions/rp.fish"
-
-step "Debian packages"
-for architecture in $architectures; do
-    case $architecture in
-    x86_64) debian=amd64 ;;
-    aarch64) debian=arm64 ;;
-    esac
-    RP=$native packaging/build.sh "$debian" "$out/rp-$version-$architecture" "$out"
-done
-
-step "bills of materials"
-for architecture in $architectures; do bill "$architecture"; done
-
-step "checksums"
-(cd "$out" && find . -type f ! -name SHA256SUMS -printf '%P\n' | sort | xargs sha256sum >SHA256SUMS)
-find "$out" -maxdepth 1 -type f -printf '%10s %f\n' | sort -k2 >&2
+esac; exit

@@ -78,19 +78,35 @@ fn the_bill_of_materials_lists_what_is_linked_and_where_it_is_from() {
         let bill = std::fs::read_to_string(directory.join(&name)).unwrap();
         let bill: Value = serde_json::from_str(&bill).unwrap();
         assert_eq!(bill["bomFormat"], "CycloneDX");
+        let sums = std::fs::read_to_string(directory.join("SHA256SUMS")).unwrap();
+        let sum = bill["metadata"]["component"]["hashes"][0]["content"]
+            .as_str()
+            .unwrap();
+        let binary = format!("rp-{}-{architecture}", env!("CARGO_PKG_VERSION"));
+        assert!(
+            sums.contains(&format!("{sum}  {binary}\n")),
+            "{sum} is not {binary}'s"
+        );
         let components = bill["components"].as_array().unwrap();
         let text = |component: &Value, key: &str| component[key].as_str().map(str::to_owned);
         let listed: BTreeSet<String> = components
             .iter()
             .filter_map(|one| text(one, "name"))
             .collect();
-        let mut linked = crates(architecture, "normal");
+        let mut linked = crates(architecture, "normal,no-proc-macro");
         linked.remove("ros2probe");
         let missing: Vec<_> = linked.difference(&listed).collect();
         assert!(missing.is_empty(), "{name}: {missing:?}");
         for component in components {
+            let own = ["ros2probe-wire", "agent-ebpf/filter.bpf.o"]
+                .contains(&component["name"].as_str().unwrap());
             let from = text(component, "purl").unwrap_or_default();
-            assert!(from.starts_with("pkg:cargo/"), "{component}");
+            assert!(own || from.starts_with("pkg:"), "{component}");
+            let summed = component["hashes"][0]["alg"] == "SHA-256";
+            assert!(
+                summed || own || component["name"] == "rust-std",
+                "{component}"
+            );
         }
     }
 }
