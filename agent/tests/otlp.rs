@@ -24,7 +24,10 @@ fn changes(name: &str) -> bool {
         || name.starts_with("ros2probe_otlp_")
         || matches!(
             name,
-            "ros2probe_snapshot_age_seconds" | "ros2probe_scrape_duration_seconds"
+            "ros2probe_snapshot_age_seconds"
+                | "ros2probe_scrape_duration_seconds"
+                // A scrape is a client itself.
+                | "ros2probe_limit_used"
         )
 }
 
