@@ -1061,6 +1061,62 @@ fn a_topic_kept_out_by_a_crowd_is_measured_once_the_crowd_has_gone() {
 }
 
 #[test]
+fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
+    const HOUR: u64 = 3600 * SECOND;
+    for (forward, step) in [(true, HOUR.cast_signed()), (false, -HOUR.cast_signed())] {
+        let mut world = World::new(&["/chatter"]);
+        world.spdp(ALICE, 10);
+        world.sedp(alice(WRITER), "rt/chatter");
+        world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
+        world.stream(alice(WRITER), 1..=500);
+        world.observer.take_events();
+        let before = world.now;
+
+        // The writer's clock is the same one.
+        world.now = world.now.saturating_add_signed(step);
+        world.observer.calendar_set(step);
+        world.stream(alice(WRITER), 501..=700);
+        // A gap that is settled ten seconds later, as without the step.
+        world.stream(alice(WRITER), 702..=1000);
+        let snapshot = world.snapshot();
+        assert_eq!(snapshot.at.0, world.now);
+        let seen = &snapshot.participants[0];
+        let age = |time: Timestamp| Timestamp(world.now).nanoseconds_since(time);
+        assert_eq!(age(seen.first_seen), 9_990 * MILLISECOND.cast_signed());
+        assert_eq!(age(seen.last_seen), 10 * MILLISECOND.cast_signed());
+        let chatter = world.measurement("/chatter");
+        assert_eq!(age(chatter.last_message.unwrap()), age(seen.last_seen));
+        assert_eq!(chatter.messages, 999, "{forward}");
+        assert!((chatter.rate_hz - 100.0).abs() < 2.0, "{}", chatter.rate_hz);
+        assert_eq!(chatter.negative_latency, 0);
+        assert!(chatter.source_latency.sum() < 1e-6, "{forward}");
+        assert!(chatter.interarrival.sum() < 10.0, "{forward}");
+        assert_eq!(world.churn("participant", "expired"), 0);
+        assert_eq!(world.node_names(), ["/talker"]);
+        for event in world.observer.take_events().events {
+            assert!(world.now.abs_diff(event.at.0) < 10 * SECOND, "{event:?}");
+        }
+
+        // And a lease that runs out does so after as long as ever.
+        assert_eq!(world.measurement("/chatter").lost, 0);
+        world.wait(9_900);
+        assert_eq!(world.snapshot().participants.len(), 1, "{forward}");
+        assert_eq!(world.measurement("/chatter").lost, 1, "{forward}");
+        world.wait(200);
+        assert_eq!(world.snapshot().participants.len(), 0, "{forward}");
+        let events = world.observer.take_events().events;
+        let expired = events.iter().find(|event| {
+            let EventKind::Participant { change, .. } = &event.kind else {
+                return false;
+            };
+            *change == churn::Event::Expired
+        });
+        assert_eq!(expired.unwrap().at.0 + 110 * MILLISECOND, world.now);
+        assert!(world.now.abs_diff(before) > HOUR / 2);
+    }
+}
+
+#[test]
 fn a_clock_that_jumps_is_followed() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);

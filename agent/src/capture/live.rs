@@ -21,6 +21,7 @@ use super::host::{HostError, HostSettings, HostTap};
 use super::intake::{self, Intake};
 use super::interfaces::Selection;
 use super::netns::{self, NetnsError};
+use super::set_clock::SetClock;
 use super::shm::scan::{Places, Scope};
 use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
@@ -86,6 +87,8 @@ pub struct LiveSource {
     wanted_asked: u64,
     refused_updates: u64,
     clock: Timestamp,
+    clocks: Clocks,
+    set_clock: SetClock,
 }
 
 /// What looks at shared memory. Its thread begins with the first look at packets, when all
@@ -158,6 +161,8 @@ impl LiveSource {
             wanted_asked: 0,
             refused_updates: 0,
             clock: clocks.now,
+            clocks,
+            set_clock: SetClock::new(&clocks),
         };
         source.refill(clocks.monotonic);
         Ok(source)
@@ -214,7 +219,18 @@ impl LiveSource {
                 GATHER
             });
         }
-        let clocks = Clocks::read();
+        let mut clocks = Clocks::read();
+        let step = self.set_clock.look(&mut clocks);
+        if step != 0 {
+            let milliseconds = step / 1_000_000;
+            tracing::info!(
+                milliseconds,
+                "the system's clock was set, or the system slept"
+            );
+            observer.calendar_set(step);
+        }
+        let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= SECOND;
+        self.clocks = clocks;
         self.refill(clocks.monotonic);
         let mut settle = 0;
         if let Some(host) = &mut self.host {
@@ -230,11 +246,15 @@ impl LiveSource {
             settle = settle.max(wire::SETTLE_NANOSECONDS);
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.take_in(observer);
+            shared_memory.take_in(&clocks, observer);
             if clocks.monotonic.wrapping_sub(self.wanted_asked) >= SECOND {
                 self.wanted_asked = clocks.monotonic;
                 shared_memory.want(observer.wanted_of_shared_memory());
             }
+        }
+        if held_up {
+            // Its rings may have been too small: nobody went because this process did not look.
+            observer.participants_alive(self.last_seen());
         }
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         Ok(())
@@ -253,7 +273,7 @@ impl LiveSource {
             wire.drain(&clocks, observer);
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.take_in(observer);
+            shared_memory.take_in(&clocks, observer);
         }
     }
 
@@ -289,10 +309,9 @@ impl LiveSource {
     /// When each followed participant last sent anything.
     #[must_use]
     pub fn last_seen(&self) -> BTreeMap<GuidPrefix, Timestamp> {
-        let clocks = Clocks::read();
         let mut seen = BTreeMap::new();
         for (participant, at) in self.filters().flat_map(Filter::participants) {
-            let at = clocks.calendar(at);
+            let at = self.clocks.calendar(at);
             let latest = seen.entry(participant).or_insert(at);
             *latest = at.max(*latest);
         }
@@ -318,6 +337,7 @@ impl LiveSource {
         self.wires
             .iter_mut()
             .map(|wire| {
+                wire.look_for_namespace();
                 Ok(DropCount {
                     dropped: wire.drops()?,
                     namespace: wire.namespace().map(Path::to_path_buf),

@@ -16,6 +16,7 @@ pub mod order;
 pub mod owners;
 pub mod pcap;
 pub mod ring;
+pub mod set_clock;
 pub mod shm;
 pub mod sockets;
 pub mod system;

@@ -125,6 +125,10 @@ impl Order {
                 return Some(Next::Walked(Record { flags, ..record }));
             }
         }
+        let mut record = record;
+        if clocks.step != 0 {
+            record.time = clocks.calendar(walked.at).0;
+        }
         self.walked.pop_front();
         Some(Next::Walked(record))
     }
@@ -162,6 +166,7 @@ mod tests {
         Clocks {
             now: Timestamp((1_000_000 + milliseconds) * MILLISECOND),
             monotonic: milliseconds * MILLISECOND,
+            step: 0,
         }
     }
 

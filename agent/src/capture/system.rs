@@ -228,6 +228,9 @@ fn page_size() -> u32 {
     u32::try_from(size).unwrap_or(65_536)
 }
 
+/// What comes has waited no longer than this, unless this process was held up.
+const RECENT_NANOSECONDS: i64 = 1_000_000_000;
+
 /// The kernel filter's clock beside the calendar's, read at one moment.
 #[derive(Clone, Copy, Debug)]
 pub struct Clocks {
@@ -235,6 +238,8 @@ pub struct Clocks {
     pub now: Timestamp,
     /// CLOCK_MONOTONIC in nanoseconds.
     pub monotonic: u64,
+    /// By how many nanoseconds the calendar's clock was set forward a moment ago.
+    pub step: i64,
 }
 
 impl Clocks {
@@ -262,7 +267,12 @@ impl Clocks {
         let after = nanoseconds(libc::CLOCK_MONOTONIC);
         let within = after.saturating_sub(before);
         let monotonic = before + within / 2;
-        (Self { now, monotonic }, within)
+        let clocks = Self {
+            now,
+            monotonic,
+            step: 0,
+        };
+        (clocks, within)
     }
 
     /// A monotonic time as a calendar time. Wrong by the step if the calendar clock was set between.
@@ -270,6 +280,26 @@ impl Clocks {
     pub const fn calendar(&self, monotonic: u64) -> Timestamp {
         let ago = self.monotonic.wrapping_sub(monotonic);
         Timestamp(self.now.0.wrapping_sub(ago))
+    }
+
+    /// When something came that bears this calendar time. Just after the clock was set, that may be a
+    /// time of the calendar before.
+    #[must_use]
+    pub const fn stamped(&self, calendar: Timestamp) -> Timestamp {
+        if self.step == 0 || self.is_recent(calendar) {
+            return calendar;
+        }
+        let moved = Timestamp(calendar.0.saturating_add_signed(self.step));
+        if self.is_recent(moved) {
+            moved
+        } else {
+            self.now
+        }
+    }
+
+    const fn is_recent(&self, calendar: Timestamp) -> bool {
+        let age = self.now.nanoseconds_since(calendar);
+        age > -RECENT_NANOSECONDS / 10 && age < RECENT_NANOSECONDS
     }
 
     /// A calendar time of the past as a monotonic time; one of the future is now.

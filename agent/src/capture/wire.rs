@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::os::fd::{AsFd as _, BorrowedFd};
+use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -61,6 +62,8 @@ pub struct WireSettings {
 /// One network namespace.
 pub struct WireTap {
     path: Option<PathBuf>,
+    /// Device and inode of what was at the path; `None` = it has been said that it is gone.
+    identity: Option<(u64, u64)>,
     ring: Ring,
     filter: Filter,
     interfaces: Interfaces,
@@ -98,6 +101,7 @@ impl WireTap {
             Some(filter.program()),
         )?;
         Ok(Self {
+            identity: path.as_deref().and_then(identity),
             path,
             ring,
             filter,
@@ -119,6 +123,19 @@ impl WireTap {
     #[must_use]
     pub fn namespace(&self) -> Option<&Path> {
         self.path.as_deref()
+    }
+
+    /// Says once that the namespace at the path is another one by now, or none: its frames are not
+    /// seen, and entering it would take privileges that were given up.
+    pub fn look_for_namespace(&mut self) {
+        let Some(path) = &self.path else { return };
+        if self.identity.is_some() && identity(path) != self.identity {
+            self.identity = None;
+            tracing::warn!(
+                namespace = %path.display(),
+                "the network namespace was removed or replaced: restart to look into what is there now"
+            );
+        }
     }
 
     /// Readable when there is something to take in.
@@ -263,6 +280,12 @@ impl WireTap {
     }
 }
 
+/// Device and inode.
+fn identity(path: &Path) -> Option<(u64, u64)> {
+    let metadata = std::fs::metadata(path).ok()?;
+    Some((metadata.dev(), metadata.ino()))
+}
+
 /// One tap's frames and records on their way to the model.
 struct Intake {
     number: u32,
@@ -332,7 +355,8 @@ impl Intake {
         observer: &mut Observer,
     ) -> Result<(), WireError> {
         self.copied_bytes += captured.bytes.len() as u64;
-        let since = captured.time.nanoseconds_since(clocks.now);
+        let time = clocks.stamped(captured.time);
+        let since = time.nanoseconds_since(clocks.now);
         let at = clocks.monotonic.saturating_add_signed(since);
         self.deliver(clocks, at, observer);
         let packet = frame::parse_cooked(
@@ -344,7 +368,7 @@ impl Intake {
         let Some(packet) = packet else { return Ok(()) };
         let outgoing = captured.packet_type == PacketType::OUTGOING;
         let mut envelope = Envelope {
-            time: captured.time.0,
+            time: time.0,
             destination: packet.destination,
             interface: captured.interface,
             outgoing,
@@ -359,7 +383,7 @@ impl Intake {
             Payload::Fragment(fragment) => {
                 let key =
                     FlowKey::new(self.number, captured.interface, outgoing, &packet, fragment);
-                let Some(whole) = self.reassembly.fragment(captured.time, key, fragment) else {
+                let Some(whole) = self.reassembly.fragment(time, key, fragment) else {
                     return Ok(());
                 };
                 if whole.handover.is_some() {

@@ -3,6 +3,7 @@
 pub mod acknowledgement;
 pub mod ahead;
 pub mod assembly;
+pub mod calendar;
 pub mod cancelled;
 pub mod cause;
 pub mod churn;

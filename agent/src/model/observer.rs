@@ -18,6 +18,7 @@ use ros2probe_wire::{
     Cursor, Endianness, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError,
 };
 
+use super::calendar::Calendar;
 use super::diagnosis::{self, Examiner};
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin};
 use super::event::{EventKind, Taken, bounded, bounded_finding, bounded_shared};
@@ -125,6 +126,7 @@ macro_rules! around {
             receivers: &$observer.receivers,
             discovery: &$observer.discovery,
             topics: &$observer.topics,
+            calendar: $observer.calendar,
         }
     };
 }
@@ -150,6 +152,7 @@ pub struct Observer {
     journal: Journal,
     /// Time up to which everything is settled.
     clock: Timestamp,
+    calendar: Calendar,
 }
 
 impl Observer {
@@ -183,6 +186,7 @@ impl Observer {
             records: 0,
             journal: Journal::default(),
             clock: Timestamp(0),
+            calendar: Calendar::default(),
         }
     }
 
@@ -212,7 +216,9 @@ impl Observer {
 
     /// What is to be given since the last call.
     pub fn take_given(&mut self) -> Vec<Given> {
-        self.payloads.take()
+        let mut given = self.payloads.take();
+        self.calendar.show_given(&mut given);
+        given
     }
 
     /// Whether somebody wants samples whole.
@@ -256,7 +262,7 @@ impl Observer {
 
     /// So much time passed between two looks at shared memory that nobody can tell what happened.
     pub fn shared_memory_uncertain(&mut self, now: Timestamp) {
-        self.profiler.uncertain(now);
+        self.profiler.uncertain(self.calendar.even(now));
     }
 
     /// Takes in what a datagram announces. What is to be counted is left to `later`, which puts it
@@ -295,12 +301,19 @@ impl Observer {
     /// These participants were last seen then, as the kernel filter knows without a record.
     pub fn participants_alive(&mut self, alive: impl IntoIterator<Item = (GuidPrefix, Timestamp)>) {
         for (prefix, at) in alive {
-            self.discovery.seen(prefix, at);
+            self.discovery.seen(prefix, self.calendar.even(at));
         }
+    }
+
+    /// The calendar was set forward by so many nanoseconds, or back: all times that come from now on
+    /// are of the new one. No time has passed by that.
+    pub const fn calendar_set(&mut self, step: i64) {
+        self.calendar.set(step);
     }
 
     /// Says what time it is: ends leases, settles gaps, judges expectations.
     pub fn advance(&mut self, now: Timestamp) {
+        let now = self.calendar.even(now);
         if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
             self.clock = Timestamp(now.0 - now.0 % TICK);
             self.tick(self.clock);
@@ -332,6 +345,7 @@ impl Observer {
 
     /// Takes over what was known before the start, until one lease from `now` on at most.
     pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
+        let now = self.calendar.even(now);
         self.discovery.restore(memory, now);
         self.examiner.forget();
         for (prefix, participant) in self.discovery.participants() {
@@ -368,18 +382,24 @@ impl Observer {
 
     /// What happened since the last call.
     pub fn take_events(&mut self) -> Taken {
-        self.journal.events.take()
+        let mut taken = self.journal.events.take();
+        self.calendar.show_events(&mut taken);
+        taken
     }
 
     /// Spans of sampled messages that ended since the last call.
     pub fn take_spans(&mut self) -> Spans {
-        self.tracer.take()
+        let mut spans = self.tracer.take();
+        self.calendar.show_spans(&mut spans);
+        spans
     }
 
     /// All facts at this moment.
     #[must_use]
     pub fn snapshot(&self, now: Timestamp) -> Snapshot {
-        super::report::snapshot(self, now)
+        let mut snapshot = super::report::snapshot(self, self.calendar.even(now));
+        self.calendar.show_snapshot(&mut snapshot);
+        snapshot
     }
 
     /// Counts a parse failure, also of those outside who parse for the core.
@@ -392,6 +412,8 @@ impl Observer {
 
     fn count(&mut self, record: &Record) {
         self.records += 1;
+        let moved = self.calendar.even_record(record);
+        let record = moved.as_ref().unwrap_or(record);
         let (writer, at) = (record.writer(), Timestamp(record.time));
         if record.kind == kind::ACKNACK {
             self.discovery.seen(record.reader().prefix, at);
@@ -480,7 +502,7 @@ impl Observer {
             let [first, second, ..] = prefix.0;
             let vendor = vendor.unwrap_or(VendorId([first, second]));
             let origin = Origin {
-                at: Timestamp(envelope.time),
+                at: self.calendar.even(Timestamp(envelope.time)),
                 sender: prefix,
                 sequence_number: record.sequence_number,
                 destination: envelope.destination,
@@ -498,7 +520,9 @@ impl Observer {
         if self.payloads.wants_bytes(writer) {
             let known = self.profiler.get(writer);
             if known.is_some_and(|known| !known.writer.has(number)) {
-                self.payloads.keep(&found.record, found.payload);
+                let moved = self.calendar.even_record(&found.record);
+                let record = moved.as_ref().unwrap_or(&found.record);
+                self.payloads.keep(record, found.payload);
             }
         }
     }

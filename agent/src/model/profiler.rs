@@ -9,6 +9,7 @@ use std::collections::HashMap;
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, Timestamp};
 
+use super::calendar::Calendar;
 use super::delivery::Totals;
 use super::journal::Journal;
 use super::receivers::Around;
@@ -219,7 +220,7 @@ impl Profiler {
         let counted = measured.writer.record(
             record,
             measured.opened,
-            &mut self.shared.scene(subject, now, journal),
+            &mut self.shared.scene(subject, now, journal, around.calendar),
         );
         if sight == Sight::Again && record.flags & flag::HOST != 0 {
             measured.writer.came_again();
@@ -320,7 +321,7 @@ impl Profiler {
         let subject = measured.subject(guid);
         measured
             .writer
-            .settle(&mut self.shared.scene(subject, now, journal));
+            .settle(&mut self.shared.scene(subject, now, journal, around.calendar));
         self.strangers -= usize::from(measured.topic.is_none());
         let subscribers = measured.subscribers.take();
         let totals = subscribers.map(|subscribers| {
@@ -345,7 +346,7 @@ impl Profiler {
             let subject = measured.subject(*guid);
             measured
                 .writer
-                .advance(&mut self.shared.scene(subject, now, journal));
+                .advance(&mut self.shared.scene(subject, now, journal, around.calendar));
             if measured.topic.is_some() {
                 if let Some(subscribers) = &mut measured.subscribers {
                     subscribers.advance(&mut self.shared.stage(subject, now, journal, around));
@@ -381,7 +382,7 @@ impl Profiler {
             let subject = measured.subject(guid);
             measured
                 .writer
-                .settle(&mut self.shared.scene(subject, now, journal));
+                .settle(&mut self.shared.scene(subject, now, journal, around.calendar));
             if let Some(subscribers) = &mut measured.subscribers {
                 subscribers.settle(&mut self.shared.stage(subject, now, journal, around));
             }
@@ -439,6 +440,7 @@ impl Shared {
         subject: Subject,
         now: Timestamp,
         journal: &'a mut Journal,
+        calendar: Calendar,
     ) -> Scene<'a> {
         let budget = match subject.topic {
             Some(_) => &mut self.budget,
@@ -448,6 +450,7 @@ impl Shared {
             now,
             budget,
             journal,
+            calendar,
         }
     }
 

@@ -14,6 +14,7 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
+use super::calendar::Calendar;
 use super::discovery::Discovery;
 use super::snapshot::SocketFacts;
 use super::sockets::Sockets;
@@ -49,6 +50,8 @@ pub struct Around<'a> {
     pub discovery: &'a Discovery,
     /// Who reads what.
     pub topics: &'a Topics,
+    /// What the clocks of writers are held against.
+    pub calendar: Calendar,
 }
 
 /// Whether a receiver has a reader of the topic.

@@ -209,7 +209,8 @@ impl Subscribers {
         let begins = record.kind == kind::DATA || record.fragment_start == 1;
         if let Some(source) = source.filter(|source| begins && self.departures.is_first(*source)) {
             let began = record.time.saturating_sub(record.elapsed.into());
-            let delay = Timestamp(began).nanoseconds_since(source);
+            let began = stage.around.calendar.shown(Timestamp(began));
+            let delay = began.nanoseconds_since(source);
             if delay >= 0 {
                 self.breakdown().send_delay.observe(seconds(delay));
             }

@@ -7,6 +7,7 @@
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
+use super::calendar::Calendar;
 use super::header::stamp_time;
 use super::histogram::Histogram;
 use super::journal::{Journal, Loss};
@@ -47,6 +48,8 @@ pub struct Scene<'a> {
     pub budget: &'a mut Budget,
     /// Where losses are told.
     pub journal: &'a mut Journal,
+    /// What the writer's clock is held against.
+    pub calendar: Calendar,
 }
 
 /// A message as it was counted.
@@ -200,7 +203,7 @@ impl Writer {
                 _ => sampled.is_current(at),
             });
         if is_sampled || takes {
-            let counted = self.sampled_record(record, is_sampled);
+            let counted = self.sampled_record(record, is_sampled, scene.calendar);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From here on every message is seen.
                 sampled.end();
@@ -326,7 +329,9 @@ impl Writer {
             }
             Outcome::Whole(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);
-                self.delays(whole.number, whole.newest, whole.source, whole.stamp, now);
+                let calendar = scene.calendar.shown(now);
+                let (source, stamp) = (whole.source, whole.stamp);
+                self.delays(whole.number, whole.newest, (source, stamp), (now, calendar));
                 return Some(Counted {
                     number: whole.number,
                     bytes: whole.bytes,
@@ -353,7 +358,12 @@ impl Writer {
     }
 
     /// Takes in a record of a view in which what is missing may have been sent all the same.
-    fn sampled_record(&mut self, record: &Record, is_sampled: bool) -> Option<Counted> {
+    fn sampled_record(
+        &mut self,
+        record: &Record,
+        is_sampled: bool,
+        calendar: Calendar,
+    ) -> Option<Counted> {
         let now = record_time(record);
         if self.sampled.is_none() || !self.is_sampled(now) {
             self.tally.messages += self.reception.abandon();
@@ -371,7 +381,7 @@ impl Writer {
                 let ends = record.kind == kind::DATA || record.ends_sample();
                 let source = record.source_timestamp().timestamp();
                 let news = sampled.sample(number, source, ends, now, sequence);
-                return self.sampled_sample(record, &news, now);
+                return self.sampled_sample(record, &news, (now, calendar.shown(now)));
             }
             kind::HEARTBEAT => {
                 self.traits.reliable = true;
@@ -388,7 +398,12 @@ impl Writer {
         None
     }
 
-    fn sampled_sample(&mut self, record: &Record, news: &News, now: Timestamp) -> Option<Counted> {
+    fn sampled_sample(
+        &mut self,
+        record: &Record,
+        news: &News,
+        (now, calendar): (Timestamp, Timestamp),
+    ) -> Option<Counted> {
         let (bytes, is_message) = match record.kind {
             kind::DATA => (record.payload_len, is_message(record)),
             _ => (record.sample_size, record.status_info == 0),
@@ -413,7 +428,8 @@ impl Writer {
         }
         if news.arrived && is_message {
             let source = record.source_timestamp();
-            self.delays(record.sequence_number, true, source, stamp, now);
+            let number = record.sequence_number;
+            self.delays(number, true, (source, stamp), (now, calendar));
             return Some(Counted {
                 number: record.sequence_number,
                 bytes,
@@ -445,13 +461,12 @@ impl Writer {
         &mut self,
         number: u64,
         newest: bool,
-        source: RtpsTime,
-        stamp: Option<(i32, u32)>,
-        now: Timestamp,
+        (source, stamp): (RtpsTime, Option<(i32, u32)>),
+        (now, calendar): (Timestamp, Timestamp),
     ) {
         let source = source.timestamp();
         if self.traits.keeps_history {
-            let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < now.0);
+            let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < calendar.0);
             let first = self.reception.sequence().first();
             if !newest || number < first || number == first && old {
                 return;
@@ -459,10 +474,10 @@ impl Writer {
         }
         let stamp = stamp
             .filter(|_| self.traits.has_header)
-            .and_then(|stamp| stamp_time(stamp, now));
+            .and_then(|stamp| stamp_time(stamp, calendar));
         let mut negative = false;
         if let Some(source) = source {
-            let delay = now.nanoseconds_since(source);
+            let delay = calendar.nanoseconds_since(source);
             negative |= delay < 0;
             if delay >= 0 {
                 self.source_latency.observe(seconds(delay));
@@ -472,7 +487,7 @@ impl Writer {
             }
         }
         if let Some(stamp) = stamp {
-            let delay = now.nanoseconds_since(stamp);
+            let delay = calendar.nanoseconds_since(stamp);
             negative |= delay < 0;
             if delay >= 0 {
                 self.header_latency.observe(seconds(delay));

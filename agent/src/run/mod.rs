@@ -34,6 +34,8 @@ const PUBLISH_ASKED: Duration = Duration::from_millis(50);
 /// Subscribers learn at least this often that nothing came.
 const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
 const CLOCK_NANOSECONDS: u64 = 100_000_000;
+/// A clock that is so far behind what was told was set back.
+const SET_BACK: u64 = 1_000_000_000;
 
 /// Why the working thread ended although nobody asked it to.
 #[derive(Debug, thiserror::Error)]
@@ -167,6 +169,9 @@ impl Run {
         self.board.events().add(self.observer.take_events());
         self.board.add_spans(self.observer.take_spans());
         let clock = self.source.clock();
+        if clock.0.saturating_add(SET_BACK) < self.told.0 {
+            self.told = clock;
+        }
         let news = (clock > self.told).then_some(clock);
         self.told = self.told.max(clock);
         self.subscriptions.deliver(self.observer.take_given(), news);

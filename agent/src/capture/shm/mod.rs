@@ -28,7 +28,7 @@ use std::time::Duration;
 
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, Record, Timestamp};
 
 use self::inbox::{Inbox, Item};
 use self::pace::{Need, Pace};
@@ -115,19 +115,24 @@ impl SharedMemory {
     }
 
     /// Gives the model what was found since the last time.
-    pub fn take_in(&self, observer: &mut Observer) {
+    pub fn take_in(&self, clocks: &Clocks, observer: &mut Observer) {
         for item in self.shared.inbox.take() {
             match item {
-                Item::Record(record) => observer.record(&record),
+                Item::Record(record) => {
+                    let time = clocks.stamped(Timestamp(record.time)).0;
+                    observer.record(&Record { time, ..record });
+                }
                 Item::Message { time, port, bytes } => {
                     let envelope = Envelope {
-                        time,
+                        time: clocks.stamped(Timestamp(time)).0,
                         destination_port: port,
                         ..Envelope::default()
                     };
                     observer.shared_memory(&envelope, &bytes);
                 }
-                Item::Uncertain(time) => observer.shared_memory_uncertain(Timestamp(time)),
+                Item::Uncertain(time) => {
+                    observer.shared_memory_uncertain(clocks.stamped(Timestamp(time)));
+                }
             }
         }
     }

@@ -33,6 +33,7 @@ impl Bench {
             now: Timestamp(self.now),
             budget: &mut self.budget,
             journal: &mut self.journal,
+            calendar: Calendar::default(),
         };
         self.writer.record(&record, self.opened, &mut scene);
         self
@@ -57,6 +58,7 @@ impl Bench {
                 now: Timestamp(self.now),
                 budget: &mut self.budget,
                 journal: &mut self.journal,
+                calendar: Calendar::default(),
             };
             self.writer.advance(&mut scene);
         }
