@@ -28,7 +28,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     let capture = capture(config.capture, options.interface.as_deref());
     privilege::check(&capture)?;
     let live = LiveSource::open(&capture, Limits::default())?;
-    privilege::give_up(&capture)?;
+    privilege::give_up(privilege::Role::capture())?;
     let participants = listen(live, options)?;
     let seconds = options.listen;
     let heard = match participants.len() {

@@ -30,7 +30,7 @@ pub(crate) fn choose(settings: &mut ApiSettings, asked: Option<Listen>, is_repor
     }
 }
 
-/// Binds what is asked for.
+/// Binds the address that is asked for, and reads the token.
 pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
     let token = settings.token_file.as_deref();
     let mut server = Server::new(token)?;
@@ -42,6 +42,11 @@ pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
     if let Some(address) = settings.listen {
         server.bind(address)?;
     }
+    Ok(server)
+}
+
+/// Binds the socket that is asked for, which makes files.
+pub(crate) fn open_socket(server: &mut Server, settings: &ApiSettings) -> Result<()> {
     match &settings.socket {
         SocketChoice::Off => {}
         SocketChoice::At(path) => server.bind_socket(path)?,
@@ -54,7 +59,7 @@ pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
             }
         }
     }
-    Ok(server)
+    Ok(())
 }
 
 /// The socket of this agent, where there is a directory for it.

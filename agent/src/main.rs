@@ -21,7 +21,9 @@ use ros2probe::config::{Config, ConfigError};
 use ros2probe::message::{Library, Sources as Places};
 use ros2probe::model::observer::{self, Observer};
 use ros2probe::model::reassembly::Limits;
-use ros2probe::privilege::{self, Missing};
+use ros2probe::privilege::{
+    self, ConfineError, Identity, Missing, Powerless, Role, Sandbox, StillPowerful,
+};
 use ros2probe::recording::{Recordings, Snapshots};
 use ros2probe::ros2::Dialect;
 use ros2probe::run::replay::Replay;
@@ -37,7 +39,7 @@ use tokio_util::sync::CancellationToken;
 
 use cli::{Arguments, Command, DEFAULT_CONFIG, Said};
 use logging::Log;
-use supervise::{Supervisor, Surfaces};
+use supervise::{Supervisor, Surfaces, Worker};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
@@ -82,7 +84,7 @@ fn run(options: cli::Run) -> Result<()> {
         &|name| std::env::var(name).ok(),
         &Host::read(),
     )?;
-    let source = open(&options, &config)?;
+    let mut source = open(&options, &config)?;
     source.announce(&config.capture);
     let board = Board::new(source.kind(), Settings::new(&config));
     let board = Arc::new(board.counting_lost_lines(log.lost_lines()));
@@ -96,7 +98,9 @@ fn run(options: cli::Run) -> Result<()> {
         )
     });
     let server = server.transpose()?;
-    let control = control::open(&config.api)?;
+    let mut control = control::open(&config.api)?;
+    announce(privilege::become_own_user());
+    control::open_socket(&mut control, &config.api)?;
     let state = match &source {
         Source::Live(_) => memory::open(&config.state_directory),
         Source::Replay(_) => None,
@@ -107,7 +111,21 @@ fn run(options: cli::Run) -> Result<()> {
     let keeps_watches = state
         .as_deref()
         .is_some_and(|state| memory::restore_watches(state, &watches));
-    privilege::give_up(&config.capture)?;
+    let role = match &mut source {
+        Source::Live(live) => {
+            live.start();
+            Role::capture()
+        }
+        Source::Replay(_) => Role::Service,
+    };
+    let worker = Worker::start(role).context("cannot start the working thread")?;
+    let exporter = export.map(|settings| Exporter::start(settings, &board));
+    let exporter = exporter.transpose()?;
+    privilege::confine(Role::Service)?;
+    let powerless = Powerless::verify()?;
+    if let Sandbox::Unfiltered(reason) = privilege::sandbox() {
+        tracing::warn!(reason, "system calls are not filtered");
+    }
     if let Some(address) = server.as_ref().and_then(|server| server.local_addr().ok()) {
         let watches = watches.in_force().entries().len();
         tracing::info!(%address, watches, "serving metrics");
@@ -170,9 +188,9 @@ fn run(options: cli::Run) -> Result<()> {
     );
     let run = run.keeping(keeper);
     if options.report && server.is_none() && control.is_empty() {
-        let ended = run.run();
+        let ended = worker.finish(run);
         print!("{}", Exposition::new(board).render(Format::Classic)?);
-        return Ok(ended?);
+        return ended;
     }
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -188,8 +206,6 @@ fn run(options: cli::Run) -> Result<()> {
         reloader,
         stop: stop.clone(),
     };
-    let exporter = export.map(|settings| Exporter::start(settings, &board));
-    let exporter = exporter.transpose()?;
     let supervisor = Supervisor {
         board: Arc::clone(&board),
         config: configured,
@@ -204,8 +220,9 @@ fn run(options: cli::Run) -> Result<()> {
         metrics: server,
         control,
         context,
+        powerless,
     };
-    let ended = runtime.block_on(supervisor.run(run, surfaces, options.report));
+    let ended = runtime.block_on(supervisor.run(worker, run, surfaces, options.report));
     snapshots.finish();
     recordings.finish();
     watches.finish();
@@ -248,6 +265,15 @@ fn open(options: &cli::Run, config: &Config) -> Result<Source> {
     Ok(Source::Replay(Box::new(replay)))
 }
 
+/// Only root's are worth a line.
+fn announce(identity: Identity) {
+    match identity {
+        Identity::AsStarted => {}
+        Identity::Own => tracing::info!("root no longer: now the user ros2probe"),
+        Identity::Root(reason) => tracing::info!(reason, "still root, without capabilities"),
+    }
+}
+
 fn check_config(file: &Path) -> Result<()> {
     let config = Config::load(file)?;
     println!(
@@ -268,7 +294,7 @@ fn message(error: &anyhow::Error) -> String {
 }
 
 fn exit_code(error: &anyhow::Error) -> ExitCode {
-    if error.is::<Missing>() {
+    if error.is::<Missing>() || error.is::<StillPowerful>() || error.is::<ConfineError>() {
         ExitCode::from(NO_PERMISSION)
     } else if error.is::<ConfigError>() || error.is::<SettingsError>() {
         ExitCode::from(BAD_CONFIG)

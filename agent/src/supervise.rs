@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, anyhow};
 use ros2probe::capture::system::give_back_program;
 use ros2probe::config::{Config, ConfigError};
+use ros2probe::privilege::{self, Powerless, Role, SpawnError};
 use ros2probe::run::{Run, RunError};
 use ros2probe::surface::api;
 use ros2probe::surface::api::reload::{NotReloaded, Reloaded, Reloads};
@@ -52,6 +53,8 @@ pub(crate) struct Surfaces {
     pub(crate) metrics: Option<Server>,
     pub(crate) control: api::Server,
     pub(crate) context: api::Context,
+    /// Nothing is served by a thread that has any privilege.
+    pub(crate) powerless: Powerless,
 }
 
 /// Signals that are listened to from before the working thread starts.
@@ -63,8 +66,15 @@ struct Signals {
     snapshot: Signal,
 }
 
-/// The working thread and the news of its end.
-struct Worker {
+/// The working thread, waiting for what it is to do, and the news of its end.
+pub(crate) struct Worker {
+    thread: JoinHandle<()>,
+    begin: oneshot::Sender<Run>,
+    ended: oneshot::Receiver<Result<(), RunError>>,
+}
+
+/// The working thread at work.
+struct Working {
     thread: JoinHandle<()>,
     ended: oneshot::Receiver<Result<(), RunError>>,
 }
@@ -72,10 +82,17 @@ struct Worker {
 impl Supervisor {
     /// Runs everything until a signal or a failure, or with `once` until the capture ends, and says
     /// in the log how it ended.
-    pub(crate) async fn run(mut self, run: Run, surfaces: Surfaces, once: bool) -> Result<()> {
+    pub(crate) async fn run(
+        mut self,
+        worker: Worker,
+        run: Run,
+        surfaces: Surfaces,
+        once: bool,
+    ) -> Result<()> {
         let mut signals = Signals::listen().context("cannot listen to signals")?;
-        let mut worker = Worker::start(run).context("cannot start the working thread")?;
+        let mut worker = worker.begin(run);
         let mut serving = JoinSet::new();
+        let _: Powerless = surfaces.powerless;
         if let Some(metrics) = surfaces.metrics {
             serving.spawn(metrics.serve(self.stop.clone()));
         }
@@ -222,14 +239,37 @@ impl Signals {
 }
 
 impl Worker {
-    fn start(run: Run) -> std::io::Result<Self> {
+    /// Starts the thread, confined to its role already: the caller need not keep what it needs.
+    pub(crate) fn start(role: Role) -> Result<Self, SpawnError> {
+        let (begin, begins) = oneshot::channel::<Run>();
         let (tell, ended) = oneshot::channel();
-        let thread = std::thread::Builder::new()
-            .name("capture".to_owned())
-            .spawn(move || {
+        let thread = std::thread::Builder::new().name("capture".to_owned());
+        let thread = privilege::spawn(role, thread, move || {
+            // An agent that fails to start has nothing to do.
+            if let Ok(run) = begins.blocking_recv() {
                 let _ = tell.send(run.run());
-            })?;
-        Ok(Self { thread, ended })
+            }
+        })?;
+        Ok(Self {
+            thread,
+            begin,
+            ended,
+        })
+    }
+
+    /// Works until the capture ends.
+    pub(crate) fn finish(self, run: Run) -> Result<()> {
+        let ended = self.begin(run).ended.blocking_recv();
+        Ok(ended.map_err(|_| anyhow!("the working thread died"))??)
+    }
+
+    fn begin(self, run: Run) -> Working {
+        // Nobody takes it when the thread has died, which is what is heard next.
+        let _ = self.begin.send(run);
+        Working {
+            thread: self.thread,
+            ended: self.ended,
+        }
     }
 }
 

@@ -301,6 +301,13 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
     let tables = health["tables"].as_array().unwrap();
     let endpoints = tables.iter().find(|table| table["table"] == "endpoints");
     assert_eq!(endpoints.unwrap()["evictions"], 0, "{health}");
+    assert_eq!(health["capabilities"].as_array().map(Vec::len), Some(0));
+    let threads = health["threads"].as_array().unwrap();
+    let named = |name: &str| threads.iter().any(|thread| thread["thread"] == name);
+    assert!(named("rp") && named("capture"), "{health}");
+    let is_confined = |thread: &Value| thread["filtered"] == true;
+    assert!(threads.iter().all(is_confined), "{health}");
+    assert_eq!(health["unfiltered_reason"], Value::Null);
     assert!(health["process_id"].as_u64().unwrap() > 1, "{health}");
     assert!(
         health["uptime_seconds"].as_f64().unwrap() < 3600.0,

@@ -17,8 +17,8 @@ use harness::prometheus::{Kind, Prometheus};
 use serde::Deserialize as _;
 use serde_yaml::Value;
 
-/// `CAP_BPF`'s bit, as /proc shows it.
-const BPF_ALONE: &str = "0000008000000000";
+/// No capability, as /proc shows it.
+const NOTHING: &str = "0000000000000000";
 const OUTAGE: Duration = Duration::from_secs(8);
 /// Of a scrape a second, on a busy machine.
 const GAP: f64 = 6.0;
@@ -83,8 +83,8 @@ fn an_agent_that_is_confined_as_the_daemon_set_says_sees_the_whole_node() -> Res
     ensure!(failed == Some(0.0), "{failed:?}");
     let status = std::fs::read_to_string(format!("/proc/{}/status", agent.process.pid()))?;
     for line in [
-        format!("CapEff:\t{BPF_ALONE}"),
-        format!("CapPrm:\t{BPF_ALONE}"),
+        format!("CapEff:\t{NOTHING}"),
+        format!("CapPrm:\t{NOTHING}"),
         "NoNewPrivs:\t1".to_owned(),
     ] {
         ensure!(

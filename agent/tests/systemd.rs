@@ -59,6 +59,50 @@ fn systemd_understands_every_line() {
 }
 
 #[test]
+fn every_test_that_the_threat_model_names_is_there() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let mut sources = String::new();
+    for directory in ["agent/src", "agent/tests", "wire/src", "wire/tests"] {
+        read_sources(&root.join(directory), &mut sources);
+    }
+    let model = std::fs::read_to_string(root.join("SECURITY.md")).unwrap();
+    let quoted = model.split('`').skip(1).step_by(2);
+    let is_test = |name: &&str| {
+        let letters = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+        name.matches('_').count() >= 2 && name.chars().all(letters)
+    };
+    let not_tests = ["no_new_privs", "ros2probe_sandbox_info"];
+    let named: Vec<&str> = quoted
+        .filter(is_test)
+        .filter(|name| !not_tests.contains(name))
+        .chain(["captures_survive"])
+        .collect();
+    assert!(named.len() > 40, "{named:?}");
+    for name in named {
+        let function = sources.find(&format!("fn {name}("));
+        let before = function.map(|at| sources.get(..at).unwrap_or_default());
+        let attribute = before.is_some_and(|before| {
+            let lines = before.lines().rev().take(4);
+            lines
+                .map(str::trim)
+                .any(|line| line.starts_with("#[test]") || line.starts_with("#[tokio::test"))
+        });
+        assert!(attribute, "SECURITY.md names {name}, which is no test");
+    }
+}
+
+fn read_sources(directory: &Path, into: &mut String) {
+    for entry in std::fs::read_dir(directory).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            read_sources(&path, into);
+        } else if path.extension().is_some_and(|extension| extension == "rs") {
+            into.push_str(&std::fs::read_to_string(path).unwrap());
+        }
+    }
+}
+
+#[test]
 fn the_agent_may_do_what_it_needs_and_nothing_else() {
     let text = std::fs::read_to_string(unit()).unwrap();
     for set in ["CapabilityBoundingSet", "AmbientCapabilities"] {

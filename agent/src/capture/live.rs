@@ -91,8 +91,7 @@ pub struct LiveSource {
     set_clock: SetClock,
 }
 
-/// What looks at shared memory. Its thread begins with the first look at packets, when all
-/// privileges that are not needed are given up: threads inherit them.
+/// What looks at shared memory. Its thread begins when the source is started.
 enum Shm {
     Off,
     Later(Scope, f64),
@@ -168,6 +167,17 @@ impl LiveSource {
         Ok(source)
     }
 
+    /// Starts the threads that need privileges of their own, before the caller gives up its own.
+    pub fn start(&mut self) {
+        if let Some(exact) = &mut self.exact
+            && let Err(error) = exact.start()
+        {
+            let reason = in_words(&error);
+            tracing::warn!(reason, "libraries that come later are not attached to");
+        }
+        self.start_shared_memory();
+    }
+
     /// The tap at the host's sockets, if that is where this looks.
     #[must_use]
     pub const fn host(&self) -> Option<&HostTap> {
@@ -197,7 +207,6 @@ impl LiveSource {
         bell: Option<BorrowedFd<'_>>,
         observer: &mut Observer,
     ) -> Result<(), CaptureError> {
-        self.start_shared_memory();
         if let Shm::Running(shared_memory) = &self.shared_memory {
             let covers_all = self.exact.as_ref().is_some_and(Exact::covers_all);
             shared_memory.pause(covers_all);
@@ -441,7 +450,8 @@ impl LiveSource {
         self.shared_memory = match started {
             Ok(running) => Shm::Running(running),
             Err(error) => {
-                tracing::warn!(%error, "shared memory is not looked at");
+                let reason = in_words(&error);
+                tracing::warn!(reason, "shared memory is not looked at");
                 Shm::Off
             }
         };

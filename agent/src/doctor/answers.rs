@@ -68,6 +68,8 @@ pub struct Health {
     pub limits: Vec<Limit>,
     /// Capabilities it kept.
     pub capabilities: Vec<String>,
+    /// Why its system calls are not filtered.
+    pub unfiltered_reason: Option<String>,
     /// Its process.
     pub process_id: u32,
     /// Since its start.

@@ -72,16 +72,12 @@ fn of_agent(health: &Health) -> Finding {
         let finding = Finding::new(AREA, "agent_capabilities", verdict, sentence);
         finding.seen(&held, "GET /health capabilities")
     };
-    let is_live = matches!(health.source.as_str(), "host" | "wire");
-    let can_change = health
-        .capabilities
-        .iter()
-        .any(|held| matches!(held.as_str(), "CAP_BPF" | "CAP_SYS_ADMIN"));
-    if is_live && !can_change && !health.capabilities.is_empty() {
-        let sentence =
-            format!("the agent lacks CAP_BPF and cannot change what it looks at; it has {held}");
-        return say(Verdict::Warning, sentence)
-            .elsewhere("AmbientCapabilities=CAP_NET_ADMIN CAP_NET_RAW CAP_BPF CAP_PERFMON    # systemctl edit ros2probe");
+    if let Some(reason) = &health.unfiltered_reason {
+        let sentence = format!(
+            "the agent kept {held}, but the kernel does not refuse system calls that it does not \
+             make: {reason}"
+        );
+        return say(Verdict::Note, sentence);
     }
     say(
         Verdict::Ok,
@@ -255,18 +251,19 @@ mod tests {
     }
 
     #[test]
-    fn what_the_agent_kept_is_judged_by_what_it_does() {
-        let health = |source: &str, held: &[&str]| Health {
-            source: source.to_owned(),
+    fn what_the_agent_kept_is_told_and_a_missing_sandbox_with_its_reason() {
+        let health = |held: &[&str], reason: Option<&str>| Health {
             capabilities: held.iter().map(|held| (*held).to_owned()).collect(),
+            unfiltered_reason: reason.map(str::to_owned),
             ..Health::default()
         };
-        assert_eq!(of_agent(&health("host", &["CAP_BPF"])).verdict, Verdict::Ok);
-        assert_eq!(
-            of_agent(&health("host", &["CAP_SYS_PTRACE"])).verdict,
-            Verdict::Warning
-        );
-        assert_eq!(of_agent(&health("replay", &[])).verdict, Verdict::Ok);
+        let kept = of_agent(&health(&["CAP_SYS_PTRACE"], None));
+        assert_eq!(kept.verdict, Verdict::Ok);
+        assert!(kept.sentence.contains("kept CAP_SYS_PTRACE"));
+        assert_eq!(of_agent(&health(&[], None)).verdict, Verdict::Ok);
+        let open = of_agent(&health(&[], Some("no filters here")));
+        assert_eq!(open.verdict, Verdict::Note);
+        assert!(open.sentence.ends_with(": no filters here"));
     }
 
     #[test]

@@ -27,6 +27,11 @@ pub(super) fn identity(page: &mut Page<'_>, state: &State, now: Instant) -> fmt:
         let reason = state.agent.source_reason.as_deref().unwrap_or_default();
         family.info(&[Label::Text(state.agent.source.label()), Label::Text(reason)])
     })?;
+    page.family(&metric::SANDBOX_INFO, |family| {
+        let sandbox = &state.agent.sandbox;
+        let reason = sandbox.reason().unwrap_or_default();
+        family.info(&[Label::Text(sandbox.label()), Label::Text(reason)])
+    })?;
     page.family(&metric::ABILITY, |family| {
         Ability::ALL.into_iter().try_for_each(|ability| {
             let able = state.agent.abilities.contains(&ability);

@@ -3,6 +3,7 @@
 
 use std::time::Instant;
 
+use crate::privilege::{self, Sandbox};
 use crate::state::StateFacts;
 use crate::subscriptions;
 
@@ -55,6 +56,8 @@ pub struct AgentFacts {
     pub exact: Vec<ExactFacts>,
     /// Who gets messages one by one.
     pub subscriptions: subscriptions::Facts,
+    /// What keeps the agent from system calls that it does not make.
+    pub sandbox: Sandbox,
 }
 
 /// One library of exact mode.
@@ -151,6 +154,7 @@ impl AgentFacts {
             shared_memory: None,
             exact: Vec::new(),
             subscriptions: subscriptions::Facts::default(),
+            sandbox: privilege::sandbox(),
         }
     }
 }

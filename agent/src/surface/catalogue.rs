@@ -440,6 +440,7 @@ pub const CATALOGUE: &[Metric] = &[
     WATCH_VIOLATED,
     BUILD_INFO,
     SOURCE_INFO,
+    SANDBOX_INFO,
     ABILITY,
     READY,
     CAPTURE_PACKETS,

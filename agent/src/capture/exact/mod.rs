@@ -21,7 +21,7 @@ use super::intake::Intake;
 use super::shm::scan::Scope;
 use super::system::Clocks;
 use crate::model::observer::Observer;
-use crate::privilege;
+use crate::privilege::{self, SpawnError};
 
 /// A process hands over a hundred thousand messages a second if it can, ten times what a socket
 /// takes: its ring is larger by this.
@@ -48,9 +48,6 @@ pub enum ExactError {
     /// The kernel programs.
     #[error(transparent)]
     Filter(#[from] FilterError),
-    /// There can be no more threads.
-    #[error("there is no thread to be had")]
-    Thread(#[source] io::Error),
 }
 
 /// The kernel programs and the thread that attaches them.
@@ -60,8 +57,8 @@ pub struct Exact {
 }
 
 impl Exact {
-    /// Loads the programs and looks for libraries to attach them to from now on, in a thread that
-    /// keeps the privileges for that. `cgroup`: only for processes of this control group.
+    /// Loads the programs and attaches them to installed libraries. `cgroup`: only for processes of
+    /// this control group.
     ///
     /// # Errors
     /// A capability is missing, or the kernel has no uprobes.
@@ -89,8 +86,17 @@ impl Exact {
         let scope = cgroup.map_or(Scope::Everybody, |path| Scope::Cgroup(path.to_path_buf()));
         Ok(Self {
             intake: Intake::new(filter),
-            search: Search::start(probes, scope).map_err(ExactError::Thread)?,
+            search: Search::new(probes, scope),
         })
+    }
+
+    /// Looks for more libraries to attach them to from now on, in a thread that keeps the privileges
+    /// for that.
+    ///
+    /// # Errors
+    /// There can be no more threads.
+    pub fn start(&mut self) -> Result<(), SpawnError> {
+        self.search.start()
     }
 
     /// Readable when a ring is half full.

@@ -20,7 +20,7 @@ use crate::capture::filter::{FilterError, Probe, Probes};
 use crate::capture::live::in_words;
 use crate::capture::shm::scan::{Name, Places, Scope};
 use crate::capture::system::DirectoryWatch;
-use crate::privilege;
+use crate::privilege::{self, Role, SpawnError};
 
 /// How often processes are gone through when nothing happens.
 const EVERY: Duration = Duration::from_secs(1);
@@ -46,6 +46,8 @@ const DISTRIBUTIONS: &str = "/opt/ros";
 /// The thread, from the outside.
 pub struct Search {
     shared: Arc<Shared>,
+    /// What the thread is given when it begins.
+    waiting: Option<(Attachments, Scope)>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -116,12 +118,9 @@ impl Default for Facts {
 }
 
 impl Search {
-    /// Starts looking. The thread has the capabilities of the caller, and gives up all it does not
-    /// need; the caller may give up all of them.
-    ///
-    /// # Errors
-    /// There can be no more threads.
-    pub fn start(probes: Probes, scope: Scope) -> io::Result<Self> {
+    /// Attaches to what is installed, and to nothing else before it is started.
+    #[must_use]
+    pub fn new(probes: Probes, scope: Scope) -> Self {
         let mut attachments = Attachments {
             probes,
             libraries: BTreeMap::new(),
@@ -134,16 +133,27 @@ impl Search {
             covers_all: AtomicBool::new(true),
             stop: AtomicBool::new(false),
         });
-        let thread = std::thread::Builder::new()
-            .name("exact".to_owned())
-            .spawn({
-                let shared = Arc::clone(&shared);
-                move || follow(&shared, attachments, scope)
-            })?;
-        Ok(Self {
+        Self {
             shared,
-            thread: Some(thread),
-        })
+            waiting: Some((attachments, scope)),
+            thread: None,
+        }
+    }
+
+    /// Starts looking, once, in a thread that gives up all it does not need; the caller may give up
+    /// everything afterwards.
+    ///
+    /// # Errors
+    /// There can be no more threads.
+    pub fn start(&mut self) -> Result<(), SpawnError> {
+        let Some((attachments, scope)) = self.waiting.take() else {
+            return Ok(());
+        };
+        let thread = std::thread::Builder::new().name("exact".to_owned());
+        let shared = Arc::clone(&self.shared);
+        let work = move || follow(&shared, attachments, scope);
+        self.thread = Some(privilege::spawn(Role::Exact, thread, work)?);
+        Ok(())
     }
 
     /// What is attached, and what is not covered.
@@ -173,9 +183,6 @@ impl Drop for Search {
 
 /// The thread.
 fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
-    if let Err(error) = privilege::keep_for_probes() {
-        tracing::warn!(%error, "looking at processes with more privileges than that takes");
-    }
     let mut processes = Processes::new(scope.clone());
     let mut places = Places::new(scope);
     // Without it, a participant that starts is noticed within a second.

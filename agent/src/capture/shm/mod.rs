@@ -19,7 +19,6 @@ pub mod verdict;
 mod image;
 
 use std::collections::BTreeSet;
-use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -36,6 +35,7 @@ use self::scan::{Name, Places};
 use self::tap::{Counters, Moment, Tap};
 use super::system::{Clocks, DirectoryWatch, run_first, thread_cpu};
 use crate::model::observer::{Observer, Wanted};
+use crate::privilege::{self, Role, SpawnError};
 
 /// How often the counters are put where others can read them.
 const REPORT: u64 = 200_000_000;
@@ -79,19 +79,20 @@ struct Shared {
 }
 
 impl SharedMemory {
-    /// Starts looking, within a share of a CPU. The thread has the capabilities of the caller.
+    /// Starts looking, within a share of a CPU. The thread keeps those of the caller's capabilities
+    /// that it needs.
     ///
     /// # Errors
     /// There can be no more threads.
-    pub fn start(places: Places, share: f64) -> io::Result<Self> {
+    pub fn start(places: Places, share: f64) -> Result<Self, SpawnError> {
         let shared = Arc::<Shared>::default();
-        let thread = std::thread::Builder::new()
-            .name("shm".to_owned())
-            .stack_size(256 << 10)
-            .spawn({
-                let shared = Arc::clone(&shared);
-                move || look(&shared, places, share)
-            })?;
+        let thread = std::thread::Builder::new().name("shm".to_owned());
+        let looks = Arc::clone(&shared);
+        let thread = privilege::spawn(
+            Role::shared_memory(),
+            thread.stack_size(256 << 10),
+            move || look(&looks, places, share),
+        )?;
         Ok(Self {
             shared,
             thread: Some(thread),

@@ -1,5 +1,6 @@
 //! `GET /health`: whether the agent sees the robot, and how well.
 
+use std::collections::BTreeSet;
 use std::sync::LazyLock;
 use std::time::{Instant, SystemTime};
 
@@ -66,8 +67,15 @@ pub(super) struct Health {
     tables: Vec<TableView>,
     /// Caps of the configuration.
     limits: Vec<LimitView>,
-    /// Capabilities it holds, after it has given up what it does not need any more.
+    /// Capabilities that some thread of it holds, after it has given up what it does not need any
+    /// more. The thread that answers holds none.
     capabilities: Vec<String>,
+    /// Its threads, as the kernel sees them.
+    threads: Vec<ThreadView>,
+    /// Why system calls are not filtered.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    unfiltered_reason: Option<&'static str>,
     /// Its process, in its own process namespace.
     process_id: u32,
     /// Since its process started; null where that cannot be read.
@@ -87,6 +95,19 @@ struct AbilityView {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     reason: Option<String>,
+}
+
+/// A thread and what it may do.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Thread)]
+struct ThreadView {
+    /// Its name; `rp` for the one that answers.
+    #[schema(example = "capture")]
+    thread: String,
+    /// Capabilities that it holds.
+    capabilities: Vec<String>,
+    /// The kernel refuses all system calls but those that it makes.
+    filtered: bool,
 }
 
 /// Where packets come from.
@@ -152,6 +173,14 @@ async fn health(State(context): State<Context>) -> Json<Health> {
     let age = instant.saturating_duration_since(agent.at);
     let started = Process::read().start_time;
     let now = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+    let threads = privilege::threads();
+    let held = threads.iter().flat_map(|thread| &thread.capabilities);
+    let held: BTreeSet<_> = held.cloned().collect();
+    let threads = threads.into_iter().map(|thread| ThreadView {
+        thread: thread.name,
+        capabilities: thread.capabilities,
+        filtered: thread.filtered,
+    });
     Json(Health {
         ready: ready.is_ok(),
         reason: ready.err(),
@@ -196,7 +225,9 @@ async fn health(State(context): State<Context>) -> Json<Health> {
                 reached: facts.reached,
             })
             .into(),
-        capabilities: privilege::held(),
+        capabilities: held.into_iter().collect(),
+        threads: threads.collect(),
+        unfiltered_reason: agent.sandbox.reason(),
         process_id: std::process::id(),
         uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),
     })

@@ -12,6 +12,11 @@ pub(in crate::surface) const SOURCE_INFO: Metric = Metric::info(
     &["source", "reason"],
     "Where packets come from: the host's sockets, the wire or a replay, and why not from one that shows more.",
 );
+pub(in crate::surface) const SANDBOX_INFO: Metric = Metric::info(
+    "ros2probe_sandbox_info",
+    &["system_calls", "reason"],
+    "Whether the kernel refuses system calls that the agent does not make (`filtered`, or `all` may be made), and why not.",
+);
 pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
     "ros2probe_capture_ability",
     &["ability"],

@@ -16,6 +16,7 @@ use super::metrics::Collector;
 use super::outlet::Outlet;
 use super::settings::{Settings, SettingsError, Target};
 use super::traces::Tracing;
+use crate::privilege::{self, Role, SpawnError};
 use crate::surface::board::Board;
 
 /// Ending takes no longer, whatever the receiver does.
@@ -36,11 +37,15 @@ pub enum StartError {
     Settings(#[from] SettingsError),
     /// The system has no thread for it.
     #[error("cannot start the thread that exports")]
-    Thread(#[source] std::io::Error),
+    Runtime(#[source] std::io::Error),
+    /// Likewise, or it has privileges that it should not have.
+    #[error("cannot start the thread that exports")]
+    Thread(#[from] SpawnError),
 }
 
 impl Exporter {
-    /// Exports what is on the board from now on.
+    /// Exports what is on the board from now on, in a thread that may make connections; the caller
+    /// need not keep that.
     ///
     /// # Errors
     /// When a connection cannot be set up; that the receiver is not there is no error.
@@ -48,19 +53,17 @@ impl Exporter {
         // Threads that block look names up, one for each signal at most.
         let mut runtime = Builder::new_current_thread();
         let runtime = runtime.max_blocking_threads(3).enable_all().build();
-        let runtime = runtime.map_err(StartError::Thread)?;
+        let runtime = runtime.map_err(StartError::Runtime)?;
         let stop = CancellationToken::new();
         let jobs = Jobs::new(settings, board, &stop, &runtime)?;
         let (tell, ended) = oneshot::channel();
-        let thread = std::thread::Builder::new()
-            .name("otlp".to_owned())
-            .spawn(move || {
-                runtime.block_on(jobs.run());
-                // A name that is being looked up must not hold the end up.
-                runtime.shutdown_background();
-                let _ = tell.send(());
-            })
-            .map_err(StartError::Thread)?;
+        let thread = std::thread::Builder::new().name("otlp".to_owned());
+        let thread = privilege::spawn(Role::Export, thread, move || {
+            runtime.block_on(jobs.run());
+            // A name that is being looked up must not hold the end up.
+            runtime.shutdown_background();
+            let _ = tell.send(());
+        })?;
         Ok(Self {
             thread,
             stop,

@@ -1,13 +1,11 @@
-//! What the agent may do: which capabilities each source needs, and giving up the rest once
-//! sockets and BPF programs are open.
+//! Which capabilities each source needs, what a thread goes on needing, and giving up the rest.
 
 use std::fmt;
 
 use caps::errors::CapsError;
 use caps::{CapSet, Capability, CapsHashSet};
 
-use crate::capture::system::allow_running_first;
-use crate::config::{CaptureSettings, ShmMode, SourceChoice};
+use crate::config::{CaptureSettings, SourceChoice};
 
 /// Attaching programs to a cgroup (`CAP_NET_ADMIN`); loading them; tracepoints, iterators and the
 /// verifier's leave to skip Spectre barriers, without which 5.15 to 6.8 refuse the filter.
@@ -44,6 +42,33 @@ pub struct Missing {
 #[derive(Debug, thiserror::Error)]
 #[error("cannot give up privileges: {0}")]
 pub struct DropError(CapsError);
+
+/// The calling thread has no capability in any set that would give it one, and can gain none: what
+/// is asked for to serve HTTP.
+#[derive(Debug)]
+pub struct Powerless(());
+
+/// It has.
+#[derive(Debug, thiserror::Error)]
+pub enum StillPowerful {
+    /// These are left.
+    #[error("refusing to serve: {left} left in the {set:?} set after all were given up")]
+    Capabilities {
+        /// Their names.
+        left: String,
+        /// Where.
+        set: CapSet,
+    },
+    /// A program that it executes could.
+    #[error("refusing to serve: no_new_privs is not set after it was")]
+    MayGain,
+    /// The kernel does not say.
+    #[error("refusing to serve: cannot read which capabilities are left: {0}")]
+    Unreadable(CapsError),
+    /// Likewise.
+    #[error("refusing to serve: cannot read no_new_privs")]
+    Unknown(#[source] std::io::Error),
+}
 
 /// Looks for what capturing as `settings` say needs. Where the choice of the source is the
 /// agent's, having what one of them needs is enough.
@@ -97,35 +122,6 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)
     }
 }
 
-/// Gives up every capability but `CAP_BPF`, which later changes of the filter's maps need where
-/// unprivileged BPF is disabled, and two where shared memory is looked at: `CAP_SYS_PTRACE`, which
-/// opens `/proc/<pid>/root`, and so the shared memory of containers, to whoever has it anyway; and
-/// `CAP_SYS_NICE` where a limit cannot allow the thread that looks to run first. Call it while the
-/// process has one thread: capabilities belong to threads, and new ones inherit them. That of exact
-/// mode looks after itself, see [`keep_for_probes`].
-///
-/// # Errors
-/// When the kernel refuses, which it does not for a process that gives up what it has.
-pub fn give_up(settings: &CaptureSettings) -> Result<(), DropError> {
-    let looks_at_memory = settings.shm.mode == ShmMode::Auto;
-    let lacks_limit = looks_at_memory && !allow_running_first();
-    keep(|capability| match capability {
-        Capability::CAP_BPF => true,
-        Capability::CAP_SYS_PTRACE => looks_at_memory,
-        Capability::CAP_SYS_NICE => lacks_limit,
-        _ => false,
-    })
-}
-
-/// The effective capabilities of the calling thread, by name; empty where they cannot be read.
-#[must_use]
-pub fn held() -> Vec<String> {
-    let effective = caps::read(None, CapSet::Effective).unwrap_or_default();
-    let mut names: Vec<_> = effective.iter().map(Capability::to_string).collect();
-    names.sort();
-    names
-}
-
 /// What [`crate::capture::exact`] lacks.
 #[must_use]
 pub fn missing_for_probes() -> Vec<&'static str> {
@@ -141,15 +137,14 @@ pub(crate) fn lacking_for_probes(effective: &CapsHashSet) -> Vec<&'static str> {
     needed.map(|(_, name)| *name).collect()
 }
 
-/// Gives up what the calling thread does not need to attach to libraries.
-///
-/// # Errors
-/// When the kernel refuses, which it does not for a thread that gives up what it has.
-pub fn keep_for_probes() -> Result<(), DropError> {
-    keep(|capability| PROBES.iter().any(|(one, _)| *one == capability))
+/// Whether this is one of what attaching to libraries needs.
+pub(super) fn is_for_probes(capability: Capability) -> bool {
+    PROBES.iter().any(|(one, _)| *one == capability)
 }
 
-fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError> {
+/// Gives up what the calling thread does not keep, from every set; from the bounding set where it
+/// may, and where it may not nothing can be gained from it any more.
+pub(super) fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError> {
     let permitted = caps::read(None, CapSet::Permitted).map_err(DropError)?;
     if caps::has_cap(None, CapSet::Effective, Capability::CAP_SETPCAP).map_err(DropError)? {
         for capability in caps::read(None, CapSet::Bounding).map_err(DropError)? {
@@ -161,6 +156,36 @@ fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError> {
     caps::clear(None, CapSet::Inheritable).map_err(DropError)?;
     caps::set(None, CapSet::Effective, &kept).map_err(DropError)?;
     caps::set(None, CapSet::Permitted, &kept).map_err(DropError)
+}
+
+impl Powerless {
+    /// Reads back what the calling thread has left.
+    ///
+    /// # Errors
+    /// There is something, or it cannot be read.
+    pub fn verify() -> Result<Self, StillPowerful> {
+        for set in [
+            CapSet::Effective,
+            CapSet::Permitted,
+            CapSet::Inheritable,
+            CapSet::Ambient,
+        ] {
+            let left = caps::read(None, set).map_err(StillPowerful::Unreadable)?;
+            if !left.is_empty() {
+                let mut left: Vec<_> = left.iter().map(Capability::to_string).collect();
+                left.sort();
+                return Err(StillPowerful::Capabilities {
+                    left: left.join(", "),
+                    set,
+                });
+            }
+        }
+        match rustix::thread::no_new_privs() {
+            Ok(true) => Ok(Self(())),
+            Ok(false) => Err(StillPowerful::MayGain),
+            Err(error) => Err(StillPowerful::Unknown(error.into())),
+        }
+    }
 }
 
 impl Missing {
@@ -247,7 +272,7 @@ mod tests {
 
     #[test]
     fn the_daemon_set_grants_what_either_source_needs_and_nothing_else() {
-        let manifest = include_str!("../../deploy/kubernetes/ros2probe.yaml");
+        let manifest = include_str!("../../../deploy/kubernetes/ros2probe.yaml");
         let mut lines = manifest.lines().map(str::trim);
         let added = lines.find_map(|line| line.strip_prefix("add: [")?.strip_suffix(']'));
         let added = added.unwrap().split(", ");

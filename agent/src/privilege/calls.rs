@@ -1,0 +1,380 @@
+//! Which system calls the threads of each role make, and the filter that refuses all others.
+//!
+//! What is refused fails with `EPERM`, as it does for who lacks a privilege; what C libraries try
+//! before an older call that is allowed with `ENOSYS`, so that they try that. Arguments count where
+//! they make the difference: memory never becomes executable, a new process never begins, the threads
+//! that look at the network and at other processes open nothing for writing.
+
+use std::collections::BTreeMap;
+
+use libc::c_long;
+use seccompiler::{
+    BackendError, BpfProgram, SeccompAction, SeccompCmpArgLen, SeccompCmpOp, SeccompCondition,
+    SeccompFilter, SeccompRule, apply_filter, sock_filter,
+};
+
+use super::Role;
+
+/// Why a filter is not in force.
+#[derive(Debug, thiserror::Error)]
+pub enum FilterError {
+    /// It cannot be put together.
+    #[error(transparent)]
+    Made(#[from] BackendError),
+    /// The kernel has none, or not for this process.
+    #[error("{0}")]
+    Refused(String),
+}
+
+/// Refuses, from now on and for good, what the calling thread does not do in this role.
+pub(super) fn load(role: Role) -> Result<(), FilterError> {
+    let program = program(role)?;
+    apply_filter(&program).map_err(|error| FilterError::Refused(error.to_string()))
+}
+
+/// The filter's program.
+fn program(role: Role) -> Result<BpfProgram, BackendError> {
+    let filter = SeccompFilter::new(
+        Allowed::to(role)?.0,
+        SeccompAction::Errno(libc::EPERM.cast_unsigned()),
+        SeccompAction::Allow,
+        std::env::consts::ARCH.try_into()?,
+    )?;
+    let mut program = absent();
+    program.extend(BpfProgram::try_from(filter)?);
+    Ok(program)
+}
+
+/// Calls for which C libraries have an older one.
+const ABSENT: [c_long; 3] = [libc::SYS_clone3, libc::SYS_epoll_pwait2, FCHMODAT2];
+/// Not told for every architecture by the libc crate.
+const FCHMODAT2: c_long = 452;
+#[cfg(target_arch = "aarch64")]
+const RENAMEAT: c_long = 38;
+#[cfg(not(target_arch = "aarch64"))]
+const RENAMEAT: c_long = libc::SYS_renameat;
+
+/// Comes before the rest of a program, which has one answer for all it does not know. These calls
+/// have the same number on all architectures.
+fn absent() -> BpfProgram {
+    let step = |code: u32, jt, jf, k| sock_filter {
+        code: u16::try_from(code).unwrap_or_default(),
+        jt,
+        jf,
+        k,
+    };
+    let load_number = step(libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0, 0);
+    let refuse = libc::SECCOMP_RET_ERRNO | libc::ENOSYS.cast_unsigned();
+    let mut program = vec![load_number];
+    for number in ABSENT {
+        let number = u32::try_from(number).unwrap_or(u32::MAX);
+        let is_it = libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K;
+        program.push(step(is_it, 0, 1, number));
+        program.push(step(libc::BPF_RET | libc::BPF_K, 0, 0, refuse));
+    }
+    program
+}
+
+/// What every thread does: memory, locks, the time, reading and writing what is open, ending.
+const EVERYWHERE: &[c_long] = &[
+    libc::SYS_brk,
+    libc::SYS_capget,
+    libc::SYS_clock_getres,
+    libc::SYS_clock_gettime,
+    libc::SYS_clock_nanosleep,
+    libc::SYS_close,
+    libc::SYS_exit,
+    libc::SYS_exit_group,
+    libc::SYS_fcntl,
+    libc::SYS_fstat,
+    libc::SYS_futex,
+    libc::SYS_getcwd,
+    libc::SYS_getegid,
+    libc::SYS_geteuid,
+    libc::SYS_getgid,
+    libc::SYS_getpid,
+    libc::SYS_getrandom,
+    libc::SYS_gettid,
+    libc::SYS_gettimeofday,
+    libc::SYS_getuid,
+    libc::SYS_lseek,
+    libc::SYS_madvise,
+    libc::SYS_mremap,
+    libc::SYS_munmap,
+    libc::SYS_nanosleep,
+    libc::SYS_ppoll,
+    libc::SYS_pread64,
+    libc::SYS_read,
+    libc::SYS_readv,
+    libc::SYS_restart_syscall,
+    libc::SYS_rseq,
+    libc::SYS_rt_sigaction,
+    libc::SYS_rt_sigprocmask,
+    libc::SYS_rt_sigreturn,
+    libc::SYS_sched_getaffinity,
+    libc::SYS_sched_yield,
+    libc::SYS_set_robust_list,
+    libc::SYS_sigaltstack,
+    libc::SYS_sysinfo,
+    libc::SYS_uname,
+    libc::SYS_write,
+    libc::SYS_writev,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_poll,
+];
+
+/// Looking for files and at them; opening is allowed apart.
+const LOOK: &[c_long] = &[
+    libc::SYS_faccessat,
+    libc::SYS_faccessat2,
+    libc::SYS_fadvise64,
+    libc::SYS_fstatfs,
+    libc::SYS_getdents64,
+    libc::SYS_newfstatat,
+    libc::SYS_readlinkat,
+    libc::SYS_statfs,
+    libc::SYS_statx,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_access,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_lstat,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_readlink,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_stat,
+];
+
+/// Changing files: state, recordings.
+const CHANGE: &[c_long] = &[
+    libc::SYS_copy_file_range,
+    libc::SYS_fallocate,
+    libc::SYS_fchmod,
+    libc::SYS_fchmodat,
+    libc::SYS_fdatasync,
+    libc::SYS_flock,
+    libc::SYS_fsync,
+    libc::SYS_ftruncate,
+    libc::SYS_mkdirat,
+    libc::SYS_openat,
+    libc::SYS_pwrite64,
+    RENAMEAT,
+    libc::SYS_renameat2,
+    libc::SYS_sendfile,
+    libc::SYS_splice,
+    libc::SYS_unlinkat,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_chmod,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_mkdir,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_open,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_rename,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_rmdir,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_unlink,
+];
+
+/// A tokio runtime and the connections that it serves.
+const SERVE: &[c_long] = &[
+    libc::SYS_accept4,
+    libc::SYS_connect,
+    libc::SYS_epoll_create1,
+    libc::SYS_epoll_ctl,
+    libc::SYS_epoll_pwait,
+    libc::SYS_eventfd2,
+    libc::SYS_getpeername,
+    libc::SYS_getsockname,
+    libc::SYS_getsockopt,
+    libc::SYS_pipe2,
+    libc::SYS_recvfrom,
+    libc::SYS_recvmsg,
+    libc::SYS_sendmsg,
+    libc::SYS_sendto,
+    libc::SYS_setsockopt,
+    libc::SYS_shutdown,
+    #[cfg(target_arch = "x86_64")]
+    libc::SYS_epoll_wait,
+];
+
+/// Asking a name server as well: many questions at once, and musl binds before it asks.
+const RESOLVE: &[c_long] = &[libc::SYS_bind, libc::SYS_recvmmsg, libc::SYS_sendmmsg];
+
+/// inotify.
+const NOTICE: &[c_long] = &[
+    libc::SYS_inotify_add_watch,
+    libc::SYS_inotify_init1,
+    libc::SYS_inotify_rm_watch,
+];
+
+/// `bpf` commands, of linux/bpf.h; on maps: look up, update, delete, next key.
+mod command {
+    pub(super) const MAPS: [libc::c_int; 4] = [1, 2, 3, 4];
+    pub(super) const LINK_CREATE: libc::c_int = 28;
+    pub(super) const ITERATOR_CREATE: libc::c_int = 33;
+}
+
+/// `ioctl` requests, the same on both architectures: of linux/perf_event.h and asm-generic/ioctls.h.
+mod request {
+    pub(super) const PERF_ENABLE: i32 = 0x2400;
+    pub(super) const PERF_DISABLE: i32 = 0x2401;
+    pub(super) const PERF_SET_BPF: i32 = 0x4004_2408;
+    /// A descriptor's flags: not blocking, closed by exec. Whether it is a terminal. How much of an
+    /// answer there is, as glibc asks when it has asked a name server.
+    pub(super) const ORDINARY: [i32; 4] = [0x5421, 0x5451, 0x5401, 0x541b];
+}
+
+/// System calls by number, each with the conditions under which it is allowed: one of them is enough,
+/// and without any it always is.
+#[derive(Default)]
+struct Allowed(BTreeMap<c_long, Vec<SeccompRule>>);
+
+impl Allowed {
+    fn to(role: Role) -> Result<Self, BackendError> {
+        let mut allowed = Self::default();
+        allowed.always(EVERYWHERE).everywhere()?;
+        match role {
+            Role::Service => allowed.service()?,
+            Role::Export => {
+                allowed.service()?;
+                for family in [libc::AF_INET, libc::AF_INET6] {
+                    for kind in [libc::SOCK_STREAM, libc::SOCK_DGRAM] {
+                        allowed.socket(family, kind)?;
+                    }
+                }
+                allowed.always(RESOLVE);
+            }
+            Role::Capture { .. } => {
+                allowed.always(LOOK).open_for_reading()?;
+                allowed.always(&[libc::SYS_getsockopt, libc::SYS_recvmsg, libc::SYS_recvfrom]);
+                let commands = command::MAPS.into_iter();
+                allowed.bpf(commands.chain([command::ITERATOR_CREATE]))?;
+                allowed.end_perf_events()?;
+            }
+            Role::SharedMemory { .. } => {
+                allowed.always(LOOK).always(NOTICE).open_for_reading()?;
+                for policy in [libc::SCHED_FIFO, libc::SCHED_OTHER] {
+                    allowed.when(libc::SYS_sched_setscheduler, &[equal(1, policy)?])?;
+                }
+            }
+            Role::Exact => {
+                allowed.always(LOOK).always(NOTICE).open_for_reading()?;
+                allowed.always(&[libc::SYS_perf_event_open]);
+                allowed.bpf([command::LINK_CREATE].into_iter())?;
+                allowed.end_perf_events()?;
+                for request in [request::PERF_ENABLE, request::PERF_SET_BPF] {
+                    allowed.when(libc::SYS_ioctl, &[equal(1, request)?])?;
+                }
+            }
+        }
+        Ok(allowed)
+    }
+
+    fn always(&mut self, calls: &[c_long]) -> &mut Self {
+        for call in calls {
+            self.0.insert(*call, Vec::new());
+        }
+        self
+    }
+
+    /// All of `conditions` hold.
+    fn when(&mut self, call: c_long, conditions: &[SeccompCondition]) -> Result<(), BackendError> {
+        let rule = SeccompRule::new(conditions.to_vec())?;
+        self.0.entry(call).or_default().push(rule);
+        Ok(())
+    }
+
+    fn everywhere(&mut self) -> Result<(), BackendError> {
+        let process = i32::try_from(std::process::id()).unwrap_or(i32::MAX);
+        for call in [libc::SYS_mmap, libc::SYS_mprotect] {
+            self.when(call, &[without(2, libc::PROT_EXEC)?])?;
+        }
+        // Its own end, as abort() does it.
+        self.when(libc::SYS_tgkill, &[equal(0, process)?])?;
+        let named_or_read = [
+            libc::PR_SET_NAME,
+            libc::PR_GET_NO_NEW_PRIVS,
+            libc::PR_CAPBSET_READ,
+        ];
+        for option in named_or_read {
+            self.when(libc::SYS_prctl, &[equal(0, option)?])?;
+        }
+        let is_set = equal(1, libc::PR_CAP_AMBIENT_IS_SET)?;
+        self.when(libc::SYS_prctl, &[equal(0, libc::PR_CAP_AMBIENT)?, is_set])?;
+        // A signal is handled by any thread, which tells the runtime through a socket that is open.
+        self.when(libc::SYS_sendto, &[condition(4, SeccompCmpOp::Eq, 0)?])?;
+        // Limits are read.
+        self.when(libc::SYS_prlimit64, &[condition(2, SeccompCmpOp::Eq, 0)?])
+    }
+
+    fn service(&mut self) -> Result<(), BackendError> {
+        self.always(LOOK).always(CHANGE).always(SERVE);
+        // A thread, never a process, never in a namespace of its own.
+        let kinds =
+            libc::CLONE_THREAD | libc::CLONE_NEWUSER | libc::CLONE_NEWNS | libc::CLONE_NEWNET;
+        let thread = SeccompCmpOp::MaskedEq(wide(kinds));
+        let thread = condition(0, thread, wide(libc::CLONE_THREAD))?;
+        self.when(libc::SYS_clone, &[thread])?;
+        for kind in [libc::SOCK_STREAM, libc::SOCK_DGRAM] {
+            self.socket(libc::AF_UNIX, kind)?;
+        }
+        self.when(libc::SYS_socketpair, &[equal(0, libc::AF_UNIX)?])?;
+        for request in request::ORDINARY {
+            self.when(libc::SYS_ioctl, &[equal(1, request)?])?;
+        }
+        Ok(())
+    }
+
+    fn socket(&mut self, family: i32, kind: i32) -> Result<(), BackendError> {
+        let flags = libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
+        let of_kind = SeccompCmpOp::MaskedEq(!wide(flags) & u64::from(u32::MAX));
+        let of_kind = SeccompCondition::new(1, SeccompCmpArgLen::Dword, of_kind, wide(kind))?;
+        self.when(libc::SYS_socket, &[equal(0, family)?, of_kind])
+    }
+
+    fn open_for_reading(&mut self) -> Result<(), BackendError> {
+        let changing = libc::O_ACCMODE | libc::O_CREAT | libc::O_TRUNC;
+        #[cfg(target_arch = "x86_64")]
+        self.when(libc::SYS_open, &[without(1, changing)?])?;
+        self.when(libc::SYS_openat, &[without(2, changing)?])
+    }
+
+    fn bpf(&mut self, commands: impl Iterator<Item = libc::c_int>) -> Result<(), BackendError> {
+        for command in commands {
+            self.when(libc::SYS_bpf, &[equal(0, command)?])?;
+        }
+        Ok(())
+    }
+
+    /// Letting go of a tracepoint or a probe.
+    fn end_perf_events(&mut self) -> Result<(), BackendError> {
+        self.when(libc::SYS_ioctl, &[equal(1, request::PERF_DISABLE)?])
+    }
+}
+
+/// An argument of 32 bits has this value.
+fn equal(argument: u8, value: i32) -> Result<SeccompCondition, BackendError> {
+    let value = u64::from(value.cast_unsigned());
+    SeccompCondition::new(argument, SeccompCmpArgLen::Dword, SeccompCmpOp::Eq, value)
+}
+
+/// An argument has none of these bits.
+fn without(argument: u8, bits: i32) -> Result<SeccompCondition, BackendError> {
+    condition(argument, SeccompCmpOp::MaskedEq(wide(bits)), 0)
+}
+
+fn condition(
+    argument: u8,
+    comparison: SeccompCmpOp,
+    value: u64,
+) -> Result<SeccompCondition, BackendError> {
+    SeccompCondition::new(argument, SeccompCmpArgLen::Qword, comparison, value)
+}
+
+fn wide(bits: i32) -> u64 {
+    u64::from(bits.cast_unsigned())
+}
+
+#[cfg(test)]
+mod tests;

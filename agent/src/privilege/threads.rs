@@ -1,0 +1,86 @@
+//! What each thread of this process has left, as the kernel tells it: what `/health` shows is read
+//! and not remembered.
+
+use std::fs;
+
+use caps::Capability;
+
+/// One thread.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ThreadPowers {
+    /// Its name; `rp` for the first one.
+    pub name: String,
+    /// Capabilities that it can use, by name.
+    pub capabilities: Vec<String>,
+    /// The kernel refuses system calls that its role does not make.
+    pub filtered: bool,
+}
+
+/// All of them, by the order in which they began; none where `/proc` does not tell.
+#[must_use]
+pub fn threads() -> Vec<ThreadPowers> {
+    let entries = fs::read_dir("/proc/self/task").into_iter().flatten();
+    let number = |name: &str| name.parse::<u32>().ok();
+    let mut numbers: Vec<_> = entries
+        .filter_map(|entry| number(entry.ok()?.file_name().to_str()?))
+        .collect();
+    numbers.sort_unstable();
+    let status = |number| fs::read_to_string(format!("/proc/self/task/{number}/status"));
+    // One that ends while this is read is gone.
+    let readable = numbers.into_iter().filter_map(|each| status(each).ok());
+    readable.map(|status| read(&status)).collect()
+}
+
+fn read(status: &str) -> ThreadPowers {
+    let value = |name: &str| {
+        let mut lines = status.lines();
+        let value = lines.find_map(|line| line.strip_prefix(name)?.strip_prefix(':'));
+        value.unwrap_or_default().trim()
+    };
+    let permitted = u64::from_str_radix(value("CapPrm"), 16).unwrap_or(u64::MAX);
+    let mut capabilities: Vec<_> = caps::all()
+        .iter()
+        .filter(|capability| permitted & capability.bitmask() != 0)
+        .map(Capability::to_string)
+        .collect();
+    capabilities.sort();
+    ThreadPowers {
+        name: value("Name").to_owned(),
+        capabilities,
+        filtered: value("Seccomp") == "2",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn powers_are_read_from_what_the_kernel_writes() {
+        let status = "Name:\tshm\nUmask:\t0077\nState:\tS (sleeping)\nCapInh:\t0000000000000000\n\
+            CapPrm:\t0000000000880000\nCapEff:\t0000000000880000\nCapBnd:\t000001ffffffffff\n\
+            CapAmb:\t0000000000000000\nNoNewPrivs:\t1\nSeccomp:\t2\nSeccomp_filters:\t1\n";
+        assert_eq!(
+            read(status),
+            ThreadPowers {
+                name: "shm".to_owned(),
+                capabilities: vec!["CAP_SYS_NICE".to_owned(), "CAP_SYS_PTRACE".to_owned()],
+                filtered: true,
+            }
+        );
+        assert!(!read("Name:\trp\nSeccomp:\t0\n").filtered);
+        assert!(!read("").capabilities.is_empty(), "not known is not none");
+    }
+
+    #[test]
+    fn every_thread_of_this_process_is_told() {
+        let (stop, stopped) = std::sync::mpsc::channel::<()>();
+        let thread = std::thread::Builder::new().name("another".to_owned());
+        let thread = thread.spawn(move || stopped.recv()).unwrap();
+        let names: Vec<_> = threads().into_iter().map(|thread| thread.name).collect();
+        assert!(names.len() >= 2);
+        assert!(names.iter().any(|name| name == "another"), "{names:?}");
+        drop(stop);
+        let _ = thread.join().unwrap();
+    }
+}
