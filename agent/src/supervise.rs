@@ -30,6 +30,8 @@ use crate::logging::Log;
 /// How often readiness is looked at until the agent is ready, and the watchdog from then on.
 const STARTING_TICK: Duration = Duration::from_millis(100);
 const TICK: Duration = Duration::from_secs(2);
+/// After which nothing is done for the first time any more unless somebody asks for it.
+const SETTLED: Duration = Duration::from_secs(5);
 /// For answers that have begun and the working thread's last round.
 const DRAIN: Duration = Duration::from_secs(3);
 
@@ -278,6 +280,8 @@ struct Watchdog {
     period: Option<Duration>,
     fed: Option<Instant>,
     ready: bool,
+    /// When the program's pages are let go of once more.
+    settled: Option<Instant>,
     sight: Sight,
 }
 
@@ -289,6 +293,7 @@ impl Watchdog {
             period,
             fed: None,
             ready: false,
+            settled: None,
             sight: Sight::default(),
         }
     }
@@ -309,7 +314,12 @@ impl Watchdog {
             self.ready = true;
             tracing::info!("ready");
             give_back_program();
+            self.settled = Some(now + SETTLED);
             let _ = sd_notify::notify(&[NotifyState::Ready]);
+        }
+        if self.settled.is_some_and(|settled| now >= settled) {
+            self.settled = None;
+            give_back_program();
         }
         let Some(period) = self.period else {
             return first;

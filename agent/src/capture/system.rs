@@ -15,8 +15,6 @@ use ros2probe_wire::Timestamp;
 
 /// Clock readings that are tried.
 const READINGS: usize = 8;
-/// Bytes of the program's file that are mapped together once it runs.
-const PIECE: u64 = 16 << 10;
 /// Nanoseconds between two clocks that are read at one moment.
 const CLOSE: u64 = 5_000;
 
@@ -170,9 +168,10 @@ pub fn give_back_memory() {
 
 /// Lets go of the program's own pages in memory, most of which are needed once, at the start: reading
 /// the configuration, loading the kernel programs. What runs on is mapped again as it is used, from the
-/// page cache, and little else beside it: the kernel maps 64 KiB around a fault, or what is cached in
-/// one piece up to 2 MiB, but nothing beyond a mapping's end. (A debugger's breakpoints are lost by this;
-/// there are none yet when an agent starts.)
+/// page cache, and nothing beside it: the kernel maps 64 KiB around a fault, or what is cached in one
+/// piece up to 2 MiB, but nothing beyond a mapping's end. So each page becomes a mapping of its own, which
+/// costs the kernel 192 bytes. (A debugger's breakpoints are lost by this; there are none yet when an
+/// agent starts.)
 pub fn give_back_program() {
     // SAFETY: the function is one for this purpose and takes no data.
     unsafe { libc::dl_iterate_phdr(Some(give_back_segments), ptr::null_mut()) };
@@ -198,12 +197,11 @@ unsafe extern "C" fn give_back_segments(
         let start = (info.dlpi_addr + header.p_vaddr).next_multiple_of(page);
         let end = (info.dlpi_addr + header.p_vaddr + header.p_memsz) / page * page;
         advise(start, end, libc::MADV_DONTNEED);
-        // Every other piece is left out of core dumps (all are), so that each is a mapping of its own.
-        let piece = PIECE.max(page);
-        let mut at = start.next_multiple_of(2 * piece);
+        // Every other page is left out of core dumps, as all are by default, to part their mappings.
+        let mut at = start;
         while at < end {
-            advise(at, end.min(at + piece), libc::MADV_DONTDUMP);
-            at += 2 * piece;
+            advise(at, at + page, libc::MADV_DONTDUMP);
+            at += 2 * page;
         }
     }
     1
