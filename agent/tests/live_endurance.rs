@@ -189,6 +189,9 @@ fn what_an_overloaded_agent_cannot_take_is_counted_and_what_comes_afterwards_is_
     let began = Instant::now();
     let span = Duration::from_secs(soak::long().map_or(3, |_| 30));
     while began.elapsed() < span {
+        // Their leases are shorter than a long flood.
+        sender.carry(&real.participant())?;
+        sender.carry(&flood.participant())?;
         for _ in 0..200 {
             sender.carry(&flood.sample(1200))?;
         }
