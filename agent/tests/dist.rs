@@ -104,7 +104,13 @@ fn version_help_and_what_is_generated_are_the_same() {
     let version = both(&["--version"]);
     let expected = concat!("rp ", env!("CARGO_PKG_VERSION"), "\n");
     assert_eq!(text(&version.stdout), expected);
-    assert!(text(&both(&["--help"]).stdout).contains("Usage: rp"));
+    // It calls itself what its file is called.
+    let help = [Program::native(), Program::arm()].map(|program| {
+        let help = text(&program.run(&["--help"]).stdout);
+        help.replace(&format!("Usage: {} ", program.file_name()), "Usage: rp ")
+    });
+    assert!(help[0].contains("Usage: rp ["), "{}", help[0]);
+    assert_eq!(help[1], help[0]);
     assert!(both(&["completions", "bash"]).stdout.len() > 1000);
     let checked = both(&["check-config", &data("../config/ros2probe.yaml")]);
     assert!(checked.status.success() && text(&checked.stdout).contains("is good"));

@@ -75,6 +75,11 @@ impl Program {
         self.architecture
     }
 
+    pub fn file_name(&self) -> String {
+        let name = self.path.file_name().unwrap();
+        name.to_string_lossy().into_owned()
+    }
+
     /// Told apart also where both are for one architecture.
     pub fn name(&self) -> String {
         let kind = self
