@@ -7,6 +7,13 @@ SUDO := $(if $(filter 0,$(shell id -u)),,sudo -E)
 HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_')
 NEXTEST := $(shell cargo nextest --version >/dev/null 2>&1 && echo yes)
 
+# Nothing here is optimized or hidden from Miri: few random cases, and its own directory.
+MIRI := MIRIFLAGS="-Zmiri-strict-provenance -Zmiri-disable-isolation $$MIRI_MORE" PROPTEST_CASES=4 \
+    CARGO_TARGET_DIR=$(TARGET)/miri cargo "+$$(.ci/prerequisites.sh --nightly)" miri test
+MIRI_TESTS := capture::ring:: capture::shm:: capture::order:: capture::whole:: \
+    subscriptions:: model::assembly:: recording::ring::
+MIRI_THREADS := what_is_read_while_another_thread_fills_the_ring subscriptions::tests::
+
 export PATH := $(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
 export LLVM_PREFIX ?= $(if $(wildcard /usr/lib/llvm-22/bin/llvm-strip),/usr/lib/llvm-22,/usr)
 # Comes with Rust and links for both architectures: no cross toolchain.
@@ -83,7 +90,17 @@ fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
 	done) || exit 1; done
 
+miri: ## rings, queues and the walk under Miri, which finds what the compiler may not assume
+	@.ci/prerequisites.sh miri
+	@$(MIRI) --package ros2probe-wire --lib
+	@$(MIRI) --package ros2probe --lib -- $(MIRI_TESTS)
+	@MIRI_MORE=-Zmiri-many-seeds=0..16 $(MIRI) --package ros2probe --lib -- $(MIRI_THREADS)
+
+deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses sources: without network
+	@.ci/prerequisites.sh deny
+	cargo deny check $(DENY)
+
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test ebpf run peers arm dist distcheck bench soak fuzz prerequisites
+.PHONY: help demo test ebpf run peers arm dist distcheck bench soak fuzz miri deny prerequisites

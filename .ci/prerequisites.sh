@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
 #
-#   prerequisites.sh demo|test|dist|ebpf|fuzz...   install what those targets need
+#   prerequisites.sh demo|test|dist|ebpf|fuzz|miri|deny...   install what those targets need
 #   prerequisites.sh types                    install what the dashboards are type-checked with
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
 #
@@ -265,6 +265,22 @@ for need; do
             cargo install cargo-fuzz --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, dist, types, ebpf, fuzz" ;;
+    miri)
+        rust
+        nightly_toolchain
+        cargo "+$(nightly)" miri --version >/dev/null 2>&1 || {
+            say "adding miri to the Rust toolchain $(nightly)"
+            rustup component add miri --toolchain "$(nightly)"
+        }
+        ;;
+    deny)
+        rust
+        cargo deny --version 2>/dev/null | grep -q '^cargo-deny 0\.20\.' || {
+            packages gcc libc6-dev
+            say "installing cargo-deny 0.20.2"
+            cargo install cargo-deny --version 0.20.2 --locked
+        }
+        ;;
+    *) die "prerequisites.sh: $need is none of demo, test, dist, types, ebpf, fuzz, miri, deny" ;;
     esac
 done

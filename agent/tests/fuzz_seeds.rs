@@ -1,5 +1,6 @@
 //! The fuzz targets' entry functions over their seeds and all truncations of them, so that what
-//! fuzzing checks is also checked where there is no fuzzer.
+//! fuzzing checks is also checked where there is no fuzzer. Of the seeds, `found-*` are what fuzzing
+//! came upon: kept for what they reach, and taken as they are.
 
 #![expect(
     clippy::unwrap_used,
@@ -19,13 +20,21 @@ const LENGTH: usize = 2_000;
 
 /// Every seed in a directory, every truncation of it, and every byte of it changed.
 fn run(directory: &str, entry: fn(&[u8])) {
+    run_up_to(LENGTH, directory, entry);
+}
+
+fn run_up_to(length: usize, directory: &str, entry: fn(&[u8])) {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join(directory);
     let mut count = 0;
     for seed in fs::read_dir(directory).unwrap() {
-        let mut bytes = fs::read(seed.unwrap().path()).unwrap();
+        let seed = seed.unwrap();
+        let mut bytes = fs::read(seed.path()).unwrap();
         count += 1;
         entry(&bytes);
-        bytes.truncate(LENGTH);
+        if seed.file_name().to_string_lossy().starts_with("found-") {
+            continue;
+        }
+        bytes.truncate(length);
         for length in 0..bytes.len() {
             entry(&bytes[..length]);
         }
@@ -69,4 +78,25 @@ fn definitions_survive() {
 #[test]
 fn messages_survive() {
     run("fuzz/seeds/message", entry::message);
+}
+
+#[test]
+fn filters_survive() {
+    run("fuzz/seeds/filter", entry::filter);
+}
+
+#[test]
+fn bags_survive() {
+    // Each is written, read, made whole and read again.
+    run_up_to(120, "fuzz/seeds/bag", entry::bag);
+}
+
+#[test]
+fn libraries_survive() {
+    run("fuzz/seeds/library", entry::library);
+}
+
+#[test]
+fn whatever_is_brought_the_model_survives() {
+    run_up_to(400, "fuzz/seeds/model", entry::model);
 }

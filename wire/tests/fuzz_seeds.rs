@@ -1,5 +1,6 @@
 //! The fuzz targets' entry functions over their seeds and all truncations of them, so that what
-//! fuzzing checks is also checked where there is no fuzzer.
+//! fuzzing checks is also checked where there is no fuzzer. Of the seeds, `found-*` are what fuzzing
+//! came upon: kept for what they reach, and taken as they are.
 
 #![expect(
     clippy::unwrap_used,
@@ -18,9 +19,13 @@ fn run(directory: &str, entry: fn(&[u8])) {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join(directory);
     let mut count = 0;
     for seed in fs::read_dir(directory).unwrap() {
-        let mut bytes = fs::read(seed.unwrap().path()).unwrap();
+        let seed = seed.unwrap();
+        let mut bytes = fs::read(seed.path()).unwrap();
         count += 1;
         entry(&bytes);
+        if seed.file_name().to_string_lossy().starts_with("found-") {
+            continue;
+        }
         bytes.truncate(1500);
         for length in 0..bytes.len() {
             entry(&bytes[..length]);
@@ -40,6 +45,7 @@ fn run(directory: &str, entry: fn(&[u8])) {
 #[test]
 fn datagrams_survive_and_the_walk_agrees_with_the_parser() {
     run("tests/data/datagrams", entry::datagram);
+    run("fuzz/seeds/datagram", entry::datagram);
 }
 
 #[test]

@@ -4,22 +4,32 @@
 //! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic,
 //! nothing delivered that was not there, an end, and an end that stays.
 
-use std::io::Cursor;
-use std::sync::LazyLock;
+use std::fs;
+use std::io::{Cursor, Write as _};
+use std::path::Path;
+use std::sync::{Arc, LazyLock};
 
+use ros2probe::bag::info::{Bag, Sort};
+use ros2probe::bag::reindex::{Found, reindex};
+use ros2probe::capture::exact::library;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::ring::block::Frames;
 use ros2probe::capture::shm::cell::Cell;
 use ros2probe::capture::shm::port::Port;
 use ros2probe::capture::shm::segment::{Buffer, Message};
 use ros2probe::capture::shm::verdict::Judge;
-use ros2probe::config::Config;
+use ros2probe::config::{Config, Watch, Watchlist};
+use ros2probe::message::filter::{Filter, Subject};
 use ros2probe::message::{Decoded, Definition, MessageType, Shown, csv, decode, yaml};
+use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::ros2::Dialect;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, Packet, Payload};
 use ros2probe_wire::record::Record;
 use ros2probe_wire::walk::{self, Envelope};
+use zerocopy::FromBytes as _;
 
 /// The block's header, and a frame's with its address.
 const BLOCK_HEADER: usize = 48;
@@ -236,6 +246,207 @@ pub fn message(bytes: &[u8]) {
     };
     if let Ok(part) = &part {
         assert_eq!(csv::line(&part.message, &few), csv::line(message, &few));
+    }
+}
+
+/// A condition, a line, and what it is asked of: a message as [`message`] reads it.
+pub fn filter(bytes: &[u8]) {
+    let mut parts = bytes.splitn(2, |byte| *byte == b'\n');
+    let (Some(condition), Some(rest)) = (parts.next(), parts.next()) else {
+        return;
+    };
+    let Ok(condition) = std::str::from_utf8(condition) else {
+        return;
+    };
+    let columns = condition.chars().count() + 1;
+    let filter = match Filter::parse(condition) {
+        Ok(filter) => filter,
+        Err(error) => return assert!((1..=columns).contains(&error.column), "{error}"),
+    };
+    let asked = |subject| {
+        if let Err(error) = filter.passes(subject) {
+            assert!((1..=columns).contains(&error.column), "{error}");
+        }
+    };
+    asked(Subject::Bytes(rest));
+    let Some((choice, payload)) = rest.split_first() else {
+        return;
+    };
+    let message_type = TYPES.get(usize::from(*choice) % TYPES.len());
+    let message = message_type.map(|found| decode(found, payload, &decode::Limits::default()));
+    if let Some(Ok(Decoded { message, .. })) = &message {
+        asked(Subject::Message(message));
+    }
+}
+
+/// A bag of one file: the first byte chooses how the file is named, the next two are the length of
+/// its metadata.yaml, little-endian, which is left out where that is 0.
+pub fn bag(bytes: &[u8]) {
+    let Some(([choice, low, high], rest)) = bytes.split_first_chunk::<3>() else {
+        return;
+    };
+    let length = usize::from(u16::from_le_bytes([*low, *high]));
+    let Some((metadata, file)) = rest.split_at_checked(length) else {
+        return;
+    };
+    let directory = scratch(|place| tempfile::tempdir_in(place)).expect("a directory");
+    let directory = directory.path();
+    let name = ["a_0.mcap", "a_0.mcap.zstd", "a_0.mcap.lz4"][usize::from(choice % 3)];
+    let path = directory.join(name);
+    fs::write(&path, file).expect("a file");
+    told(&path);
+    if !metadata.is_empty() {
+        fs::write(directory.join("metadata.yaml"), metadata).expect("a file");
+        told(directory);
+    }
+    let Ok(report) = reindex(directory) else {
+        return;
+    };
+    let [of_file] = report.files.as_slice() else {
+        panic!("one file, and {report:?}");
+    };
+    assert!(!path.with_extension("mcap.part").exists());
+    // What was made whole is whole, and says the same again.
+    told(directory);
+    let again = reindex(directory).expect("what was written");
+    assert_eq!(again.metadata.message_count, report.metadata.message_count);
+    assert_eq!(again.metadata.topics, report.metadata.topics);
+    for file in &again.files {
+        let is_same = file.messages == of_file.messages;
+        assert!(
+            is_same && !matches!(file.found, Found::Unfinished { .. }),
+            "{file:?}"
+        );
+    }
+}
+
+/// All that is told of a bag or a file.
+fn told(path: &Path) {
+    let Ok(bag) = Bag::open(path) else { return };
+    let details = bag.details().ok();
+    for (dialect, sort) in [
+        (Dialect::Humble, Sort::Type),
+        (Dialect::Jazzy, Sort::Name),
+        (Dialect::Kilted, Sort::Count),
+    ] {
+        assert!(bag.text(dialect, sort, details.as_ref()).ends_with('\n'));
+        let names = bag.names(dialect, sort);
+        assert!(names.is_empty() || names.ends_with('\n'));
+    }
+}
+
+/// Makes something of files, in memory where there is such a place.
+fn scratch<T>(make: impl Fn(&Path) -> std::io::Result<T>) -> std::io::Result<T> {
+    make(Path::new("/dev/shm")).or_else(|_| make(&std::env::temp_dir()))
+}
+
+/// A library that a process has loaded.
+pub fn library(bytes: &[u8]) {
+    let mut file = scratch(|place| tempfile::tempfile_in(place)).expect("a file");
+    file.write_all(bytes).expect("room");
+    if let Ok(entry) = library::find(&file) {
+        assert!(entry.offset <= bytes.len() as u64);
+    }
+}
+
+/// What a source brings the model, one thing after the other: kind, time since the one before in
+/// 10 ms, length (little-endian), and so many bytes.
+pub fn model(bytes: &[u8]) {
+    const START: u64 = 1_795_143_000_000_000_000;
+    const STEP: u64 = 10_000_000;
+    let mut observer = small_observer();
+    let mut now = START;
+    let mut rest = bytes;
+    observer.advance(Timestamp(now));
+    while let Some(([kind, wait, low, high], behind)) = rest.split_first_chunk::<4>() {
+        let length = usize::from(u16::from_le_bytes([*low, *high])).min(behind.len());
+        let (content, behind) = behind.split_at(length);
+        rest = behind;
+        // A clock may also be set back.
+        now = match wait {
+            0xff => now.saturating_sub(5 * STEP),
+            wait => now + u64::from(*wait) * STEP,
+        };
+        observer.advance(Timestamp(now));
+        brought(&mut observer, *kind, now, content);
+        observer.interest_changes();
+        observer.take_given();
+    }
+    let memory = observer.memory();
+    observer.settle();
+    let snapshot = observer.snapshot(Timestamp(now));
+    assert!(snapshot.participants.len() <= SMALL.participants);
+    assert!(snapshot.nodes.len() <= SMALL.nodes);
+    assert!(snapshot.unknown_writers.len() <= SMALL.unknown_writers);
+    for table in &snapshot.tables {
+        assert!(table.size <= table.limit, "{table:?}");
+    }
+    let endpoints = snapshot.topics.iter();
+    let endpoints = endpoints.map(|topic| topic.publishers.len() + topic.subscriptions.len());
+    assert!(endpoints.sum::<usize>() <= SMALL.endpoints);
+    observer.take_events();
+    observer.take_spans();
+    // What is remembered can be taken back, as far as it is believed.
+    let mut after = small_observer();
+    after.restore(&memory, Timestamp(now));
+    assert!(after.memory().participants.len() <= memory.participants.len());
+}
+
+/// Few of everything, so that what happens at the caps happens soon.
+const SMALL: Settings = Settings {
+    participants: 3,
+    endpoints: 8,
+    nodes: 4,
+    topics: 2,
+    unknown_writers: 2,
+    deliveries: 4,
+    interest: 12,
+    sample_bytes: 1 << 12,
+    payload_bytes: 1 << 14,
+    topic_grace: 1_000_000_000,
+    directed: true,
+};
+
+fn small_observer() -> Observer {
+    let mut observer = Observer::new(SMALL);
+    let watches = ["/**", "/a"].map(|pattern| Watch::named(pattern).expect("a pattern"));
+    let watchlist = Watchlist::new(watches.to_vec());
+    observer.set_watchlist(watchlist.expect("patterns"));
+    observer.set_wishes(Arc::new(vec![Wish {
+        id: 1,
+        selection: Arc::new(Selection::all()),
+        domain_id: None,
+        depth: Depth::Payloads,
+    }]));
+    observer
+}
+
+fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
+    let envelope = Envelope {
+        time: now,
+        destination: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 239, 255, 0, 1],
+        destination_port: 7400 + u16::from(kind >> 4),
+        source_port: 40_000,
+        host: kind & 8 != 0,
+        socket: u64::from(kind >> 6),
+        ..Envelope::default()
+    };
+    match kind & 7 {
+        0 | 1 => observer.datagram(&envelope, content, None),
+        2 => observer.shared_memory(&envelope, content),
+        3 => observer.cut_datagram(&envelope, content, u32::from(kind) * 8),
+        4 => observer.announcements(&envelope, content, |observer, record| {
+            observer.record(&record);
+        }),
+        // As the kernel's programs write them, of whatever was sent.
+        _ => {
+            if let Ok((record, _)) = Record::read_from_prefix(content) {
+                observer.record(&Record {
+                    time: now,
+                    ..record
+                });
+            }
+        }
     }
 }
 

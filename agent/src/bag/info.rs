@@ -270,7 +270,7 @@ pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
     let (start, end) = contents
         .times
         .unwrap_or((metadata::NO_START, metadata::NO_START));
-    let message_count = contents.counts.values().sum();
+    let message_count = contents.messages();
     let topics = contents.channels.values().map(|channel| {
         let of_channel = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
         let schema = contents.schemas.get(&channel.schema_id);
@@ -364,10 +364,10 @@ impl<'a> Parts<'a> {
             if dialect > Dialect::Jazzy
                 && let Some(part) = of_action()
             {
-                parts.apart += topic.message_count;
+                parts.apart = parts.apart.saturating_add(topic.message_count);
                 parts.action(topic, part);
             } else if dialect > Dialect::Humble && is_event {
-                parts.apart += topic.message_count;
+                parts.apart = parts.apart.saturating_add(topic.message_count);
                 parts.services.push(topic);
             } else {
                 parts.topics.push(topic);
@@ -386,7 +386,7 @@ impl<'a> Parts<'a> {
                 Sort::Type => parts.actions.sort_by(|a, b| a.type_name.cmp(&b.type_name)),
                 Sort::Count => parts
                     .actions
-                    .sort_by_key(|action| action.counts.iter().sum::<u64>()),
+                    .sort_by_key(|action| action.counts.map(u128::from).iter().sum::<u128>()),
             }
         }
         parts
@@ -409,7 +409,7 @@ impl<'a> Parts<'a> {
         });
         if let Some(action) = self.actions.get_mut(at) {
             if let Some(count) = action.counts.get_mut(part) {
-                *count += topic.message_count;
+                *count = count.saturating_add(topic.message_count);
             }
             if !type_suffix.is_empty()
                 && let Some(type_name) = topic.type_name.strip_suffix(type_suffix)

@@ -104,6 +104,13 @@ impl Contents {
         Ok(scan.contents)
     }
 
+    /// Messages of all channels. A summary may say any numbers.
+    pub(super) fn messages(&self) -> u64 {
+        self.counts
+            .values()
+            .fold(0, |sum, count| sum.saturating_add(*count))
+    }
+
     pub(super) fn take(&mut self, opcode: Opcode, content: &[u8]) {
         match opcode {
             Opcode::SCHEMA => {

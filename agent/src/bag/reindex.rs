@@ -103,7 +103,7 @@ pub fn reindex(directory: &Path) -> Result<Report, ReindexError> {
         }
         reports.push(FileReport {
             name: name.clone(),
-            messages: contents.map_or(0, |contents| contents.counts.values().sum()),
+            messages: contents.map_or(0, |contents| contents.messages()),
             found,
         });
     }
@@ -307,7 +307,7 @@ fn metadata_of(
                     ..topic.clone()
                 };
             }
-            known.message_count += topic.message_count;
+            known.message_count = known.message_count.saturating_add(topic.message_count);
         }
         said.get_or_insert(part);
     }
@@ -335,9 +335,11 @@ fn metadata_of(
     Metadata {
         version,
         storage_identifier: "mcap".to_owned(),
-        duration: times.map_or(0, |(start, end)| end - start),
+        duration: times.map_or(0, |(start, end)| end.saturating_sub(start)),
         starting_time: times.map_or(metadata::NO_START, |(start, _)| start),
-        message_count: topics.values().map(|topic| topic.message_count).sum(),
+        message_count: topics
+            .values()
+            .fold(0, |sum, topic| sum.saturating_add(topic.message_count)),
         topics: topics.into_values().collect(),
         compression_format: compression.name().to_owned(),
         compression_mode: match compression {

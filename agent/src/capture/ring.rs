@@ -5,22 +5,25 @@
 //! it is bound to no interface, so that interfaces which appear later are seen as well. It never
 //! sends. Which frames are kept, and how much of each, is the filter's verdict and not decided here.
 //!
-//! Kernel memory is touched in this module only: a [`Block`] is lent to its reader and goes back to
-//! the kernel when it is dropped. What is in a block is read by [`block`] as plain bytes.
+//! Kernel memory is touched here and in [`turns`] only: a [`Block`] is lent to its reader and goes
+//! back to the kernel when it is dropped. What is in a block is read by [`block`] as plain bytes.
 
 pub mod block;
+mod turns;
 
 use std::ffi::c_void;
 use std::io;
 use std::mem::{size_of, size_of_val};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 use std::ptr::NonNull;
-use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
 
 use libc::{c_int, socklen_t};
 
+use turns::Turns;
+
 pub use block::{Frames, RingFrame};
+pub use turns::Block;
 
 /// The kernel wants a frame size in TPACKET_V3 too, but packs frames as tightly as they fit.
 const NOMINAL_FRAME: usize = 2048;
@@ -108,20 +111,10 @@ pub enum RingError {
 #[derive(Debug)]
 pub struct Ring {
     // Fields are dropped in this order: the memory is given back before the socket is closed.
-    memory: Mapping,
+    turns: Turns,
+    _memory: Mapping,
     socket: OwnedFd,
-    block_size: usize,
-    blocks: usize,
-    /// Block that the kernel will hand over next.
-    next: usize,
     statistics: Statistics,
-}
-
-/// A block of frames on loan from the kernel. Frames are dropped while the reader keeps all blocks,
-/// so it should not be kept for long.
-#[derive(Debug)]
-pub struct Block<'a> {
-    ring: &'a mut Ring,
 }
 
 impl Ring {
@@ -174,12 +167,14 @@ impl Ring {
             "PACKET_RX_RING",
         )?;
         let memory = Mapping::new(&socket, block_size * settings.blocks)?;
+        // SAFETY: as many blocks are mapped, from the beginning of a page on, whole pages each, until
+        // the mapping is dropped, behind `turns` and together with it. The other side is the kernel,
+        // which keeps to the protocol of TPACKET_V3.
+        let turns = unsafe { Turns::new(memory.start.cast(), block_size, settings.blocks) };
         let ring = Self {
-            memory,
+            turns,
+            _memory: memory,
             socket,
-            block_size,
-            blocks: settings.blocks,
-            next: 0,
             statistics: Statistics::default(),
         };
         bind(&ring.socket, interface)?;
@@ -189,18 +184,12 @@ impl Ring {
     /// How many blocks there are.
     #[must_use]
     pub const fn blocks(&self) -> usize {
-        self.blocks
+        self.turns.blocks()
     }
 
     /// The next block if the kernel is done with it.
     pub fn block(&mut self) -> Option<Block<'_>> {
-        // Acquire: pairs with the write barrier between the kernel's last write to the block and
-        // its status (net/packet/af_packet.c, prb_flush_block).
-        let status = self.status().load(Ordering::Acquire);
-        if status & libc::TP_STATUS_USER == 0 {
-            return None;
-        }
-        Some(Block { ring: self })
+        self.turns.block()
     }
 
     /// Waits until a block is ready; `false` when the time is over or a signal came.
@@ -270,51 +259,11 @@ impl Ring {
         self.statistics.freezes += u64::from(fresh.tp_freeze_q_cnt);
         Ok(self.statistics)
     }
-
-    /// The word by which the next block changes hands.
-    fn status(&self) -> &AtomicU32 {
-        let offset = self.next * self.block_size + block::STATUS;
-        // SAFETY: `next < blocks`, so the word lies within the mapping, which is `blocks` times
-        // `block_size` long and page-aligned (and STATUS a multiple of 4).
-        let word = unsafe { self.memory.start.byte_add(offset) };
-        // SAFETY: aligned and mapped as above, for as long as `self` lives. Kernel and user space
-        // both access it as one 32-bit word; the kernel does not write it while we own the block.
-        unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) }
-    }
 }
 
 impl AsFd for Ring {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.socket.as_fd()
-    }
-}
-
-impl Block<'_> {
-    /// The frames in it.
-    #[must_use]
-    pub fn frames(&self) -> Frames<'_> {
-        Frames::new(self.bytes())
-    }
-
-    fn bytes(&self) -> &[u8] {
-        let offset = self.ring.next * self.ring.block_size;
-        // SAFETY: `next < blocks`, so the block lies within the mapping.
-        let start = unsafe { self.ring.memory.start.byte_add(offset) };
-        // SAFETY: the block is mapped for as long as the ring lives, which this borrows. It belongs
-        // to user space since `Ring::block` saw TP_STATUS_USER, and until our Drop the kernel
-        // writes nothing into it; nor do we. Any bytes are valid `u8`.
-        unsafe { std::slice::from_raw_parts(start.cast().as_ptr(), self.ring.block_size) }
-    }
-}
-
-impl Drop for Block<'_> {
-    fn drop(&mut self) {
-        // Release: our reads of the block come before the kernel's writes. Pairs with the read
-        // barrier after the status in net/packet/af_packet.c, prb_dispatch_next_block.
-        self.ring
-            .status()
-            .store(libc::TP_STATUS_KERNEL, Ordering::Release);
-        self.ring.next = (self.ring.next + 1) % self.ring.blocks;
     }
 }
 

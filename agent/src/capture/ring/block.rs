@@ -158,7 +158,7 @@ fn size(value: u32) -> usize {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use proptest::prelude::*;
 
     use super::*;
@@ -167,13 +167,19 @@ mod tests {
         block[at..at + 4].copy_from_slice(&value.to_ne_bytes());
     }
 
-    /// Two frames of 5 and 7 bytes, as the kernel lays them out.
+    /// Two frames of 5 and 7 bytes.
     fn block() -> Vec<u8> {
+        block_of(&[b"first", b"another"])
+    }
+
+    /// Frames as the kernel lays them out; the last one with a VLAN tag.
+    pub(in crate::capture::ring) fn block_of(frames: &[&[u8]]) -> Vec<u8> {
         let mut block = vec![0; 48];
         put(&mut block, STATUS, libc::TP_STATUS_USER);
-        put(&mut block, COUNT, 2);
+        put(&mut block, COUNT, u32::try_from(frames.len()).unwrap());
         put(&mut block, FIRST, 48);
-        for (number, bytes, last) in [(1_u8, &b"first"[..], false), (2, b"another", true)] {
+        for (number, bytes) in (1_u32..).zip(frames) {
+            let last = number == u32::try_from(frames.len()).unwrap();
             let at = block.len();
             let start = 48 + 32;
             let step = (start + bytes.len()).next_multiple_of(16);
@@ -186,7 +192,7 @@ mod tests {
             };
             put(header, offset_of!(tpacket3_hdr, tp_next_offset), next);
             put(header, offset_of!(tpacket3_hdr, tp_sec), 1_700_000_000);
-            put(header, offset_of!(tpacket3_hdr, tp_nsec), u32::from(number));
+            put(header, offset_of!(tpacket3_hdr, tp_nsec), number);
             put(
                 header,
                 offset_of!(tpacket3_hdr, tp_snaplen),
@@ -203,7 +209,7 @@ mod tests {
             }
             header[24..26].copy_from_slice(&u16::try_from(start).unwrap().to_ne_bytes());
             header[ADDRESS + 2..ADDRESS + 4].copy_from_slice(&[0x08, 0x00]);
-            put(header, ADDRESS + 4, u32::from(number) + 10);
+            put(header, ADDRESS + 4, number + 10);
             header[ADDRESS + 10] = 4;
             header[start..start + bytes.len()].copy_from_slice(bytes);
         }

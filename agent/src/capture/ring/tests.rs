@@ -166,13 +166,13 @@ fn asking_for_a_block_that_is_not_ready_changes_nothing() {
         for _ in 0..7 {
             assert!(ring.block().is_none());
         }
-        assert_eq!(ring.next, 0);
+        assert_eq!(ring.turns.next(), 0);
         assert!(!ring.wait(Duration::from_millis(1)).unwrap());
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         socket.send_to(b"RTPS", "127.0.0.1:7400").unwrap();
         let seen = sent_until(&mut ring, |payloads| !payloads.is_empty());
         assert_eq!(seen, [(1, b"RTPS".to_vec())]);
-        assert_eq!(ring.next, 1);
+        assert_eq!(ring.turns.next(), 1);
     });
 }
 

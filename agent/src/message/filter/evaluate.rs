@@ -299,14 +299,22 @@ fn binary<'a>(
         return Err(format!("cannot calculate with '{left}' and '{right}'"));
     };
     if let (Number::Int(one), Number::Int(other)) = (one, other) {
+        let remainder = |one: i128, other: i128| {
+            let remainder = one.wrapping_rem(other);
+            // Its sign is the divisor's, so the sum of both is nearer to 0 than either.
+            let differs = remainder != 0 && (remainder < 0) != (other < 0);
+            if differs {
+                remainder + other
+            } else {
+                remainder
+            }
+        };
         let floor = |one: i128, other: i128| {
             let quotient = one.checked_div(other)?;
-            let exact = quotient * other == one;
-            Some(if exact || (one < 0) == (other < 0) {
-                quotient
-            } else {
-                quotient - 1
-            })
+            let rest = one.wrapping_rem(other);
+            // With a rest, the divisor is at least 2, and there is room below the quotient.
+            let below = rest != 0 && (rest < 0) != (other < 0);
+            Some(quotient - i128::from(below))
         };
         if other == 0
             && matches!(
@@ -321,9 +329,7 @@ fn binary<'a>(
             Operator::Subtract => one.checked_sub(other),
             Operator::Multiply => one.checked_mul(other),
             Operator::FloorDivide => floor(one, other),
-            Operator::Remainder => {
-                floor(one, other).and_then(|quotient| one.checked_sub(quotient * other))
-            }
+            Operator::Remainder => Some(remainder(one, other)),
             Operator::Power if other >= 0 => u32::try_from(other)
                 .ok()
                 .and_then(|other| one.checked_pow(other)),

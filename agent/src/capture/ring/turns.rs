@@ -1,0 +1,230 @@
+//! Whose turn it is: the blocks of a ring, one after the other, each passed to and fro between the
+//! kernel and its reader by one word.
+//!
+//! Knows no socket and no system call: over plain memory, with a thread in the kernel's place, it
+//! does the same, which is how the tests run it under Miri.
+
+use std::ptr::NonNull;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use super::block::{Frames, STATUS};
+
+/// The blocks, and which of them comes next.
+#[derive(Debug)]
+pub(super) struct Turns {
+    start: NonNull<u8>,
+    block_size: usize,
+    blocks: usize,
+    /// Block that the kernel will hand over next.
+    next: usize,
+}
+
+/// A block of frames on loan from the kernel. Frames are dropped while the reader keeps all blocks,
+/// so it should not be kept for long.
+#[derive(Debug)]
+pub struct Block<'a> {
+    turns: &'a mut Turns,
+}
+
+// SAFETY: whoever made it has said that the memory is there for as long as it is; it is reached
+// through this value only, and no thread has a claim to it.
+unsafe impl Send for Turns {}
+
+impl Turns {
+    /// Blocks that lie one behind the other from `start` on.
+    ///
+    /// # Safety
+    /// `start` is aligned to 8, `block_size` a multiple of that and at least a block's header, and
+    /// `blocks`, not 0, times `block_size` bytes are mapped for as long as the value lives. Nobody
+    /// but the other side touches them, and that writes into a block only while its status does not
+    /// have `TP_STATUS_USER`, after having read that with acquire, and before setting it with
+    /// release.
+    pub(super) const unsafe fn new(start: NonNull<u8>, block_size: usize, blocks: usize) -> Self {
+        Self {
+            start,
+            block_size,
+            blocks,
+            next: 0,
+        }
+    }
+
+    /// How many blocks there are.
+    pub(super) const fn blocks(&self) -> usize {
+        self.blocks
+    }
+
+    /// Which block comes next.
+    #[cfg(test)]
+    pub(super) const fn next(&self) -> usize {
+        self.next
+    }
+
+    /// The next block if the kernel is done with it.
+    pub(super) fn block(&mut self) -> Option<Block<'_>> {
+        // Acquire: pairs with the write barrier between the kernel's last write to the block and
+        // its status (net/packet/af_packet.c, prb_flush_block).
+        let status = self.status().load(Ordering::Acquire);
+        if status & libc::TP_STATUS_USER == 0 {
+            return None;
+        }
+        Some(Block { turns: self })
+    }
+
+    /// Where the next block begins.
+    fn start(&self) -> NonNull<u8> {
+        // SAFETY: `next < blocks`, so the block lies within the memory that `new` was told of.
+        unsafe { self.start.byte_add(self.next * self.block_size) }
+    }
+
+    /// The word by which the next block changes hands.
+    fn status(&self) -> &AtomicU32 {
+        // SAFETY: a block is longer than its header, which has the word (STATUS, a multiple of 4).
+        let word = unsafe { self.start().byte_add(STATUS) };
+        // SAFETY: aligned and mapped as `new` was told, for as long as `self` lives. Kernel and user
+        // space both access it as one 32-bit word; the kernel does not write it while we own the
+        // block.
+        unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) }
+    }
+}
+
+impl Block<'_> {
+    /// The frames in it.
+    #[must_use]
+    pub fn frames(&self) -> Frames<'_> {
+        Frames::new(self.bytes())
+    }
+
+    fn bytes(&self) -> &[u8] {
+        let start = self.turns.start();
+        // SAFETY: the block is mapped for as long as the ring lives, which this borrows. It belongs
+        // to user space since `Turns::block` saw TP_STATUS_USER, and until our Drop the kernel
+        // writes nothing into it; nor do we. Any bytes are valid `u8`.
+        unsafe { std::slice::from_raw_parts(start.as_ptr(), self.turns.block_size) }
+    }
+}
+
+impl Drop for Block<'_> {
+    fn drop(&mut self) {
+        // Release: our reads of the block come before the kernel's writes. Pairs with the read
+        // barrier after the status in net/packet/af_packet.c, prb_dispatch_next_block.
+        self.turns
+            .status()
+            .store(libc::TP_STATUS_KERNEL, Ordering::Release);
+        self.turns.next = (self.turns.next + 1) % self.turns.blocks;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::thread;
+
+    use super::*;
+    use crate::capture::ring::block::tests::block_of;
+
+    const BLOCK: usize = 512;
+    const BLOCKS: usize = 3;
+
+    /// Memory of a ring, as words so that it is aligned.
+    struct Memory(NonNull<u8>);
+
+    // SAFETY: plain memory; what is done to it is what the test is about.
+    unsafe impl Send for Memory {}
+
+    impl Memory {
+        const WORDS: usize = BLOCK * BLOCKS / 8;
+
+        fn new() -> Self {
+            let words = vec![0_u64; Self::WORDS].into_boxed_slice();
+            Self(NonNull::new(Box::into_raw(words).cast()).unwrap())
+        }
+
+        fn turns(&self) -> Turns {
+            // SAFETY: as long and as aligned as said, and every test frees it last.
+            unsafe { Turns::new(self.0, BLOCK, BLOCKS) }
+        }
+
+        /// What the kernel does: waits for its turn, fills the block, gives it away.
+        fn fill(&self, index: usize, bytes: &[u8]) {
+            // SAFETY: within the memory.
+            let block = unsafe { self.0.byte_add(index * BLOCK) };
+            // SAFETY: likewise.
+            let word = unsafe { block.byte_add(STATUS) };
+            // SAFETY: aligned, and accessed as an atomic by both sides.
+            let status = unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) };
+            while status.load(Ordering::Acquire) & libc::TP_STATUS_USER != 0 {
+                thread::yield_now();
+            }
+            let (head, tail) = (&bytes[..STATUS], &bytes[STATUS + 4..]);
+            // SAFETY: the block is the kernel's, and the reader has let go of it.
+            unsafe { block.copy_from_nonoverlapping(NonNull::from(head).cast(), head.len()) };
+            // SAFETY: within the block, behind the status.
+            let behind = unsafe { word.byte_add(4) };
+            // SAFETY: as above.
+            unsafe { behind.copy_from_nonoverlapping(NonNull::from(tail).cast(), tail.len()) };
+            status.store(libc::TP_STATUS_USER, Ordering::Release);
+        }
+
+        /// After everything that was made of it.
+        fn free(self) {
+            let words = std::ptr::slice_from_raw_parts_mut(self.0.cast().as_ptr(), Self::WORDS);
+            // SAFETY: from `new`, and nobody has it any more.
+            drop(unsafe { Box::<[u64]>::from_raw(words) });
+        }
+    }
+
+    fn payload(number: u8) -> Vec<u8> {
+        vec![number; usize::from(number % 7) * 9 + 1]
+    }
+
+    /// The frames of the next block, waited for.
+    fn next(turns: &mut Turns) -> Vec<Vec<u8>> {
+        loop {
+            if let Some(block) = turns.block() {
+                return block.frames().map(|frame| frame.bytes.to_vec()).collect();
+            }
+            thread::yield_now();
+        }
+    }
+
+    #[test]
+    fn a_block_is_the_readers_until_it_is_dropped_and_then_the_next_ones_turn_comes() {
+        let memory = Memory::new();
+        let mut turns = memory.turns();
+        assert!(turns.block().is_none());
+        memory.fill(0, &block_of(&[b"first"]));
+        memory.fill(1, &block_of(&[b"second", b"third"]));
+        assert_eq!(next(&mut turns), [b"first"]);
+        assert_eq!(next(&mut turns), [&b"second"[..], b"third"]);
+        assert!(turns.block().is_none());
+        // Not the first again: the third is next, and only then the first.
+        memory.fill(0, &block_of(&[b"again"]));
+        assert!(turns.block().is_none());
+        memory.fill(2, &block_of(&[]));
+        assert!(next(&mut turns).is_empty());
+        assert_eq!(next(&mut turns), [b"again"]);
+        memory.free();
+    }
+
+    #[test]
+    fn what_is_read_while_another_thread_fills_the_ring_is_what_it_wrote() {
+        const NUMBERS: u8 = if cfg!(miri) { 12 } else { 240 };
+        let memory = Memory::new();
+        let mut turns = memory.turns();
+        thread::scope(|scope| {
+            let kernel = Memory(memory.0);
+            scope.spawn(move || {
+                // All of it, not only the pointer in it.
+                let kernel = kernel;
+                for number in 0..NUMBERS {
+                    let bytes = block_of(&[&payload(number), b"", &payload(number ^ 1)]);
+                    kernel.fill(usize::from(number) % BLOCKS, &bytes);
+                }
+            });
+            for number in 0..NUMBERS {
+                let expected = [payload(number), Vec::new(), payload(number ^ 1)];
+                assert_eq!(next(&mut turns), expected);
+            }
+        });
+        memory.free();
+    }
+}
