@@ -88,7 +88,7 @@ fn filters_survive() {
 #[test]
 fn bags_survive() {
     // Each is written, read, made whole and read again.
-    run_up_to(120, "fuzz/seeds/bag", entry::bag);
+    run_up_to(120, "fuzz/seeds/bag_file", entry::bag_file);
 }
 
 #[test]

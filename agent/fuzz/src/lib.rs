@@ -281,7 +281,7 @@ pub fn filter(bytes: &[u8]) {
 
 /// A bag of one file: the first byte chooses how the file is named, the next two are the length of
 /// its metadata.yaml, little-endian, which is left out where that is 0.
-pub fn bag(bytes: &[u8]) {
+pub fn bag_file(bytes: &[u8]) {
     let Some(([choice, low, high], rest)) = bytes.split_first_chunk::<3>() else {
         return;
     };
