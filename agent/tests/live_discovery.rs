@@ -10,6 +10,7 @@
 mod harness;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::panic::resume_unwind;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -60,35 +61,43 @@ fn an_agent_that_starts_after_half_of_the_rust_dds_nodes_shows_all() -> Result<(
 
 #[test]
 fn a_late_agent_shows_writers_it_cannot_name_with_their_rate() -> Result<()> {
-    for stack in Stack::ALL {
-        let link = Link::new()?;
-        let stream = Stream {
-            rate: 100.0,
-            ..Stream::small(1500)
-        };
-        let (mut publisher, _subscriber) = talking(&link, stack, &stream)?;
-        std::thread::sleep(Duration::from_secs(1));
-        let watcher = Watcher::start(&link.monitor)?;
-        let unknown = |page: &Scrape| page.sum("ros2_unknown_writers", &[]) == 1.0;
-        watcher.wait(unknown, PATIENCE, "an unknown writer")?;
+    // Each on a link of its own, so none has to wait for the others.
+    std::thread::scope(|scope| {
+        let stacks = Stack::ALL.map(|stack| scope.spawn(move || late_agent_shows_rate(stack)));
+        stacks
+            .into_iter()
+            .try_for_each(|stack| stack.join().unwrap_or_else(|panic| resume_unwind(panic)))
+    })
+}
 
-        let log = publisher.log()?;
-        let guid = log.endpoints().find_map(|endpoint| endpoint.guid.clone());
-        let guid = guid.context("no GUID in the log")?;
-        let writer = format!("{}.{}", &guid[..24], &guid[24..]);
-        let count = || -> Result<f64> {
-            let page = watcher.agent.scrape()?;
-            let writer = [("writer", writer.as_str())];
-            let count = page.value("ros2_unknown_writer_messages_total", &writer);
-            count.with_context(|| format!("no {writer:?} in {}", page.0))
-        };
-        let before = (count()?, Instant::now());
-        std::thread::sleep(Duration::from_secs(5));
-        let rate = (count()? - before.0) / before.1.elapsed().as_secs_f64();
-        // Counts are as old as the snapshot: up to a second of five.
-        assert!((70.0..130.0).contains(&rate), "{stack:?}: {rate} Hz");
-        publisher.process.terminate()?;
-    }
+fn late_agent_shows_rate(stack: Stack) -> Result<()> {
+    let link = Link::new()?;
+    let stream = Stream {
+        rate: 100.0,
+        ..Stream::small(1500)
+    };
+    let (mut publisher, _subscriber) = talking(&link, stack, &stream)?;
+    std::thread::sleep(Duration::from_secs(1));
+    let watcher = Watcher::start(&link.monitor)?;
+    let unknown = |page: &Scrape| page.sum("ros2_unknown_writers", &[]) == 1.0;
+    watcher.wait(unknown, PATIENCE, "an unknown writer")?;
+
+    let log = publisher.log()?;
+    let guid = log.endpoints().find_map(|endpoint| endpoint.guid.clone());
+    let guid = guid.context("no GUID in the log")?;
+    let writer = format!("{}.{}", &guid[..24], &guid[24..]);
+    let count = || -> Result<f64> {
+        let page = watcher.agent.scrape()?;
+        let writer = [("writer", writer.as_str())];
+        let count = page.value("ros2_unknown_writer_messages_total", &writer);
+        count.with_context(|| format!("no {writer:?} in {}", page.0))
+    };
+    let before = (count()?, Instant::now());
+    std::thread::sleep(Duration::from_secs(5));
+    let rate = (count()? - before.0) / before.1.elapsed().as_secs_f64();
+    // Counts are as old as the snapshot: up to a second of five.
+    assert!((70.0..130.0).contains(&rate), "{stack:?}: {rate} Hz");
+    publisher.process.terminate()?;
     Ok(())
 }
 
