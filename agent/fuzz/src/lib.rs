@@ -302,9 +302,8 @@ pub fn bag_file(bytes: &[u8]) {
     let Ok(report) = reindex(directory) else {
         return;
     };
-    let [of_file] = report.files.as_slice() else {
-        panic!("one file, and {report:?}");
-    };
+    assert_eq!(report.files.len(), 1);
+    let of_file = &report.files[0];
     assert!(!path.with_extension("mcap.part").exists());
     // What was made whole is whole, and says the same again.
     told(directory);
