@@ -55,6 +55,11 @@ fn expressions_mean_what_they_mean_in_python() {
             "m.n // 2 == -2 and m.n % 2 == 1 and m.n / 2 == -1.5 and 7.5 // 2 == 3",
             true,
         ),
+        // The smallest number there is here.
+        (
+            "-(2 ** 126) * 2 % 3 == 1 and -(2 ** 126) * 2 // 3 < -(2 ** 125)",
+            true,
+        ),
         (
             "1 + 2 * 3 == 7 and (1 + 2) * 3 == 9 and 2 ** 3 ** 2 == 512",
             true,
