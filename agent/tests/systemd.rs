@@ -63,7 +63,7 @@ fn every_test_that_the_threat_model_names_is_there() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let mut sources = String::new();
     for directory in ["agent/src", "agent/tests", "wire/src", "wire/tests"] {
-        read_sources(&root.join(directory), &mut sources);
+        read_sources(&root.join(directory), &mut sources).unwrap();
     }
     let model = std::fs::read_to_string(root.join("SECURITY.md")).unwrap();
     let quoted = model.split('`').skip(1).step_by(2);
@@ -91,15 +91,16 @@ fn every_test_that_the_threat_model_names_is_there() {
     }
 }
 
-fn read_sources(directory: &Path, into: &mut String) {
-    for entry in std::fs::read_dir(directory).unwrap() {
-        let path = entry.unwrap().path();
+fn read_sources(directory: &Path, into: &mut String) -> std::io::Result<()> {
+    for entry in std::fs::read_dir(directory)? {
+        let path = entry?.path();
         if path.is_dir() {
-            read_sources(&path, into);
+            read_sources(&path, into)?;
         } else if path.extension().is_some_and(|extension| extension == "rs") {
-            into.push_str(&std::fs::read_to_string(path).unwrap());
+            into.push_str(&std::fs::read_to_string(path)?);
         }
     }
+    Ok(())
 }
 
 #[test]
