@@ -262,7 +262,8 @@ impl Reception {
     ) -> Outcome {
         let number = record.sequence_number;
         let now = Timestamp(record.time);
-        if self.sequence.has(number) {
+        // Sequence numbers are signed (RTPS 2.5, 9.3.2): beyond is none.
+        if self.sequence.has(number) || number > u64::MAX >> 1 {
             return Outcome::Again;
         }
         let progress = self.samples.fragment(record, now, budget);

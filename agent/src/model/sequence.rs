@@ -180,7 +180,7 @@ impl Sequence {
 
     /// A sample of this number exists, for some of its fragments came.
     pub fn exists(&mut self, number: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
-        if self.started() && number >= self.next {
+        if self.started() && number >= self.next && number <= u64::MAX >> 1 {
             self.extend(number, number + 1, now, settled);
         }
     }

@@ -215,6 +215,20 @@ fn a_forged_jump_is_not_a_million_losses() {
 }
 
 #[test]
+fn a_fragment_of_a_number_that_cannot_be_loses_nothing() {
+    for number in [(u64::MAX >> 1) + 1, u64::MAX - 1, u64::MAX] {
+        let mut bench = Bench::default();
+        bench.receive([1, 2]);
+        let mut decided = 0;
+        let now = Timestamp(bench.now);
+        bench.sequence.exists(number, now, &mut |_| decided += 1);
+        assert_eq!((decided, bench.sequence.next()), (0, 3));
+        bench.receive([3]).wait(3);
+        assert!(bench.lost.is_empty() && bench.duplicates.is_empty());
+    }
+}
+
+#[test]
 fn more_undecided_than_the_window_holds_is_decided_at_once() {
     let mut bench = Bench::default();
     bench.receive([1, 200_000]);
