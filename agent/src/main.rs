@@ -99,7 +99,10 @@ fn run(options: cli::Run) -> Result<()> {
     });
     let server = server.transpose()?;
     let mut control = control::open(&config.api)?;
-    announce(privilege::become_own_user());
+    // A replay is a person's own command, which reads and writes that person's files.
+    if matches!(source, Source::Live(_)) {
+        announce(privilege::become_own_user());
+    }
     control::open_socket(&mut control, &config.api)?;
     let state = match &source {
         Source::Live(_) => memory::open(&config.state_directory),

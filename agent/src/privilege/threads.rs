@@ -75,8 +75,15 @@ mod tests {
     #[test]
     fn every_thread_of_this_process_is_told() {
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
+        // A thread takes its name itself, once it runs.
+        let (runs, running) = std::sync::mpsc::channel();
         let thread = std::thread::Builder::new().name("another".to_owned());
-        let thread = thread.spawn(move || stopped.recv()).unwrap();
+        let thread = thread.spawn(move || {
+            runs.send(()).unwrap();
+            stopped.recv()
+        });
+        let thread = thread.unwrap();
+        running.recv().unwrap();
         let names: Vec<_> = threads().into_iter().map(|thread| thread.name).collect();
         assert!(names.len() >= 2);
         assert!(names.iter().any(|name| name == "another"), "{names:?}");
