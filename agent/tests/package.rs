@@ -131,7 +131,7 @@ fn a_host_with_systemd_is_served_until_the_package_is_purged() -> Result<()> {
 
     // A wrong configuration is said and fails nothing but the service; put right, it starts.
     host.run(&format!(
-        "systemctl enable --now ros2probe; cp {CONFIG} /root/; echo wach: [] >>{CONFIG}"
+        "systemctl enable --now ros2probe; cp {CONFIG} /srv/; echo wach: [] >>{CONFIG}"
     ))?;
     let said = host.attempt(&upgrade)?;
     ensure!(
@@ -144,7 +144,9 @@ fn a_host_with_systemd_is_served_until_the_package_is_purged() -> Result<()> {
         "installed",
     )?;
     is(RUNS, "failed")?;
-    host.run(&format!("cp /root/ros2probe.yaml {CONFIG}"))?;
+    host.run(&format!(
+        "cp /srv/ros2probe.yaml {CONFIG}; rm /srv/ros2probe.yaml"
+    ))?;
     host.run(&upgrade)?;
     is(RUNS, "active")?;
 
@@ -195,7 +197,7 @@ fn a_host_without_systemd_takes_the_package_too() -> Result<()> {
 /// Nobody but dpkg remembers it, and the user is kept.
 fn nothing_left(host: &Debian) -> Result<()> {
     let left = host.run(
-        "find / -xdev \\( -path /proc -o -path /sys -o -path /packages -o -path /var/log -o -path /root \\) -prune \
+        "find / -xdev \\( -path /proc -o -path /sys -o -path /packages -o -path /var/log \\) -prune \
          -o \\( -name '*ros2probe*' -o -path '/usr/share/man/*/rp*' \\) -print",
     )?;
     ensure!(left.is_empty(), "left behind:\n{left}");
@@ -218,7 +220,7 @@ fn serves_as_the_unit_says(host: &Debian) -> Result<()> {
         .collect();
     let only = format!("-all,{}", capabilities.join(","));
     let command = setting("ExecStart=")?;
-    host.run("install -d -o ros2probe -g ros2probe /run/ros2probe; touch /root/before")?;
+    host.run("install -d -o ros2probe -g ros2probe /run/ros2probe; touch /srv/before")?;
     host.run(&format!(
         "(STATE_DIRECTORY=/var/lib/ros2probe RUNTIME_DIRECTORY=/run/ros2probe setpriv --reuid {user} \
          --regid {group} --clear-groups --inh-caps {only} --ambient-caps {only} --bounding-set {only} \
@@ -236,7 +238,7 @@ fn serves_as_the_unit_says(host: &Debian) -> Result<()> {
     host.run("test -e /var/lib/ros2probe/discovery.json")?;
     let written = host.run(
         "find / -xdev \\( -path /proc -o -path /sys -o -path /dev -o -path /packages \\) -prune \
-         -o -newer /root/before ! -type d ! -path '/tmp/*' -user root -print",
+         -o -newer /srv/before ! -type d ! -path '/tmp/*' -user root -print",
     )?;
     ensure!(written.is_empty(), "root owns what was written:\n{written}");
     Ok(())
