@@ -24,7 +24,7 @@ use ros2probe::model::reassembly::Limits;
 use ros2probe::privilege::{
     self, ConfineError, Identity, Missing, Powerless, Role, Sandbox, StillPowerful,
 };
-use ros2probe::recording::{Recordings, Snapshots};
+use ros2probe::recording::{Recordings, Refusal, Snapshots};
 use ros2probe::ros2::Dialect;
 use ros2probe::run::replay::Replay;
 use ros2probe::run::{Run, Source};
@@ -178,8 +178,14 @@ fn run(options: cli::Run) -> Result<()> {
         Arc::clone(&subscriptions),
         Arc::new(library),
     ));
-    let snapshots = Snapshots::start(&config.recordings.snapshots, &recordings, &board)
-        .context("recordings.snapshots")?;
+    let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings, &board) {
+        // The disk is not there today: no reason to see nothing.
+        Err(refusal @ Refusal::NoDirectory) if config.recordings.is_in(&config.state_directory) => {
+            tracing::error!(%refusal, "no snapshots are kept");
+            Snapshots::default()
+        }
+        started => started.context("recordings.snapshots")?,
+    };
     let snapshots = Arc::new(snapshots);
     let run = Run::new(
         source,
@@ -195,7 +201,9 @@ fn run(options: cli::Run) -> Result<()> {
         print!("{}", Exposition::new(board).render(Format::Classic)?);
         return ended;
     }
+    // Threads that block make bags for clients; the unit allows 32 threads in all.
     let runtime = tokio::runtime::Builder::new_current_thread()
+        .max_blocking_threads(4)
         .enable_all()
         .build();
     let runtime = runtime.context("cannot start the runtime of the metrics listener")?;

@@ -50,8 +50,12 @@ fn spdp(prefix: GuidPrefix) -> Message {
 
 /// A robot of two participants, told in full to an agent.
 fn robot(observer: &mut Observer) {
+    robot_at(observer, START);
+}
+
+fn robot_at(observer: &mut Observer, start: u64) {
     for (prefix, node) in [(ALICE, "lidar"), (BOB, "mapper")] {
-        put(observer, START, spdp(prefix));
+        put(observer, start, spdp(prefix));
         let string = "std_msgs::msg::dds_::String_";
         let ends = [
             (WRITER, SEDP_WRITERS, "rt/points"),
@@ -63,7 +67,7 @@ fn robot(observer: &mut Observer) {
             let payload = forge::endpoint(guid, topic, string, true);
             put(
                 observer,
-                START,
+                start,
                 Message::from(prefix).data(sedp, 7, &payload),
             );
         }
@@ -71,11 +75,11 @@ fn robot(observer: &mut Observer) {
         let payload = forge::entities(prefix, 24, &[("/", node, writer)]);
         put(
             observer,
-            START,
+            start,
             Message::from(prefix).data(NODES, 4, &payload),
         );
     }
-    observer.advance(Timestamp(START + SECOND));
+    observer.advance(Timestamp(start + SECOND));
 }
 
 /// What is shown of the robot, without when it was seen and without the mark.
@@ -173,6 +177,31 @@ fn who_is_heard_within_a_lease_stays_and_who_is_not_goes() {
     assert_eq!(snapshot.nodes.len(), 1);
     assert_eq!(snapshot.nodes[0].name, "/mapper");
     assert!(snapshot.unknown_writers.is_empty());
+}
+
+#[test]
+fn a_robot_whose_clock_begins_in_1970_is_seen_and_forgotten_like_any_other() {
+    // A Raspberry Pi has none that runs without power, and the agent is there before NTP.
+    for start in [1, SECOND, 30 * SECOND] {
+        let mut observer = agent(Settings::default());
+        robot_at(&mut observer, start);
+        let count = |observer: &Observer, at| {
+            let snapshot = observer.snapshot(Timestamp(at));
+            (snapshot.participants.len(), snapshot.nodes.len())
+        };
+        assert_eq!(count(&observer, start + SECOND), (2, 2), "{start}");
+        let memory = observer.memory();
+        observer.advance(Timestamp(start + 9 * SECOND));
+        assert_eq!(count(&observer, start + 9 * SECOND), (2, 2), "{start}");
+        observer.advance(Timestamp(start + 11 * SECOND));
+        assert_eq!(count(&observer, start + 11 * SECOND), (0, 0), "{start}");
+        // Started again before the clock was set.
+        let mut after = restarted(&memory, start);
+        after.advance(Timestamp(start + 9 * SECOND));
+        assert_eq!(count(&after, start + 9 * SECOND), (2, 2), "{start}");
+        after.advance(Timestamp(start + 11 * SECOND));
+        assert_eq!(count(&after, start + 11 * SECOND), (0, 0), "{start}");
+    }
 }
 
 #[test]

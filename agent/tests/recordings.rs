@@ -248,3 +248,29 @@ fn a_late_recording_has_what_was_sent_once_before_it_where_the_watchlist_asks_fo
     let messages = messages(&directory.path().join("bags/late"));
     assert_eq!(messages["/tf_static"].len(), 1, "{messages:?}");
 }
+
+#[test]
+fn snapshots_without_a_place_are_a_mistake_only_where_none_was_asked_for() {
+    let directory = tempfile::tempdir().unwrap();
+    let configuration = directory.path().join("ros2probe.yaml");
+    let run = |state: &str| {
+        let snapshots = "recordings: {snapshots: [{name: incident, topics: ['/**']}]}\n";
+        std::fs::write(&configuration, format!("{snapshots}{state}")).unwrap();
+        let output = local_agent::rp()
+            .args(["run", "--report", "--replay"])
+            .arg(local_agent::capture())
+            .arg("--config")
+            .arg(&configuration)
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        (output.status.code(), output.stdout.len(), said)
+    };
+    // A replay has no state directory, as an agent whose disk is not there.
+    let (code, length, said) = run("");
+    assert_eq!(code, Some(0), "{said}");
+    assert!(length > 1000 && said.contains("no snapshots are kept"));
+    let (code, _, said) = run("state_directory: off\n");
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("the agent has no place for recordings"));
+}

@@ -180,6 +180,14 @@ pub struct RecordingSettings {
     pub snapshots: Vec<SnapshotSettings>,
 }
 
+impl RecordingSettings {
+    /// Bags go into the state directory, wherever that is.
+    #[must_use]
+    pub fn is_in(&self, state: &StateChoice) -> bool {
+        self.directory == StateChoice::Auto && *state != StateChoice::Off
+    }
+}
+
 /// The last seconds of some topics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SnapshotSettings {

@@ -22,6 +22,7 @@ use super::board::Board;
 use super::bounded::{Bounded, Refusal};
 use super::exposition::{Exposition, Format};
 use super::large::Answers;
+use super::listen::listen;
 #[cfg(feature = "tls")]
 use super::tls::{Acceptor, Tls};
 use super::web_config::{WebConfig, WebConfigError};
@@ -88,12 +89,8 @@ impl Server {
         let gate = (!web.users.is_empty()).then(|| Arc::new(Gate::new(web.users)));
         #[cfg(feature = "tls")]
         let acceptor = web.tls.as_ref().map(Acceptor::new).transpose()?;
-        let bind = || {
-            let listener = std::net::TcpListener::bind(address)?;
-            listener.set_nonblocking(true)?;
-            Ok(listener)
-        };
-        let listener = bind().map_err(|source| ListenError::Address { address, source })?;
+        let listener =
+            listen(address).map_err(|source| ListenError::Address { address, source })?;
         Ok(Self {
             listener,
             board,

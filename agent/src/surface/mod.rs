@@ -15,6 +15,7 @@ pub mod exposition;
 pub mod http;
 mod large;
 pub mod limit_facts;
+mod listen;
 pub mod otlp;
 mod page;
 mod process;

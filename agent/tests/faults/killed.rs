@@ -147,6 +147,10 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     let start = began.elapsed();
     let robot = Robot::start(&link)?;
     scene.node_is_known("/robot")?;
+    scene.agent.scrape_until("probes in place", |page| {
+        let ability = [("ability", "shared_memory_exact")];
+        page.sum("ros2probe_capture_ability", &ability) > 0.0
+    })?;
     wait_until("a state", || {
         let text = fs::read_to_string(places.state.join("discovery.json"));
         Ok(text.unwrap_or_default().contains("/robot"))

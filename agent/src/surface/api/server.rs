@@ -19,6 +19,7 @@ use super::security::{Door, Kind, Token, TokenError};
 use super::{Context, router};
 use crate::config::Limit;
 use crate::surface::bounded::{Bounded, Refusal};
+use crate::surface::listen::listen;
 
 /// Owner and group.
 const SOCKET_MODE: u32 = 0o660;
@@ -113,12 +114,7 @@ impl Server {
         if !address.ip().is_loopback() && self.token.is_none() {
             return Err(OpenError::Unprotected { address });
         }
-        let bind = || {
-            let listener = TcpListener::bind(address)?;
-            listener.set_nonblocking(true)?;
-            Ok(listener)
-        };
-        let listener = bind().map_err(|source| OpenError::Address { address, source })?;
+        let listener = listen(address).map_err(|source| OpenError::Address { address, source })?;
         self.addresses.push(listener);
         Ok(())
     }
