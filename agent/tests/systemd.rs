@@ -115,6 +115,7 @@ fn the_agent_may_do_what_it_needs_and_nothing_else() {
         "LimitMEMLOCK=infinity",
         "Before=network.target",
         "Restart=always",
+        "StartLimitIntervalSec=0",
         "User=ros2probe",
         "Group=ros2probe",
         "LimitRTPRIO=1",
