@@ -18,14 +18,14 @@ mod local_agent;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
-use std::net::{SocketAddr, TcpStream};
+use std::net::TcpStream;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
 use forge::{Message, SEDP_WRITERS, SPDP};
 use host::{BOB, Host, Seen};
-use local_agent::{Answer, LocalAgent, PATIENCE, metric};
+use local_agent::{LocalAgent, PATIENCE, ask, metric};
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::payloads::{Given, News, Sample};
@@ -35,7 +35,6 @@ use ros2probe::subscriptions::{
 };
 use ros2probe::surface::{AgentFacts, Board, SourceKind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
-use serde_json::Value;
 use tokio_util::sync::CancellationToken;
 
 const MILLISECOND: u64 = 1_000_000;
@@ -227,7 +226,7 @@ fn unknown_writers_beyond_the_cap_are_not_followed_until_one_is_forgotten() {
 }
 
 #[test]
-fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
+fn flows_beyond_the_cap_are_counted_and_their_messages_too() {
     let limits = Limits {
         flows: 2,
         ..Limits::default()
@@ -248,23 +247,6 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
             .all(|each| each.delivered.messages == 10)
     );
     assert_eq!(host.measurement().messages, 10);
-    for number in 11..=60 {
-        (2..=3).for_each(|socket| host.data(at(socket), number));
-        host.wait(400);
-    }
-    let sockets: Vec<_> = host
-        .deliveries()
-        .iter()
-        .map(|each| each.sockets.clone())
-        .collect();
-    assert_eq!(sockets, [[2], [3]]);
-    let (used, reached) = standing(limits, host.snapshot(), Limit::Flows);
-    host.data(at(3), 61);
-    assert_eq!(used, 2);
-    assert_eq!(
-        standing(limits, host.snapshot(), Limit::Flows),
-        (2, reached)
-    );
 }
 
 fn sample(number: u64) -> Given {
@@ -353,18 +335,6 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, limits: &str) -> Loca
     std::fs::write(&configuration, text).unwrap();
     let configuration = configuration.to_str().unwrap();
     LocalAgent::start_on(capture, &["--speed", speed, "--config", configuration])
-}
-
-fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
-    let stream = TcpStream::connect(api).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    let length = body.len();
-    let head = format!(
-        "{method} {path} HTTP/1.1\r\nHost: {api}\r\nContent-Type: application/json\r\n\
-         Content-Length: {length}\r\n"
-    );
-    let Answer { status, body, .. } = local_agent::exchange(stream, &head, body);
-    (status, serde_json::from_str(&body).unwrap_or(Value::Null))
 }
 
 /// Waits until a cap stands so.

@@ -9,7 +9,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use local_agent::{Answer, LocalAgent, PATIENCE};
+use local_agent::{LocalAgent, PATIENCE, ask};
 use serde_json::Value;
 
 /// An agent that may write bags, and replays slowly.
@@ -24,19 +24,6 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalA
     std::fs::write(&configuration, text).unwrap();
     let configuration = configuration.to_str().unwrap();
     LocalAgent::start_on(capture, &["--speed", speed, "--config", configuration])
-}
-
-fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
-    let stream = std::net::TcpStream::connect(api).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
-    let length = body.len();
-    let head = format!(
-        "{method} {path} HTTP/1.1\r\nHost: {api}\r\nContent-Type: application/json\r\n\
-         Content-Length: {length}\r\n"
-    );
-    let Answer { status, body, .. } = local_agent::exchange(stream, &head, body);
-    let body = serde_json::from_str(&body).unwrap_or_else(|error| panic!("{error}: {body}"));
-    (status, body)
 }
 
 /// Asks for the recording until it is as wanted.

@@ -8,6 +8,8 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
+use serde_json::Value;
+
 /// Longest wait for anything.
 pub const PATIENCE: Duration = Duration::from_secs(30);
 
@@ -183,6 +185,19 @@ pub fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> 
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
     let head = format!("{method} {path} HTTP/1.1\r\nHost: {address}\r\n{headers}");
     exchange(stream, &head, "")
+}
+
+/// Asks the control API: the status, and the body or null where it is not JSON.
+pub fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
+    let stream = TcpStream::connect(api).unwrap();
+    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    let length = body.len();
+    let head = format!(
+        "{method} {path} HTTP/1.1\r\nHost: {api}\r\nContent-Type: application/json\r\n\
+         Content-Length: {length}\r\n"
+    );
+    let Answer { status, body, .. } = exchange(stream, &head, body);
+    (status, serde_json::from_str(&body).unwrap_or_default())
 }
 
 /// Sends a request of this head, without its last line, and this body; reads the answer.
