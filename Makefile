@@ -4,6 +4,8 @@ SHELL := /bin/bash
 
 TARGET := $(abspath $(or $(CARGO_TARGET_DIR),target))
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo -E)
+# What is shipped for this machine.
+SHIPPED := $(shell uname -m)-unknown-linux-musl
 HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_')
 NEXTEST := $(shell cargo nextest --version >/dev/null 2>&1 && echo yes)
 
@@ -69,17 +71,19 @@ distcheck: ## build what make dist has built again, elsewhere, and compare every
 	packaging/dist.sh --again
 
 bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
-	@.ci/prerequisites.sh test
+	@.ci/prerequisites.sh test dist
 	cargo bench --workspace
 	@$(MAKE) --no-print-directory peers
-	cargo build --release --package ros2probe --bin rp --target $(shell uname -m)-unknown-linux-musl
+	cargo build --release --package ros2probe --bin rp --target $(SHIPPED)
 	cargo build --release --package ros2probe --example robot --example workloads
 	@$(SUDO) $(TARGET)/release/examples/workloads $(BENCH_OPTIONS)
 
-soak: ## an hour of a changing graph, and faults, on the release build; SOAK_SECONDS=N; results in target/soak (needs root)
-	@.ci/prerequisites.sh test
+soak: ## an hour of a changing graph, and faults, on what is shipped; SOAK_SECONDS=N; results in target/soak (needs root)
+	@.ci/prerequisites.sh test dist
+	cargo build --release --package ros2probe --bin rp --target $(SHIPPED)
 	@mkdir -p $(TARGET)/soak && rm -f $(TARGET)/soak/faults.md
-	ROS2PROBE_SOAK=1 ROS2PROBE_SOAK_SECONDS=$(or $(SOAK_SECONDS),3600) cargo test --release \
+	ROS2PROBE_SOAK=1 ROS2PROBE_SOAK_SECONDS=$(or $(SOAK_SECONDS),3600) \
+	    ROS2PROBE_SOAK_PROGRAM=$(TARGET)/$(SHIPPED)/release/rp cargo test --release \
 	    --package ros2probe --test live_endurance --test live_faults --no-fail-fast -- \
 	    --nocapture --test-threads 1
 	@cat $(TARGET)/soak/faults.md
