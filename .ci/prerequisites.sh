@@ -113,6 +113,17 @@ bags() {
     echo "${versions[*]}" >"$place/versions"
 }
 
+# Knows the schema of CycloneDX, to hold our bills of materials against it.
+bills() {
+    local place=$tools/bills version=11.12.0
+    compgen -G "$place/lib/python3*/site-packages/cyclonedx_python_lib-$version.dist-info" >/dev/null && return
+    packages python3 python3-venv
+    say "installing cyclonedx-python-lib $version from PyPI into target/tools/bills"
+    rm -rf "$place"
+    python3 -m venv "$place"
+    "$place/bin/pip" install --quiet --disable-pip-version-check "cyclonedx-python-lib[json-validation]==$version"
+}
+
 # Runs the aarch64 binary on another machine: called by name, registered with nothing.
 qemu() {
     [ "$(uname -m)" = aarch64 ] && return
@@ -247,6 +258,7 @@ for need; do
         packages gcc libc6-dev python3
         rust
         musl x86_64 aarch64
+        bills
         qemu
         debian
         cargo_deb

@@ -1,7 +1,7 @@
 //! What `make dist` leaves, if it is that which is looked at (`ROS2PROBE_DIST`).
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use serde_json::Value;
@@ -70,11 +70,30 @@ fn no_path_of_the_machine_that_built_it_is_in_a_binary() {
     }
 }
 
+/// What is wrong with a bill, says a reader that is not ours; nothing if it keeps to the schema.
+fn flaw(bill: &Path) -> String {
+    let tools = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/tools");
+    let python = tools.join("bills/bin/python");
+    let script = "import sys\n\
+        from cyclonedx.schema import SchemaVersion\n\
+        from cyclonedx.validation.json import JsonStrictValidator\n\
+        validator = JsonStrictValidator(SchemaVersion.V1_5)\n\
+        print(validator.validate_str(open(sys.argv[1]).read()) or '')";
+    let output = Command::new(&python)
+        .args(["-c", script])
+        .arg(bill)
+        .output()
+        .unwrap_or_else(|error| panic!("{}: {error}; run `make dist`", python.display()));
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    text(&output.stdout).trim().to_owned()
+}
+
 #[test]
 fn the_bill_of_materials_lists_what_is_linked_and_where_it_is_from() {
     let Some(directory) = released() else { return };
     for Binary { architecture, .. } in program::shipped() {
         let name = format!("rp-{}-{architecture}.cdx.json", env!("CARGO_PKG_VERSION"));
+        assert_eq!(flaw(&directory.join(&name)), "", "{name}");
         let bill = std::fs::read_to_string(directory.join(&name)).unwrap();
         let bill: Value = serde_json::from_str(&bill).unwrap();
         assert_eq!(bill["bomFormat"], "CycloneDX");
