@@ -7,7 +7,6 @@ SUDO := $(if $(filter 0,$(shell id -u)),,sudo -E)
 # What is shipped for this machine.
 SHIPPED := $(shell uname -m)-unknown-linux-musl
 HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_')
-NEXTEST := $(shell cargo nextest --version >/dev/null 2>&1 && echo yes)
 
 # Nothing here is optimized or hidden from Miri: few random cases, and its own directory.
 MIRI := MIRIFLAGS="-Zmiri-strict-provenance -Zmiri-disable-isolation $$MIRI_MORE" PROPTEST_CASES=4 \
@@ -46,7 +45,7 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
 	cargo test --package ros2probe --features tls --test web_config --test otlp_tls --quiet
-	$(if $(NEXTEST),cargo nextest run --workspace,cargo test --workspace --lib --bins --tests)
+	cargo nextest run --workspace
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf

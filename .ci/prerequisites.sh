@@ -172,6 +172,13 @@ cargo_deb() {
     cargo install cargo-deb --version 3.8.0 --locked --debug --no-default-features
 }
 
+# Built without optimization, which takes two minutes; it waits for tests most of its time.
+nextest() {
+    cargo nextest --version >/dev/null 2>&1 && return
+    say "installing cargo-nextest 0.9.151"
+    cargo install cargo-nextest --version 0.9.151 --locked --debug --no-default-features --features default-no-update
+}
+
 rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
@@ -248,6 +255,7 @@ for need; do
         bags
         types
         rust
+        nextest
         musl aarch64
         qemu
         debian
