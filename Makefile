@@ -19,7 +19,6 @@ MIRI_AGENT := capture::ring::block capture::ring::turns capture::shm::cell captu
 MIRI_THREADS := capture::ring::turns
 
 export PATH := $(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
-export LLVM_PREFIX ?= $(if $(wildcard /usr/lib/llvm-22/bin/llvm-strip),/usr/lib/llvm-22,/usr)
 # Comes with Rust and links for both architectures: no cross toolchain.
 export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_MUSL_LINKER := rust-lld
 # The tests make network namespaces: build as the user, run the tests as root.

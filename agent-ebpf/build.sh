@@ -6,11 +6,13 @@
 #   build.sh --stale   fail when the sources have changed since the object was built (no toolchain)
 #
 # Needs nightly (or what NIGHTLY names) with rust-src, and bpf-linker: `make prerequisites` installs
-# them. LLVM_PREFIX says where LLVM's tools are.
+# them. LLVM_PREFIX says where LLVM's tools are, if they are not where Debian puts LLVM 22 or in PATH.
 set -euo pipefail
 cd "$(dirname "$0")"
 
 nightly=${NIGHTLY:-nightly}
+strip=${LLVM_PREFIX:-/usr/lib/llvm-22}/bin/llvm-strip
+[ -x "$strip" ] || strip=llvm-strip
 
 sources() {
     cat Cargo.toml Cargo.lock build.sh src/*.rs ../wire/Cargo.toml \
@@ -38,7 +40,7 @@ CARGO_ENCODED_RUSTFLAGS="$flags" cargo "+$nightly" build --quiet --release --loc
     --target bpfel-unknown-none -Z build-std=core
 built=target/bpfel-unknown-none/release/filter
 # The linker needs the debug information to write BTF; nobody needs it afterwards.
-"${LLVM_PREFIX:-/usr/lib/llvm-22}/bin/llvm-strip" --strip-debug "$built"
+"$strip" --strip-debug "$built"
 
 if [ "${1:-}" = --check ]; then
     ./build.sh --stale
