@@ -35,7 +35,7 @@ use aya_ebpf::{
 use ros2probe_wire::filter::Counter;
 
 use crate::{
-    maps::{INTERFACES, claim_incoming, count, count_outside, release, setting},
+    maps::{INTERFACES, WIRE, claim_incoming, count, count_outside, release, setting},
     packet::hook,
 };
 
@@ -44,8 +44,18 @@ const PACKET_OUTGOING: u32 = 4;
 /// The loopback device has this index in every network namespace.
 const LOOPBACK: u32 = 1;
 
-/// For an AF_PACKET SOCK_DGRAM socket: the frame begins at the IP header. Returns the bytes that go
-/// into the socket's packet ring: all of the frame, or none.
+/// What an AF_PACKET SOCK_DGRAM socket has attached: goes on with [`wire`]. A socket pays for the
+/// length of its program, and up to Linux 6.7 it may not hold 20 KB (`net.core.optmem_max`).
+#[socket_filter]
+pub fn wire_entry(context: SkBuffContext) -> i64 {
+    // SAFETY: index 0 is in the array, and the loader puts a program of the same type there.
+    unsafe { WIRE.tail_call(&context, 0) };
+    // Only if nothing is there.
+    0
+}
+
+/// For such a socket: the frame begins at the IP header. Returns the bytes that go into the socket's
+/// packet ring: all of the frame, or none.
 #[socket_filter]
 pub fn wire(context: SkBuffContext) -> i64 {
     frame(context.skb.skb).unwrap_or(0)

@@ -4,7 +4,7 @@ use core::arch::asm;
 
 use aya_ebpf::{
     macros::map,
-    maps::{Array, HashMap, LruHashMap, PerCpuArray, RingBuf},
+    maps::{Array, HashMap, LruHashMap, PerCpuArray, ProgramArray, RingBuf},
 };
 use ros2probe_wire::{
     Record,
@@ -69,6 +69,9 @@ macro_rules! setting {
 }
 pub(crate) use setting;
 
+/// The wire hook's program, for the short one that goes on with it. Set by the loader.
+#[map]
+pub static WIRE: ProgramArray = ProgramArray::with_max_entries(1, 0);
 /// Writers and readers that user space has classified: GUID to `Verdict`.
 #[map]
 pub static INTEREST: HashMap<[u32; 4], u32> =

@@ -10,7 +10,7 @@ mod host;
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 
-use aya::maps::{Array, HashMap, Map, MapData, MapError, PerCpuArray, RingBuf};
+use aya::maps::{Array, HashMap, Map, MapData, MapError, PerCpuArray, ProgramArray, RingBuf};
 use aya::programs::{Program, ProgramError, ProgramFd};
 use aya::{Ebpf, EbpfError, EbpfLoader};
 use ros2probe_wire::filter::{Budget, Counter};
@@ -102,8 +102,11 @@ impl Default for FilterSettings {
 
 /// One loaded filter with its maps: of the wire hook, or of the host hook.
 pub struct Filter {
-    /// The wire hook's program, or the host hook's for datagrams on their way in.
+    /// What is attached: the wire hook's entry, or the host hook's for datagrams on their way in.
     program: ProgramFd,
+    /// The wire hook's program, which its entry goes on with; the kernel empties it when this is
+    /// closed.
+    _wire: Option<ProgramArray<MapData>>,
     host: Option<host::Hook>,
     /// Captured datagrams, but not on the wire hook.
     pieces: Option<RingBuf<MapData>>,
@@ -127,7 +130,14 @@ impl Filter {
         let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
         let mut ebpf = open(settings, false, &sizes, None, 0)?;
         let program = load_program(&mut ebpf, "wire")?;
-        Self::with_maps(&mut ebpf, program, None)
+        let mut wire: ProgramArray<_> = take(&mut ebpf, "WIRE")?;
+        wire.set(0, &program, 0).map_err(failed("WIRE", "set"))?;
+        let entry = load_program(&mut ebpf, "wire_entry")?;
+        let filter = Self::with_maps(&mut ebpf, entry, None)?;
+        Ok(Self {
+            _wire: Some(wire),
+            ..filter
+        })
     }
 
     fn with_maps(
@@ -143,6 +153,7 @@ impl Filter {
         }
         Ok(Self {
             program,
+            _wire: None,
             host,
             pieces: None,
             interest: take(ebpf, "INTEREST")?,

@@ -3,9 +3,11 @@
 use std::net::UdpSocket;
 use std::time::Instant;
 
+use ros2probe_wire::filter::Counter;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use super::*;
+use crate::capture::filter::{Filter, FilterSettings};
 use crate::capture::netns::tests::{in_new_namespace, ip};
 use crate::model::reassembly::{FlowKey, Limits, Reassembly};
 
@@ -88,6 +90,23 @@ fn filter(keep: i32) -> OwnedFd {
     assert!(fd >= 0, "{}", io::Error::last_os_error());
     // SAFETY: just made.
     unsafe { OwnedFd::from_raw_fd(i32::try_from(fd).unwrap()) }
+}
+
+#[test]
+fn a_socket_that_may_hold_as_little_as_up_to_linux_6_7_takes_the_kernel_filter() {
+    in_new_namespace(|| {
+        // From Linux 6.8 on each network namespace has its own, of 128 KB; before, the host's is what
+        // it is.
+        let _ = std::fs::write("/proc/sys/net/core/optmem_max", "20480");
+        let filter = Filter::load(&FilterSettings::default()).unwrap();
+        let ring = Ring::open(SMALL, Some(filter.program())).unwrap();
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        socket.send_to(b"RTPS", "127.0.0.1:7400").unwrap();
+        let counters = filter.counters().unwrap();
+        let looked_at = |frames: &(Counter, u64)| *frames == (Counter::Frames, 1);
+        assert!(counters.iter().any(looked_at), "{counters:?}");
+        drop(ring);
+    });
 }
 
 #[test]
