@@ -58,7 +58,7 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
     let (status, refused) = ask(&mut api, "POST", "/recordings", r#"{"name": "none"}"#)?;
     let detail = refused["detail"].as_str().unwrap_or_default().to_owned();
     ensure!(
-        status == 507 && detail.contains("Too many open files"),
+        status == 507 && detail.contains("(os error 24)"),
         "{status} {refused}"
     );
     ensure!(!bags.join("none").exists(), "an empty bag is left");
