@@ -63,6 +63,7 @@ impl HostTap {
         // First, so that nothing dies unseen behind the hook.
         filter.look_inside(cgroup.is_whole_host());
         filter.attach(cgroup.directory())?;
+        filter.settle();
         let hierarchy = match &settings.cgroup {
             Some(path) => hierarchy::mount_point().unwrap_or_else(|_| path.clone()),
             None => cgroup.path().to_path_buf(),

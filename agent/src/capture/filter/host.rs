@@ -29,7 +29,8 @@ const PROGRAMS: [(&str, CgroupSkbAttachType); 2] = [
 
 /// What the host hook has besides what both hooks have.
 pub(super) struct Hook {
-    programs: Ebpf,
+    /// Until they are attached: it holds the object's instructions and types, half a megabyte.
+    programs: Option<Ebpf>,
     places: Places,
     inside: Option<Inside>,
     egress: ProgramFd,
@@ -72,7 +73,7 @@ impl Filter {
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
         let mut filter = Self::with_maps(&mut ebpf, ingress, None)?;
         filter.host = Some(Hook {
-            programs: ebpf,
+            programs: Some(ebpf),
             places,
             inside: None,
             egress,
@@ -95,9 +96,10 @@ impl Filter {
             return Err(FilterError::Missing("host hook"));
         };
         let mut links = Vec::new();
+        let programs = host.programs.as_mut();
+        let programs = programs.ok_or(FilterError::Missing("object any more"))?;
         for (name, direction) in PROGRAMS {
-            let program: &mut CgroupSkb = host
-                .programs
+            let program: &mut CgroupSkb = programs
                 .program_mut(name)
                 .ok_or(FilterError::Missing(name))?
                 .try_into()
@@ -120,9 +122,18 @@ impl Filter {
     /// Attaches the programs that look further inside the kernel, as many as it allows. `whole_host`:
     /// the hook is attached to the topmost cgroup, so it sees every socket. Nothing on the wire hook.
     pub fn look_inside(&mut self, whole_host: bool) {
-        if let Some(host) = &mut self.host {
-            let inside = Inside::attach(&mut host.programs, &host.places, whole_host);
+        if let Some(host) = &mut self.host
+            && let Some(programs) = &mut host.programs
+        {
+            let inside = Inside::attach(programs, &host.places, whole_host);
             host.inside = Some(inside);
+        }
+    }
+
+    /// Nothing more will be attached: what that takes is given up. What is in place stays.
+    pub fn settle(&mut self) {
+        if let Some(host) = &mut self.host {
+            host.programs = None;
         }
     }
 
