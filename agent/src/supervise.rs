@@ -7,7 +7,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow};
-use ros2probe::capture::system::give_back_program;
+use ros2probe::capture::system::{give_back_program, part_program};
 use ros2probe::config::{Config, ConfigError};
 use ros2probe::privilege::{self, Powerless, Role, SpawnError};
 use ros2probe::run::{Run, RunError};
@@ -30,8 +30,9 @@ use crate::logging::Log;
 /// How often readiness is looked at until the agent is ready, and the watchdog from then on.
 const STARTING_TICK: Duration = Duration::from_millis(100);
 const TICK: Duration = Duration::from_secs(2);
-/// After which nothing is done for the first time any more unless somebody asks for it.
-const SETTLED: Duration = Duration::from_secs(5);
+/// How often the program's pages are let go of. What is needed again within that time is a few hundred,
+/// and having them again takes the kernel a millisecond.
+const GIVE_BACK: Duration = Duration::from_secs(10);
 /// For answers that have begun and the working thread's last round.
 const DRAIN: Duration = Duration::from_secs(3);
 
@@ -280,8 +281,8 @@ struct Watchdog {
     period: Option<Duration>,
     fed: Option<Instant>,
     ready: bool,
-    /// When the program's pages are let go of once more.
-    settled: Option<Instant>,
+    /// When the program's pages were let go of.
+    given_back: Instant,
     sight: Sight,
 }
 
@@ -293,7 +294,7 @@ impl Watchdog {
             period,
             fed: None,
             ready: false,
-            settled: None,
+            given_back: Instant::now(),
             sight: Sight::default(),
         }
     }
@@ -313,12 +314,11 @@ impl Watchdog {
         if first {
             self.ready = true;
             tracing::info!("ready");
-            give_back_program();
-            self.settled = Some(now + SETTLED);
+            part_program();
             let _ = sd_notify::notify(&[NotifyState::Ready]);
         }
-        if self.settled.is_some_and(|settled| now >= settled) {
-            self.settled = None;
+        if first || now.saturating_duration_since(self.given_back) >= GIVE_BACK {
+            self.given_back = now;
             give_back_program();
         }
         let Some(period) = self.period else {

@@ -166,23 +166,43 @@ pub fn give_back_memory() {
     }
 }
 
-/// Lets go of the program's own pages in memory, most of which are needed once, at the start: reading
-/// the configuration, loading the kernel programs. What runs on is mapped again as it is used, from the
-/// page cache, and nothing beside it: the kernel maps 64 KiB around a fault, or what is cached in one
-/// piece up to 2 MiB, but nothing beyond a mapping's end. So each page becomes a mapping of its own, which
-/// costs the kernel 192 bytes. (A debugger's breakpoints are lost by this; there are none yet when an
-/// agent starts.)
+/// Lets go of the program's own pages in memory, most of which are needed now and then: at the start, for
+/// a newcomer, for a command. What runs on is mapped again as it is used, from the page cache. (A
+/// debugger's breakpoints are lost by this.)
 pub fn give_back_program() {
-    // SAFETY: the function is one for this purpose and takes no data.
-    unsafe { libc::dl_iterate_phdr(Some(give_back_segments), ptr::null_mut()) };
+    for_constant_segments(|start, end| advise(start, end, libc::MADV_DONTNEED));
+}
+
+/// Makes each of the program's pages a mapping of its own, which costs the kernel 192 bytes: it maps 64 KiB
+/// around a fault, or what is cached in one piece up to 2 MiB, but nothing beyond a mapping's end.
+pub fn part_program() {
+    let page = u64::from(page_size());
+    for_constant_segments(|start, end| {
+        // Every other page is left out of core dumps, as all are by default, to part their mappings.
+        let mut at = start;
+        while at < end {
+            advise(at, at + page, libc::MADV_DONTDUMP);
+            at += 2 * page;
+        }
+    });
+}
+
+/// Whole pages of the program that nothing writes to, from one address to another.
+fn for_constant_segments(mut work: impl FnMut(u64, u64)) {
+    let mut work: &mut dyn FnMut(u64, u64) = &mut work;
+    let data = (&raw mut work).cast();
+    // SAFETY: the function takes this as its data, and is called on this thread until this returns.
+    unsafe { libc::dl_iterate_phdr(Some(constant_segments), data) };
 }
 
 /// Called with what is loaded, first the program. Ends after that.
-unsafe extern "C" fn give_back_segments(
+unsafe extern "C" fn constant_segments(
     info: *mut libc::dl_phdr_info,
     _size: libc::size_t,
-    _data: *mut c_void,
+    work: *mut c_void,
 ) -> c_int {
+    // SAFETY: [`for_constant_segments`] hands this over, and waits.
+    let work = unsafe { &mut *work.cast::<&mut dyn FnMut(u64, u64)>() };
     // SAFETY: the caller, the C library, hands over what describes one loaded object.
     let info = unsafe { &*info };
     // SAFETY: it says where that object's program headers are, and how many.
@@ -196,13 +216,7 @@ unsafe extern "C" fn give_back_segments(
         // Whole pages only: the others may belong to what can be written, too.
         let start = (info.dlpi_addr + header.p_vaddr).next_multiple_of(page);
         let end = (info.dlpi_addr + header.p_vaddr + header.p_memsz) / page * page;
-        advise(start, end, libc::MADV_DONTNEED);
-        // Every other page is left out of core dumps, as all are by default, to part their mappings.
-        let mut at = start;
-        while at < end {
-            advise(at, at + page, libc::MADV_DONTDUMP);
-            at += 2 * page;
-        }
+        work(start, end);
     }
     1
 }
@@ -333,6 +347,25 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
+
+    /// Bytes of files that are mapped and in memory, as the kernel counts them.
+    fn of_files() -> u64 {
+        let status = std::fs::read_to_string("/proc/self/status").unwrap();
+        let line = status
+            .lines()
+            .find_map(|line| line.strip_prefix("RssFile:"));
+        let kilobytes = line.unwrap().trim().trim_end_matches(" kB");
+        kilobytes.parse::<u64>().unwrap() * 1024
+    }
+
+    #[test]
+    fn the_program_is_let_go_of_comes_back_page_by_page_and_goes_on() {
+        part_program();
+        let before = of_files();
+        give_back_program();
+        let after = of_files();
+        assert!(after + 1_000_000 < before, "{before} {after}");
+    }
 
     #[test]
     fn waiting_ends_with_the_time_and_with_data() {
