@@ -94,15 +94,24 @@ impl Exposition {
     /// # Errors
     /// Never while writing to memory; the formatting machinery wants to be asked.
     pub fn render(&self, format: Format) -> Result<String, fmt::Error> {
-        let start = Instant::now();
         let mut page = String::new();
+        self.write(format, &mut page)?;
+        Ok(page)
+    }
+
+    /// Writes the whole page.
+    ///
+    /// # Errors
+    /// `page` takes no more.
+    pub fn write(&self, format: Format, page: &mut impl Write) -> fmt::Result {
+        let start = Instant::now();
         match format {
-            Format::OpenMetrics => text::encode(&mut page, &self.registry)?,
-            Format::Classic => text::encode(&mut Classic::new(&mut page), &self.registry)?,
+            Format::OpenMetrics => text::encode(page, &self.registry)?,
+            Format::Classic => text::encode(&mut Classic::new(page), &self.registry)?,
         }
         let took = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
         self.last_scrape_nanoseconds.store(took, Ordering::Relaxed);
-        Ok(page)
+        Ok(())
     }
 }
 
@@ -122,8 +131,8 @@ impl Collector for Scrape {
 
 /// Turns OpenMetrics into text format 0.0.4: families carry their full names, an info is a gauge,
 /// and there are no units and no end mark. Samples are the same in both and pass through.
-struct Classic<'a> {
-    out: &'a mut String,
+struct Classic<'a, W> {
+    out: &'a mut W,
     place: Place,
     /// The comment line so far.
     comment: String,
@@ -138,8 +147,8 @@ enum Place {
     Comment,
 }
 
-impl<'a> Classic<'a> {
-    fn new(out: &'a mut String) -> Self {
+impl<'a, W: Write> Classic<'a, W> {
+    fn new(out: &'a mut W) -> Self {
         Self {
             out,
             place: Place::Start,
@@ -149,7 +158,7 @@ impl<'a> Classic<'a> {
     }
 
     /// A part of a line.
-    fn part(&mut self, text: &str) {
+    fn part(&mut self, text: &str) -> fmt::Result {
         if self.place == Place::Start && !text.is_empty() {
             // Label values come later in a line, so nothing from outside can begin one.
             self.place = if text.starts_with('#') {
@@ -160,20 +169,22 @@ impl<'a> Classic<'a> {
         }
         match self.place {
             Place::Comment => self.comment.push_str(text),
-            _ => self.out.push_str(text),
+            _ => self.out.write_str(text)?,
         }
+        Ok(())
     }
 
-    fn end_line(&mut self) {
+    fn end_line(&mut self) -> fmt::Result {
         match self.place {
             Place::Start => {}
-            Place::Sample => self.out.push('\n'),
-            Place::Comment => self.end_comment(),
+            Place::Sample => self.out.write_char('\n')?,
+            Place::Comment => self.end_comment()?,
         }
         self.place = Place::Start;
+        Ok(())
     }
 
-    fn end_comment(&mut self) {
+    fn end_comment(&mut self) -> fmt::Result {
         let line = std::mem::take(&mut self.comment);
         if let Some(help) = line.strip_prefix("# HELP ") {
             help.split_once(' ')
@@ -188,24 +199,23 @@ impl<'a> Classic<'a> {
                 "info" => ("_info", "gauge"),
                 _ => ("", kind),
             };
-            let head = ["# HELP ", name, suffix, " ", &self.help, "\n"];
-            let kind = ["# TYPE ", name, suffix, " ", kind, "\n"];
-            self.out.extend(head.into_iter().chain(kind));
+            writeln!(self.out, "# HELP {name}{suffix} {}", self.help)?;
+            writeln!(self.out, "# TYPE {name}{suffix} {kind}")?;
         }
+        Ok(())
     }
 }
 
-impl Write for Classic<'_> {
+impl<W: Write> Write for Classic<'_, W> {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         if !text.as_bytes().contains(&b'\n') {
-            self.part(text);
-            return Ok(());
+            return self.part(text);
         }
         for (index, part) in text.split('\n').enumerate() {
             if index > 0 {
-                self.end_line();
+                self.end_line()?;
             }
-            self.part(part);
+            self.part(part)?;
         }
         Ok(())
     }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use axum::Router;
 use axum::extract::State as Extract;
-use axum::http::header::{ACCEPT, CACHE_CONTROL, CONTENT_TYPE, RETRY_AFTER};
+use axum::http::header::{ACCEPT, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER};
 use axum::http::{HeaderMap, Method, StatusCode};
 use axum::middleware;
 use axum::response::{Html, IntoResponse, Response};
@@ -23,6 +23,7 @@ use super::bounded::{Bounded, Refusal};
 use super::exposition::{Exposition, Format};
 use super::large::Answers;
 use super::listen::listen;
+use super::packed::Packed;
 #[cfg(feature = "tls")]
 use super::tls::{Acceptor, Tls};
 use super::web_config::{WebConfig, WebConfigError};
@@ -186,17 +187,19 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
             .into_response();
     };
     pages.board.refresh(REFRESH_PATIENCE).await;
-    match pages.exposition.render(format) {
-        Ok(page) => (
-            [
-                (CONTENT_TYPE, format.content_type()),
-                (CACHE_CONTROL, "no-store"),
-            ],
-            turn.keep(page.into()),
-        )
-            .into_response(),
-        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    let mut page = Packed::default();
+    if pages.exposition.write(format, &mut page).is_err() {
+        return StatusCode::INTERNAL_SERVER_ERROR.into_response();
     }
+    (
+        [
+            (CONTENT_TYPE, format.content_type()),
+            (CACHE_CONTROL, "no-store"),
+        ],
+        [(CONTENT_LENGTH, page.len())],
+        turn.keep_packed(page),
+    )
+        .into_response()
 }
 
 async fn readyz(Extract(pages): Extract<Pages>) -> Response {

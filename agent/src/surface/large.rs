@@ -4,9 +4,11 @@
 
 use std::time::Duration;
 
-use axum::body::Bytes;
+use axum::body::{Body, Bytes};
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::time::timeout;
+
+use super::packed::Packed;
 
 /// Large answers of one surface at once.
 const AT_ONCE: usize = 2;
@@ -51,6 +53,14 @@ impl Answers {
 }
 
 impl Turn {
+    /// The text as an answer, which keeps the place if it is large.
+    pub(super) fn keep_packed(self, text: Packed) -> Body {
+        if text.len() < LARGE {
+            return text.into_body(());
+        }
+        text.into_body(self)
+    }
+
     /// The answer, which keeps the place if it is large.
     pub(super) fn keep(self, bytes: Bytes) -> Bytes {
         if bytes.len() < LARGE {

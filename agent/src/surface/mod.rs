@@ -17,6 +17,7 @@ mod large;
 pub mod limit_facts;
 mod listen;
 pub mod otlp;
+mod packed;
 mod page;
 mod process;
 pub mod recording_facts;
