@@ -243,10 +243,9 @@ impl<C: Carrier> Crowd<C> {
     /// Leases that have ended.
     fn bury(&mut self) {
         let now = Instant::now();
-        let late = |member: &Member| member.seen.elapsed() > member.lease.mul_f64(LATE);
         let (silenced, members) = std::mem::take(&mut self.members)
             .into_iter()
-            .partition(late);
+            .partition(Member::is_late);
         self.members = members;
         self.silent.extend(Vec::from_iter(silenced));
         let (ended, silent): (Vec<_>, _) = std::mem::take(&mut self.silent)
@@ -261,7 +260,8 @@ impl<C: Carrier> Crowd<C> {
     fn renew(&mut self) -> Result<()> {
         for index in 0..self.members.len() {
             let member = &self.members[index];
-            if member.seen.elapsed() > member.lease / 3 {
+            // Held up while it renewed others, this may be too late for some.
+            if member.seen.elapsed() > member.lease / 3 && !member.is_late() {
                 let message = member.announcement();
                 self.say(&message)?;
                 self.members[index].seen = Instant::now();
@@ -470,6 +470,10 @@ impl<C: Carrier> Crowd<C> {
 impl Member {
     fn stays(&self) -> bool {
         self.slot < STAYING
+    }
+
+    fn is_late(&self) -> bool {
+        self.seen.elapsed() > self.lease.mul_f64(LATE)
     }
 
     /// When its lease ends.
