@@ -226,7 +226,7 @@ fn unknown_writers_beyond_the_cap_are_not_followed_until_one_is_forgotten() {
 }
 
 #[test]
-fn flows_beyond_the_cap_are_counted_and_their_messages_too() {
+fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
     let limits = Limits {
         flows: 2,
         ..Limits::default()
@@ -247,6 +247,23 @@ fn flows_beyond_the_cap_are_counted_and_their_messages_too() {
             .all(|each| each.delivered.messages == 10)
     );
     assert_eq!(host.measurement().messages, 10);
+    for number in 11..=60 {
+        (2..=3).for_each(|socket| host.data(at(socket), number));
+        host.wait(400);
+    }
+    let sockets: Vec<_> = host
+        .deliveries()
+        .iter()
+        .map(|each| each.sockets.clone())
+        .collect();
+    assert_eq!(sockets, [[2], [3]]);
+    let (used, reached) = standing(limits, host.snapshot(), Limit::Flows);
+    host.data(at(3), 61);
+    assert_eq!(used, 2);
+    assert_eq!(
+        standing(limits, host.snapshot(), Limit::Flows),
+        (2, reached)
+    );
 }
 
 fn sample(number: u64) -> Given {

@@ -28,9 +28,9 @@ use tempfile::TempDir;
 const API: &str = "http://127.0.0.1:17401";
 /// How long an agent may take to show what is so.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Of `make soak`: until memory is what it will be. The allocator takes 20 to 40 minutes for that.
-const WARM_UP: f64 = 0.5;
-/// What memory may rise from then on.
+/// Of `make soak`: until memory is what it will be.
+const WARM_UP: f64 = 0.15;
+/// What the memory of an hour may rise.
 const GROWTH: f64 = 0.02;
 
 #[test]
