@@ -187,7 +187,7 @@ pub fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> 
     exchange(stream, &head, "")
 }
 
-/// Asks the control API: the status, and the body or null where it is not JSON.
+/// Asks the control API: the status, and the JSON of the body or null without one.
 pub fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
     let stream = TcpStream::connect(api).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -197,7 +197,11 @@ pub fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value
          Content-Length: {length}\r\n"
     );
     let Answer { status, body, .. } = exchange(stream, &head, body);
-    (status, serde_json::from_str(&body).unwrap_or_default())
+    if body.is_empty() {
+        return (status, Value::Null);
+    }
+    let body = serde_json::from_str(&body).unwrap_or_else(|error| panic!("{error}: {body}"));
+    (status, body)
 }
 
 /// Sends a request of this head, without its last line, and this body; reads the answer.
