@@ -397,6 +397,8 @@ mod tests {
             }
             kilobytes
         };
+        // As the agent does: what is cached in one piece comes back in one piece otherwise.
+        part_program();
         let before = resident();
         give_back_program();
         let after = resident();
