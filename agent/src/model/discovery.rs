@@ -86,11 +86,13 @@ struct PendingNodes {
 }
 
 /// All participants, endpoints and nodes.
+///
+/// Boxed: a table in which much comes and goes has up to four places for each entry.
 #[derive(Debug)]
 pub struct Discovery {
     caps: Caps,
-    participants: HashMap<GuidPrefix, Participant>,
-    endpoints: HashMap<Guid, Endpoint>,
+    participants: HashMap<GuidPrefix, Box<Participant>>,
+    endpoints: HashMap<Guid, Box<Endpoint>>,
     pending_endpoints: VecDeque<PendingEndpoint>,
     pending_nodes: HashMap<GuidPrefix, PendingNodes>,
     graveyard: Graveyard,
@@ -142,13 +144,13 @@ impl Discovery {
 
     /// Everybody.
     #[must_use]
-    pub const fn participants(&self) -> &HashMap<GuidPrefix, Participant> {
+    pub const fn participants(&self) -> &HashMap<GuidPrefix, Box<Participant>> {
         &self.participants
     }
 
     /// All endpoints of known participants.
     #[must_use]
-    pub const fn endpoints(&self) -> &HashMap<Guid, Endpoint> {
+    pub const fn endpoints(&self) -> &HashMap<Guid, Box<Endpoint>> {
         &self.endpoints
     }
 
@@ -218,7 +220,7 @@ impl Discovery {
         }
         self.participants.insert(
             guid.prefix,
-            Participant {
+            Box::new(Participant {
                 portrait: portrait.clone(),
                 addresses: Addresses::of(announcement),
                 restored: None,
@@ -230,7 +232,7 @@ impl Discovery {
                 readers_told: false,
                 domain_source: source,
                 nodes_from: None,
-            },
+            }),
         );
         let subject = Subject::participant(domain_id, guid, &portrait);
         self.note(&subject, Event::Appeared, origin.at, journal);
@@ -439,7 +441,7 @@ impl Discovery {
             data_sharing: announcement.datasharing,
         };
         let subject = Subject::endpoint(guid, &endpoint);
-        self.endpoints.insert(guid, endpoint);
+        self.endpoints.insert(guid, Box::new(endpoint));
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.insert(guid);
         }
@@ -554,7 +556,7 @@ impl Discovery {
         if let Some(event) = event {
             self.note(&Subject::endpoint(guid, &endpoint), event, at, journal);
         }
-        self.changes.push(Change::Gone(guid, Box::new(endpoint)));
+        self.changes.push(Change::Gone(guid, endpoint));
     }
 
     /// A participant's domain is told better than before: all it has moves along.
@@ -573,8 +575,7 @@ impl Discovery {
         participant.domain_id = domain_id;
         for guid in &participant.endpoints {
             if let Some(endpoint) = self.endpoints.get_mut(guid) {
-                self.changes
-                    .push(Change::Gone(*guid, Box::new(endpoint.clone())));
+                self.changes.push(Change::Gone(*guid, endpoint.clone()));
                 endpoint.domain_id = domain_id;
                 self.changes.push(Change::Appeared(*guid));
             }

@@ -92,9 +92,11 @@ pub struct Topic {
 }
 
 /// All topics of all domains.
+///
+/// Boxed: a table in which much comes and goes has up to four places for each entry.
 #[derive(Debug, Default)]
 pub struct Topics {
-    topics: HashMap<TopicId, Topic>,
+    topics: HashMap<TopicId, Box<Topic>>,
     index: BTreeMap<(u32, Arc<str>), TopicId>,
     /// Those without endpoints, by the time when the last one went.
     vanished: BTreeSet<(Timestamp, TopicId)>,
@@ -220,12 +222,12 @@ impl Topics {
     /// One topic.
     #[must_use]
     pub fn get(&self, id: TopicId) -> Option<&Topic> {
-        self.topics.get(&id)
+        self.topics.get(&id).map(Box::as_ref)
     }
 
     /// One topic.
     pub fn get_mut(&mut self, id: TopicId) -> Option<&mut Topic> {
-        self.topics.get_mut(&id)
+        self.topics.get_mut(&id).map(Box::as_mut)
     }
 
     /// The topic of this DDS name, or of the topic it stands beside.
@@ -240,7 +242,7 @@ impl Topics {
     pub fn iter(&self) -> impl Iterator<Item = (TopicId, &Topic)> {
         self.index
             .values()
-            .filter_map(|id| Some((*id, self.topics.get(id)?)))
+            .filter_map(|id| Some((*id, &**self.topics.get(id)?)))
     }
 
     /// All handles, by domain and DDS name.
@@ -418,7 +420,7 @@ impl Topics {
             .insert((domain_id, Arc::clone(&naming.dds_name)), id);
         self.topics.insert(
             id,
-            Topic {
+            Box::new(Topic {
                 domain_id,
                 naming: Naming {
                     beside: false,
@@ -437,7 +439,7 @@ impl Topics {
                 reader_appeared: Timestamp(0),
                 published: Timestamp(0),
                 vanished: None,
-            },
+            }),
         );
         id
     }

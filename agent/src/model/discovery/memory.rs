@@ -102,16 +102,16 @@ impl Discovery {
     pub fn memory(&self) -> Memory {
         let mut participants: Vec<_> = self.participants.iter().collect();
         participants.sort_unstable_by_key(|(prefix, _)| **prefix);
-        let remember = |(prefix, participant): (&GuidPrefix, &Participant)| {
+        let remembered = participants.into_iter().map(|(prefix, participant)| {
             let endpoints = participant.endpoints.iter();
             let endpoints = endpoints.filter_map(|guid| {
                 let endpoint = self.endpoints.get(guid)?;
                 Some(RememberedEndpoint::of(*guid, endpoint))
             });
             Remembered::of(*prefix, participant, endpoints.collect())
-        };
+        });
         Memory {
-            participants: participants.into_iter().map(remember).collect(),
+            participants: remembered.collect(),
         }
     }
 
@@ -143,11 +143,11 @@ impl Discovery {
                     continue;
                 }
                 if participant.endpoints.insert(guid) {
-                    self.endpoints.insert(guid, endpoint);
+                    self.endpoints.insert(guid, Box::new(endpoint));
                     self.changes.push(Change::Appeared(guid));
                 }
             }
-            self.participants.insert(prefix, participant);
+            self.participants.insert(prefix, Box::new(participant));
         }
     }
 }
