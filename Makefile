@@ -27,7 +27,7 @@ export CARGO_TARGET_$(HOST)_RUNNER := $(SUDO) env PATH=$(PATH)
 endif
 
 help: ## this list
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
+	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
 
 demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it by itself (needs root)
 	@.ci/prerequisites.sh demo
@@ -44,7 +44,12 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
 	cargo test --package ros2probe --features tls --test web_config --test otlp_tls --quiet
+	@.ci/prerequisites.sh --left-out
 	cargo nextest run --workspace
+
+test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
+	@.ci/prerequisites.sh test ros2
+	cargo nextest run --package ros2probe --run-ignored only --filterset 'binary(/^humble_/)'
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf
@@ -108,4 +113,4 @@ deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test ebpf run peers arm dist distcheck bench soak fuzz miri deny prerequisites
+.PHONY: help demo test test-ros2 ebpf run peers arm dist distcheck bench soak fuzz miri deny prerequisites

@@ -3,7 +3,9 @@
 #
 #   prerequisites.sh demo|test|dist|ebpf|fuzz|miri|deny...   install what those targets need
 #   prerequisites.sh types                    install what the dashboards are type-checked with
+#   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
+#   prerequisites.sh --left-out               print which tests `make test` leaves out
 #
 # Made for Debian 12 and Ubuntu 22.04 or newer. It starts no service, adds no package source and
 # changes no system setting; what cannot be had ends it with a line that says how to get it.
@@ -179,6 +181,22 @@ nextest() {
     cargo install cargo-nextest --version 0.9.151 --locked --debug --no-default-features --features default-no-update
 }
 
+# No package source has ROS 2 Humble for Debian 12: an archive with a script of its own does.
+ros2() {
+    [ -e /opt/ros/humble/env.sh ] && return
+    local installer=../shared/ros2/install.sh
+    [ -e "$installer" ] ||
+        die "ROS 2 Humble is missing: /opt/ros/humble/env.sh is not there, nor is $installer"
+    say "installing ROS 2 Humble into /opt/ros with $installer"
+    as_root bash "$installer"
+}
+
+left_out() {
+    local tests
+    tests=$(cat agent/tests/humble_*.rs | grep -c '^#\[ignore = "needs ROS 2 Humble')
+    say "left out here: the $tests tests with real ROS 2 Humble nodes (make test-ros2)"
+}
+
 rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
@@ -242,6 +260,8 @@ network_tools=(iproute2 nftables ethtool util-linux procps curl ca-certificates 
 for need; do
     case $need in
     --nightly) nightly ;;
+    --left-out) left_out ;;
+    ros2) ros2 ;;
     demo)
         packages "${network_tools[@]}" gcc libc6-dev
         rust

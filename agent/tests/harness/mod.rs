@@ -19,6 +19,7 @@ pub(crate) mod network;
 pub(crate) mod peer;
 pub(crate) mod process;
 pub(crate) mod prometheus;
+pub(crate) mod shared_memory;
 pub(crate) mod snmp;
 pub(crate) mod soak;
 pub(crate) mod switch;
