@@ -45,6 +45,26 @@ fn the_whole_corpus_reproduces_its_ground_truth_if_it_is_there() {
     truth::scenarios(&corpus).iter().for_each(check);
 }
 
+#[test]
+fn what_a_keep_last_writer_overwrote_is_lost_as_the_subscribers_log_says() {
+    for (label, lost) in [("fastrtps-udp", 8), ("cyclonedds", 78)] {
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
+        let directory = data.join(label).join("keep-last-lossy-2ns");
+        let [received] = &truth::received(&directory)[..] else {
+            panic!("one subscriber")
+        };
+        assert_eq!(received.lost_between.len(), lost, "{label}");
+        let replayed = Replayed::of(&directory.join("capture.pcap.gz"));
+        compare_losses(label, received, &replayed);
+        let topics = &replayed.end.topics;
+        let topic = topics.iter().find(|topic| topic.name == received.topic);
+        let delivered = topic.unwrap().received.as_deref().unwrap();
+        assert_eq!(delivered.messages, received.count, "{label}");
+        let counts = (delivered.lost(), delivered.irrelevant);
+        assert_eq!(counts, (lost as u64, 0), "{label}");
+    }
+}
+
 fn check(scenario: &Scenario) {
     let name = scenario.name();
     let facts = scenario.facts();
@@ -379,20 +399,22 @@ fn logged_losses(name: &str, scenario: &Scenario, replayed: &Replayed) {
         return;
     }
     for received in scenario.received() {
-        let theirs: BTreeSet<_> = received.lost_between.iter().map(|seq| seq + 1).collect();
-        let topic = format!("rt{}", received.topic);
-        let (_, ours) = replayed
-            .losses
-            .iter()
-            .find(|(guid, _)| replayed.topic_of(guid) == Some(topic.as_str()))
-            .unzip();
-        assert_eq!(ours.cloned().unwrap_or_default(), theirs, "{name}: {topic}");
-        assert_eq!(
-            replayed.measurement(&topic).messages,
-            received.count,
-            "{name}: {topic}"
-        );
+        compare_losses(name, &received, replayed);
     }
+}
+
+/// A writer sequence number is the logged sequence + 1.
+fn compare_losses(name: &str, received: &truth::Received, replayed: &Replayed) {
+    let theirs: BTreeSet<_> = received.lost_between.iter().map(|seq| seq + 1).collect();
+    let topic = format!("rt{}", received.topic);
+    let (_, ours) = replayed
+        .losses
+        .iter()
+        .find(|(guid, _)| replayed.topic_of(guid) == Some(topic.as_str()))
+        .unzip();
+    assert_eq!(ours.cloned().unwrap_or_default(), theirs, "{name}: {topic}");
+    let messages = replayed.measurement(&topic).messages;
+    assert_eq!(messages, received.count, "{name}: {topic}");
 }
 
 /// When the graph stood still for a real participant, it was the same here.

@@ -605,21 +605,12 @@ fn copies_of_a_multicast_on_its_way_out_are_no_duplicates() {
 fn an_acknowledgement_tells_what_a_reader_waits_for() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
-    let acknack = |host: &mut Host, base: u64, bits: u32, bitmap: u32| {
-        let record = Record {
-            reader: guid_words(Guid::new(BOB, READER)),
-            stamp_seconds: bits,
-            stamp_nanoseconds: bitmap,
-            ..host.record(bob.leaving(), kind::ACKNACK, base)
-        };
-        host.put(record);
-    };
-    acknack(&mut host, 1, 0, 0);
+    host.acknack(bob, 1);
     for number in 1..=20 {
         host.data(bob, number);
         host.wait(100);
     }
-    acknack(&mut host, 11, 2, 0b11 << 30);
+    host.request(bob, 11, 2, 0b11 << 30);
     let topic = host.topic();
     let [facts] = &topic.acknowledgements[..] else {
         panic!("one reader")
@@ -879,17 +870,78 @@ fn heartbeats_alone_lose_nothing_until_the_reader_asks() {
     // All samples are larger than what gets through, and the reader asks for them.
     for number in 101..=120 {
         host.heartbeat(bob.directed(BOB), 1, number);
-        let acknack = Record {
-            reader: guid_words(Guid::new(BOB, READER)),
-            stamp_seconds: 1,
-            stamp_nanoseconds: 1 << 31,
-            ..host.record(bob.leaving(), kind::ACKNACK, 101)
-        };
-        host.put(acknack);
+        host.request(bob, 101, 1, 1 << 31);
         host.wait(100);
     }
     host.wait(12_000);
-    assert!((118..=120).contains(&host.deliveries()[0].delivered.lost()));
+    // What it acknowledged before came by shared memory.
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.lost(), facts.irrelevant), (20, 99));
+}
+
+#[test]
+fn what_a_writer_of_few_samples_overwrote_before_it_came_is_lost() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=100 {
+        // KEEP_LAST (1): of 50 and 51 only the HEARTBEAT with 51 came.
+        match number {
+            10 | 20 | 21 | 50 => {}
+            51 => host.heartbeat(bob.directed(BOB), 51, 51),
+            _ => {
+                host.data(bob, number);
+                host.heartbeat(bob.directed(BOB), number, number);
+            }
+        }
+        host.wait(10);
+    }
+    host.wait(12_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.messages, facts.lost(), facts.irrelevant), (95, 5, 0));
+    assert_eq!(host.losses(LossCause::BeforeHost), [10, 20, 21, 50, 51]);
+    assert_eq!(host.measurement().lost, 5);
+}
+
+#[test]
+fn what_its_reader_acknowledged_is_not_lost_although_it_was_not_seen() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=101 {
+        if number % 10 != 0 {
+            host.data(bob, number);
+        }
+        host.acknack(bob, number + 1);
+        host.heartbeat(bob.directed(BOB), number, number);
+        host.wait(10);
+    }
+    host.wait(12_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!(
+        (facts.messages, facts.lost(), facts.irrelevant),
+        (91, 0, 10)
+    );
+    assert_eq!(
+        (host.measurement().lost, host.measurement().irrelevant),
+        (0, 10)
+    );
+}
+
+#[test]
+fn what_was_written_while_a_reader_was_away_is_not_lost_when_a_heartbeat_begins_later() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    (1..=100).for_each(|number| host.data(bob, number));
+    host.wait(50);
+    host.unsubscribe(BOB, 2);
+    host.wait(1000);
+    host.subscribe(BOB, 3);
+    host.wait(10);
+    host.heartbeat(bob.directed(BOB), 391, 400);
+    (401..=410).for_each(|number| host.data(bob, number));
+    host.wait(12_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.messages, facts.lost()), (110, 0));
+    assert_eq!(host.measurement().lost, 0);
 }
 
 /// What becomes of one sample.

@@ -62,6 +62,12 @@ impl Acknowledgements {
         self.trim();
     }
 
+    /// Those of these readers that acknowledged at all have all samples below this number.
+    pub fn floor(&self, is_meant: impl Fn(Guid) -> bool) -> Option<u64> {
+        let meant = self.readers.iter().filter(|reader| is_meant(reader.guid));
+        meant.map(|reader| reader.base).min()
+    }
+
     /// The writer's newest sample is this one.
     pub fn wrote(&mut self, number: u64, at: Timestamp) {
         if self.readers.is_empty() {

@@ -269,18 +269,11 @@ impl Delivery {
         if !self.proven {
             return;
         }
-        // A best-effort reader does not hear what the writer will not send again: it is lost.
-        let sequence_number = if self.best_effort {
-            1
-        } else {
-            record.sequence_number
-        };
-        let record = Record {
-            sequence_number,
-            ..*record
-        };
+        let sequence = self.reception.sequence();
+        let before = (sequence.next(), sequence.last_advance());
         let (reception, budget, mut deciding) = self.split(scene);
-        reception.heartbeat(&record, budget, &mut |decision| deciding.take(decision));
+        reception.heartbeat(record, budget, &mut |decision| deciding.take(decision));
+        self.excuse_unheard(before);
     }
 
     /// Takes in a GAP for this receiver.
@@ -298,6 +291,11 @@ impl Delivery {
         let first = sequence.first();
         self.proven |= sequence.started() && set().any(|number| number >= first);
         sequence.requested(set());
+    }
+
+    /// Its readers have all below `base`.
+    pub fn acknowledged(&mut self, base: u64) {
+        self.reception.sequence_mut().acknowledged(base);
     }
 
     /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What does
@@ -338,7 +336,9 @@ impl Delivery {
     pub fn advance(&mut self, scene: &mut Scene<'_>) {
         let (now, window) = (scene.now, settle_window(self.is_reliable(scene)));
         let (reception, budget, mut deciding) = self.split(scene);
-        reception.advance(now, window, budget, &mut |decision| deciding.take(decision));
+        reception.advance(now, (window, window), budget, &mut |decision| {
+            deciding.take(decision)
+        });
         self.conclude(now, scene);
         self.deaths.settled(self.reception.sequence().settled());
         self.cancelled.expire(now.0);
@@ -406,15 +406,12 @@ impl Delivery {
         if !is_sent && self.misses(number) && number < sequence.settled() {
             return self.late(record, scene);
         }
-        let (next, advanced) = (sequence.next(), sequence.last_advance());
+        let before = (sequence.next(), sequence.last_advance());
         let (reception, budget, mut deciding) = self.split(scene);
         let outcome = reception.sample(record, reliable, budget, &mut |decision| {
             deciding.take(decision);
         });
-        let sequence = self.reception.sequence_mut();
-        if next > 0 && advanced < self.opened && sequence.next() > next {
-            sequence.excuse(next, sequence.next());
-        }
+        self.excuse_unheard(before);
         match outcome {
             Outcome::Open => (false, None),
             Outcome::Again => {
@@ -428,6 +425,15 @@ impl Delivery {
                 self.whole(&whole, scene);
                 (false, Some(whole))
             }
+        }
+    }
+
+    /// What was written until its reader appeared is for no reader here: `next` and when it last rose
+    /// are those before the record that is taken in.
+    fn excuse_unheard(&mut self, (next, advanced): (u64, Timestamp)) {
+        let sequence = self.reception.sequence_mut();
+        if next > 0 && advanced < self.opened && sequence.next() > next {
+            sequence.excuse(next, sequence.next());
         }
     }
 

@@ -212,6 +212,11 @@ impl Profiler {
                 .subscribers
                 .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
             sight = subscribers.record(record, &mut stage);
+            if record.kind == kind::ACKNACK
+                && let Some(below) = subscribers.acknowledged_below()
+            {
+                measured.writer.acknowledged(below);
+            }
         }
         if record.flags & UNDELIVERED != 0 || sight == Sight::Covered {
             return Sighting::Measured;

@@ -195,17 +195,18 @@ impl Reception {
         }
     }
 
-    /// Decides what has been open for `window` nanoseconds.
+    /// Decides what has been open for `window` nanoseconds, and what the writer withdrew `grace`
+    /// nanoseconds ago.
     pub fn advance(
         &mut self,
         now: Timestamp,
-        window: u64,
+        (window, grace): (u64, u64),
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {
         let Self { sequence, samples } = self;
         let hold = samples.growing(now, window);
-        sequence.advance(now, window, hold, &mut |settled| {
+        sequence.advance(now, (window, grace), hold, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
         samples.expire(now, 2 * window, budget);

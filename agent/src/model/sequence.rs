@@ -1,8 +1,9 @@
 //! Which sequence numbers of one writer came, and which never will.
 //!
 //! A gap is not a loss yet: it stays open for the settle window, so that reordering and
-//! retransmission can fill it. What GAP, HEARTBEAT's firstSN or the moment of first sight excuse is
-//! never a loss. Memory is two bitmaps that grow with the number of undecided sequence numbers, up
+//! retransmission can fill it. What GAP, an ACKNACK or the moment of first sight excuses is never a
+//! loss. HEARTBEAT's firstSN excuses nothing: a sample that never came and that the writer no longer
+//! has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory is two bitmaps that grow with the number of undecided sequence numbers, up
 //! to [`MAX_WINDOW`]. It knows no payloads and no time but the one it is given.
 
 use std::collections::VecDeque;
@@ -39,6 +40,10 @@ pub struct Sequence {
     settled: u64,
     /// All that are known to exist are below this.
     next: u64,
+    /// The writer has none below this any more: the highest firstSN of its HEARTBEATs.
+    available: u64,
+    /// A value that `available` had, and since when.
+    withdrawn: Option<(Timestamp, u64)>,
     received: Bitmap,
     excused: Bitmap,
     /// `next` at some moments, oldest first.
@@ -235,8 +240,8 @@ impl Sequence {
         self.first
     }
 
-    /// HEARTBEAT: the writer has `first..=last`. What lies before `first` it will never send again;
-    /// what lies up to `last` exists.
+    /// HEARTBEAT: the writer has `first..=last`. It will send nothing below `first` again; all up to
+    /// `last` exist.
     pub fn heartbeat(
         &mut self,
         first: u64,
@@ -247,16 +252,23 @@ impl Sequence {
         if !self.started() || first == 0 || first > last.saturating_add(1) {
             return;
         }
-        self.excuse(self.settled, first.min(self.next));
         let next = last.saturating_add(1);
         if next > self.next && next - self.next <= MAX_AHEAD {
-            let start = self.next.max(first);
-            if start > self.next {
-                self.extend(start - 1, start, now, settled);
-                self.excuse(self.settled, start);
-            }
-            self.note_gap(start, next, now);
+            self.note_gap(self.next, next, now);
             self.extend(next - 1, next, now, settled);
+        }
+        let available = first.min(self.next);
+        if available > self.available {
+            self.available = available;
+            self.withdrawn.get_or_insert((now, available));
+        }
+    }
+
+    /// ACKNACK: the readers have all below `base`, also what was not seen here, except samples that
+    /// the writer had withdrawn before.
+    pub fn acknowledged(&mut self, base: u64) {
+        if self.started() {
+            self.excuse(self.available, base);
         }
     }
 
@@ -307,11 +319,12 @@ impl Sequence {
         self.excused.set_all(start, end.min(self.next));
     }
 
-    /// Decides what has been open for `window`, but nothing from `hold` on.
+    /// Decides what has been open for `window`, and what the writer withdrew `grace` ago, but nothing
+    /// from `hold` on.
     pub fn advance(
         &mut self,
         now: Timestamp,
-        window: u64,
+        (window, grace): (u64, u64),
         hold: Option<u64>,
         settled: &mut impl FnMut(Settled),
     ) {
@@ -319,10 +332,17 @@ impl Sequence {
             return;
         }
         let mut limit = None;
+        if let Some((at, available)) = self.withdrawn
+            && at.0.saturating_add(grace) <= now.0
+        {
+            limit = Some(available);
+            let later = self.available > available;
+            self.withdrawn = later.then_some((now, self.available));
+        }
         while let Some((at, next)) = self.checkpoints.front().copied()
             && at.0.saturating_add(window) <= now.0
         {
-            limit = Some(next);
+            limit = limit.max(Some(next));
             if hold.is_some_and(|hold| hold < next) {
                 break;
             }

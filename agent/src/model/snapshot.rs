@@ -249,7 +249,8 @@ pub struct Measurement {
     pub duplicates: u64,
     /// Samples whose fragments never became complete (also counted in `lost` once settled).
     pub incomplete: u64,
-    /// Samples excused by GAP, HEARTBEAT firstSN, or because the kernel did not know their writer yet.
+    /// Samples excused by GAP, by the ACKNACKs of readers that have them, or because the kernel did not
+    /// know their writer yet.
     pub irrelevant: u64,
     /// Time of the last new sample.
     pub last_message: Option<Timestamp>,

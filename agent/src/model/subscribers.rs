@@ -158,6 +158,7 @@ impl Subscribers {
             let is_reader = |topic: &Topic| is_reader(topic, record.reader());
             if stage.topic().is_some_and(is_reader) {
                 self.acknowledgements.record(record);
+                self.acknowledged(record);
             }
             return Sight::New;
         }
@@ -192,6 +193,12 @@ impl Subscribers {
             self.arrive(index, record, stage)
         };
         if came_again { Sight::Again } else { Sight::New }
+    }
+
+    /// All readers that acknowledge have all samples below this number; `None` if none does.
+    #[must_use]
+    pub fn acknowledged_below(&self) -> Option<u64> {
+        self.acknowledgements.floor(|_| true)
     }
 
     /// The writer's newest sample is this one.

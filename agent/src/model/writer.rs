@@ -244,11 +244,17 @@ impl Writer {
         counted
     }
 
+    /// Its readers have all below `base`.
+    pub fn acknowledged(&mut self, base: u64) {
+        self.reception.sequence_mut().acknowledged(base);
+    }
+
     /// Settles what has waited long enough.
     pub fn advance(&mut self, scene: &mut Scene<'_>) {
         let (now, window) = (scene.now, settle_window(self.traits.reliable));
         let (reception, mut settling) = self.parts(scene.journal, scene.now);
-        reception.advance(now, window, scene.budget, &mut |decision| {
+        let windows = (window, BEST_EFFORT_WINDOW);
+        reception.advance(now, windows, scene.budget, &mut |decision| {
             settling.take(decision);
         });
     }

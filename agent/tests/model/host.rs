@@ -258,6 +258,21 @@ impl Host {
         });
     }
 
+    /// Bob's reader has all below `base`.
+    pub fn acknack(&mut self, bob: Seen, base: u64) {
+        self.request(bob, base, 0, 0);
+    }
+
+    /// And asks for some of the next `bits`.
+    pub fn request(&mut self, bob: Seen, base: u64, bits: u32, bitmap: u32) {
+        self.put(Record {
+            reader: guid_words(Guid::new(BOB, READER)),
+            stamp_seconds: bits,
+            stamp_nanoseconds: bitmap,
+            ..self.record(bob.leaving(), kind::ACKNACK, base)
+        });
+    }
+
     /// This one will not come.
     pub fn gap(&mut self, seen: Seen, number: u64) {
         self.put(Record {

@@ -40,15 +40,27 @@ impl Bench {
         }
     }
 
+    fn heartbeat(&mut self, first: u64, last: u64) -> &mut Self {
+        let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
+        let mut note = |settled| note(settled, lost, irrelevant);
+        self.sequence
+            .heartbeat(first, last, Timestamp(self.now), &mut note);
+        self
+    }
+
     fn wait(&mut self, seconds: u64) -> &mut Self {
         let end = self.now + seconds * SECOND;
         while self.now < end {
             self.now += SECOND / 10;
             let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
-            self.sequence
-                .advance(Timestamp(self.now), SECOND, None, &mut |settled| {
+            self.sequence.advance(
+                Timestamp(self.now),
+                (SECOND, SECOND),
+                None,
+                &mut |settled| {
                     note(settled, lost, irrelevant);
-                });
+                },
+            );
         }
         self
     }
@@ -116,20 +128,53 @@ fn nothing_before_the_first_sight_is_lost() {
 }
 
 #[test]
-fn gap_and_heartbeat_excuse() {
+fn gap_excuses_and_heartbeat_does_not() {
     let mut bench = Bench::default();
     bench.receive([1, 4, 7, 9]);
     bench
         .sequence
         .gap(2, 4, [].into_iter(), Timestamp(bench.now), &mut |_| {});
-    bench
-        .sequence
-        .heartbeat(7, 9, Timestamp(bench.now), &mut |_| {});
+    bench.heartbeat(7, 9).wait(3);
+    assert_eq!(
+        (bench.irrelevant.as_slice(), bench.lost.as_slice()),
+        (&[2, 3][..], &[5, 6, 8][..])
+    );
+}
+
+#[test]
+fn what_readers_acknowledge_is_no_loss_unless_the_writer_had_withdrawn_it() {
+    let mut bench = Bench::default();
+    bench.receive([1, 4]);
+    bench.sequence.acknowledged(4);
+    bench.heartbeat(4, 4).receive([7]);
+    bench.heartbeat(7, 7);
+    bench.sequence.acknowledged(8);
     bench.wait(3);
     assert_eq!(
         (bench.irrelevant.as_slice(), bench.lost.as_slice()),
-        (&[2, 3, 5, 6][..], &[8][..])
+        (&[2, 3][..], &[5, 6][..])
     );
+}
+
+#[test]
+fn what_a_heartbeat_tells_and_withdraws_at_once_is_lost() {
+    let mut bench = Bench::default();
+    bench.receive([1, 2]).heartbeat(6, 6).wait(3);
+    assert_eq!(bench.lost, [3, 4, 5, 6]);
+}
+
+#[test]
+fn what_the_writer_withdrew_is_decided_after_the_grace_and_not_the_window() {
+    let mut bench = Bench::default();
+    bench.receive([1, 4, 6]).heartbeat(4, 6);
+    let mut lost = Vec::new();
+    for (after, decided) in [(SECOND - 1, &[][..]), (SECOND, &[2, 3])] {
+        let now = Timestamp(bench.now + after);
+        let windows = (10 * SECOND, SECOND);
+        let mut note = |settled| note(settled, &mut lost, &mut Vec::new());
+        bench.sequence.advance(now, windows, None, &mut note);
+        assert_eq!(lost, decided);
+    }
 }
 
 #[test]

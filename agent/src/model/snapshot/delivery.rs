@@ -28,8 +28,8 @@ pub struct Delivered {
     pub unmatched: u64,
     /// Samples and fragments that came again; copies of one multicast on its way out do not count.
     pub duplicates: u64,
-    /// Samples that will not come because the writer said so (GAP, HEARTBEAT's firstSN), or that
-    /// were written while nobody here was listening.
+    /// Samples that the writer left out (GAP), that were written while no reader was here, or that
+    /// its readers acknowledged although no copy was seen.
     pub irrelevant: u64,
     /// Samples that never reached this host.
     pub lost_before_host: u64,

@@ -61,6 +61,23 @@ impl Subscribers {
         }
     }
 
+    /// A reader has all below the base of this ACKNACK. A delivery is its participant's: what all of
+    /// its readers have came there, whether it was seen or not.
+    pub(super) fn acknowledged(&mut self, record: &Record) {
+        let prefix = record.reader().prefix;
+        let below = self.acknowledgements.floor(|guid| guid.prefix == prefix);
+        for delivery in &mut self.deliveries {
+            let below = match delivery.receiver() {
+                Receiver::Participant(receiver) if receiver == prefix => below,
+                Receiver::Way(way) if way.is_open() => self.acknowledgements.floor(|_| true),
+                _ => None,
+            };
+            if let Some(below) = below {
+                delivery.acknowledged(below);
+            }
+        }
+    }
+
     pub(super) fn not_reassembled(&mut self, record: &Record, stage: &mut Stage<'_>) {
         self.reassembled = true;
         let place = Place::of(record);

@@ -22,7 +22,7 @@ pub(super) struct MeasurementView {
     duplicate_messages: u64,
     /// Lost messages of which a part was seen.
     incomplete_messages: u64,
-    /// Messages that the writer excused.
+    /// Messages that the writer left out (GAP), or that readers acknowledged unseen; no losses.
     irrelevant_messages: u64,
     /// Lost of those that were sent; null while there were none.
     loss_ratio: Option<f64>,
@@ -121,7 +121,7 @@ pub(super) struct DeliveredView {
     unmatched_messages: u64,
     /// Messages and fragments that came again.
     duplicate_messages: u64,
-    /// Messages that the writer excused.
+    /// Messages that the writer left out (GAP), or that readers acknowledged unseen; no losses.
     irrelevant_messages: u64,
 }
 

@@ -57,7 +57,7 @@ pub(in crate::surface) const TOPIC_DELIVERY_RECOVERED: Metric = Metric::counter(
 pub(in crate::surface) const TOPIC_DELIVERY_IRRELEVANT: Metric = Metric::counter(
     "ros2_topic_delivery_irrelevant_messages_total",
     TOPIC,
-    "Messages that did not come because their writer said that they would not (GAP, HEARTBEAT): no losses.",
+    "Messages that the writer left out (GAP), or that the reader acknowledged unseen: no losses.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_UNMATCHED: Metric = Metric::counter(
     "ros2_topic_delivery_unmatched_messages_total",
@@ -171,7 +171,7 @@ pub(in crate::surface) const SUBSCRIBER_RECOVERY_SECONDS: Metric = Metric::count
 pub(in crate::surface) const SUBSCRIBER_IRRELEVANT: Metric = Metric::counter(
     "ros2_subscriber_irrelevant_messages_total",
     SUBSCRIBER,
-    "Messages that the writer excused (GAP, HEARTBEAT).",
+    "Messages that the writer left out (GAP), or that the reader acknowledged unseen.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_UNMATCHED: Metric = Metric::counter(
