@@ -134,7 +134,7 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
             let name = capture.display();
             assert_eq!(format!("{alone:?}"), format!("{with:?}"), "{name}");
             let mut counts = counts(&news, depth);
-            let mut incomplete = 0;
+            let (mut incomplete, mut lost) = (0, 0);
             for topic in &with.topics {
                 let Some(measured) = &topic.measurement else {
                     continue;
@@ -145,19 +145,23 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
                 assert_eq!(given, expected, "{name}: {key:?}");
                 messages += given.0;
                 incomplete += measured.incomplete;
+                lost += measured.lost;
             }
             assert!(counts.is_empty(), "{name}: {counts:?}");
             let missed = news.iter().filter_map(|news| match news {
                 News::Missed(missed) => Some((missed.reason, missed.samples)),
                 News::Sample(_) => None,
             });
-            let missed: Vec<_> = missed.collect();
-            let expected = (MissedReason::Incomplete, 1);
-            assert!(
-                missed.iter().all(|missed| *missed == expected),
-                "{name}: {missed:?}"
-            );
-            assert_eq!(missed.len() as u64, incomplete, "{name}");
+            let mut told: BTreeMap<_, u64> = BTreeMap::new();
+            for (reason, samples) in missed {
+                *told.entry(reason).or_default() += samples;
+            }
+            let mut expected = BTreeMap::from([
+                (MissedReason::Incomplete, incomplete),
+                (MissedReason::Lost, lost - incomplete),
+            ]);
+            expected.retain(|_, samples| *samples > 0);
+            assert_eq!(told, expected, "{name}");
         }
     }
     assert!(messages >= 64, "{messages}");
@@ -265,6 +269,38 @@ fn a_sample_that_stays_incomplete_is_told_and_not_given() {
         (ALICE, 2, Err(MissedReason::Incomplete)),
     ];
     assert_eq!(given, expected);
+}
+
+#[test]
+fn each_subscription_is_told_of_the_losses_since_it_began() {
+    let mut robot = Robot::new(Settings::default());
+    let data = |robot: &mut Robot, number| {
+        robot.put(Message::from(ALICE).data(WRITER, number, b"\0\x01\0\0anything"));
+    };
+    let wishes = |robot: &mut Robot, ids: &[u64]| {
+        let wishes = ids.iter().map(|id| wish(*id, Depth::Arrivals));
+        robot.observer.set_wishes(Arc::new(wishes.collect()));
+    };
+    wishes(&mut robot, &[3]);
+    data(&mut robot, 1);
+    data(&mut robot, 4);
+    wishes(&mut robot, &[3, 5]);
+    data(&mut robot, 8);
+    robot.at += 12 * SECOND;
+    robot.observer.advance(Timestamp(robot.at));
+    let given = robot.observer.take_given().into_iter();
+    let mut missed: Vec<_> = given
+        .filter_map(|given| match given.news {
+            News::Missed(missed) => {
+                assert_eq!(missed.reason, MissedReason::Lost);
+                assert_eq!(missed.samples, missed.last - missed.first + 1);
+                Some((given.to.to_vec(), missed.first, missed.last))
+            }
+            News::Sample(_) => None,
+        })
+        .collect();
+    missed.sort();
+    assert_eq!(missed, [(vec![3], 2, 3), (vec![3, 5], 5, 7)]);
 }
 
 #[test]

@@ -135,11 +135,10 @@ impl Echo {
                 let mut text = String::new();
                 let mut is_enough = false;
                 match came {
-                    Came::Clock => text = lost.now(now),
+                    Came::Clock => {}
                     Came::Missed(missed) => text = lost.missed(missed),
                     Came::Message(sample, payload) => {
                         is_seen = true;
-                        lost.came(sample);
                         let wanted = self.message_type.as_ref().or(expected.as_ref());
                         if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
                             let message_type = if raw { None } else { types.of(sample) };
@@ -166,10 +165,6 @@ impl Echo {
             },
         )?;
         if went == Went::ToTheEnd {
-            let text = lost.now(i64::MAX);
-            if !self.no_lost_messages {
-                output.write(&text)?;
-            }
             let is_known = is_seen || self.message_type.is_some();
             if !is_known
                 && topic(

@@ -163,7 +163,7 @@ fn hint(missed: &MissedFacts) {
         Reason::NotCaptured => {
             eprintln!("rp: {samples} messages of {topic} are not shown: the agent has no room");
         }
-        Reason::Incomplete => {}
+        Reason::Incomplete | Reason::Lost => {}
     }
 }
 

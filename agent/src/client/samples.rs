@@ -103,6 +103,7 @@ impl<'a> Samples<'a> {
                     samples: facts.samples,
                     reason: match facts.reason {
                         Reason::Incomplete => MissedReason::Incomplete,
+                        Reason::Lost => MissedReason::Lost,
                         Reason::NotCaptured => MissedReason::NotCaptured,
                         Reason::QueueFull => MissedReason::QueueFull,
                     },

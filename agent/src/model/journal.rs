@@ -46,6 +46,19 @@ pub struct Loss {
     pub last: u64,
 }
 
+/// Consecutive samples that were settled as lost, until they are taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Missing {
+    /// Whose.
+    pub writer: Guid,
+    /// First lost sequence number.
+    pub first: u64,
+    /// Last lost sequence number.
+    pub last: u64,
+    /// Fragments of it came; then it is one sample.
+    pub incomplete: bool,
+}
+
 /// Consecutive samples that one receiver lost, told once the cause is known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeliveryLoss {
@@ -73,7 +86,7 @@ pub struct Journal {
     discovery: VecDeque<DiscoveryEvent>,
     losses: VecDeque<Loss>,
     delivery_losses: VecDeque<DeliveryLoss>,
-    unfinished: Vec<(Guid, u64)>,
+    missing: Vec<Missing>,
     /// What waits to be told.
     pub events: Events,
 }
@@ -102,16 +115,22 @@ impl Journal {
         self.discovery.push_back(event);
     }
 
-    /// A sample of which fragments came is lost; kept for whoever wants it until the next look.
-    pub fn leave_unfinished(&mut self, writer: Guid, number: u64) {
-        if self.unfinished.len() < LIMIT {
-            self.unfinished.push((writer, number));
+    /// Keeps lost samples for the subscriptions until the next [`Self::take_missing`].
+    pub fn leave_missing(&mut self, missing: Missing) {
+        if let Some(last) = self.missing.last_mut()
+            && (last.writer, last.incomplete) == (missing.writer, false)
+            && !missing.incomplete
+            && last.last.checked_add(1) == Some(missing.first)
+        {
+            last.last = missing.last;
+        } else if self.missing.len() < LIMIT {
+            self.missing.push(missing);
         }
     }
 
-    /// Those since the last look.
-    pub fn take_unfinished(&mut self) -> Vec<(Guid, u64)> {
-        std::mem::take(&mut self.unfinished)
+    /// Those since the last call.
+    pub fn take_missing(&mut self) -> Vec<Missing> {
+        std::mem::take(&mut self.missing)
     }
 
     /// Adds a loss, to the last entry when it continues that one.

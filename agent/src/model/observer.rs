@@ -328,7 +328,7 @@ impl Observer {
     pub fn settle(&mut self) {
         let around = around!(self);
         self.profiler.settle(self.clock, &mut self.journal, around);
-        self.tell_unfinished();
+        self.tell_missing();
         self.tell_losses();
         self.examine(self.clock);
     }
@@ -436,7 +436,7 @@ impl Observer {
             Sighting::Unmeasured => {}
             Sighting::Measured => return,
             Sighting::Counted(counted) => {
-                self.tell_unfinished();
+                self.tell_missing();
                 self.payloads.counted(writer, &counted);
                 return;
             }
@@ -527,10 +527,10 @@ impl Observer {
         }
     }
 
-    /// Tells those who want samples which of them will stay incomplete.
-    fn tell_unfinished(&mut self) {
-        for (writer, number) in self.journal.take_unfinished() {
-            self.payloads.unfinished(writer, number);
+    /// Tells the subscriptions which samples will not come.
+    fn tell_missing(&mut self) {
+        for missing in self.journal.take_missing() {
+            self.payloads.missing(&missing);
         }
     }
 
@@ -797,7 +797,9 @@ impl Observer {
                                 qos: endpoint.qos.clone(),
                             })),
                         };
-                        self.payloads.want(guid, topic, wished, now);
+                        let known = self.profiler.get(guid);
+                        let next = known.map_or(0, |known| known.writer.next());
+                        self.payloads.want(guid, topic, wished, (next, now));
                     }
                     _ => self.payloads.release(guid),
                 }
@@ -817,7 +819,7 @@ impl Observer {
         let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, around) else {
             return;
         };
-        self.tell_unfinished();
+        self.tell_missing();
         if let Some(topic) = self.topics.get_mut(retired.topic) {
             topic.retire(&retired.measurement, retired.totals.as_ref());
         }
@@ -834,7 +836,7 @@ impl Observer {
         for guid in strangers.forgotten {
             self.interest.remove(guid);
         }
-        self.tell_unfinished();
+        self.tell_missing();
         if now.0.is_multiple_of(SECOND) {
             self.payloads.expire(now);
             self.topics.expire(now, self.settings.topic_grace);

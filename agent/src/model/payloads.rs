@@ -13,6 +13,7 @@ use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::assembly::Assembly;
+use super::journal::Missing;
 use super::topic::Wished;
 use super::writer::Counted;
 
@@ -92,6 +93,8 @@ pub struct Missed {
 pub enum MissedReason {
     /// Some of its fragments were never seen.
     Incomplete,
+    /// Nothing of it was seen, and it is lost.
+    Lost,
     /// It was counted, but its bytes were lost on the way to the agent or found no room.
     NotCaptured,
     /// Its reader was too slow.
@@ -124,6 +127,8 @@ struct Interested {
     to: Arc<[u64]>,
     payloads: Arc<[u64]>,
     arrivals: Arc<[u64]>,
+    /// Each of those ids, and the first number that is for it.
+    begins: Vec<(u64, u64)>,
     /// Since when bytes are wanted.
     since: Timestamp,
 }
@@ -142,13 +147,19 @@ pub struct Payloads {
 
 impl MissedReason {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Incomplete, Self::NotCaptured, Self::QueueFull];
+    pub const ALL: [Self; 4] = [
+        Self::Incomplete,
+        Self::Lost,
+        Self::NotCaptured,
+        Self::QueueFull,
+    ];
 
     /// Label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
             Self::Incomplete => "incomplete",
+            Self::Lost => "lost",
             Self::NotCaptured => "not_captured",
             Self::QueueFull => "queue_full",
         }
@@ -189,11 +200,23 @@ impl Payloads {
         self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
     }
 
-    /// Gives the samples of this writer from `now` on.
-    pub fn want(&mut self, writer: Guid, topic: Topic, wished: &Wished, now: Timestamp) {
+    /// Gives the samples of this writer from `now` on; the next one has number `next`.
+    pub fn want(
+        &mut self,
+        writer: Guid,
+        topic: Topic,
+        wished: &Wished,
+        (next, now): (u64, Timestamp),
+    ) {
         let before = self.writers.remove(&writer);
         let known = before.as_ref().filter(|known| *known.topic == topic);
         let topic = known.map_or_else(|| Arc::new(topic), |known| Arc::clone(&known.topic));
+        let begins = |id: &u64| {
+            let known = before.iter().flat_map(|before| &before.begins);
+            let known = known.copied().find(|(known, _)| known == id);
+            known.unwrap_or((*id, next))
+        };
+        let begins = wished.ids.iter().map(begins).collect();
         let was_deep = before.filter(|before| !before.payloads.is_empty());
         self.deep -= usize::from(was_deep.is_some());
         self.deep += usize::from(!wished.payloads.is_empty());
@@ -207,6 +230,7 @@ impl Payloads {
             to: Arc::clone(&wished.ids),
             payloads: Arc::clone(&wished.payloads),
             arrivals: arrivals.copied().collect(),
+            begins,
             since: was_deep.map_or(now, |before| before.since),
         };
         self.writers.insert(writer, interested);
@@ -256,7 +280,7 @@ impl Payloads {
         // What was under way when bytes were first wanted has not come whole.
         let is_expected = counted.began.0 >= interested.since.0.saturating_add(TELLING);
         let missed = (bytes == 0 && is_expected && !interested.payloads.is_empty())
-            .then(|| interested.missed(writer, counted.number, MissedReason::NotCaptured));
+            .then(|| interested.not_captured(writer, counted.number));
         if !sample.to.is_empty() {
             self.give(sample, bytes);
         }
@@ -265,14 +289,27 @@ impl Payloads {
         }
     }
 
-    /// Fragments of this sample came, but not all of them: it will never be counted.
-    pub fn unfinished(&mut self, writer: Guid, number: u64) {
+    /// These samples are lost: they will never be counted.
+    pub fn missing(&mut self, missing: &Missing) {
+        let Missing {
+            writer,
+            first,
+            last,
+            incomplete,
+        } = *missing;
         let Some(interested) = self.writers.get(&writer) else {
             return;
         };
-        let missed = interested.missed(writer, number, MissedReason::Incomplete);
-        self.assembly.forget(writer, number);
-        self.give(missed, 0);
+        let reason = match incomplete {
+            true => MissedReason::Incomplete,
+            false => MissedReason::Lost,
+        };
+        if incomplete {
+            self.assembly.forget(writer, first);
+        }
+        for missed in interested.lost(writer, (first, last), reason) {
+            self.give(missed, 0);
+        }
     }
 
     /// Forgets what will not be complete.
@@ -306,7 +343,7 @@ impl Payloads {
             && self.given.len() < 2 * WAITING
         {
             let (writer, number) = (sample.writer, sample.sequence_number);
-            let mut missed = interested.missed(writer, number, MissedReason::NotCaptured);
+            let mut missed = interested.not_captured(writer, number);
             missed.to = given.to;
             self.given.push(missed);
         }
@@ -314,21 +351,42 @@ impl Payloads {
 }
 
 impl Interested {
-    /// That a sample is missed: by those who want its bytes, where only those were lost.
-    fn missed(&self, writer: Guid, number: u64, reason: MissedReason) -> Given {
-        let to = match reason {
-            MissedReason::NotCaptured => &self.payloads,
-            MissedReason::Incomplete | MissedReason::QueueFull => &self.to,
+    /// That these samples are lost, to each subscription those that are for it.
+    fn lost(&self, writer: Guid, (first, last): (u64, u64), reason: MissedReason) -> Vec<Given> {
+        let mut told: Vec<(u64, Vec<u64>)> = Vec::new();
+        for (id, begin) in &self.begins {
+            let first = first.max(*begin);
+            match told.iter_mut().find(|(known, _)| *known == first) {
+                Some((_, to)) => to.push(*id),
+                None if first <= last => told.push((first, vec![*id])),
+                None => {}
+            }
+        }
+        let given = |(first, to): (u64, Vec<u64>)| Given {
+            to: to.into(),
+            news: News::Missed(Missed {
+                topic: Arc::clone(&self.topic),
+                writer,
+                first,
+                last,
+                samples: last - first + 1,
+                reason,
+            }),
         };
+        told.into_iter().map(given).collect()
+    }
+
+    /// That a counted sample is missed by the subscriptions that want its bytes.
+    fn not_captured(&self, writer: Guid, number: u64) -> Given {
         Given {
-            to: Arc::clone(to),
+            to: Arc::clone(&self.payloads),
             news: News::Missed(Missed {
                 topic: Arc::clone(&self.topic),
                 writer,
                 first: number,
                 last: number,
                 samples: 1,
-                reason,
+                reason: MissedReason::NotCaptured,
             }),
         }
     }

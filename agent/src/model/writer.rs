@@ -10,7 +10,7 @@ use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 use super::calendar::Calendar;
 use super::header::stamp_time;
 use super::histogram::Histogram;
-use super::journal::{Journal, Loss};
+use super::journal::{Journal, Loss, Missing};
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception, is_message};
 use super::sampled::{News, Sampled};
@@ -533,9 +533,12 @@ impl Settling<'_> {
             return;
         };
         self.tally.incomplete += u64::from(incomplete);
-        if incomplete {
-            self.journal.leave_unfinished(self.writer, first);
-        }
+        self.journal.leave_missing(Missing {
+            writer: self.writer,
+            first,
+            last,
+            incomplete,
+        });
         let count = last - first + 1;
         self.tally.lost += count;
         self.tally.window.current(self.at).lost += count;

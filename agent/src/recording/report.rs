@@ -21,7 +21,7 @@ pub struct Report {
     pub messages: u64,
     /// Bytes of those messages.
     pub bytes: u64,
-    /// Messages that were on the wire and are not in the bag.
+    /// Messages that were sent and are not in the bag.
     pub missing: u64,
     /// By topic.
     pub topics: BTreeMap<String, TopicReport>,
@@ -46,6 +46,9 @@ pub struct TopicReport {
     pub bytes: u64,
     /// Never complete on the wire: fragments were lost.
     pub incomplete: u64,
+    /// Lost on the way: nothing of them was seen.
+    #[serde(default)]
+    pub lost: u64,
     /// On the wire, but lost on the way to the agent.
     pub not_captured: u64,
     /// Dropped because the storage was too slow.
@@ -70,7 +73,7 @@ pub struct MissingRun {
     pub last_sequence_number: u64,
     /// How many of those in between.
     pub samples: u64,
-    /// `incomplete`, `not_captured` or `dropped`.
+    /// `incomplete`, `lost`, `not_captured` or `dropped`.
     pub reason: String,
 }
 
@@ -96,6 +99,7 @@ impl Report {
         let topic = self.topic(&missed.topic.name);
         let (count, reason) = match missed.reason {
             MissedReason::Incomplete => (&mut topic.incomplete, "incomplete"),
+            MissedReason::Lost => (&mut topic.lost, "lost"),
             MissedReason::NotCaptured => (&mut topic.not_captured, "not_captured"),
             MissedReason::QueueFull => (&mut topic.dropped, "dropped"),
         };
@@ -148,6 +152,7 @@ impl Report {
         for (name, topic) in &self.topics {
             let counts = [
                 (topic.incomplete, "incomplete on the wire"),
+                (topic.lost, "lost on the way"),
                 (topic.not_captured, "lost on the way to the agent"),
                 (topic.dropped, "dropped, the storage was too slow"),
                 (topic.unwritten, "not written, the storage took no more"),

@@ -145,8 +145,8 @@ pub struct MissedFacts {
     pub first_sequence_number: u64,
     /// Number of the last.
     pub last_sequence_number: u64,
-    /// `incomplete`: fragments were never seen; `not_captured`: its bytes were lost on the way to
-    /// the agent; `queue_full`: this reader was too slow.
+    /// `incomplete`: fragments were never seen; `lost`: nothing of it was seen; `not_captured`: its
+    /// bytes were lost on the way to the agent; `queue_full`: this reader was too slow.
     pub reason: Reason,
 }
 
@@ -157,6 +157,8 @@ pub struct MissedFacts {
 pub enum Reason {
     /// Fragments were never seen.
     Incomplete,
+    /// Nothing of them was seen, and they are lost.
+    Lost,
     /// The bytes were lost on the way to the agent.
     NotCaptured,
     /// The reader was too slow.
@@ -224,6 +226,7 @@ impl From<&Missed> for MissedFacts {
             last_sequence_number: missed.last,
             reason: match missed.reason {
                 MissedReason::Incomplete => Reason::Incomplete,
+                MissedReason::Lost => Reason::Lost,
                 MissedReason::NotCaptured => Reason::NotCaptured,
                 MissedReason::QueueFull => Reason::QueueFull,
             },
