@@ -167,6 +167,56 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
     assert!(messages >= 64, "{messages}");
 }
 
+/// What a subscriber of a capture logged.
+#[derive(serde::Deserialize)]
+struct Logged {
+    lost_between: Vec<u64>,
+    /// When each message reached its callback.
+    t: Vec<u64>,
+}
+
+#[derive(serde::Deserialize)]
+struct GroundTruth {
+    received: Vec<Logged>,
+}
+
+#[test]
+fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_times() {
+    for label in ["fastrtps-udp", "cyclonedds"] {
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
+        let directory = data.join(label).join("keep-last-lossy-2ns");
+        let truth = std::fs::read(directory.join("groundtruth.json")).unwrap();
+        let truth: GroundTruth = serde_json::from_slice(&truth).unwrap();
+        let logged = truth.received.first().unwrap();
+        let capture = directory.join("capture.pcap.gz");
+        for depth in [Depth::Arrivals, Depth::Payloads] {
+            let (mut given, mut lost) = (Vec::new(), BTreeSet::new());
+            for news in replayed(&capture, Some(depth)).1 {
+                match news {
+                    News::Sample(sample) if &*sample.topic.name == "/chatter" => {
+                        given.push((sample.sequence_number - 1, sample.time.0));
+                    }
+                    News::Missed(missed) if &*missed.topic.name == "/chatter" => {
+                        assert_eq!(missed.reason, MissedReason::Lost, "{label}");
+                        lost.extend(missed.first - 1..missed.last);
+                    }
+                    _ => {}
+                }
+            }
+            let lacking = logged.lost_between.iter().copied();
+            assert_eq!(lost, lacking.collect(), "{label} {depth:?}");
+            let numbers = given.iter().map(|(number, _)| *number);
+            assert!(numbers.is_sorted(), "{label}");
+            assert_eq!(given.len(), logged.t.len(), "{label}");
+            // A callback runs some time after the datagram that it was waiting for.
+            let late = given.iter().zip(&logged.t);
+            let late = late.filter(|((_, at), t)| !(0..20_000_000).contains(&t.wrapping_sub(*at)));
+            let late: Vec<_> = late.collect();
+            assert!(late.len() * 50 <= given.len(), "{label}: {late:?}");
+        }
+    }
+}
+
 /// A domain in which two participants announce a writer of a topic each.
 struct Robot {
     observer: Observer,

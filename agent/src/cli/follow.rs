@@ -163,6 +163,11 @@ fn hint(missed: &MissedFacts) {
         Reason::NotCaptured => {
             eprintln!("rp: {samples} messages of {topic} are not shown: the agent has no room");
         }
+        Reason::Unannounced => {
+            eprintln!(
+                "rp: {samples} messages of {topic} are not shown: they came before their publisher was announced"
+            );
+        }
         Reason::Incomplete | Reason::Lost => {}
     }
 }

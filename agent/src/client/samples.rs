@@ -104,6 +104,7 @@ impl<'a> Samples<'a> {
                     reason: match facts.reason {
                         Reason::Incomplete => MissedReason::Incomplete,
                         Reason::Lost => MissedReason::Lost,
+                        Reason::Unannounced => MissedReason::Unannounced,
                         Reason::NotCaptured => MissedReason::NotCaptured,
                         Reason::QueueFull => MissedReason::QueueFull,
                     },

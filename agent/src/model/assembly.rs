@@ -110,6 +110,13 @@ impl Assembly {
         }
     }
 
+    /// Whether all bytes of this sample came.
+    #[must_use]
+    pub fn is_whole(&self, writer: Guid, number: u64) -> bool {
+        let part = self.parts.get(&(writer, number));
+        part.is_some_and(|part| part.head.len() == part.size)
+    }
+
     /// The bytes of a sample that was counted, if all of them came; nothing of it is kept.
     pub fn take(&mut self, writer: Guid, number: u64) -> Option<Bytes> {
         let part = self.remove((writer, number))?;

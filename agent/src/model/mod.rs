@@ -17,6 +17,7 @@ pub mod expectation;
 pub mod header;
 pub mod histogram;
 pub mod identity;
+pub mod in_order;
 pub mod interest;
 pub mod journal;
 pub mod observer;

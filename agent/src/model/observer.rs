@@ -29,7 +29,7 @@ use super::journal::Journal;
 use super::passage::{lacks_names, may_share_memory};
 use super::payloads::{self, Given, Offered, Payloads};
 use super::pieces::Pieces;
-use super::profiler::{Profiler, Sighting};
+use super::profiler::{Measured, Profiler, Sighting, UNDELIVERED};
 use super::rate::Slot;
 use super::receivers::{Around, Receivers};
 use super::selection::Wish;
@@ -37,7 +37,7 @@ use super::snapshot::{Snapshot, SocketFacts, WatchState};
 use super::topic::{Naming, Topic, TopicId, Topics, Watched};
 use super::trace::{Spans, Subject, Tracer};
 use super::way::Place;
-use super::writer::Traits;
+use super::writer::{Counted, Traits};
 use crate::config::{Limits, Watch, Watchlist};
 
 const SECOND: u64 = 1_000_000_000;
@@ -329,6 +329,9 @@ impl Observer {
         let around = around!(self);
         self.profiler.settle(self.clock, &mut self.journal, around);
         self.tell_missing();
+        for writer in self.payloads.unsettled() {
+            self.payloads.give_all(writer, self.clock);
+        }
         self.tell_losses();
         self.examine(self.clock);
     }
@@ -434,10 +437,16 @@ impl Observer {
         let journal = &mut self.journal;
         match self.profiler.record(writer, record, journal, around) {
             Sighting::Unmeasured => {}
-            Sighting::Measured => return,
+            Sighting::Measured => {
+                if self.payloads.is_unsettled(writer) {
+                    self.came_again(writer, record);
+                    self.turn(writer, at);
+                }
+                return;
+            }
             Sighting::Counted(counted) => {
                 self.tell_missing();
-                self.payloads.counted(writer, &counted);
+                self.counted(writer, &counted);
                 return;
             }
         }
@@ -445,7 +454,70 @@ impl Observer {
             && !self.discovery.endpoints().contains_key(&writer)
             && !self.discovery.was_buried(writer, at);
         if is_strange {
-            self.profiler.stranger(writer, record, journal, around);
+            let sighting = self.profiler.stranger(writer, record, journal, around);
+            if let Sighting::Counted(counted) = sighting {
+                self.counted(writer, &counted);
+            }
+        }
+    }
+
+    /// Gives a sample, when it is its turn, or remembers that it was of a stranger.
+    fn counted(&mut self, writer: Guid, counted: &Counted) {
+        if self.wishes.is_empty() {
+            return;
+        }
+        if !self.payloads.wants(writer) {
+            let known = self.profiler.get(writer);
+            if known.is_some_and(|known| known.topic.is_none()) {
+                self.payloads.counted_of_stranger(writer, counted.number);
+            }
+            return;
+        }
+        if let Some(progress) = self.profiler.progress(writer, counted.at) {
+            let skip = self.payloads.counted(writer, counted, &progress);
+            self.skip(writer, skip);
+        }
+    }
+
+    /// Gives a sample that was counted while its writer was a stranger, now that it comes again.
+    fn came_again(&mut self, writer: Guid, record: &Record) {
+        let (number, at) = (record.sequence_number, Timestamp(record.time));
+        let (bytes, stamp, is_last) = match record.kind {
+            kind::DATA => (record.payload_len, record.header_stamp(), true),
+            kind::DATA_FRAG => (record.sample_size, None, record.ends_sample()),
+            _ => return,
+        };
+        if record.flags & UNDELIVERED != 0 || !self.payloads.lacks(writer, number) {
+            return;
+        }
+        let has_header = |known: &Measured| known.writer.traits().has_header;
+        let counted = Counted {
+            number,
+            bytes: bytes.into(),
+            source: record.source_timestamp(),
+            stamp: stamp.filter(|_| self.profiler.get(writer).is_some_and(has_header)),
+            at,
+            began: at,
+            sampled: false,
+        };
+        let progress = self.profiler.progress(writer, at);
+        if let Some(progress) = progress.filter(|_| is_last || self.payloads.wants_bytes(writer)) {
+            let skip = self.payloads.came_again(writer, &counted, &progress);
+            self.skip(writer, skip);
+        }
+    }
+
+    /// Gives the samples of this writer whose turn it is.
+    fn turn(&mut self, writer: Guid, now: Timestamp) {
+        if let Some(progress) = self.profiler.progress(writer, now) {
+            let skip = self.payloads.turn(writer, &progress, now);
+            self.skip(writer, skip);
+        }
+    }
+
+    fn skip(&mut self, writer: Guid, number: Option<u64>) {
+        if let Some(number) = number {
+            self.profiler.skip(writer, number);
         }
     }
 
@@ -519,7 +591,8 @@ impl Observer {
         let (writer, number) = (found.record.writer(), found.record.sequence_number);
         if self.payloads.wants_bytes(writer) {
             let known = self.profiler.get(writer);
-            if known.is_some_and(|known| !known.writer.has(number)) {
+            let lacks = self.payloads.lacks(writer, number);
+            if lacks || known.is_some_and(|known| !known.writer.has(number)) {
                 let moved = self.calendar.even_record(&found.record);
                 let record = moved.as_ref().unwrap_or(&found.record);
                 self.payloads.keep(record, found.payload);
@@ -713,7 +786,7 @@ impl Observer {
         self.interest.remove(guid);
         self.tracer.forget(guid);
         self.retire(guid, now);
-        self.payloads.release(guid);
+        self.payloads.release(guid, now);
         let (domain_id, topic) = (endpoint.domain_id, bounded_shared(&endpoint.topic));
         self.journal.events.name(guid, domain_id, &topic);
         let id = naming(endpoint).and_then(|naming| self.topics.find(endpoint.domain_id, &naming));
@@ -801,7 +874,7 @@ impl Observer {
                         let next = known.map_or(0, |known| known.writer.next());
                         self.payloads.want(guid, topic, wished, (next, now));
                     }
-                    _ => self.payloads.release(guid),
+                    _ => self.payloads.release(guid, now),
                 }
                 if measured {
                     let (traits, opened) = (traits(endpoint), topic.reader_appeared);
@@ -837,8 +910,16 @@ impl Observer {
             self.interest.remove(guid);
         }
         self.tell_missing();
+        for writer in self.payloads.unsettled() {
+            self.turn(writer, now);
+        }
         if now.0.is_multiple_of(SECOND) {
             self.payloads.expire(now);
+            let profiler = &self.profiler;
+            self.payloads.retain_strangers(|writer| {
+                let known = profiler.get(writer);
+                known.is_some_and(|known| known.topic.is_none())
+            });
             self.topics.expire(now, self.settings.topic_grace);
             self.receivers.tidy(&self.discovery);
             self.promote();

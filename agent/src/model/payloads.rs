@@ -1,10 +1,11 @@
-//! Samples for those who want them one by one: each once for its writer and sequence number, at the
-//! moment in which the profiler counts it, in that order.
+//! Samples for those who want them one by one: each once for its writer and sequence number, as soon
+//! as the profiler counts it, those of a reliable writer in the order of their numbers
+//! ([`super::in_order`]).
 //!
 //! What waits to be taken is bounded; what finds no room is counted and told. It measures nothing:
 //! whether somebody wants samples changes no number.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use bytes::Bytes;
@@ -13,12 +14,15 @@ use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::assembly::Assembly;
+use super::in_order::{Due, InOrder, Progress};
 use super::journal::Missing;
 use super::topic::Wished;
 use super::writer::Counted;
 
 /// Entries that wait to be taken: a round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
+/// Numbers of one unannounced writer that are remembered.
+const EARLIER: usize = 1024;
 /// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
 /// not told of.
 const TELLING: u64 = 400_000_000;
@@ -52,7 +56,8 @@ pub struct Offered {
 pub struct Sample {
     /// Its topic.
     pub topic: Arc<Topic>,
-    /// Of the datagram that completed it.
+    /// Of the datagram that completed it, or, where it waited for a lower number, of the moment in
+    /// which that came or was given up. Never goes back for one writer.
     pub time: Timestamp,
     /// Who wrote it.
     pub writer: Guid,
@@ -95,6 +100,8 @@ pub enum MissedReason {
     Incomplete,
     /// Nothing of it was seen, and it is lost.
     Lost,
+    /// It came before its writer was announced, and not again.
+    Unannounced,
     /// It was counted, but its bytes were lost on the way to the agent or found no room.
     NotCaptured,
     /// Its reader was too slow.
@@ -131,6 +138,15 @@ struct Interested {
     begins: Vec<(u64, u64)>,
     /// Since when bytes are wanted.
     since: Timestamp,
+    order: InOrder,
+}
+
+/// Numbers of a writer that is not announced yet.
+#[derive(Debug, Default)]
+struct Earlier {
+    numbers: BTreeSet<u64>,
+    /// Lower ones that are not remembered: the first, the last, and how many.
+    before: Option<(u64, u64, u64)>,
 }
 
 /// The wanted writers and what waits to be taken.
@@ -140,16 +156,21 @@ pub struct Payloads {
     /// How many of them are wanted with bytes.
     deep: usize,
     assembly: Assembly,
+    /// Of writers that nobody announced yet, what was counted while samples were wished for.
+    strangers: HashMap<Guid, Earlier>,
     given: Vec<Given>,
     given_bytes: usize,
+    /// Bytes that wait for lower numbers.
+    waiting_bytes: usize,
     refused: u64,
 }
 
 impl MissedReason {
     /// All of them.
-    pub const ALL: [Self; 4] = [
+    pub const ALL: [Self; 5] = [
         Self::Incomplete,
         Self::Lost,
+        Self::Unannounced,
         Self::NotCaptured,
         Self::QueueFull,
     ];
@@ -160,6 +181,7 @@ impl MissedReason {
         match self {
             Self::Incomplete => "incomplete",
             Self::Lost => "lost",
+            Self::Unannounced => "unannounced",
             Self::NotCaptured => "not_captured",
             Self::QueueFull => "queue_full",
         }
@@ -174,8 +196,10 @@ impl Payloads {
             writers: HashMap::new(),
             deep: 0,
             assembly: Assembly::new(limit),
+            strangers: HashMap::new(),
             given: Vec::new(),
             given_bytes: 0,
+            waiting_bytes: 0,
             refused: 0,
         }
     }
@@ -184,7 +208,8 @@ impl Payloads {
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
         let (bytes, limit, evictions) = self.assembly.size();
-        (bytes + self.given_bytes, limit, evictions + self.refused)
+        let bytes = bytes + self.given_bytes + self.waiting_bytes;
+        (bytes, limit, evictions + self.refused)
     }
 
     /// Whether the bytes of anybody's samples are wanted.
@@ -217,9 +242,10 @@ impl Payloads {
             known.unwrap_or((*id, next))
         };
         let begins = wished.ids.iter().map(begins).collect();
-        let was_deep = before.filter(|before| !before.payloads.is_empty());
+        let was_deep = before.as_ref().filter(|before| !before.payloads.is_empty());
         self.deep -= usize::from(was_deep.is_some());
         self.deep += usize::from(!wished.payloads.is_empty());
+        let since = was_deep.map_or(now, |before| before.since);
         if was_deep.is_some() && wished.payloads.is_empty() {
             self.assembly.release(writer);
         }
@@ -231,13 +257,17 @@ impl Payloads {
             payloads: Arc::clone(&wished.payloads),
             arrivals: arrivals.copied().collect(),
             begins,
-            since: was_deep.map_or(now, |before| before.since),
+            since,
+            order: before.map_or_else(InOrder::default, |before| before.order),
         };
         self.writers.insert(writer, interested);
+        self.announced(writer, now);
     }
 
-    /// No longer.
-    pub fn release(&mut self, writer: Guid) {
+    /// No longer, after what waits of it.
+    pub fn release(&mut self, writer: Guid, now: Timestamp) {
+        self.strangers.remove(&writer);
+        self.give_all(writer, now);
         let before = self.writers.remove(&writer);
         if before.is_some_and(|before| !before.payloads.is_empty()) {
             self.deep -= 1;
@@ -247,25 +277,34 @@ impl Payloads {
 
     /// Keeps what a DATA or DATA_FRAG brings of a sample that has not been counted yet.
     pub fn keep(&mut self, record: &Record, payload: &[u8]) {
-        self.assembly.put(record, payload, self.given_bytes);
+        let beside = self.given_bytes + self.waiting_bytes;
+        self.assembly.put(record, payload, beside);
     }
 
-    /// A sample of this writer was counted.
-    pub fn counted(&mut self, writer: Guid, counted: &Counted) {
-        let Some(interested) = self.writers.get(&writer) else {
-            return;
-        };
+    /// Whether samples of this writer are given.
+    #[must_use]
+    pub fn wants(&self, writer: Guid) -> bool {
+        self.writers.contains_key(&writer)
+    }
+
+    /// A sample of this writer was counted. Returns as [`Self::turn`] does.
+    pub fn counted(&mut self, writer: Guid, counted: &Counted, progress: &Progress) -> Option<u64> {
+        let interested = self.writers.get_mut(&writer)?;
         let payload = match interested.payloads.is_empty() {
             true => None,
             false => self.assembly.take(writer, counted.number),
         };
-        let (to, bytes) = match &payload {
-            Some(payload) => (&interested.to, payload.len()),
-            None => (&interested.arrivals, 0),
+        // What was under way when bytes were first wanted has not come whole.
+        let is_expected = counted.began.0 >= interested.since.0.saturating_add(TELLING);
+        let missed = (payload.is_none() && is_expected && !interested.payloads.is_empty())
+            .then(|| interested.not_captured(writer, counted.number));
+        let to = match &payload {
+            Some(_) => &interested.to,
+            None => &interested.arrivals,
         };
-        let sample = Given {
+        let due = Due {
             to: Arc::clone(to),
-            news: News::Sample(Arc::new(Sample {
+            sample: Sample {
                 topic: Arc::clone(&interested.topic),
                 time: counted.at,
                 writer,
@@ -275,18 +314,107 @@ impl Payloads {
                 size: u32::try_from(counted.bytes).unwrap_or(u32::MAX),
                 sampled: counted.sampled,
                 payload,
-            })),
+            },
+            missed,
         };
-        // What was under way when bytes were first wanted has not come whole.
-        let is_expected = counted.began.0 >= interested.since.0.saturating_add(TELLING);
-        let missed = (bytes == 0 && is_expected && !interested.payloads.is_empty())
-            .then(|| interested.not_captured(writer, counted.number));
-        if !sample.to.is_empty() {
-            self.give(sample, bytes);
+        let mut before = Vec::new();
+        interested
+            .order
+            .begin(progress.incarnation, counted.at, &mut |due| {
+                before.push(due)
+            });
+        self.waiting_bytes += due.bytes();
+        interested.order.put(due);
+        before.into_iter().for_each(|due| self.give_due(due));
+        self.turn(writer, progress, counted.at)
+    }
+
+    /// A sample from before the announcement came again. Returns as [`Self::turn`] does.
+    pub fn came_again(
+        &mut self,
+        writer: Guid,
+        counted: &Counted,
+        progress: &Progress,
+    ) -> Option<u64> {
+        let is_whole = self.assembly.is_whole(writer, counted.number);
+        if self.wants_bytes(writer) && !is_whole {
+            return None;
         }
-        if let Some(missed) = missed {
-            self.give(missed, 0);
+        self.counted(writer, counted, progress)
+    }
+
+    /// Whether this sample was counted before its writer was announced, and is to be given if it
+    /// comes again.
+    #[must_use]
+    pub fn lacks(&self, writer: Guid, number: u64) -> bool {
+        let interested = self.writers.get(&writer);
+        interested.is_some_and(|interested| interested.order.lacks(number))
+    }
+
+    /// A sample of a writer that nobody announced yet was counted.
+    pub fn counted_of_stranger(&mut self, writer: Guid, number: u64) {
+        let earlier = self.strangers.entry(writer).or_default();
+        earlier.numbers.insert(number);
+        if earlier.numbers.len() > EARLIER
+            && let Some(lowest) = earlier.numbers.pop_first()
+        {
+            let (first, _, count) = earlier.before.unwrap_or((lowest, lowest, 0));
+            earlier.before = Some((first.min(lowest), lowest, count + 1));
         }
+    }
+
+    /// Forgets unannounced writers that are no more.
+    pub fn retain_strangers(&mut self, is_there: impl Fn(Guid) -> bool) {
+        self.strangers.retain(|writer, _| is_there(*writer));
+    }
+
+    /// Writers of which something waits, or may come again, in the order of their GUIDs.
+    #[must_use]
+    pub fn unsettled(&self) -> Vec<Guid> {
+        let is_unsettled = |interested: &Interested| !interested.order.is_idle();
+        let writers = self.writers.iter();
+        let mut writers: Vec<_> = writers
+            .filter(|(_, interested)| is_unsettled(interested))
+            .map(|(writer, _)| *writer)
+            .collect();
+        writers.sort_unstable();
+        writers
+    }
+
+    /// Whether something of this writer waits, or may come again.
+    #[must_use]
+    pub fn is_unsettled(&self, writer: Guid) -> bool {
+        let interested = self.writers.get(&writer);
+        interested.is_some_and(|interested| !interested.order.is_idle())
+    }
+
+    /// Gives the samples of this writer whose turn it is. Returns the number below which nothing is
+    /// waited for any more, if the order was given up.
+    pub fn turn(&mut self, writer: Guid, progress: &Progress, now: Timestamp) -> Option<u64> {
+        let (_, limit, _) = self.assembly.size();
+        let room = (limit / 2).saturating_sub(self.waiting_bytes);
+        let interested = self.writers.get_mut(&writer)?;
+        let order = &mut interested.order;
+        let room = room + order.bytes();
+        let forgone = order.forgone(progress, now);
+        let mut due = Vec::new();
+        let skip = order.turn(progress, now, room, &mut |each| due.push(each));
+        self.unannounced(writer, &forgone);
+        due.into_iter().for_each(|due| self.give_due(due));
+        skip
+    }
+
+    /// Nothing more will come of this writer: gives what waits, and tells what never came again.
+    pub fn give_all(&mut self, writer: Guid, now: Timestamp) {
+        let nothing_awaited = Progress::default();
+        let Some(interested) = self.writers.get_mut(&writer) else {
+            return;
+        };
+        let forgone = interested.order.forgone(&nothing_awaited, now);
+        let mut due = Vec::new();
+        interested.order.give_all(now, &mut |each| due.push(each));
+        self.unannounced(writer, &forgone);
+        due.into_iter().for_each(|due| self.give_due(due));
     }
 
     /// These samples are lost: they will never be counted.
@@ -328,6 +456,49 @@ impl Payloads {
     pub const fn is_full(&self) -> bool {
         let (_, limit, _) = self.assembly.size();
         self.given.len() >= WAITING / 2 || self.given_bytes > limit / 4
+    }
+
+    /// What was counted of this writer while it was a stranger is to be given if it comes again.
+    fn announced(&mut self, writer: Guid, now: Timestamp) {
+        let Some(earlier) = self.strangers.remove(&writer) else {
+            return;
+        };
+        let Some(interested) = self.writers.get_mut(&writer) else {
+            return;
+        };
+        interested.order.announced(earlier.numbers, now);
+        if let Some((first, last, samples)) = earlier.before {
+            let missed = interested.unannounced(writer, (first, last), samples);
+            self.give(missed, 0);
+        }
+    }
+
+    /// These will not come again.
+    fn unannounced(&mut self, writer: Guid, numbers: &[u64]) {
+        let Some(interested) = self.writers.get(&writer) else {
+            return;
+        };
+        let runs = numbers.chunk_by(|before, after| before + 1 == *after);
+        let missed: Vec<_> = runs
+            .filter_map(|run| Some((*run.first()?, *run.last()?)))
+            .map(|(first, last)| interested.unannounced(writer, (first, last), last - first + 1))
+            .collect();
+        missed.into_iter().for_each(|missed| self.give(missed, 0));
+    }
+
+    fn give_due(&mut self, due: Due) {
+        let bytes = due.bytes();
+        self.waiting_bytes -= bytes;
+        if !due.to.is_empty() {
+            let sample = Given {
+                to: due.to,
+                news: News::Sample(Arc::new(due.sample)),
+            };
+            self.give(sample, bytes);
+        }
+        if let Some(missed) = due.missed {
+            self.give(missed, 0);
+        }
     }
 
     fn give(&mut self, given: Given, bytes: usize) {
@@ -374,6 +545,21 @@ impl Interested {
             }),
         };
         told.into_iter().map(given).collect()
+    }
+
+    /// That samples came before the announcement alone.
+    fn unannounced(&self, writer: Guid, (first, last): (u64, u64), samples: u64) -> Given {
+        Given {
+            to: Arc::clone(&self.to),
+            news: News::Missed(Missed {
+                topic: Arc::clone(&self.topic),
+                writer,
+                first,
+                last,
+                samples,
+                reason: MissedReason::Unannounced,
+            }),
+        }
     }
 
     /// That a counted sample is missed by the subscriptions that want its bytes.

@@ -11,6 +11,7 @@ use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::calendar::Calendar;
 use super::delivery::Totals;
+use super::in_order::Progress;
 use super::journal::Journal;
 use super::receivers::Around;
 use super::samples::Budget;
@@ -36,7 +37,7 @@ const STRANGERS_SHARE: usize = 4;
 const SILENT: u64 = 10 * SECOND;
 const GIVEN_UP: usize = 64;
 /// Records of what did not arrive: nothing that was sent.
-const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
+pub(super) const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
 
 /// One measured writer.
 #[derive(Debug)]
@@ -154,6 +155,21 @@ impl Profiler {
         self.writers.iter()
     }
 
+    /// How far the samples of this writer are decided.
+    pub fn progress(&mut self, guid: Guid, now: Timestamp) -> Option<Progress> {
+        let measured = self.writers.get_mut(&guid)?;
+        let subscribers = measured.subscribers.as_ref();
+        let below = subscribers.and_then(|subscribers| subscribers.acknowledged_below());
+        Some(measured.writer.progress(below.is_some(), now))
+    }
+
+    /// Nothing below `number` of this writer is waited for any more.
+    pub fn skip(&mut self, guid: Guid, number: u64) {
+        if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.writer.skip(number);
+        }
+    }
+
     /// Writers of topics, strangers, the strangers' cap, and strangers refused or forgotten for it.
     #[must_use]
     pub fn size(&self) -> (usize, usize, usize, u64) {
@@ -252,22 +268,22 @@ impl Profiler {
         record: &Record,
         journal: &mut Journal,
         around: Around<'_>,
-    ) {
+    ) -> Sighting {
         let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
         if !is_sample || record.flags & UNDELIVERED != 0 {
-            return;
+            return Sighting::Unmeasured;
         }
         let now = Timestamp(record.time);
         if self.strangers >= self.stranger_limit && !self.make_room(now, around) {
             self.stranger_evictions += 1;
-            return;
+            return Sighting::Unmeasured;
         }
         self.strangers += 1;
         self.writers.insert(
             guid,
             Measured::new(Writer::new(guid, Traits::default()), None, now),
         );
-        self.record(guid, record, journal, around);
+        self.record(guid, record, journal, around)
     }
 
     /// Measures this writer of a topic from now on; what it was measured as a stranger comes along.

@@ -44,6 +44,12 @@ pub struct Sequence {
     available: u64,
     /// A value that `available` had, and since when.
     withdrawn: Option<(Timestamp, u64)>,
+    /// All readers that acknowledge have all below this, or will not get them.
+    acknowledged: u64,
+    /// All below came, or no reader waits for them; as far as was looked.
+    complete: u64,
+    /// How often it began.
+    incarnation: u32,
     received: Bitmap,
     excused: Bitmap,
     /// `next` at some moments, oldest first.
@@ -269,7 +275,38 @@ impl Sequence {
     pub fn acknowledged(&mut self, base: u64) {
         if self.started() {
             self.excuse(self.available, base);
+            self.acknowledged = self.acknowledged.max(base);
         }
+    }
+
+    /// All below came, or no reader waits for them: the writer left them out or has them no longer,
+    /// readers acknowledged them, or they are settled.
+    pub fn complete(&mut self) -> u64 {
+        let decided = self.settled.max(self.available).max(self.floor());
+        self.complete = self.complete.max(decided);
+        while self.complete < self.next
+            && (self.received.get(self.complete) || self.excused.get(self.complete))
+        {
+            self.complete += 1;
+        }
+        self.complete
+    }
+
+    /// Nothing below `number` is waited for any more.
+    pub fn skip(&mut self, number: u64) {
+        self.complete = self.complete.max(number.min(self.next));
+    }
+
+    /// The writer will send none below this again.
+    #[must_use]
+    pub fn awaited(&self) -> u64 {
+        self.available.max(self.acknowledged)
+    }
+
+    /// How often the numbers began anew.
+    #[must_use]
+    pub const fn incarnation(&self) -> u32 {
+        self.incarnation
     }
 
     /// GAP: `start..base` and some numbers from there on will never come.
@@ -377,6 +414,8 @@ impl Sequence {
             next: number,
             newest_source: self.newest_source,
             last_advance: self.last_advance,
+            complete: number,
+            incarnation: self.incarnation.wrapping_add(1),
             received: Bitmap::with_len(MIN_WINDOW),
             excused: Bitmap::with_len(MIN_WINDOW),
             ..Self::default()

@@ -10,6 +10,7 @@ use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 use super::calendar::Calendar;
 use super::header::stamp_time;
 use super::histogram::Histogram;
+use super::in_order::Progress;
 use super::journal::{Journal, Loss, Missing};
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception, is_message};
@@ -247,6 +248,27 @@ impl Writer {
     /// Its readers have all below `base`.
     pub fn acknowledged(&mut self, base: u64) {
         self.reception.sequence_mut().acknowledged(base);
+    }
+
+    /// How far its samples are decided; `acknowledged` = by readers that acknowledge.
+    pub fn progress(&mut self, acknowledged: bool, now: Timestamp) -> Progress {
+        let reliable = self.traits.reliable && !self.is_sampled(now);
+        let sequence = self.reception.sequence_mut();
+        if !reliable || !acknowledged {
+            sequence.skip(sequence.next());
+        }
+        Progress {
+            incarnation: sequence.incarnation(),
+            complete: sequence.complete(),
+            awaited: sequence.awaited(),
+            reliable,
+            acknowledged,
+        }
+    }
+
+    /// Nothing below `number` is waited for any more.
+    pub fn skip(&mut self, number: u64) {
+        self.reception.sequence_mut().skip(number);
     }
 
     /// Settles what has waited long enough.

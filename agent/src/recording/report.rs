@@ -49,6 +49,9 @@ pub struct TopicReport {
     /// Lost on the way: nothing of them was seen.
     #[serde(default)]
     pub lost: u64,
+    /// Came before their writer was announced, and not again.
+    #[serde(default)]
+    pub unannounced: u64,
     /// On the wire, but lost on the way to the agent.
     pub not_captured: u64,
     /// Dropped because the storage was too slow.
@@ -73,7 +76,7 @@ pub struct MissingRun {
     pub last_sequence_number: u64,
     /// How many of those in between.
     pub samples: u64,
-    /// `incomplete`, `lost`, `not_captured` or `dropped`.
+    /// `incomplete`, `lost`, `unannounced`, `not_captured` or `dropped`.
     pub reason: String,
 }
 
@@ -100,6 +103,7 @@ impl Report {
         let (count, reason) = match missed.reason {
             MissedReason::Incomplete => (&mut topic.incomplete, "incomplete"),
             MissedReason::Lost => (&mut topic.lost, "lost"),
+            MissedReason::Unannounced => (&mut topic.unannounced, "unannounced"),
             MissedReason::NotCaptured => (&mut topic.not_captured, "not_captured"),
             MissedReason::QueueFull => (&mut topic.dropped, "dropped"),
         };
@@ -153,6 +157,10 @@ impl Report {
             let counts = [
                 (topic.incomplete, "incomplete on the wire"),
                 (topic.lost, "lost on the way"),
+                (
+                    topic.unannounced,
+                    "sent before their publisher was announced",
+                ),
                 (topic.not_captured, "lost on the way to the agent"),
                 (topic.dropped, "dropped, the storage was too slow"),
                 (topic.unwritten, "not written, the storage took no more"),

@@ -145,8 +145,9 @@ pub struct MissedFacts {
     pub first_sequence_number: u64,
     /// Number of the last.
     pub last_sequence_number: u64,
-    /// `incomplete`: fragments were never seen; `lost`: nothing of it was seen; `not_captured`: its
-    /// bytes were lost on the way to the agent; `queue_full`: this reader was too slow.
+    /// `incomplete`: fragments were never seen; `lost`: nothing of it was seen; `unannounced`: it
+    /// came before its writer was announced, and not again; `not_captured`: its bytes were lost on the
+    /// way to the agent; `queue_full`: this reader was too slow.
     pub reason: Reason,
 }
 
@@ -159,6 +160,8 @@ pub enum Reason {
     Incomplete,
     /// Nothing of them was seen, and they are lost.
     Lost,
+    /// They came before their writer was announced, and not again.
+    Unannounced,
     /// The bytes were lost on the way to the agent.
     NotCaptured,
     /// The reader was too slow.
@@ -227,6 +230,7 @@ impl From<&Missed> for MissedFacts {
             reason: match missed.reason {
                 MissedReason::Incomplete => Reason::Incomplete,
                 MissedReason::Lost => Reason::Lost,
+                MissedReason::Unannounced => Reason::Unannounced,
                 MissedReason::NotCaptured => Reason::NotCaptured,
                 MissedReason::QueueFull => Reason::QueueFull,
             },

@@ -111,7 +111,7 @@ fn a_slow_reader_loses_the_oldest_and_is_told_before_what_is_left() {
     assert_eq!((missed.first, missed.last, missed.samples), (1, 6, 6));
     assert_eq!(missed.reason, MissedReason::QueueFull);
     assert_eq!(numbers(&mut slow), [7, 8, 9, 10]);
-    assert_eq!(all.facts().missed, [0, 0, 0, 6]);
+    assert_eq!(all.facts().missed, [0, 0, 0, 0, 6]);
     assert_eq!(all.facts().queued_bytes, 0);
 }
 

@@ -16,7 +16,9 @@ impl Lost {
         match missed.reason {
             Reason::Incomplete | Reason::Lost => {}
             // They were on the wire.
-            Reason::NotCaptured | Reason::QueueFull => return String::new(),
+            Reason::Unannounced | Reason::NotCaptured | Reason::QueueFull => {
+                return String::new();
+            }
         }
         self.total += missed.samples;
         format!(

@@ -229,7 +229,7 @@ pub(in crate::surface) const SAMPLES_GIVEN: Metric = Metric::counter(
 pub(in crate::surface) const SAMPLES_MISSED: Metric = Metric::counter(
     "ros2probe_missed_messages_total",
     &["reason"],
-    "Messages that a subscription did not get, and was told so: incomplete (fragments were never seen), lost (nothing of them was seen), not_captured (their bytes were lost on the way to the agent, or found no room), queue_full (the reader was too slow).",
+    "Messages that a subscription did not get, and was told so: incomplete (fragments were never seen), lost (nothing of them was seen), unannounced (they came before their writer was announced, and not again), not_captured (their bytes were lost on the way to the agent, or found no room), queue_full (the reader was too slow).",
 );
 pub(in crate::surface) const SAMPLES_QUEUED: Metric = Metric::gauge(
     "ros2probe_queued_bytes",

@@ -1,0 +1,180 @@
+//! One writer's samples in the order in which a reliable subscriber gets them.
+//!
+//! A reader delivers a sample once all lower ones have come, or will not come (RTPS 2.5, 8.4.12).
+//! So a sample that was counted waits here behind a hole until its repair comes, the writer leaves
+//! it out or withdraws it, the readers acknowledge it, or it counts as lost; its time is then the
+//! time of that moment. What waits is bounded in number, bytes and time: beyond, order is given up
+//! and a late repair is given late. A stream without holes never waits, nor does one that no reader
+//! acknowledges.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use ros2probe_wire::Timestamp;
+
+use super::payloads::{Given, Sample};
+
+const SECOND: u64 = 1_000_000_000;
+/// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three seconds
+/// at the latest.
+const PATIENCE: u64 = 4 * SECOND;
+/// Samples that wait at once.
+const WAITING: usize = 4096;
+/// Samples from before the announcement come again within this time, or not at all.
+const AGAIN: u64 = 10 * SECOND;
+/// How long the first ACKNACK may take after the announcement.
+const MATCHING: u64 = SECOND;
+
+/// How far a writer's samples are decided.
+#[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
+pub struct Progress {
+    /// Rises when the writer begins anew under its GUID, and its numbers with it.
+    pub incarnation: u32,
+    /// All below came, or no reader waits for them.
+    pub complete: u64,
+    /// No reader waits for any below this.
+    pub awaited: u64,
+    /// The writer retransmits.
+    pub reliable: bool,
+    /// And has readers that acknowledge.
+    pub acknowledged: bool,
+}
+
+/// A sample and those who get it.
+#[derive(Debug)]
+pub struct Due {
+    /// Ids of the wishes.
+    pub to: Arc<[u64]>,
+    /// The sample.
+    pub sample: Sample,
+    /// What those are given who miss its bytes.
+    pub missed: Option<Given>,
+}
+
+/// The samples that wait for lower numbers.
+#[derive(Debug, Default)]
+pub struct InOrder {
+    waiting: BTreeMap<u64, Due>,
+    bytes: usize,
+    incarnation: Option<u32>,
+    /// The number that is waited for, and since when.
+    hole: (u64, Timestamp),
+    /// Of the latest sample that was given.
+    last: Timestamp,
+    /// Numbers that were counted before the writer was announced, and were not given.
+    earlier: BTreeSet<u64>,
+    announced: Timestamp,
+}
+
+impl Due {
+    /// Bytes of its payload.
+    pub fn bytes(&self) -> usize {
+        self.sample.payload.as_ref().map_or(0, bytes::Bytes::len)
+    }
+}
+
+impl InOrder {
+    /// Whether anything waits, or may come again.
+    #[must_use]
+    pub fn is_idle(&self) -> bool {
+        self.waiting.is_empty() && self.earlier.is_empty()
+    }
+
+    /// Bytes of payloads that wait.
+    #[must_use]
+    pub const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// These were counted before the writer was announced, which it was at `now`.
+    pub fn announced(&mut self, earlier: BTreeSet<u64>, now: Timestamp) {
+        (self.earlier, self.announced) = (earlier, now);
+    }
+
+    /// Whether this sample was counted before the announcement and has not been given.
+    #[must_use]
+    pub fn lacks(&self, number: u64) -> bool {
+        self.earlier.contains(&number)
+    }
+
+    /// The numbers that follow are of this incarnation: those of the one before were first.
+    pub fn begin(&mut self, incarnation: u32, now: Timestamp, give: &mut impl FnMut(Due)) {
+        if self.incarnation.replace(incarnation) != Some(incarnation) {
+            self.give_all(now, give);
+        }
+    }
+
+    /// A sample is to be given, when it is its turn.
+    pub fn put(&mut self, due: Due) {
+        let number = due.sample.sequence_number;
+        self.earlier.remove(&number);
+        self.bytes += due.bytes();
+        if let Some(before) = self.waiting.insert(number, due) {
+            self.bytes -= before.bytes();
+        }
+    }
+
+    /// Samples from before the announcement that will not come again.
+    pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<u64> {
+        if self.earlier.is_empty() {
+            return Vec::new();
+        }
+        let is_late = self.announced.0.saturating_add(AGAIN) <= now.0;
+        if is_late || !progress.reliable {
+            return std::mem::take(&mut self.earlier).into_iter().collect();
+        }
+        let kept = self.earlier.split_off(&progress.awaited);
+        let gone = std::mem::replace(&mut self.earlier, kept);
+        gone.into_iter().collect()
+    }
+
+    /// Gives those whose turn it is at `now`; at most `room` bytes may go on waiting. Returns the
+    /// number below which nothing is waited for any more, if the order was given up.
+    pub fn turn(
+        &mut self,
+        progress: &Progress,
+        now: Timestamp,
+        room: usize,
+        give: &mut impl FnMut(Due),
+    ) -> Option<u64> {
+        self.begin(progress.incarnation, now, give);
+        let first = self
+            .earlier
+            .first()
+            .filter(|_| progress.acknowledged || self.announced.0.saturating_add(MATCHING) > now.0);
+        let complete = first.map_or(progress.complete, |first| progress.complete.min(*first));
+        while let Some(entry) = self.waiting.first_entry()
+            && *entry.key() < complete
+        {
+            let due = entry.remove();
+            self.give(due, now, give);
+        }
+        if self.waiting.is_empty() {
+            return None;
+        }
+        if self.hole.0 != complete {
+            self.hole = (complete, now);
+        }
+        let is_late = self.hole.1.0.saturating_add(PATIENCE) <= now.0;
+        if is_late || self.waiting.len() > WAITING || self.bytes > room {
+            let last = self.waiting.last_key_value().map(|(number, _)| *number);
+            self.give_all(now, give);
+            return last.map(|last| last.saturating_add(1));
+        }
+        None
+    }
+
+    /// Gives all that wait: nothing more will come.
+    pub fn give_all(&mut self, now: Timestamp, give: &mut impl FnMut(Due)) {
+        while let Some((_, due)) = self.waiting.pop_first() {
+            self.give(due, now, give);
+        }
+    }
+
+    fn give(&mut self, mut due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
+        self.bytes -= due.bytes();
+        due.sample.time = due.sample.time.max(now).max(self.last);
+        self.last = due.sample.time;
+        give(due);
+    }
+}
