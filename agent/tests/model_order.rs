@@ -2,6 +2,7 @@
 //! and what never waits. Virtual time and forged records.
 #![allow(
     clippy::unwrap_used,
+    clippy::panic,
     clippy::indexing_slicing,
     reason = "a test that meets the unexpected has failed"
 )]

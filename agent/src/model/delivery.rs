@@ -337,7 +337,7 @@ impl Delivery {
         let (now, window) = (scene.now, settle_window(self.is_reliable(scene)));
         let (reception, budget, mut deciding) = self.split(scene);
         reception.advance(now, (window, window), budget, &mut |decision| {
-            deciding.take(decision)
+            deciding.take(decision);
         });
         self.conclude(now, scene);
         self.deaths.settled(self.reception.sequence().settled());

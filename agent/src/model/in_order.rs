@@ -104,6 +104,13 @@ impl InOrder {
         }
     }
 
+    /// A sample that is to be given now: no other waits.
+    pub fn pass(&mut self, mut due: Due, now: Timestamp) -> Due {
+        due.sample.time = now.max(self.last);
+        self.last = due.sample.time;
+        due
+    }
+
     /// A sample is to be given, when it is its turn.
     pub fn put(&mut self, due: Due) {
         let number = due.sample.sequence_number;
@@ -171,10 +178,13 @@ impl InOrder {
         }
     }
 
-    fn give(&mut self, mut due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
+    fn give(&mut self, due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
         self.bytes -= due.bytes();
-        due.sample.time = due.sample.time.max(now).max(self.last);
-        self.last = due.sample.time;
-        give(due);
+        // Players order by time: those that waited for the same repair are a nanosecond apart.
+        let after = match due.sample.time < now {
+            true => Timestamp(self.last.0.saturating_add(1)),
+            false => due.sample.time,
+        };
+        give(self.pass(due, now.max(after)));
     }
 }

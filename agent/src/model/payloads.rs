@@ -318,13 +318,18 @@ impl Payloads {
             missed,
         };
         let mut before = Vec::new();
-        interested
-            .order
-            .begin(progress.incarnation, counted.at, &mut |due| {
-                before.push(due)
-            });
+        let order = &mut interested.order;
+        order.begin(progress.incarnation, counted.at, &mut |due| {
+            before.push(due);
+        });
         self.waiting_bytes += due.bytes();
-        interested.order.put(due);
+        if order.is_idle() && counted.number < progress.complete {
+            let due = order.pass(due, counted.at);
+            before.push(due);
+            before.into_iter().for_each(|due| self.give_due(due));
+            return None;
+        }
+        order.put(due);
         before.into_iter().for_each(|due| self.give_due(due));
         self.turn(writer, progress, counted.at)
     }

@@ -74,7 +74,7 @@ pub enum Refused {
 /// What a reader gets.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Item {
-    /// A message, once, in the order in which messages are counted.
+    /// A message, once; those of a reliable writer in its order.
     Sample(Arc<Sample>),
     /// Everything up to this time has been given; at least ten times a second.
     Clock(Timestamp),
