@@ -26,12 +26,17 @@ use ros2probe_wire::record::kind;
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
 fn wish(host: &mut Host, depth: Depth) {
-    host.observer.set_wishes(Arc::new(vec![Wish {
-        id: 1,
+    wishes(host, &[1], depth);
+}
+
+fn wishes(host: &mut Host, ids: &[u64], depth: Depth) {
+    let wishes = ids.iter().map(|id| Wish {
+        id: *id,
         selection: Arc::new(Selection::all()),
         domain_id: None,
         depth,
-    }]));
+    });
+    host.observer.set_wishes(Arc::new(wishes.collect()));
 }
 
 /// A host with a reader of Bob's that acknowledges.
@@ -336,6 +341,25 @@ fn what_came_before_the_announcement_is_given_once_when_it_comes_again() {
         let measured = dora.host.measurement();
         assert_eq!((measured.messages, measured.duplicates), (6, 6));
     }
+}
+
+#[test]
+fn a_subscription_is_told_of_what_came_before_the_announcement_since_it_began() {
+    let mut dora = Unannounced::new(Depth::Arrivals);
+    (1..=3).for_each(|number| dora.data(number));
+    wishes(&mut dora.host, &[1, 2], Depth::Arrivals);
+    dora.data(4);
+    dora.announce(false);
+    dora.data(5);
+    let given = dora.host.observer.take_given().into_iter();
+    let mut told: Vec<_> = given
+        .filter_map(|given| match given.news {
+            News::Missed(missed) => Some((given.to.to_vec(), missed.first, missed.last)),
+            News::Sample(_) => None,
+        })
+        .collect();
+    told.sort();
+    assert_eq!(told, [(vec![1], 1, 4), (vec![2], 4, 4)]);
 }
 
 #[test]

@@ -211,6 +211,9 @@ impl Observer {
     /// meanwhile, whether they are watched or not; what was counted stays.
     pub fn set_wishes(&mut self, wishes: Arc<Vec<Wish>>) {
         self.wishes = wishes;
+        if self.wishes.is_empty() {
+            self.payloads.retain_strangers(|_| false);
+        }
         self.consult_all();
     }
 
@@ -469,7 +472,9 @@ impl Observer {
         if !self.payloads.wants(writer) {
             let known = self.profiler.get(writer);
             if known.is_some_and(|known| known.topic.is_none()) {
-                self.payloads.counted_of_stranger(writer, counted.number);
+                let wishes = self.wishes.iter().map(|wish| wish.id);
+                let number = counted.number;
+                self.payloads.counted_of_stranger(writer, number, wishes);
             }
             return;
         }

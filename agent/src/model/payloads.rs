@@ -145,6 +145,8 @@ struct Interested {
 #[derive(Debug, Default)]
 struct Earlier {
     numbers: BTreeSet<u64>,
+    /// Ids of the wishes, and the first number that was counted while each was there.
+    begins: Vec<(u64, u64)>,
     /// Lower ones that are not remembered: the first, the last, and how many.
     before: Option<(u64, u64, u64)>,
 }
@@ -237,7 +239,9 @@ impl Payloads {
         let known = before.as_ref().filter(|known| *known.topic == topic);
         let topic = known.map_or_else(|| Arc::new(topic), |known| Arc::clone(&known.topic));
         let begins = |id: &u64| {
-            let known = before.iter().flat_map(|before| &before.begins);
+            let earlier = self.strangers.get(&writer).map(|earlier| &earlier.begins);
+            let known = before.iter().map(|before| &before.begins);
+            let known = known.chain(earlier).flatten();
             let known = known.copied().find(|(known, _)| known == id);
             known.unwrap_or((*id, next))
         };
@@ -356,9 +360,19 @@ impl Payloads {
         interested.is_some_and(|interested| interested.order.lacks(number))
     }
 
-    /// A sample of a writer that nobody announced yet was counted.
-    pub fn counted_of_stranger(&mut self, writer: Guid, number: u64) {
+    /// A sample of a writer that nobody announced yet was counted, while there were these wishes.
+    pub fn counted_of_stranger(
+        &mut self,
+        writer: Guid,
+        number: u64,
+        wishes: impl Iterator<Item = u64>,
+    ) {
         let earlier = self.strangers.entry(writer).or_default();
+        for id in wishes {
+            if !earlier.begins.iter().any(|(known, _)| *known == id) {
+                earlier.begins.push((id, number));
+            }
+        }
         earlier.numbers.insert(number);
         if earlier.numbers.len() > EARLIER
             && let Some(lowest) = earlier.numbers.pop_first()
@@ -440,7 +454,7 @@ impl Payloads {
         if incomplete {
             self.assembly.forget(writer, first);
         }
-        for missed in interested.lost(writer, (first, last), reason) {
+        for missed in interested.missed(writer, (first, last), reason) {
             self.give(missed, 0);
         }
     }
@@ -473,8 +487,14 @@ impl Payloads {
         };
         interested.order.announced(earlier.numbers, now);
         if let Some((first, last, samples)) = earlier.before {
-            let missed = interested.unannounced(writer, (first, last), samples);
-            self.give(missed, 0);
+            let reason = MissedReason::Unannounced;
+            let mut missed = interested.missed(writer, (first, last), reason);
+            for given in &mut missed {
+                if let News::Missed(missed) = &mut given.news {
+                    missed.samples = missed.samples.min(samples);
+                }
+            }
+            missed.into_iter().for_each(|missed| self.give(missed, 0));
         }
     }
 
@@ -486,7 +506,7 @@ impl Payloads {
         let runs = numbers.chunk_by(|before, after| before + 1 == *after);
         let missed: Vec<_> = runs
             .filter_map(|run| Some((*run.first()?, *run.last()?)))
-            .map(|(first, last)| interested.unannounced(writer, (first, last), last - first + 1))
+            .flat_map(|run| interested.missed(writer, run, MissedReason::Unannounced))
             .collect();
         missed.into_iter().for_each(|missed| self.give(missed, 0));
     }
@@ -527,8 +547,8 @@ impl Payloads {
 }
 
 impl Interested {
-    /// That these samples are lost, to each subscription those that are for it.
-    fn lost(&self, writer: Guid, (first, last): (u64, u64), reason: MissedReason) -> Vec<Given> {
+    /// That these samples will not come, to each subscription those that are for it.
+    fn missed(&self, writer: Guid, (first, last): (u64, u64), reason: MissedReason) -> Vec<Given> {
         let mut told: Vec<(u64, Vec<u64>)> = Vec::new();
         for (id, begin) in &self.begins {
             let first = first.max(*begin);
@@ -550,21 +570,6 @@ impl Interested {
             }),
         };
         told.into_iter().map(given).collect()
-    }
-
-    /// That samples came before the announcement alone.
-    fn unannounced(&self, writer: Guid, (first, last): (u64, u64), samples: u64) -> Given {
-        Given {
-            to: Arc::clone(&self.to),
-            news: News::Missed(Missed {
-                topic: Arc::clone(&self.topic),
-                writer,
-                first,
-                last,
-                samples,
-                reason: MissedReason::Unannounced,
-            }),
-        }
     }
 
     /// That a counted sample is missed by the subscriptions that want its bytes.
