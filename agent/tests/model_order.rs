@@ -146,13 +146,15 @@ fn a_hole_that_nothing_explains_is_waited_for_a_while_and_its_late_repair_is_giv
 }
 
 #[test]
-fn nothing_waits_of_a_best_effort_writer_or_where_no_reader_acknowledges() {
+fn nothing_waits_of_a_best_effort_writer_or_for_best_effort_readers() {
     for reliable in [false, true] {
         let mut host = Host::new();
         host.writer(reliable);
         let bob = host.reader(BOB, 7411);
         wish(&mut host, Depth::Arrivals);
-        if !reliable {
+        if reliable {
+            host.subscribe_with(BOB, 2, false);
+        } else {
             host.acknack(bob, 1);
         }
         for number in [1, 3, 2, 6] {
@@ -160,6 +162,28 @@ fn nothing_waits_of_a_best_effort_writer_or_where_no_reader_acknowledges() {
             assert_eq!(numbers(&mut host), [number], "{reliable}");
         }
     }
+}
+
+#[test]
+fn a_reliable_reader_is_waited_for_before_its_first_acknack_and_not_for_ever() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    wish(&mut host, Depth::Arrivals);
+    host.data(bob, 1);
+    host.data(bob, 3);
+    host.data(bob, 2);
+    assert_eq!(numbers(&mut host), [1, 2, 3]);
+    host.data(bob, 5);
+    host.wait(4_100);
+    assert_eq!(numbers(&mut host), [5]);
+    // Its ACKNACKs go where they are not seen.
+    host.data(bob, 7);
+    assert_eq!(numbers(&mut host), [7]);
+    host.acknack(bob, 8);
+    host.data(bob, 9);
+    assert!(numbers(&mut host).is_empty());
+    host.data(bob, 8);
+    assert_eq!(numbers(&mut host), [8, 9]);
 }
 
 #[test]
@@ -381,7 +405,7 @@ fn what_came_before_the_announcement_and_never_again_is_told_as_unannounced() {
                 ]
             );
         } else {
-            dora.host.wait(1_100);
+            dora.host.wait(4_100);
             assert!(!numbers(&mut dora.host).is_empty(), "{reliable}");
             dora.data(6);
             dora.host.wait(10_000);

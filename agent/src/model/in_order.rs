@@ -4,8 +4,8 @@
 //! So a sample that was counted waits here behind a hole until its repair comes, the writer leaves
 //! it out or withdraws it, the readers acknowledge it, or it counts as lost; its time is then the
 //! time of that moment. What waits is bounded in number, bytes and time: beyond, order is given up
-//! and a late repair is given late. A stream without holes never waits, nor does one that no reader
-//! acknowledges.
+//! and a late repair is given late. A stream without holes never waits, nor does one without a
+//! reliable reader, or whose readers are elsewhere: no ACKNACK is seen while a hole is waited for.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -36,7 +36,7 @@ pub struct Progress {
     pub awaited: u64,
     /// The writer retransmits.
     pub reliable: bool,
-    /// And has readers that acknowledge.
+    /// And has readers that acknowledge, or may begin to.
     pub acknowledged: bool,
 }
 

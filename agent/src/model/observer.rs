@@ -478,7 +478,8 @@ impl Observer {
             }
             return;
         }
-        if let Some(progress) = self.profiler.progress(writer, counted.at) {
+        let progress = self.profiler.progress(writer, counted.at, around!(self));
+        if let Some(progress) = progress {
             let skip = self.payloads.counted(writer, counted, &progress);
             self.skip(writer, skip);
         }
@@ -505,7 +506,7 @@ impl Observer {
             began: at,
             sampled: false,
         };
-        let progress = self.profiler.progress(writer, at);
+        let progress = self.profiler.progress(writer, at, around!(self));
         if let Some(progress) = progress.filter(|_| is_last || self.payloads.wants_bytes(writer)) {
             let skip = self.payloads.came_again(writer, &counted, &progress);
             self.skip(writer, skip);
@@ -514,7 +515,8 @@ impl Observer {
 
     /// Gives the samples of this writer whose turn it is.
     fn turn(&mut self, writer: Guid, now: Timestamp) {
-        if let Some(progress) = self.profiler.progress(writer, now) {
+        let progress = self.profiler.progress(writer, now, around!(self));
+        if let Some(progress) = progress {
             let skip = self.payloads.turn(writer, &progress, now);
             self.skip(writer, skip);
         }

@@ -6,6 +6,7 @@
 
 use std::collections::HashMap;
 
+use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, Timestamp};
 
@@ -57,6 +58,8 @@ pub struct Measured {
     /// Of a stranger, the cookie of the socket it sends by; 0 = unknown.
     pub sent_from: u64,
     opened: Timestamp,
+    /// A hole was waited for, and no ACKNACK came.
+    unacknowledged: bool,
     /// From here on the kernel hands over all of its fragments.
     sure_from: Timestamp,
 }
@@ -156,16 +159,17 @@ impl Profiler {
     }
 
     /// How far the samples of this writer are decided.
-    pub fn progress(&mut self, guid: Guid, now: Timestamp) -> Option<Progress> {
+    pub fn progress(&mut self, guid: Guid, now: Timestamp, around: Around<'_>) -> Option<Progress> {
         let measured = self.writers.get_mut(&guid)?;
-        let subscribers = measured.subscribers.as_ref();
-        let below = subscribers.and_then(|subscribers| subscribers.acknowledged_below());
-        Some(measured.writer.progress(below.is_some(), now))
+        let acknowledged = measured.is_acknowledged()
+            || !measured.unacknowledged && measured.has_reliable_reader(around);
+        Some(measured.writer.progress(acknowledged, now))
     }
 
     /// Nothing below `number` of this writer is waited for any more.
     pub fn skip(&mut self, guid: Guid, number: u64) {
         if let Some(measured) = self.writers.get_mut(&guid) {
+            measured.unacknowledged = !measured.is_acknowledged();
             measured.writer.skip(number);
         }
     }
@@ -504,6 +508,19 @@ impl Measured {
         }
     }
 
+    fn is_acknowledged(&self) -> bool {
+        let subscribers = self.subscribers.as_ref();
+        subscribers.is_some_and(|subscribers| subscribers.acknowledged_below().is_some())
+    }
+
+    /// Whether a reader of its topic asks for repairs, as far as discovery knows.
+    fn has_reliable_reader(&self, around: Around<'_>) -> bool {
+        let topic = self.topic.and_then(|topic| around.topics.get(topic));
+        let readers = topic.into_iter().flat_map(|topic| &topic.readers);
+        let mut known = readers.filter_map(|guid| around.discovery.endpoints().get(guid));
+        known.any(|reader| reader.qos.reliability == Reliability::RELIABLE)
+    }
+
     fn new(writer: Writer, topic: Option<TopicId>, now: Timestamp) -> Self {
         Self {
             writer: Box::new(writer),
@@ -514,6 +531,7 @@ impl Measured {
             metered: false,
             sent_from: 0,
             opened: Timestamp(0),
+            unacknowledged: false,
             sure_from: Timestamp(0),
         }
     }
