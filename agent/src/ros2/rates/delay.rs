@@ -53,6 +53,11 @@ impl Ages {
         self.newest = time;
     }
 
+    /// A message passed of which the stamp was not seen: the ages that are known are reported again.
+    pub fn passed(&mut self, time: i64) {
+        self.newest = self.newest.max(time);
+    }
+
     /// The lines of every second; nothing before the second message.
     pub fn lines(&mut self) -> Option<String> {
         if self.ages.is_empty() {
@@ -110,6 +115,20 @@ mod tests {
         assert_eq!(ages.lines().as_deref(), Some("no new messages\n"));
         ages.arrived(1300 * MILLISECOND, 1300 * MILLISECOND);
         assert!(ages.lines().unwrap().ends_with("window: 3\n"));
+    }
+
+    #[test]
+    fn messages_whose_stamp_was_not_seen_are_new_messages_all_the_same() {
+        let mut ages = Ages::new(10);
+        ages.passed(900 * MILLISECOND);
+        assert_eq!(ages.lines(), None);
+        for at in [1000, 1100] {
+            ages.arrived(at * MILLISECOND, (at - 2) * MILLISECOND);
+        }
+        let text = ages.lines().unwrap();
+        ages.passed(1200 * MILLISECOND);
+        assert_eq!(ages.lines(), Some(text));
+        assert_eq!(ages.lines().as_deref(), Some("no new messages\n"));
     }
 
     #[test]

@@ -344,11 +344,10 @@ impl Rates {
                 }
             }
             Some(Series::Bandwidth(sizes)) => sizes.arrived(arrival.time, arrival.size),
-            Some(Series::Delay(ages)) => {
-                if let Some(stamp) = arrival.header_stamp {
-                    ages.arrived(arrival.time, stamp);
-                }
-            }
+            Some(Series::Delay(ages)) => match arrival.header_stamp {
+                Some(stamp) => ages.arrived(arrival.time, stamp),
+                None => ages.passed(arrival.time),
+            },
             None => {}
         }
     }
