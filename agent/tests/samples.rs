@@ -268,6 +268,13 @@ impl Robot {
         self.observer.datagram(&envelope, &message.bytes(), None);
     }
 
+    /// Read in shared memory, where others may have been missed.
+    fn look(&mut self, message: Message) {
+        self.at += 1_000_000;
+        let envelope = forge::multicast(self.at, 0);
+        self.observer.shared_memory(&envelope, &message.bytes());
+    }
+
     fn fragment(&mut self, prefix: GuidPrefix, number: u64, start: u32, payload: &[u8]) {
         self.put(Message::from(prefix).fragment(WRITER, number, start, 1000, payload));
     }
@@ -321,6 +328,37 @@ fn fragments_make_the_payload_that_was_sent_in_the_order_of_counting() {
     let guid = Guid::new(BOB, WRITER);
     robot.put(Message::from(BOB).dispose_by_key(WRITER, 3, 0x70, guid));
     let expected = [(ALICE, 1, Ok(large)), (BOB, 2, Ok(small[..400].to_vec()))];
+    assert_eq!(robot.given(), expected);
+}
+
+#[test]
+fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    robot.at += SECOND;
+    let large = payload(3000);
+    for start in [1, 2, 3] {
+        robot.look(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
+    }
+    // Looks at two ports may find them in another order, and twice.
+    for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
+        robot.look(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
+    }
+    let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
+    let given = robot.given();
+    let (whole, missed): (Vec<_>, Vec<_>) = given.into_iter().partition(|each| each.2.is_ok());
+    // The last fragment of 2 was seen while one was missing: it was given up then.
+    assert_eq!(whole, [expected[0].clone(), expected[2].clone()]);
+    assert_eq!(missed, [(ALICE, 2, Err(MissedReason::NotCaptured))]);
+    robot.look(Message::from(ALICE).data(WRITER, 4, &payload(24)));
+    // A fragment was overwritten before it was read.
+    for start in [1, 3] {
+        robot.look(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
+    }
+    let expected = [
+        (ALICE, 4, Ok(payload(24))),
+        (ALICE, 5, Err(MissedReason::NotCaptured)),
+    ];
     assert_eq!(robot.given(), expected);
 }
 

@@ -33,6 +33,9 @@ impl Bytes for &[u8] {
 
 /// Size of the RTPS message header, where the first submessage begins.
 pub const HEADER_LEN: u32 = 20;
+/// Longest message that is walked. A datagram has 65,507 bytes at most; in shared memory a transport
+/// may be configured to hand over longer ones.
+pub const MAX_MESSAGE: u32 = 32 << 20;
 /// `RTPS` as it lies in memory.
 pub const MAGIC: u32 = u32::from_ne_bytes(*b"RTPS");
 
@@ -138,7 +141,7 @@ impl Walk {
     /// Whether `len` bytes at `offset` lie in the datagram and among the first `present` bytes.
     #[inline(always)]
     const fn reach(&self, offset: u32, len: u32, present: u32) -> Reach {
-        // Offsets stay below 2^17: a 16-bit length from a position below 2^16.
+        // Offsets stay below 2^27: a 16-bit length from a position below `MAX_MESSAGE`.
         let end = offset + len;
         if end > self.datagram_len {
             Reach::Outside
@@ -639,7 +642,8 @@ pub fn datagram<'a>(
     handover: Option<&Handover>,
     mut show: impl FnMut(Found<'a>),
 ) -> Outcome {
-    let Ok(datagram_len) = u16::try_from(payload.len()).map(u32::from) else {
+    let length = u32::try_from(payload.len()).ok();
+    let Some(datagram_len) = length.filter(|length| *length <= MAX_MESSAGE) else {
         return Outcome::Malformed;
     };
     let mut walk = Walk {
@@ -660,6 +664,7 @@ pub fn datagram<'a>(
         }
         walk.begin(source, datagram_len);
     }
+    walk.record.datagram_len = u16::try_from(datagram_len).unwrap_or(u16::MAX);
     loop {
         let start = walk.offset;
         let step = step(&mut walk, &payload, datagram_len);

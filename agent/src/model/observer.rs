@@ -239,15 +239,12 @@ impl Observer {
     /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`
     /// the kernel filter has reported what lies before its offset.
     pub fn datagram(&mut self, envelope: &Envelope, payload: &[u8], handover: Option<&Handover>) {
-        self.walk(envelope, payload, handover, Self::count);
+        self.walk(envelope, payload, handover, 0, Self::count);
     }
 
     /// Takes in a message that was read in shared memory, where others may have been missed.
     pub fn shared_memory(&mut self, envelope: &Envelope, payload: &[u8]) {
-        self.walk(envelope, payload, None, |observer, record| {
-            let flags = record.flags | flag::SHM;
-            observer.count(&Record { flags, ..*record });
-        });
+        self.walk(envelope, payload, None, flag::SHM, Self::count);
     }
 
     /// What is wanted of shared memory at the moment.
@@ -276,7 +273,7 @@ impl Observer {
         payload: &[u8],
         mut later: impl FnMut(&mut Self, Record),
     ) {
-        self.walk(envelope, payload, None, |observer, record| {
+        self.walk(envelope, payload, None, 0, |observer, record| {
             if record.writer().entity.is_builtin() {
                 observer.count(record);
             } else {
@@ -558,6 +555,7 @@ impl Observer {
         envelope: &Envelope,
         payload: &[u8],
         handover: Option<&Handover>,
+        flags: u16,
         mut count: impl FnMut(&mut Self, &Record),
     ) {
         self.datagrams += 1;
@@ -565,7 +563,8 @@ impl Observer {
             .get(6..8)
             .and_then(|bytes| <[u8; 2]>::try_from(bytes).ok());
         let vendor = vendor.filter(|vendor| *vendor != [0, 0]).map(VendorId);
-        let outcome = walk::datagram(payload, envelope, handover, |found| {
+        let outcome = walk::datagram(payload, envelope, handover, |mut found| {
+            found.record.flags |= flags;
             self.announced(&found, vendor, envelope);
             count(self, &found.record);
         });
@@ -595,13 +594,13 @@ impl Observer {
 
     /// Keeps the bytes of a sample that somebody wants and that was not counted yet.
     fn keep(&mut self, found: &Found<'_>) {
-        let (writer, number) = (found.record.writer(), found.record.sequence_number);
+        let writer = found.record.writer();
         if self.payloads.wants_bytes(writer) {
+            let moved = self.calendar.even_record(&found.record);
+            let record = moved.as_ref().unwrap_or(&found.record);
             let known = self.profiler.get(writer);
-            let lacks = self.payloads.lacks(writer, number);
-            if lacks || known.is_some_and(|known| !known.writer.has(number)) {
-                let moved = self.calendar.even_record(&found.record);
-                let record = moved.as_ref().unwrap_or(&found.record);
+            let lacks = self.payloads.lacks(writer, record.sequence_number);
+            if lacks || known.is_some_and(|known| !known.writer.has(record)) {
                 self.payloads.keep(record, found.payload);
             }
         }

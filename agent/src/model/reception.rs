@@ -12,6 +12,8 @@ use super::sequence::{Arrival, Manner, Sequence, Settled};
 
 /// A fragment that completes its sample this late after the sample's last one was retransmitted.
 const REPAIR: i64 = 5_000_000;
+/// Numbers below the newest whose fragments a sampled view still waits for.
+const UNDER_WAY: u64 = 8;
 const DATA_FLAG: u8 = 0x04;
 const FRAGMENT_KEY_FLAG: u8 = 0x04;
 
@@ -88,6 +90,17 @@ impl Reception {
     #[must_use]
     pub fn is_partial(&self, number: u64) -> bool {
         self.samples.is_partial(number)
+    }
+
+    /// Takes in a DATA_FRAG of a view in which samples may be missing: whether it completes its
+    /// sample. Samples far below it are waited for no longer.
+    pub fn assemble(&mut self, record: &Record, budget: &mut Budget) -> bool {
+        let oldest = record.sequence_number.saturating_sub(UNDER_WAY);
+        self.samples.forget_below(oldest, budget);
+        let progress = self
+            .samples
+            .fragment(record, Timestamp(record.time), budget);
+        matches!(progress, Progress::Complete(_))
     }
 
     /// Moves what the unfinished samples take from one budget to another.

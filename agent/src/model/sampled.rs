@@ -30,6 +30,8 @@ pub struct Sampled {
     unmeasured: u64,
     /// Bit `i`: the number `i + 1` below the next one was seen, or needs not be.
     sighted: u128,
+    /// Likewise: all of it was seen, or its last fragment while others were not.
+    finished: u128,
     /// The latest number that arrived whole as far as can be told, and when.
     arrived: Option<(u64, Timestamp)>,
     /// Where its payload begins with a header: the stamp that came with the first fragment.
@@ -47,6 +49,19 @@ pub struct News {
     pub interval: Option<i64>,
     /// It is the newest one and has arrived: its delay is a delivery delay.
     pub arrived: bool,
+    /// Nothing more of it is waited for, for the first time.
+    pub finished: bool,
+}
+
+/// What was seen of a sample, its latest record included.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Seen {
+    /// A part of it, of which more follows.
+    Part,
+    /// Its last fragment, while others are missing.
+    Tail,
+    /// All of it.
+    Whole,
 }
 
 impl Sampled {
@@ -61,6 +76,7 @@ impl Sampled {
             uncertain: 0,
             unmeasured: 0,
             sighted: u128::MAX,
+            finished: u128::MAX,
             arrived: None,
             head: None,
         }
@@ -106,12 +122,21 @@ impl Sampled {
         }
     }
 
-    /// Takes in a sample or a fragment of one. `ends` = nothing of it follows.
+    /// Whether nothing more is waited for of this sample, where `next` is the number after the newest.
+    #[must_use]
+    pub fn has(&self, number: u64, next: u64) -> bool {
+        number < next
+            && self
+                .bit(number, next)
+                .is_none_or(|bit| self.finished & bit != 0)
+    }
+
+    /// Takes in a sample or a fragment of one.
     pub fn sample(
         &mut self,
         number: u64,
         source: Option<Timestamp>,
-        ends: bool,
+        seen: Seen,
         now: Timestamp,
         sequence: &mut Sequence,
     ) -> News {
@@ -130,23 +155,28 @@ impl Sampled {
         sequence.begin(number);
         if sequence.next() != before {
             // It begins, perhaps anew.
-            (self.sighted, self.arrived) = (u128::MAX, None);
+            (self.sighted, self.finished, self.arrived) = (u128::MAX, u128::MAX, None);
         }
         let samples = self.advance(number.saturating_add(1), now, sequence);
         self.span += samples;
         let below = sequence.next().saturating_sub(number).saturating_sub(1);
-        let bit = self.bit(number, sequence.next());
-        if let Some(bit) = bit.filter(|bit| self.sighted & bit == 0) {
+        let bit = self.bit(number, sequence.next()).unwrap_or(0);
+        if self.sighted & bit != bit {
             self.sighted |= bit;
             self.seen += 1;
+        }
+        let finished = seen != Seen::Part && self.finished & bit != bit;
+        if finished {
+            self.finished |= bit;
         }
         let mut news = News {
             samples,
             alike: samples.saturating_add(std::mem::take(&mut self.unmeasured)),
+            finished,
             ..News::default()
         };
         let is_later = self.arrived.is_none_or(|(arrived, _)| arrived < number);
-        if ends && below == 0 && is_later {
+        if seen != Seen::Part && below == 0 && is_later {
             news.arrived = true;
             news.interval = self
                 .arrived
@@ -180,7 +210,9 @@ impl Sampled {
         if sequence.started() && start <= sequence.next() && ahead <= MAX_AHEAD {
             let skipped = self.advance(end, now, sequence);
             let bits = u32::try_from(skipped).unwrap_or(u32::MAX);
-            self.sighted |= 1_u128.checked_shl(bits).map_or(u128::MAX, |bit| bit - 1);
+            let skipped = 1_u128.checked_shl(bits).map_or(u128::MAX, |bit| bit - 1);
+            self.sighted |= skipped;
+            self.finished |= skipped;
         }
         samples
     }
@@ -214,6 +246,7 @@ impl Sampled {
         let samples = end - next;
         let bits = u32::try_from(samples).unwrap_or(u32::MAX);
         self.sighted = self.sighted.checked_shl(bits).unwrap_or(0);
+        self.finished = self.finished.checked_shl(bits).unwrap_or(0);
         samples
     }
 }
@@ -241,14 +274,14 @@ mod tests {
         }
 
         fn see(&mut self, number: u64) -> News {
-            self.part(number, true)
+            self.part(number, Seen::Whole)
         }
 
-        fn part(&mut self, number: u64, ends: bool) -> News {
+        fn part(&mut self, number: u64, seen: Seen) -> News {
             self.now += SECOND / 100;
             let now = Timestamp(self.now);
             self.sampled
-                .sample(number, Some(now), ends, now, &mut self.sequence)
+                .sample(number, Some(now), seen, now, &mut self.sequence)
         }
 
         fn counts(&self) -> (u64, u64) {
@@ -277,14 +310,43 @@ mod tests {
     #[test]
     fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
         let mut view = View::new();
-        let news = [false, false, true, true].map(|ends| view.part(1, ends));
+        let parts = [Seen::Part, Seen::Part, Seen::Whole, Seen::Whole];
+        let news = parts.map(|seen| view.part(1, seen));
         assert_eq!(news.map(|news| news.samples), [1, 0, 0, 0]);
         assert_eq!(news.map(|news| news.arrived), [false, false, true, false]);
+        assert_eq!(news.map(|news| news.finished), [false, false, true, false]);
         view.see(3);
         // Late, but seen after all.
-        assert_eq!(view.see(2), News::default());
+        let late = News {
+            finished: true,
+            ..News::default()
+        };
+        assert_eq!(view.see(2), late);
         assert_eq!(view.see(2), News::default());
         assert_eq!(view.counts(), (3, 3));
+    }
+
+    #[test]
+    fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
+        let mut view = View::new();
+        view.see(1);
+        let has = |view: &View, number| view.sampled.has(number, view.sequence.next());
+        view.part(2, Seen::Part);
+        assert_eq!(
+            [1, 2, 3].map(|number| has(&view, number)),
+            [true, false, false]
+        );
+        // The next one begins before it is whole.
+        view.part(3, Seen::Part);
+        view.part(2, Seen::Whole);
+        assert_eq!([2, 3].map(|number| has(&view, number)), [true, false]);
+        view.part(3, Seen::Tail);
+        view.see(500);
+        // Too long ago to be waited for; what a GAP passes over is not waited for either.
+        assert!(has(&view, 300) && !has(&view, 499));
+        let now = Timestamp(view.now);
+        view.sampled.skip(501, 503, now, &mut view.sequence);
+        assert!(has(&view, 502) && !has(&view, 499));
     }
 
     #[test]
@@ -336,8 +398,8 @@ mod tests {
         let now = Timestamp(view.now);
         assert_eq!(view.sampled.exist(5, now, &mut view.sequence), 4);
         view.now += SECOND;
-        for ends in [false, false, true] {
-            assert_eq!(view.part(4, ends).samples, 0);
+        for seen in [Seen::Part, Seen::Part, Seen::Whole] {
+            assert_eq!(view.part(4, seen).samples, 0);
         }
         assert_eq!(view.counts(), (2, 5));
     }

@@ -190,6 +190,13 @@ impl Samples {
         index.is_some()
     }
 
+    /// Forgets those with a lower number than this.
+    pub fn forget_below(&mut self, number: u64, budget: &mut Budget) {
+        while let Some(index) = self.partial.iter().position(|each| each.number < number) {
+            self.close(index, budget);
+        }
+    }
+
     /// Forgets what got no fragment for `window` nanoseconds; how many that were.
     pub fn expire(&mut self, now: Timestamp, window: u64, budget: &mut Budget) -> u64 {
         let mut expired = 0;

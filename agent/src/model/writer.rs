@@ -14,7 +14,7 @@ use super::in_order::Progress;
 use super::journal::{Journal, Loss, Missing};
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception, is_message};
-use super::sampled::{News, Sampled};
+use super::sampled::{News, Sampled, Seen};
 use super::samples::Budget;
 use super::snapshot::Measurement;
 
@@ -154,10 +154,18 @@ impl Writer {
         self.tally.duplicates += 1;
     }
 
-    /// Whether this sample needs nothing more: it was counted, or is settled.
+    /// Whether the sample that this record is of needs nothing more: it was counted, or is settled.
     #[must_use]
-    pub fn has(&self, number: u64) -> bool {
-        self.reception.sequence().has(number)
+    pub fn has(&self, record: &Record) -> bool {
+        let (number, at) = (record.sequence_number, record_time(record));
+        let sequence = self.reception.sequence();
+        if is_looked_at(record) && self.is_exact(at) {
+            return true;
+        }
+        match &self.sampled {
+            Some(sampled) if sampled.is_current(at) => sampled.has(number, sequence.next()),
+            _ => sequence.has(number),
+        }
     }
 
     /// Messages counted.
@@ -189,7 +197,7 @@ impl Writer {
     ) -> Option<Counted> {
         let at = record_time(record);
         let is_exact = record.flags & flag::EXACT != 0;
-        let is_sampled = record.flags & flag::SHM != 0 && !is_exact;
+        let is_sampled = is_looked_at(record);
         if is_exact {
             self.exact = self.exact.max(Some(at));
         } else if is_sampled && self.is_exact(at) {
@@ -204,7 +212,7 @@ impl Writer {
                 _ => sampled.is_current(at),
             });
         if is_sampled || takes {
-            let counted = self.sampled_record(record, is_sampled, scene.calendar);
+            let counted = self.sampled_record(record, is_sampled, scene);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From here on every message is seen.
                 sampled.end();
@@ -390,7 +398,7 @@ impl Writer {
         &mut self,
         record: &Record,
         is_sampled: bool,
-        calendar: Calendar,
+        scene: &mut Scene<'_>,
     ) -> Option<Counted> {
         let now = record_time(record);
         if self.sampled.is_none() || !self.is_sampled(now) {
@@ -402,14 +410,23 @@ impl Writer {
         if is_sampled {
             sampled.touch(now);
         }
-        let sequence = self.reception.sequence_mut();
         let number = record.sequence_number;
+        let has = sampled.has(number, self.reception.sequence().next());
+        let is_whole = match record.kind {
+            kind::DATA_FRAG => !has && self.reception.assemble(record, scene.budget),
+            _ => true,
+        };
+        let sequence = self.reception.sequence_mut();
         let told = match record.kind {
             kind::DATA | kind::DATA_FRAG => {
-                let ends = record.kind == kind::DATA || record.ends_sample();
+                let seen = match is_whole {
+                    true => Seen::Whole,
+                    false if record.ends_sample() => Seen::Tail,
+                    false => Seen::Part,
+                };
                 let source = record.source_timestamp().timestamp();
-                let news = sampled.sample(number, source, ends, now, sequence);
-                return self.sampled_sample(record, &news, (now, calendar.shown(now)));
+                let news = sampled.sample(number, source, seen, now, sequence);
+                return self.sampled_sample(record, &news, (now, scene.calendar.shown(now)));
             }
             kind::HEARTBEAT => {
                 self.traits.reliable = true;
@@ -454,10 +471,12 @@ impl Writer {
         if let Some(interval) = news.interval {
             self.interarrival.observe(seconds(interval));
         }
+        let source = record.source_timestamp();
         if news.arrived && is_message {
-            let source = record.source_timestamp();
             let number = record.sequence_number;
             self.delays(number, true, (source, stamp), (now, calendar));
+        }
+        if news.finished && is_message {
             return Some(Counted {
                 number: record.sequence_number,
                 bytes,
@@ -571,6 +590,11 @@ impl Settling<'_> {
             last,
         });
     }
+}
+
+/// Whether it was read in shared memory, where others may have been missed.
+const fn is_looked_at(record: &Record) -> bool {
+    record.flags & (flag::SHM | flag::EXACT) == flag::SHM
 }
 
 const fn record_time(record: &Record) -> Timestamp {

@@ -168,6 +168,25 @@ fn a_length_of_zero_reaches_the_end_but_not_for_pad_and_info_ts() {
 }
 
 #[test]
+fn a_message_longer_than_a_datagram_ends_in_a_sample_of_any_size() {
+    // Fast DDS with a transport of shared memory alone: the last submessage has the length 0.
+    let short = submessage(0x15, 0x05, &data_body(true, 1, &[0, 1, 0, 0]));
+    let body = data_body(true, 2, &[7; 200_000]);
+    let bytes = message(&[short, [&[0x15, 0x05, 0, 0][..], &body].concat()]);
+    let (outcome, found) = walk_all(&bytes);
+    assert_eq!(outcome, Outcome::Complete);
+    let seen: Vec<_> = found
+        .iter()
+        .map(|(record, payload)| (record.sequence_number, record.payload_len, payload.len()))
+        .collect();
+    assert_eq!(seen, [(1, 4, 4), (2, 200_000, 200_000)]);
+    let last = found.last().map(|(record, _)| record.datagram_len);
+    assert_eq!(last, Some(u16::MAX));
+    let long = vec![0; MAX_MESSAGE as usize + 1];
+    assert_eq!(walk_all(&long).0, Outcome::Malformed);
+}
+
+#[test]
 fn a_gap_of_256_becomes_two_records() {
     let body = [
         &READER[..],

@@ -6,7 +6,7 @@
 
 use std::cell::RefCell;
 
-use ros2probe_wire::walk::Bytes;
+use ros2probe_wire::walk::{Bytes, MAX_MESSAGE};
 
 use super::cell::Descriptor;
 use super::source::Source;
@@ -26,7 +26,7 @@ pub struct Buffer {
     validity: u32,
     data: u64,
     /// Its length.
-    pub length: u16,
+    pub length: u32,
 }
 
 /// Why a message is not there.
@@ -34,8 +34,8 @@ pub struct Buffer {
 pub enum Refusal {
     /// Its buffer has been used again since.
     Expired,
-    /// What stands there cannot be one of ours: it lies outside the file, or is longer than a
-    /// datagram.
+    /// What stands there cannot be one of ours: it lies outside the file, or is longer than any
+    /// message that is read.
     Malformed,
 }
 
@@ -67,7 +67,10 @@ impl Buffer {
         } else {
             Refusal::Expired
         };
-        buffer.length = u16::try_from(size).map_err(|_| refused)?;
+        if size > MAX_MESSAGE {
+            return Err(refused);
+        }
+        buffer.length = size;
         buffer.data = u64::from(data);
         Ok(buffer)
     }
@@ -80,9 +83,14 @@ impl Buffer {
         status.is_some_and(|status| status & VALIDITY == u64::from(self.validity))
     }
 
-    /// Reads the whole message. Look at [`Self::is_valid`] afterwards.
+    /// Reads the whole message. Look at [`Self::is_valid`] afterwards. Allocates no more than the
+    /// file has bytes.
     pub fn read<S: Source + ?Sized>(&self, source: &S, into: &mut Vec<u8>) -> bool {
-        into.resize(self.length.into(), 0);
+        let last = u64::from(self.length).saturating_sub(1);
+        if !source.read(self.data.saturating_add(last), &mut [0]) {
+            return false;
+        }
+        into.resize(usize::try_from(self.length).unwrap_or(0), 0);
         source.read(self.data, into)
     }
 }
@@ -136,7 +144,7 @@ impl<S: Source + ?Sized> Bytes for Message<'_, S> {
         if let Some(words) = within(window) {
             return Some(words);
         }
-        let left = u32::from(self.buffer.length).checked_sub(offset)?;
+        let left = self.buffer.length.checked_sub(offset)?;
         let length = usize::try_from(left).ok()?.min(WINDOW);
         (window.start, window.length) = (offset, 0);
         let bytes = window.bytes.get_mut(..length)?;

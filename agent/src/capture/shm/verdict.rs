@@ -82,7 +82,7 @@ impl Judge {
     pub fn judge<B: Bytes>(
         &mut self,
         message: &B,
-        length: u16,
+        length: u32,
         template: Record,
         records: &mut Vec<Record>,
     ) -> Judgement {
@@ -92,12 +92,12 @@ impl Judge {
         if magic != MAGIC {
             return Judgement::Foreign;
         }
-        let length = u32::from(length);
         let mut walk = Walk {
             record: template,
             ..Walk::default()
         };
         walk.begin(source, length);
+        walk.record.datagram_len = u16::try_from(length).unwrap_or(u16::MAX);
         let first = records.len();
         for _ in 0..SUBMESSAGES {
             let step = walk::step(&mut walk, message, length);
@@ -149,7 +149,9 @@ impl Judge {
     /// Captured within its budget, then metered within that of all.
     fn unknown(&mut self, writer: [u32; 4], length: u32) -> Verdict {
         let has_room = self.unknown.len() < UNKNOWN_CAPACITY as usize;
-        if (has_room || self.unknown.contains_key(&writer)) && self.capture_left > 0 {
+        let is_datagram = length <= u16::MAX.into();
+        let has_place = has_room || self.unknown.contains_key(&writer);
+        if is_datagram && has_place && self.capture_left > 0 {
             let used = self.unknown.entry(writer).or_default();
             if *used < UNKNOWN_CAPTURE_BYTES {
                 *used = used.saturating_add(length);
@@ -199,7 +201,7 @@ mod tests {
             flags: flag::SHM,
             ..Record::default()
         };
-        let length = u16::try_from(message.len()).unwrap();
+        let length = u32::try_from(message.len()).unwrap();
         let judgement = judge.judge(&message, length, template, &mut records);
         (judgement, records)
     }
