@@ -401,6 +401,8 @@ fn what_goes_through_shared_memory_is_not_called_silent() {
     let topic = robot.get("/topics/chatter");
     let passages = topic["passages"].as_array().unwrap();
     assert_eq!(passages[0]["passage"], "shared_memory", "{topic}");
+    // A capture has nothing of it.
+    assert_eq!(passages[0]["view"], "none", "{topic}");
     assert_eq!(topic["reasons"][0]["code"], "shared_memory", "{topic}");
 }
 

@@ -177,6 +177,7 @@ fn topic(
             topic.writers.iter(),
             &topic.readers.iter(),
         ),
+        is_read: topic.wished.is_some(),
     }
 }
 

@@ -150,6 +150,8 @@ pub struct TopicFacts {
     /// Pairs of its live writers and readers by how messages pass between them; those that there
     /// are.
     pub passages: Vec<PassageCount>,
+    /// Its samples are given one by one.
+    pub is_read: bool,
 }
 
 /// How messages pass between a writer and a reader, as both announce it.

@@ -249,6 +249,7 @@ pub fn topic(name: &str) -> TopicFacts {
             passage: Passage::SharedMemory,
             pairs: 1,
         }],
+        is_read: false,
     }
 }
 

@@ -22,7 +22,8 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Domain, Scope, only};
 use super::silence::{Circumstances, ReasonView};
 use super::watch::ExpectationsView;
-use crate::model::snapshot::{AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts};
+use crate::model::snapshot::{AcknowledgementFacts, DeliveryFacts, Passage, Snapshot, TopicFacts};
+use crate::surface::Ability;
 use crate::surface::board::State as BoardState;
 use crate::watches::InForce;
 
@@ -106,6 +107,12 @@ struct PassageView {
     passage: &'static str,
     /// How many pairs.
     pairs: usize,
+    /// Of `shared_memory`, how it is seen just now: `exact`, every message in the process that sends
+    /// it; `close`, by as many looks as `capture.shm.reading_cpu_percent` allows, because its samples
+    /// are read; `sampled`, by fewer looks; `none`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    view: Option<&'static str>,
 }
 
 /// A watch that covers the topic.
@@ -280,15 +287,19 @@ fn is_called(topic: &TopicFacts, name: &str) -> bool {
 struct Desk<'a> {
     in_force: &'a InForce,
     snapshot: &'a Snapshot,
+    /// Every message into shared memory is seen.
+    is_exact: bool,
     circumstances: Circumstances<'a>,
 }
 
 impl<'a> Desk<'a> {
     fn new(state: &'a BoardState, in_force: &'a InForce) -> Self {
         let snapshot = state.known();
+        let abilities = &state.agent.abilities;
         Self {
             in_force,
             snapshot,
+            is_exact: abilities.contains(&Ability::SharedMemoryExact),
             circumstances: Circumstances {
                 snapshot,
                 index: Index::new(snapshot),
@@ -308,6 +319,7 @@ impl<'a> Desk<'a> {
         let passages = facts.passages.iter().map(|count| PassageView {
             passage: count.passage.label(),
             pairs: count.pairs,
+            view: (count.passage == Passage::SharedMemory).then(|| self.view(facts)),
         });
         TopicView {
             domain_id: facts.domain_id,
@@ -328,6 +340,19 @@ impl<'a> Desk<'a> {
             passages: passages.collect(),
             diagnoses: findings.map(|finding| (*finding).into()).collect(),
             reasons: self.circumstances.reasons(facts),
+        }
+    }
+
+    /// How messages of this topic in shared memory are seen just now.
+    fn view(&self, facts: &TopicFacts) -> &'static str {
+        if self.is_exact {
+            "exact"
+        } else if !self.circumstances.looks_at_memory {
+            "none"
+        } else if facts.is_read {
+            "close"
+        } else {
+            "sampled"
         }
     }
 
