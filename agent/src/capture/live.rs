@@ -22,6 +22,7 @@ use super::intake::{self, Intake};
 use super::interfaces::Selection;
 use super::netns::{self, NetnsError};
 use super::set_clock::SetClock;
+use super::shm::pace::Budget as Shares;
 use super::shm::scan::{Places, Scope};
 use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
@@ -94,7 +95,7 @@ pub struct LiveSource {
 /// What looks at shared memory. Its thread begins when the source is started.
 enum Shm {
     Off,
-    Later(Scope, f64),
+    Later(Scope, Shares),
     Running(SharedMemory),
 }
 
@@ -143,8 +144,11 @@ impl LiveSource {
         let shared_memory = match settings.shm.mode {
             ShmMode::Off => Shm::Off,
             ShmMode::Auto => {
-                let share = settings.shm.cpu_percent / 100.0;
-                Shm::Later(scope(settings, host.is_some()), share)
+                let budget = Shares {
+                    watching: settings.shm.cpu_percent / 100.0,
+                    every: settings.shm.reading_cpu_percent / 100.0,
+                };
+                Shm::Later(scope(settings, host.is_some()), budget)
             }
         };
         let clocks = Clocks::read();
@@ -215,7 +219,11 @@ impl LiveSource {
         let interfaces = self.wires.iter().flat_map(WireTap::descriptors);
         let processes = self.exact.iter().flat_map(Exact::descriptors);
         let rings = bell.is_some().into();
-        let taps = sockets.chain(processes).chain(interfaces);
+        let looks = match &self.shared_memory {
+            Shm::Running(shared_memory) => shared_memory.descriptor(),
+            Shm::Off | Shm::Later(..) => None,
+        };
+        let taps = sockets.chain(processes).chain(interfaces).chain(looks);
         let descriptors: Vec<_> = bell.into_iter().chain(taps).collect();
         let began = Instant::now();
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
@@ -256,9 +264,12 @@ impl LiveSource {
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
             shared_memory.take_in(&clocks, observer);
-            if clocks.monotonic.wrapping_sub(self.wanted_asked) >= SECOND {
-                self.wanted_asked = clocks.monotonic;
-                shared_memory.want(observer.wanted_of_shared_memory());
+        }
+        if clocks.monotonic.wrapping_sub(self.wanted_asked) >= TENTH {
+            self.wanted_asked = clocks.monotonic;
+            let wanted = observer.wanted_of_shared_memory();
+            if let Shm::Running(shared_memory) = &self.shared_memory {
+                shared_memory.want(wanted);
             }
         }
         if held_up {
@@ -443,10 +454,10 @@ impl LiveSource {
     }
 
     fn start_shared_memory(&mut self) {
-        let Shm::Later(scope, share) = &self.shared_memory else {
+        let Shm::Later(scope, budget) = &self.shared_memory else {
             return;
         };
-        let started = SharedMemory::start(Places::new(scope.clone()), *share);
+        let started = SharedMemory::start(Places::new(scope.clone()), *budget);
         self.shared_memory = match started {
             Ok(running) => Shm::Running(running),
             Err(error) => {

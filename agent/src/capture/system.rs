@@ -322,6 +322,18 @@ impl Clocks {
     }
 }
 
+/// Nanoseconds of the monotonic clock.
+#[must_use]
+pub fn monotonic() -> u64 {
+    nanoseconds(libc::CLOCK_MONOTONIC)
+}
+
+/// Nanoseconds since the Unix epoch.
+#[must_use]
+pub fn calendar() -> u64 {
+    nanoseconds(libc::CLOCK_REALTIME)
+}
+
 /// CPU time that the calling thread has used, in nanoseconds.
 #[must_use]
 pub fn thread_cpu() -> u64 {

@@ -271,6 +271,7 @@ impl Reader {
                 mode: shm.mode,
                 exact: shm.exact,
                 cpu_percent: shm.cpu_percent,
+                reading_cpu_percent: shm.reading_cpu_percent,
             },
         };
         self.check_source(&settings);

@@ -84,6 +84,8 @@ pub struct ShmSettings {
     pub exact: ExactChoice,
     /// Share of one CPU that it may cost, in percent.
     pub cpu_percent: f64,
+    /// The same while samples are given one by one.
+    pub reading_cpu_percent: f64,
 }
 
 /// Whether shared memory is looked at.
@@ -383,6 +385,7 @@ impl Default for Config {
                     mode: ShmMode::default(),
                     exact: ExactChoice::default(),
                     cpu_percent: defaults::SHM_CPU_PERCENT,
+                    reading_cpu_percent: defaults::SHM_READING_CPU_PERCENT,
                 },
             },
             metrics: MetricsSettings {
@@ -436,6 +439,7 @@ mod defaults {
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
     pub(super) const SHM_CPU_PERCENT: f64 = 1.5;
+    pub(super) const SHM_READING_CPU_PERCENT: f64 = 25.0;
     pub(super) const LISTEN: &str = "127.0.0.1:17400";
     pub(super) const API: &str = "127.0.0.1:17401";
 

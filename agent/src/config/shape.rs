@@ -142,6 +142,10 @@ pub(super) struct ShmShape {
     /// meet. With less, fewer of the messages are seen; they are counted all the same.
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) cpu_percent: f64,
+    /// The same while samples of a topic that goes through shared memory are recorded, echoed,
+    /// retained or measured by a command: then every message is wanted, and looks are many.
+    #[schemars(range(min = 0.1, max = 100))]
+    pub(super) reading_cpu_percent: f64,
 }
 
 /// Interface names or globs (`eth*`).
@@ -300,6 +304,7 @@ impl Default for ShmShape {
             mode: ShmMode::default(),
             exact: ExactChoice::default(),
             cpu_percent: defaults::SHM_CPU_PERCENT,
+            reading_cpu_percent: defaults::SHM_READING_CPU_PERCENT,
         }
     }
 }

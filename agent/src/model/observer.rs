@@ -82,6 +82,8 @@ pub enum Wanted {
     Names,
     /// Samples of a measured writer may pass there.
     Samples,
+    /// Those of a writer whose samples are to be given one by one.
+    EverySample,
 }
 
 impl Default for Settings {
@@ -250,8 +252,10 @@ impl Observer {
     /// What is wanted of shared memory at the moment.
     #[must_use]
     pub fn wanted_of_shared_memory(&self) -> Wanted {
-        let mut measured = self.profiler.iter().map(|(guid, _)| *guid);
-        if measured.any(|guid| may_share_memory(&self.discovery, guid)) {
+        let may_share = |guid: &Guid| may_share_memory(&self.discovery, *guid);
+        if self.payloads.wanted().any(may_share) {
+            Wanted::EverySample
+        } else if self.profiler.iter().any(|(guid, _)| may_share(guid)) {
             Wanted::Samples
         } else if lacks_names(&self.discovery, self.clock) {
             Wanted::Names

@@ -227,6 +227,11 @@ impl Payloads {
         self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
     }
 
+    /// The writers whose samples are given.
+    pub fn wanted(&self) -> impl Iterator<Item = &Guid> {
+        self.writers.keys()
+    }
+
     /// Gives the samples of this writer from `now` on; the next one has number `next`.
     pub fn want(
         &mut self,

@@ -1,12 +1,17 @@
 //! What the tap found, on its way to the working thread: bounded, and counted where it overflows.
 
+use std::io::{self, Read as _, Write as _};
+use std::os::fd::{AsFd as _, BorrowedFd};
+use std::os::unix::net::UnixStream;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use ros2probe_wire::record::{Record, kind};
 
 /// Records, and bytes of captured messages, that wait at most.
 const MAX_RECORDS: usize = 16_384;
-const MAX_BYTES: usize = 4 << 20;
+const MAX_BYTES: usize = 16 << 20;
+/// From so many bytes on it asks to be emptied: a camera fills it in a fifth of a second.
+const MUCH: usize = 1 << 20;
 
 /// One thing that was found.
 #[derive(Debug)]
@@ -30,6 +35,14 @@ pub enum Item {
 #[derive(Debug, Default)]
 pub struct Inbox {
     waiting: Mutex<Waiting>,
+    bell: Option<Bell>,
+}
+
+/// Wakes the working thread.
+#[derive(Debug)]
+struct Bell {
+    ringer: UnixStream,
+    listener: UnixStream,
 }
 
 #[derive(Debug, Default)]
@@ -40,14 +53,38 @@ struct Waiting {
 }
 
 impl Inbox {
+    /// Empty, with a descriptor that is readable when much waits.
+    #[must_use]
+    pub fn with_bell() -> Self {
+        Self {
+            waiting: Mutex::default(),
+            // Without one, what waits is taken when the working thread looks by itself.
+            bell: Bell::new().ok(),
+        }
+    }
+
+    /// Readable when much waits.
+    #[must_use]
+    pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.bell.as_ref()?.listener.as_fd())
+    }
+
     /// Takes over what `found` holds, and leaves it empty.
     pub fn put(&self, found: &mut Vec<Item>) {
         if found.is_empty() {
             return;
         }
         let waiting = &mut *self.waiting();
+        let had_much = waiting.bytes >= MUCH;
         for item in found.drain(..) {
             waiting.put(item);
+        }
+        if let Some(bell) = self.bell.as_ref()
+            && !had_much
+            && waiting.bytes >= MUCH
+        {
+            // Full: it rings already.
+            let _ = (&bell.ringer).write(&[1]);
         }
     }
 
@@ -55,6 +92,9 @@ impl Inbox {
     #[must_use]
     pub fn take(&self) -> Vec<Item> {
         let waiting = &mut *self.waiting();
+        if let Some(bell) = self.bell.as_ref().filter(|_| waiting.bytes >= MUCH) {
+            let _ = (&bell.listener).read(&mut [0; 8]);
+        }
         waiting.bytes = 0;
         std::mem::take(&mut waiting.items)
     }
@@ -68,6 +108,15 @@ impl Inbox {
     /// Nothing that is done under this lock can fail.
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Bell {
+    fn new() -> io::Result<Self> {
+        let (ringer, listener) = UnixStream::pair()?;
+        ringer.set_nonblocking(true)?;
+        listener.set_nonblocking(true)?;
+        Ok(Self { ringer, listener })
     }
 }
 
@@ -100,7 +149,10 @@ impl Waiting {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
+    use crate::capture::system::wait;
 
     fn fragment(start: u32) -> Item {
         Item::Record(Record {
@@ -142,12 +194,35 @@ mod tests {
     }
 
     #[test]
+    fn it_rings_once_much_waits_and_is_silent_when_that_is_taken() {
+        let inbox = Inbox::with_bell();
+        let message = |length| Item::Message {
+            time: 0,
+            port: 0,
+            bytes: vec![0; length],
+        };
+        let rings = || {
+            let listener = inbox.descriptor().unwrap();
+            wait(&[listener], Duration::ZERO).unwrap() == Some(0)
+        };
+        for _ in 0..2 {
+            inbox.put(&mut vec![message(MUCH - 1)]);
+            assert!(!rings());
+            inbox.put(&mut vec![message(1), message(1)]);
+            assert!(rings());
+            inbox.put(&mut vec![message(MUCH)]);
+            assert_eq!(inbox.take().len(), 4);
+            assert!(!rings());
+        }
+    }
+
+    #[test]
     fn what_there_is_no_room_for_is_counted() {
         let inbox = Inbox::default();
         let message = || Item::Message {
             time: 0,
             port: 0,
-            bytes: vec![0; 1 << 20],
+            bytes: vec![0; 4 << 20],
         };
         inbox.put(&mut vec![
             message(),

@@ -19,6 +19,7 @@ pub mod verdict;
 mod image;
 
 use std::collections::BTreeSet;
+use std::os::fd::BorrowedFd;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -30,10 +31,10 @@ use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use self::inbox::{Inbox, Item};
-use self::pace::{Need, Pace};
+use self::pace::{Budget, Need, Pace};
 use self::scan::{Name, Places};
-use self::tap::{Counters, Moment, Tap};
-use super::system::{Clocks, DirectoryWatch, run_first, thread_cpu};
+use self::tap::{Counters, Tap};
+use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu};
 use crate::model::observer::{Observer, Wanted};
 use crate::privilege::{self, Role, SpawnError};
 
@@ -79,19 +80,22 @@ struct Shared {
 }
 
 impl SharedMemory {
-    /// Starts looking, within a share of a CPU. The thread keeps those of the caller's capabilities
+    /// Starts looking, within shares of a CPU. The thread keeps those of the caller's capabilities
     /// that it needs.
     ///
     /// # Errors
     /// There can be no more threads.
-    pub fn start(places: Places, share: f64) -> Result<Self, SpawnError> {
-        let shared = Arc::<Shared>::default();
+    pub fn start(places: Places, budget: Budget) -> Result<Self, SpawnError> {
+        let shared = Arc::new(Shared {
+            inbox: Inbox::with_bell(),
+            ..Shared::default()
+        });
         let thread = std::thread::Builder::new().name("shm".to_owned());
         let looks = Arc::clone(&shared);
         let thread = privilege::spawn(
             Role::shared_memory(),
             thread.stack_size(256 << 10),
-            move || look(&looks, places, share),
+            move || look(&looks, places, budget),
         )?;
         Ok(Self {
             shared,
@@ -113,6 +117,12 @@ impl SharedMemory {
     /// Looks no longer, or again: everything is seen in the processes that send it.
     pub fn pause(&self, is_paused: bool) {
         self.shared.is_paused.store(is_paused, Ordering::Release);
+    }
+
+    /// Readable when much was found that has not been taken in.
+    #[must_use]
+    pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
+        self.shared.inbox.descriptor()
     }
 
     /// Gives the model what was found since the last time.
@@ -144,6 +154,7 @@ impl SharedMemory {
             Wanted::Nothing => Need::Nothing,
             Wanted::Names => Need::Names,
             Wanted::Samples => Need::Watching,
+            Wanted::EverySample => Need::Every,
         };
         self.shared.wanted.store(need as u8, Ordering::Relaxed);
     }
@@ -184,10 +195,10 @@ impl Shared {
 }
 
 /// The thread.
-fn look(shared: &Shared, places: Places, share: f64) {
-    let mut tap = Tap::new(places);
+fn look(shared: &Shared, places: Places, budget: Budget) {
+    let mut tap = Tap::new(places, calendar);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
-    let mut pace = Pace::new(share).on(cpus);
+    let mut pace = Pace::new(budget).on(cpus);
     // Without it, somebody who comes is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched = BTreeSet::new();
@@ -208,20 +219,16 @@ fn look(shared: &Shared, places: Places, share: f64) {
             std::thread::sleep(PAUSE);
             continue;
         }
-        let clocks = Clocks::read();
-        let now = Moment {
-            monotonic: clocks.monotonic,
-            calendar: clocks.now.0,
-        };
-        let monotonic = seconds(now.monotonic);
+        let now = monotonic();
+        let at = seconds(now);
         let announced = tap.look(now, &mut found);
         shared.inbox.put(&mut found);
         looks += 1;
-        if looks % ACCOUNT_EVERY == 0 || !pace.is_meeting(monotonic) {
+        if looks % ACCOUNT_EVERY == 0 || !(tap.is_hurried || tap.misses_nothing) {
             cpu = seconds(thread_cpu());
         }
-        if now.monotonic.saturating_sub(reported) >= REPORT {
-            reported = now.monotonic;
+        if now.saturating_sub(reported) >= REPORT {
+            reported = now;
             shared.report(&tap, looks, pace.stretch());
         }
         let wanted = shared.wanted.load(Ordering::Relaxed);
@@ -234,12 +241,13 @@ fn look(shared: &Shared, places: Places, share: f64) {
             Need::Nothing
         };
         if tap.met() {
-            pace.news(monotonic);
+            pace.news(at);
         }
-        let sleep = pace.sleep(monotonic, cpu, announced, need);
-        if may_be_first && pace.is_meeting(monotonic) != is_first {
+        let sleep = pace.sleep(at, cpu, announced, need);
+        tap.is_hurried = pace.is_meeting(at);
+        tap.misses_nothing = need == Need::Every;
+        if may_be_first && (tap.is_hurried || tap.misses_nothing) != is_first {
             is_first = !is_first;
-            tap.is_hurried = is_first;
             if let Err(error) = run_first(is_first) {
                 (may_be_first, is_first) = (false, false);
                 tracing::info!(%error, "names said in shared memory may be missed on a busy host");
@@ -258,7 +266,7 @@ fn look(shared: &Shared, places: Places, share: f64) {
         }
         if watch.wait(sleep, |name| Name::parse(name).is_some()) {
             tap.somebody_comes();
-            pace.newcomer(monotonic);
+            pace.newcomer(at);
         }
     }
 }

@@ -31,6 +31,13 @@ const NEWS: f64 = 0.1;
 /// CPU time for it: at most so many seconds, and so much more each second.
 const CREDIT: f64 = 10.0;
 const CREDIT_PER_SECOND: f64 = 0.01;
+/// At most while every message is wanted. In a burst a sender uses its buffers again after some
+/// 100 us, and its reader is quicker than that.
+const EVERY: f64 = 50e-6;
+const SOON: f64 = 20e-6;
+/// CPU time that may be saved for it, so that a short recording lacks nothing, and overdrawn.
+const SAVINGS: f64 = 5.0;
+const OVERDRAFT: f64 = 0.25;
 /// Sleeps get no longer than this, whatever it costs.
 const LONGEST: f64 = 50e-3;
 
@@ -43,18 +50,29 @@ pub enum Need {
     Names,
     /// Something is measured.
     Watching,
+    /// Every message is wanted, not their number alone.
+    Every,
 }
 
 impl Need {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Nothing, Self::Names, Self::Watching];
+    pub const ALL: [Self; 4] = [Self::Nothing, Self::Names, Self::Watching, Self::Every];
+}
+
+/// Shares of a CPU, 0.015 for 1.5 %.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Budget {
+    /// While messages are counted and names are read.
+    pub watching: f64,
+    /// While every message is wanted.
+    pub every: f64,
 }
 
 /// The sleeps.
 #[derive(Debug)]
 pub struct Pace {
-    /// Share of a CPU.
-    budget: f64,
+    budget: Budget,
+    need: Need,
     sleep: f64,
     stretch: f64,
     quiet_since: f64,
@@ -66,14 +84,19 @@ pub struct Pace {
     was_close: bool,
     /// CPU time for close looks that is left.
     credit: f64,
+    /// What is left of the budget while every message is wanted, as of a time and the CPU time that
+    /// was used up to then.
+    savings: f64,
+    spent: (f64, f64),
 }
 
 impl Pace {
-    /// Within this share of a CPU, 0.015 for 1.5 %.
+    /// Within these shares of a CPU.
     #[must_use]
-    pub const fn new(budget: f64) -> Self {
+    pub const fn new(budget: Budget) -> Self {
         Self {
             budget,
+            need: Need::Nothing,
             sleep: WATCHING,
             stretch: 1.0,
             quiet_since: 0.0,
@@ -83,6 +106,8 @@ impl Pace {
             has_company: false,
             was_close: false,
             credit: CREDIT,
+            savings: SAVINGS,
+            spent: (0.0, 0.0),
         }
     }
 
@@ -133,12 +158,23 @@ impl Pace {
             return Duration::from_secs_f64(MEETING);
         }
         self.meeting_until = now;
+        if (need == Need::Every) != (self.need == Need::Every) {
+            // By another measure from now on.
+            (self.stretch, self.accounted) = (1.0, (now, cpu));
+            let saved = (now - self.spent.0) * self.budget.every;
+            self.savings = (self.savings + saved).min(SAVINGS);
+            self.spent = (now, cpu);
+        }
+        self.need = need;
         self.account(now, cpu);
+        if need == Need::Every {
+            return self.sleep_little(now, cpu, found);
+        }
         let longest = match need {
             Need::Nothing => NOTHING,
             _ if now - self.quiet_since > QUIET_AFTER => QUIET,
             Need::Names => NAMES,
-            Need::Watching => WATCHING,
+            Need::Watching | Need::Every => WATCHING,
         };
         self.sleep = match found {
             0 => (self.sleep * SLOWER).min(longest),
@@ -153,6 +189,23 @@ impl Pace {
     #[must_use]
     pub const fn stretch(&self) -> f64 {
         self.stretch
+    }
+
+    /// The sleep while every message is wanted: shorter for a moment after each, which may be the
+    /// first of a burst. It always sleeps, for it runs before those whose messages it reads.
+    fn sleep_little(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
+        let (then, used) = std::mem::replace(&mut self.spent, (now, cpu));
+        let saved = (now - then) * self.budget.every - (cpu - used);
+        self.savings = (self.savings + saved).clamp(-OVERDRAFT, SAVINGS);
+        self.sleep = EVERY;
+        if found > 0 {
+            self.awake_until = now + BURSTS;
+        }
+        if self.savings <= 0.0 {
+            let slower = EVERY * self.stretch.max(SLOWER);
+            return Duration::from_secs_f64(slower.min(LONGEST));
+        }
+        Duration::from_secs_f64(if now < self.awake_until { SOON } else { EVERY })
     }
 
     fn meet(&mut self, until: f64) {
@@ -170,8 +223,12 @@ impl Pace {
         self.accounted = (now, cpu);
         self.credit = (self.credit + elapsed * CREDIT_PER_SECOND).min(CREDIT);
         let share = (cpu - used) / elapsed;
+        let budget = match self.need {
+            Need::Every => self.budget.every,
+            Need::Nothing | Need::Names | Need::Watching => self.budget.watching,
+        };
         // Waking up less often by the factor that it costs too much, but not all at once.
-        let wanted = share / self.budget;
+        let wanted = share / budget;
         let correction = wanted.clamp(0.8, 1.5);
         self.stretch = (self.stretch * correction).clamp(1.0, LONGEST / BURST);
     }
@@ -180,6 +237,11 @@ impl Pace {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const BUDGET: Budget = Budget {
+        watching: 0.015,
+        every: 0.25,
+    };
 
     /// Runs for `seconds` with a look costing `cost`; the share of CPU over the second half, and
     /// the looks in it.
@@ -211,7 +273,10 @@ mod tests {
         for budget in [0.005, 0.015, 0.1] {
             for cost in [5e-6, 25e-6, 200e-6] {
                 for burst in [0, 1, 40] {
-                    let mut pace = Pace::new(budget);
+                    let mut pace = Pace::new(Budget {
+                        watching: budget,
+                        every: 1.0,
+                    });
                     let (share, _) = run(&mut pace, 20.0, cost, Need::Watching, |_| burst);
                     // A look that costs 200 us at every 50 ms is 0.4 %: less is not to be had.
                     assert!(share <= budget * 1.1, "{budget} {cost} {burst}: {share}");
@@ -222,7 +287,7 @@ mod tests {
 
     #[test]
     fn it_looks_a_thousand_times_a_second_while_it_may() {
-        let mut pace = Pace::new(0.015);
+        let mut pace = Pace::new(BUDGET);
         let busy = |now: f64| usize::from(now % 1.0 < 0.01);
         let (_, looks) = run(&mut pace, 10.0, 5e-6, Need::Watching, busy);
         assert!(looks > 900.0, "{looks}");
@@ -231,7 +296,7 @@ mod tests {
     #[test]
     fn where_little_is_needed_it_looks_seldom() {
         let looks = |need| {
-            let mut pace = Pace::new(0.015);
+            let mut pace = Pace::new(BUDGET);
             run(&mut pace, 20.0, 5e-6, need, |_| 0).1
         };
         assert!((9.0..11.0).contains(&looks(Need::Nothing)));
@@ -241,7 +306,7 @@ mod tests {
 
     #[test]
     fn when_somebody_comes_it_looks_closely_but_not_for_ever() {
-        let mut pace = Pace::new(0.015);
+        let mut pace = Pace::new(BUDGET);
         pace.newcomer(100.0);
         let look = |pace: &mut Pace, now, cpu| pace.sleep(now, cpu, 0, Need::Nothing).as_micros();
         assert_eq!(look(&mut pace, 100.01, 0.0), 10);
@@ -262,7 +327,7 @@ mod tests {
     #[test]
     fn after_each_message_of_a_newcomer_it_stays_awake_where_others_have_a_cpu() {
         for cpus in [1, 2] {
-            let mut pace = Pace::new(0.015).on(cpus);
+            let mut pace = Pace::new(BUDGET).on(cpus);
             pace.newcomer(100.0);
             let mut look = |now, found| pace.sleep(now, 0.0, found, Need::Names).as_micros();
             let awake = if cpus > 1 { 0 } else { 10 };
@@ -274,8 +339,39 @@ mod tests {
     }
 
     #[test]
+    fn while_every_message_is_wanted_it_looks_every_50_us_within_a_budget_of_its_own() {
+        let idle = |_: f64| 0;
+        let mut pace = Pace::new(BUDGET).on(2);
+        let (share, looks) = run(&mut pace, 10.0, 8e-6, Need::Every, idle);
+        assert!(looks > 15_000.0 && share < 0.16, "{looks} {share}");
+        // A hundred thousand messages a second, and looks that cost much.
+        for cost in [8e-6, 60e-6] {
+            let mut pace = Pace::new(BUDGET).on(2);
+            (pace.need, pace.savings) = (Need::Every, 0.0);
+            let (share, looks) = run(&mut pace, 20.0, cost, Need::Every, |_| 10);
+            assert!(share <= 0.27 && looks > 2000.0, "{cost} {share} {looks}");
+            // Nobody wants them any more: what was learnt of the cost does not carry over.
+            let first = pace.sleep(30.0, 9.0, 1, Need::Watching);
+            assert!(first <= Duration::from_micros(500), "{first:?}");
+        }
+    }
+
+    #[test]
+    fn after_a_message_that_is_wanted_it_looks_again_soon_while_the_budget_allows_it() {
+        let mut pace = Pace::new(BUDGET).on(2);
+        let mut look = |now, cpu, found| pace.sleep(now, cpu, found, Need::Every).as_micros();
+        assert_eq!(look(1.0, 0.0, 0), 50);
+        assert_eq!(look(1.001, 0.0, 1), 20);
+        assert_eq!(look(1.001_1, 0.0, 0), 20);
+        assert_eq!(look(1.001_3, 0.0, 0), 50);
+        // What was saved is spent, and saved again.
+        assert_eq!(look(1.5, 7.0, 1), 75);
+        assert_eq!(look(4.5, 7.0, 1), 20);
+    }
+
+    #[test]
     fn a_burst_is_followed_closely_and_then_left_alone() {
-        let mut pace = Pace::new(0.015);
+        let mut pace = Pace::new(BUDGET);
         assert_eq!(pace.sleep(0.01, 0.0, 5, Need::Watching).as_micros(), 100);
         let mut last = Duration::ZERO;
         for step in 0..10 {

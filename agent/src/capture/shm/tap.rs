@@ -50,6 +50,10 @@ pub struct Tap {
     pub judge: Judge,
     /// Whether it has to be back soon: what takes long is put off.
     pub is_hurried: bool,
+    /// Whether every message is wanted: silent ports are looked at as often as others.
+    pub misses_nothing: bool,
+    /// The calendar, in nanoseconds since the Unix epoch.
+    calendar: Box<dyn FnMut() -> u64>,
     counters: Counters,
     opened: u64,
     met: bool,
@@ -127,19 +131,20 @@ struct Identity {
     validity: u32,
 }
 
-/// One moment on the two clocks that matter here.
-#[derive(Clone, Copy, Debug)]
-pub struct Moment {
-    /// Nanoseconds, monotonic.
-    pub monotonic: u64,
-    /// Nanoseconds since the Unix epoch.
-    pub calendar: u64,
+/// When a message was read: its times and whether those tell when it was sent.
+#[derive(Clone, Copy)]
+struct Reading {
+    monotonic: u64,
+    /// After the message was announced, so never before it was sent.
+    calendar: u64,
+    /// It was announced since the last look.
+    is_timely: bool,
 }
 
 impl Tap {
-    /// Nothing open.
+    /// Nothing open. `calendar` gives nanoseconds since the Unix epoch.
     #[must_use]
-    pub fn new(places: Places) -> Self {
+    pub fn new(places: Places, calendar: impl FnMut() -> u64 + 'static) -> Self {
         Self {
             places,
             ports: Vec::new(),
@@ -148,6 +153,8 @@ impl Tap {
             remembered: Remembered::default(),
             judge: Judge::default(),
             is_hurried: false,
+            misses_nothing: false,
+            calendar: Box::new(calendar),
             counters: Counters::default(),
             opened: 0,
             met: false,
@@ -215,14 +222,15 @@ impl Tap {
         }
     }
 
-    /// Looks everywhere once; appends what is of interest. How many messages were announced.
-    pub fn look(&mut self, now: Moment, found: &mut Vec<Item>) -> usize {
-        self.now = now.monotonic;
-        self.judge.refill(now.monotonic);
-        if now.monotonic.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0 {
-            self.listed = now.monotonic;
+    /// Looks everywhere once, at `now` nanoseconds of the monotonic clock; appends what is of
+    /// interest. How many messages were announced.
+    pub fn look(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
+        self.now = now;
+        self.judge.refill(now);
+        if now.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0 {
+            self.listed = now;
             self.scan(now, found);
-        } else if !self.unborn.is_empty() && now.monotonic.saturating_sub(self.tried) >= TRY_EVERY {
+        } else if !self.unborn.is_empty() && now.saturating_sub(self.tried) >= TRY_EVERY {
             self.attach(now, found);
         }
         let most = if self.is_hurried {
@@ -232,11 +240,7 @@ impl Tap {
         };
         let mut announced = 0;
         for index in 0..self.ports.len() {
-            if self
-                .ports
-                .get(index)
-                .is_some_and(|open| open.due <= now.monotonic)
-            {
+            if self.ports.get(index).is_some_and(|open| open.due <= now) {
                 announced += self.look_at(index, now, found);
                 if announced >= most {
                     break;
@@ -246,27 +250,33 @@ impl Tap {
         announced
     }
 
-    fn look_at(&mut self, index: usize, now: Moment, found: &mut Vec<Item>) -> usize {
+    fn look_at(&mut self, index: usize, now: u64, found: &mut Vec<Item>) -> usize {
         let Some(open) = self.ports.get_mut(index) else {
             return 0;
         };
         let key = open.key;
         let mut announced = std::mem::take(&mut self.announced);
-        let look = open.port.look(&open.file, now.monotonic, &mut announced);
+        let look = open.port.look(&open.file, now, &mut announced);
         let number = announced.len();
+        let is_uncertain = look.is_some_and(|look| look.is_uncertain);
+        let calendar = match number > 0 || is_uncertain {
+            true => (self.calendar)(),
+            false => 0,
+        };
         match look {
             Some(look) => {
                 if look.pushed > 0 {
-                    open.busy = now.monotonic;
+                    open.busy = now;
                 }
-                let is_silent = now.monotonic.saturating_sub(open.busy) > SILENT_AFTER;
-                open.due = now.monotonic + if is_silent { SILENT_EVERY } else { 0 };
+                let is_silent = now.saturating_sub(open.busy) > SILENT_AFTER;
+                let rests = is_silent && !self.misses_nothing;
+                open.due = now + if rests { SILENT_EVERY } else { 0 };
                 self.counters.announced += look.pushed;
                 self.counters.missed += look.overwritten;
                 self.counters.unfilled += look.unfilled;
-                if look.is_uncertain {
+                if is_uncertain {
                     self.counters.uncertain += 1;
-                    found.push(Item::Uncertain(now.calendar));
+                    found.push(Item::Uncertain(calendar));
                 }
             }
             None => {
@@ -279,9 +289,14 @@ impl Tap {
         let mut latest = std::mem::take(&mut self.latest);
         let places = announced.iter().enumerate();
         latest.extend(places.map(|(index, it)| ((it.segment, it.node), index)));
+        let reading = Reading {
+            monotonic: now,
+            calendar,
+            is_timely: true,
+        };
         for (index, descriptor) in announced.drain(..).enumerate() {
             if latest.get(&(descriptor.segment, descriptor.node)) == Some(&index) {
-                self.read(key, &descriptor, now, true, found);
+                self.read(key, &descriptor, reading, found);
             } else {
                 self.counters.missed += 1;
             }
@@ -296,12 +311,11 @@ impl Tap {
         &mut self,
         (place, generation, port): PortKey,
         descriptor: &Descriptor,
-        now: Moment,
-        is_timely: bool,
+        reading: Reading,
         found: &mut Vec<Item>,
     ) {
         let key = (place, generation, descriptor.segment);
-        self.open_segment(key, now.monotonic);
+        self.open_segment(key, reading.monotonic);
         let Some(Segment::Open(segment, serial)) = self.segments.get(&key) else {
             self.counters.unreachable += 1;
             return;
@@ -326,7 +340,7 @@ impl Tap {
             }
         };
         let template = Record {
-            time: now.calendar,
+            time: reading.calendar,
             destination_port: u16::try_from(port).unwrap_or(0),
             flags: flag::SHM,
             ..Record::default()
@@ -350,16 +364,18 @@ impl Tap {
         self.counters.read += 1;
         if judgement == Judgement::Captured {
             self.counters.captured += 1;
-            self.met |= self.judge.announces;
+            // Samples that are read are no news of participants.
+            let is_news = !(self.misses_nothing && self.judge.is_wanted);
+            self.met |= self.judge.announces && is_news;
             self.counters.captured_bytes += bytes.len() as u64;
             found.push(Item::Message {
-                time: now.calendar,
+                time: reading.calendar,
                 port: template.destination_port,
                 bytes,
             });
         }
         for mut record in self.records.drain(..) {
-            if !is_timely {
+            if !reading.is_timely {
                 record.source_timestamp = 0;
                 record.flags &= !flag::STAMP;
             }
@@ -391,15 +407,15 @@ impl Tap {
     }
 
     /// Opens what is new and lets go of what is gone or is another file by now.
-    fn scan(&mut self, now: Moment, found: &mut Vec<Item>) {
+    fn scan(&mut self, now: u64, found: &mut Vec<Item>) {
         let every = if self.is_hurried {
             FIND_IN_A_HURRY
         } else {
             FIND_EVERY
         };
-        let finds = now.monotonic.saturating_sub(self.found) >= every || self.found == 0;
+        let finds = now.saturating_sub(self.found) >= every || self.found == 0;
         if finds {
-            self.found = now.monotonic;
+            self.found = now;
             self.places.find();
         }
         if !self.places.list() && !finds {
@@ -435,8 +451,8 @@ impl Tap {
     }
 
     /// Opens ports that have come to be.
-    fn attach(&mut self, now: Moment, found: &mut Vec<Item>) {
-        self.tried = now.monotonic;
+    fn attach(&mut self, now: u64, found: &mut Vec<Item>) {
+        self.tried = now;
         for (key, path) in std::mem::take(&mut self.unborn) {
             if self.ports.len() >= MAX_PORTS {
                 self.counters.left_out += 1;
@@ -446,7 +462,7 @@ impl Tap {
                 continue;
             };
             let (_, _, number) = key;
-            let Some((port, backlog)) = Port::attach(&file, number, now.monotonic) else {
+            let Some((port, backlog)) = Port::attach(&file, number, now) else {
                 // Not laid out yet, or not as known.
                 self.unborn.push((key, path));
                 continue;
@@ -455,14 +471,19 @@ impl Tap {
                 key,
                 file,
                 port,
-                busy: now.monotonic,
-                due: now.monotonic,
+                busy: now,
+                due: now,
             };
             let at = self.ports.partition_point(|open| open.key.2 <= number);
             self.ports.insert(at, open);
             self.met = true;
+            let reading = Reading {
+                monotonic: now,
+                calendar: (self.calendar)(),
+                is_timely: false,
+            };
             for descriptor in backlog {
-                self.read(key, &descriptor, now, false, found);
+                self.read(key, &descriptor, reading, found);
             }
         }
     }

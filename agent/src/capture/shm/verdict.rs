@@ -42,6 +42,8 @@ pub struct Judge {
     refilled: u64,
     /// The message that was captured last is about endpoints or nodes, and more of that may follow.
     pub announces: bool,
+    /// It is of a writer whose messages are wanted whole: its nodes, or samples that are read.
+    pub is_wanted: bool,
 }
 
 /// Nothing classified.
@@ -54,6 +56,7 @@ impl Default for Judge {
             records_left: RECORDS_PER_SECOND,
             refilled: 0,
             announces: false,
+            is_wanted: false,
         }
     }
 }
@@ -122,6 +125,7 @@ impl Judge {
                     let is_sample = matches!(walk.record.kind, kind::DATA | kind::DATA_FRAG);
                     let writer = walk.record.writer().entity;
                     self.announces = is_sample && writer != EntityId::SPDP_WRITER;
+                    self.is_wanted = self.interest.contains_key(&walk.record.writer);
                     records.truncate(first);
                     return Judgement::Captured;
                 }
@@ -236,7 +240,11 @@ mod tests {
         assert!(!rules.announces);
         let endpoint = message(&[(WRITER, 1), ([0, 0, 3, 0xc2], 1)]);
         assert_eq!(judge(&mut rules, &endpoint).0, Judgement::Captured);
-        assert!(rules.announces);
+        assert!(rules.announces && !rules.is_wanted);
+        rules.set(guid(WRITER), Some(Verdict::Capture));
+        let read = message(&[(WRITER, 2)]);
+        assert_eq!(judge(&mut rules, &read).0, Judgement::Captured);
+        assert!(rules.announces && rules.is_wanted);
     }
 
     #[test]

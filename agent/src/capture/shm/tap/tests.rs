@@ -1,8 +1,10 @@
 //! The tap over files that our own writer of the layout makes.
 
+use std::cell::Cell;
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
+use std::rc::Rc;
 
 use proptest::prelude::*;
 use ros2probe_wire::Guid;
@@ -39,19 +41,23 @@ struct Host {
     directory: TempDir,
     tap: Tap,
     now: u64,
+    calendar: Rc<Cell<u64>>,
 }
 
 impl Host {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let mut tap = Tap::new(Places::new(Scope::Directories(vec![
-            directory.path().to_path_buf(),
-        ])));
+        let directories = vec![directory.path().to_path_buf()];
+        let places = Places::new(Scope::Directories(directories));
+        let calendar = Rc::new(Cell::new(SECOND));
+        let clock = Rc::clone(&calendar);
+        let mut tap = Tap::new(places, move || clock.get());
         tap.judge.set(writer(), Some(Verdict::Meter));
         Self {
             directory,
             tap,
             now: SECOND,
+            calendar,
         }
     }
 
@@ -63,19 +69,26 @@ impl Host {
         PortImage::new(number, 16, 0x100).in_directory(self.path())
     }
 
+    fn large_segment(&self, id: u8) -> SegmentImage {
+        SegmentImage::new([id; 8], 1 << 20).in_directory(self.path())
+    }
+
     fn segment(&self, id: u8) -> SegmentImage {
         SegmentImage::new([id; 8], 1 << 16).in_directory(self.path())
     }
 
+    /// Lets time pass and looks.
+    fn find_after(&mut self, nanoseconds: u64) -> Vec<Item> {
+        self.now += nanoseconds;
+        self.calendar.set(self.calendar.get() + nanoseconds);
+        let mut found = Vec::new();
+        self.tap.look(self.now, &mut found);
+        found
+    }
+
     /// Lets time pass and looks; the numbers of the samples that were found.
     fn look_after(&mut self, nanoseconds: u64) -> Vec<u64> {
-        self.now += nanoseconds;
-        let now = Moment {
-            monotonic: self.now,
-            calendar: self.now,
-        };
-        let mut found = Vec::new();
-        self.tap.look(now, &mut found);
+        let found = self.find_after(nanoseconds);
         let numbers = found.iter().filter_map(|item| match item {
             Item::Record(record) if record.kind == kind::DATA => Some(record.sequence_number),
             _ => None,
@@ -120,17 +133,78 @@ fn discovery_is_handed_on_whole_with_the_port_it_came_by() {
     let mut message = sample(1);
     message[44..48].copy_from_slice(&[0, 1, 0, 0xc2]);
     port.push(segment.put(&message));
-    host.now += MILLISECOND;
-    let now = Moment {
-        monotonic: host.now,
-        calendar: 5,
-    };
-    let mut found = Vec::new();
-    host.tap.look(now, &mut found);
+    host.calendar.set(4);
+    let found = host.find_after(1);
     let [Item::Message { time, port, bytes }] = found.as_slice() else {
         panic!("{found:?}");
     };
     assert_eq!((*time, *port, bytes), (5, 7410, &message));
+}
+
+#[test]
+fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
+    let mut host = Host::new();
+    host.tap.judge.set(writer(), Some(Verdict::Capture));
+    let (mut port, mut segment) = (host.port(7411), host.large_segment(1));
+    host.look_after(SECOND);
+    // The last submessage of a message may be longer than its length field can tell: 0, to the end.
+    let mut message = sample(1);
+    message[34..36].fill(0);
+    message.resize(200_000, 7);
+    port.push(segment.put(&message));
+    let found = host.find_after(MILLISECOND);
+    let [Item::Message { bytes, .. }] = found.as_slice() else {
+        panic!("{found:?}");
+    };
+    assert_eq!(bytes, &message);
+    // Metered, it is one sample of that size.
+    host.tap.judge.set(writer(), Some(Verdict::Meter));
+    port.push(segment.put(&message));
+    let found = host.find_after(MILLISECOND);
+    let [Item::Record(record)] = found.as_slice() else {
+        panic!("{found:?}");
+    };
+    assert_eq!(record.payload_len, 200_000 - 56);
+    assert_eq!(host.tap.counters().malformed, 0);
+}
+
+#[test]
+fn a_message_bears_the_time_after_it_was_announced_and_not_that_of_the_look_s_beginning() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    host.look_after(SECOND);
+    // It is sent while the look is under way already.
+    let clock = Rc::clone(&host.calendar);
+    host.tap.calendar = Box::new(move || clock.replace(clock.get() + 1000));
+    port.push(segment.put(&sample(1)));
+    let sent = host.calendar.get();
+    let mut found = Vec::new();
+    host.tap.look(host.now, &mut found);
+    let [Item::Record(record)] = found.as_slice() else {
+        panic!("{found:?}");
+    };
+    assert!(record.time >= sent, "{} {sent}", record.time);
+}
+
+#[test]
+fn while_every_message_is_wanted_a_silent_port_is_looked_at_each_time() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    host.look_after(SECOND);
+    host.tap.misses_nothing = true;
+    host.look_after(SILENT_AFTER + 1);
+    host.look_after(MILLISECOND);
+    let descriptor = segment.put(&sample(5));
+    port.push(descriptor);
+    assert_eq!(host.look_after(MILLISECOND), [5]);
+    // One that is read tells of no participant: looks stay within the budget for readers.
+    host.tap.judge.set(writer(), Some(Verdict::Capture));
+    host.tap.met();
+    port.push(segment.put(&sample(6)));
+    assert_eq!(host.find_after(MILLISECOND).len(), 1);
+    assert!(!host.tap.met());
+    // Its buffer is used again before a port at rest would be looked at.
+    segment.free(descriptor);
 }
 
 #[test]
@@ -141,13 +215,7 @@ fn what_stood_in_the_ring_before_is_found_without_a_time_of_its_own() {
     port.push(old);
     port.push(new);
     segment.free(old);
-    host.now += SECOND;
-    let now = Moment {
-        monotonic: host.now,
-        calendar: host.now,
-    };
-    let mut found = Vec::new();
-    host.tap.look(now, &mut found);
+    let found = host.find_after(SECOND);
     let [Item::Record(record)] = found.as_slice() else {
         panic!("{found:?}");
     };
