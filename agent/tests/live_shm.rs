@@ -388,6 +388,40 @@ fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_op
     Ok(())
 }
 
+/// Of killed processes the files stay, with what they sent last. An agent that starts then believes
+/// none of it.
+#[test]
+fn files_of_killed_processes_make_no_node_and_no_unknown_writer() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let stream = Stream {
+        count: 400,
+        linger: 60.0,
+        ..shared()
+    };
+    let (mut publisher, mut subscriber) = host.pair(&stream)?;
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    for peer in [&mut publisher, &mut subscriber] {
+        peer.process.signal("KILL")?;
+        peer.process.wait(PATIENCE)?;
+    }
+    let (ports, segments) = files_of(&host.shared_memory())?;
+    ensure!(!ports.is_empty() && !segments.is_empty(), "nothing is left");
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let looked = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "directory")]) > 0.0;
+    agent.scrape_until("shared memory is found", looked)?;
+    // Strangers are shown after 3 s.
+    std::thread::sleep(Duration::from_secs(5));
+    let page = agent.scrape()?;
+    assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0, "{}", page.0);
+    assert_eq!(page.samples("ros2_node_info", &[]).count(), 0);
+    assert_eq!(page.sum("ros2_participants", &[]), 0.0);
+    assert_eq!(page.sum("ros2probe_shm_open", &[("kind", "port")]), 0.0);
+    Ok(())
+}
+
 #[test]
 fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Result<()> {
     let network = Namespace::alone()?;

@@ -259,6 +259,7 @@ fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
             ("unfilled", counters.unfilled),
             ("unreachable", counters.unreachable),
             ("malformed", counters.malformed),
+            ("abandoned", counters.abandoned),
             ("uncertain", counters.uncertain),
             ("left_out", counters.left_out),
             ("refused", facts.refused),

@@ -7,6 +7,7 @@
 
 pub mod cell;
 mod inbox;
+mod owner;
 pub mod pace;
 pub mod port;
 pub mod scan;

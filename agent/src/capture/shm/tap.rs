@@ -11,6 +11,7 @@ use ros2probe_wire::record::{Record, flag};
 
 use super::cell::{Descriptor, SegmentId};
 use super::inbox::Item;
+use super::owner::Locks;
 use super::port::Port;
 use super::scan::{Generation, Name, PlaceId, Places};
 use super::segment::{Buffer, Message, Refusal};
@@ -44,6 +45,8 @@ pub struct Tap {
     ports: Vec<Open>,
     /// Ports that were listed and are not laid out yet.
     unborn: Vec<(PortKey, PathBuf)>,
+    /// Ports whose process is dead, by their inodes: they are looked at again at the next search.
+    abandoned: HashSet<(PortKey, u64)>,
     segments: HashMap<SegmentKey, Segment>,
     remembered: Remembered,
     /// The rules, and what is wanted.
@@ -91,6 +94,8 @@ pub struct Counters {
     pub unreachable: u64,
     /// Contradictory or no RTPS.
     pub malformed: u64,
+    /// Read, and left out: they stood there when their process was dead already.
+    pub abandoned: u64,
     /// Looks that came so late that a ring may have gone round unnoticed.
     pub uncertain: u64,
     /// Files and places left out because of a cap.
@@ -149,6 +154,7 @@ impl Tap {
             places,
             ports: Vec::new(),
             unborn: Vec::new(),
+            abandoned: HashSet::new(),
             segments: HashMap::new(),
             remembered: Remembered::default(),
             judge: Judge::default(),
@@ -179,6 +185,7 @@ impl Tap {
     /// Lets go of everything that is open. What is there then is found with the next look.
     pub fn let_go(&mut self) {
         self.ports.clear();
+        self.abandoned.clear();
         self.segments.clear();
         (self.listed, self.found) = (0, 0);
     }
@@ -417,6 +424,7 @@ impl Tap {
         if finds {
             self.found = now;
             self.places.find();
+            self.abandoned.clear();
         }
         if !self.places.list() && !finds {
             return;
@@ -438,25 +446,28 @@ impl Tap {
         let known: HashSet<_> = self.ports.iter().map(|open| open.key).collect();
         self.unborn.clear();
         for (id, place) in places {
-            for name in place.files.keys() {
-                if let Name::Port(generation, number) = name
-                    && !known.contains(&(*id, *generation, *number))
-                {
-                    let path = place.path.join(name.file_name());
-                    self.unborn.push(((*id, *generation, *number), path));
+            for (name, inode) in &place.files {
+                let Name::Port(generation, number) = name else {
+                    continue;
+                };
+                let key = (*id, *generation, *number);
+                if !known.contains(&key) && !self.abandoned.contains(&(key, *inode)) {
+                    self.unborn.push((key, place.path.join(name.file_name())));
                 }
             }
         }
         self.attach(now, found);
     }
 
-    /// Opens ports that have come to be.
+    /// Opens ports that have come to be. What stands in them already counts while the process that
+    /// sent it lives: files of a killed one stay until another takes their names.
     fn attach(&mut self, now: u64, found: &mut Vec<Item>) {
         self.tried = now;
+        let mut attached = Vec::new();
         for (key, path) in std::mem::take(&mut self.unborn) {
             if self.ports.len() >= MAX_PORTS {
                 self.counters.left_out += 1;
-                return;
+                break;
             }
             let Ok(file) = SharedFile::open(&path) else {
                 continue;
@@ -474,18 +485,48 @@ impl Tap {
                 busy: now,
                 due: now,
             };
-            let at = self.ports.partition_point(|open| open.key.2 <= number);
-            self.ports.insert(at, open);
-            self.met = true;
             let reading = Reading {
                 monotonic: now,
                 calendar: (self.calendar)(),
                 is_timely: false,
             };
-            for descriptor in backlog {
-                self.read(key, &descriptor, reading, found);
-            }
+            // Read before anything else: names are overwritten within 50 us.
+            let read = backlog.iter().map(|descriptor| {
+                let mut items = Vec::new();
+                self.read(key, descriptor, reading, &mut items);
+                ((key.0, key.1, descriptor.segment), items)
+            });
+            let read: Vec<_> = read.filter(|(_, items)| !items.is_empty()).collect();
+            attached.push((open, path, read));
         }
+        if attached.is_empty() {
+            return;
+        }
+        let locks = Locks::read();
+        for (open, path, read) in attached {
+            for (segment, mut items) in read {
+                if self.is_abandoned(&locks, segment) {
+                    self.counters.abandoned += 1;
+                } else {
+                    found.append(&mut items);
+                }
+            }
+            if locks.is_abandoned(&path) {
+                self.abandoned.insert((open.key, open.file.inode()));
+                continue;
+            }
+            let (_, _, number) = open.key;
+            let at = self.ports.partition_point(|open| open.key.2 <= number);
+            self.ports.insert(at, open);
+            self.met = true;
+        }
+    }
+
+    /// Whether the process that made this segment is dead.
+    fn is_abandoned(&self, locks: &Locks, (place, generation, id): SegmentKey) -> bool {
+        let place = self.places.places.get(&place);
+        let name = Name::Segment(generation, id).file_name();
+        place.is_some_and(|place| locks.is_abandoned(&place.path.join(name)))
     }
 }
 

@@ -224,6 +224,49 @@ fn what_stood_in_the_ring_before_is_found_without_a_time_of_its_own() {
     assert_eq!(host.tap.counters().missed, 1);
 }
 
+/// Beside a file of Fast DDS's, the one whose lock says that its process lives.
+fn lock_of(path: &Path, lives: bool) -> fs::File {
+    let mut name = path.as_os_str().to_owned();
+    name.push("_el");
+    let file = fs::File::create(name).unwrap();
+    if lives {
+        file.try_lock().unwrap();
+    }
+    file
+}
+
+#[test]
+fn files_of_a_killed_process_are_no_port_and_their_messages_no_traffic() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    let locks = [port.path(host.path()), segment.path(host.path())];
+    let killed = locks.each_ref().map(|path| lock_of(path, false));
+    port.push(segment.put(&sample(1)));
+    assert_eq!(host.look_after(SECOND), [0; 0]);
+    assert!(!host.tap.has_ports() && !host.tap.met());
+    // Its port is another's now, who was sent something by one that lives.
+    let mut living = host.segment(2);
+    let lives = [port.path(host.path()), living.path(host.path())];
+    let lives = lives.each_ref().map(|path| lock_of(path, true));
+    port.push(living.put(&sample(2)));
+    assert_eq!(host.look_after(FIND_EVERY), [2]);
+    assert!(host.tap.has_ports() && host.tap.met());
+    port.push(living.put(&sample(3)));
+    assert_eq!(host.look_after(MILLISECOND), [3]);
+    drop((killed, lives));
+}
+
+#[test]
+fn what_one_that_lives_sent_to_the_port_of_a_killed_process_counts() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    let _dead = lock_of(&port.path(host.path()), false);
+    let _lives = lock_of(&segment.path(host.path()), true);
+    port.push(segment.put(&sample(1)));
+    assert_eq!(host.look_after(SECOND), [1]);
+    assert!(!host.tap.has_ports());
+}
+
 #[test]
 fn a_buffer_that_was_used_again_is_missed_and_not_misread() {
     let mut host = Host::new();

@@ -1,0 +1,114 @@
+//! Whether the process that made a file of shared memory still lives.
+//!
+//! Fast DDS keeps an flock on `<file>_el` (exclusive) or `<file>_sl` (shared) while it uses the file.
+//! The kernel lists locks in `/proc/locks` by device and inode, so nothing is opened or locked here:
+//! peers take these locks themselves to find files of dead processes.
+
+use std::collections::HashSet;
+use std::fs;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::Path;
+
+/// Suffixes of the files that bear the locks.
+const LOCKED: [&str; 2] = ["_el", "_sl"];
+/// The inode of the host's own process namespace (`PROC_PID_INIT_INO`). In others, `/proc/locks`
+/// leaves out the locks of processes that are not in them.
+const HOST_PROCESSES: u64 = 0xefff_fffc;
+
+/// Device and inode of a file.
+type FileId = (u32, u32, u64);
+
+/// The locks of this host at one moment.
+#[derive(Debug, Default)]
+pub struct Locks {
+    /// `None` where they cannot be told.
+    held: Option<HashSet<FileId>>,
+}
+
+impl Locks {
+    /// Reads them.
+    #[must_use]
+    pub fn read() -> Self {
+        let namespace = fs::metadata("/proc/self/ns/pid");
+        let sees_all = namespace.is_ok_and(|namespace| namespace.ino() == HOST_PROCESSES);
+        let list = fs::read_to_string("/proc/locks").ok().filter(|_| sees_all);
+        Self {
+            held: list.map(|list| list.lines().filter_map(file_of).collect()),
+        }
+    }
+
+    /// Whether the process that made this file of shared memory is dead for sure: the file that
+    /// bears its lock is there, and nobody holds the lock.
+    #[must_use]
+    pub fn is_abandoned(&self, path: &Path) -> bool {
+        let Some(held) = &self.held else {
+            return false;
+        };
+        let mut bears_lock = false;
+        for suffix in LOCKED {
+            let mut name = path.as_os_str().to_owned();
+            name.push(suffix);
+            let Ok(metadata) = fs::symlink_metadata(&name) else {
+                continue;
+            };
+            let device = metadata.dev();
+            if held.contains(&(libc::major(device), libc::minor(device), metadata.ino())) {
+                return false;
+            }
+            bears_lock = true;
+        }
+        bears_lock
+    }
+}
+
+/// The file of a line as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`; that of a process that
+/// waits for a lock (`1: -> FLOCK ...`) holds none.
+fn file_of(line: &str) -> Option<FileId> {
+    let mut words = line.split_whitespace().skip(1);
+    if words.next() != Some("FLOCK") {
+        return None;
+    }
+    let mut file = words.nth(3)?.split(':');
+    let major = u32::from_str_radix(file.next()?, 16).ok()?;
+    let minor = u32::from_str_radix(file.next()?, 16).ok()?;
+    Some((major, minor, file.next()?.parse().ok()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_of_the_list_names_the_file_whose_lock_is_held() {
+        let line = "12: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF";
+        assert_eq!(file_of(line), Some((0, 0x1a, 5678)));
+        for other in [
+            "12: -> FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF",
+            "3: POSIX  ADVISORY  READ  9 fd:00:5678 0 EOF",
+            "12: FLOCK  ADVISORY  WRITE 1234 00:1a",
+            "12: FLOCK",
+            "",
+        ] {
+            assert_eq!(file_of(other), None, "{other}");
+        }
+    }
+
+    #[test]
+    fn a_file_is_abandoned_when_nobody_holds_the_lock_beside_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("fastrtps_port7411");
+        fs::write(&path, "x").unwrap();
+        // Without a file that bears a lock nothing is known.
+        assert!(!Locks::read().is_abandoned(&path));
+        for suffix in LOCKED {
+            let name = directory.path().join(format!("fastrtps_port7411{suffix}"));
+            let file = fs::File::create(&name).unwrap();
+            assert!(Locks::read().is_abandoned(&path));
+            file.try_lock_shared().unwrap();
+            assert!(!Locks::read().is_abandoned(&path));
+            drop(file);
+            assert!(Locks::read().is_abandoned(&path));
+        }
+        assert!(!Locks::default().is_abandoned(&path));
+    }
+}
