@@ -246,7 +246,7 @@ impl<'a> Observed<'a> {
     fn wait_for_view(&self, view: &str) -> Result<()> {
         wait_until(view, || {
             let topic = self.topic("/points")?;
-            Ok(topic["passages"][0]["view"] == view)
+            Ok(topic.pointer("/passages/0/view") == Some(&view.into()))
         })
     }
 
@@ -393,6 +393,39 @@ fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
     observed.wait_for_view("sampled")
 }
 
+/// With `exact: auto` the breakpoint is there while samples are read, and no longer.
+#[test]
+fn on_demand_every_sample_is_seen_and_the_breakpoint_goes_with_the_last_reader() -> Result<()> {
+    let host = SharedMemory::new()?;
+    let observed = host.observe("exact: auto")?;
+    let stream = in_shared_memory(150_000, 40);
+    let (mut publisher, _subscriber) = host.known_pair(&observed, &stream)?;
+    let maps = std::fs::read_to_string(format!("/proc/{}/maps", publisher.process.pid()))?;
+    let line = maps.lines().find(|line| line.contains("/libfastrtps.so"));
+    let library = line.and_then(|line| line.get(line.find('/')?..));
+    let library = PathBuf::from(library.context("no Fast DDS")?);
+    let is_attached = |peer: &Peer| -> Result<bool> {
+        let code = harness::code::at_function(&peer.process, &library)?;
+        Ok(code.in_memory != code.in_file)
+    };
+    ensure!(!is_attached(&publisher)?, "nobody reads samples yet");
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    observed.wait_for_view("exact")?;
+    ensure!(is_attached(&publisher)?, "a sample is to be read");
+    // Until the next round of the capture, shared memory is looked at, too.
+    std::thread::sleep(Duration::from_millis(500));
+    publisher.go()?;
+    let (whole, missed) = given(&mut lines, &stream)?;
+    ensure!((whole, missed) == (stream.count, 0), "{whole} {missed}");
+    drop(lines);
+    drop(client);
+    wait_until("the breakpoint is taken out", || {
+        Ok(!is_attached(&publisher)?)
+    })?;
+    observed.wait_for_view("sampled")
+}
+
 /// A host with a `/dev/shm` of its own.
 struct SharedMemory {
     network: Namespace,
@@ -433,7 +466,7 @@ impl SharedMemory {
             let deadline = Instant::now() + Duration::from_secs(4);
             while Instant::now() < deadline {
                 let topic = observed.topic(&stream.topic)?;
-                if topic["passages"][0]["pairs"] == 1 {
+                if topic.pointer("/passages/0/pairs") == Some(&1.into()) {
                     return Ok((publisher, subscriber));
                 }
                 std::thread::sleep(Duration::from_millis(100));

@@ -28,7 +28,7 @@ use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
 use super::wire::{self, TapError, WireSettings, WireTap};
 use crate::config::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
-use crate::model::observer::Observer;
+use crate::model::observer::{Observer, Wanted};
 use crate::model::reassembly::Limits;
 
 /// What unclassified writers may cost each second, all together: a dozen nodes that start at once
@@ -270,6 +270,9 @@ impl LiveSource {
             let wanted = observer.wanted_of_shared_memory();
             if let Shm::Running(shared_memory) = &self.shared_memory {
                 shared_memory.want(wanted);
+            }
+            if let Some(exact) = &self.exact {
+                exact.want(wanted == Wanted::EverySample);
             }
         }
         if held_up {
@@ -551,6 +554,7 @@ fn open_exact(settings: &CaptureSettings, host: bool) -> (Option<Exact>, Option<
         settings.cgroup.as_deref(),
         settings.ring_bytes,
         settings.record_ring_bytes,
+        settings.shm.exact == ExactChoice::Auto,
     );
     match opened {
         Ok(exact) => (Some(exact), None),

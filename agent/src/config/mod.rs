@@ -108,6 +108,9 @@ pub enum ExactChoice {
     Off,
     /// By a breakpoint of the kernel's in the code of the processes that send.
     Uprobe,
+    /// As `uprobe`, but only while samples of a topic that goes through shared memory are given one
+    /// by one; otherwise shared memory is only read.
+    Auto,
 }
 
 /// Where the agent looks.

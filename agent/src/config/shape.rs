@@ -137,6 +137,8 @@ pub(super) struct ShmShape {
     pub(super) mode: ShmMode,
     /// `uprobe`: see every message, by a breakpoint that the kernel puts into the code of all
     /// processes that use Fast DDS; where that is not possible, shared memory is read as usual.
+    /// `auto`: the same, only while samples of a topic that goes through shared memory are recorded,
+    /// echoed, retained or measured by a command.
     pub(super) exact: ExactChoice,
     /// Share of one CPU that looking may cost, in percent, but for moments in which participants
     /// meet. With less, fewer of the messages are seen; they are counted all the same.

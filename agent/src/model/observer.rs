@@ -269,6 +269,12 @@ impl Observer {
         self.profiler.uncertain(self.calendar.even(now));
     }
 
+    /// Messages into shared memory are no longer seen in the processes that send them: what is read
+    /// there counts from now on.
+    pub fn seen_exactly_no_longer(&mut self) {
+        self.profiler.seen_exactly_no_longer();
+    }
+
     /// Takes in what a datagram announces. What is to be counted is left to `later`, which puts it
     /// in order with what comes another way and gives it to [`Self::record`].
     pub fn announcements(

@@ -265,6 +265,13 @@ impl Profiler {
         }
     }
 
+    /// Writers are no longer seen in the processes that they belong to.
+    pub fn seen_exactly_no_longer(&mut self) {
+        for measured in self.writers.values_mut() {
+            measured.writer.seen_exactly_no_longer();
+        }
+    }
+
     /// Takes in a record of a writer nobody announced.
     pub fn stranger(
         &mut self,

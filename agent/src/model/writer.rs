@@ -187,6 +187,11 @@ impl Writer {
         }
     }
 
+    /// It is no longer seen in the process that it belongs to.
+    pub const fn seen_exactly_no_longer(&mut self) {
+        self.exact = None;
+    }
+
     /// Takes in a record of this writer; gives the message that it completed. `opened` is when last
     /// a way for its samples was opened that this host sees: what is missing before it went elsewhere.
     pub fn record(

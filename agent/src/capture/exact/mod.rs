@@ -54,11 +54,12 @@ pub enum ExactError {
 pub struct Exact {
     intake: Intake,
     search: Search,
+    was_attached: bool,
 }
 
 impl Exact {
-    /// Loads the programs and attaches them to installed libraries. `cgroup`: only for processes of
-    /// this control group.
+    /// Loads the programs. Attaches them to installed libraries, or with `on_demand` to none before
+    /// [`Self::want`]. `cgroup`: only for processes of this control group.
     ///
     /// # Errors
     /// A capability is missing, or the kernel has no uprobes.
@@ -66,6 +67,7 @@ impl Exact {
         cgroup: Option<&Path>,
         ring_bytes: usize,
         record_ring_bytes: usize,
+        on_demand: bool,
     ) -> Result<Self, ExactError> {
         let missing = privilege::missing_for_probes();
         if !missing.is_empty() {
@@ -86,7 +88,8 @@ impl Exact {
         let scope = cgroup.map_or(Scope::Everybody, |path| Scope::Cgroup(path.to_path_buf()));
         Ok(Self {
             intake: Intake::new(filter),
-            search: Search::new(probes, scope),
+            search: Search::new(probes, scope, on_demand),
+            was_attached: false,
         })
     }
 
@@ -104,9 +107,22 @@ impl Exact {
         self.intake.descriptors()
     }
 
-    /// Gives the model what was found.
+    /// Whether every sample is wanted of a writer that may send into shared memory. Matters where
+    /// the programs are attached on demand alone.
+    pub fn want(&self, wanted: bool) {
+        self.search.want(wanted);
+    }
+
+    /// Gives the model what was found, and once the programs are no longer attached, that nothing
+    /// more is found.
     pub fn take_in(&mut self, clocks: &Clocks, observer: &mut Observer) {
+        let is_attached = self.search.is_attached();
         self.intake.take_in(clocks, observer);
+        if self.was_attached && !is_attached {
+            self.intake.drain(clocks, observer);
+            observer.seen_exactly_no_longer();
+        }
+        self.was_attached = is_attached;
     }
 
     /// Gives the model what still waits, at the end.

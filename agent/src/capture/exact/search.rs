@@ -30,6 +30,11 @@ const GATHER: Duration = Duration::from_millis(20);
 const LINGER: Duration = Duration::from_secs(60);
 /// How long one that could not be attached to is not tried again.
 const RETRY: Duration = Duration::from_secs(5);
+/// Between the first look at shared memory and the last message that is seen in its process.
+const OVERLAP: Duration = Duration::from_millis(400);
+/// Why nothing is attached on demand.
+const RESTING: &str =
+    "capture.shm.exact is auto, and no samples are read of a topic that goes through shared memory";
 /// Libraries with a probe of their own: images of containers on one host.
 const MAX_LIBRARIES: usize = 64;
 
@@ -75,6 +80,12 @@ struct Shared {
     facts: Mutex<Facts>,
     /// Also until the first look is over: it takes a moment, and what is installed is seen.
     covers_all: AtomicBool,
+    /// Whether it is to be attached.
+    wanted: AtomicBool,
+    /// Whether anything may be attached.
+    attached: AtomicBool,
+    /// It may be wanted no longer.
+    on_demand: bool,
     stop: AtomicBool,
 }
 
@@ -107,6 +118,16 @@ enum Refusal {
     Probe(#[from] FilterError),
 }
 
+impl Facts {
+    /// It is attached on demand, and nobody demands it.
+    fn resting() -> Self {
+        Self {
+            libraries: Vec::new(),
+            uncovered: Some(RESTING.to_owned()),
+        }
+    }
+}
+
 /// Nobody has looked yet.
 impl Default for Facts {
     fn default() -> Self {
@@ -118,19 +139,29 @@ impl Default for Facts {
 }
 
 impl Search {
-    /// Attaches to what is installed, and to nothing else before it is started.
+    /// Attaches to what is installed, and to nothing else before it is started; `on_demand` to nothing
+    /// before it is wanted.
     #[must_use]
-    pub fn new(probes: Probes, scope: Scope) -> Self {
+    pub fn new(probes: Probes, scope: Scope, on_demand: bool) -> Self {
         let mut attachments = Attachments {
             probes,
             libraries: BTreeMap::new(),
         };
         // A participant says its names once, within a tenth of a second: what is there already is
         // not waited for.
-        attachments.install(&installed(), Instant::now());
+        if !on_demand {
+            attachments.install(&installed(), Instant::now());
+        }
+        let facts = match on_demand {
+            true => Facts::resting(),
+            false => Facts::default(),
+        };
         let shared = Arc::new(Shared {
-            facts: Mutex::default(),
-            covers_all: AtomicBool::new(true),
+            facts: Mutex::new(facts),
+            covers_all: AtomicBool::new(!on_demand),
+            wanted: AtomicBool::new(!on_demand),
+            attached: AtomicBool::new(!on_demand),
+            on_demand,
             stop: AtomicBool::new(false),
         });
         Self {
@@ -154,6 +185,23 @@ impl Search {
         let work = move || follow(&shared, attachments, scope);
         self.thread = Some(privilege::spawn(Role::Exact, thread, work)?);
         Ok(())
+    }
+
+    /// Attaches, or lets go of everything, where that is done on demand.
+    pub fn want(&self, wanted: bool) {
+        let shared = &self.shared;
+        if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {
+            return;
+        }
+        if let Some(thread) = &self.thread {
+            thread.thread().unpark();
+        }
+    }
+
+    /// Whether anything may be attached.
+    #[must_use]
+    pub fn is_attached(&self) -> bool {
+        self.shared.attached.load(Ordering::Acquire)
     }
 
     /// What is attached, and what is not covered.
@@ -190,6 +238,21 @@ fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
     let mut watched = BTreeSet::new();
     let (mut somebody_came, mut asked_all) = (true, None::<Instant>);
     while !shared.stop.load(Ordering::Acquire) {
+        if !shared.wanted.load(Ordering::Acquire) {
+            if shared.attached.load(Ordering::Acquire) {
+                // Shared memory is looked at again before nothing is seen here any more.
+                shared.tell(Facts::resting());
+                std::thread::sleep(OVERLAP);
+                attachments.libraries.clear();
+                shared.attached.store(false, Ordering::Release);
+                tracing::info!("no longer attached: no samples are read");
+            }
+            somebody_came = true;
+            asked_all = None;
+            std::thread::park_timeout(EVERY);
+            continue;
+        }
+        shared.attached.store(true, Ordering::Release);
         let now = Instant::now();
         let all = somebody_came && asked_all.is_none_or(|at| now - at >= EVERY);
         if all {
@@ -226,6 +289,7 @@ impl Shared {
         let mut known = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
         if known.uncovered != facts.uncovered {
             match &facts.uncovered {
+                Some(reason) if reason == RESTING => {}
                 Some(reason) => tracing::warn!(reason, "shared memory is sampled"),
                 None => tracing::info!("every message into shared memory is seen"),
             }

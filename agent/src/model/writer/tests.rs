@@ -447,3 +447,20 @@ fn what_passed_before_a_writer_was_seen_in_its_process_counts_by_its_span() {
     let facts = bench.wait(60_000).facts();
     assert_eq!((facts.messages, facts.lost), (13 + 11, 1));
 }
+
+#[test]
+fn when_a_writer_is_no_longer_seen_in_its_process_shared_memory_counts_at_once() {
+    let mut bench = Bench::new(Traits::default());
+    for number in [1, 2, 3] {
+        bench.put(in_its_process(data(number))).wait(10);
+    }
+    bench.put(in_shared_memory(data(3)));
+    bench.writer.seen_exactly_no_longer();
+    for number in [3, 5, 6] {
+        bench.put(in_shared_memory(data(number))).wait(10);
+    }
+    let facts = bench.wait(60_000).facts();
+    let sampled = facts.sampled.unwrap();
+    assert_eq!((facts.messages, facts.lost, facts.duplicates), (6, 0, 0));
+    assert_eq!((sampled.seen, sampled.span), (2, 3));
+}
