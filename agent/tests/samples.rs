@@ -363,6 +363,40 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
 }
 
 #[test]
+fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_for_them() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    let look = |robot: &mut Robot, number| {
+        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+    };
+    for number in [1, 2, 5] {
+        look(&mut robot, number);
+    }
+    let given = |number| (ALICE, number, Ok(small.clone()));
+    assert_eq!(robot.given(), [given(1), given(2), given(5)]);
+    let sent = robot.at;
+    let now = Timestamp(sent + SECOND / 20);
+    robot.observer.advance(now);
+    assert!(robot.observer.given_until(now).0 < sent);
+    // One of them comes late.
+    look(&mut robot, 3);
+    assert_eq!(robot.given(), [given(3)]);
+    let now = Timestamp(sent + SECOND);
+    robot.observer.advance(now);
+    assert_eq!(robot.observer.given_until(now), now);
+    let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
+    assert_eq!(robot.given(), [not_captured]);
+    // The end of a capture waits for nothing.
+    look(&mut robot, 8);
+    robot.observer.settle();
+    assert_eq!(
+        robot.given(),
+        [given(8), (ALICE, 6, Err(MissedReason::NotCaptured))]
+    );
+}
+
+#[test]
 fn a_sample_that_stays_incomplete_is_told_and_not_given() {
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);

@@ -8,6 +8,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::cause::LossCause;
 use super::event::Events;
+use super::payloads::MissedReason;
 
 /// Entries kept of discovery events and of writers' losses each.
 const LIMIT: usize = 1024;
@@ -46,17 +47,17 @@ pub struct Loss {
     pub last: u64,
 }
 
-/// Consecutive samples that were settled as lost, until they are taken.
+/// Consecutive samples that subscriptions will not get, until they are taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Missing {
     /// Whose.
     pub writer: Guid,
-    /// First lost sequence number.
+    /// First sequence number.
     pub first: u64,
-    /// Last lost sequence number.
+    /// Last sequence number.
     pub last: u64,
-    /// Fragments of it came; then it is one sample.
-    pub incomplete: bool,
+    /// Why; an incomplete one stands alone.
+    pub reason: MissedReason,
 }
 
 /// Consecutive samples that one receiver lost, told once the cause is known.
@@ -115,11 +116,11 @@ impl Journal {
         self.discovery.push_back(event);
     }
 
-    /// Keeps lost samples for the subscriptions until the next [`Self::take_missing`].
+    /// Keeps samples that will not come for the subscriptions until the next [`Self::take_missing`].
     pub fn leave_missing(&mut self, missing: Missing) {
         if let Some(last) = self.missing.last_mut()
-            && (last.writer, last.incomplete) == (missing.writer, false)
-            && !missing.incomplete
+            && (last.writer, last.reason) == (missing.writer, missing.reason)
+            && missing.reason != MissedReason::Incomplete
             && last.last.checked_add(1) == Some(missing.first)
         {
             last.last = missing.last;

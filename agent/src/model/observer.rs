@@ -226,6 +226,15 @@ impl Observer {
         given
     }
 
+    /// The time up to which all samples were given, or told as missing, that have come by `now`.
+    #[must_use]
+    pub fn given_until(&self, now: Timestamp) -> Timestamp {
+        let writers = self.payloads.wanted();
+        let writers = writers.filter_map(|writer| self.profiler.get(*writer));
+        let unseen = writers.filter_map(|measured| measured.writer.unseen_since());
+        unseen.fold(now, |until, since| until.min(self.calendar.shown(since)))
+    }
+
     /// Whether somebody wants samples whole.
     #[must_use]
     pub const fn wants_payloads(&self) -> bool {

@@ -138,6 +138,8 @@ struct Interested {
     begins: Vec<(u64, u64)>,
     /// Since when bytes are wanted.
     since: Timestamp,
+    /// Number of the first sample that was given with its bytes.
+    first_whole: Option<u64>,
     order: InOrder,
 }
 
@@ -255,6 +257,7 @@ impl Payloads {
         self.deep -= usize::from(was_deep.is_some());
         self.deep += usize::from(!wished.payloads.is_empty());
         let since = was_deep.map_or(now, |before| before.since);
+        let first_whole = was_deep.and_then(|before| before.first_whole);
         if was_deep.is_some() && wished.payloads.is_empty() {
             self.assembly.release(writer);
         }
@@ -267,6 +270,7 @@ impl Payloads {
             arrivals: arrivals.copied().collect(),
             begins,
             since,
+            first_whole,
             order: before.map_or_else(InOrder::default, |before| before.order),
         };
         self.writers.insert(writer, interested);
@@ -304,7 +308,14 @@ impl Payloads {
             false => self.assembly.take(writer, counted.number),
         };
         // What was under way when bytes were first wanted has not come whole.
-        let is_expected = counted.began.0 >= interested.since.0.saturating_add(TELLING);
+        let is_expected = counted.began.0 >= interested.since.0.saturating_add(TELLING)
+            || interested
+                .first_whole
+                .is_some_and(|first| first < counted.number);
+        if payload.is_some() {
+            let first = interested.first_whole.get_or_insert(counted.number);
+            *first = counted.number.min(*first);
+        }
         let missed = (payload.is_none() && is_expected && !interested.payloads.is_empty())
             .then(|| interested.not_captured(writer, counted.number));
         let to = match &payload {
@@ -441,22 +452,18 @@ impl Payloads {
         due.into_iter().for_each(|due| self.give_due(due));
     }
 
-    /// These samples are lost: they will never be counted.
+    /// These samples will not come.
     pub fn missing(&mut self, missing: &Missing) {
         let Missing {
             writer,
             first,
             last,
-            incomplete,
+            reason,
         } = *missing;
         let Some(interested) = self.writers.get(&writer) else {
             return;
         };
-        let reason = match incomplete {
-            true => MissedReason::Incomplete,
-            false => MissedReason::Lost,
-        };
-        if incomplete {
+        if reason == MissedReason::Incomplete {
             self.assembly.forget(writer, first);
         }
         for missed in interested.missed(writer, (first, last), reason) {

@@ -15,6 +15,10 @@ use super::snapshot::SampledFacts;
 const HOLD: u64 = 10_000_000_000;
 /// HEARTBEAT and GAP may run ahead of what was seen by at most this.
 const MAX_AHEAD: u64 = 4096;
+/// How long a sample that was not seen may still come by another way before it is left out.
+const PATIENCE: u64 = 200_000_000;
+/// Numbers below the next one of which it is known one by one whether they were seen.
+const WINDOW: u64 = u128::BITS as u64;
 
 /// State of one writer's sampled view.
 #[derive(Debug)]
@@ -32,6 +36,14 @@ pub struct Sampled {
     sighted: u128,
     /// Likewise: all of it was seen, or its last fragment while others were not.
     finished: u128,
+    /// The number to which these bits belong.
+    next: u64,
+    /// Nothing below this is waited for.
+    settled: u64,
+    /// When [`Self::look`] last settled, and the next number at that time.
+    looked: (Timestamp, u64),
+    /// Runs of numbers that were settled without being seen.
+    unseen: Vec<(u64, u64)>,
     /// The latest number that arrived whole as far as can be told, and when.
     arrived: Option<(u64, Timestamp)>,
     /// Where its payload begins with a header: the stamp that came with the first fragment.
@@ -77,6 +89,10 @@ impl Sampled {
             unmeasured: 0,
             sighted: u128::MAX,
             finished: u128::MAX,
+            next: 0,
+            settled: 0,
+            looked: (now, 0),
+            unseen: Vec::new(),
             arrived: None,
             head: None,
         }
@@ -103,8 +119,37 @@ impl Sampled {
     }
 
     /// It is seen otherwise from now on.
-    pub const fn end(&mut self) {
+    pub fn end(&mut self) {
         (self.last, self.left) = (Timestamp(0), true);
+        self.settle_all();
+    }
+
+    /// Waits no longer for what was missing at the last look and is still.
+    pub fn look(&mut self, now: Timestamp) {
+        let (then, next) = self.looked;
+        if now.0.saturating_sub(then.0) >= PATIENCE {
+            self.settle(next.min(self.next));
+            self.looked = (now, self.next);
+        }
+    }
+
+    /// Waits for nothing any longer.
+    pub fn settle_all(&mut self) {
+        self.settle(self.next);
+    }
+
+    /// Since when a sample is waited for.
+    #[must_use]
+    pub fn unseen_since(&self) -> Option<Timestamp> {
+        let open = self.next.saturating_sub(self.settled);
+        let open = u32::try_from(open).unwrap_or(u32::MAX);
+        let open = 1_u128.checked_shl(open).map_or(u128::MAX, |bit| bit - 1);
+        (!self.finished & open != 0).then_some(self.looked.0)
+    }
+
+    /// Runs of numbers that were sent and not seen, first and last, each once.
+    pub fn take_unseen(&mut self) -> Vec<(u64, u64)> {
+        std::mem::take(&mut self.unseen)
     }
 
     /// The tap cannot tell what passed before `now`.
@@ -144,6 +189,7 @@ impl Sampled {
             return News::default();
         }
         let before = sequence.next();
+        self.follow(before, now);
         let is_told_only = self
             .bit(number, before)
             .is_some_and(|bit| self.sighted & bit == 0);
@@ -155,9 +201,11 @@ impl Sampled {
         sequence.begin(number);
         if sequence.next() != before {
             // It begins, perhaps anew.
-            (self.sighted, self.finished, self.arrived) = (u128::MAX, u128::MAX, None);
+            self.settle_all();
+            self.begin(sequence.next(), now);
+            self.arrived = None;
         }
-        let samples = self.advance(number.saturating_add(1), now, sequence);
+        let samples = self.advance(number.saturating_add(1), true, now, sequence);
         self.span += samples;
         let below = sequence.next().saturating_sub(number).saturating_sub(1);
         let bit = self.bit(number, sequence.next()).unwrap_or(0);
@@ -165,7 +213,8 @@ impl Sampled {
             self.sighted |= bit;
             self.seen += 1;
         }
-        let finished = seen != Seen::Part && self.finished & bit != bit;
+        let is_open = number >= self.settled && self.finished & bit != bit;
+        let finished = seen != Seen::Part && is_open;
         if finished {
             self.finished |= bit;
         }
@@ -193,7 +242,8 @@ impl Sampled {
         if !sequence.started() || end.saturating_sub(sequence.next()) > MAX_AHEAD {
             return 0;
         }
-        let samples = self.advance(end, now, sequence);
+        self.follow(sequence.next(), now);
+        let samples = self.advance(end, true, now, sequence);
         self.span += samples;
         self.unmeasured += samples;
         samples
@@ -208,7 +258,7 @@ impl Sampled {
         let samples = self.exist(start - 1, now, sequence);
         let ahead = end.saturating_sub(sequence.next());
         if sequence.started() && start <= sequence.next() && ahead <= MAX_AHEAD {
-            let skipped = self.advance(end, now, sequence);
+            let skipped = self.advance(end, false, now, sequence);
             let bits = u32::try_from(skipped).unwrap_or(u32::MAX);
             let skipped = 1_u128.checked_shl(bits).map_or(u128::MAX, |bit| bit - 1);
             self.sighted |= skipped;
@@ -234,10 +284,19 @@ impl Sampled {
     }
 
     /// Everything below `end` is used, and none of it is a loss. How many numbers that is more.
-    fn advance(&mut self, end: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
+    /// `sent` = samples have them.
+    fn advance(&mut self, end: u64, sent: bool, now: Timestamp, sequence: &mut Sequence) -> u64 {
         let next = sequence.next();
         if end <= next {
             return 0;
+        }
+        let oldest = end.saturating_sub(WINDOW);
+        self.settle(oldest.min(next));
+        if oldest > next {
+            if sent {
+                self.leave_out(next, oldest - 1);
+            }
+            self.settled = oldest;
         }
         sequence.exists(end - 1, now, &mut |_| {});
         for number in next.max(end.saturating_sub(MAX_WINDOW))..end {
@@ -247,7 +306,41 @@ impl Sampled {
         let bits = u32::try_from(samples).unwrap_or(u32::MAX);
         self.sighted = self.sighted.checked_shl(bits).unwrap_or(0);
         self.finished = self.finished.checked_shl(bits).unwrap_or(0);
+        self.next = end;
         samples
+    }
+
+    /// What was counted meanwhile was seen otherwise.
+    fn follow(&mut self, next: u64, now: Timestamp) {
+        if self.next != next {
+            self.settle_all();
+            self.begin(next, now);
+        }
+    }
+
+    /// All below `next` was seen, or needs not be.
+    const fn begin(&mut self, next: u64, now: Timestamp) {
+        (self.sighted, self.finished) = (u128::MAX, u128::MAX);
+        (self.next, self.settled, self.looked) = (next, next, (now, next));
+    }
+
+    /// Nothing below `end` is waited for any longer: what was not seen of it is left out.
+    fn settle(&mut self, end: u64) {
+        let known = self.next.saturating_sub(WINDOW).max(self.settled);
+        for number in known..end.min(self.next) {
+            let bit = self.bit(number, self.next);
+            if bit.is_some_and(|bit| self.finished & bit == 0) {
+                self.leave_out(number, number);
+            }
+        }
+        self.settled = self.settled.max(end.min(self.next));
+    }
+
+    fn leave_out(&mut self, first: u64, last: u64) {
+        match self.unseen.last_mut() {
+            Some(run) if run.1.checked_add(1) == Some(first) => run.1 = last,
+            _ => self.unseen.push((first, last)),
+        }
     }
 }
 
@@ -402,6 +495,57 @@ mod tests {
             assert_eq!(view.part(4, seen).samples, 0);
         }
         assert_eq!(view.counts(), (2, 5));
+    }
+
+    #[test]
+    fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
+        let mut view = View::new();
+        let look = |view: &mut View| {
+            view.now += PATIENCE;
+            view.sampled.look(Timestamp(view.now));
+            view.sampled.take_unseen()
+        };
+        view.see(1);
+        assert_eq!(look(&mut view), []);
+        view.see(5);
+        assert!(view.sampled.unseen_since().is_some());
+        // It may still come until the next look.
+        assert_eq!(look(&mut view), []);
+        assert!(view.see(3).finished);
+        assert_eq!(look(&mut view), [(2, 2), (4, 4)]);
+        assert_eq!(view.sampled.unseen_since(), None);
+        assert!(!view.see(4).finished, "given after it was left out");
+        // A part is nothing, and neither is what a HEARTBEAT says was sent.
+        view.part(6, Seen::Part);
+        let now = Timestamp(view.now);
+        view.sampled.exist(8, now, &mut view.sequence);
+        // What a GAP says was never sent is not missing.
+        view.sampled.skip(9, 200, now, &mut view.sequence);
+        assert_eq!(look(&mut view), [(6, 8)]);
+        assert_eq!(look(&mut view), []);
+        assert_eq!(
+            (view.see(200).finished, view.see(1000).finished),
+            (true, true)
+        );
+        view.sampled.settle_all();
+        assert_eq!(view.sampled.take_unseen(), [(201, 999)]);
+    }
+
+    #[test]
+    fn what_was_counted_otherwise_meanwhile_is_not_left_out() {
+        let mut view = View::new();
+        view.see(1);
+        view.see(3);
+        view.sampled.end();
+        assert_eq!(view.sampled.take_unseen(), [(2, 2)]);
+        let now = Timestamp(view.now);
+        for number in 4..500 {
+            view.sequence.exists(number, now, &mut |_| {});
+        }
+        view.see(500);
+        view.see(502);
+        view.sampled.settle_all();
+        assert_eq!(view.sampled.take_unseen(), [(501, 501)]);
     }
 
     #[test]

@@ -12,6 +12,7 @@ use super::header::stamp_time;
 use super::histogram::Histogram;
 use super::in_order::Progress;
 use super::journal::{Journal, Loss, Missing};
+use super::payloads::MissedReason;
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception, is_message};
 use super::sampled::{News, Sampled, Seen};
@@ -218,6 +219,7 @@ impl Writer {
             });
         if is_sampled || takes {
             let counted = self.sampled_record(record, is_sampled, scene);
+            self.leave_unseen(scene.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From here on every message is seen.
                 sampled.end();
@@ -284,8 +286,18 @@ impl Writer {
         self.reception.sequence_mut().skip(number);
     }
 
+    /// Since when a sample is waited for that was sent and not seen.
+    #[must_use]
+    pub fn unseen_since(&self) -> Option<Timestamp> {
+        self.sampled.as_ref()?.unseen_since()
+    }
+
     /// Settles what has waited long enough.
     pub fn advance(&mut self, scene: &mut Scene<'_>) {
+        if let Some(sampled) = &mut self.sampled {
+            sampled.look(scene.now);
+            self.leave_unseen(scene.journal);
+        }
         let (now, window) = (scene.now, settle_window(self.traits.reliable));
         let (reception, mut settling) = self.parts(scene.journal, scene.now);
         let windows = (window, BEST_EFFORT_WINDOW);
@@ -296,6 +308,10 @@ impl Writer {
 
     /// Settles everything: nothing more will come.
     pub fn settle(&mut self, scene: &mut Scene<'_>) {
+        if let Some(sampled) = &mut self.sampled {
+            sampled.settle_all();
+            self.leave_unseen(scene.journal);
+        }
         let (reception, mut settling) = self.parts(scene.journal, scene.now);
         reception.settle(scene.budget, &mut |decision| settling.take(decision));
     }
@@ -386,6 +402,19 @@ impl Writer {
             Outcome::Whole(_) => {}
         }
         None
+    }
+
+    /// Leaves samples for the journal that were sent and not seen.
+    fn leave_unseen(&mut self, journal: &mut Journal) {
+        let unseen = self.sampled.as_mut().map(|sampled| sampled.take_unseen());
+        for (first, last) in unseen.into_iter().flatten() {
+            journal.leave_missing(Missing {
+                writer: self.guid,
+                first,
+                last,
+                reason: MissedReason::NotCaptured,
+            });
+        }
     }
 
     fn is_exact(&self, now: Timestamp) -> bool {
@@ -583,7 +612,10 @@ impl Settling<'_> {
             writer: self.writer,
             first,
             last,
-            incomplete,
+            reason: match incomplete {
+                true => MissedReason::Incomplete,
+                false => MissedReason::Lost,
+            },
         });
         let count = last - first + 1;
         self.tally.lost += count;

@@ -168,13 +168,14 @@ impl Run {
     fn hand_over(&mut self) {
         self.board.events().add(self.observer.take_events());
         self.board.add_spans(self.observer.take_spans());
-        let clock = self.source.clock();
+        let given = self.observer.take_given();
+        let clock = self.observer.given_until(self.source.clock());
         if clock.0.saturating_add(SET_BACK) < self.told.0 {
             self.told = clock;
         }
         let news = (clock > self.told).then_some(clock);
         self.told = self.told.max(clock);
-        self.subscriptions.deliver(self.observer.take_given(), news);
+        self.subscriptions.deliver(given, news);
     }
 
     /// Watches and gives what is asked for since the last look. The kernel knows it before the next packets.
