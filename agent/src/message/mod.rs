@@ -6,6 +6,7 @@
 pub mod csv;
 pub mod decode;
 pub mod definition;
+mod digits;
 mod embedded;
 pub mod filter;
 mod hash;

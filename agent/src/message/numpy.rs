@@ -2,6 +2,7 @@
 //!
 //! Of numpy's rules only those for numbers in one dimension are here, with its default options.
 
+use super::digits;
 use super::python;
 use super::value::{Scalar, ScalarKind, Scalars};
 
@@ -141,8 +142,8 @@ impl Float {
     /// Shortest digits, at most as many behind the point as the precision: whole and fraction.
     fn positional(self) -> (String, String) {
         let (short, exact) = match self {
-            Self::Single(number) => (format!("{number}"), format!("{number:.PRECISION$}")),
-            Self::Double(number) => (format!("{number}"), format!("{number:.PRECISION$}")),
+            Self::Single(number) => (digits::positional(number), format!("{number:.PRECISION$}")),
+            Self::Double(number) => (digits::positional(number), format!("{number:.PRECISION$}")),
         };
         split(&short, &exact)
     }
@@ -161,8 +162,8 @@ impl Float {
     /// Shortest digits with an exponent: whole, fraction, exponent.
     fn scientific(self) -> (String, String, i32) {
         let (short, exact) = match self {
-            Self::Single(number) => (format!("{number:e}"), format!("{number:.PRECISION$e}")),
-            Self::Double(number) => (format!("{number:e}"), format!("{number:.PRECISION$e}")),
+            Self::Single(number) => (digits::scientific(number), format!("{number:.PRECISION$e}")),
+            Self::Double(number) => (digits::scientific(number), format!("{number:.PRECISION$e}")),
         };
         let mantissa = |text: &str| text.split('e').next().unwrap_or_default().to_owned();
         let (whole, fraction) = split(&mantissa(&short), &mantissa(&exact));

@@ -3,8 +3,10 @@
 //! ROS keeps arrays of a fixed length in numpy arrays, sequences of numbers in `array.array` and
 //! everything else in lists; each of them prints in its own way.
 
-use std::fmt::Write as _;
+use std::fmt::{LowerExp, Write as _};
+use std::str::FromStr;
 
+use super::digits;
 use super::numpy;
 use super::value::{Array, Items, Message, Scalar, ScalarKind, Value};
 
@@ -29,12 +31,12 @@ pub fn repr(value: &Value<'_>) -> String {
 
 /// `repr()` of a float.
 pub fn float(value: f64) -> String {
-    exponent(format!("{value:?}"))
+    laid_out(value)
 }
 
 /// `str()` of a numpy `float32`: the digits that it takes to tell it from its neighbours.
 pub fn float32(value: f32) -> String {
-    exponent(format!("{value:?}"))
+    laid_out(value)
 }
 
 /// `str()` of a scalar.
@@ -74,7 +76,7 @@ pub fn bytes(bytes: &[u8]) -> String {
     text
 }
 
-/// `repr()` of a string. What is printable is judged by a few ranges instead of the whole table.
+/// `repr()` of a string.
 pub fn string(value: &str) -> String {
     let quote = quote(value.contains('\''), value.contains('"'));
     let mut text = String::with_capacity(value.len() + 2);
@@ -127,31 +129,30 @@ fn quote(single: bool, double: bool) -> char {
     if single && !double { '"' } else { '\'' }
 }
 
+/// As `str.isprintable()`, by the same categories of Unicode in a newer version than Humble's Python.
 fn is_printable(character: char) -> bool {
-    match character {
-        ' ' => true,
-        '\u{ad}' | '\u{200b}'..='\u{200f}' | '\u{202a}'..='\u{202e}' => false,
-        '\u{2060}'..='\u{206f}' | '\u{e000}'..='\u{f8ff}' | '\u{feff}' => false,
-        '\u{fff0}'..='\u{fffb}' | '\u{e0000}'..='\u{10ffff}' => false,
-        _ => !character.is_control() && !character.is_whitespace(),
+    if character.is_ascii() {
+        return !character.is_control();
     }
+    // Behind another character Rust escapes combining ones only where they are not printable.
+    let text: String = ['a', character].iter().collect();
+    text.escape_debug().count() == 2
 }
 
-/// Rust's shortest digits switch to an exponent where Python's do; Python writes it with a sign and
-/// at least two digits.
-fn exponent(digits: String) -> String {
-    match digits.as_str() {
-        "NaN" => return "nan".to_owned(),
-        "inf" | "-inf" => return digits,
-        _ => {}
-    }
-    let Some((mantissa, exponent)) = digits.split_once('e') else {
-        return digits;
+/// Below 1e-4 and from 1e16 on with an exponent, which has a sign and at least two digits.
+fn laid_out<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
+    let text = digits::scientific(value);
+    let Some((mantissa, exponent)) = text.split_once('e') else {
+        return text.to_ascii_lowercase();
     };
-    let mantissa = mantissa.strip_suffix(".0").unwrap_or(mantissa);
-    match exponent.strip_prefix('-') {
-        Some(exponent) => format!("{mantissa}e-{exponent:0>2}"),
-        None => format!("{mantissa}e+{exponent:0>2}"),
+    match exponent.parse() {
+        Ok(-4..=15) => {
+            let text = digits::positional(value);
+            let point = if text.contains('.') { "" } else { ".0" };
+            format!("{text}{point}")
+        }
+        Ok::<i32, _>(exponent) => format!("{mantissa}e{exponent:+03}"),
+        Err(_) => text,
     }
 }
 
@@ -268,6 +269,7 @@ mod tests {
             (f64::NAN, "nan"),
             (f64::NEG_INFINITY, "-inf"),
             (f64::from(0.1_f32), "0.10000000149011612"),
+            (f64::from(540.926_1_f32), "540.9260864257812"),
         ] {
             assert_eq!(float(value), text);
         }
@@ -281,8 +283,8 @@ mod tests {
         assert_eq!(string("it's"), "\"it's\"");
         assert_eq!(string("it's \"so\""), "'it\\'s \"so\"'");
         assert_eq!(
-            string("a\n\u{1}\u{200b}\u{e9}\\"),
-            "'a\\n\\x01\\u200b\u{e9}\\\\'"
+            string("a\n\u{1}\u{200b}\u{e9}\u{301}\u{fffe}\\"),
+            "'a\\n\\x01\\u200b\u{e9}\u{301}\\ufffe\\\\'"
         );
         assert_eq!(
             bytes(b"\x00\x01\x00'\"~\x7f\xff"),

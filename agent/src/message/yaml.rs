@@ -17,12 +17,13 @@ const STEP: usize = 2;
 /// What ends a line in YAML 1.1.
 const BREAKS: [char; 4] = ['\n', '\u{85}', '\u{2028}', '\u{2029}'];
 
-/// Block style or flow style.
+/// How sequences are written. Mappings outside of sequences are always in block style: PyYAML has no
+/// style of its own for the ordered mappings that messages become.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Style {
     /// A line for each value.
     Block,
-    /// All in one line.
+    /// Each sequence in one line, with the mappings in it.
     Flow,
 }
 
@@ -32,13 +33,12 @@ pub fn document(message: &Message<'_>, shown: &Shown, style: Style) -> String {
         text: String::new(),
         shown,
         style,
+        is_in_flow: false,
     };
-    match style {
-        Style::Block if !message.values.is_empty() => writer.block(message, 0, false),
-        _ => {
-            writer.flow(message, STEP);
-            writer.text.push('\n');
-        }
+    if message.values.is_empty() {
+        writer.text.push_str("{}\n");
+    } else {
+        writer.block(message, 0, false);
     }
     writer.text
 }
@@ -47,6 +47,8 @@ struct Writer<'a> {
     text: String,
     shown: &'a Shown,
     style: Style,
+    /// Inside of a sequence in flow style, where fewer strings are plain.
+    is_in_flow: bool,
 }
 
 impl Writer<'_> {
@@ -63,7 +65,9 @@ impl Writer<'_> {
                     self.text.push('\n');
                     self.block(inner, indent + STEP, false);
                 }
-                Value::Array(array) if array.length > 0 && !self.shown.no_arrays => {
+                Value::Array(array)
+                    if array.length > 0 && !self.shown.no_arrays && self.style == Style::Block =>
+                {
                     self.text.push('\n');
                     self.block_sequence(array, indent);
                 }
@@ -130,6 +134,7 @@ impl Writer<'_> {
 
     fn flow_sequence(&mut self, array: &Array<'_>, indent: usize) {
         let (count, cut) = self.shown.elements(array.length);
+        let outside = std::mem::replace(&mut self.is_in_flow, true);
         self.text.push('[');
         let mut first = true;
         let mut separate = |writer: &mut Self| {
@@ -162,6 +167,7 @@ impl Writer<'_> {
             self.string("...", indent + STEP);
         }
         self.text.push(']');
+        self.is_in_flow = outside;
     }
 
     /// A value that stays in its line, behind key or dash.
@@ -210,9 +216,10 @@ impl Writer<'_> {
     /// A string in the plainest form that reads back as the same string.
     fn string(&mut self, text: &str, indent: usize) {
         let forms = Forms::of(text);
-        let plain = match self.style {
-            Style::Block => forms.block_plain,
-            Style::Flow => forms.flow_plain,
+        let plain = if self.is_in_flow {
+            forms.flow_plain
+        } else {
+            forms.block_plain
         };
         if plain && !text.is_empty() && !reads_as_other(text) {
             self.text.push_str(text);

@@ -364,14 +364,9 @@ fn info_around(sample: &SampleFacts) -> String {
 /// The first number of an event is its kind, of which people are told the name.
 fn with_name_of_event(document: String) -> String {
     for (number, name) in EVENTS.iter().enumerate() {
-        for (before, behind) in [
-            ("info:\n  event_type: ", "\n"),
-            ("{info: {event_type: ", ","),
-        ] {
-            let start = format!("{before}{number}{behind}");
-            if let Some(rest) = document.strip_prefix(&start) {
-                return format!("{before}{name}{behind}{rest}");
-            }
+        let start = format!("info:\n  event_type: {number}\n");
+        if let Some(rest) = document.strip_prefix(&start) {
+            return format!("info:\n  event_type: {name}\n{rest}");
         }
     }
     document

@@ -63,7 +63,7 @@ impl Form {
                 let differ = [
                     (python::string(string), repr),
                     (document(string, Place::Single, Style::Block), block),
-                    (document(string, Place::Single, Style::Flow), flow),
+                    (document(string, Place::Nested, Style::Flow), flow),
                     (document(string, Place::Nested, Style::Block), nested),
                     (document(string, Place::Listed, Style::Block), listed),
                 ];

@@ -165,7 +165,7 @@ fn events_have_names_in_both_styles() {
 MSG: a/Info\nuint8 event_type\nint64 sequence_number";
     let message_type = MessageType::parse(&"a/msg/B".parse().unwrap(), event).unwrap();
     let mut payload = vec![0, 1, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0];
-    payload.extend([7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+    payload.extend([7, 0, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, 1, 2]);
     let print = |style, csv, interface| {
         let options = Options {
             style,
@@ -177,14 +177,14 @@ MSG: a/Info\nuint8 event_type\nint64 sequence_number";
     };
     assert_eq!(
         print(Style::Block, false, None),
-        "info:\n  event_type: RESPONSE_SENT\n  sequence_number: 7\nrequest: []\n---\n"
+        "info:\n  event_type: RESPONSE_SENT\n  sequence_number: 7\nrequest:\n- 1\n- 2\n---\n"
     );
     assert_eq!(
         print(Style::Flow, false, Some("GOAL_SERVICE")),
         "interface: GOAL_SERVICE\n\
-         {info: {event_type: RESPONSE_SENT, sequence_number: 7}, request: []}\n---\n"
+         info:\n  event_type: RESPONSE_SENT\n  sequence_number: 7\nrequest: [1, 2]\n---\n"
     );
-    assert_eq!(print(Style::Block, true, None), "2,7,\n");
+    assert_eq!(print(Style::Block, true, None), "2,7,1,2\n");
 }
 
 #[test]

@@ -24,6 +24,18 @@ PIECES = [
 ]
 
 
+class Mapping(dict):
+    """Is represented without a style of its own, as rosidl_runtime_py has messages represented."""
+
+
+def represent_mapping(dumper, mapping):
+    pairs = [(dumper.represent_data(key), dumper.represent_data(mapping[key])) for key in mapping]
+    return yaml.MappingNode("tag:yaml.org,2002:map", pairs)
+
+
+yaml.add_representer(Mapping, represent_mapping)
+
+
 def yaml_of(value, flow):
     return yaml.dump(
         value, allow_unicode=True, width=sys.maxsize, default_flow_style=flow, sort_keys=False)
@@ -38,7 +50,7 @@ def strings():
             "string": text,
             "repr": repr(text),
             "block": yaml_of({"data": text}, False),
-            "flow": yaml_of({"data": text}, True),
+            "flow": yaml_of(Mapping(a=Mapping(b=[Mapping(data=text), Mapping(data=text)])), True),
             "nested": yaml_of({"a": {"b": [{"data": text}, {"data": text}]}}, False),
             "listed": yaml_of({"a": {"data": [text, "x"]}}, False),
         }
