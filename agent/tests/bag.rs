@@ -602,3 +602,48 @@ fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
         assert!(files.iter().all(|file| file["profile"] == "ros2"));
     }
 }
+
+#[test]
+fn rosbags_opens_a_bag_whose_types_are_not_known() {
+    let directory = tempfile::tempdir().unwrap();
+    let bags = [Form::Humble, Form::Compatible, Form::Named].map(|form| {
+        let path = directory.path().join(format!("{form:?}"));
+        let options = Options {
+            form,
+            ..Options::default()
+        };
+        let mut writer = Writer::create(&path, options).unwrap();
+        let known = writer
+            .topic(topic("/chatter", "std_msgs/msg/String"))
+            .unwrap();
+        let unknown = TopicDescription {
+            schema: None,
+            ..topic("/custom", "custom_msgs/msg/Custom")
+        };
+        let unknown = writer.topic(unknown).unwrap();
+        for (index, of) in [known, unknown].into_iter().enumerate() {
+            let time = Timestamp(BEGIN + index as u64);
+            writer.write(of, time, time, 1, &text(7)).unwrap();
+        }
+        writer.close(BTreeMap::new()).unwrap();
+        path
+    });
+    let paths: Vec<&Path> = bags.iter().map(AsRef::as_ref).collect();
+    for found in read_by_others(&paths) {
+        let connections = found["rosbags"]["connections"].as_array().unwrap();
+        let definitions: Vec<_> = connections
+            .iter()
+            .map(|connection| (&connection["topic"], &connection["definition"]))
+            .collect();
+        assert_eq!(
+            definitions,
+            [
+                (&json!("/chatter"), &json!("MSG")),
+                (&json!("/custom"), &json!("NONE"))
+            ]
+        );
+        assert_eq!(found["rosbags"]["messages"].as_array().unwrap().len(), 2);
+        let schemas = &found["mcap"][0]["schemas"];
+        assert_eq!(schemas["custom_msgs/msg/Custom"], json!(["", 0]));
+    }
+}

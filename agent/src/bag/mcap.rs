@@ -52,7 +52,7 @@ pub struct Schema {
     pub id: u16,
     /// `pkg/msg/Type`.
     pub name: String,
-    /// `ros2msg`; `unknown` where the text is empty.
+    /// `ros2msg`; empty where the definition is unknown (rosbag2 also writes `unknown`).
     pub encoding: String,
     /// The definition.
     pub data: Vec<u8>,

@@ -641,8 +641,8 @@ impl Topic {
         let description = &self.description;
         let (encoding, data) = match &description.schema {
             Some(schema) => (schema.encoding.as_str(), schema.text.as_bytes()),
-            None if form == Form::Humble => ("", &[][..]),
-            None => ("unknown", &[][..]),
+            // As in Humble. rosbag2 accepts `unknown` as well, PyPI `rosbags` does not.
+            None => ("", &[][..]),
         };
         let schema = SchemaRecord {
             id: self.schema_id,
