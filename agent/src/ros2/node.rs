@@ -24,11 +24,14 @@ pub fn list(nodes: &[NodeName], all: bool, count: bool) -> Told {
             .filter(|node| all || !is_hidden_node(&node.name));
         shown.flat_map(|node| std::iter::repeat_n(node.name.as_str(), node.instances))
     };
-    let text = if count {
-        format!("{}\n", shown().count())
-    } else {
-        shown().map(|name| format!("{name}\n")).collect()
-    };
+    if count {
+        // Without the warning, as in the original.
+        return Told {
+            text: format!("{}\n", shown().count()),
+            warning: None,
+        };
+    }
+    let text = shown().map(|name| format!("{name}\n")).collect();
     let is_doubled = nodes
         .iter()
         .any(|node| node.instances > 1 && (all || !is_hidden_node(&node.name)));
@@ -102,7 +105,8 @@ mod tests {
                 .unwrap()
                 .starts_with("WARNING: Be aware that there are nodes")
         );
-        assert_eq!(list(&nodes, true, true).text, "4\n");
+        let counted = list(&nodes, true, true);
+        assert_eq!((counted.text.as_str(), counted.warning), ("4\n", None));
         let single = list(&names(&[("/talker", 1)]), false, false);
         assert_eq!((single.text.as_str(), single.warning), ("/talker\n", None));
         assert_eq!(list(&[], false, false).text, "");

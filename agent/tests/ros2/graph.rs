@@ -65,6 +65,33 @@ fn what_the_original_says_of_a_graph_is_said() {
     assert_eq!((same, different), (56, differing));
 }
 
+/// Nodes of one name, and a topic and a service of two types (`fixtures/cli/mixed.py`).
+#[test]
+fn a_node_has_the_types_of_its_own_endpoints_where_a_topic_has_several() {
+    let capture = own().join("mixed.pcap.gz");
+    let recorded = std::fs::read_to_string(own().join("mixed.jsonl")).unwrap();
+    let mut count = 0;
+    for line in recorded.lines() {
+        let line: Value = serde_json::from_str(line).unwrap();
+        let text = |key: &str| line[key].as_str().unwrap();
+        let words = line["arguments"].as_array().unwrap();
+        let mut words: Vec<&str> = words.iter().map(|word| word.as_str().unwrap()).collect();
+        words.extend(["--distro", "humble", "--replay", capture.to_str().unwrap()]);
+        let output = run(&words);
+        let code = line["code"].as_i64().map(|code| code as i32);
+        assert_eq!(output.status.code(), code, "{}", text("name"));
+        assert_eq!(stdout(&output), text("stdout"), "{}", text("name"));
+        // The warning of later releases, and both nodes instead of one (`ros2cli-differences.md`).
+        let expected = text("stderr")
+            .replace("aware that are nodes", "aware that there are nodes")
+            .replace("exact name, this can", "exact name, which can")
+            .replace("about only one of them", "about all of them");
+        assert_eq!(stderr(&output), expected, "{}", text("name"));
+        count += 1;
+    }
+    assert_eq!(count, 12);
+}
+
 /// What the original prints of `/robot1/sensor_node` as `//r/o/b/o/t/1sensor_node`.
 #[test]
 fn the_nodes_of_an_action_bear_their_names() {

@@ -6,7 +6,7 @@ use ros2probe_wire::{Guid, GuidPrefix};
 
 use crate::model::diagnosis::Diagnosis;
 use crate::model::snapshot::{
-    ParticipantFacts, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
+    EndpointFacts, ParticipantFacts, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
 };
 
 /// A watchlist entry and how a topic stands with it.
@@ -20,9 +20,9 @@ pub(super) struct Index<'a> {
     watches: HashMap<(u32, &'a str), Vec<Watching<'a>>>,
 }
 
-/// Topics by their endpoints.
+/// Endpoints and their topics, by GUID.
 #[derive(Debug)]
-pub(super) struct Ends<'a>(HashMap<Guid, &'a TopicFacts>);
+pub(super) struct Ends<'a>(HashMap<Guid, (&'a TopicFacts, &'a EndpointFacts)>);
 
 impl<'a> Index<'a> {
     pub(super) fn new(snapshot: &'a Snapshot) -> Self {
@@ -76,13 +76,13 @@ impl<'a> Ends<'a> {
         let mut ends = HashMap::new();
         for topic in &snapshot.topics {
             for endpoint in topic.publishers.iter().chain(&topic.subscriptions) {
-                ends.insert(endpoint.guid, topic);
+                ends.insert(endpoint.guid, (topic, endpoint));
             }
         }
         Self(ends)
     }
 
-    pub(super) fn topic(&self, guid: Guid) -> Option<&'a TopicFacts> {
+    pub(super) fn endpoint(&self, guid: Guid) -> Option<(&'a TopicFacts, &'a EndpointFacts)> {
         self.0.get(&guid).copied()
     }
 }

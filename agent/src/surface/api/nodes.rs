@@ -21,7 +21,7 @@ use super::party::{Side, action, action_type, service_type};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Scope, only};
 use crate::model::diagnosis::Diagnosis;
-use crate::model::snapshot::{NodeFacts, Snapshot, TopicFacts};
+use crate::model::snapshot::{NodeFacts, Snapshot};
 
 /// Nodes.
 #[derive(Debug, Serialize, ToSchema)]
@@ -212,16 +212,18 @@ impl<'a> Desk<'a> {
         let readers = nodes.iter().flat_map(|node| &node.readers);
         let ends = writers.map(|guid| (guid, true));
         for (guid, is_writer) in ends.chain(readers.map(|guid| (guid, false))) {
-            let Some(topic) = self.ends.topic(*guid) else {
+            let Some((topic, endpoint)) = self.ends.endpoint(*guid) else {
                 continue;
             };
+            // Not the topic's types: nodes of another type may be on it.
+            let message_type = endpoint.message_type.as_str();
             let side = Side::of(topic, is_writer);
             if let (Some(side), Some((name, _))) = (side, action(topic)) {
                 let names = match side {
                     Side::Server => &mut action_servers,
                     Side::Client => &mut action_clients,
                 };
-                names.add(name.as_str(), types(topic).filter_map(action_type));
+                names.add(name.as_str(), action_type(message_type));
             }
             if topic.hidden && !self.scope.shows_hidden() {
                 continue;
@@ -232,10 +234,10 @@ impl<'a> Desk<'a> {
                         Side::Server => &mut services,
                         Side::Client => &mut clients,
                     };
-                    names.add(&topic.name, types(topic).map(service_type));
+                    names.add(&topic.name, Some(service_type(message_type)));
                 }
-                _ if is_writer => publishers.add(&topic.name, types(topic)),
-                _ => subscriptions.add(&topic.name, types(topic)),
+                _ if is_writer => publishers.add(&topic.name, Some(message_type)),
+                _ => subscriptions.add(&topic.name, Some(message_type)),
             }
         }
         Some(NodeView {
@@ -278,10 +280,13 @@ impl<'a> Desk<'a> {
 }
 
 impl<'a> Names<'a> {
-    fn add(&mut self, name: &str, types: impl Iterator<Item = &'a str>) {
+    fn add(&mut self, name: &str, message_type: Option<&'a str>) {
         match self.0.get_mut(name) {
-            Some(known) => known.extend(types),
-            None => drop(self.0.insert(name.to_owned(), types.collect())),
+            Some(known) => known.extend(message_type),
+            None => drop(
+                self.0
+                    .insert(name.to_owned(), message_type.into_iter().collect()),
+            ),
         }
     }
 
@@ -291,8 +296,4 @@ impl<'a> Names<'a> {
             .map(|(name, types)| NamedView { name, types })
             .collect()
     }
-}
-
-fn types(topic: &TopicFacts) -> impl Iterator<Item = &str> {
-    topic.message_types.iter().map(String::as_str)
 }
