@@ -43,12 +43,12 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
 #[must_use]
 pub fn absent(host: &Host, config: &Config, reason: &str, is_denied: bool) -> Vec<Finding> {
     let finding = if is_denied {
-        let sentence = "an agent runs, and this user may not ask it";
+        let sentence = "an agent is running, but this user may not query it";
         Finding::new(AREA, "reachable", Verdict::Unknown, sentence)
             .seen(reason, "connect(2)")
             .remedy("sudo rp doctor    # or: sudo usermod -aG ros2probe $USER, and log in again")
     } else {
-        let sentence = "no agent answers: nothing is observed, and of the graph nothing is known";
+        let sentence = "no agent answers: nothing is observed and the graph is unknown";
         Finding::new(AREA, "reachable", Verdict::Warning, sentence)
             .seen(reason, "connect(2)")
             .remedy(match is_installed(host) {
@@ -77,7 +77,7 @@ pub fn misconfigured(path: &Path, mistakes: &str) -> Finding {
     let sentence = format!("the configuration is wrong: {first}{more}");
     let finding = Finding::new(AREA, "configuration", Verdict::Problem, sentence);
     let finding = finding.seen(mistakes, path.display().to_string());
-    finding.remedy("rp check-config    # says all of it")
+    finding.remedy("rp check-config    # prints all mistakes")
 }
 
 fn running(health: &Health, place: &str) -> Finding {
@@ -85,11 +85,11 @@ fn running(health: &Health, place: &str) -> Finding {
         .uptime_seconds
         .map_or_else(String::new, |up| format!(", up {}", duration(up)));
     let finding = if health.ready {
-        let sentence = format!("an agent answers and sees{since}");
+        let sentence = format!("the agent is running and sees traffic{since}");
         Finding::new(AREA, "ready", Verdict::Ok, sentence).seen("true", format!("{FROM} ready"))
     } else {
-        let reason = health.reason.as_deref().unwrap_or("it does not say why");
-        let sentence = format!("an agent answers and does not see: {reason}");
+        let reason = health.reason.as_deref().unwrap_or("it gives no reason");
+        let sentence = format!("the agent is running but sees nothing: {reason}");
         Finding::new(AREA, "ready", Verdict::Problem, sentence)
             .seen(reason, format!("{FROM} reason"))
             .remedy("journalctl -u ros2probe -e")
@@ -103,15 +103,15 @@ fn version(health: &Health, own: &str) -> Finding {
             AREA,
             "version",
             Verdict::Ok,
-            format!("version {own}, as this rp"),
+            format!("version {own}, same as this rp"),
         )
     } else {
         let sentence = format!(
-            "the agent is of version {}, this rp of {own}",
+            "the agent is version {}, this rp is version {own}",
             health.version
         );
         Finding::new(AREA, "version", Verdict::Note, sentence)
-            .remedy("sudo systemctl restart ros2probe    # runs what is installed now")
+            .remedy("sudo systemctl restart ros2probe    # starts the installed version")
     };
     finding.seen(&health.version, format!("{FROM} version"))
 }
@@ -140,12 +140,14 @@ fn losses(health: &Health) -> Vec<Finding> {
     let lossy = rings.iter().filter(|(count, ..)| *count > 0);
     let mut findings: Vec<_> = lossy
         .map(|(count, what, check, ring)| {
-            let sentence =
-                format!("{count} {what} were lost in a full ring: counts are lower bounds");
+            let sentence = format!(
+                "{count} {what} were lost because a ring buffer was full: counts are \
+                    lower bounds"
+            );
             Finding::new(AREA, check, Verdict::Warning, sentence)
                 .seen(count.to_string(), format!("{FROM} {check}"))
                 .configure(format!(
-                    "capture: {{{ring}: BYTES}}    # twice what it is, a power of two"
+                    "capture: {{{ring}: BYTES}}    # double it; a power of two"
                 ))
         })
         .collect();
@@ -154,7 +156,7 @@ fn losses(health: &Health) -> Vec<Finding> {
             AREA,
             "losses",
             Verdict::Ok,
-            "it lost no packet and no record",
+            "no packets or records lost by the agent",
         );
         findings.push(finding.seen("0", format!("{FROM} dropped_*")));
     }
@@ -177,12 +179,12 @@ fn limits(health: &Health) -> Vec<Finding> {
             false => "was reached",
         };
         let sentence = match reached {
-            0 => format!("limits.{key} {now}: {used} of {cap}, nothing was refused so far"),
-            reached => format!("limits.{key} {now} ({cap}): {reached} refused or given up so far"),
+            0 => format!("limits.{key} {now}: {used} of {cap}, nothing refused so far"),
+            reached => format!("limits.{key} {now} ({cap}): {reached} refused or evicted so far"),
         };
         let finding = Finding::new(AREA, "limits", Verdict::Warning, sentence);
         let finding = finding.seen(
-            format!("{used} used, {reached} refused or given up"),
+            format!("{used} used, {reached} refused or evicted"),
             format!("{FROM} limits {key}"),
         );
         let most = config::Limit::find(key).map_or(u64::MAX, |limit| limit.row().range.1 as u64);
@@ -191,9 +193,9 @@ fn limits(health: &Health) -> Vec<Finding> {
             cap.saturating_mul(2).min(most),
             match key.as_str() {
                 "participants" | "endpoints" | "unknown_writers" =>
-                    "a storm of forged participants does this too",
+                    "forged participants also cause this",
                 "topics" | "watches" => "or fewer watches",
-                _ => "memory grows with it: systemctl show ros2probe -p MemoryMax",
+                _ => "raises memory use: systemctl show ros2probe -p MemoryMax",
             }
         ))
     })
@@ -211,7 +213,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
     let mut findings: Vec<_> = full
         .map(|table| {
             let sentence = format!(
-                "its table of {} was full at {}: {} entries were given up",
+                "its table of {} was full at {}: {} entries were evicted",
                 table.table, table.limit, table.evictions
             );
             let finding = Finding::new(AREA, "evictions", Verdict::Warning, sentence).seen(
@@ -220,7 +222,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
             );
             match limit(&table.table) {
                 Some(key) => finding.configure(format!(
-                    "limits: {{{key}: {}}}    # a storm of forged writers does this too",
+                    "limits: {{{key}: {}}}    # forged writers also cause this",
                     table.limit.saturating_mul(2)
                 )),
                 None => finding,
@@ -229,7 +231,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
         .collect();
     if health.topics_rejected > 0 && !is_told("topics") {
         let sentence = format!(
-            "{} watched topics are beyond limits.topics and not measured",
+            "{} watched topics exceed limits.topics and are not measured",
             health.topics_rejected
         );
         let finding = Finding::new(AREA, "topics_rejected", Verdict::Warning, sentence);
@@ -264,7 +266,7 @@ fn watches(answers: &Answers) -> Finding {
         finding.seen(watches.len().to_string(), "GET /watch")
     };
     if watches.is_empty() {
-        let sentence = "nothing is watched: the graph is known, no topic is measured";
+        let sentence = "no watches: the graph is known, but no topic is measured";
         return say(Verdict::Note, sentence.to_owned())
             .configure("watch: ['/**']    # or: curl -X POST localhost:17401/watch/TOPIC");
     }
@@ -276,7 +278,10 @@ fn watches(answers: &Answers) -> Finding {
     match idle.len() {
         0 => say(
             Verdict::Ok,
-            format!("{} watches, each with a topic", watches.len()),
+            match watches.len() {
+                1 => "1 watch, matching a topic".to_owned(),
+                count => format!("{count} watches, each matching a topic"),
+            },
         ),
         count => {
             let named: Vec<_> = idle.iter().take(NAMED).copied().collect();
@@ -284,19 +289,22 @@ fn watches(answers: &Answers) -> Finding {
                 0 => String::new(),
                 more => format!(" and {more} more"),
             };
-            let sentence = format!("no topic yet for the watches {}{more}", named.join(", "));
-            say(Verdict::Note, sentence).remedy("rp topic list    # is it called so?")
+            let sentence = format!(
+                "no topic matches the watches {} yet{more}",
+                named.join(", ")
+            );
+            say(Verdict::Note, sentence).remedy("rp topic list    # check the name")
         }
     }
 }
 
 fn kept(health: &Health) -> Finding {
     let finding = if health.watches_kept {
-        let sentence = "what it knows outlives a restart";
+        let sentence = "state is kept across restarts";
         Finding::new(AREA, "state", Verdict::Ok, sentence)
     } else {
-        let sentence = "it has no state directory that it can write, or finds a newer rp's state there: \
-                        a restart loses names and added watches";
+        let sentence = "no usable state directory (not writable, or written by a newer rp): a \
+            restart loses names and added watches";
         Finding::new(AREA, "state", Verdict::Warning, sentence)
             .remedy("sudo mkdir -p /var/lib/ros2probe    # or the unit's StateDirectory=ros2probe")
     };
@@ -324,7 +332,7 @@ fn ports(host: &Host, config: &Config) -> Vec<Finding> {
 
 fn busy(key: &str, address: SocketAddr) -> Finding {
     let port = address.port();
-    let sentence = format!("somebody else listens on port {port}: an agent would not start");
+    let sentence = format!("port {port} is in use by another program: the agent would not start");
     let finding = Finding::new(AREA, "ports", Verdict::Problem, sentence);
     let finding = finding.seen(port.to_string(), SOCKETS.join(", "));
     finding
@@ -358,7 +366,7 @@ fn state_directory(host: &Host, choice: &StateChoice) -> Option<Finding> {
     let finding = match fs::metadata(host.files.path(&path)) {
         Ok(directory) if !directory.is_dir() => say(
             Verdict::Problem,
-            format!("{path} is no directory: an agent cannot keep what it knows"),
+            format!("{path} is not a directory: the agent cannot save its state"),
         )
         .configure(format!(
             "state_directory: {path}    # must name a directory"
@@ -367,13 +375,10 @@ fn state_directory(host: &Host, choice: &StateChoice) -> Option<Finding> {
             let is_mine = host.is_root() || directory.uid() == host.user_id;
             let mode = directory.permissions().mode() & 0o7777;
             let say = match is_mine || mode & 0o002 != 0 {
-                true => say(
-                    Verdict::Ok,
-                    format!("{path} is there to keep what an agent knows"),
-                ),
+                true => say(Verdict::Ok, format!("{path} is writable for saved state")),
                 false => say(
                     Verdict::Note,
-                    format!("an agent of this user could not keep what it knows in {path}"),
+                    format!("an agent run by this user could not save its state in {path}"),
                 )
                 .remedy("sudo rp run    # or the service"),
             };
@@ -381,11 +386,14 @@ fn state_directory(host: &Host, choice: &StateChoice) -> Option<Finding> {
         }
         Err(error) => say(
             Verdict::Note,
-            format!("{path} is not there: an agent started by hand keeps nothing over a restart"),
+            format!(
+                "{path} does not exist: an agent started by hand keeps no state across \
+                restarts"
+            ),
         )
         .seen(error.to_string(), &path)
         .remedy(format!(
-            "sudo mkdir -p {path}    # the service makes its own"
+            "sudo mkdir -p {path}    # the service creates its own"
         )),
     };
     Some(finding)
@@ -487,9 +495,9 @@ mod tests {
         assert_eq!(
             of("limits"),
             [
-                "limits.topics is reached (10): 2 refused or given up so far",
-                "limits.flows was reached (10): 3 refused or given up so far",
-                "limits.recordings is reached: 100 of 100, nothing was refused so far",
+                "limits.topics is reached (10): 2 refused or evicted so far",
+                "limits.flows was reached (10): 3 refused or evicted so far",
+                "limits.recordings is reached: 100 of 100, nothing refused so far",
             ]
         );
         assert_eq!(of("evictions").len(), 1, "told once: {findings:?}");

@@ -81,7 +81,7 @@ pub fn check(host: &Host, answers: Option<&Answers>) -> Vec<Finding> {
     findings.extend(lost(
         topics,
         "reassembly_losses",
-        "in IP reassembly, for want of a fragment",
+        "in IP reassembly, because a fragment was missing",
         |topic| {
             topic
                 .received
@@ -131,8 +131,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
     let (most, default) = (RECEIVE_MAX.read(files), RECEIVE_DEFAULT.read(files));
     let finding = match &most {
         Err(error) => {
-            let sentence =
-                format!("how large receive buffers of sockets may be is not known: {error}");
+            let sentence = format!("the maximum socket receive buffer is unknown: {error}");
             say(Verdict::Unknown, sentence)
                 .remedy("sysctl net.core.rmem_max    # on the host itself")
         }
@@ -141,7 +140,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
             let (verdict, words) = match largest {
                 None if *most >= wanted => (
                     Verdict::Ok,
-                    "enough for usual point clouds and images".to_owned(),
+                    "enough for typical point clouds and images".to_owned(),
                 ),
                 None => (
                     Verdict::Note,
@@ -158,7 +157,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
                 Some(largest) => (
                     Verdict::Warning,
                     format!(
-                        "two messages of {} ({} each) do not fit: a burst is lost at a busy subscriber",
+                        "two messages of {} ({} each) do not fit: a busy subscriber loses a burst",
                         largest.topic,
                         size(largest.bytes)
                     ),
@@ -192,7 +191,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
         let Ok(most) = bytes else {
             // Without IPv6 there is none of it.
             if number == 0 {
-                let sentence = "how much memory IP reassembly may take is not known".to_owned();
+                let sentence = "the memory limit of IP reassembly is unknown".to_owned();
                 let finding =
                     say(Verdict::Unknown, sentence).remedy(format!("sysctl {}", memory.0));
                 findings.push(memory.show(finding, &bytes));
@@ -204,8 +203,8 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
         let finding = match largest {
             Some(largest) if most < wanted => {
                 let sentence = format!(
-                    "reassembly of {version} may take {}: with lost fragments of messages as large \
-                     as those of {} ({}) it is full for {} s at a time",
+                    "reassembly of {version} may use {}: lost fragments of messages as large as \
+                     those of {} ({}) fill it for {} s",
                     size(most),
                     largest.topic,
                     size(largest.bytes),
@@ -226,7 +225,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
             }
             _ => say(
                 Verdict::Ok,
-                format!("reassembly of {version} may take {}", size(most)),
+                format!("reassembly of {version} may use {}", size(most)),
             ),
         };
         findings.push(time.show(memory.show(finding, &bytes), &seconds));
@@ -270,7 +269,7 @@ fn lost(
         })
         .collect();
     let sum: u64 = lossy.iter().map(|topic| count(topic)).sum();
-    let sentence = format!("{sum} messages died {place}: {}", named.join(", "));
+    let sentence = format!("{sum} messages were lost {place}: {}", named.join(", "));
     let finding = Finding::new(AREA, check, verdict, sentence);
     let finding = finding.seen(sum.to_string(), "GET /topics received");
     Some(helped(finding))
@@ -292,7 +291,7 @@ impl Sysctl {
     /// The command, and where its line has to stand to last.
     fn set(self, value: u64) -> String {
         format!(
-            "{}    # to last: /etc/sysctl.d/60-ros.conf",
+            "{}    # permanent: /etc/sysctl.d/60-ros.conf",
             self.line(value)
         )
     }

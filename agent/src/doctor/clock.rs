@@ -23,13 +23,13 @@ pub fn check(host: &Host) -> Vec<Finding> {
     let keepers = keepers(host);
     let say = |verdict, sentence: String| Finding::new(AREA, "synchronised", verdict, sentence);
     let kept = match keepers.as_slice() {
-        [] => "nobody that is known keeps it".to_owned(),
+        [] => "no NTP/PTP service found".to_owned(),
         names => format!("kept by {}", names.join(", ")),
     };
     let finding = match &host.clock {
         Err(error) => say(
             Verdict::Unknown,
-            format!("the kernel does not tell whether the clock is synchronised; {kept}"),
+            format!("the kernel does not report whether the clock is synchronised; {kept}"),
         )
         .seen(error, "adjtimex(2)")
         .remedy("timedatectl    # or: chronyc tracking"),
@@ -40,8 +40,8 @@ pub fn check(host: &Host) -> Vec<Finding> {
             );
             let finding = if !state.synchronised {
                 let sentence = format!(
-                    "the clock is not synchronised ({kept}): latency within this host is right, \
-                     between hosts it is wrong by as much as their clocks are apart"
+                    "the clock is not synchronised ({kept}): latency within this host is right; \
+                     between hosts it is off by the difference of their clocks"
                 );
                 say(Verdict::Warning, sentence).remedy(
                     "sudo apt install chrony    # on every host; for microseconds: linuxptp",
@@ -49,7 +49,7 @@ pub fn check(host: &Host) -> Vec<Finding> {
             } else if state.maximum_error > COARSE && state.estimated_error > COARSE {
                 let sentence = format!(
                     "the clock is synchronised to {estimated} ms ({kept}): shorter latencies \
-                     between hosts say nothing"
+                     between hosts are not meaningful"
                 );
                 say(Verdict::Note, sentence)
                     .remedy("chronyc tracking    # or ptp, for microseconds")

@@ -41,14 +41,16 @@ fn overview(participants: &[Participant], processes: Option<usize>, topics: usiz
         return match processes {
             Some(count @ 1..) => say(
                 Verdict::Problem,
-                format!("the agent sees no participant, though {count} ROS processes run here"),
+                format!(
+                    "the agent sees no participant, but {count} ROS processes are running here"
+                ),
             )
             .remedy(
                 "rp doctor --verbose    # source, control group and interfaces above; RMW below",
             ),
             _ => say(
                 Verdict::Note,
-                "the agent sees no participant: nothing speaks DDS".to_owned(),
+                "the agent sees no participant: no DDS traffic".to_owned(),
             ),
         };
     }
@@ -89,8 +91,7 @@ fn names(participants: &[Participant]) -> Option<Finding> {
         return None;
     }
     let sentence = format!(
-        "of {} neither topics nor nodes, or no nodes, are known: that is said once, and the agent \
-         started later",
+        "the topics or nodes of {} are unknown: they were announced once, before the agent started",
         many(count, "participant")
     );
     let finding = Finding::new(AREA, "names", Verdict::Warning, sentence);
@@ -106,7 +107,7 @@ fn restored(participants: &[Participant]) -> Option<Finding> {
         return None;
     }
     let sentence = format!(
-        "{} known from before the agent's start and not heard since; gone when the lease ends",
+        "{} restored from saved state, awaiting confirmation; removed when the lease ends",
         many(count, "participant")
     );
     let finding = Finding::new(AREA, "restored", Verdict::Note, sentence);
@@ -116,13 +117,12 @@ fn restored(participants: &[Participant]) -> Option<Finding> {
 fn unknown_writers(answers: &Answers) -> Option<Finding> {
     let writers = &answers.participants.unknown_writers;
     let first = writers.first()?;
-    let sentence = format!(
-        "{} without a known announcement: the topic is not known, only that something is sent",
-        match writers.len() {
-            1 => "1 writer sends".to_owned(),
-            count => format!("{count} writers send"),
-        }
-    );
+    let sentence = match writers.len() {
+        1 => "1 writer is active whose announcement was missed; its topic is unknown".to_owned(),
+        count => format!(
+            "{count} writers are active whose announcement was missed; their topics are unknown"
+        ),
+    };
     let finding = Finding::new(AREA, "unknown_writers", Verdict::Warning, sentence);
     let finding = finding.seen(
         format!("{}: {}", writers.len(), first.guid),
@@ -137,8 +137,8 @@ fn secured(participants: &[Participant]) -> Option<Finding> {
         return None;
     }
     let sentence = format!(
-        "{} with DDS security: what is encrypted stays unseen, and so are their topics and nodes \
-         where discovery is",
+        "{} with DDS security: encrypted messages are not visible, nor are topics and nodes if \
+         discovery is encrypted",
         many(count, "participant")
     );
     let finding = Finding::new(AREA, "secured", Verdict::Note, sentence);
@@ -163,28 +163,30 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             .collect()
     };
     let mut findings = Vec::new();
-    let mut say = |check, verdict, topics: &[&Topic], words: &str, remedy: Option<Helps>| {
-        if topics.is_empty() {
-            return;
-        }
-        let sentence = format!(
-            "{} {words}: {}",
-            many(topics.len(), "topic"),
-            listed(topics)
-        );
-        let finding = Finding::new(AREA, check, verdict, sentence);
-        let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
-        findings.push(match remedy {
-            Some(helps) => helps(finding),
-            None => finding,
-        });
-    };
+    let mut say =
+        |check, verdict, topics: &[&Topic], (verb, words): (&str, &str), remedy: Option<Helps>| {
+            if topics.is_empty() {
+                return;
+            }
+            let s = if topics.len() == 1 { "s" } else { "" };
+            let sentence = format!(
+                "{} {verb}{s} {words}: {}",
+                many(topics.len(), "topic"),
+                listed(topics)
+            );
+            let finding = Finding::new(AREA, check, verdict, sentence);
+            let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
+            findings.push(match remedy {
+                Some(helps) => helps(finding),
+                None => finding,
+            });
+        };
     let shared = of("shared_memory");
     if able("shared_memory_exact") {
-        let words = "by Fast DDS's shared memory only, each message seen";
+        let words = ("use", "only Fast DDS shared memory; every message is seen");
         say("shared_memory", Verdict::Ok, &shared, words, None);
     } else if able("shared_memory") {
-        let words = "by Fast DDS's shared memory only, where samples are seen";
+        let words = ("use", "only Fast DDS shared memory, which is sampled");
         say(
             "shared_memory",
             Verdict::Note,
@@ -192,12 +194,12 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             words,
             Some(|finding| {
                 finding.configure(
-                    "capture: {shm: {exact: uprobe}}    # every message; touches the senders",
+                    "capture: {shm: {exact: uprobe}}    # every message; instruments the senders",
                 )
             }),
         );
     } else {
-        let words = "by Fast DDS's shared memory only, which is not looked at";
+        let words = ("use", "only Fast DDS shared memory, which is not read");
         say(
             "shared_memory",
             Verdict::Warning,
@@ -210,7 +212,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         "data_sharing",
         Verdict::Warning,
         &of("data_sharing"),
-        "by Fast DDS's data sharing only, which nobody can see",
+        ("use", "only Fast DDS data sharing and cannot be observed"),
         Some(|finding| {
             finding.elsewhere(
                 "<data_sharing><kind>OFF</kind></data_sharing>    # Fast DDS's profile of the writer",
@@ -221,7 +223,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         "iceoryx",
         Verdict::Warning,
         &of("iceoryx"),
-        "by iceoryx only, which nobody can see",
+        ("use", "only iceoryx and cannot be observed"),
         Some(|finding| {
             finding.elsewhere(
                 "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI",
@@ -232,7 +234,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         "same_process",
         Verdict::Note,
         &of("same_process"),
-        "within one process only, which nobody can see",
+        ("stay", "inside one process and cannot be observed"),
         None,
     );
     findings
@@ -256,17 +258,17 @@ fn mismatches(topics: &[Topic]) -> Vec<Finding> {
     const KINDS: [(&str, &str, &str); 3] = [
         (
             "qos_incompatible",
-            "with publishers and subscribers whose QoS do not fit",
+            "with publishers and subscribers of incompatible QoS",
             "rp topic info --verbose TOPIC    # compare reliability and durability",
         ),
         (
             "type_conflict",
-            "with several types, which do not talk",
-            "rp topic info --verbose TOPIC    # whose type is the wrong one",
+            "with several types; endpoints of different types do not communicate",
+            "rp topic info --verbose TOPIC    # shows each endpoint's type",
         ),
         (
             "type_hash_conflict",
-            "with several definitions of one type, which misread each other",
+            "with several definitions of one type, which endpoints misread",
             "colcon build    # all nodes, with the same version of the interface package",
         ),
     ];
@@ -356,7 +358,9 @@ mod tests {
         let findings = check(&answers(late, "", ""), None);
         let names = findings.iter().find(|each| each.check == "names").unwrap();
         assert!(
-            names.sentence.starts_with("of 1 participant "),
+            names
+                .sentence
+                .starts_with("the topics or nodes of 1 participant "),
             "{}",
             names.sentence
         );
@@ -412,7 +416,7 @@ mod tests {
             .find(|each| each.check == "qos_incompatible")
             .unwrap();
         assert!(
-            finding.sentence.ends_with("do not fit: /a, /b"),
+            finding.sentence.ends_with("of incompatible QoS: /a, /b"),
             "{}",
             finding.sentence
         );

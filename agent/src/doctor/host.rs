@@ -130,7 +130,7 @@ impl Files {
     pub fn number<T: FromStr>(&self, path: &str) -> Result<T, Unread> {
         let text = self.text(path)?;
         let number = text.parse();
-        number.map_err(|_| Unread::Other(format!("`{text}` is no number")))
+        number.map_err(|_| Unread::Other(format!("`{text}` is not a number")))
     }
 
     /// Names in a directory, sorted.

@@ -32,7 +32,7 @@ pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Findin
     let names = match host.files.names(PLACE) {
         Ok(names) => names,
         Err(error) => {
-            let sentence = "network interfaces are not known";
+            let sentence = "the network interfaces are unknown";
             let finding = Finding::new(AREA, "interfaces", Verdict::Unknown, sentence);
             return vec![finding.seen(error.to_string(), PLACE).remedy("ip link")];
         }
@@ -48,7 +48,7 @@ pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Findin
     if !mute.is_empty() {
         let names = list(&mute);
         let sentence = format!(
-            "no multicast on {names}: participants behind it are found only where they are named \
+            "no multicast on {names}: participants there are found only if configured \
              (ROS_STATIC_PEERS, a discovery server)"
         );
         let mut finding = Finding::new(AREA, "multicast", Verdict::Warning, sentence);
@@ -65,8 +65,8 @@ pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Findin
     let small: Vec<_> = used().filter(|each| each.mtu < SMALL_MTU).collect();
     if !small.is_empty() {
         let sentence = format!(
-            "packets on {} are small: every datagram of a large message is cut into IP fragments, \
-             and one that is lost costs the message",
+            "the MTU of {} is small: large messages are cut into IP fragments, and one lost \
+             fragment loses the message",
             list(&small)
         );
         let mut finding = Finding::new(AREA, "mtu", Verdict::Note, sentence);
@@ -100,7 +100,7 @@ fn elsewhere(host: &Host, names: &[String]) -> Option<Finding> {
             .map(String::as_str)
             .filter(|name| *name != "bonding_masters")
     })?;
-    let sentence = "/sys shows the interfaces of another network namespace than this one";
+    let sentence = "/sys shows the interfaces of another network namespace";
     let finding = Finding::new(AREA, "interfaces", Verdict::Unknown, sentence);
     let finding = finding.seen(
         format!("{foreign} in one of them"),
@@ -141,7 +141,7 @@ fn overview(all: &[Interface]) -> Finding {
     };
     let used: Vec<_> = all.iter().filter(|each| each.is_used()).collect();
     if used.is_empty() {
-        let sentence = "no interface but loopback is up: only this host's own nodes can be seen";
+        let sentence = "only loopback is up: only this host's own nodes are visible";
         return say(Verdict::Note, sentence.to_owned()).remedy("ip link");
     }
     let named: Vec<_> = used
@@ -172,20 +172,20 @@ fn loopback(all: &[Interface], localhost: bool) -> Option<Finding> {
     };
     let name = &loopback.name;
     Some(if loopback.flags & UP == 0 {
-        let sentence = format!("{name} is down: nodes of this host that talk by it do not");
+        let sentence = format!("{name} is down: nodes of this host cannot use it");
         say(Verdict::Problem, sentence).remedy(format!("sudo ip link set {name} up"))
     } else if loopback.flags & MULTICAST != 0 {
         say(Verdict::Ok, format!("{name} is up, with multicast"))
     } else if localhost {
         let sentence = format!(
             "{name} has no multicast, and nodes here are limited to it: some implementations \
-             (Cyclone DDS) then find each other only by the addresses they try in turn"
+             (Cyclone DDS) then discover each other only by probing unicast addresses"
         );
         say(Verdict::Note, sentence).remedy(format!("sudo ip link set {name} multicast on"))
     } else {
         say(
             Verdict::Ok,
-            format!("{name} is up, without multicast as usual"),
+            format!("{name} is up, without multicast (the default)"),
         )
     })
 }
@@ -202,13 +202,13 @@ fn looked_at(agent: &Health) -> Finding {
                 .iter()
                 .all(|name| matches!(*name, "sockets" | "processes")) =>
         {
-            "the agent looks at the sockets, whatever interface they use".to_owned()
+            "the agent observes the sockets, on every interface".to_owned()
         }
-        "host" => format!("the agent looks at the sockets and at {}", join(&names)),
+        "host" => format!("the agent observes the sockets and {}", join(&names)),
         _ if names.iter().all(|name| *name == "any") => {
-            "the agent looks at every interface, and had no RTPS packet so far".to_owned()
+            "the agent captures on every interface, but has seen no RTPS packets yet".to_owned()
         }
-        _ => format!("the agent had RTPS packets from {}", join(&names)),
+        _ => format!("the agent sees RTPS packets on {}", join(&names)),
     };
     let mut finding = Finding::new(AREA, "looked_at", Verdict::Ok, sentence);
     for each in agent.interfaces.iter().take(LISTED) {
@@ -361,7 +361,7 @@ mod tests {
         assert!(
             looked_at(&agent)
                 .sentence
-                .contains("at the sockets, whatever")
+                .contains("the sockets, on every interface")
         );
         let agent: Health = serde_json::from_str(
             r#"{"source":"wire","interfaces":[{"interface":"any"},{"interface":"eth0","packets":7}]}"#,

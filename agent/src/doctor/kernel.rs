@@ -43,7 +43,7 @@ pub fn check(host: &Host) -> Vec<Finding> {
 fn version(release: &Result<String, Unread>) -> Finding {
     let say = |verdict, sentence: String| Finding::new(AREA, "version", verdict, sentence);
     match release {
-        Err(error) => say(Verdict::Unknown, "the kernel's version is not known".into())
+        Err(error) => say(Verdict::Unknown, "the kernel version is unknown".into())
             .seen(error.to_string(), RELEASE)
             .remedy("uname -r"),
         Ok(text) => match parse(text) {
@@ -55,7 +55,7 @@ fn version(release: &Result<String, Unread>) -> Finding {
             .remedy("rp run --replay FILE    # a capture from tcpdump works on any kernel"),
             None => say(
                 Verdict::Unknown,
-                format!("Linux `{text}`: of what version?"),
+                format!("Linux `{text}`: version not recognised"),
             ),
         }
         .seen(text, RELEASE),
@@ -68,12 +68,12 @@ fn types(host: &Host) -> Finding {
             AREA,
             "types",
             Verdict::Ok,
-            "the kernel describes its types (BTF)",
+            "kernel type information (BTF) is available",
         )
         .seen("there", TYPES);
     }
-    let sentence = "the kernel does not describe its types (BTF): which process holds a socket, and \
-                    messages that died in reassembly, are not to be had";
+    let sentence = "the kernel has no type information (BTF): socket owners and messages lost in \
+        reassembly are unknown";
     Finding::new(AREA, "types", Verdict::Warning, sentence)
         .seen("not there", TYPES)
         .elsewhere("CONFIG_DEBUG_INFO_BTF=y    # in the kernel's configuration")
@@ -94,15 +94,12 @@ fn compiler(host: &Host) -> Finding {
         // Shown in the first network namespace only.
         Err(Unread::Missing) => say(
             Verdict::Ok,
-            "whether BPF programs are compiled is told outside of containers only",
+            "BPF JIT status is not visible inside a container",
         )
         .seen("not there", COMPILER),
-        Err(error) => say(
-            Verdict::Unknown,
-            "whether BPF programs are compiled (JIT) may not be read",
-        )
-        .seen(error.to_string(), COMPILER)
-        .remedy("sudo sysctl net.core.bpf_jit_enable"),
+        Err(error) => say(Verdict::Unknown, "the BPF JIT status is not readable")
+            .seen(error.to_string(), COMPILER)
+            .remedy("sudo sysctl net.core.bpf_jit_enable"),
     }
 }
 
@@ -111,20 +108,17 @@ fn unprivileged(host: &Host) -> Finding {
     match host.files.number::<u32>(UNPRIVILEGED) {
         Ok(0) => say(
             Verdict::Note,
-            "every user may load BPF programs, which the agent has no need of",
+            "any user may load BPF programs; the agent does not need this",
         )
         .seen("0", UNPRIVILEGED)
         .remedy("sudo sysctl -w kernel.unprivileged_bpf_disabled=1"),
         Ok(value) => say(
             Verdict::Ok,
-            "only who has CAP_BPF loads BPF programs; the agent keeps it",
+            "unprivileged BPF is disabled; loading needs CAP_BPF",
         )
         .seen(value.to_string(), UNPRIVILEGED),
-        Err(error) => say(
-            Verdict::Ok,
-            "BPF programs are loaded by who has CAP_BPF; the agent keeps it",
-        )
-        .seen(error.to_string(), UNPRIVILEGED),
+        Err(error) => say(Verdict::Ok, "loading BPF programs needs CAP_BPF")
+            .seen(error.to_string(), UNPRIVILEGED),
     }
 }
 
@@ -134,13 +128,13 @@ fn lockdown(host: &Host) -> Option<Finding> {
     let (verdict, sentence) = match mode.as_str() {
         "confidentiality" => (
             Verdict::Warning,
-            "the kernel is locked down for confidentiality: programs may not read its memory, so \
-             socket owners and lost messages are not to be had",
+            "the kernel is locked down for confidentiality: BPF programs may not read its \
+             memory, so socket owners and causes of loss are unknown",
         ),
         "none" => (Verdict::Ok, "the kernel is not locked down"),
         _ => (
             Verdict::Ok,
-            "the kernel is locked down for integrity, which leaves the agent what it needs",
+            "the kernel is locked down for integrity, which does not restrict the agent",
         ),
     };
     let finding = Finding::new(AREA, "lockdown", verdict, sentence).seen(text, LOCKDOWN);
@@ -156,8 +150,8 @@ fn control_groups(host: &Host) -> Finding {
     let say = |verdict, sentence: String| Finding::new(AREA, "cgroup", verdict, sentence);
     let mounts = host.files.bytes(MOUNTS, 1 << 20).unwrap_or_default();
     let Some(point) = topmost(&mounts) else {
-        let sentence = "no control group hierarchy v2 is mounted: the agent cannot look at the \
-                        sockets, only at interfaces";
+        let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
+            only, not sockets";
         return say(Verdict::Warning, sentence.to_owned())
             .seen("no cgroup2", MOUNTS)
             .remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
@@ -165,17 +159,17 @@ fn control_groups(host: &Host) -> Finding {
     let point = point.display().to_string();
     match Cgroup::open(&host.files.path(&point)) {
         Ok(group) if group.is_whole_host() => {
-            say(Verdict::Ok, format!("control groups v2 of the whole host at {point}"))
+            say(Verdict::Ok, format!("cgroup v2 hierarchy of the whole host at {point}"))
         }
         Ok(_) => say(
             Verdict::Note,
-            format!("{point} shows a part of the control groups: sockets of other containers stay \
-                     invisible"),
+            format!("{point} shows only part of the cgroup hierarchy: sockets of other \
+                containers are not visible"),
         )
         .elsewhere("--cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro    # docker run; hostPath in Kubernetes"),
         Err(HierarchyError::Open { source, .. }) => say(
             Verdict::Unknown,
-            format!("the control groups at {point} cannot be opened: {source}"),
+            format!("the cgroup hierarchy at {point} cannot be opened: {source}"),
         ),
         Err(error) => say(Verdict::Warning, error.to_string()),
     }
@@ -195,7 +189,7 @@ fn pages(host: &Host) -> Finding {
             AREA,
             "pages",
             Verdict::Unknown,
-            format!("pages of {kibibytes} KiB: nobody has tried that"),
+            format!("pages of {kibibytes} KiB: untested"),
         ),
     };
     finding.seen(host.page_bytes.to_string(), "sysconf(_SC_PAGESIZE)")
@@ -213,19 +207,19 @@ fn locked_memory(host: &Host) -> Finding {
         Some("unlimited") => say(Verdict::Ok, "locked memory is not limited".to_owned()),
         Some(soft) if soft.parse().is_ok_and(|soft: u64| soft >= LOCKED_BYTES) => say(
             Verdict::Ok,
-            format!("{soft} bytes may be locked, which is enough"),
+            format!("{soft} bytes may be locked, enough for the agent"),
         ),
         Some(soft) => say(
             Verdict::Problem,
             format!(
-                "this kernel counts BPF maps as locked memory, and only {soft} bytes of that \
-                     are allowed here"
+                "this kernel counts BPF maps as locked memory, but only {soft} bytes may be \
+                 locked here"
             ),
         )
         .remedy("ulimit -l unlimited    # the unit has LimitMEMLOCK=infinity"),
         None => say(
             Verdict::Unknown,
-            "how much memory may be locked is not known".to_owned(),
+            "the limit of locked memory is unknown".to_owned(),
         ),
     };
     finding.seen(soft.unwrap_or("not there"), LIMITS)

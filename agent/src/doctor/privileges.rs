@@ -52,7 +52,7 @@ fn own(host: &Host, settings: &CaptureSettings, is_running: bool) -> Finding {
         None => say(Verdict::Ok, "this shell may capture".to_owned()),
         Some(_) if is_running => say(
             Verdict::Ok,
-            "this shell may not capture itself, which is the running agent's to do".to_owned(),
+            "this shell may not capture; the running agent does".to_owned(),
         ),
         Some(missing) => say(
             Verdict::Note,
@@ -73,15 +73,13 @@ fn of_agent(health: &Health) -> Finding {
         finding.seen(&held, "GET /health capabilities")
     };
     if let Some(reason) = &health.unfiltered_reason {
-        let sentence = format!(
-            "the agent kept {held}, but the kernel does not refuse system calls that it does not \
-             make: {reason}"
-        );
+        let sentence =
+            format!("the agent kept {held}, but its system calls are not filtered: {reason}");
         return say(Verdict::Note, sentence);
     }
     say(
         Verdict::Ok,
-        format!("the agent kept {held} and gave up the rest"),
+        format!("the agent kept {held} and dropped the rest"),
     )
 }
 
@@ -99,7 +97,7 @@ fn containers(answers: &Answers) -> Option<Finding> {
     if !looks || !contained || has("CAP_SYS_PTRACE") {
         return None;
     }
-    let sentence = "ROS runs in containers here, and the agent may not look at their shared memory";
+    let sentence = "ROS runs in containers here, but the agent may not read their shared memory";
     let finding = Finding::new(AREA, "containers", Verdict::Warning, sentence);
     let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
     Some(finding.elsewhere(
@@ -117,7 +115,7 @@ fn probes(host: &Host, settings: &CaptureSettings) -> Option<Finding> {
         return None;
     }
     let missing = missing.join(" and ");
-    let sentence = format!("capture.shm.exact needs {missing}, which this shell does not have");
+    let sentence = format!("capture.shm.exact needs {missing}, which this shell lacks");
     let finding = Finding::new(AREA, "probes", Verdict::Note, sentence);
     let finding = finding.seen(&missing, "CapEff, this process");
     Some(finding.elsewhere(
@@ -151,7 +149,7 @@ fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
             match is_answering {
                 true => say(
                     Verdict::Note,
-                    "the agent was started by hand: no service is installed that starts it again",
+                    "the agent was started by hand: no service is installed to restart it",
                 ),
                 false => say(Verdict::Note, "the service ros2probe is not installed"),
             }
@@ -169,23 +167,20 @@ fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
     });
     let is_enabled = std::fs::symlink_metadata(host.files.path(ENABLED)).is_ok();
     let finding = match (is_running, is_enabled) {
-        (true, true) => say(
-            Verdict::Ok,
-            "the service ros2probe runs and starts with the host",
-        ),
+        (true, true) => say(Verdict::Ok, "the service ros2probe is running and enabled"),
         (true, false) => say(
             Verdict::Note,
-            "the service ros2probe runs, but not after the next boot",
+            "the service ros2probe is running but not enabled at boot",
         )
         .remedy("sudo systemctl enable ros2probe"),
         (false, true) => say(
             Verdict::Problem,
-            "the service ros2probe is enabled and does not run",
+            "the service ros2probe is enabled but not running",
         )
         .remedy("systemctl status ros2probe; journalctl -u ros2probe -b"),
         (false, false) => say(
             Verdict::Note,
-            "the service ros2probe is installed and does not run",
+            "the service ros2probe is installed but not running",
         )
         .remedy("sudo systemctl enable --now ros2probe"),
     };

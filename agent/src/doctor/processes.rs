@@ -104,24 +104,24 @@ impl Processes {
         let domains = self.differing(
             "domain",
             "nodes in different domains do not see each other",
-            "export ROS_DOMAIN_ID=N    # the same for all that should talk",
+            "export ROS_DOMAIN_ID=N    # the same for all nodes",
             |process| Some(process.domain()),
         );
         let implementations = self.differing(
             "rmw",
-            "different implementations talk in part only, and services not reliably",
-            "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # one for all",
+            "mixed RMWs: topics may work only partly, services are unreliable",
+            "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # the same for all nodes",
             |process| process.implementation.map(str::to_owned),
         );
         let ranges = self.differing(
             "range",
-            "who looks at localhost only is not found from elsewhere",
+            "nodes limited to localhost are not discovered from other hosts",
             "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # the same for all; unset ROS_LOCALHOST_ONLY",
             |process| Some(process.variables.range().words()),
         );
         let servers = self.differing(
             "discovery_server",
-            "who uses a discovery server is not found by those who use another one or none",
+            "nodes with different discovery servers do not discover each other",
             "export ROS_DISCOVERY_SERVER=ADDRESS:11811    # the same for all, or unset for all",
             |process| {
                 let server = process.variables.shown("ROS_DISCOVERY_SERVER");
@@ -133,7 +133,7 @@ impl Processes {
         );
         let security = self.differing(
             "security",
-            "secured nodes do not talk to those that are not",
+            "secured and unsecured nodes do not communicate",
             "export ROS_SECURITY_ENABLE=true    # for all, or for none",
             |process| {
                 let is_secured = process.variables.is_secured();
@@ -153,7 +153,7 @@ impl Processes {
             1 => format!("process {first}"),
             count => format!("{count} processes"),
         };
-        let sentence = format!("{which} may not be looked at: no ROS node there is compared");
+        let sentence = format!("{which} cannot be inspected; skipped");
         let verdict = if is_root {
             Verdict::Note
         } else {
@@ -241,7 +241,7 @@ impl Processes {
         }
         let listed: Vec<_> = domains.iter().flatten().map(u32::to_string).collect();
         let sentence = format!(
-            "this shell is in domain {own}, all ROS processes in {}: its tools will not find them",
+            "this shell uses domain {own}, all ROS processes use {}: its tools will not find them",
             listed.join(", ")
         );
         let finding = Finding::new(AREA, "shell_domain", Verdict::Warning, sentence);
@@ -338,7 +338,10 @@ fn command(host: &Host, id: u32) -> String {
         .unwrap_or_default();
     let script = words.iter().skip(1).find(|word| !word.starts_with('-'));
     let is_interpreter = first.starts_with("python") || matches!(first, "bash" | "sh" | "node");
+    let has_no_file = words.get(1).is_some_and(|word| word == "-c");
     let name = match script {
+        Some(code) if is_interpreter && code.contains("ros2cli.daemon") => "ros2 daemon",
+        Some(_) if is_interpreter && has_no_file => first,
         Some(script) if is_interpreter && !script.is_empty() => base_name(script),
         _ => first,
     };
@@ -448,6 +451,19 @@ mod tests {
         );
         assert_eq!(sentence(&findings, "security"), None);
         assert_eq!(sentence(&findings, "discovery_server"), None);
+    }
+
+    #[test]
+    fn code_on_the_command_line_is_not_taken_for_a_name() {
+        let daemon = "python3\0-c\0from ros2cli.daemon.daemonize import main; main()\0--name";
+        for (line, expected) in [
+            (daemon, "ros2 daemon"),
+            ("python3\0-c\0import rclpy; rclpy.spin()", "python3"),
+            ("python3\0-u\0/opt/talker.py", "talker.py"),
+        ] {
+            let (_directory, host) = host(&[("/proc/7/cmdline", line)]);
+            assert_eq!(command(&host, 7), expected);
+        }
     }
 
     #[test]

@@ -40,9 +40,9 @@ fn none(host: &Host) -> Finding {
         "environment",
         Verdict::Note,
         if is_sudo {
-            "no ROS variables: sudo does not pass them on, so the shell's own are not known"
+            "no ROS variables: sudo does not pass them on"
         } else {
-            "no ROS is set up in this shell, which the agent does not need"
+            "ROS is not set up in this shell; the agent does not need it"
         },
     );
     let finding = finding.seen("none", FROM);
@@ -63,15 +63,15 @@ fn domain(host: &Host, variables: &Variables) -> Finding {
     let finding = match variables.domain() {
         Err(text) => say(
             Verdict::Problem,
-            format!("`{text}` is no domain: nodes of this shell do not start"),
+            format!("`{text}` is not a domain ID: nodes of this shell do not start"),
         )
         .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
         Ok(domain) => match ephemeral(host) {
             Some((first, last)) if overlaps(domain, first, last) => say(
                 Verdict::Warning,
                 format!(
-                    "the ports of domain {domain} are among those ({first} to {last}) that the \
-                     kernel gives to anybody: a node may find its port taken"
+                    "the ports of domain {domain} are in the ephemeral range ({first} to \
+                     {last}): a node may find its port in use"
                 ),
             )
             .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
@@ -107,18 +107,16 @@ fn implementation(variables: &Variables) -> Finding {
         }
         Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => say(
             Verdict::Note,
-            format!("{name}: what it sends through its own shared memory stays invisible"),
+            format!("{name}: messages in its own shared memory are not visible"),
         ),
         Some(name) if name.starts_with("rmw_zenoh") => say(
             Verdict::Warning,
-            format!("{name} is no DDS: of its nodes nothing will be seen"),
+            format!("{name} is not DDS: its nodes are not visible"),
         )
-        .remedy(
-            "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # or another one that speaks RTPS",
-        ),
+        .remedy("export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # or another RTPS implementation"),
         Some(name) => say(
             Verdict::Note,
-            format!("{name}: seen as far as it speaks RTPS over UDP"),
+            format!("{name}: visible where it uses RTPS over UDP"),
         ),
     };
     let shown = name.unwrap_or_else(|| "not set".to_owned());
@@ -129,24 +127,24 @@ fn range(variables: &Variables) -> Finding {
     let say = |verdict, sentence: &str| Finding::new(AREA, "range", verdict, sentence);
     let peers = variables.shown("ROS_STATIC_PEERS");
     let mut finding = match variables.range() {
-        Range::Subnet => say(Verdict::Ok, "nodes look for others in the subnet"),
+        Range::Subnet => say(Verdict::Ok, "discovery range: subnet"),
         Range::System => say(
             Verdict::Ok,
-            "nodes look for others as the implementation is configured",
+            "discovery range: as configured in the RMW implementation",
         ),
         Range::Localhost => say(
             Verdict::Note,
-            "nodes of this shell talk to this host only: robots elsewhere do not see them",
+            "discovery range: this host only; other robots do not see these nodes",
         )
         .remedy("unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
         Range::Off => say(
             Verdict::Warning,
-            "nodes of this shell look for nobody: discovery is off",
+            "discovery is off: nodes of this shell find no others",
         )
         .remedy("export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
         Range::Wrong(_) => say(
             Verdict::Warning,
-            "ROS_AUTOMATIC_DISCOVERY_RANGE has no value that ROS knows: it takes LOCALHOST",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is invalid: ROS uses LOCALHOST",
         )
         .remedy(
             "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # or LOCALHOST, OFF, SYSTEM_DEFAULT",
@@ -160,7 +158,7 @@ fn range(variables: &Variables) -> Finding {
         );
         finding.verdict = finding.verdict.max(Verdict::Warning);
     } else if let Some(peers) = &peers {
-        finding.sentence = format!("{}, and ask {peers}", finding.sentence);
+        finding.sentence = format!("{}; static peers: {peers}", finding.sentence);
     }
     for name in [
         "ROS_LOCALHOST_ONLY",
@@ -178,16 +176,11 @@ fn range(variables: &Variables) -> Finding {
 fn server(variables: &Variables) -> Option<Finding> {
     let server = variables.shown("ROS_DISCOVERY_SERVER")?;
     let sentence = format!(
-        "nodes are introduced by the discovery server at {server}: the agent sees what its own \
-         host's nodes and the server say here, not what they say elsewhere"
+        "discovery server at {server}: the agent sees only the discovery traffic on this host"
     );
     let finding = Finding::new(AREA, "discovery_server", Verdict::Note, sentence);
     let finding = finding.seen(server, format!("ROS_DISCOVERY_SERVER, {FROM}"));
-    Some(
-        finding.remedy(
-            "export ROS_SUPER_CLIENT=TRUE    # for ros2 tools, which see nothing otherwise",
-        ),
-    )
+    Some(finding.remedy("export ROS_SUPER_CLIENT=TRUE    # ros2 tools need it"))
 }
 
 /// Of Fast DDS.
@@ -199,12 +192,12 @@ fn transports(variables: &Variables) -> Option<Finding> {
     let finding = match kind {
         "LARGE_DATA" | "LARGE_DATAv6" | "P2P" => say(
             Verdict::Warning,
-            format!("with {kind} Fast DDS sends messages by TCP, which the agent does not read"),
+            format!("with {kind}, Fast DDS uses TCP, which the agent does not read"),
         )
         .remedy("export FASTDDS_BUILTIN_TRANSPORTS=DEFAULT"),
         "SHM" => say(
             Verdict::Note,
-            "nodes of this shell use shared memory alone: samples are seen, and other hosts do not \
+            "nodes of this shell use only shared memory, which is sampled; other hosts do not \
              see them"
                 .to_owned(),
         ),
@@ -229,21 +222,19 @@ fn profiles(host: &Host, variables: &Variables) -> Vec<Finding> {
         match read(host, path) {
             Err(error) => say(
                 Verdict::Warning,
-                format!(
-                    "Fast DDS's profiles cannot be read: {error}; nodes then run with its defaults"
-                ),
+                format!("Fast DDS's profiles cannot be read: {error}; nodes run with the defaults"),
             )
-            .remedy(format!("unset {name}    # or correct it")),
+            .remedy(format!("unset {name}    # or fix it")),
             Ok(bytes) => {
                 let text = String::from_utf8_lossy(&bytes);
                 if text.contains("TCPv4") || text.contains("TCPv6") || text.contains("LARGE_DATA") {
                     say(
                         Verdict::Warning,
-                        "Fast DDS's profiles name TCP, which the agent does not read".to_owned(),
+                        "Fast DDS's profiles use TCP, which the agent does not read".to_owned(),
                     )
                     .elsewhere("<type>UDPv4</type>    # in the transport descriptors of that file")
                 } else {
-                    say(Verdict::Ok, "Fast DDS's profiles are there".to_owned())
+                    say(Verdict::Ok, "Fast DDS profiles found".to_owned())
                 }
             }
         }
@@ -280,9 +271,7 @@ fn cyclone(host: &Host, variables: &Variables) -> Option<Finding> {
                     "Cyclone DDS's configuration cannot be read: {error}; its nodes do not start"
                 );
                 let verdict = Verdict::Problem;
-                return Some(
-                    say(verdict, sentence).remedy("unset CYCLONEDDS_URI    # or correct it"),
-                );
+                return Some(say(verdict, sentence).remedy("unset CYCLONEDDS_URI    # or fix it"));
             }
         }
     }
@@ -295,14 +284,13 @@ fn cyclone(host: &Host, variables: &Variables) -> Option<Finding> {
     Some(if is_on(shared) || text.contains("PubSubMessageExchange") {
         say(
             Verdict::Warning,
-            "Cyclone DDS uses iceoryx between processes of this host, which the agent cannot see"
-                .to_owned(),
+            "Cyclone DDS uses iceoryx within this host, which the agent cannot see".to_owned(),
         )
         .elsewhere("<SharedMemory><Enable>false</Enable></SharedMemory>")
     } else {
         say(
             Verdict::Ok,
-            "Cyclone DDS has a configuration of its own".to_owned(),
+            "Cyclone DDS has its own configuration".to_owned(),
         )
     })
 }
@@ -318,13 +306,13 @@ fn security(variables: &Variables) -> Option<Finding> {
     let (verdict, sentence) = if variables.is_secured() {
         (
             Verdict::Note,
-            "DDS security is on: participants are seen; names, rates and messages are not where \
-             they are encrypted",
+            "DDS security is on: participants are visible; encrypted names, rates and messages \
+             are not",
         )
     } else {
         (
             Verdict::Ok,
-            "DDS security is set up and off (ROS_SECURITY_ENABLE is not `true`)",
+            "DDS security is configured but off (ROS_SECURITY_ENABLE is not `true`)",
         )
     };
     let mut finding = Finding::new(AREA, "security", verdict, sentence);

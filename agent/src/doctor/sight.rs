@@ -9,7 +9,7 @@ const AREA: Area = Area::Sight;
 /// Where an agent says it.
 pub(super) const ASKED: &str = "GET /health";
 /// Where a trial told.
-pub(super) const TRIED: &str = "a trial: the programs were loaded for a moment";
+pub(super) const TRIED: &str = "test load of the BPF programs";
 
 /// What a source can see.
 #[derive(Clone, Debug, Default)]
@@ -61,7 +61,7 @@ impl Sight {
 /// Why nothing is known: neither does an agent run here, nor may a trial be made.
 #[must_use]
 pub fn untried(reason: &str) -> Vec<Finding> {
-    let sentence = "what the kernel lets the agent see was not tried";
+    let sentence = "kernel support was not tested";
     let finding = Finding::new(AREA, "source", Verdict::Unknown, sentence);
     vec![
         finding
@@ -73,12 +73,12 @@ pub fn untried(reason: &str) -> Vec<Finding> {
 /// A trial that failed.
 #[must_use]
 pub fn failed(error: &str) -> Vec<Finding> {
-    let sentence = format!("an agent could not look at this host: {error}");
+    let sentence = format!("the agent cannot observe this host: {error}");
     let finding = Finding::new(AREA, "source", Verdict::Problem, sentence);
     vec![
         finding
             .seen(error, TRIED)
-            .remedy("sudo rp run    # says the same with its whole cause"),
+            .remedy("sudo rp run    # prints the full cause"),
     ]
 }
 
@@ -107,21 +107,21 @@ fn source(sight: &Sight) -> Finding {
     let finding = match (sight.source.as_str(), &sight.source_reason) {
         ("host", _) => say(
             Verdict::Ok,
-            "the agent looks at the sockets of this host: whole messages, each subscriber apart"
+            "the agent observes the sockets of this host: whole messages, per subscriber"
                 .to_owned(),
         ),
         ("wire", Some(reason)) => say(
             Verdict::Warning,
             format!(
-                "the agent looks at the interfaces only, where subscribers cannot be told \
-                     apart and losses have no cause: {reason}"
+                "the agent observes interfaces only: no figures per subscriber, no causes of \
+                 loss: {reason}"
             ),
         )
-        .configure("capture: {source: host}    # fails with the reason instead of making do"),
+        .configure("capture: {source: host}    # fails with the reason instead of falling back"),
         ("wire", None) => say(
             Verdict::Note,
-            "the agent looks at the interfaces, as it was told to: subscribers cannot be told \
-             apart and losses have no cause"
+            "the agent observes interfaces, as configured: no figures per subscriber, no causes \
+             of loss"
                 .to_owned(),
         )
         .configure("capture: {source: auto}"),
@@ -135,11 +135,11 @@ const fn words(ability: Ability) -> &'static str {
     match ability {
         Ability::Subscribers => "what each subscriber received",
         Ability::Sent => "messages that leave this host",
-        Ability::SocketLosses => "messages that die in a full socket buffer",
-        Ability::ReassemblyLosses => "messages that die in IP reassembly",
+        Ability::SocketLosses => "messages lost in a full socket buffer",
+        Ability::ReassemblyLosses => "messages lost in IP reassembly",
         Ability::Owners => "which process a socket belongs to",
         Ability::Containers => "all containers",
-        Ability::Forwarded => "traffic that only passes this host",
+        Ability::Forwarded => "traffic merely forwarded by this host",
         Ability::SharedMemory => "Fast DDS's shared memory, in samples",
         Ability::SharedMemoryExact => "each message in Fast DDS's shared memory",
     }
@@ -165,29 +165,29 @@ fn lacking(sight: &Sight, ability: Ability) -> Option<Finding> {
         }
         Ability::Containers if !is_host => (
             Verdict::Note,
-            "not inside containers that have a network namespace of their own".to_owned(),
+            "containers with their own network namespace are not seen".to_owned(),
             Some("capture: {network_namespaces: [/run/netns/NAME]}"),
         ),
         Ability::Containers => (
             Verdict::Note,
-            "only sockets of one control group: other containers stay invisible".to_owned(),
+            "limited to one cgroup; other containers are not visible".to_owned(),
             Some("capture: {cgroup: null}    # and in a container the host's /sys/fs/cgroup"),
         ),
         Ability::Forwarded => (
             Verdict::Note,
-            "not traffic between other hosts that only passes this one".to_owned(),
+            "traffic merely forwarded between other hosts is not seen".to_owned(),
             Some(
                 "capture: {mirror_interfaces: [eth1]}    # a mirror port or a gateway's interface",
             ),
         ),
         Ability::SharedMemory => (
             Verdict::Warning,
-            "not Fast DDS's shared memory, by which most nodes of one host talk".to_owned(),
+            "Fast DDS shared memory, which most nodes of one host use, is not seen".to_owned(),
             Some("capture: {shm: {mode: auto}}"),
         ),
         Ability::SharedMemoryExact => (
             Verdict::Note,
-            "of messages in Fast DDS's shared memory samples, not each one".to_owned(),
+            "Fast DDS shared memory is sampled; not every message is seen".to_owned(),
             Some("capture: {shm: {exact: uprobe}}    # and CAP_SYS_ADMIN, CAP_SYS_PTRACE"),
         ),
         _ => (Verdict::Warning, format!("not {}", words(ability)), None),
@@ -240,7 +240,7 @@ mod tests {
         assert_eq!(found.verdict, Verdict::Warning);
         assert_eq!(
             found.sentence,
-            "not messages that die in IP reassembly: the kernel does not tell"
+            "not messages lost in IP reassembly: the kernel does not tell"
         );
     }
 

@@ -186,7 +186,8 @@ mod tests {
         Report::new(
             "robot1",
             vec![
-                Finding::new(Area::Kernel, "version", Verdict::Ok, "Linux 6.8").seen("6.8", "/proc/x"),
+                Finding::new(Area::Kernel, "version", Verdict::Ok, "Linux 6.8")
+                    .seen("6.8", "/proc/x"),
                 Finding::new(
                     Area::Buffers,
                     "receive",
@@ -194,7 +195,10 @@ mod tests {
                     "a socket may buffer 213 KB: two messages of /points (2.7 MB each) do not fit",
                 )
                 .seen("212992", "/proc/sys/net/core/rmem_max")
-                .remedy("sudo sysctl -w net.core.rmem_max=6291456    # to last: /etc/sysctl.d/60-ros.conf"),
+                .remedy(
+                    "sudo sysctl -w net.core.rmem_max=6291456    # permanent: \
+                    /etc/sysctl.d/60-ros.conf",
+                ),
             ],
         )
     }
@@ -206,14 +210,18 @@ mod tests {
             "rp doctor {version} on robot1: 1 warning, 1 ok
 
 Kernel
-  ok       Linux 6.8
+  ok       Linux \
+             6.8
 
 Buffers
-  warning  a socket may buffer 213 KB: two messages of /points (2.7 MB each) do
+  warning  a socket may buffer 213 KB: two messages of /points (2.7 MB \
+             each) do
            not fit
            /proc/sys/net/core/rmem_max: 212992
-           # to last: /etc/sysctl.d/60-ros.conf
-           > sudo sysctl -w net.core.rmem_max=6291456
+           \
+             # permanent: /etc/sysctl.d/60-ros.conf
+           > sudo sysctl -w \
+             net.core.rmem_max=6291456
 "
         );
         assert_eq!(text(&report(), Style::default()), expected);

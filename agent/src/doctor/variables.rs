@@ -155,7 +155,7 @@ impl Range {
             Self::Localhost => "localhost only".to_owned(),
             Self::Off => "no discovery".to_owned(),
             Self::System => "as the implementation is configured".to_owned(),
-            Self::Wrong(value) => format!("`{value}`, taken for localhost only"),
+            Self::Wrong(value) => format!("`{value}`, treated as localhost only"),
         }
     }
 }
