@@ -78,7 +78,7 @@ fn expectation(watch: &Watching) -> Styled {
         expected.extend(most.map(|most| format!("{what} at most {most}")));
     }
     if expected.is_empty() {
-        expected.push("nothing expected".to_owned());
+        expected.push("no expectations".to_owned());
     }
     let origin = match watch.origin.as_deref() {
         Some("config") => " (configuration)",
@@ -93,7 +93,7 @@ fn expectation(watch: &Watching) -> Styled {
     };
     let is_broken = matches!(watch.state.as_str(), "violated" | "silent");
     let line = format!(
-        "{} watched as {}{origin}, {}: {state}",
+        "{} matches watch {}{origin}, {}: {state}",
         if is_broken { '!' } else { '-' },
         safe(&watch.watch),
         expected.join(", "),
@@ -117,7 +117,7 @@ fn measured(topic: &Topic, lines: &mut Vec<Styled>) {
         return;
     };
     if !is_measured(topic) && !topic.publishers.is_empty() {
-        let line = "measured no longer: what follows is of before; press w to go on";
+        let line = "no longer measured; the figures below are old; press w to resume";
         lines.push((line.to_owned(), Kind::Plain));
     }
     lines.push((counts(counted), Kind::Plain));
@@ -132,14 +132,14 @@ fn measured(topic: &Topic, lines: &mut Vec<Styled>) {
     }
     if let Some(sampled) = counted.sampled {
         let line = format!(
-            "shared memory is looked at now and then: {} of {} messages were seen",
+            "shared memory is sampled: {} of {} messages were seen",
             sampled.seen_messages, sampled.existing_messages
         );
         lines.push((line, Kind::Plain));
     }
     if counted.negative_latency_messages > 0 {
         let line = format!(
-            "clocks are apart: {} messages are stamped after they came",
+            "clocks differ: {} messages have timestamps later than their arrival",
             counted.negative_latency_messages
         );
         lines.push((line, Kind::Problem));
@@ -149,7 +149,7 @@ fn measured(topic: &Topic, lines: &mut Vec<Styled>) {
 fn counts(counted: &Measurement) -> String {
     let all = counted.messages + counted.lost_messages;
     let mut line = format!(
-        "since it is measured: {} of {all} messages, {}",
+        "since measurement started: {} of {all} messages, {}",
         counted.messages,
         bytes(as_real(counted.bytes))
     );
@@ -181,7 +181,7 @@ fn causes(it: &Delivered) -> String {
         ("before this host", it.lost_before_host_messages),
         ("in reassembly", it.lost_in_reassembly_messages),
         ("in full socket buffers", it.lost_in_socket_buffer_messages),
-        ("cause not known yet", it.pending_messages),
+        ("cause unknown so far", it.pending_messages),
     ];
     let causes = causes.iter().filter(|(_, count)| *count > 0);
     let causes: Vec<_> = causes
@@ -208,7 +208,7 @@ fn diagnosis(finding: &Map<String, Value>, topic: &Topic) -> String {
             value("policies")
         ),
         "type_conflict" => format!(
-            "endpoints of different types do not talk: {}",
+            "endpoints of different types do not communicate: {}",
             value("types")
         ),
         "type_hash_conflict" => format!(
@@ -218,16 +218,16 @@ fn diagnosis(finding: &Map<String, Value>, topic: &Topic) -> String {
         ),
         "unheard_publisher" => {
             format!(
-                "{} publishes and nobody matches: {}",
+                "{} has no matching subscriber ({})",
                 who("writer"),
-                value("reason")
+                unmatched(&value("reason"))
             )
         }
         "unfed_subscriber" => {
             format!(
-                "{} subscribes and nobody matches: {}",
+                "{} has no matching publisher ({})",
                 who("reader"),
-                value("reason")
+                unmatched(&value("reason"))
             )
         }
         _ => {
@@ -235,6 +235,17 @@ fn diagnosis(finding: &Map<String, Value>, topic: &Topic) -> String {
             let all = all.map(|(key, value)| format!("{}={}", safe(key), shown(value)));
             all.collect::<Vec<_>>().join(" ")
         }
+    }
+}
+
+/// The reason of `unheard_publisher` and `unfed_subscriber`, in words.
+fn unmatched(reason: &str) -> &str {
+    match reason {
+        "qos" => "incompatible QoS",
+        "type" => "type mismatch",
+        "partition" => "another partition",
+        "nobody" => "none announced",
+        other => other,
     }
 }
 

@@ -133,7 +133,7 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     let mut warn = |text: String| warnings.push((format!("! {text}"), Kind::Problem));
     if let Some((since, why)) = &app.gone {
         let since = now.saturating_duration_since(*since).as_secs();
-        warn(format!("agent gone for {since} s, retrying: {why}"));
+        warn(format!("agent unreachable for {since} s, retrying: {why}"));
     }
     if let Some(age) = app.age(now).filter(|age| *age > FRESH)
         && !app
@@ -141,13 +141,13 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
             .as_ref()
             .is_some_and(|(health, _)| health.finished && app.gone.is_none())
     {
-        warn(format!("what is shown is {} s old", age.as_secs()));
+        warn(format!("the data shown is {} s old", age.as_secs()));
     }
     let Some((health, _)) = &app.health else {
         return warnings;
     };
     if !health.ready {
-        let why = health.reason.as_deref().unwrap_or("it does not say why");
+        let why = health.reason.as_deref().unwrap_or("it gives no reason");
         warn(format!("the agent does not see the robot: {}", safe(why)));
     }
     if health.dropped() > 0 {
@@ -178,14 +178,14 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     let unseen = unseen.count() as u64;
     if unseen > 0 {
         warn(format!(
-            "{} cannot be seen: Enter says why",
+            "{} not visible: press Enter for the reason",
             counted(unseen, "topic")
         ));
     }
     if health.unknown_writers > 0 {
         let writers = counted(health.unknown_writers, "writer");
         warn(format!(
-            "{writers} without a name: `rp discover` asks for them"
+            "{writers} without a known topic: `rp discover` requests their announcements"
         ));
     }
     if health.topics_rejected > 0 {
@@ -195,7 +195,7 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     for table in health.tables.iter().filter(|table| table.evictions > 0) {
         let (count, name) = (table.evictions, safe(&table.table));
         warn(format!(
-            "the table of {name} is full: {count} given up (limits)"
+            "the table of {name} is full: {count} evicted (limits)"
         ));
     }
     if let Some(reason) = &health.source_reason {

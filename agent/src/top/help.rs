@@ -4,7 +4,7 @@ use super::details::Styled;
 use super::look::Kind;
 
 const HELP: &str = "\
-rp top: what a robot's topics do, as its agent sees it     any key goes back
+rp top: a robot's topics as its agent sees them     any key goes back
 
  up down k j       select a topic         PgUp PgDn Home End g G   by pages
  / text            only names, types or states with this text; Esc: as before

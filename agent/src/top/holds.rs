@@ -60,7 +60,7 @@ impl Holds {
         match self.all.remove(key) {
             Some(Held::Stream(stop)) => {
                 stop.store(true, Ordering::Relaxed);
-                format!("{name}: rp top asks for it no longer")
+                format!("{name}: no longer measured for rp top")
             }
             Some(Held::Watch(path)) => match self.agent.delete(&path) {
                 Ok(()) => format!("{name}: the watch is removed"),
@@ -95,7 +95,7 @@ impl Holds {
                 if let Some(Held::Stream(stop)) = before {
                     stop.store(true, Ordering::Relaxed);
                 }
-                format!("{name}: watched, also after rp top has ended; w removes it")
+                format!("{name}: stays watched after rp top ends; w removes it")
             }
             Err(error) => format!("{name}: {error}"),
         }

@@ -168,7 +168,7 @@ fn nothing(app: &App) -> &'static str {
     match (app.updated, app.rows().is_empty()) {
         (None, _) => "  waiting for the agent",
         (Some(_), true) => "  no topics yet",
-        (Some(_), false) => "  the filter leaves nothing: Esc clears it",
+        (Some(_), false) => "  no topic matches the filter: Esc clears it",
     }
 }
 
@@ -186,7 +186,7 @@ fn events(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
     }
     rule(frame, area, &title, app.focus == Pane::Events, look);
     if lines.is_empty() {
-        put(frame, body, 0, "nothing happened yet", look, Kind::Faint);
+        put(frame, body, 0, "no events yet", look, Kind::Faint);
     }
     let shown = lines.get(first..behind).unwrap_or_default();
     for (line, at) in shown.iter().zip(0..body.height) {

@@ -97,7 +97,7 @@ pub(in crate::top) fn robot() -> Topics {
             "watches": [{"watch": "/**", "state": "ok"}], "measurement": quiet,
             "passages": [{"passage": "same_process", "pairs": 1}],
             "reasons": [{"code": "same_process",
-                "detail": "no message of 1 pairs uses the network: both ends are in one process"}]},
+                "detail": "publisher and subscriber share one process; nothing crosses the network"}]},
         {"domain_id": 0, "name": "/diagnostics", "dds_name": "rt/diagnostics", "kind": "topic",
             "message_types": ["diagnostic_msgs/msg/DiagnosticArray"],
             "publishers": [endpoint("07.1", "/robot1/base", Value::Null)], "subscriptions": [],
@@ -240,14 +240,14 @@ fn an_agent_that_is_blind_or_gone_never_looks_healthy() {
     let mut shown = app(start);
     let text = screen(&mut shown, (80, 24), ASCII, at(1));
     assert!(text.contains("agent sees the host's sockets"), "{text}");
-    assert!(text.contains("! 1 topic cannot be seen"), "{text}");
+    assert!(text.contains("! 1 topic not visible"), "{text}");
 
     shown.take(health(&json!({"dropped_records": 7})), at(1));
     let text = screen(&mut shown, (80, 24), ASCII, at(1));
     assert!(text.contains("! dropping now: 7 records"), "{text}");
     let text = screen(&mut shown, (80, 24), ASCII, at(60));
     assert!(text.contains("! dropped: 7 records"), "{text}");
-    assert!(text.contains("! what is shown is 60 s old"), "{text}");
+    assert!(text.contains("! the data shown is 60 s old"), "{text}");
 
     let blind = json!({"ready": false, "reason": "the capture has made no progress for 9 s"});
     shown.take(health(&blind), at(1));
@@ -261,7 +261,7 @@ fn an_agent_that_is_blind_or_gone_never_looks_healthy() {
     let text = screen(&mut shown, (80, 24), ASCII, at(12));
     assert!(text.contains("AGENT GONE"), "{text}");
     assert!(
-        text.contains("! agent gone for 10 s, retrying: connection refused"),
+        text.contains("! agent unreachable for 10 s, retrying: connection refused"),
         "{text}"
     );
     shown.take(Fact::Topics(Box::new(robot())), at(13));
