@@ -131,6 +131,9 @@ pub(crate) struct Record {
     definitions: Vec<PathBuf>,
     #[command(flatten)]
     unused: Unused,
+    /// Set for `rp bag convert`, which needs no keys.
+    #[arg(skip)]
+    has_no_keys: bool,
     #[command(flatten)]
     target: Target,
 }
@@ -175,6 +178,7 @@ impl Record {
         (self.target.host, self.target.socket) = (None, None);
         self.target.replay = Some(capture);
         self.output = Some(bag);
+        self.has_no_keys = true;
         self
     }
 
@@ -226,12 +230,13 @@ impl Record {
         }
         let (give, orders) = channel();
         listen(give.clone())?;
-        let keys = Keys::take();
+        let keys = (!self.has_no_keys).then(Keys::take).flatten();
         match &keys {
             Some(_) => {
                 log("INFO", "Press SPACE for pausing/resuming");
                 read_keys(give);
             }
+            None if self.has_no_keys => {}
             None => eprintln!("stdin is not a terminal device. Keyboard handling disabled."),
         }
         log("INFO", "Listening for topics...");

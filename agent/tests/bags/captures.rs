@@ -52,6 +52,7 @@ fn check(scenarios: &[Scenario]) {
         let output = convert(&scenario.capture, &bag, &["--include-hidden-topics"]);
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success(), "{name}: {stderr}");
+        assert!(!stderr.contains("stdin"), "{name}: {stderr}");
         let (complete, incomplete) = on_the_wire(scenario);
         let found = in_the_bag(&name, &bag);
         if name.contains("cli-observed") || name.contains("fastrtps-default/lifecycle") {
