@@ -326,8 +326,8 @@ fn live_capture_where_there_is_no_bpf_is_refused_with_one_line() {
     assert_eq!(
         said.lines().last(),
         Some(
-            "rp: there is no BPF here: not in this kernel, or not in what emulates this processor: \
-             Function not implemented (os error 38)"
+            "rp: BPF is not available: not supported by this kernel or emulator: Function not \
+             implemented (os error 38)"
         ),
         "{said}"
     );

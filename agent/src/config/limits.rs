@@ -123,8 +123,8 @@ impl Limit {
                 default: 1_000,
                 range: (1, 100_000),
                 what: "DDS participants",
-                reached: "one that is not heard any more makes room (for 5 s, if it was there for less \
-                          than 2 s, else for 90 s); otherwise the newcomer is left out",
+                reached: "one that is no longer heard makes room (for 5 s, if it was there for \
+                    less than 2 s, else for 90 s); otherwise the newcomer is left out",
                 told_by: "ros2probe_table_evictions_total",
                 bytes: 2 << 10,
             },
@@ -133,8 +133,8 @@ impl Limit {
                 default: 8_192,
                 range: (1, 1_000_000),
                 what: "Writers and readers",
-                reached: "a participant that is not heard any more makes room with all it has; \
-                          otherwise the newcomer is left out",
+                reached: "a participant that is no longer heard makes room with all its entries; \
+                    otherwise the newcomer is left out",
                 told_by: "ros2probe_table_evictions_total",
                 bytes: 5_632,
             },
@@ -142,9 +142,9 @@ impl Limit {
                 key: "topics",
                 default: 1_000,
                 range: (1, 100_000),
-                what: "Topics that are measured and have series of their own",
-                reached: "one that has vanished makes room; otherwise the newcomer is listed and not \
-                          measured, until there is room",
+                what: "Measured topics with series of their own",
+                reached: "one that has vanished makes room; otherwise the newcomer is listed but \
+                    not measured until an entry is free",
                 told_by: "ros2probe_topics_rejected_total",
                 bytes: 15 << 10,
             },
@@ -161,7 +161,7 @@ impl Limit {
                 key: "unknown_writers",
                 default: 256,
                 range: (1, 100_000),
-                what: "Writers that send without a known announcement",
+                what: "Writers whose announcement was missed",
                 reached: "one that sent less than 10 messages and nothing for 3 s makes room; \
                           otherwise the newcomer is not followed",
                 told_by: "ros2probe_table_evictions_total",
@@ -183,7 +183,7 @@ impl Limit {
                 default: 4 << 20,
                 range: (65_536, 1 << 30),
                 what: "Bytes of captured datagrams of which fragments are missing",
-                reached: "the oldest datagram is given up",
+                reached: "the oldest datagram is dropped",
                 told_by: "ros2probe_incomplete_datagrams_total",
                 bytes: 1,
             },
@@ -202,8 +202,8 @@ impl Limit {
                 range: (1 << 20, 16 << 30),
                 what: "Bytes of messages that are put together for them (one half), or wait to be \
                        read (the other)",
-                reached: "the oldest message of the longest queue goes, or the one least complete, \
-                          and its readers are told",
+                reached: "the oldest message of the longest queue is dropped, or the least \
+                    complete one, and reported to its readers",
                 told_by: "ros2probe_missed_messages_total",
                 bytes: 1,
             },

@@ -305,7 +305,7 @@ impl State {
     /// The reason why it does not.
     pub fn ready(&self, now: Instant) -> Result<(), String> {
         if self.snapshot.is_none() {
-            return Err("starting: nothing was captured yet".to_owned());
+            return Err("starting: nothing captured yet".to_owned());
         }
         if self.agent.finished {
             return Ok(());

@@ -171,7 +171,7 @@ pub(super) const PARTICIPANT_INFO: Metric = Metric::info(
         "pid",
         "cgroup",
     ],
-    "Participants and the process each lives in: as it says, or who holds the socket it sends by.",
+    "Participants and their processes, as announced or from the owner of the sending socket.",
 );
 pub(super) const TOPICS: Metric = Metric::gauge(
     "ros2_topics",
@@ -204,7 +204,7 @@ pub(super) const UNKNOWN_WRITER_RATE: Metric = Metric::gauge(
 pub(super) const UNKNOWN_WRITER_INFO: Metric = Metric::info(
     "ros2_unknown_writer_info",
     &["writer", "vendor", "host", "process", "pid", "cgroup"],
-    "Who an unknown writer is: what its participant says, and who holds the socket it sends by.",
+    "Unknown writers: their participants' announcements and the owners of their sending sockets.",
 )
 .experimental();
 
@@ -242,7 +242,7 @@ pub(super) const TOPIC_BYTES: Metric = Metric::counter(
 pub(super) const TOPIC_LOST: Metric = Metric::counter(
     "ros2_topic_lost_messages_total",
     TOPIC,
-    "Messages that were sent but never seen whole: sequence gaps that nothing excused or filled.",
+    "Messages that were sent but never seen whole: sequence gaps neither excused nor repaired.",
 );
 pub(super) const TOPIC_RECOVERED: Metric = Metric::counter(
     "ros2_topic_recovered_messages_total",
@@ -252,12 +252,12 @@ pub(super) const TOPIC_RECOVERED: Metric = Metric::counter(
 pub(super) const TOPIC_DUPLICATES: Metric = Metric::counter(
     "ros2_topic_duplicate_messages_total",
     TOPIC,
-    "Messages and fragments seen again, counted nowhere else.",
+    "Duplicate messages and fragments, not counted elsewhere.",
 );
 pub(super) const TOPIC_INCOMPLETE: Metric = Metric::counter(
     "ros2_topic_incomplete_messages_total",
     TOPIC,
-    "Fragmented messages of which a part never came; they are lost messages too.",
+    "Fragmented messages with a missing part; also counted as lost.",
 );
 pub(super) const TOPIC_LAST_MESSAGE: Metric = Metric::gauge(
     "ros2_topic_last_message_timestamp_seconds",
@@ -303,17 +303,19 @@ pub(super) const TOPIC_NEGATIVE_LATENCY: Metric = Metric::counter(
 pub(super) const TOPIC_SAMPLED: Metric = Metric::counter(
     "ros2_topic_sampled_messages_total",
     TOPIC,
-    "Of its messages, those counted by the span of their sequence numbers, because the topic is seen in shared memory: not each of them was looked at, and none of them is reported lost.",
+    "Messages counted by the span of sequence numbers, because the topic is sampled in shared \
+     memory; not every one was seen, and none is reported lost.",
 );
 pub(super) const TOPIC_SAMPLED_SEEN: Metric = Metric::counter(
     "ros2_topic_sampled_seen_messages_total",
     TOPIC,
-    "Of those, the ones that were looked at; intervals and latencies are those of these.",
+    "Sampled messages that were seen; intervals and latencies are of these.",
 );
 pub(super) const TOPIC_SAMPLED_UNCERTAIN: Metric = Metric::counter(
     "ros2_topic_sampled_uncertain_total",
     TOPIC,
-    "Looks at shared memory that came so late that more may have passed than can be told.",
+    "Polls of shared memory so late that the ring may have been overwritten; loss in between is \
+     unknown.",
 );
 pub(super) const TOPIC_COVERAGE: Metric = Metric::gauge(
     "ros2_topic_sampled_coverage_ratio",

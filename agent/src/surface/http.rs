@@ -178,7 +178,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
     let format = Format::negotiate(&accepts.join(","));
     let Some(turn) = PAGES.turn().await else {
         pages.board.limits().reached(Limit::MetricsClients, 1);
-        let reason = "others are reading slowly what fills the memory for pages\n";
+        let reason = "memory for pages is used up by slow readers\n";
         return (
             StatusCode::SERVICE_UNAVAILABLE,
             [(RETRY_AFTER, "1")],

@@ -173,7 +173,7 @@ impl TlsShape {
 
 /// `$2y$10$` and 53 letters; the cost is bounded, since whoever comes may have it spent.
 fn check_hash(hash: &str) -> Result<(), String> {
-    let unfit = "is no bcrypt hash, as `htpasswd -nBC 10 NAME` prints";
+    let unfit = "is not a bcrypt hash, as printed by `htpasswd -nBC 10 NAME`";
     let mut parts = hash.split('$');
     let (none, version, cost) = (parts.next(), parts.next(), parts.next());
     let letters = parts.next().unwrap_or_default();
@@ -221,9 +221,9 @@ mod tests {
     fn what_would_leave_the_listener_open_is_refused() {
         for (text, says) in [
             ("basic_auth_user:\n  alice: x\n", "basic_auth_user"),
-            ("basic_auth_users:\n  alice: secret\n", "no bcrypt hash"),
-            ("basic_auth_users: {a: $2y$10$short}", "no bcrypt hash"),
-            ("basic_auth_users: {a: $1$10$short}", "no bcrypt hash"),
+            ("basic_auth_users:\n  alice: secret\n", "not a bcrypt hash"),
+            ("basic_auth_users: {a: $2y$10$short}", "not a bcrypt hash"),
+            ("basic_auth_users: {a: $1$10$short}", "not a bcrypt hash"),
             ("http_server_config: {http2: true}", "http_server_config"),
             ("tls_server_config: {cert_file: a}", "key_file"),
             (

@@ -135,11 +135,11 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
             description = "Id of the last event that was received, as a browser sends it."),
     ),
     responses(
-        (status = 200, description = "Events, until the client goes or the agent ends.",
+        (status = 200, description = "Events, until the client disconnects or the agent stops.",
             body = EventView<'static>, content_type = "text/event-stream"),
-        (status = 422, description = "No such event name or topic, or no id.",
+        (status = 422, description = "No such event name or topic, or an invalid id.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 503, description = "There are too many streams already, or the agent is about to end.",
+        (status = 503, description = "Too many streams, or the agent is shutting down.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -189,7 +189,7 @@ fn no_id(text: &str) -> Problem {
     let text: String = text.chars().take(64).collect();
     Problem::new(
         Code::InvalidRequest,
-        format!("`{text}` is no id of an event; `after=0` asks for all that are kept"),
+        format!("`{text}` is not an event id; `after=0` requests all kept events"),
     )
 }
 

@@ -125,7 +125,7 @@ static VIEWS: Answers = Answers::new();
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
     let Some(turn) = VIEWS.turn().await else {
         context.board.limits().reached(Limit::ApiClients, 1);
-        let detail = "others are reading slowly what fills the memory for views";
+        let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();
     };
     let (head, body) = next.run(request).await.into_parts();

@@ -135,7 +135,7 @@ async fn list(
     params(NodeParameter, Scope),
     responses(
         (status = 200, description = "The node.", body = NodeView<'static>),
-        (status = 404, description = "There is no such node.",
+        (status = 404, description = "No such node.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "It is in several domains.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -157,7 +157,7 @@ async fn show(
     let found = found.map(|(node, nodes)| (node.domain_id, nodes)).collect();
     let missing = || {
         let hint = hint(&name, admitted().map(|(node, _)| node.name.as_str()));
-        Problem::new(Code::NoSuchNode, format!("there is no node {name}{hint}"))
+        Problem::new(Code::NoSuchNode, format!("no node {name}{hint}"))
     };
     let nodes = only(found, &name, missing)?;
     let desk = Desk::new(snapshot, scope);

@@ -24,7 +24,7 @@ const COMMON: [(&str, &str); 6] = [
     ("403", "Sent to a foreign name, or by a foreign web page."),
     ("413", "The body is too large."),
     ("429", "Too many requests."),
-    ("503", "The agent is about to end."),
+    ("503", "The agent is shutting down."),
 ];
 
 #[derive(OpenApi)]
@@ -36,11 +36,11 @@ const COMMON: [(&str, &str); 6] = [
     ),
     components(schemas(ProblemBody)),
     tags(
-        (name = "watch", description = "What is measured, changed while the agent runs."),
-        (name = "events", description = "What happens, as it happens."),
+        (name = "watch", description = "Watches, changed while the agent runs."),
+        (name = "events", description = "Events, as they happen."),
         (name = "samples", description = "Messages of topics, one by one, as they come."),
         (name = "recordings", description = "Bags that the agent writes."),
-        (name = "graph", description = "What is known of the robot."),
+        (name = "graph", description = "The robot's graph and measurements."),
         (name = "agent", description = "The agent itself."),
     )
 )]

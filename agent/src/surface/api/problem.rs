@@ -122,7 +122,7 @@ impl Code {
             Self::ForeignHost => (
                 "foreign-host",
                 StatusCode::FORBIDDEN,
-                "The request was sent to another name",
+                "The request names another host",
             ),
             Self::ForeignOrigin => (
                 "foreign-origin",
@@ -141,7 +141,7 @@ impl Code {
             Self::MethodNotAllowed => (
                 "method-not-allowed",
                 StatusCode::METHOD_NOT_ALLOWED,
-                "The path does not know the method",
+                "Method not allowed",
             ),
             Self::WatchDiffers => (
                 "watch-differs",
@@ -149,15 +149,11 @@ impl Code {
                 "Watched with other settings",
             ),
             Self::WatchGiven => ("watch-given", StatusCode::CONFLICT, "Not a client's watch"),
-            Self::TooManyWatches => (
-                "too-many-watches",
-                StatusCode::CONFLICT,
-                "No room for another watch",
-            ),
+            Self::TooManyWatches => ("too-many-watches", StatusCode::CONFLICT, "Too many watches"),
             Self::NothingToReload => (
                 "nothing-to-reload",
                 StatusCode::CONFLICT,
-                "There is no configuration file",
+                "No configuration file",
             ),
             Self::BodyTooLarge => (
                 "body-too-large",
@@ -172,7 +168,7 @@ impl Code {
             Self::InvalidRequest => (
                 "invalid-request",
                 StatusCode::UNPROCESSABLE_ENTITY,
-                "What is asked for is not possible",
+                "The request cannot be satisfied",
             ),
             Self::InvalidConfiguration => (
                 "invalid-configuration",
@@ -217,7 +213,7 @@ impl Code {
             Self::TooManyRecordings => (
                 "too-many-recordings",
                 StatusCode::CONFLICT,
-                "No room for another recording",
+                "Too many recordings",
             ),
             Self::NoPlaceForRecordings => (
                 "no-place-for-recordings",
@@ -232,7 +228,7 @@ impl Code {
             Self::Ending => (
                 "ending",
                 StatusCode::SERVICE_UNAVAILABLE,
-                "The agent is about to end",
+                "The agent is shutting down",
             ),
         }
     }

@@ -108,7 +108,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     get,
     path = "/recordings",
     tag = "recordings",
-    responses((status = 200, description = "Those under way, and the last ones that ended.",
+    responses((status = 200, description = "Running recordings, and the last ones that ended.",
         body = RecordingList))
 )]
 async fn list(State(context): State<Context>) -> Json<RecordingList> {
@@ -133,9 +133,9 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
             headers(("location" = String, description = "Path of the recording."))),
         (status = 409, description = "There is one of that name, or there are too many.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 415, description = "The body is not said to be JSON.",
+        (status = 415, description = "The content type is not JSON.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 422, description = "What is asked for is not possible.",
+        (status = 422, description = "The request cannot be satisfied.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 507, description = "The storage does not take it.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -150,7 +150,7 @@ async fn begin(
     context.state().await;
     let recordings = Arc::clone(&context.recordings);
     let begun = tokio::task::spawn_blocking(move || recordings.begin(wanted)).await;
-    let begun = begun.map_err(|_| Problem::new(Code::Ending, "the agent is about to end"))?;
+    let begun = begun.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
     let recording = begun.map_err(|refusal| problem(&refusal))?;
     // From the next snapshot on the kernel's filter knows what is wanted.
     context.state().await;
@@ -167,7 +167,7 @@ async fn begin(
     params(("name" = String, Path, description = "Its name.")),
     responses(
         (status = 200, description = "How it goes.", body = RecordingView),
-        (status = 404, description = "There is none of that name.",
+        (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -188,9 +188,9 @@ async fn show(
     tag = "recordings",
     params(("name" = String, Path, description = "Its name.")),
     responses(
-        (status = 200, description = "It has ended; what it has and has not.", body = RecordingView),
-        (status = 202, description = "It is about to end: the storage is slow.", body = RecordingView),
-        (status = 404, description = "There is none of that name.",
+        (status = 200, description = "It has ended; its report.", body = RecordingView),
+        (status = 202, description = "It is ending; the storage is slow.", body = RecordingView),
+        (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -217,7 +217,7 @@ async fn end(
     responses(
         (status = 202, description = "It will be paused within a tenth of a second.",
             body = RecordingView),
-        (status = 404, description = "There is none of that name.",
+        (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -237,7 +237,7 @@ async fn pause(
     responses(
         (status = 202, description = "It will go on within a tenth of a second.",
             body = RecordingView),
-        (status = 404, description = "There is none of that name.",
+        (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -256,7 +256,7 @@ async fn resume(
     params(("name" = String, Path, description = "Its name.")),
     responses(
         (status = 202, description = "It will within a tenth of a second.", body = RecordingView),
-        (status = 404, description = "There is none of that name.",
+        (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -277,7 +277,7 @@ fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Problem> {
     let found = context.recordings.find(name);
     found.ok_or_else(|| {
         let name: String = name.chars().take(128).collect();
-        let detail = format!("there is no recording `{name}`; GET /recordings lists them");
+        let detail = format!("no recording `{name}`; GET /recordings lists them");
         Problem::new(Code::NoSuchRecording, detail)
     })
 }

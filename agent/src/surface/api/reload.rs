@@ -78,7 +78,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 async fn reload(State(context): State<Context>) -> Result<Json<Reloaded>, Problem> {
     let (answer, answered) = oneshot::channel();
     let asked = context.reloader.0.send(answer).await;
-    let ending = || Problem::new(Code::Ending, "the agent is about to end");
+    let ending = || Problem::new(Code::Ending, "the agent is shutting down");
     asked.map_err(|_| ending())?;
     match answered.await.map_err(|_| ending())? {
         Ok(reloaded) => Ok(Json(reloaded)),
@@ -87,7 +87,7 @@ async fn reload(State(context): State<Context>) -> Result<Json<Reloaded>, Proble
             "the agent was started without a configuration file",
         )),
         Err(NotReloaded::Mistakes(mistakes)) => {
-            let detail = "the agent keeps what it had; correct the file and reload again";
+            let detail = "the agent keeps its configuration; fix the file and reload";
             let problem = Problem::new(Code::InvalidConfiguration, detail);
             Err(problem.with_mistakes(mistakes))
         }

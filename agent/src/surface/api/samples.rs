@@ -107,9 +107,10 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     tag = "samples",
     params(Wanted),
     responses(
-        (status = 200, description = "Lines, until the client goes, the capture or the agent ends.",
+        (status = 200, description = "Lines, until the client disconnects, or the capture or the \
+            agent ends.",
             content((Line = "application/x-ndjson"), (Line = "application/vnd.ros2probe.samples"))),
-        (status = 422, description = "Nothing is wanted, or what is wanted can be no topic.",
+        (status = 422, description = "No topic requested, or an invalid topic name.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 503, description = "There are too many subscriptions already.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -235,7 +236,7 @@ fn selection(wanted: &Wanted) -> Result<Selection, Problem> {
         include.push(Choice::All);
     }
     if include.is_empty() {
-        let detail = "nothing is wanted: `topic`, `regex` or `all=true`";
+        let detail = "no topic requested: use `topic`, `regex` or `all=true`";
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
     Ok(Selection {

@@ -56,7 +56,7 @@ pub enum OpenError {
         path: PathBuf,
     },
     /// Something is there that is not to be replaced.
-    #[error("{} is there and is no socket: change `api.socket`", path.display())]
+    #[error("{} exists and is not a socket: change `api.socket`", path.display())]
     NoSocket {
         /// Where.
         path: PathBuf,
@@ -319,7 +319,7 @@ mod tests {
         assert!(!path.exists());
         fs::write(&path, "").unwrap();
         let error = Server::new(None).unwrap().bind_socket(&path).unwrap_err();
-        assert!(one_line(&error).contains("is no socket"));
+        assert!(one_line(&error).contains("is not a socket"));
         assert!(path.exists());
 
         let missing = directory.path().join("missing/api.sock");

@@ -78,16 +78,16 @@ impl<'a> Circumstances<'a> {
         }
         let is_connected = match (topic.publishers.len(), topic.subscriptions.len()) {
             (0, _) if topic.vanished => {
-                say(Cause::NoPublisher, "its last endpoint has gone".to_owned());
+                say(Cause::NoPublisher, "its last endpoint is gone".to_owned());
                 false
             }
             (0, subscriptions) => {
-                let detail = format!("nobody publishes, {subscriptions} subscribed");
+                let detail = format!("no publishers, {subscriptions} subscribed");
                 say(Cause::NoPublisher, detail);
                 false
             }
             (_, 0) => {
-                let detail = "nobody subscribes: most writers send nothing then".to_owned();
+                let detail = "no subscribers: most writers send nothing".to_owned();
                 say(Cause::NoSubscriber, detail);
                 false
             }
@@ -113,7 +113,7 @@ impl<'a> Circumstances<'a> {
                     say(code, detail);
                 } else if self.is_elsewhere(topic) {
                     let detail = "publishers and subscribers are on other hosts; capture.source: \
-                                  wire sees what passes this one";
+                        wire sees traffic that passes this host";
                     say(Cause::OutsideView, detail.to_owned());
                 } else {
                     say(Cause::Quiet, self.quiet(measured));
@@ -178,8 +178,8 @@ impl<'a> Circumstances<'a> {
             return (Cause::WatchRejected, detail.to_owned());
         }
         let detail = match name.strip_prefix('/') {
-            Some(path) => format!("nothing is counted: POST /watch/{path}"),
-            None => "nothing is counted: the configuration can list it".to_owned(),
+            Some(path) => format!("not measured: POST /watch/{path}"),
+            None => "not measured: add it to the configuration".to_owned(),
         };
         (Cause::NotWatched, detail)
     }
@@ -194,24 +194,29 @@ impl<'a> Circumstances<'a> {
         {
             return None;
         }
-        let pairs: usize = passages.map(|count| count.pairs).sum();
-        let detail = |how: &str| format!("no message of {pairs} pairs uses the network: {how}");
+        let detail = |how: &str| format!("{how}; nothing crosses the network");
         Some(match most.passage {
             Passage::Network => return None,
             Passage::SharedMemory if self.looks_at_memory => {
-                let how = "they use shared memory, where none was seen lately";
+                let how = "messages pass through shared memory; none was seen lately";
                 (Cause::SharedMemory, detail(how))
             }
             Passage::SharedMemory => {
-                let how = "they use shared memory, which this agent does not look at";
+                let how = "messages pass through shared memory, which this agent does not read";
                 (Cause::SharedMemory, detail(how))
             }
             Passage::DataSharing => {
                 let how = "subscribers read the publisher's history in memory (data sharing)";
                 (Cause::DataSharing, detail(how))
             }
-            Passage::SameProcess => (Cause::SameProcess, detail("both ends are in one process")),
-            Passage::Iceoryx => (Cause::Iceoryx, detail("they use iceoryx")),
+            Passage::SameProcess => (
+                Cause::SameProcess,
+                detail(
+                    "publisher and subscriber share \
+                one process",
+                ),
+            ),
+            Passage::Iceoryx => (Cause::Iceoryx, detail("messages pass through iceoryx")),
         })
     }
 

@@ -113,7 +113,7 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
     params(("name" = String, Path, description = "Its name.")),
     responses(
         (status = 201, description = "The bag.", body = WrittenView),
-        (status = 404, description = "The configuration has none of that name.",
+        (status = 404, description = "The configuration has no snapshot of that name.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 507, description = "It could not be written, and is still in memory.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -125,7 +125,7 @@ async fn write(
 ) -> Result<Response, Problem> {
     let Some(written) = context.snapshots.write(&name).await else {
         let name: String = name.chars().take(64).collect();
-        let detail = format!("there is no snapshot `{name}`; GET /snapshots lists them");
+        let detail = format!("no snapshot `{name}`; GET /snapshots lists them");
         return Err(Problem::new(Code::NoSuchSnapshot, detail));
     };
     let written = written.map_err(|reason| Problem::new(Code::StorageRefuses, reason))?;

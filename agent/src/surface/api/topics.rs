@@ -235,7 +235,7 @@ async fn list(
     params(TopicParameter, Domain),
     responses(
         (status = 200, description = "The topic.", body = TopicDetails<'static>),
-        (status = 404, description = "There is no such topic.",
+        (status = 404, description = "No such topic.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "It is in several domains.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -258,7 +258,7 @@ async fn show(
     let missing = || {
         let names = admitted().map(|topic| topic.name.as_str());
         let hint = hint(&name, names);
-        Problem::new(Code::NoSuchTopic, format!("nobody has {name}{hint}"))
+        Problem::new(Code::NoSuchTopic, format!("no endpoint on {name}{hint}"))
     };
     let topic: &TopicFacts = only(found, &name, missing)?;
     Ok(Json(desk.details(topic)).into_response())

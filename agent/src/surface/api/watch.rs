@@ -243,11 +243,12 @@ async fn show(
         (status = 200, description = "It is watched just so already.", body = WatchView),
         (status = 201, description = "It is watched from now on.", body = WatchView,
             headers(("location" = String, description = "Path of the watch."))),
-        (status = 409, description = "It is watched with other settings, or there is no room.",
+        (status = 409, description = "It is watched with other settings, or the limit of watches \
+            is reached.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 415, description = "The body is not said to be JSON.",
+        (status = 415, description = "The content type is not JSON.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 422, description = "No such topic name, or settings that cannot be.",
+        (status = 422, description = "Invalid topic name or settings.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -273,11 +274,12 @@ async fn add(
         (status = 200, description = "It is watched just so.", body = WatchView),
         (status = 201, description = "It is watched from now on.", body = WatchView,
             headers(("location" = String, description = "Path of the watch."))),
-        (status = 409, description = "The configuration lists it otherwise, or there is no room.",
+        (status = 409, description = "The configuration lists it with other settings, or the \
+            limit of watches is reached.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 415, description = "The body is not said to be JSON.",
+        (status = 415, description = "The content type is not JSON.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 422, description = "No such topic name, or settings that cannot be.",
+        (status = 422, description = "Invalid topic name or settings.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -429,8 +431,8 @@ fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
 
 fn unknown(topic: &str, domain_id: Option<u32>) -> Problem {
     let detail = match domain_id {
-        None => format!("there is no watch {topic} for every domain"),
-        Some(domain_id) => format!("there is no watch {topic} for domain {domain_id}"),
+        None => format!("no watch {topic} for all domains"),
+        Some(domain_id) => format!("no watch {topic} for domain {domain_id}"),
     };
     Problem::new(Code::NoSuchWatch, detail)
 }

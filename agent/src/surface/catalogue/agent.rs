@@ -5,12 +5,13 @@ use super::Metric;
 pub(in crate::surface) const BUILD_INFO: Metric = Metric::info(
     "ros2probe_build_info",
     &["version", "arch"],
-    "What is running.",
+    "Version and build of the agent.",
 );
 pub(in crate::surface) const SOURCE_INFO: Metric = Metric::info(
     "ros2probe_capture_source_info",
     &["source", "reason"],
-    "Where packets come from: the host's sockets, the wire or a replay, and why not from one that shows more.",
+    "The source of packets: the host's sockets, the wire or a replay, and why a source that \
+     shows more is not used.",
 );
 pub(in crate::surface) const SANDBOX_INFO: Metric = Metric::info(
     "ros2probe_sandbox_info",
@@ -20,7 +21,9 @@ pub(in crate::surface) const SANDBOX_INFO: Metric = Metric::info(
 pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
     "ros2probe_capture_ability",
     &["ability"],
-    "1 for what the source can see: subscribers apart, messages sent, which messages died in a socket's buffer or in reassembly, owners of sockets, containers, traffic that is only forwarded, shared memory, each message there.",
+    "1 if the source can see it: each subscriber, messages sent, losses in socket buffers and in \
+     reassembly, socket owners, containers, forwarded traffic, shared memory, every message in \
+     it.",
 );
 pub(in crate::surface) const READY: Metric = Metric::gauge(
     "ros2probe_ready",
@@ -30,12 +33,14 @@ pub(in crate::surface) const READY: Metric = Metric::gauge(
 pub(in crate::surface) const CAPTURE_PACKETS: Metric = Metric::counter(
     "ros2probe_capture_packets_total",
     &["interface"],
-    "Packets that the filter let through to user space; `sockets` are datagrams captured at the host's sockets, `processes` messages captured in those that send into shared memory.",
+    "Packets passed by the filter to user space; `sockets` are datagrams captured at the host's \
+     sockets, `processes` messages captured in processes that send into shared memory.",
 );
 pub(in crate::surface) const CAPTURE_DROPPED: Metric = Metric::counter(
     "ros2probe_capture_dropped_packets_total",
     &["interface"],
-    "Packets lost because the ring was full, by socket (`any`: all interfaces of a namespace): above 0, everything else is a lower bound.",
+    "Packets lost because the ring was full, by socket (`any`: all interfaces of a namespace); \
+     above 0, all other counts are lower bounds.",
 );
 pub(in crate::surface) const CAPTURE_COPIED: Metric = Metric::counter(
     "ros2probe_capture_copied_bytes_total",
@@ -46,13 +51,14 @@ pub(in crate::surface) const CAPTURE_COPIED: Metric = Metric::counter(
 pub(in crate::surface) const FILTER_EVENTS: Metric = Metric::counter(
     "ros2probe_filter_events_total",
     &["event"],
-    "What the kernel filter met and did, by event.",
+    "Events of the kernel filter.",
 )
 .experimental();
 pub(in crate::surface) const FILTER_REFUSED: Metric = Metric::counter(
     "ros2probe_filter_refused_updates_total",
     &[],
-    "Changes of interest for which the kernel filter had no room: those writers stay unknown to it.",
+    "Changes of interest refused because the kernel filter's table was full; those writers stay \
+     unknown to it.",
 );
 pub(in crate::surface) const RECORDS_DROPPED: Metric = Metric::counter(
     "ros2probe_records_dropped_total",
@@ -67,7 +73,8 @@ pub(in crate::surface) const PIECES_DROPPED: Metric = Metric::counter(
 pub(in crate::surface) const CONTENDED: Metric = Metric::counter(
     "ros2probe_contended_datagrams_total",
     &[],
-    "Frames and datagrams that the kernel programs could not look at, having interrupted each other too often: above 0, counts are lower bounds.",
+    "Frames and datagrams that the kernel programs skipped because they interrupted each other \
+     too often; above 0, counts are lower bounds.",
 );
 pub(in crate::surface) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
     "ros2probe_incomplete_datagrams_total",
@@ -88,11 +95,11 @@ pub(in crate::surface) const SHM_OPEN: Metric = Metric::gauge(
 pub(in crate::surface) const SHM_EVENTS: Metric = Metric::counter(
     "ros2probe_shm_events_total",
     &["event"],
-    "What the look at shared memory met: messages announced at ports, read, captured, missed, and what went wrong.",
+    "Shared-memory polling: messages announced at ports, read, captured and missed, and errors.",
 )
 .experimental();
 pub(in crate::surface) const SHM_LOOKS: Metric =
-    Metric::counter("ros2probe_shm_looks_total", &[], "Looks at shared memory.");
+    Metric::counter("ros2probe_shm_looks_total", &[], "Polls of shared memory.");
 pub(in crate::surface) const SHM_CPU: Metric = Metric::counter(
     "ros2probe_shm_cpu_seconds_total",
     &[],
@@ -107,7 +114,7 @@ pub(in crate::surface) const SHM_EXACT_INFO: Metric = Metric::info(
 pub(in crate::surface) const DATAGRAMS: Metric = Metric::counter(
     "ros2probe_datagrams_total",
     &[],
-    "Datagrams looked at in user space.",
+    "Datagrams parsed in user space.",
 );
 pub(in crate::surface) const RECORDS: Metric = Metric::counter(
     "ros2probe_records_total",
@@ -117,7 +124,7 @@ pub(in crate::surface) const RECORDS: Metric = Metric::counter(
 pub(in crate::surface) const DECODE_ERRORS: Metric = Metric::counter(
     "ros2probe_decode_errors_total",
     &["stage", "reason"],
-    "Packets and submessages that could not be read, by what was being read and why.",
+    "Packets and submessages that could not be parsed, by element and reason.",
 );
 pub(in crate::surface) const TABLE_ENTRIES: Metric = Metric::gauge(
     "ros2probe_table_entries",
@@ -129,7 +136,7 @@ pub(in crate::surface) const TABLE_LIMIT: Metric =
 pub(in crate::surface) const TABLE_EVICTIONS: Metric = Metric::counter(
     "ros2probe_table_evictions_total",
     &["table"],
-    "Entries given up because of the cap.",
+    "Entries evicted because of the cap.",
 );
 pub(in crate::surface) const LIMIT: Metric = Metric::gauge(
     "ros2probe_limit",
@@ -144,7 +151,8 @@ pub(in crate::surface) const LIMIT_USED: Metric = Metric::gauge(
 pub(in crate::surface) const LIMIT_REACHED: Metric = Metric::counter(
     "ros2probe_limit_reached_total",
     &["limit"],
-    "What was refused, or given up to make room, because of each cap; tables, topics, subscriptions and messages are counted by their own metrics as well.",
+    "Entries refused or evicted because of each cap; tables, topics, subscriptions and messages \
+     also have metrics of their own.",
 );
 pub(in crate::surface) const TRACKED_TOPICS: Metric = Metric::gauge(
     "ros2probe_tracked_topics",
@@ -193,12 +201,12 @@ pub(in crate::surface) const RELOAD_TIMESTAMP: Metric = Metric::gauge(
 pub(in crate::surface) const STATE_WRITES: Metric = Metric::counter(
     "ros2probe_state_writes_total",
     &["outcome"],
-    "Times that what discovery knows was written to the state directory, or could not be; absent where no state is kept.",
+    "Writes of discovery state to the state directory, by result; absent if no state is kept.",
 );
 pub(in crate::surface) const RESTORED: Metric = Metric::gauge(
     "ros2probe_restored_participants",
     &[],
-    "Participants known from before the agent's start and not heard since; they go when their lease ends.",
+    "Participants restored from saved state and not heard since; removed when their lease ends.",
 );
 pub(in crate::surface) const OTLP_EXPORTS: Metric = Metric::counter(
     "ros2probe_otlp_exports_total",
@@ -208,7 +216,9 @@ pub(in crate::surface) const OTLP_EXPORTS: Metric = Metric::counter(
 pub(in crate::surface) const OTLP_DROPPED: Metric = Metric::counter(
     "ros2probe_otlp_dropped_total",
     &["signal", "reason"],
-    "Data points, log records and spans that were not delivered: overflow (no room here), superseded (by newer points while the endpoint was away), refused, rejected (in part) or shutdown.",
+    "Data points, log records and spans that were not delivered: overflow (queue full), \
+     superseded (by newer points while the endpoint was away), refused, rejected (in part) or \
+     shutdown.",
 );
 
 pub(in crate::surface) const SUBSCRIPTIONS: Metric = Metric::gauge(
@@ -229,19 +239,23 @@ pub(in crate::surface) const SAMPLES_GIVEN: Metric = Metric::counter(
 pub(in crate::surface) const SAMPLES_MISSED: Metric = Metric::counter(
     "ros2probe_missed_messages_total",
     &["reason"],
-    "Messages that a subscription did not get, and was told so: incomplete (fragments were never seen), lost (nothing of them was seen), unannounced (they came before their writer was announced, and not again), not_captured (their bytes were lost on the way to the agent, or found no room), queue_full (the reader was too slow).",
+    "Messages that a subscription missed and that were reported to it: incomplete (fragments \
+     were never seen), lost (nothing of it was seen), unannounced (sent before its writer was \
+     announced and never repeated), not_captured (its bytes could not be captured), queue_full \
+     (the reader was too slow).",
 );
 pub(in crate::surface) const SAMPLES_QUEUED: Metric = Metric::gauge(
     "ros2probe_queued_bytes",
     &[],
-    "Bytes of messages that wait in the queues of subscriptions, half of limits.payload_bytes at most; what is put together is in the table payloads.",
+    "Bytes of messages waiting in the queues of subscriptions, at most half of \
+     limits.payload_bytes; messages being reassembled are in the table payloads.",
 )
 .unit("bytes");
 
 pub(in crate::surface) const SAMPLES_RETAINED: Metric = Metric::gauge(
     "ros2probe_retained_bytes",
     &[],
-    "Bytes of last messages that are kept for recordings that begin later (watches with retain: last), 4 MiB at most.",
+    "Bytes of last messages kept for later recordings (watches with retain: last), at most 4 MiB.",
 )
 .unit("bytes");
 pub(in crate::surface) const RECORDINGS: Metric = Metric::gauge(
@@ -263,7 +277,8 @@ pub(in crate::surface) const RECORDED_BYTES: Metric = Metric::counter(
 pub(in crate::surface) const RECORDINGS_MISSING: Metric = Metric::counter(
     "ros2probe_recordings_missing_messages_total",
     &[],
-    "Messages that were sent and are in no bag although they were to be: incomplete on the wire, lost on the way, or dropped because the storage was too slow.",
+    "Messages sent but missing in a bag: incomplete on the wire, not captured, or dropped \
+     because the storage was too slow.",
 );
 pub(in crate::surface) const SNAPSHOT_MESSAGES: Metric = Metric::gauge(
     "ros2probe_snapshot_messages",
@@ -279,7 +294,8 @@ pub(in crate::surface) const SNAPSHOT_BYTES: Metric = Metric::gauge(
 pub(in crate::surface) const SNAPSHOT_CROWDED_OUT: Metric = Metric::counter(
     "ros2probe_snapshot_crowded_out_messages_total",
     &["snapshot"],
-    "Messages that were young enough for a snapshot and had to go for want of room: above 0, it is shorter than its seconds.",
+    "Messages evicted from a snapshot's memory before its time span; above 0, the snapshot is \
+     shorter than configured.",
 );
 pub(in crate::surface) const SNAPSHOTS_WRITTEN: Metric = Metric::counter(
     "ros2probe_snapshots_written_total",
@@ -291,12 +307,16 @@ pub(in crate::surface) const SNAPSHOTS_FAILED: Metric = Metric::counter(
     &["snapshot"],
     "Bags of a snapshot that could not be written.",
 );
-pub(in crate::surface) const EVENTS: Metric =
-    Metric::counter("ros2probe_events_total", &["name"], "Events told, by name.");
+pub(in crate::surface) const EVENTS: Metric = Metric::counter(
+    "ros2probe_events_total",
+    &["name"],
+    "Events emitted, by name.",
+);
 pub(in crate::surface) const EVENTS_DROPPED: Metric = Metric::counter(
     "ros2probe_events_dropped_total",
     &["reason"],
-    "Events only counted in a storm, or overwritten before a slow reader came to them: a stream of /events, or the sender of log records.",
+    "Events counted but not emitted in a storm, or overwritten before a slow reader (a stream of \
+     /events, or the sender of log records) read them.",
 );
 pub(in crate::surface) const LOG_LINES_LOST: Metric = Metric::counter(
     "ros2probe_log_lines_lost_total",

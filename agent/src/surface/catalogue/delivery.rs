@@ -42,32 +42,34 @@ pub(in crate::surface) const TOPIC_DELIVERED_BYTES: Metric = Metric::counter(
 pub(in crate::surface) const TOPIC_DELIVERY_LOST: Metric = Metric::counter(
     "ros2_topic_delivery_lost_messages_total",
     &["domain_id", "topic", "cause"],
-    "Messages that a receiver on this host never got, by where they died: before_host, reassembly or socket_buffer.",
+    "Messages that a receiver on this host never got, by where they were lost: before_host, \
+     reassembly or socket_buffer.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_PENDING: Metric = Metric::gauge(
     "ros2_topic_delivery_pending_messages",
     TOPIC,
-    "Messages that are lost too, but it takes the kernel up to 35 s to say where.",
+    "Lost messages whose place of loss the kernel reports only after up to 35 s.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_RECOVERED: Metric = Metric::counter(
     "ros2_topic_delivery_recovered_messages_total",
     TOPIC,
-    "Delivered messages that were missing first and came by retransmission.",
+    "Delivered messages that were missing at first and were repaired by retransmission.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_IRRELEVANT: Metric = Metric::counter(
     "ros2_topic_delivery_irrelevant_messages_total",
     TOPIC,
-    "Messages that the writer left out (GAP), or that the reader acknowledged unseen: no losses.",
+    "Messages that their writer declared irrelevant (GAP) or that the reader acknowledged unseen; not losses.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_UNMATCHED: Metric = Metric::counter(
     "ros2_topic_delivery_unmatched_messages_total",
     TOPIC,
-    "Messages that arrived where no reader of the topic is: delivered to nobody.",
+    "Messages that arrived at a socket without a reader of the topic.",
 );
 pub(in crate::surface) const TOPIC_LAG: Metric = Metric::gauge(
     "ros2_topic_acknowledgement_lag_messages",
     TOPIC,
-    "Messages that the slowest reliable reader has not acknowledged; some writers ask for it seldom while nothing is missing.",
+    "Messages that the slowest reliable reader has not acknowledged; some writers rarely request \
+     acknowledgements while none is missing.",
 );
 pub(in crate::surface) const TOPIC_LAG_SECONDS: Metric = Metric::gauge(
     "ros2_topic_acknowledgement_lag_seconds",
@@ -84,13 +86,14 @@ pub(in crate::surface) const TOPIC_SEND_DELAY: Metric = Metric::histogram(
 pub(in crate::surface) const TOPIC_TRANSIT: Metric = Metric::histogram(
     "ros2_topic_transit_seconds",
     TOPIC,
-    "From leaving to arriving, last datagram to last datagram, where both happen on this host; one value for each receiver.",
+    "Time from sending to arrival, last datagram to last datagram, if both are on this host; one \
+     value for each receiver.",
 )
 .unit("seconds");
 pub(in crate::surface) const TOPIC_TRANSFER: Metric = Metric::histogram(
     "ros2_topic_transfer_seconds",
     TOPIC,
-    "From the first to the last datagram of a message that came in several.",
+    "Time from the first to the last datagram of a message of several datagrams.",
 )
 .unit("seconds");
 pub(in crate::surface) const TOPIC_RETRANSMISSION: Metric = Metric::histogram(
@@ -127,7 +130,8 @@ pub(in crate::surface) const SUBSCRIBER_INFO: Metric = Metric::info(
         "pid",
         "cgroup",
     ],
-    "Who receives: nodes with readers of the topic, participant, and process and control group of the socket where they can be had.",
+    "Receivers: nodes with readers of the topic, participant, and process and control group of \
+     the socket if known.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_RECEIVED: Metric = Metric::counter(
@@ -146,25 +150,25 @@ pub(in crate::surface) const SUBSCRIBER_RECEIVED_BYTES: Metric = Metric::counter
 pub(in crate::surface) const SUBSCRIBER_LOST: Metric = Metric::counter(
     "ros2_subscriber_lost_messages_total",
     SUBSCRIBER_CAUSE,
-    "Messages of a writer that this receiver never got, by where they died.",
+    "Messages of a writer that this receiver never got, by where they were lost.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_PENDING: Metric = Metric::gauge(
     "ros2_subscriber_pending_messages",
     SUBSCRIBER,
-    "Messages that are lost too, while it is not known where.",
+    "Lost messages whose place of loss is not known yet.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_RECOVERED: Metric = Metric::counter(
     "ros2_subscriber_recovered_messages_total",
     SUBSCRIBER,
-    "Received messages that came by retransmission.",
+    "Received messages that were retransmitted.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_RECOVERY_SECONDS: Metric = Metric::counter(
     "ros2_subscriber_recovery_seconds_total",
     SUBSCRIBER,
-    "Time for which those were missing, summed.",
+    "Total time for which those were missing.",
 )
 .unit("seconds")
 .experimental();
@@ -196,18 +200,19 @@ pub(in crate::surface) const READER_LAG_SECONDS: Metric = Metric::gauge(
 pub(in crate::surface) const READER_MISSING: Metric = Metric::gauge(
     "ros2_reader_missing_messages",
     READER,
-    "Messages that the reader asked for in its last ACKNACK.",
+    "Messages that the reader requested in its last ACKNACK.",
 )
 .experimental();
 pub(in crate::surface) const READER_REQUESTED: Metric = Metric::counter(
     "ros2_reader_requested_messages_total",
     READER,
-    "Messages that the reader asked for again, every request counted.",
+    "Messages that the reader requested again, every request counted.",
 )
 .experimental();
 pub(in crate::surface) const SOCKET_DROPS: Metric = Metric::counter(
     "ros2_socket_unidentified_drops_total",
     &["socket", "process", "pid", "cgroup"],
-    "Datagrams that a socket had no room for and of which it is not known what they held; for the first 64 sockets with any.",
+    "Datagrams of unknown content dropped by a full socket buffer; for the first 64 sockets with \
+     any.",
 )
 .experimental();

@@ -5,7 +5,7 @@ use super::{Metric, TOPIC};
 pub(in crate::surface) const DIAGNOSES: Metric = Metric::gauge(
     "ros2_diagnoses",
     &["kind"],
-    "Findings about the graph of each kind, also while there is none; /topics names them.",
+    "Findings about the graph by kind, 0 included; /topics lists them.",
 );
 pub(in crate::surface) const QOS_INCOMPATIBLE_PAIRS: Metric = Metric::gauge(
     "ros2_qos_incompatible_pairs",
@@ -25,17 +25,17 @@ pub(in crate::surface) const TOPIC_CONFLICTING_TYPE_HASHES: Metric = Metric::gau
 pub(in crate::surface) const UNHEARD_PUBLISHERS: Metric = Metric::gauge(
     "ros2_topic_unheard_publishers",
     TOPIC,
-    "Publishers that have had no matching subscriber for 5 s; not on /rosout and the like.",
+    "Publishers without a matching subscriber for 5 s, except on /rosout and similar topics.",
 );
 pub(in crate::surface) const UNFED_SUBSCRIPTIONS: Metric = Metric::gauge(
     "ros2_topic_unfed_subscriptions",
     TOPIC,
-    "Subscriptions that have had no matching publisher for 5 s; not on /rosout and the like.",
+    "Subscriptions without a matching publisher for 5 s, except on /rosout and similar topics.",
 );
 pub(in crate::surface) const DUPLICATE_NODES: Metric = Metric::gauge(
     "ros2_duplicate_nodes",
     &["domain_id", "ros_node"],
-    "Nodes of one name in one domain, where there are several.",
+    "Nodes that share one name in one domain.",
 );
 pub(in crate::surface) const NODE_DOMAINS: Metric = Metric::gauge(
     "ros2_node_domains",

@@ -122,7 +122,7 @@ pub(super) const PARTICIPANT_DISCOVERED: Definition = Definition::new(
     "ros2.participant.discovered",
     Severity::Info,
     PARTICIPANT,
-    "A participant announced itself for the first time, or again after it was gone.",
+    "A participant announced itself for the first time, or again after leaving.",
 );
 pub(super) const PARTICIPANT_CHANGED: Definition = Definition::new(
     "ros2.participant.changed",
@@ -134,7 +134,7 @@ pub(super) const PARTICIPANT_LOST: Definition = Definition::new(
     "ros2.participant.lost",
     Severity::Warn,
     PARTICIPANT_GONE,
-    "A participant went: its lease expired, or (INFO) it said goodbye, cause disposed.",
+    "A participant left: its lease expired, or (INFO) it said goodbye, cause disposed.",
 )
 .relief(Severity::Info);
 pub(super) const ENDPOINT_DISCOVERED: Definition = Definition::new(
@@ -192,7 +192,7 @@ pub(super) const TOPIC_SILENT: Definition = Definition::new(
     "ros2.topic.silent",
     Severity::Warn,
     &["domain_id", "topic", "watch", "last_message_seconds_ago"],
-    "A watched topic has publishers, but nothing came for longer than max_silence_s.",
+    "A watched topic has publishers, but no message for longer than max_silence_s.",
 );
 pub(super) const QOS_INCOMPATIBLE: Definition = Definition::new(
     "ros2.qos.incompatible",
@@ -204,33 +204,35 @@ pub(super) const QOS_RESOLVED: Definition = Definition::new(
     "ros2.qos.resolved",
     Severity::Info,
     QOS,
-    "They talk now, or one of them has gone.",
+    "They match now, or one of them is gone.",
 );
 pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "ros2.graph.diagnosed",
     Severity::Warn,
     FINDING,
-    "Something else is wrong with the graph, as `diagnosis` says: type_conflict, type_hash_conflict, duplicate_node, node_in_several_domains, or (INFO) unheard_publisher, unfed_subscriber.",
+    "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
+     duplicate_node, node_in_several_domains, or (INFO) unheard_publisher, unfed_subscriber.",
 )
 .relief(Severity::Info);
 pub(super) const GRAPH_RESOLVED: Definition = Definition::new(
     "ros2.graph.resolved",
     Severity::Info,
     FINDING,
-    "It is not so any more; the attributes say how it was.",
+    "The fault is gone; the attributes describe how it was.",
 );
 
 pub(super) const STARTED: Definition = Definition::new(
     "ros2probe.agent.started",
     Severity::Info,
     &["version", "source"],
-    "The agent started: ids begin anew.",
+    "The agent started; event ids start again.",
 );
 pub(super) const CAPTURE_DROPPED: Definition = Definition::new(
     "ros2probe.capture.dropped",
     Severity::Error,
     &["what", "count"],
-    "The agent lost packets, records or datagrams for want of room, or could not look at them: what it tells is a lower bound.",
+    "The agent lost packets, records or datagrams because a buffer was full, or could not parse \
+     them; its figures are lower bounds.",
 );
 pub(super) const CAPTURE_BLIND: Definition = Definition::new(
     "ros2probe.capture.blind",
@@ -254,7 +256,7 @@ pub(super) const CONFIG_REFUSED: Definition = Definition::new(
     "ros2probe.config.reload_failed",
     Severity::Error,
     &["error"],
-    "A configuration was refused; the one before stays in force.",
+    "A configuration was refused; the previous one stays in force.",
 );
 pub(super) const RECORDING_STARTED: Definition = Definition::new(
     "ros2probe.recording.started",
@@ -266,33 +268,33 @@ pub(super) const RECORDING_ENDED: Definition = Definition::new(
     "ros2probe.recording.ended",
     Severity::Error,
     &["recording", "messages", "missing", "reason"],
-    "A bag is complete; with a reason where the storage took no more.",
+    "A bag is complete; with a reason if the storage failed.",
 )
 .relief(Severity::Info);
 pub(super) const SNAPSHOT_TAKEN: Definition = Definition::new(
     "ros2probe.snapshot.taken",
     Severity::Error,
     &["snapshot", "recording", "messages", "reason"],
-    "What came before an incident is in a bag; with a reason where it could not be written.",
+    "The messages before an incident are in a bag; with a reason if writing failed.",
 )
 .relief(Severity::Info);
 pub(super) const WATCH_ADDED: Definition = Definition::new(
     "ros2probe.watch.added",
     Severity::Info,
     &["watch", "watch_domain_id"],
-    "Somebody asked through the API for a topic to be watched, or to be watched otherwise.",
+    "A client added or changed a watch through the API.",
 );
 pub(super) const WATCH_REMOVED: Definition = Definition::new(
     "ros2probe.watch.removed",
     Severity::Info,
     &["watch", "watch_domain_id"],
-    "Somebody ended a watch through the API.",
+    "A client removed a watch through the API.",
 );
 pub(super) const SUPPRESSED: Definition = Definition::new(
     "ros2probe.events.suppressed",
     Severity::Warn,
     &["event", "count"],
-    "So many events of one name, or of a group of names, came in a second that the rest of them is only counted.",
+    "Too many events of one name or group in a second; the rest are only counted.",
 );
 
 /// All of them.

@@ -192,7 +192,7 @@ impl Client {
                 endpoint = %self.target.endpoint,
                 code = ?status.code(),
                 reason = status.message(),
-                "the OTLP receiver does not take what is exported"
+                "the OTLP receiver refuses the export"
             );
         }
     }

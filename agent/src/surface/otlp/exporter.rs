@@ -77,7 +77,7 @@ impl Exporter {
         if timeout(ENDING, self.ended).await.is_err() {
             tracing::warn!("the last export did not end in time");
         } else if self.thread.join().is_err() {
-            tracing::error!("the exporting thread died");
+            tracing::error!("the exporting thread panicked");
         }
     }
 }

@@ -60,7 +60,7 @@ pub enum SettingsError {
     )]
     NoTls(String),
     /// A header that cannot be sent.
-    #[error("{place}: `{name}` is no header that can be sent: names are lower case, values ASCII")]
+    #[error("{place}: `{name}` is not a valid header: names are lower case, values ASCII")]
     Header {
         /// Where it is written.
         place: String,
