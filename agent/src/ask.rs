@@ -35,10 +35,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
         1 => "1 participant".to_owned(),
         count => format!("{count} participants"),
     };
-    writeln!(
-        out,
-        "{heard} heard in up to {seconds} s of listening; nothing was sent"
-    )?;
+    writeln!(out, "{heard} heard within {seconds} s; nothing was sent")?;
     let mut targets = Vec::new();
     for participant in &participants {
         let described = describe(participant);
@@ -51,7 +48,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
         }
     }
     if options.participant.is_some() && targets.is_empty() {
-        bail!("this participant cannot be asked, or was not heard");
+        bail!("this participant was not heard or cannot be asked");
     }
     if !options.all && options.participant.is_none() {
         writeln!(out, "to ask, name one with --participant, or --all")?;
@@ -64,7 +61,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     }
     if failed > 0 {
         bail!(
-            "{failed} of {} participants did not tell all",
+            "{failed} of {} participants answered only in part",
             targets.len()
         );
     }
@@ -149,7 +146,7 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
     }
     // What will be sent is said before it is sent.
     out.flush()?;
-    let took = converse(&mut session, &socket).context("goodbye may not have been said")?;
+    let took = converse(&mut session, &socket).context("the goodbye may not have been sent")?;
     report(&session, took, out)
 }
 

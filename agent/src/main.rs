@@ -280,8 +280,10 @@ fn open(options: &cli::Run, config: &Config) -> Result<Source> {
 fn announce(identity: Identity) {
     match identity {
         Identity::AsStarted => {}
-        Identity::Own => tracing::info!("root no longer: now the user ros2probe"),
-        Identity::Root(reason) => tracing::info!(reason, "still root, without capabilities"),
+        Identity::Own => tracing::info!("switched from root to user ros2probe"),
+        Identity::Root(reason) => {
+            tracing::info!("running as root with capabilities dropped ({reason})");
+        }
     }
 }
 

@@ -59,12 +59,12 @@ pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
         }
         Loaded::Known(memory) => {
             let participants = memory.participants.len();
-            tracing::info!(%path, participants, "known from before, until confirmed");
+            tracing::info!(%path, participants, "restored from saved state, awaiting confirmation");
             Some(memory)
         }
         Loaded::Nothing => None,
         Loaded::AnotherBoot => {
-            tracing::info!(%path, "the state is of another boot and not used");
+            tracing::info!(%path, "the state is from another boot and is ignored");
             None
         }
         Loaded::Unusable { reason, aside } => {
@@ -87,8 +87,8 @@ fn left_alone(newer: &Newer) {
         path = %path.display(),
         version,
         known,
-        "a newer rp wrote this state: it is left to that one, and this one starts without it and \
-         keeps nothing there; upgrade rp, or remove the file"
+        "a newer rp wrote this state: starting without it and leaving the file untouched; \
+         upgrade rp, or remove the file"
     );
 }
 
@@ -119,7 +119,8 @@ fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
             return None;
         }
         Kept::These(watches) => {
-            tracing::info!(%path, watches = watches.len(), "watched again, as clients had asked");
+            tracing::info!(%path, watches = watches.len(), "restored the watches that clients \
+                added");
             watches
         }
         Kept::Unusable { reason, aside } => {

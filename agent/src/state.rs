@@ -254,7 +254,7 @@ impl StateDirectory {
                 Ok(document) => Found::This(document),
                 Err(error) => self.set_aside(file, error.to_string()),
             },
-            None => self.set_aside(file, format!("there is no version {version} of it")),
+            None => self.set_aside(file, format!("version {version} is not supported")),
         }
     }
 
@@ -453,7 +453,7 @@ mod tests {
             unusable(&directory);
         }
         fs::write(&file, r#"{"version": 0, "boot": {}, "clouds": []}"#).unwrap();
-        assert_eq!(unusable(&directory), "there is no version 0 of it");
+        assert_eq!(unusable(&directory), "version 0 is not supported");
         let aside = fs::read_to_string(place.path().join("discovery.json.corrupt")).unwrap();
         assert!(aside.contains("clouds"));
         directory.write(Memory::default()).unwrap();

@@ -127,11 +127,11 @@ impl Supervisor {
                     match ended {
                         Ok(Ok(())) if once => break Ok("end of capture"),
                         Ok(Ok(())) => {
-                            tracing::info!("the capture has ended, its final state stays");
+                            tracing::info!("the capture has ended; its final state remains");
                         }
                         Ok(Err(error)) => break Err(error.into()),
                         // Its sender went without a word: the panic is in the log.
-                        Err(_) => break Err(anyhow!("the working thread died")),
+                        Err(_) => break Err(anyhow!("the working thread panicked")),
                     }
                 }
                 _ = tick.tick() => {
@@ -152,7 +152,7 @@ impl Supervisor {
         });
         let drained = drained.await.is_ok();
         if drained && worker.thread.join().is_err() {
-            tracing::error!("the working thread died while ending");
+            tracing::error!("the working thread panicked while shutting down");
         }
         // After the working thread, whose last state it exports.
         if let Some(exporter) = self.exporter.take() {
@@ -263,7 +263,7 @@ impl Worker {
     /// Works until the capture ends.
     pub(crate) fn finish(self, run: Run) -> Result<()> {
         let ended = self.begin(run).ended.blocking_recv();
-        Ok(ended.map_err(|_| anyhow!("the working thread died"))??)
+        Ok(ended.map_err(|_| anyhow!("the working thread panicked"))??)
     }
 
     fn begin(self, run: Run) -> Working {

@@ -600,7 +600,7 @@ fn without_the_kernels_types_full_sockets_are_told_as_long_as_every_socket_is_se
     let one_cgroup = Observed::with(&settings);
     let abilities = one_cgroup.filter.inside().unwrap().abilities();
     let reason = abilities.socket_losses.clone().unwrap_err();
-    assert!(reason.contains("only one cgroup"), "{reason}");
+    assert!(reason.contains("limited to one cgroup"), "{reason}");
     assert!(abilities.owners.is_err() && abilities.reassembly_losses.is_err());
 
     let mut filter = Filter::load_host(&settings).unwrap();

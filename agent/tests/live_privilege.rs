@@ -179,7 +179,10 @@ fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> 
         "{files:?}"
     );
     let log = std::fs::read_to_string(log)?;
-    ensure!(log.contains("root no longer"), "{log}");
+    ensure!(
+        log.contains("switched from root to user ros2probe"),
+        "{log}"
+    );
     Ok(())
 }
 

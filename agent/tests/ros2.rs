@@ -140,13 +140,13 @@ fn who_cannot_be_asked_is_said_in_one_line() {
     fails_with(&ask(&closed.unwrap().to_string()), "connection refused");
     fails_with(
         &ask(&answering(b"SSH-2.0-OpenSSH_9.6\r\n")),
-        "is no ros2probe agent",
+        "is not a ros2probe agent",
     );
     let page = b"HTTP/1.1 404 Not Found\r\ncontent-length: 4\r\n\r\noops";
-    fails_with(&ask(&answering(page)), "is no ros2probe agent");
+    fails_with(&ask(&answering(page)), "is not a ros2probe agent");
     let problem = b"HTTP/1.1 404 Not Found\r\nconnection: close\r\n\r\n\
         {\"type\":\"urn:ros2probe:problem:not-found\",\"detail\":\"\"}";
-    fails_with(&ask(&answering(problem)), "does not know /names");
+    fails_with(&ask(&answering(problem)), "has no /names");
     let problem = b"HTTP/1.1 401 Unauthorized\r\nconnection: close\r\n\r\n\
         {\"type\":\"urn:ros2probe:problem:unauthorized\",\"detail\":\"\"}";
     fails_with(&ask(&answering(problem)), "`--token-file FILE`");

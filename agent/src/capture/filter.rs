@@ -39,7 +39,7 @@ pub enum FilterError {
     #[error("loading the kernel filter is not permitted")]
     NotPermitted(#[source] io::Error),
     /// There is no such system call.
-    #[error("there is no BPF here: not in this kernel, or not in what emulates this processor")]
+    #[error("BPF is not available: not supported by this kernel or emulator")]
     NoBpf(#[source] io::Error),
     /// The object does not load.
     #[error("the kernel filter does not load")]

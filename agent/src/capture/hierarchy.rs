@@ -20,7 +20,7 @@ pub enum HierarchyError {
     #[error("cannot read {MOUNTS}")]
     Mounts(#[source] io::Error),
     /// Only v1, or nothing.
-    #[error("no control group hierarchy v2 is mounted: `mount -t cgroup2 none /sys/fs/cgroup`")]
+    #[error("no cgroup v2 hierarchy is mounted: `mount -t cgroup2 none /sys/fs/cgroup`")]
     NotMounted,
     /// The directory.
     #[error("cannot open the control group {}", path.display())]

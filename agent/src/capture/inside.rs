@@ -194,7 +194,7 @@ fn socket_losses(
 ) -> Result<Vec<RawTracePointLink>, String> {
     if !whole_host && let Err(reason) = places.need(&[Layout::SocketCookie]) {
         // A socket that the hook does not see could be taken for one that it does.
-        return Err(format!("only one cgroup is looked at, and {reason}"));
+        return Err(format!("limited to one cgroup, and {reason}"));
     }
     let mut links = vec![tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")?];
     if release().is_none_or(|release| release < TELLS_IPV6) {

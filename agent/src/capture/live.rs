@@ -177,7 +177,7 @@ impl LiveSource {
             && let Err(error) = exact.start()
         {
             let reason = in_words(&error);
-            tracing::warn!(reason, "libraries that come later are not attached to");
+            tracing::warn!(reason, "uprobes are not attached to libraries loaded later");
         }
         self.start_shared_memory();
     }
@@ -465,7 +465,7 @@ impl LiveSource {
             Ok(running) => Shm::Running(running),
             Err(error) => {
                 let reason = in_words(&error);
-                tracing::warn!(reason, "shared memory is not looked at");
+                tracing::warn!(reason, "shared memory is not read");
                 Shm::Off
             }
         };

@@ -120,7 +120,7 @@ impl Sockets {
             && !self.failed
         {
             self.failed = true;
-            tracing::warn!(%error, "it is no longer known who holds which socket");
+            tracing::warn!(%error, "socket owners are no longer known");
         }
         found.ok()
     }

@@ -133,7 +133,7 @@ impl WireTap {
             self.identity = None;
             tracing::warn!(
                 namespace = %path.display(),
-                "the network namespace was removed or replaced: restart to look into what is there now"
+                "the network namespace was removed or replaced: restart to observe the current one"
             );
         }
     }

@@ -22,7 +22,7 @@ pub(crate) struct Action {
 enum Verb {
     /// Print a list of actions
     List(List),
-    /// Print who serves and who calls an action
+    /// Print the servers and clients of an action
     Info(Info),
     /// Print an action's type
     Type(Type),
@@ -37,7 +37,7 @@ struct List {
     /// Also print the actions' types
     #[arg(short = 't', long)]
     show_types: bool,
-    /// Only print how many actions there are
+    /// Only print the number of actions
     #[arg(short = 'c', long)]
     count_actions: bool,
     #[command(flatten)]
@@ -51,7 +51,7 @@ struct Info {
     /// Also print the action's type
     #[arg(short = 't', long)]
     show_types: bool,
-    /// Only print how many serve and call it
+    /// Only print the number of its servers and clients
     #[arg(short = 'c', long)]
     count: bool,
     #[command(flatten)]
@@ -70,7 +70,7 @@ struct Type {
 struct Find {
     /// The type, as example_interfaces/action/Fibonacci
     action_type: String,
-    /// Only print how many actions there are
+    /// Only print the number of actions
     #[arg(short = 'c', long)]
     count_actions: bool,
     #[command(flatten)]

@@ -48,7 +48,7 @@ struct Info {
     /// Only display topic names
     #[arg(short, long)]
     topic_name: bool,
-    /// Read all messages, and say what topics, services and actions take up
+    /// Read all messages and print the size of topics, services and actions
     #[arg(short, long)]
     verbose: bool,
     /// Sort topics, services and actions by this

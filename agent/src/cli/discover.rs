@@ -8,17 +8,17 @@ use ros2probe_wire::GuidPrefix;
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
-An agent that was started after the robot knows who is there, but not what they called their topics
-and nodes: that is said once. This command finds the participants by listening, prints what it will
-send, and asks: at most 6 packets for each, to it alone, from a participant of a few milliseconds
-that says goodbye. A running agent on this host sees the answers too. With neither --participant
-nor --all it lists whom it could ask.
+An agent started after the robot knows the participants, but not their topics and nodes, which are
+announced only once. This command finds participants by listening, prints what it will send, and
+requests the announcements again: at most 6 unicast packets for each, from a participant that lives
+for a few milliseconds and says goodbye. A running agent on this host sees the answers too. Without
+--participant and --all it lists the participants.
 Participants with DDS security are not asked. Needs the same capabilities as `rp run`.
 Exit codes: 0 all answered, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
 
 Examples:
-  sudo rp discover --all --dry-run                what would be sent to whom
-  sudo rp discover --all                          everybody
+  sudo rp discover --all --dry-run                print what would be sent
+  sudo rp discover --all                          all participants
   sudo rp discover --participant 010f1a2b3c4d5e6f00000000")]
 pub(crate) struct Discover {
     /// Only participants of this domain
@@ -30,10 +30,10 @@ pub(crate) struct Discover {
     /// Ask every participant that is heard
     #[arg(long)]
     pub(crate) all: bool,
-    /// Print what would be sent, and send nothing
+    /// Print what would be sent, but send nothing
     #[arg(long)]
     pub(crate) dry_run: bool,
-    /// Ask for endpoints alone: one packet less
+    /// Request endpoints only: one packet less
     #[arg(long)]
     pub(crate) no_nodes: bool,
     /// Listen on the wire of this interface instead of at the host's sockets

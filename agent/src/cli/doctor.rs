@@ -19,14 +19,14 @@ use super::{DEFAULT_CONFIG, Output};
 /// `rp doctor`.
 #[derive(Args, Debug)]
 #[command(after_help = "\
-It looks at the kernel, privileges, interfaces, ROS variables and processes, buffers and the clock of
-this host, and asks the agent, if one runs, for what it sees. It changes nothing. Where no agent runs
-and it may, it loads the agent's kernel programs for a moment to see whether the kernel takes them.
-What this user may not look at is `unknown`, with the command that looks: mostly `sudo rp doctor`.
-With --host it tells about that agent and its graph alone, with --replay about the capture's graph.
-Without --domain every domain is told about, whatever ROS_DOMAIN_ID says.
+It checks the kernel, privileges, interfaces, ROS variables and processes, buffers and the clock of
+this host, and asks the agent, if one is running, what it sees. It changes nothing. If no agent is
+running and privileges allow, it briefly loads the agent's kernel programs to test the kernel.
+Checks that this user may not do are `unknown`, with the command for them: mostly `sudo rp doctor`.
+With --host it reports only on that agent and its graph, with --replay on the capture's graph.
+Without --domain it reports on every domain, whatever ROS_DOMAIN_ID is.
 Verdicts: ok, note (by choice, or good to know), unknown, warning (something will be missing or
-wrong), problem (broken). A line with `>` is what to do: a command, or a line of the configuration.
+wrong), problem (broken). A line with `>` is the remedy: a command, or a line of the configuration.
 Exit codes: 0 no problem (warnings are none), 1 a problem, or no answer with --host, 2 wrong usage.
 
 Examples:
@@ -38,7 +38,7 @@ pub(crate) struct Doctor {
     /// Print JSON: one object, for fleets
     #[arg(long)]
     json: bool,
-    /// Also show what each line rests on where all is fine
+    /// Also show the evidence of lines without a problem
     #[arg(short, long, conflicts_with = "json")]
     verbose: bool,
     /// Configuration file of the agent; when left out, /etc/ros2probe/ros2probe.yaml if there is one

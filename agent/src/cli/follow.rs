@@ -32,16 +32,16 @@ pub(crate) struct Printing {
     /// Print all elements of arrays and all of strings
     #[arg(long, short = 'f')]
     full_length: bool,
-    /// Print so many elements of arrays and characters of strings, then `...`
+    /// Print at most this many elements of arrays and characters of strings, then `...`
     #[arg(long, short = 'l', value_name = "N", default_value_t = 128)]
     truncate_length: usize,
-    /// Print of arrays only type and length
+    /// Print only type and length of arrays
     #[arg(long)]
     no_arr: bool,
-    /// Print of strings only the length
+    /// Print only the length of strings
     #[arg(long)]
     no_str: bool,
-    /// Print YAML in one line
+    /// Print sequences in YAML flow style
     #[arg(long)]
     flow_style: bool,
     /// Directory that has definitions as package/msg/Type.msg; may be repeated. Looked at before

@@ -70,17 +70,17 @@ pub(crate) enum Command {
 pub(crate) enum Question {
     /// Recordings on disk, as `ros2 bag` makes and reads them
     Bag(bag::Bag),
-    /// What topics there are and what comes by them, as `ros2 topic` says
+    /// List, inspect and measure topics, as `ros2 topic` does
     Topic(topic::Topic),
-    /// What nodes there are and what they do, as `ros2 node` says
+    /// List and inspect nodes, as `ros2 node` does
     Node(node::Node),
-    /// What services there are, as `ros2 service` says
+    /// List and inspect services, as `ros2 service` does
     Service(service::Service),
-    /// What actions there are, as `ros2 action` says
+    /// List and inspect actions, as `ros2 action` does
     Action(action::Action),
-    /// Say what this host will show and what not, and what to do about it
+    /// Check what is visible on this host and what is not, with remedies
     Doctor(doctor::Doctor),
-    /// Show a robot's topics live in the terminal: rates, losses, latencies, what is wrong
+    /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
     Top(top::Top),
 }
 

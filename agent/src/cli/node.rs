@@ -21,7 +21,7 @@ pub(crate) struct Node {
 enum Verb {
     /// Print a list of nodes
     List(List),
-    /// Print what a node publishes, subscribes to, serves and calls
+    /// Print a node's publishers, subscriptions, services and actions
     Info(Info),
 }
 
@@ -30,7 +30,7 @@ struct List {
     /// Also print hidden nodes
     #[arg(short = 'a', long)]
     all: bool,
-    /// Only print how many nodes there are
+    /// Only print the number of nodes
     #[arg(short = 'c', long)]
     count_nodes: bool,
     #[command(flatten)]

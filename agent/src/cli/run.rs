@@ -10,12 +10,12 @@ use ros2probe::config::Watch;
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Signals: SIGHUP reads the configuration again, SIGTERM and SIGINT end the agent.
-Exit codes: 0 ended as asked, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
+Exit codes: 0 ended on request, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
 RUST_LOG, read at the start, overrides the configured log level.
 
 Examples:
   sudo rp run                                     observe this host
-  rp run --replay robot.pcap.gz --report          what was on the wire, as metrics on stdout
+  rp run --replay robot.pcap.gz --report          print the capture's metrics to stdout
   rp run --replay robot.pcap --watch '/camera/**' --metrics 127.0.0.1:9400")]
 pub(crate) struct Run {
     /// Configuration file; when left out, /etc/ros2probe/ros2probe.yaml if there is one

@@ -29,9 +29,9 @@ enum Verb {
     Type(Type),
     /// Print services of a type
     Find(Find),
-    /// Print a service's type and how many serve and call it
+    /// Print a service's type and the number of its servers and clients
     Info(Info),
-    /// Print what a service's introspection tells of its requests and responses
+    /// Print a service's requests and responses from its introspection
     Echo(Box<ServiceEcho>),
 }
 
@@ -40,7 +40,7 @@ struct List {
     /// Also print the services' types
     #[arg(short = 't', long)]
     show_types: bool,
-    /// Only print how many services there are
+    /// Only print the number of services
     #[arg(short = 'c', long)]
     count_services: bool,
     /// Consider hidden services as well
@@ -64,7 +64,7 @@ struct Type {
 struct Find {
     /// The type, as rcl_interfaces/srv/ListParameters
     service_type: String,
-    /// Only print how many services there are
+    /// Only print the number of services
     #[arg(short = 'c', long)]
     count_services: bool,
     /// Consider hidden services as well

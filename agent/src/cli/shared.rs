@@ -21,7 +21,7 @@ pub(crate) struct Spinning {
     /// Accepted without effect
     #[arg(long, short = 's')]
     use_sim_time: bool,
-    /// Accepted without effect: there is no daemon
+    /// Accepted without effect: rp uses no daemon
     #[arg(long)]
     no_daemon: bool,
 }
@@ -29,7 +29,7 @@ pub(crate) struct Spinning {
 /// Quality of service of the original's own subscription; accepted, so that scripts go on working.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Matching {
-    /// Accepted without effect, as all options of quality of service: there is no subscription
+    /// Accepted without effect, as all QoS options: rp does not subscribe
     #[arg(long, value_name = "PROFILE")]
     qos_profile: Option<String>,
     #[arg(long, value_name = "N", hide = true)]
@@ -113,7 +113,7 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
     let others: Vec<String> = others.map(u32::to_string).collect();
     if names.is_empty() && !others.is_empty() {
         eprintln!(
-            "rp: nothing is in domain {domain_id}; the agent sees domain {}: pass `--domain N`",
+            "rp: domain {domain_id} is empty; the agent sees domain {}: pass `--domain N`",
             others.join(", ")
         );
     }

@@ -21,7 +21,7 @@ Without --domain it shows all domains. Keys: press ? in it. NO_COLOR and the loc
 Topics that are not watched are not measured: w has the selected one measured until rp top ends.
 
 Examples:
-  rp top                                  what the robot's topics do, live
+  rp top                                  the robot's topics, live
   rp top --sort loss --filter camera
   ssh robot rp top --once --problems      one table as text
   rp top --replay robot.pcap.gz           the same from a capture")]
@@ -32,7 +32,7 @@ pub(crate) struct Top {
     /// Sort by this
     #[arg(long, value_enum, value_name = "COLUMN", default_value_t = Column::Name)]
     sort: Column,
-    /// Sort the other way round
+    /// Reverse the order
     #[arg(long)]
     reverse: bool,
     /// Show only topics with this in name, type or state
@@ -49,7 +49,7 @@ pub(crate) struct Top {
     /// Also show hidden topics and those of services
     #[arg(long)]
     hidden: bool,
-    /// Ask the agent so often
+    /// Interval between requests to the agent
     #[arg(long, value_name = "SECONDS", default_value = "1", value_parser = interval,
         conflicts_with = "once")]
     interval: Duration,

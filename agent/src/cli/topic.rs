@@ -27,19 +27,19 @@ pub(crate) struct Topic {
 enum Verb {
     /// Print a list of topics
     List(List),
-    /// Print a topic's type and who is at its ends
+    /// Print a topic's type and its endpoints
     Info(Info),
     /// Print a topic's type
     Type(Type),
     /// Print topics of a type
     Find(Find),
-    /// Print messages as they come
+    /// Print messages as they arrive
     Echo(Box<Echo>),
-    /// Print how often messages come
+    /// Print the rate of messages
     Hz(Hz),
-    /// Print how many bytes a second come
+    /// Print the bandwidth of messages
     Bw(Bandwidth),
-    /// Print how old messages are by the stamp in their header
+    /// Print the age of messages by the stamp in their header
     Delay(Delay),
 }
 
@@ -48,7 +48,7 @@ struct List {
     /// Also print the topics' types
     #[arg(short = 't', long)]
     show_types: bool,
-    /// Only print how many topics there are
+    /// Only print the number of topics
     #[arg(short = 'c', long)]
     count_topics: bool,
     /// Print types and numbers of publishers and subscribers
@@ -67,7 +67,7 @@ struct List {
 struct Info {
     /// Name of the topic, as /chatter
     topic_name: String,
-    /// Also print each end with its node, GID and quality of service
+    /// Also print each endpoint with its node, GID and QoS
     #[arg(short = 'v', long)]
     verbose: bool,
     #[command(flatten)]
@@ -90,7 +90,7 @@ struct Type {
 struct Find {
     /// The type, as std_msgs/msg/String
     topic_type: String,
-    /// Only print how many topics there are
+    /// Only print the number of topics
     #[arg(short = 'c', long)]
     count_topics: bool,
     /// Consider hidden topics as well

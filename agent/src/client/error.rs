@@ -12,8 +12,8 @@ use crate::capture::pcap::PcapError;
 pub enum ClientError {
     /// Nobody listens on this host.
     #[error(
-        "no agent runs here: start one with `sudo systemctl start ros2probe`, or in a terminal \
-         with `sudo rp run`; a capture is asked with `--replay FILE`"
+        "no agent is running here: start one with `sudo systemctl start ros2probe`, or in a \
+         terminal with `sudo rp run`; to read a capture, use `--replay FILE`"
     )]
     NoAgent,
     /// Somebody listens, but not for this user.
@@ -57,13 +57,13 @@ pub enum ClientError {
         offered: bool,
     },
     /// Something else listens there.
-    #[error("what answers at {place} is no ros2probe agent")]
+    #[error("{place} is not a ros2probe agent")]
     NotAnAgent {
         /// Where.
         place: String,
     },
     /// The agent does not know what was asked for.
-    #[error("the agent at {place} is older than this rp: it does not know {path}")]
+    #[error("the agent at {place} is older than this rp and has no {path}")]
     Older {
         /// Where.
         place: String,
@@ -71,7 +71,10 @@ pub enum ClientError {
         path: String,
     },
     /// The agent's answer is not what this version expects.
-    #[error("the agent at {place} is of another version than this rp: {path} cannot be read")]
+    #[error(
+        "the agent at {place} has another version than this rp: its answer for {path} cannot \
+        be read"
+    )]
     Unreadable {
         /// Where.
         place: String,
@@ -84,7 +87,7 @@ pub enum ClientError {
     #[error("{0}")]
     Refused(Refusal),
     /// The path has characters that a path has not.
-    #[error("{path} cannot be asked for")]
+    #[error("{path} cannot be requested")]
     Path {
         /// The path.
         path: String,

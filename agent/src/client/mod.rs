@@ -154,7 +154,8 @@ impl Agent {
 
     /// It ended before it said anything.
     fn hung_up(&self, path: &str) -> ClientError {
-        self.way.broke(format!("{path} ended before it began"))
+        self.way
+            .broke(format!("{path} ended before its first byte"))
     }
 
     /// Where it is, for people.

@@ -93,9 +93,9 @@ impl Refusal {
     #[must_use]
     pub const fn reason(self) -> &'static str {
         match self {
-            Self::Secured => "announces security, and is not asked",
+            Self::Secured => "announces security: not asked",
             Self::NoAddress => "announces no IPv4 address for discovery",
-            Self::Asking => "is another one that asks",
+            Self::Asking => "is another rp discover",
         }
     }
 }

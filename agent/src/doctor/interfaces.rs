@@ -369,7 +369,7 @@ mod tests {
         .unwrap();
         assert_eq!(
             looked_at(&agent).sentence,
-            "the agent had RTPS packets from eth0"
+            "the agent sees RTPS packets on eth0"
         );
     }
 

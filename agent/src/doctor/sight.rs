@@ -253,14 +253,14 @@ mod tests {
         };
         let chosen = check(&sight);
         assert_eq!(find(&chosen, "source").unwrap().verdict, Verdict::Note);
-        sight.source_reason = Some("no control group hierarchy v2 is mounted".to_owned());
+        sight.source_reason = Some("no cgroup v2 hierarchy is mounted".to_owned());
         let forced = check(&sight);
         let source = find(&forced, "source").unwrap();
         assert_eq!(source.verdict, Verdict::Warning);
         assert!(
             source
                 .sentence
-                .ends_with("no control group hierarchy v2 is mounted")
+                .ends_with("no cgroup v2 hierarchy is mounted")
         );
         assert!(find(&forced, "owners").is_none());
         assert_eq!(

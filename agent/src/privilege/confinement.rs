@@ -69,13 +69,13 @@ pub enum ConfineError {
 #[derive(Debug, thiserror::Error)]
 pub enum SpawnError {
     /// The system has none.
-    #[error("there is no thread to be had")]
+    #[error("failed to spawn a thread")]
     Thread(#[from] io::Error),
     /// It could not be confined, and ended.
     #[error(transparent)]
     Confine(#[from] ConfineError),
     /// It died before it had begun.
-    #[error("the thread died")]
+    #[error("the thread panicked")]
     Died,
 }
 

@@ -33,7 +33,7 @@ pub fn become_own_user() -> Identity {
     }
     let read = |path| fs::read_to_string(path).unwrap_or_default();
     let Some((user, group)) = find(&read("/etc/passwd"), &read("/etc/group")) else {
-        return Identity::Root(format!("there is no user {NAME}"));
+        return Identity::Root(format!("user {NAME} does not exist"));
     };
     let effective = caps::read(None, CapSet::Effective).unwrap_or_default();
     let needed = [Capability::CAP_SETUID, Capability::CAP_SETGID];

@@ -132,7 +132,7 @@ impl Snapshots {
             return Some(Err("too many clients wait for it".to_owned()));
         }
         let written = written.await;
-        Some(written.unwrap_or_else(|_| Err("the agent is about to end".to_owned())))
+        Some(written.unwrap_or_else(|_| Err("the agent is shutting down".to_owned())))
     }
 
     /// Has all of them written.

@@ -63,7 +63,7 @@ impl Source {
         }
         for (ability, able) in inside(live).into_iter().flatten() {
             if let Err(reason) = able {
-                tracing::warn!(ability = ability.label(), reason, "not to be had here");
+                tracing::warn!(ability = ability.label(), reason, "not available here");
             }
         }
         let able = abilities(live);

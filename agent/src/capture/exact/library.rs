@@ -60,10 +60,10 @@ pub enum LibraryError {
     #[error("it cannot be read")]
     Read(#[from] io::Error),
     /// A length or an offset that the file does not hold.
-    #[error("it is no library: {0}")]
+    #[error("not a library: {0}")]
     Malformed(WireError),
     /// Not ELF, or larger than a library is.
-    #[error("it is no library that this machine runs")]
+    #[error("not a library for this machine")]
     Foreign,
     /// It has been built without, or the function is called otherwise.
     #[error(

@@ -34,7 +34,7 @@ pub enum ExactError {
     #[error("it needs {0}")]
     Missing(String),
     /// The control group.
-    #[error("the control group {} cannot be looked at", path.display())]
+    #[error("the cgroup {} cannot be inspected", path.display())]
     Cgroup {
         /// Its directory.
         path: PathBuf,

@@ -110,7 +110,7 @@ struct Library {
 enum Refusal {
     #[error("it cannot be opened")]
     Open(#[source] io::Error),
-    #[error("it is no file")]
+    #[error("not a file")]
     NoFile,
     #[error(transparent)]
     Library(#[from] LibraryError),
@@ -133,7 +133,7 @@ impl Default for Facts {
     fn default() -> Self {
         Self {
             libraries: Vec::new(),
-            uncovered: Some("processes have not been looked at yet".to_owned()),
+            uncovered: Some("processes have not been inspected yet".to_owned()),
         }
     }
 }
@@ -315,7 +315,7 @@ impl Attachments {
             }
             // If it cannot be, that is said when somebody uses it.
             if let Ok(probe) = attach(&mut self.probes, path) {
-                tracing::info!(library = %path.display(), "attached before it is used");
+                tracing::info!(library = %path.display(), "uprobe attached in advance");
                 let library = Library {
                     path: path.clone(),
                     probe: Ok(probe),
@@ -343,7 +343,7 @@ impl Attachments {
             let is_used = library.is_installed || now - library.used < LINGER;
             if !is_used && library.probe.is_ok() {
                 let library = library.path.display();
-                tracing::info!(%library, "no longer attached: nobody uses it");
+                tracing::info!(%library, "uprobe detached: the library is no longer in use");
             }
             is_used
         });
@@ -414,7 +414,7 @@ impl Attachments {
             }
         }
         let closed = processes.closed();
-        closed.map(|process| format!("process {process} may not be looked at"))
+        closed.map(|process| format!("process {process} cannot be inspected"))
     }
 }
 

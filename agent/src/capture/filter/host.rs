@@ -64,7 +64,7 @@ impl Filter {
         let places = if settings.kernel_types {
             Places::look_up()
         } else {
-            Places::unknown("the kernel was not asked for its types".to_owned())
+            Places::unknown("kernel types were not read".to_owned())
         };
         let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
         let mut ebpf = open(settings, true, &sizes, Some(&places), 0)?;

@@ -160,7 +160,7 @@ impl Section {
     fn describe(&mut self, body: &[u8], packets: u64) -> Result<(), PcapError> {
         let malformed = |what| PcapError::Malformed { packets, what };
         if self.interfaces.len() >= MOST_INTERFACES {
-            return Err(malformed("more interfaces than anybody has"));
+            return Err(malformed("too many interfaces"));
         }
         let interface = Interface::read(Cursor::new(body, self.endianness))
             .map_err(|error| malformed(error.what))?

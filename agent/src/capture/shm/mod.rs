@@ -251,7 +251,8 @@ fn look(shared: &Shared, places: Places, budget: Budget) {
             is_first = !is_first;
             if let Err(error) = run_first(is_first) {
                 (may_be_first, is_first) = (false, false);
-                tracing::info!(%error, "names said in shared memory may be missed on a busy host");
+                tracing::info!(%error, "names announced in shared memory may be missed on a busy \
+                    host");
             }
         }
         let Some(watch) = &mut watch else {
