@@ -2,15 +2,33 @@
 //! seconds before an expectation was violated.
 #![expect(clippy::unwrap_used, clippy::panic, reason = "a test may panic")]
 
+#[path = "model/capture.rs"]
+#[allow(dead_code, reason = "each test file uses its own part")]
+mod capture;
+#[path = "model/forge.rs"]
+#[allow(dead_code, reason = "each test file uses its own part")]
+mod forge;
 mod local_agent;
 
 use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
+use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
+use capture::{Capture, ETHERNET, writer};
 use local_agent::{LocalAgent, PATIENCE, ask};
+use ros2probe_wire::GuidPrefix;
 use serde_json::Value;
+
+const SECOND: u64 = 1_000_000_000;
+const START: u64 = 1_795_143_000 * SECOND;
+const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
+/// Topics of a robot with navigation and two cameras.
+const MANY: usize = 171;
 
 /// An agent that may write bags, and replays slowly.
 fn agent(directory: &Path, more: &str) -> LocalAgent {
@@ -260,4 +278,178 @@ fn snapshots_without_a_place_are_a_mistake_only_where_none_was_asked_for() {
     let (code, _, said) = run("state_directory: off\n");
     assert_eq!(code, Some(1), "{said}");
     assert!(said.contains("the agent has no place for recordings"));
+}
+
+/// A minute of so many topics, one message of each a second.
+fn many_topics(path: &Path) {
+    let mut capture = Capture::new(ETHERNET);
+    capture.participant(START, 0, ALICE);
+    for topic in 0..MANY {
+        let guid = writer(ALICE, topic);
+        capture.writer(
+            START,
+            0,
+            guid,
+            &format!("rt/topic{topic}"),
+            topic as u64 + 1,
+        );
+    }
+    for second in 1..60 {
+        for topic in 0..MANY {
+            let time = START + second * SECOND + topic as u64 * 1_000_000;
+            capture.sample(time, 0, writer(ALICE, topic), second);
+        }
+    }
+    capture.write(path);
+}
+
+/// An `rp bag record` and what it prints on stderr.
+struct Recording {
+    child: Child,
+    lines: Receiver<String>,
+    said: Vec<String>,
+}
+
+impl Recording {
+    fn start(api: SocketAddr, bag: &Path, options: &[&str]) -> Self {
+        let mut command = local_agent::rp();
+        command.args(["bag", "record", "-a", "--host", &api.to_string(), "-o"]);
+        command.arg(bag).args(options);
+        Self::of(&mut command)
+    }
+
+    fn of(command: &mut Command) -> Self {
+        command.env_remove("ROS_DISTRO").env_remove("ROS_DOMAIN_ID");
+        command.stdin(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let stderr = BufReader::new(child.stderr.take().unwrap());
+        let (give, lines) = channel();
+        std::thread::spawn(move || {
+            let mut lines = stderr.lines().map_while(Result::ok);
+            lines.all(|line| give.send(line).is_ok())
+        });
+        Self {
+            child,
+            lines,
+            said: Vec::new(),
+        }
+    }
+
+    /// Waits for a line that has `text`, and says how long that took.
+    fn wait_for(&mut self, text: &str) -> Duration {
+        let begun = Instant::now();
+        loop {
+            let left = PATIENCE.saturating_sub(begun.elapsed());
+            let Ok(line) = self.lines.recv_timeout(left) else {
+                panic!("no `{text}` in {:#?}", self.said);
+            };
+            self.said.push(line);
+            if self.said.last().unwrap().contains(text) {
+                return begun.elapsed();
+            }
+        }
+    }
+
+    fn signal(&self, name: &str) {
+        let id = self.child.id().to_string();
+        let sent = Command::new("kill").args([name, &id]).status().unwrap();
+        assert!(sent.success());
+    }
+
+    /// How it ended and after how long.
+    fn end(&mut self) -> (ExitStatus, Duration) {
+        let begun = Instant::now();
+        let status = loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status;
+            }
+            assert!(begun.elapsed() < PATIENCE, "{:#?}", self.said);
+            std::thread::sleep(Duration::from_millis(20));
+        };
+        self.said.extend(self.lines.iter());
+        (status, begun.elapsed())
+    }
+}
+
+impl Drop for Recording {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[test]
+fn a_recording_of_many_topics_begins_and_ends_without_a_question_for_each() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("many.pcap");
+    many_topics(&capture);
+    let agent = LocalAgent::start_on(&capture, &["--speed", "1"]);
+    agent.wait_for_metric("ros2_topics{domain_id=\"0\",kind=\"topic\"}", |topics| {
+        topics == MANY as f64
+    });
+    let bag = directory.path().join("bag");
+    let mut recording = Recording::start(agent.api, &bag, &[]);
+    let began = recording.wait_for("Recording...");
+    std::thread::sleep(Duration::from_secs(2));
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    eprintln!("{MANY} topics: began after {began:?}, ended after {ended:?}");
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert!(began < Duration::from_secs(3), "began after {began:?}");
+    // It waits up to two seconds for messages on their way: a replay's clock is not that of now.
+    assert!(ended < Duration::from_secs(5), "ended after {ended:?}");
+    assert_eq!(messages(&bag).len(), MANY);
+}
+
+#[test]
+fn a_recording_that_is_interrupted_while_it_begins_leaves_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    // An agent that takes the request and never answers.
+    let socket = directory.path().join("api.sock");
+    let listener = UnixListener::bind(&socket).unwrap();
+    let bag = directory.path().join("bag");
+    let mut command = local_agent::rp();
+    command
+        .args(["bag", "record", "-a", "--socket"])
+        .arg(&socket);
+    let mut recording = Recording::of(command.arg("-o").arg(&bag));
+    let asked = listener.accept().unwrap();
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    assert_eq!(status.code(), Some(2), "{:#?}", recording.said);
+    assert!(ended < Duration::from_secs(5), "{ended:?}");
+    assert!(
+        recording.said[0].contains("no bag was made"),
+        "{:?}",
+        recording.said
+    );
+    assert!(!bag.exists());
+    drop(asked);
+}
+
+#[test]
+fn a_second_interrupt_ends_a_recording_at_once_with_its_report() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("many.pcap");
+    many_topics(&capture);
+    let agent = LocalAgent::start_on(&capture, &["--speed", "1"]);
+    let bag = directory.path().join("bag");
+    let mut recording = Recording::start(agent.api, &bag, &[]);
+    recording.wait_for("Recording...");
+    std::thread::sleep(Duration::from_secs(2));
+    // The first one waits for messages on their way until a time that a replay never reaches.
+    recording.signal("-INT");
+    recording.wait_for("Completing the bag");
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert!(ended < Duration::from_millis(1500), "{ended:?}");
+    let count: usize = messages(&bag).values().map(Vec::len).sum();
+    assert!(count > 0);
+    let report = format!("{count} messages in {}", bag.display());
+    assert!(
+        recording.said.iter().any(|line| line.ends_with(&report)),
+        "{:#?}",
+        recording.said
+    );
 }

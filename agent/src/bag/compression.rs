@@ -5,6 +5,7 @@
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use ruzstd::encoding::CompressionLevel;
 
@@ -18,6 +19,33 @@ pub enum Compression {
     Lz4,
     /// Zstandard frames.
     Zstd,
+}
+
+/// How far the compression of a file is, and whether it is to be given up: shared between the
+/// thread that compresses and the one that waits.
+#[derive(Debug, Default)]
+pub struct Progress {
+    read: AtomicU64,
+    given_up: AtomicBool,
+}
+
+impl Progress {
+    /// Bytes of the file that were read so far.
+    #[must_use]
+    pub fn read(&self) -> u64 {
+        self.read.load(Ordering::Relaxed)
+    }
+
+    /// Has the compression end at its next read; the file stays as it is.
+    pub fn give_up(&self) {
+        self.given_up.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether [`Self::give_up`] was called.
+    #[must_use]
+    pub fn is_given_up(&self) -> bool {
+        self.given_up.load(Ordering::Relaxed)
+    }
 }
 
 impl Compression {
@@ -82,60 +110,69 @@ impl Compression {
         })
     }
 
-    /// Compresses one file into another, as one frame.
-    pub fn compress_file(self, source: &File, into: &File) -> io::Result<()> {
+    /// Compresses one file into another, as one frame. Fails where `progress` is given up.
+    pub fn compress_file(self, source: &File, into: &File, progress: &Progress) -> io::Result<()> {
         let size = source.metadata()?.len();
-        let mut source = Watched::new(BufReader::with_capacity(1 << 17, source));
+        let source = BufReader::with_capacity(1 << 17, source);
+        let mut source = Watched::new(source, progress);
         match self {
             Self::None => {
-                io::copy(&mut source.inner, &mut &*into)?;
+                io::copy(&mut source, &mut &*into)?;
             }
             Self::Lz4 => {
                 let info = lz4_flex::frame::FrameInfo::new().content_size(Some(size));
                 let mut encoder = lz4_flex::frame::FrameEncoder::with_frame_info(info, into);
-                io::copy(&mut source.inner, &mut encoder)?;
+                io::copy(&mut source, &mut encoder)?;
+                source.failed.take().map_or(Ok(()), Err)?;
                 encoder.finish().map_err(io::Error::other)?;
             }
             Self::Zstd => {
                 let mut drain = SizedFrame::new(into, size);
                 ruzstd::encoding::compress(&mut source, &mut drain, CompressionLevel::Fastest);
                 drain.finish()?;
-                source.failed.map_or(Ok(()), Err)?;
+                source.failed.take().map_or(Ok(()), Err)?;
                 if source.read != size {
                     return Err(io::Error::other("the file changed while it was compressed"));
                 }
             }
         }
-        Ok(())
+        source.failed.map_or(Ok(()), Err)
     }
 }
 
 /// Remembers an error and ends, for `ruzstd` takes none.
-struct Watched<R> {
+struct Watched<'a, R> {
     inner: R,
+    progress: &'a Progress,
     read: u64,
     failed: Option<io::Error>,
 }
 
-impl<R: Read> Watched<R> {
-    fn new(inner: R) -> Self {
+impl<'a, R: Read> Watched<'a, R> {
+    fn new(inner: R, progress: &'a Progress) -> Self {
         Self {
             inner,
+            progress,
             read: 0,
             failed: None,
         }
     }
 }
 
-impl<R: Read> Read for Watched<R> {
+impl<R: Read> Read for Watched<'_, R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         if self.failed.is_some() {
+            return Ok(0);
+        }
+        if self.progress.is_given_up() {
+            self.failed = Some(io::Error::other("given up"));
             return Ok(0);
         }
         loop {
             match self.inner.read(buffer) {
                 Ok(read) => {
                     self.read += read as u64;
+                    self.progress.read.store(self.read, Ordering::Relaxed);
                     return Ok(read);
                 }
                 Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
@@ -246,9 +283,31 @@ mod tests {
         let full = File::options().write(true).open("/dev/full").unwrap();
         for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
             let error = compression
-                .compress_file(&File::open(&path).unwrap(), &full)
+                .compress_file(&File::open(&path).unwrap(), &full, &Progress::default())
                 .unwrap_err();
             assert!(error.to_string().contains("No space left"), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_compression_that_is_given_up_fails() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("source");
+        std::fs::write(&path, b"0123456789".repeat(100_000)).unwrap();
+        let into = File::create(directory.path().join("into")).unwrap();
+        let progress = Progress::default();
+        for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
+            let source = File::open(&path).unwrap();
+            compression
+                .compress_file(&source, &into, &progress)
+                .unwrap();
+            assert_eq!(progress.read(), 1_000_000);
+        }
+        progress.give_up();
+        for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
+            let source = File::open(&path).unwrap();
+            let error = compression.compress_file(&source, &into, &progress);
+            assert_eq!(error.unwrap_err().to_string(), "given up");
         }
     }
 }

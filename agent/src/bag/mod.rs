@@ -19,7 +19,7 @@ pub mod read;
 pub mod reindex;
 mod writer;
 
-pub use compression::Compression;
+pub use compression::{Compression, Progress};
 pub use options::{Form, Options, Storage};
 pub use writer::{
     Compressed, FileCompression, Schema, Summary, TopicDescription, TopicId, TopicSummary, Writer,

@@ -14,6 +14,7 @@ use std::sync::Arc;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Qos;
 
+use super::compression::Progress;
 use super::file::{FileWriter, METADATA_NAME};
 use super::mcap::{Channel, Message, Metadata as MetadataRecord, Schema as SchemaRecord};
 use super::metadata::{self, Metadata};
@@ -340,7 +341,17 @@ impl Writer {
     /// Completes the bag. `custom_data` stands in metadata.yaml and in the last file: what was lost
     /// or left out belongs there. Where the storage takes no more, what waits is given up, counted in
     /// the summary, and the file completed in the room that was kept for that.
-    pub fn close(mut self, custom_data: BTreeMap<String, String>) -> Result<Summary, Error> {
+    pub fn close(self, custom_data: BTreeMap<String, String>) -> Result<Summary, Error> {
+        self.close_with(custom_data, |work| work.run().map(Some))
+    }
+
+    /// As [`Self::close`], with files compressed by `compress`. Where it returns `None` the file
+    /// stays uncompressed, as [`super::reindex`] finds it.
+    pub fn close_with(
+        mut self,
+        custom_data: BTreeMap<String, String>,
+        mut compress: impl FnMut(FileCompression) -> Result<Option<Compressed>, Error>,
+    ) -> Result<Summary, Error> {
         self.options.custom_data.extend(custom_data);
         let mut refused = None;
         match self.finish_file() {
@@ -355,8 +366,9 @@ impl Writer {
             finished => finished?,
         }
         for work in self.take_file_compressions() {
-            let done = work.run()?;
-            self.compressed(&done)?;
+            if let Some(done) = compress(work)? {
+                self.compressed(&done)?;
+            }
         }
         match self.write_metadata_file() {
             Err(error) if refused.is_none() && self.unwritten.is_empty() => return Err(error),
@@ -606,8 +618,19 @@ impl FileCompression {
         }
     }
 
+    /// Bytes of the file.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        fs::metadata(&self.path).map_or(0, |metadata| metadata.len())
+    }
+
     /// Compresses the file beside itself, then removes it. Takes long; needs room for both.
     pub fn run(&self) -> Result<Compressed, Error> {
+        self.run_watched(&Progress::default())
+    }
+
+    /// As [`Self::run`]. Fails where `progress` is given up; the file then stays as it was.
+    pub fn run_watched(&self, progress: &Progress) -> Result<Compressed, Error> {
         let into = with_suffix(&self.path, self.compression.name());
         let part = with_suffix(&into, "part");
         let wrong = |error| Error::writing(&part, error);
@@ -617,7 +640,7 @@ impl FileCompression {
                 .write(true)
                 .create_new(true)
                 .open(&part)?;
-            self.compression.compress_file(&source, &target)?;
+            self.compression.compress_file(&source, &target, progress)?;
             target.sync_data()?;
             let bytes = target.metadata()?.len();
             fs::rename(&part, &into)?;

@@ -1,20 +1,23 @@
 //! `rp bag record`: a bag written by this process, with its rights and where it was started, out of
 //! what an agent gives. Says on stderr what the original says there.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::io::{self, IsTerminal as _, Read as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::mpsc::{Sender, channel};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, anyhow, bail};
 use clap::Args;
 use ros2probe::bag::{self, Form, Options, Storage, Writer};
-use ros2probe::client::{Agent, Samples, Target, encoded};
+use ros2probe::client::{Agent, Samples, Target};
 use ros2probe::message::{Library, Sources as Places};
 use ros2probe::recording::{
-    Announced, Asked, Ended, Filter, Order, Recorder, Ring, Sources, default_name, record, schema,
+    Announced, Asked, Ended, Filter, Going, Graph, Order, Recorder, Ring, Sources, default_name,
+    record, schema,
 };
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::name::full_name;
@@ -28,13 +31,17 @@ use super::interrupt::INTERRUPTED;
 /// Room for messages that wait for the storage, as the original's cache.
 const CACHE: u64 = 100 << 20;
 const SPACE: u8 = b' ';
+/// How long an answer about announcements is waited for, and how old it may be.
+const GRAPH_PATIENCE: Duration = Duration::from_secs(2);
+const GRAPH_AGE: Duration = Duration::from_secs(1);
 
 /// `rp bag record`.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Nothing on the network tells that there is a recording: messages are copied, not subscribed to. What
 was never whole on the wire is not in the bag and is named at the end, and in the bag's metadata.
-Space pauses and resumes. SIGUSR1 writes what waits in --snapshot-mode. Ctrl-C ends the recording.
+Space pauses and resumes. SIGUSR1 writes what waits in --snapshot-mode. Ctrl-C ends the recording;
+a second one skips what takes long (messages on their way, compression of files), a third one all.
 
 Examples:
   rp bag record -a                                      every topic
@@ -131,11 +138,11 @@ pub(crate) struct Record {
     definitions: Vec<PathBuf>,
     #[command(flatten)]
     unused: Unused,
-    /// Set for `rp bag convert`, which needs no keys.
-    #[arg(skip)]
-    has_no_keys: bool,
     #[command(flatten)]
     target: Target,
+    /// Set for `rp bag convert`, which ends by itself and needs no keys.
+    #[arg(skip)]
+    is_batch: bool,
 }
 
 /// Options of the original that change nothing here.
@@ -165,6 +172,18 @@ struct Unused {
 /// Standard input without lines and echo, until it is dropped.
 struct Keys(Termios);
 
+/// How far a recording is, for the thread that hears signals.
+#[derive(Clone)]
+struct Phase(Arc<AtomicU8>);
+
+/// What an agent says of topics, asked for all of them at once.
+struct Announcements<'a> {
+    agent: &'a Agent,
+    path: String,
+    known: HashMap<String, Announced>,
+    at: Option<Instant>,
+}
+
 impl Record {
     /// As `rp bag convert` means it: this capture into this bag, all topics unless some are chosen.
     pub(crate) fn of_capture(mut self, capture: PathBuf, bag: PathBuf) -> Self {
@@ -178,11 +197,14 @@ impl Record {
         (self.target.host, self.target.socket) = (None, None);
         self.target.replay = Some(capture);
         self.output = Some(bag);
-        self.has_no_keys = true;
+        self.is_batch = true;
         self
     }
 
     pub(crate) fn ask(self) -> Result<ExitCode> {
+        let phase = Phase::starting();
+        let (give, orders) = channel();
+        listen(give.clone(), phase.clone())?;
         let dialect = self.target.dialect();
         let filter = Filter::new(self.asked(dialect)?).map_err(|error| refused(&error))?;
         let options = self.options()?;
@@ -211,11 +233,12 @@ impl Record {
             dialect,
         );
         let library = Library::new(places);
-        let asked = &agent;
+        let mut announcements = Announcements::new(&agent, domain_id);
         let sources = Sources {
-            announced: Box::new(move |name| announced(asked, domain_id, name)),
+            announced: Box::new(move |names| announcements.of(names)),
             schema: Box::new(move |name, hash| schema(&library, name, hash)),
         };
+        phase.begin();
         let writer = Writer::create(&directory, options)?;
         let mut recorder = Recorder::new(writer, filter, sources);
         if self.snapshot_mode {
@@ -223,20 +246,18 @@ impl Record {
             recorder = recorder.waiting_in(Ring::new(room, None));
         }
         recorder.pause(self.start_paused);
-        for topic in &samples.opened().topics {
-            if let Some(message_type) = topic.types.first() {
-                recorder.declare(&topic.topic, message_type)?;
-            }
-        }
-        let (give, orders) = channel();
-        listen(give.clone())?;
-        let keys = (!self.has_no_keys).then(Keys::take).flatten();
+        let opened = samples.opened().topics.iter();
+        recorder.declare(opened.filter_map(|topic| {
+            let message_type = topic.types.first()?;
+            Some((topic.topic.as_str(), message_type.as_str()))
+        }))?;
+        let keys = if self.is_batch { None } else { Keys::take() };
         match &keys {
             Some(_) => {
                 log("INFO", "Press SPACE for pausing/resuming");
                 read_keys(give);
             }
-            None if self.has_no_keys => {}
+            None if self.is_batch => {}
             None => eprintln!("stdin is not a terminal device. Keyboard handling disabled."),
         }
         log("INFO", "Listening for topics...");
@@ -251,7 +272,7 @@ impl Record {
         );
         let mut said = Told::new();
         let next = |patience: Duration| samples.next_within(patience);
-        let (ended, broke) = record(recorder, next, &orders, |recorder| said.tell(recorder));
+        let (ended, broke) = record(recorder, next, &orders, |going| said.tell(going));
         drop(keys);
         said.finish();
         let code = report(&ended);
@@ -346,6 +367,8 @@ struct Told {
     files: usize,
     paused: Option<bool>,
     progress: bool,
+    /// Tenths of a file.
+    compressing: u64,
 }
 
 impl Told {
@@ -355,10 +378,35 @@ impl Told {
             files: 1,
             paused: None,
             progress: io::stderr().is_terminal(),
+            compressing: u64::MAX,
         }
     }
 
-    fn tell(&mut self, recorder: &Recorder<'_>) {
+    fn tell(&mut self, going: Going<'_>) {
+        match going {
+            Going::Recording(recorder) => self.recording(recorder),
+            Going::Completing => {
+                self.clear();
+                log(
+                    "INFO",
+                    "Completing the bag; Ctrl-C again to skip what takes long",
+                );
+            }
+            Going::Compressing { done, of } => {
+                self.clear();
+                let percent = (100 * done).checked_div(of).unwrap_or(100);
+                let text = format!("compressing a file of {} MB: {percent} %", of / 1_000_000);
+                if self.progress {
+                    eprint!("{text}");
+                } else if self.compressing != percent / 10 {
+                    self.compressing = percent / 10;
+                    log("INFO", &text);
+                }
+            }
+        }
+    }
+
+    fn recording(&mut self, recorder: &Recorder<'_>) {
         let report = recorder.report();
         if report.topics.len() > self.topics {
             self.clear();
@@ -435,10 +483,61 @@ fn refused(error: &ros2probe::recording::FilterError) -> anyhow::Error {
     Said(format!("{error}")).into()
 }
 
-/// What is announced of a topic; nothing where the agent does not know it, or is gone.
-fn announced(agent: &Agent, domain_id: u32, name: &str) -> Announced {
-    let path = format!("/topics{}?domain_id={domain_id}", encoded(name));
-    agent.get(&path).unwrap_or_default()
+impl Phase {
+    const STARTING: u8 = 0;
+    const BEGUN: u8 = 1;
+    const CANCELLED: u8 = 2;
+
+    fn starting() -> Self {
+        Self(Arc::new(AtomicU8::new(Self::STARTING)))
+    }
+
+    /// From now on there is a bag, which a signal completes.
+    fn begin(&self) {
+        if !self.turn(Self::BEGUN) {
+            // The process is about to end.
+            loop {
+                std::thread::park();
+            }
+        }
+    }
+
+    /// Whether nothing was begun yet, and now never will be.
+    fn cancel(&self) -> bool {
+        self.turn(Self::CANCELLED)
+    }
+
+    fn turn(&self, into: u8) -> bool {
+        let turned =
+            self.0
+                .compare_exchange(Self::STARTING, into, Ordering::AcqRel, Ordering::Acquire);
+        turned.is_ok()
+    }
+}
+
+impl<'a> Announcements<'a> {
+    fn new(agent: &'a Agent, domain_id: u32) -> Self {
+        Self {
+            agent,
+            path: format!("/topics?domain_id={domain_id}&hidden=true"),
+            known: HashMap::new(),
+            at: None,
+        }
+    }
+
+    /// What was known last, where the agent does not answer any more.
+    fn of(&mut self, names: &[String]) -> Vec<Announced> {
+        let is_old = self.at.is_none_or(|at| at.elapsed() > GRAPH_AGE);
+        if is_old || names.iter().any(|name| !self.known.contains_key(name)) {
+            let graph = self.agent.get_within::<Graph>(&self.path, GRAPH_PATIENCE);
+            if let Ok(graph) = graph {
+                self.known = graph.by_name();
+                self.at = Some(Instant::now());
+            }
+        }
+        let known = names.iter().map(|name| self.known.get(name).cloned());
+        known.map(Option::unwrap_or_default).collect()
+    }
 }
 
 /// Whose distribution this is, as far as the shell says.
@@ -460,8 +559,9 @@ fn pair(text: &str) -> Result<(String, String), String> {
     Ok((key.to_owned(), value.to_owned()))
 }
 
-/// Ctrl-C and SIGTERM end the recording, again at once; SIGUSR1 writes what waits.
-fn listen(give: Sender<Order>) -> io::Result<()> {
+/// Ctrl-C and SIGTERM end the recording: the first one in order, the second one without what takes
+/// long, the third one at once. SIGUSR1 writes what waits.
+fn listen(give: Sender<Order>, phase: Phase) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .build()?;
@@ -476,16 +576,31 @@ fn listen(give: Sender<Order>) -> io::Result<()> {
         (interrupt?, terminate?, user?)
     };
     let wait = async move {
-        let mut stopping = false;
+        let mut stops = 0_u8;
         loop {
-            let order = tokio::select! {
-                _ = signals.0.recv() => Order::Stop,
-                _ = signals.1.recv() => Order::Stop,
-                _ = signals.2.recv() => Order::Snapshot,
+            let is_stop = tokio::select! {
+                _ = signals.0.recv() => true,
+                _ = signals.1.recv() => true,
+                _ = signals.2.recv() => false,
             };
-            if order == Order::Stop && std::mem::replace(&mut stopping, true) {
-                std::process::exit(INTERRUPTED.into());
-            }
+            stops = stops.saturating_add(u8::from(is_stop));
+            let order = match stops {
+                _ if !is_stop => Order::Snapshot,
+                1 if phase.cancel() => {
+                    log(
+                        "INFO",
+                        "Interrupted before the recording began; no bag was made",
+                    );
+                    std::process::exit(INTERRUPTED.into());
+                }
+                1 => Order::Stop,
+                2 => Order::Hurry,
+                _ => {
+                    let text = "Interrupted; `rp bag reindex` makes the bag whole";
+                    log("ERROR", text);
+                    std::process::exit(INTERRUPTED.into());
+                }
+            };
             // Nobody takes orders any more when it has ended by itself.
             let _ = give.send(order);
         }

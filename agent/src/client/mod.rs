@@ -91,7 +91,19 @@ impl Agent {
     /// # Errors
     /// The agent is gone, refuses, or answers something else.
     pub fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
-        self.exchange(Method::GET, path, None)
+        self.exchange(Method::GET, path, None, PATIENCE)
+    }
+
+    /// As [`Self::get`], with an answer within `patience`.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn get_within<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        patience: Duration,
+    ) -> Result<T, ClientError> {
+        self.exchange(Method::GET, path, None, patience)
     }
 
     /// Sends `body`.
@@ -103,7 +115,7 @@ impl Agent {
         path: &str,
         body: &B,
     ) -> Result<T, ClientError> {
-        self.exchange(Method::POST, path, Some(json(body)))
+        self.exchange(Method::POST, path, Some(json(body)), PATIENCE)
     }
 
     /// Puts `body` there.
@@ -115,7 +127,7 @@ impl Agent {
         path: &str,
         body: &B,
     ) -> Result<T, ClientError> {
-        self.exchange(Method::PUT, path, Some(json(body)))
+        self.exchange(Method::PUT, path, Some(json(body)), PATIENCE)
     }
 
     /// Removes what is there.
@@ -169,14 +181,15 @@ impl Agent {
         method: Method,
         path: &str,
         body: Option<Bytes>,
+        patience: Duration,
     ) -> Result<T, ClientError> {
         let answer = self.runtime.block_on(async {
             let exchange = async {
                 let answer = self.send(method, path, body).await?;
                 self.whole(path, answer).await
             };
-            let patience = timeout(PATIENCE, exchange).await;
-            patience.unwrap_or_else(|_| Err(self.way.slow()))
+            let answer = timeout(patience, exchange).await;
+            answer.unwrap_or_else(|_| Err(self.way.slow()))
         })?;
         self.decoded(path, &answer)
     }

@@ -1,10 +1,42 @@
 //! What discovery says of a topic, as far as a bag says it: from a snapshot within the agent, from
 //! the API's JSON where a client records.
 
+use std::collections::HashMap;
+
 use serde::Deserialize;
 
 use crate::model::snapshot::{EndpointFacts, TopicFacts};
 use crate::subscriptions::line::{QosFacts, seconds};
+
+/// The API's `/topics`: what is announced of all topics.
+#[derive(Clone, Debug, Default, Deserialize)]
+pub struct Graph {
+    topics: Vec<GraphTopic>,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+struct GraphTopic {
+    name: String,
+    dds_name: String,
+    kind: String,
+    #[serde(flatten)]
+    announced: Announced,
+}
+
+impl Graph {
+    /// By the names that messages bear: ROS names of topics, else DDS names.
+    #[must_use]
+    pub fn by_name(self) -> HashMap<String, Announced> {
+        let topics = self.topics.into_iter().map(|topic| {
+            let name = match topic.kind.as_str() {
+                "service_request" | "service_reply" | "discovery" | "dds" => topic.dds_name,
+                _ => topic.name,
+            };
+            (name, topic.announced)
+        });
+        topics.collect()
+    }
+}
 
 /// A topic at the moment in which it is taken into a bag.
 #[derive(Clone, Debug, Default, Deserialize)]

@@ -13,11 +13,11 @@ mod service;
 mod session;
 mod snapshot;
 
-pub use announced::Announced;
+pub use announced::{Announced, Graph};
 pub use filter::{Asked, Candidate, Filter, FilterError};
 pub use recorder::{Ended, Recorder, Sources};
 pub use report::{MissingRun, Report, TopicReport};
 pub use ring::Ring;
 pub use service::{Recording, Recordings, Refusal, Stage, Status, Wanted, default_name, schema};
-pub use session::{Order, record};
+pub use session::{Going, Order, record};
 pub use snapshot::{Snapshots, Written};

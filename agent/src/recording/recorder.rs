@@ -31,11 +31,14 @@ const WRITERS: usize = 256;
 
 /// Where a recorder learns what it does not see in samples.
 pub struct Sources<'a> {
-    /// What is announced of a topic at the moment.
-    pub announced: Box<dyn FnMut(&str) -> Announced + Send + 'a>,
+    /// What is announced at the moment of the topics of these names, in their order.
+    pub announced: Box<Announcements<'a>>,
     /// How messages of a type look; the type and its announced hash.
     pub schema: Box<Schemas<'a>>,
 }
+
+/// What is announced of topics, asked for all at once: each question may take a while.
+pub type Announcements<'a> = dyn FnMut(&[String]) -> Vec<Announced> + Send + 'a;
 
 /// The schema of a type, by its name and announced hash.
 pub type Schemas<'a> = dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send + 'a;
@@ -172,13 +175,21 @@ impl<'a> Recorder<'a> {
         self.writer.compressed(done)
     }
 
-    /// Takes a topic into the bag that may never have a message; `name` as discovery knows it.
+    /// Takes topics into the bag that may never have a message: each by its name and type, as
+    /// discovery knows them.
     ///
     /// # Errors
     /// The storage takes no more.
-    pub fn declare(&mut self, name: &str, message_type: &str) -> Result<(), Error> {
-        if !self.topics.contains_key(name) {
-            let place = self.decide(name, message_type, None, false)?;
+    pub fn declare<'t>(
+        &mut self,
+        topics: impl IntoIterator<Item = (&'t str, &'t str)>,
+    ) -> Result<(), Error> {
+        let mut topics: Vec<(&str, &str)> = topics.into_iter().collect();
+        topics.retain(|(name, _)| !self.topics.contains_key(*name));
+        let names: Vec<String> = topics.iter().map(|(name, _)| (*name).to_owned()).collect();
+        let announced = self.ask(&names);
+        for ((name, message_type), announced) in topics.into_iter().zip(announced) {
+            let place = self.decide(name, message_type, None, announced, false)?;
             // One that is left out may yet be published.
             if matches!(place, Place::Taken(_)) {
                 self.topics.insert(name.to_owned(), place);
@@ -214,14 +225,25 @@ impl<'a> Recorder<'a> {
 
     /// Completes the bag. `error` is what ended it, if that was the storage.
     #[must_use]
-    pub fn finish(mut self, error: Option<Error>) -> Ended {
+    pub fn finish(self, error: Option<Error>) -> Ended {
+        self.finish_with(error, |work| work.run().map(Some))
+    }
+
+    /// As [`Self::finish`], with whole files compressed by `compress`: see [`Writer::close_with`].
+    #[must_use]
+    pub fn finish_with(
+        mut self,
+        error: Option<Error>,
+        compress: impl FnMut(FileCompression) -> Result<Option<Compressed>, Error>,
+    ) -> Ended {
         self.note_what_was_sent_before();
         // Before the report goes into the bag.
         self.writer.settle();
         for (topic, messages, bytes) in self.writer.unwritten() {
             self.report.unwritten(topic, messages, bytes);
         }
-        let closed = self.writer.close(self.report.custom_data());
+        let custom_data = self.report.custom_data();
+        let closed = self.writer.close_with(custom_data, compress);
         let (summary, close_error) = match closed {
             Ok(summary) => (Some(summary), None),
             Err(error) => (None, Some(error)),
@@ -287,7 +309,13 @@ impl<'a> Recorder<'a> {
             name, message_type, ..
         } = topic;
         if !self.topics.contains_key(&**name) {
-            let place = self.decide(name, message_type, topic.offered.as_deref(), true)?;
+            let offered = topic.offered.as_deref();
+            // What the writer announced comes with its messages; the rest has to be asked for.
+            let announced = match offered {
+                Some(_) if !self.filter.asked().ignore_leaf_topics => Announced::default(),
+                _ => self.ask_one(name),
+            };
+            let place = self.decide(name, message_type, offered, announced, true)?;
             self.topics.insert(name.to_string(), place);
         }
         let Some(Place::Taken(taken)) = self.topics.get_mut(&**name) else {
@@ -308,18 +336,28 @@ impl<'a> Recorder<'a> {
         Ok(Some(taken))
     }
 
+    /// What is announced of these topics: as many answers as there are names.
+    fn ask(&mut self, names: &[String]) -> Vec<Announced> {
+        if names.is_empty() {
+            return Vec::new();
+        }
+        let mut announced = (self.sources.announced)(names);
+        announced.resize_with(names.len(), Announced::default);
+        announced
+    }
+
+    fn ask_one(&mut self, name: &str) -> Announced {
+        self.ask(&[name.to_owned()]).pop().unwrap_or_default()
+    }
+
     fn decide(
         &mut self,
         name: &str,
         message_type: &str,
         offered: Option<&Offered>,
+        announced: Announced,
         came: bool,
     ) -> Result<Place, Error> {
-        // What the writer announced comes with its messages; the rest has to be asked for.
-        let announced = match offered {
-            Some(_) if !self.filter.asked().ignore_leaf_topics => Announced::default(),
-            _ => (self.sources.announced)(name),
-        };
         let known = announced
             .message_types
             .first()
@@ -382,23 +420,23 @@ impl<'a> Recorder<'a> {
 
     /// Publishers that keep samples for late joiners, of which the first ones are not in the bag.
     fn note_what_was_sent_before(&mut self) {
+        let taken = self.order.clone();
+        let announced = self.ask(&taken);
         let mut names: Vec<String> = Vec::new();
-        for (name, place) in &self.topics {
-            let Place::Taken(taken) = place else { continue };
-            let announced = (self.sources.announced)(name);
+        for (name, announced) in taken.into_iter().zip(announced) {
+            let Some(Place::Taken(taken)) = self.topics.get(&name) else {
+                continue;
+            };
             let keepers = announced.publishers.iter();
-            let keepers = keepers.filter(|publisher| publisher.keeps_samples());
+            let mut keepers = keepers.filter(|publisher| publisher.keeps_samples());
             let begun: HashSet<String> = taken
                 .first
                 .iter()
                 .filter(|(_, first)| **first <= 1)
                 .map(|(writer, _)| writer.to_string())
                 .collect();
-            if keepers
-                .into_iter()
-                .any(|keeper| !begun.contains(&keeper.guid))
-            {
-                names.push(name.clone());
+            if keepers.any(|keeper| !begun.contains(&keeper.guid)) {
+                names.push(name);
             }
         }
         names.sort();
@@ -470,9 +508,12 @@ mod tests {
 
     fn recorder(directory: &std::path::Path, asked: Asked) -> Recorder<'static> {
         let sources = Sources {
-            announced: Box::new(|name| match name {
-                "/tf_static" => keepers(),
-                _ => Announced::default(),
+            announced: Box::new(|names| {
+                let announced = names.iter().map(|name| match name.as_str() {
+                    "/tf_static" => keepers(),
+                    _ => Announced::default(),
+                });
+                announced.collect()
             }),
             schema: Box::new(|_, _| None),
         };
@@ -578,10 +619,11 @@ mod tests {
         // Nothing came at all: it is in the bag by its name.
         let directory = tempfile::tempdir().unwrap();
         let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
-        recorder
-            .declare("/tf_static", "tf2_msgs/msg/TFMessage")
-            .unwrap();
-        recorder.declare("/nobody", "std_msgs/msg/String").unwrap();
+        let topics = [
+            ("/tf_static", "tf2_msgs/msg/TFMessage"),
+            ("/nobody", "std_msgs/msg/String"),
+        ];
+        recorder.declare(topics).unwrap();
         let ended = recorder.finish(None);
         assert_eq!(ended.report.sent_before, ["/tf_static"]);
         assert_eq!(ended.report.topics.len(), 1);

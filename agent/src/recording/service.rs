@@ -1,6 +1,7 @@
 //! The agent's own recordings: begun and ended by clients, each on a thread of its own, written where
 //! the configuration allows and nowhere else.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -15,7 +16,7 @@ use super::announced::Announced;
 use super::filter::{Asked, Filter, FilterError};
 use super::recorder::{Ended, Recorder, Sources};
 use super::report::Report;
-use super::session::{self, Order};
+use super::session::{self, Going, Order};
 use crate::bag::{self, Options, Schema, Writer};
 use crate::capture::system::give_back_memory;
 use crate::client::Got;
@@ -189,12 +190,13 @@ impl Recordings {
                     .covers(kind, &topic.name, &topic.dds_name, hidden)
         });
         // Messages come of no more than are measured; whoever announces thousands fills no bag.
-        for topic in covered.take(self.board.limits().caps().topics) {
-            if let Some(message_type) = topic.message_types.first() {
-                let declared = recorder.declare(&topic.name, message_type);
-                declared.map_err(|error| refusal(&name, error))?;
-            }
-        }
+        let covered = covered.take(self.board.limits().caps().topics);
+        let covered = covered.filter_map(|topic| {
+            let message_type = topic.message_types.first()?;
+            Some((topic.name.as_str(), message_type.as_str()))
+        });
+        let declared = recorder.declare(covered);
+        declared.map_err(|error| refusal(&name, error))?;
         let (give, orders) = channel();
         let recording = Arc::new(Recording {
             name,
@@ -303,11 +305,17 @@ impl Recordings {
     pub(super) fn sources(&self, domain_id: u32) -> Sources<'static> {
         let (board, library) = (Arc::clone(&self.board), Arc::clone(&self.library));
         Sources {
-            announced: Box::new(move |name| {
+            announced: Box::new(move |names| {
                 let state = board.state();
-                let mut topics = state.known().topics.iter();
-                let topic = topics.find(|topic| topic.domain_id == domain_id && topic.name == name);
-                topic.map(Announced::from).unwrap_or_default()
+                let topics = state.known().topics.iter();
+                let topics = topics.filter(|topic| topic.domain_id == domain_id);
+                let topics: HashMap<_, _> =
+                    topics.map(|topic| (topic.name.as_str(), topic)).collect();
+                let announced = names.iter().map(|name| {
+                    let topic = topics.get(name.as_str());
+                    topic.map_or_else(Announced::default, |topic| Announced::from(*topic))
+                });
+                announced.collect()
             }),
             schema: Box::new(move |name, hash| schema(&library, name, hash)),
         }
@@ -391,9 +399,11 @@ impl Recording {
             );
             counted = now;
         };
-        let (ended, _) = session::record(recorder, next, orders, |recorder| {
-            count(recorder.report());
-            self.tell(recorder);
+        let (ended, _) = session::record(recorder, next, orders, |going| {
+            if let Going::Recording(recorder) = going {
+                count(recorder.report());
+                self.tell(recorder);
+            }
         });
         count(&ended.report);
         figures.active.fetch_sub(1, Ordering::Relaxed);

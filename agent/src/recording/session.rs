@@ -4,6 +4,8 @@
 //! What was sent before the end was asked for is still taken. Whole files are compressed beside it,
 //! by a thread that ends with it.
 
+use std::collections::VecDeque;
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -11,7 +13,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use ros2probe_wire::Timestamp;
 
 use super::recorder::{Ended, Recorder};
-use crate::bag::{Compressed, Error};
+use crate::bag::{Compressed, Error, FileCompression, Progress};
 use crate::client::Got;
 use crate::subscriptions::Item;
 
@@ -37,32 +39,74 @@ pub enum Order {
     Snapshot,
     /// Complete the bag.
     Stop,
+    /// Complete it without what takes long: messages on their way, compression of whole files.
+    Hurry,
+}
+
+/// What a recording is doing.
+#[derive(Clone, Copy, Debug)]
+pub enum Going<'a> {
+    /// It takes messages.
+    Recording(&'a Recorder<'a>),
+    /// It takes the last messages and completes the bag.
+    Completing,
+    /// It compresses a whole file.
+    Compressing {
+        /// Bytes compressed so far.
+        done: u64,
+        /// Bytes of the file.
+        of: u64,
+    },
 }
 
 /// Whole files on their way to being compressed, one after the other.
 #[derive(Default)]
 struct Compressing {
-    thread: Option<JoinHandle<Vec<Result<Compressed, Error>>>>,
+    waiting: VecDeque<FileCompression>,
+    under_way: Option<UnderWay>,
+}
+
+/// A file that is being compressed by a thread of its own.
+struct UnderWay {
+    thread: JoinHandle<Result<Compressed, Error>>,
+    progress: Arc<Progress>,
+    bytes: u64,
+}
+
+/// Orders and the one who listens, while the bag is being completed.
+struct Completion<'a, T> {
+    orders: &'a Receiver<Order>,
+    tell: T,
+    told: Instant,
+    hurry: bool,
 }
 
 /// Records until it ends; the second value is why the source did, if it broke. `tell` hears of the
-/// recorder now and then, and whenever an order was carried out.
+/// recording now and then, and whenever an order was carried out.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
     mut next: impl FnMut(Duration) -> Result<Got, E>,
     orders: &Receiver<Order>,
-    mut tell: impl FnMut(&Recorder<'_>),
+    mut tell: impl FnMut(Going<'_>),
 ) -> (Ended, Option<E>) {
     let mut compressing = Compressing::default();
     let mut stopping: Option<(Timestamp, Instant)> = None;
+    let mut hurry = false;
     let mut told = Instant::now();
-    tell(&recorder);
+    tell(Going::Recording(&recorder));
     let (refused, broke) = loop {
         match carry_out(orders, &mut recorder) {
             Ok(Carried::Nothing) => {}
-            Ok(Carried::Out) => tell(&recorder),
+            Ok(Carried::Out) => tell(Going::Recording(&recorder)),
             Ok(Carried::Stop) => {
-                stopping.get_or_insert_with(|| (now(), Instant::now() + FAREWELL));
+                if stopping.is_none() {
+                    stopping = Some((now(), Instant::now() + FAREWELL));
+                    tell(Going::Completing);
+                }
+            }
+            Ok(Carried::Hurry) => {
+                hurry = true;
+                break (None, None);
             }
             Err(error) => break (Some(error), None),
         }
@@ -72,7 +116,7 @@ pub fn record<E>(
         };
         if told.elapsed() >= TELL {
             told = Instant::now();
-            tell(&recorder);
+            tell(Going::Recording(&recorder));
             if let Err(error) = compressing.look(&mut recorder) {
                 break (Some(error), None);
             }
@@ -94,16 +138,27 @@ pub fn record<E>(
             _ => {}
         }
     };
-    tell(&recorder);
-    let compressed = compressing.finish(&mut recorder);
+    tell(Going::Recording(&recorder));
+    let mut completion = Completion {
+        orders,
+        tell,
+        told: Instant::now(),
+        hurry,
+    };
+    let compressed = compressing.finish(&mut recorder, &mut completion);
     let refused = refused.or(compressed.err());
-    (recorder.finish(refused), broke)
+    let compress = |work| match UnderWay::begin(work) {
+        Some(under_way) => under_way.wait(&mut completion),
+        None => Ok(None),
+    };
+    (recorder.finish_with(refused, compress), broke)
 }
 
 enum Carried {
     Nothing,
     Out,
     Stop,
+    Hurry,
 }
 
 fn carry_out(orders: &Receiver<Order>, recorder: &mut Recorder<'_>) -> Result<Carried, Error> {
@@ -115,6 +170,7 @@ fn carry_out(orders: &Receiver<Order>, recorder: &mut Recorder<'_>) -> Result<Ca
             Ok(Order::Toggle) => recorder.pause(!recorder.is_paused()),
             Ok(Order::Split) => recorder.split()?,
             Ok(Order::Snapshot) => recorder.snapshot()?,
+            Ok(Order::Hurry) => return Ok(Carried::Hurry),
             // Who could give orders has gone.
             Ok(Order::Stop) | Err(TryRecvError::Disconnected) => return Ok(Carried::Stop),
             Err(TryRecvError::Empty) => return Ok(carried),
@@ -126,33 +182,87 @@ fn carry_out(orders: &Receiver<Order>, recorder: &mut Recorder<'_>) -> Result<Ca
 impl Compressing {
     /// Takes over what is done, and begins with what waits.
     fn look(&mut self, recorder: &mut Recorder<'_>) -> Result<(), Error> {
-        if self
-            .thread
-            .as_ref()
-            .is_some_and(|thread| !thread.is_finished())
+        if let Some(under_way) = &self.under_way
+            && !under_way.thread.is_finished()
         {
             return Ok(());
         }
-        self.finish(recorder)?;
-        let work = recorder.take_compressions();
-        if !work.is_empty() {
-            let run = move || work.iter().map(crate::bag::FileCompression::run).collect();
-            let thread = std::thread::Builder::new().name("compress".to_owned());
-            // Without a thread the files stay as they are, which is no loss.
-            self.thread = thread.spawn(run).ok();
+        if let Some(done) = self.under_way.take().and_then(UnderWay::join) {
+            recorder.compressed(&done?)?;
         }
+        self.waiting.extend(recorder.take_compressions());
+        self.under_way = self.waiting.pop_front().and_then(UnderWay::begin);
         Ok(())
     }
 
-    /// Waits for what is under way.
-    fn finish(&mut self, recorder: &mut Recorder<'_>) -> Result<(), Error> {
-        let Some(done) = self.thread.take().and_then(|thread| thread.join().ok()) else {
-            return Ok(());
-        };
-        for done in done {
-            recorder.compressed(&done?)?;
+    /// Waits for what was begun and for what waits.
+    fn finish(
+        &mut self,
+        recorder: &mut Recorder<'_>,
+        completion: &mut Completion<'_, impl FnMut(Going<'_>)>,
+    ) -> Result<(), Error> {
+        let waiting = std::mem::take(&mut self.waiting).into_iter();
+        let waiting = waiting.filter_map(UnderWay::begin);
+        for under_way in self.under_way.take().into_iter().chain(waiting) {
+            if let Some(done) = under_way.wait(completion)? {
+                recorder.compressed(&done)?;
+            }
         }
         Ok(())
+    }
+}
+
+impl UnderWay {
+    /// `None` without a thread: then the file stays as it is, which is no loss.
+    fn begin(work: FileCompression) -> Option<Self> {
+        let progress = Arc::new(Progress::default());
+        let (watched, bytes) = (Arc::clone(&progress), work.bytes());
+        let thread = std::thread::Builder::new().name("compress".to_owned());
+        let thread = thread.spawn(move || work.run_watched(&watched)).ok()?;
+        Some(Self {
+            thread,
+            progress,
+            bytes,
+        })
+    }
+
+    fn join(self) -> Option<Result<Compressed, Error>> {
+        self.thread.join().ok()
+    }
+
+    /// Waits until the file is compressed; `None` where that was given up.
+    fn wait(
+        self,
+        completion: &mut Completion<'_, impl FnMut(Going<'_>)>,
+    ) -> Result<Option<Compressed>, Error> {
+        while !self.thread.is_finished() {
+            if completion.is_hurried() {
+                self.progress.give_up();
+                break;
+            }
+            completion.compressing(self.progress.read(), self.bytes);
+            std::thread::sleep(LOOK);
+        }
+        let is_given_up = self.progress.is_given_up();
+        match self.join() {
+            Some(Ok(done)) => Ok(Some(done)),
+            Some(Err(error)) if !is_given_up => Err(error),
+            Some(Err(_)) | None => Ok(None),
+        }
+    }
+}
+
+impl<T: FnMut(Going<'_>)> Completion<'_, T> {
+    fn is_hurried(&mut self) -> bool {
+        self.hurry |= self.orders.try_iter().any(|order| order == Order::Hurry);
+        self.hurry
+    }
+
+    fn compressing(&mut self, done: u64, of: u64) {
+        if self.told.elapsed() >= TELL {
+            self.told = Instant::now();
+            (self.tell)(Going::Compressing { done, of });
+        }
     }
 }
 
