@@ -7,6 +7,12 @@
     reason = "a test that meets the unexpected has failed"
 )]
 
+#[path = "model/capture.rs"]
+#[allow(dead_code, reason = "each test file uses its own part")]
+mod capture;
+#[path = "model/forge.rs"]
+#[allow(dead_code, reason = "each test file uses its own part")]
+mod forge;
 mod local_agent;
 
 use std::collections::BTreeMap;
@@ -349,4 +355,35 @@ fn without_samples(
     }
     std::fs::write(to, kept).unwrap();
     left_out
+}
+
+#[test]
+fn a_replay_tells_every_endpoint_that_the_capture_announces_in_its_own_time() {
+    const SECOND: u64 = 1_000_000_000;
+    const START: u64 = 1_795_143_000 * SECOND;
+    let alice = ros2probe_wire::GuidPrefix(*b"\x01\x10alice-host");
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("announced.pcap");
+    let mut capture = capture::Capture::new(capture::ETHERNET);
+    capture.participant(START, 0, alice);
+    // 422 in 4 s: 200 a second are a storm, 106 are none.
+    for number in 0..422 {
+        let time = START + number as u64 * SECOND / 106;
+        let topic = format!("rt/topic{number}");
+        let guid = capture::writer(alice, number);
+        capture.writer(time, 0, guid, &topic, number as u64 + 1);
+    }
+    capture.write(&path);
+    let told = |speed: &str| {
+        let mut agent = LocalAgent::start_on(&path, &["--speed", speed]);
+        agent.wait_for_log("the capture has ended");
+        let events = kept(&agent, "&name=ros2.endpoint.*");
+        let told = events
+            .iter()
+            .map(|event| (event.event.clone(), event.attribute("topic")));
+        told.collect::<Vec<_>>()
+    };
+    let at_once = told("max");
+    assert_eq!(at_once.len(), 422, "{:?}", at_once.last());
+    assert_eq!(at_once, told("4"));
 }

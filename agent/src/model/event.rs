@@ -1,9 +1,10 @@
 //! What happened, for whoever wants to be told once rather than to ask how it stands: discovery
 //! churn, bursts of lost samples, changes of expectations.
 //!
-//! Facts without words: names, severities and attributes are the surface's. What waits to be taken
-//! is bounded for each class by itself, so that a storm of one leaves room for the others; what
-//! found no room is counted. Nobody has to take anything.
+//! Facts without words: names, severities and attributes are the surface's. The events of a second
+//! are bounded for each class by itself, so that a storm of one leaves room for the others; what
+//! found no room is counted. The seconds are those of the source's clock: a capture gives the same
+//! events at any speed.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -17,8 +18,11 @@ use super::diagnosis::Diagnosis;
 use super::journal::Loss;
 use super::snapshot::WatchState;
 
-/// Events of one class that wait at most: those of one round of the capture thread.
-const WAITING: u16 = 512;
+const SECOND: u64 = 1_000_000_000;
+/// Events of one class in a second of the source's clock.
+const MOST: u16 = 512;
+/// So many wait that they should be taken before more comes.
+const MANY: usize = 1024;
 /// Writers whose losses of one second are added up.
 const BURSTS: usize = 1024;
 /// Longest text kept, as of a topic's name.
@@ -170,7 +174,8 @@ pub struct Events {
 /// What one class has.
 #[derive(Clone, Copy, Debug, Default)]
 struct Room {
-    waiting: u16,
+    second: u64,
+    in_second: u16,
     overflow: u64,
 }
 
@@ -200,12 +205,23 @@ impl Events {
     /// Adds one, if there is room.
     pub fn push(&mut self, at: Timestamp, kind: EventKind) {
         let room = self.classes.entry(kind.class()).or_default();
-        if room.waiting >= WAITING {
+        let second = at.0 / SECOND;
+        // What is settled late belongs to the second before; further back the clock was set.
+        if second != room.second && second.checked_add(1) != Some(room.second) {
+            (room.second, room.in_second) = (second, 0);
+        }
+        if room.in_second >= MOST {
             room.overflow += 1;
             return;
         }
-        room.waiting += 1;
+        room.in_second += 1;
         self.waiting.push(Event { at, kind });
+    }
+
+    /// So many wait to be taken that nothing more should be given to the model before.
+    #[must_use]
+    pub const fn are_many(&self) -> bool {
+        self.waiting.len() >= MANY
     }
 
     /// Adds a loss to its writer's burst.
@@ -250,16 +266,12 @@ impl Events {
 
     /// Everything since the last call.
     pub fn take(&mut self) -> Taken {
-        let overflow = self
-            .classes
-            .iter()
-            .map(|(class, room)| (*class, room.overflow));
-        let taken = Taken {
+        let classes = self.classes.iter_mut();
+        let overflow = classes.map(|(class, room)| (*class, std::mem::take(&mut room.overflow)));
+        Taken {
             overflow: overflow.filter(|(_, count)| *count > 0).collect(),
             events: std::mem::take(&mut self.waiting),
-        };
-        self.classes.clear();
-        taken
+        }
     }
 }
 
@@ -366,15 +378,18 @@ mod tests {
     #[test]
     fn a_storm_of_one_class_leaves_room_for_the_others_and_is_counted() {
         let mut events = Events::default();
-        for number in 0..WAITING + 7 {
+        for number in 0..MOST + 7 {
             events.push(Timestamp(number.into()), node("/a"));
         }
         events.lose(&loss(guid(1), 10, 5, 7));
         events.end_bursts(|_| {});
         let taken = events.take();
-        assert_eq!(taken.events.len(), usize::from(WAITING) + 1);
+        assert_eq!(taken.events.len(), usize::from(MOST) + 1);
         assert_eq!(taken.overflow, [(Class::Node, 7)]);
-        events.push(Timestamp(1), node("/b"));
+        // Taken or not, the second has had its share; the next one has its own.
+        events.push(Timestamp(SECOND - 1), node("/b"));
+        assert_eq!(events.take().overflow, [(Class::Node, 1)]);
+        events.push(Timestamp(SECOND), node("/b"));
         let taken = events.take();
         assert_eq!((taken.events.len(), taken.overflow.len()), (1, 0));
     }

@@ -244,7 +244,7 @@ impl Observer {
     /// So much waits to be given that it should be taken before more comes.
     #[must_use]
     pub const fn has_much_to_give(&self) -> bool {
-        self.payloads.is_full()
+        self.payloads.is_full() || self.journal.events.are_many()
     }
 
     /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`

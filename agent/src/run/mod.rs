@@ -151,6 +151,9 @@ impl Run {
             if held {
                 self.source.rest();
             }
+            if finished {
+                self.board.events().settle();
+            }
             polled?;
             if finished {
                 return Ok(());
@@ -166,10 +169,11 @@ impl Run {
 
     /// Gives away what happened since the last time; nobody makes this wait.
     fn hand_over(&mut self) {
-        self.board.events().add(self.observer.take_events());
+        let now = self.source.clock();
+        self.board.events().add(self.observer.take_events(), now);
         self.board.add_spans(self.observer.take_spans());
         let given = self.observer.take_given();
-        let clock = self.observer.given_until(self.source.clock());
+        let clock = self.observer.given_until(now);
         if clock.0.saturating_add(SET_BACK) < self.told.0 {
             self.told = clock;
         }

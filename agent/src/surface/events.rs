@@ -3,7 +3,8 @@
 //! Who tells is never held up: it appends under a lock that readers hold only to copy references.
 //! A reader keeps its own place; what was overwritten before it came is counted and told to it,
 //! never passed over in silence. Storms are cut here: so many events of one name in a second, the
-//! rest in one number.
+//! rest in one number. The seconds of what happened to the robot are those of the source's clock, so
+//! that a capture gives the same events at any speed.
 //!
 //! A number belongs to one run of the agent. Written out, an id names the run too, so that after a
 //! restart nobody mistakes an old place for a new one.
@@ -27,6 +28,7 @@ pub use record::{AgentEvent, Record, Value};
 pub use table::{Definition, EVENTS, Severity, markdown};
 pub use watchman::{Drops, Sight};
 
+const SECOND: u64 = 1_000_000_000;
 /// Events kept.
 const KEPT: usize = 4096;
 /// Events of one name in a second.
@@ -81,11 +83,19 @@ struct Log {
     /// Number of the latest event.
     last: u64,
     told: BTreeMap<&'static str, u64>,
-    /// Whole second of the agent's life, and what was told in it.
-    second: u64,
-    this_second: BTreeMap<&'static str, u32>,
-    held_back: BTreeMap<&'static str, u64>,
+    /// Of the robot, in seconds of the source's clock.
+    robot: Storm,
+    /// Of the agent, in seconds of its life.
+    agent: Storm,
     suppressed: u64,
+}
+
+/// Events of one whole second.
+#[derive(Debug, Default)]
+struct Storm {
+    second: u64,
+    told: BTreeMap<&'static str, u32>,
+    held_back: BTreeMap<&'static str, u64>,
 }
 
 #[derive(Debug)]
@@ -115,18 +125,38 @@ impl EventLog {
         }
     }
 
-    /// Tells what the model noticed. Called with nothing too, so that a storm's end is told.
-    pub fn add(&self, taken: Taken) {
-        self.add_at(taken, Instant::now());
+    /// Tells what the model noticed until `clock`, the source's. Called with nothing too, so that a
+    /// storm's end is told.
+    pub fn add(&self, taken: Taken, clock: Timestamp) {
+        let mut log = self.log();
+        let before = log.last;
+        for event in taken.events {
+            log.turn_robot(event.at.0 / SECOND);
+            log.tell(event.at, Happened::Robot(event.kind));
+        }
+        for (class, count) in taken.overflow {
+            log.hold_back(group(class), count);
+        }
+        // What is settled late happened up to a second ago.
+        log.turn_robot((clock.0 / SECOND).saturating_sub(1));
+        let is_news = log.last > before;
+        drop(log);
+        if is_news {
+            self.news.notify_waiters();
+        }
+    }
+
+    /// Nothing more will come: tells what is still held back.
+    pub fn settle(&self) {
+        let mut log = self.log();
+        log.tell_held_back();
+        drop(log);
+        self.news.notify_waiters();
     }
 
     /// Tells what happened to the agent just now.
     pub fn tell(&self, event: AgentEvent) {
-        let mut log = self.log();
-        log.turn(self.second(Instant::now()));
-        log.tell(wall_clock(), Happened::Agent(event));
-        drop(log);
-        self.news.notify_waiters();
+        self.tell_at(event, Instant::now());
     }
 
     /// Events behind this number, oldest first, not more than so many.
@@ -220,21 +250,18 @@ impl EventLog {
         dropped
     }
 
-    fn add_at(&self, taken: Taken, now: Instant) {
+    fn tell_at(&self, event: AgentEvent, now: Instant) {
+        let second = now.saturating_duration_since(self.begun).as_secs();
         let mut log = self.log();
-        let before = log.last;
-        log.turn(self.second(now));
-        for event in taken.events {
-            log.tell(event.at, Happened::Robot(event.kind));
+        if second > log.agent.second {
+            for (event, count) in log.agent.turn(second) {
+                let suppressed = AgentEvent::Suppressed { event, count };
+                log.append(wall_clock(), Happened::Agent(suppressed));
+            }
         }
-        for (class, count) in taken.overflow {
-            log.hold_back(group(class), count);
-        }
-        let is_news = log.last > before;
+        log.tell(wall_clock(), Happened::Agent(event));
         drop(log);
-        if is_news {
-            self.news.notify_waiters();
-        }
+        self.news.notify_waiters();
     }
 
     /// As if so many events had come and all that is kept had gone since.
@@ -247,10 +274,6 @@ impl EventLog {
         self.news.notify_waiters();
     }
 
-    fn second(&self, now: Instant) -> u64 {
-        now.saturating_duration_since(self.begun).as_secs()
-    }
-
     /// What was appended before a panic is whole.
     fn log(&self) -> MutexGuard<'_, Log> {
         self.log.lock().unwrap_or_else(PoisonError::into_inner)
@@ -258,32 +281,40 @@ impl EventLog {
 }
 
 impl Log {
-    /// It is this second now: tells what the last one held back.
-    fn turn(&mut self, second: u64) {
-        if second <= self.second {
+    /// It is this second of the source's clock now: tells what the last one held back. What belongs
+    /// to the second before is of this one; further back the clock was set.
+    fn turn_robot(&mut self, second: u64) {
+        let current = self.robot.second;
+        if second == current || second.checked_add(1) == Some(current) {
             return;
         }
-        self.second = second;
-        self.this_second.clear();
-        for (event, count) in std::mem::take(&mut self.held_back) {
+        self.tell_held_back();
+        self.robot.turn(second);
+    }
+
+    fn tell_held_back(&mut self) {
+        let end = Timestamp(self.robot.second.saturating_add(1).saturating_mul(SECOND));
+        for (event, count) in std::mem::take(&mut self.robot.held_back) {
             let suppressed = AgentEvent::Suppressed { event, count };
-            self.append(wall_clock(), Happened::Agent(suppressed));
+            self.append(end, Happened::Agent(suppressed));
         }
     }
 
     fn tell(&mut self, at: Timestamp, happened: Happened) {
         let name = happened.definition().name;
-        let told = self.this_second.entry(name).or_default();
-        if *told >= MOST {
-            self.hold_back(name, 1);
-            return;
+        let storm = match happened {
+            Happened::Robot(_) => &mut self.robot,
+            Happened::Agent(_) => &mut self.agent,
+        };
+        if storm.admits(name) {
+            self.append(at, happened);
+        } else {
+            self.suppressed += 1;
         }
-        *told += 1;
-        self.append(at, happened);
     }
 
     fn hold_back(&mut self, name: &'static str, count: u64) {
-        *self.held_back.entry(name).or_default() += count;
+        *self.robot.held_back.entry(name).or_default() += count;
         self.suppressed += count;
     }
 
@@ -299,6 +330,26 @@ impl Log {
             observed: wall_clock(),
             happened,
         }));
+    }
+}
+
+impl Storm {
+    /// Begins this second; what the one before held back, by name.
+    fn turn(&mut self, second: u64) -> BTreeMap<&'static str, u64> {
+        self.second = second;
+        self.told.clear();
+        std::mem::take(&mut self.held_back)
+    }
+
+    /// Whether there is room for an event of this name; held back otherwise.
+    fn admits(&mut self, name: &'static str) -> bool {
+        let told = self.told.entry(name).or_default();
+        if *told >= MOST {
+            *self.held_back.entry(name).or_default() += 1;
+            return false;
+        }
+        *told += 1;
+        true
     }
 }
 
