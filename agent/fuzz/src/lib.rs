@@ -403,6 +403,7 @@ const SMALL: Settings = Settings {
     sample_bytes: 1 << 12,
     payload_bytes: 1 << 14,
     topic_grace: 1_000_000_000,
+    telling: 400_000_000,
     directed: true,
 };
 

@@ -64,6 +64,15 @@ pub enum PcapError {
         /// The system's reason.
         source: io::Error,
     },
+    /// None of its packets can be read.
+    #[error(
+        "its link type is {}, which rp cannot read: capture Ethernet, loopback or the interface `any`",
+        link_name(*link)
+    )]
+    UnsupportedLink {
+        /// The link layer of its packets.
+        link: Link,
+    },
     /// Neither pcap nor pcapng.
     #[error("not a capture: it begins with {0:02x?}, which is neither pcap nor pcapng")]
     NotACapture([u8; 4]),
@@ -172,6 +181,15 @@ impl PcapReader {
         self.packets
     }
 
+    /// The link layer of all packets, where the file has one for all (pcap only).
+    #[must_use]
+    pub const fn link(&self) -> Option<Link> {
+        match &self.format {
+            Format::Classic(classic) => Some(classic.link),
+            Format::NextGeneration(_) => None,
+        }
+    }
+
     /// Name of the interface with this number, where the capture tells (pcapng only).
     #[must_use]
     pub fn interface_name(&self, interface: u32) -> Option<&str> {
@@ -277,6 +295,24 @@ impl Classic {
             length: length.max(captured),
         }))
     }
+}
+
+/// The number of a link layer, and what it is where captures of it are common.
+#[must_use]
+pub fn link_name(link: Link) -> String {
+    let name = match link.0 {
+        9 => "PPP",
+        105 => "802.11",
+        119 => "802.11 with Prism header",
+        127 => "802.11 with radiotap header",
+        187 | 201 => "Bluetooth",
+        189 | 220 => "USB",
+        192 => "PPI",
+        195 | 230 => "802.15.4",
+        227 => "CAN",
+        _ => return link.0.to_string(),
+    };
+    format!("{} ({name})", link.0)
 }
 
 /// The upper half of the field tells about frame check sequences: the IP length cuts those off.

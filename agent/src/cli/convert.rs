@@ -15,6 +15,9 @@ use super::record::Record;
 The whole capture (`rp bag record --replay FILE --from T --until T` takes a part), at the speed of this
 machine: nothing is dropped. Messages have the times at which they were captured. What was never whole on the wire is not
 in the bag and is named at the end, and in the bag's metadata. No privilege and no agent is needed.
+Exit code: 0 when everything is in the bag; 3 when the bag is written and something is missing:
+fragments, messages before the announcement of their writer, unknown writers, topics that pass
+through memory, other domains, the end of a cut capture; 1 when there is nothing to read or to write.
 
 Examples:
   rp bag convert robot.pcap.gz drive                     every topic

@@ -14,6 +14,7 @@ use ros2probe::ros2::name::full_name;
 use ros2probe::visible::visible_lines;
 
 use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
+use super::notes::{NOT_ALL_PRINTED, Notes};
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
@@ -28,7 +29,7 @@ const CLEAR: &str = "\x1b[H\x1b[2J\n";
 numbers, strings, comparisons, in, and, or, not, + - * / // % **, lists, abs, all, any, bool, float,
 int, len, max, min, str, sum, and of strings startswith, endswith, lower, upper.
 
-Messages that were sent before cannot be had without joining the domain: they are not printed.
+rp does not subscribe, so it cannot request messages that were sent before.
 
 Examples:
   rp topic echo /chatter --once
@@ -59,10 +60,10 @@ pub(crate) struct Echo {
     /// Print times and sequence number before each message
     #[arg(long, short = 'i')]
     include_message_info: bool,
-    /// Do not tell of lost messages
+    /// Do not report lost messages
     #[arg(long)]
     no_lost_messages: bool,
-    /// Accepted without effect: lost messages are told anyway
+    /// Accepted without effect: lost messages are reported anyway
     #[arg(long, hide = true)]
     lost_messages: bool,
     /// Clear the screen before each message
@@ -126,45 +127,42 @@ impl Echo {
         let mut lost = Lost::default();
         let mut start = None;
         let mut is_seen = known.is_some();
-        let went = follow(
-            &agent,
-            domain_id,
-            std::slice::from_ref(&name),
-            |came, now| {
-                let start = *start.get_or_insert(now);
-                let mut text = String::new();
-                let mut is_enough = false;
-                match came {
-                    Came::Clock => {}
-                    Came::Missed(missed) => text = lost.missed(missed),
-                    Came::Message(sample, payload) => {
-                        is_seen = true;
-                        let wanted = self.message_type.as_ref().or(expected.as_ref());
-                        if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
-                            let message_type = if raw { None } else { types.of(sample) };
-                            let told = echo.message(sample, message_type.as_deref(), &payload);
-                            let told = told.map_err(said)?;
-                            eprint!("{}", visible_lines(&told.err));
-                            if let Some(message) = told.out {
-                                if self.clear {
-                                    output.write(CLEAR)?;
-                                }
-                                output.write(&for_stdout(message))?;
-                                is_enough = self.once;
+        let names = std::slice::from_ref(&name);
+        let mut notes = Notes::begin(&agent, domain_id, is_waiting, names, NOT_ALL_PRINTED);
+        let went = follow(&agent, domain_id, names, &mut notes, |came, now| {
+            let start = *start.get_or_insert(now);
+            let mut text = String::new();
+            let mut is_enough = false;
+            match came {
+                Came::Clock => {}
+                Came::Missed(missed) => text = lost.missed(missed),
+                Came::Message(sample, payload) => {
+                    is_seen = true;
+                    let wanted = self.message_type.as_ref().or(expected.as_ref());
+                    if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
+                        let message_type = if raw { None } else { types.of(sample) };
+                        let told = echo.message(sample, message_type.as_deref(), &payload);
+                        let told = told.map_err(said)?;
+                        eprint!("{}", visible_lines(&told.err));
+                        if let Some(message) = told.out {
+                            if self.clear {
+                                output.write(CLEAR)?;
                             }
+                            output.write(&for_stdout(message))?;
+                            is_enough = self.once;
                         }
                     }
                 }
-                if !text.is_empty() && !self.no_lost_messages {
-                    output.write(&text)?;
-                }
-                is_enough |= self
-                    .timeout
-                    .is_some_and(|timeout| elapsed(start, now) >= timeout);
-                Ok(if is_enough { Went::Enough } else { Went::On })
-            },
-        )?;
-        if went == Went::ToTheEnd {
+            }
+            if !text.is_empty() && !self.no_lost_messages {
+                output.write(&text)?;
+            }
+            is_enough |= self
+                .timeout
+                .is_some_and(|timeout| elapsed(start, now) >= timeout);
+            Ok(if is_enough { Went::Enough } else { Went::On })
+        })?;
+        if matches!(went, Went::ToTheEnd | Went::Cut) {
             let is_known = is_seen || self.message_type.is_some();
             if !is_known
                 && topic(
@@ -180,7 +178,7 @@ impl Echo {
         if echo.unreadable() > 1 {
             eprintln!("rp: {} messages could not be read", echo.unreadable());
         }
-        Ok(ExitCode::SUCCESS)
+        Ok(ExitCode::from(u8::from(went == Went::Cut)))
     }
 
     fn options(&self) -> Result<echo::Options> {
@@ -245,8 +243,8 @@ fn hint(name: &str, known: &Topic, expected: Option<&str>) {
         .any(|one| one.qos.durability == "TRANSIENT_LOCAL")
     {
         eprintln!(
-            "rp: what was sent on {name} before now is not printed: its publishers keep it for \
-             subscribers, and rp is none"
+            "rp: {name} is latched; rp does not subscribe, so it cannot request earlier messages (see \
+             `retain: last`)"
         );
     }
 }

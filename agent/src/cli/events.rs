@@ -11,6 +11,7 @@ use ros2probe::ros2::name::full_name;
 use ros2probe::visible::visible_lines;
 
 use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
+use super::notes::{NOT_ALL_PRINTED, Notes};
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
@@ -166,7 +167,10 @@ fn print(
         ..echo::Options::default()
     });
     let names: Vec<_> = topics.iter().map(|(_, name)| name.clone()).collect();
-    follow(agent, target.domain()?, &names, |came, _| {
+    let domain_id = target.domain()?;
+    let is_replay = target.replay.is_some();
+    let mut notes = Notes::begin(agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
+    let went = follow(agent, domain_id, &names, &mut notes, |came, _| {
         if let Came::Message(sample, payload) = came
             && expected.is_none_or(|expected| expected == sample.message_type)
             && let Some(message_type) = types.of(sample)
@@ -179,7 +183,7 @@ fn print(
         }
         Ok(Went::On)
     })?;
-    Ok(ExitCode::SUCCESS)
+    Ok(ExitCode::from(u8::from(went == Went::Cut)))
 }
 
 fn said(refused: Refused) -> anyhow::Error {

@@ -13,13 +13,16 @@ use ros2probe::message::filter::{Filter, Subject};
 use ros2probe::message::yaml::Style;
 use ros2probe::message::{Library, Limits, MessageType, Shown, Sources, decode};
 use ros2probe::ros2::facts::Topic;
-use ros2probe::subscriptions::line::{Line, MissedFacts, Reason, SampleFacts};
+use ros2probe::subscriptions::line::{Line, MissedFacts, SampleFacts};
 use ros2probe::visible::{visible, visible_lines};
 
 use super::Said;
+use super::notes::Notes;
 
+/// What is wrong when a live agent ends its stream.
+pub(crate) const AGENT_ENDED: &str = "the agent has ended: `systemctl status ros2probe` shows why, `rp run` starts one in a terminal";
 /// How a replay ends.
-const END_OF_CAPTURE: &str = "end of capture";
+pub(crate) const END_OF_CAPTURE: &str = "end of capture";
 /// Writers whose types are remembered.
 const MAX_WRITERS: usize = 1024;
 
@@ -108,6 +111,8 @@ pub(crate) enum Went {
     Enough,
     /// The capture has ended.
     ToTheEnd,
+    /// The rest of the capture cannot be read, which stderr says.
+    Cut,
 }
 
 /// The messages of topics: each thing that comes, and the time in nanoseconds, until `visit` has
@@ -116,6 +121,7 @@ pub(crate) fn follow(
     agent: &Agent,
     domain_id: u32,
     topics: &[String],
+    notes: &mut Notes<'_>,
     mut visit: impl FnMut(Came<'_>, i64) -> Result<Went>,
 ) -> Result<Went> {
     let names: Vec<String> = topics.iter().map(|name| encoded(name)).collect();
@@ -130,46 +136,36 @@ pub(crate) fn follow(
                 let length = sample.payload_bytes.unwrap_or(0);
                 let payload = lines.bytes(usize::try_from(length)?)?;
                 now = now.max(Some(sample.time_ns));
+                notes.came(&sample.topic, sample.sampled);
                 visit(Came::Message(&sample, payload), sample.time_ns)?
             }
             Line::Clock(clock) => {
                 now = now.max(Some(clock.time_ns));
+                notes.now()?;
                 visit(Came::Clock, clock.time_ns)?
             }
             Line::Missed(missed) => {
-                hint(&missed);
+                notes.missed(&missed);
                 match now {
                     Some(now) => visit(Came::Missed(&missed), now)?,
                     None => Went::On,
                 }
             }
-            Line::End(end) if end.reason == END_OF_CAPTURE => return Ok(Went::ToTheEnd),
+            Line::End(end) if end.reason == END_OF_CAPTURE => {
+                notes.end()?;
+                return Ok(Went::ToTheEnd);
+            }
+            Line::End(_) if agent.outcome().is_some() => {
+                notes.end()?;
+                return Ok(Went::Cut);
+            }
             Line::End(_) => break,
         };
         if went != Went::On {
             return Ok(went);
         }
     }
-    Err(Said("the agent has ended".to_owned()).into())
-}
-
-/// What was on the wire and is not shown is said on stderr.
-fn hint(missed: &MissedFacts) {
-    let (samples, topic) = (missed.samples, visible(&missed.topic));
-    match missed.reason {
-        Reason::QueueFull => {
-            eprintln!("rp: {samples} messages of {topic} are not shown: too slow here");
-        }
-        Reason::NotCaptured => {
-            eprintln!("rp: {samples} messages of {topic} are not shown: the agent has no room");
-        }
-        Reason::Unannounced => {
-            eprintln!(
-                "rp: {samples} messages of {topic} are not shown: they came before their publisher was announced"
-            );
-        }
-        Reason::Incomplete | Reason::Lost => {}
-    }
+    Err(Said(AGENT_ENDED.to_owned()).into())
 }
 
 /// What an agent knows of a topic.

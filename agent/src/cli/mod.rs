@@ -11,6 +11,7 @@ mod events;
 mod follow;
 mod interrupt;
 mod node;
+mod notes;
 mod output;
 mod rates;
 mod record;

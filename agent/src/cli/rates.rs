@@ -14,8 +14,9 @@ use ros2probe::ros2::rates::{Arrival, End, Named, Origin, Quantity, Rates};
 use ros2probe::ros2::{Dialect, Refused};
 use ros2probe::subscriptions::line::{Line, Reason};
 
-use super::follow::{Sieve, library};
+use super::follow::{AGENT_ENDED, END_OF_CAPTURE, Sieve, library};
 use super::interrupt::INTERRUPTED;
+use super::notes::Notes;
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, Said};
 
@@ -23,9 +24,6 @@ use super::{Output, Said};
 const LONG: usize = 10_000;
 /// Window of `bw`.
 const SHORT: usize = 100;
-/// How a replay ends.
-const END_OF_CAPTURE: &str = "end of capture";
-
 /// `rp topic hz`.
 #[derive(Args, Debug)]
 pub(crate) struct Hz {
@@ -164,6 +162,7 @@ fn measure(
 ) -> Result<ExitCode> {
     let dialect = target.dialect();
     let domain_id = target.domain()?;
+    let mut names = Vec::new();
     let (mut rates, query) = if topics.all {
         if !topics.names.is_empty() {
             return Err(Said("Cannot specify both --all/-a and topic names".to_owned()).into());
@@ -179,11 +178,16 @@ fn measure(
             Ok(Named { typed, name })
         });
         let named: Vec<Named> = named.collect::<Result<_, Refused>>().map_err(said)?;
-        let names: Vec<String> = named.iter().map(|named| encoded(&named.name)).collect();
-        let query = format!("topic={}", names.join(","));
+        names = named.iter().map(|named| named.name.clone()).collect();
+        let query: Vec<String> = names.iter().map(|name| encoded(name)).collect();
+        let query = format!("topic={}", query.join(","));
         (Rates::of(quantity, dialect, window, named), query)
     };
     let agent = Agent::reach_stream(target)?;
+    let is_replay = target.replay.is_some();
+    let mut notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
+    rates.said_sampled(notes.sampled());
+    let mut code = ExitCode::SUCCESS;
     let payload = sieve.is_some();
     let path = format!("/samples?{query}&domain_id={domain_id}&payload={payload}");
     let mut lines = agent.stream(&path)?;
@@ -200,6 +204,7 @@ fn measure(
                 rates.opened(&present)
             }
             Line::Sample(sample) => {
+                notes.came(&sample.topic, false);
                 let arrival = Arrival {
                     time: sample.time_ns,
                     size: sample.size,
@@ -229,20 +234,28 @@ fn measure(
             }
             Line::Clock(clock) => {
                 rates.clock(clock.time_ns);
+                notes.now()?;
                 Ok(())
             }
             Line::Missed(missed) => {
-                if missed.reason == Reason::QueueFull {
-                    let (samples, topic) = (missed.samples, missed.topic);
-                    eprintln!("rp: {samples} messages of {topic} are not counted: too slow here");
+                // Arrivals are counted without their bytes.
+                if matches!(missed.reason, Reason::QueueFull | Reason::Unannounced) {
+                    notes.missed(&missed);
                 }
                 Ok(())
             }
             Line::End(end) => {
                 rates.finish();
-                match end.reason.as_str() {
-                    END_OF_CAPTURE => Err(End::Idle),
-                    _ => Err(End::Refused(Refused("rp: the agent has ended".to_owned()))),
+                if end.reason == END_OF_CAPTURE {
+                    notes.end()?;
+                    Err(End::Idle)
+                } else if agent.outcome().is_some() {
+                    // The rest of the capture cannot be read, which stderr says.
+                    notes.end()?;
+                    code = ExitCode::FAILURE;
+                    Err(End::Idle)
+                } else {
+                    Err(End::Refused(Refused(format!("rp: {AGENT_ENDED}"))))
                 }
             }
         };
@@ -257,7 +270,17 @@ fn measure(
             Err(End::Refused(refused)) => return Err(said(refused)),
         }
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(code)
+}
+
+/// What being sampled means for this quantity.
+const fn sampled(quantity: Quantity) -> &'static str {
+    match quantity {
+        Quantity::Rate | Quantity::Bandwidth => {
+            "unseen messages are counted from sequence numbers and their times estimated"
+        }
+        Quantity::Delay => "unseen messages have no delay",
+    }
 }
 
 fn said(refused: Refused) -> anyhow::Error {

@@ -1,23 +1,23 @@
 //! `rp bag record`: a bag written by this process, with its rights and where it was started, out of
 //! what an agent gives. Says on stderr what the original says there.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::io::{self, IsTerminal as _, Read as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::mpsc::{Sender, channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, anyhow, bail};
 use clap::Args;
 use ros2probe::bag::{self, Form, Options, Storage, Writer};
-use ros2probe::client::{Agent, Samples, Target};
+use ros2probe::client::{Agent, Outcome, Samples, Target};
 use ros2probe::message::{Library, Sources as Places};
 use ros2probe::recording::{
-    Announced, Asked, Ended, Filter, Going, Graph, Order, Recorder, Ring, Sources, default_name,
-    record, schema,
+    Announced, Asked, Ended, Filter, Going, Graph, Order, Recorder, Ring, Sight, Sources,
+    Strangers, default_name, record, schema, unobserved_lines,
 };
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::name::full_name;
@@ -27,10 +27,13 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::Said;
 use super::interrupt::INTERRUPTED;
+use super::notes::{SILENT, is_sampled, sampled, samples_shared_memory};
 
 /// Room for messages that wait for the storage, as the original's cache.
 const CACHE: u64 = 100 << 20;
 const SPACE: u8 = b' ';
+/// What ends a capture's recording that lacks something the capture holds.
+const INCOMPLETE: u8 = 3;
 /// How long an answer about announcements is waited for, and how old it may be.
 const GRAPH_PATIENCE: Duration = Duration::from_secs(2);
 const GRAPH_AGE: Duration = Duration::from_secs(1);
@@ -42,6 +45,7 @@ Nothing on the network tells that there is a recording: messages are copied, not
 was never whole on the wire is not in the bag and is named at the end, and in the bag's metadata.
 Space pauses and resumes. SIGUSR1 writes what waits in --snapshot-mode. Ctrl-C ends the recording;
 a second one skips what takes long (messages on their way, compression of files), a third one all.
+Exit code: 0; 1 when the storage takes no more; of a capture, 3 when something is not in the bag.
 
 Examples:
   rp bag record -a                                      every topic
@@ -179,8 +183,9 @@ struct Phase(Arc<AtomicU8>);
 /// What an agent says of topics, asked for all of them at once.
 struct Announcements<'a> {
     agent: &'a Agent,
-    path: String,
+    domain_id: u32,
     known: HashMap<String, Announced>,
+    sight: Sight,
     at: Option<Instant>,
 }
 
@@ -217,8 +222,11 @@ impl Record {
             ))
             .into());
         }
-        let agent = Agent::reach_stream(&self.target)?;
+        let agent = Agent::reach_stream_measured(&self.target)?;
         let query = filter.query(domain_id, self.max_cache_size);
+        let announcements = Arc::new(Mutex::new(Announcements::new(&agent, domain_id)));
+        // A replay goes on with the stream.
+        let before = locked(&announcements).sight();
         let mut samples = Samples::open(&agent, &query)?;
         let filter = if self.no_discovery {
             let opened = samples.opened().topics.iter();
@@ -233,19 +241,25 @@ impl Record {
             dialect,
         );
         let library = Library::new(places);
-        let mut announcements = Announcements::new(&agent, domain_id);
+        let (asked, seen) = (Arc::clone(&announcements), Arc::clone(&announcements));
         let sources = Sources {
-            announced: Box::new(move |names| announcements.of(names)),
+            announced: Box::new(move |names| locked(&asked).of(names)),
+            sight: Box::new(move || locked(&seen).sight()),
             schema: Box::new(move |name, hash| schema(&library, name, hash)),
         };
         phase.begin();
         let writer = Writer::create(&directory, options)?;
-        let mut recorder = Recorder::new(writer, filter, sources);
+        let mut recorder = Recorder::new(writer, filter, domain_id, before, sources);
         if self.snapshot_mode {
             let room = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
             recorder = recorder.waiting_in(Ring::new(room, None));
         }
         recorder.pause(self.start_paused);
+        let is_live = self.target.replay.is_none();
+        let mut said = Told::new(is_live.then(|| Arc::clone(&announcements)));
+        if is_live && samples_shared_memory(&agent) {
+            said.sampled(&recorder, &locked(&announcements).sight);
+        }
         let opened = samples.opened().topics.iter();
         recorder.declare(opened.filter_map(|topic| {
             let message_type = topic.types.first()?;
@@ -270,12 +284,12 @@ impl Record {
                 "Recording..."
             },
         );
-        let mut said = Told::new();
         let next = |patience: Duration| samples.next_within(patience);
         let (ended, broke) = record(recorder, next, &orders, |going| said.tell(going));
         drop(keys);
         said.finish();
-        let code = report(&ended);
+        let outcome = agent.outcome().unwrap_or_default();
+        let code = report(&ended, &outcome, self.target.replay.is_some());
         match broke {
             Some(error) => Err(error.into()),
             None => Ok(code),
@@ -362,7 +376,11 @@ impl Drop for Keys {
 }
 
 /// What was said of a recording so far.
-struct Told {
+struct Told<'a> {
+    /// Asked why topics are silent, where that can be answered.
+    announcements: Option<Arc<Mutex<Announcements<'a>>>>,
+    begun: Instant,
+    sampled: BTreeSet<String>,
     topics: usize,
     files: usize,
     paused: Option<bool>,
@@ -371,9 +389,12 @@ struct Told {
     compressing: u64,
 }
 
-impl Told {
-    fn new() -> Self {
+impl<'a> Told<'a> {
+    fn new(announcements: Option<Arc<Mutex<Announcements<'a>>>>) -> Self {
         Self {
+            announcements,
+            begun: Instant::now(),
+            sampled: BTreeSet::new(),
             topics: 0,
             files: 1,
             paused: None,
@@ -406,7 +427,50 @@ impl Told {
         }
     }
 
+    /// Names the topics that are sampled from the start.
+    fn sampled(&mut self, recorder: &Recorder<'_>, sight: &Sight) {
+        let topics = sight.topics.iter();
+        let topics = topics.filter(|topic| is_sampled(topic) && recorder.takes(topic));
+        self.say_sampled(topics.map(|topic| topic.name.clone()).collect());
+    }
+
+    fn say_sampled(&mut self, topics: Vec<String>) {
+        if let Some(text) = sampled(&topics, "not every message will be in the bag") {
+            self.clear();
+            log("WARN", &text);
+        }
+        self.sampled.extend(topics);
+    }
+
+    /// After a while, once: why nothing came of topics.
+    fn explain(&mut self, recorder: &Recorder<'_>) {
+        if self.begun.elapsed() < SILENT {
+            return;
+        }
+        let Some(announcements) = self.announcements.take() else {
+            return;
+        };
+        let sight = locked(&announcements).sight();
+        let mut lines = unobserved_lines(&recorder.unobserved(&sight));
+        let is_known = |name: &&String| sight.topics.iter().any(|topic| topic.name == **name);
+        let unknown = recorder
+            .asked()
+            .topics
+            .iter()
+            .filter(|name| !is_known(name));
+        lines.extend(unknown.map(|name| {
+            format!("{name} has no known publisher; it is recorded from its first message on")
+        }));
+        for line in lines {
+            self.clear();
+            log("WARN", &line);
+        }
+    }
+
     fn recording(&mut self, recorder: &Recorder<'_>) {
+        self.explain(recorder);
+        let new = recorder.sampled().difference(&self.sampled);
+        self.say_sampled(new.cloned().collect());
         let report = recorder.report();
         if report.topics.len() > self.topics {
             self.clear();
@@ -455,8 +519,9 @@ impl Told {
     }
 }
 
-/// What is in the bag and what is not; 1 where the storage refused something.
-fn report(ended: &Ended) -> ExitCode {
+/// What is in the bag and what is not. 1 where the storage refused something or nothing of a capture
+/// could be read, [`INCOMPLETE`] where something of a capture is not in the bag.
+fn report(ended: &Ended, outcome: &Outcome, is_replay: bool) -> ExitCode {
     for line in ended.report.shortfalls() {
         log("WARN", &line);
     }
@@ -472,10 +537,21 @@ fn report(ended: &Ended) -> ExitCode {
         let (messages, directory) = (summary.messages, summary.directory.display());
         log("INFO", &format!("{messages} messages in {directory}"));
     }
-    log("INFO", "Recording stopped");
-    match ended.error {
-        None => ExitCode::SUCCESS,
-        Some(_) => ExitCode::FAILURE,
+    let is_whole = outcome.fault.is_none() && outcome.unsupported_packets == 0;
+    let is_complete = ended.report.is_complete() && is_whole && ended.error.is_none();
+    if is_complete {
+        log("INFO", "Recording stopped");
+    } else {
+        let text = "Recording stopped; not everything that was sent is in the bag, see above";
+        log("WARN", text);
+    }
+    let is_unreadable = outcome.fault.is_some() && ended.report.messages == 0;
+    if ended.error.is_some() || is_unreadable {
+        ExitCode::FAILURE
+    } else if is_replay && !is_complete {
+        ExitCode::from(INCOMPLETE)
+    } else {
+        ExitCode::SUCCESS
     }
 }
 
@@ -519,8 +595,9 @@ impl<'a> Announcements<'a> {
     fn new(agent: &'a Agent, domain_id: u32) -> Self {
         Self {
             agent,
-            path: format!("/topics?domain_id={domain_id}&hidden=true"),
+            domain_id,
             known: HashMap::new(),
+            sight: Sight::default(),
             at: None,
         }
     }
@@ -529,15 +606,38 @@ impl<'a> Announcements<'a> {
     fn of(&mut self, names: &[String]) -> Vec<Announced> {
         let is_old = self.at.is_none_or(|at| at.elapsed() > GRAPH_AGE);
         if is_old || names.iter().any(|name| !self.known.contains_key(name)) {
-            let graph = self.agent.get_within::<Graph>(&self.path, GRAPH_PATIENCE);
-            if let Ok(graph) = graph {
-                self.known = graph.by_name();
-                self.at = Some(Instant::now());
-            }
+            self.ask();
         }
         let known = names.iter().map(|name| self.known.get(name).cloned());
         known.map(Option::unwrap_or_default).collect()
     }
+
+    fn sight(&mut self) -> Sight {
+        self.ask();
+        self.sight.clone()
+    }
+
+    fn ask(&mut self) {
+        let graph = self
+            .agent
+            .get_within::<Graph>("/topics?hidden=true", GRAPH_PATIENCE);
+        let strangers = self
+            .agent
+            .get_within::<Strangers>("/participants", GRAPH_PATIENCE);
+        let (Ok(graph), Ok(strangers)) = (graph, strangers) else {
+            return;
+        };
+        self.known = graph.clone().by_name(self.domain_id);
+        self.sight = graph.sight(strangers);
+        self.at = Some(Instant::now());
+    }
+}
+
+/// What is behind the lock is whole at any moment.
+fn locked<'l, 'a>(
+    announcements: &'l Mutex<Announcements<'a>>,
+) -> std::sync::MutexGuard<'l, Announcements<'a>> {
+    announcements.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Whose distribution this is, as far as the shell says.

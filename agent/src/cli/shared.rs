@@ -105,8 +105,7 @@ impl Graph {
     }
 }
 
-/// All names in a domain, also hidden ones. Where there is nothing but in other domains, stderr says
-/// so once.
+/// All names in a domain, also hidden ones. Why they are lacking, stderr says.
 pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
     let names: Names = agent.get(&format!("/names?domain_id={domain_id}&hidden=true"))?;
     let others = names.domains.iter().filter(|other| **other != domain_id);
@@ -117,7 +116,36 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
             others.join(", ")
         );
     }
+    if let Some(text) = late(&names, agent.is_replay()) {
+        eprintln!("rp: {text}");
+    }
     Ok(names)
+}
+
+/// What was announced before the agent, or the capture, began: endpoints are announced once.
+fn late(names: &Names, is_replay: bool) -> Option<String> {
+    let Names {
+        participants,
+        unknown_writers,
+        ..
+    } = names;
+    let what = match (names.topics.is_empty(), unknown_writers) {
+        (true, _) if *participants > 0 => {
+            format!("{participants} participants are known, but none of their topics")
+        }
+        (_, 0) => return None,
+        (_, 1) => {
+            "1 writer is active whose announcement was missed; its topic is unknown".to_owned()
+        }
+        (_, many) => format!(
+            "{many} writers are active whose announcement was missed; their topics are unknown"
+        ),
+    };
+    Some(if is_replay {
+        format!("{what}: the capture begins after them")
+    } else {
+        format!("{what}: the agent started after them; `rp discover` has them announced again")
+    })
 }
 
 /// Prints what there is to say.

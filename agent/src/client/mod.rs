@@ -27,6 +27,7 @@ use tokio::time::timeout;
 use crate::capture::pcap::Speed;
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
+pub use replayed::Outcome;
 use replayed::Stop;
 pub use samples::{Got, Samples};
 pub use target::{Target, Unfit};
@@ -70,6 +71,14 @@ impl Agent {
     /// As [`Self::reach`].
     pub fn reach_measured(target: &Target, speed: Option<Speed>) -> Result<Self, ClientError> {
         Self::find(target, speed.map_or(Stop::AtEndMeasured, Stop::Never))
+    }
+
+    /// As [`Self::reach_stream`], but all topics of a capture are measured.
+    ///
+    /// # Errors
+    /// As [`Self::reach`].
+    pub fn reach_stream_measured(target: &Target) -> Result<Self, ClientError> {
+        Self::find(target, Stop::AtBeginningMeasured)
     }
 
     fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
@@ -168,6 +177,18 @@ impl Agent {
     fn hung_up(&self, path: &str) -> ClientError {
         self.way
             .broke(format!("{path} ended before its first byte"))
+    }
+
+    /// It is a capture that is asked.
+    #[must_use]
+    pub const fn is_replay(&self) -> bool {
+        matches!(self.way, Way::Replayed(_))
+    }
+
+    /// How the replay of a capture ended; `None` for a live agent, and while it goes on.
+    #[must_use]
+    pub fn outcome(&self) -> Option<Outcome> {
+        self.way.outcome()
     }
 
     /// Where it is, for people.

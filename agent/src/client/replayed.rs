@@ -2,21 +2,23 @@
 //! over sockets: what is true of a capture and of a robot is said by the same code.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
 
+use ros2probe_wire::frame::Link;
 use tokio::io::{DuplexStream, duplex};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 
 use super::{ClientError, Target};
-use crate::capture::pcap::Speed;
+use crate::capture::pcap::{PcapError, Speed, link_name};
 use crate::config::{Config, Watch};
 use crate::message::{Library, Sources};
 use crate::model::observer::{self, Observer};
 use crate::model::reassembly::Limits;
 use crate::recording::Recordings;
 use crate::run::replay::{Replay, Waiter, rest};
-use crate::run::{Run, Source};
+use crate::run::{Run, RunError, Source};
 use crate::subscriptions::{Caps, Subscriptions};
 use crate::surface::api::{self, reload};
 use crate::surface::{Board, Settings};
@@ -24,6 +26,10 @@ use crate::watches::Watches;
 
 /// What a pipe holds: more than most answers.
 const PIPE: usize = 1 << 20;
+/// A capture is read offline: what a live agent measures at once is no measure for it.
+const TOPICS: usize = 16_384;
+/// How long the end of a replay whose streams have ended is waited for.
+const PATIENCE: Duration = Duration::from_millis(500);
 
 /// How far a capture is replayed before anything is asked.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -34,6 +40,8 @@ pub(super) enum Stop {
     AtEndMeasured,
     /// To where messages are wanted from.
     AtBeginning,
+    /// To where messages are wanted from, with every topic measured.
+    AtBeginningMeasured,
     /// Not at all: it goes on while it is asked, with every topic measured.
     Never(Speed),
 }
@@ -45,6 +53,16 @@ pub(super) struct Replayed {
     pipes: mpsc::UnboundedSender<DuplexStream>,
     waiter: Option<Waiter>,
     stop: CancellationToken,
+    outcome: Arc<OnceLock<Outcome>>,
+}
+
+/// How a replay ended.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Outcome {
+    /// Why the rest of the capture was not read.
+    pub fault: Option<String>,
+    /// Packets of link layers that cannot be read.
+    pub unsupported_packets: u64,
 }
 
 impl Replayed {
@@ -55,7 +73,8 @@ impl Replayed {
         target: &Target,
         stop: Stop,
     ) -> Result<Self, ClientError> {
-        let config = Config::default();
+        let mut config = Config::default();
+        config.limits.topics = TOPICS;
         let limits = Limits {
             bytes: config.limits.reassembly_bytes,
             ..Limits::default()
@@ -75,7 +94,7 @@ impl Replayed {
         if is_live {
             replay = replay.quiet();
         }
-        if stop == Stop::AtBeginning {
+        if matches!(stop, Stop::AtBeginning | Stop::AtBeginningMeasured) {
             let (rest, other) = rest(target.from);
             replay = replay.resting(rest);
             waiter = Some(other);
@@ -83,7 +102,9 @@ impl Replayed {
         let source = Source::Replay(Box::new(replay));
         let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
         let watched = match stop {
-            Stop::AtEndMeasured | Stop::Never(_) => Watch::named("/**").into_iter().collect(),
+            Stop::AtEndMeasured | Stop::AtBeginningMeasured | Stop::Never(_) => {
+                Watch::named("/**").into_iter().collect()
+            }
             Stop::AtEnd | Stop::AtBeginning => Vec::new(),
         };
         let watches = Watches::new(Arc::clone(&board), Vec::new(), watched);
@@ -91,7 +112,11 @@ impl Replayed {
             source: std::io::Error::other(error),
         })?;
         let watches = Arc::new(watches);
-        let settings = observer::Settings::default().with_limits(&config.limits);
+        let settings = observer::Settings {
+            // No kernel has to be told first.
+            telling: 0,
+            ..observer::Settings::default().with_limits(&config.limits)
+        };
         let token = CancellationToken::new();
         let caps = Caps {
             subscriptions: config.limits.subscriptions,
@@ -108,14 +133,24 @@ impl Replayed {
             token.clone(),
         );
         let (tell, ended) = oneshot::channel();
+        let outcome = Arc::new(OnceLock::new());
+        let (how, seen, file) = (
+            Arc::clone(&outcome),
+            Arc::clone(&board),
+            capture.to_path_buf(),
+        );
         let work = move || {
+            let ended = run.run();
+            let left_out = seen.state().agent.unsupported_packets.clone();
             // Where it is live, the screen is somebody else's, who sees that nothing comes any more.
-            if let Err(error) = run.run()
-                && !is_live
-            {
-                eprintln!("rp: {:#}", anyhow::Error::from(error));
+            if !is_live {
+                explain(&file, &ended, &left_out);
             }
-            let _ = tell.send(());
+            let _ = how.set(Outcome {
+                fault: ended.as_ref().err().map(ToString::to_string),
+                unsupported_packets: left_out.iter().map(|(_, packets)| packets).sum(),
+            });
+            let _ = tell.send(ended.err());
         };
         let thread = std::thread::Builder::new().name("replay".to_owned());
         let thread = thread.spawn(work);
@@ -142,7 +177,14 @@ impl Replayed {
         tokio::spawn(api::serve_in_process(opened, context));
         match &mut waiter {
             None if is_live => {}
-            None => drop(ended.await),
+            // A link layer that cannot be read is no capture for this program.
+            None => {
+                if let Ok(Some(RunError::Replay(error @ PcapError::UnsupportedLink { .. }))) =
+                    ended.await
+                {
+                    return Err(failed(error));
+                }
+            }
             Some(waiter) => waiter.rests().await,
         }
         Ok(Self {
@@ -150,7 +192,17 @@ impl Replayed {
             pipes,
             waiter,
             stop: token,
+            outcome,
         })
+    }
+
+    /// How it ended; nothing while it goes on.
+    pub(super) fn outcome(&self) -> Option<Outcome> {
+        let deadline = Instant::now() + PATIENCE;
+        while self.outcome.get().is_none() && Instant::now() < deadline {
+            std::thread::sleep(PATIENCE / 50);
+        }
+        self.outcome.get().cloned()
     }
 
     /// A pipe to the agent.
@@ -177,5 +229,33 @@ impl Replayed {
 impl Drop for Replayed {
     fn drop(&mut self) {
         self.stop.cancel();
+    }
+}
+
+/// Says on stderr what of a capture was not read, and what to do.
+fn explain(capture: &Path, ended: &Result<(), RunError>, left_out: &[(u16, u64)]) {
+    let capture = capture.display();
+    let unreadable =
+        |error: &RunError| matches!(error, RunError::Replay(PcapError::UnsupportedLink { .. }));
+    match ended {
+        // The error of the whole command says so.
+        Err(error) if unreadable(error) => return,
+        Err(RunError::Replay(error @ (PcapError::Truncated { .. } | PcapError::Read { .. }))) => {
+            eprintln!(
+                "rp: {capture} is incomplete: {error}; what follows is missing. Copy it again, or let \
+                 tcpdump end by itself"
+            );
+        }
+        Err(RunError::Replay(error)) => {
+            eprintln!("rp: {capture} cannot be read further: {error}; what follows is missing");
+        }
+        Err(error) => eprintln!("rp: {error}"),
+        Ok(()) => {}
+    }
+    for (link, packets) in left_out {
+        let link = link_name(Link(*link));
+        eprintln!(
+            "rp: {packets} packets of {capture} have link type {link}, which is not supported"
+        );
     }
 }

@@ -16,7 +16,7 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::time::timeout;
 
-use super::replayed::{Replayed, Stop};
+use super::replayed::{Outcome, Replayed, Stop};
 use super::{ClientError, Target};
 
 /// Where the package and the service manager put the agent's socket.
@@ -98,6 +98,14 @@ impl Way {
     pub(super) fn go_on(&self) {
         if let Self::Replayed(replayed) = self {
             replayed.go_on();
+        }
+    }
+
+    /// How a replay ended, if this is one that did.
+    pub(super) fn outcome(&self) -> Option<Outcome> {
+        match self {
+            Self::Replayed(replayed) => replayed.outcome(),
+            Self::Socket(_) | Self::Address(_) => None,
         }
     }
 

@@ -69,6 +69,8 @@ pub struct Settings {
     pub payload_bytes: usize,
     /// Nanoseconds for which a topic without endpoints is still reported.
     pub topic_grace: u64,
+    /// Nanoseconds after which the bytes of samples come at the latest once they are wanted.
+    pub telling: u64,
     /// Records say who sent: not so those of a capture file.
     pub directed: bool,
 }
@@ -99,6 +101,7 @@ impl Default for Settings {
             sample_bytes: 1 << 20,
             payload_bytes: 20 << 20,
             topic_grace: 600 * SECOND,
+            telling: payloads::TELLING,
             directed: true,
         }
     }
@@ -178,7 +181,7 @@ impl Observer {
                 settings.deliveries,
             ),
             pieces: Pieces::default(),
-            payloads: Payloads::new(settings.payload_bytes),
+            payloads: Payloads::new(settings.payload_bytes, settings.telling),
             wishes: Arc::default(),
             receivers: Receivers::new(settings.deliveries),
             tracer: Tracer::new(settings.directed),

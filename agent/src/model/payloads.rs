@@ -25,7 +25,7 @@ const WAITING: usize = 65_536;
 const EARLIER: usize = 1024;
 /// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
 /// not told of.
-const TELLING: u64 = 400_000_000;
+pub const TELLING: u64 = 400_000_000;
 
 /// The topic of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -157,6 +157,7 @@ struct Earlier {
 #[derive(Debug)]
 pub struct Payloads {
     writers: HashMap<Guid, Interested>,
+    telling: u64,
     /// How many of them are wanted with bytes.
     deep: usize,
     assembly: Assembly,
@@ -193,11 +194,13 @@ impl MissedReason {
 }
 
 impl Payloads {
-    /// Nobody wants anything; later at most `limit` bytes at once.
+    /// Nobody wants anything; later at most `limit` bytes at once, which come at the latest `telling`
+    /// nanoseconds after they are wanted.
     #[must_use]
-    pub fn new(limit: usize) -> Self {
+    pub fn new(limit: usize, telling: u64) -> Self {
         Self {
             writers: HashMap::new(),
+            telling,
             deep: 0,
             assembly: Assembly::new(limit),
             strangers: HashMap::new(),
@@ -308,7 +311,7 @@ impl Payloads {
             false => self.assembly.take(writer, counted.number),
         };
         // What was under way when bytes were first wanted has not come whole.
-        let is_expected = counted.began.0 >= interested.since.0.saturating_add(TELLING)
+        let is_expected = counted.began.0 >= interested.since.0.saturating_add(self.telling)
             || interested
                 .first_whole
                 .is_some_and(|first| first < counted.number);

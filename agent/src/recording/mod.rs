@@ -13,10 +13,10 @@ mod service;
 mod session;
 mod snapshot;
 
-pub use announced::{Announced, Graph};
+pub use announced::{Announced, Graph, GraphTopic, SeenTopic, Sight, Strangers};
 pub use filter::{Asked, Candidate, Filter, FilterError};
 pub use recorder::{Ended, Recorder, Sources};
-pub use report::{MissingRun, Report, TopicReport};
+pub use report::{MissingRun, OtherDomain, Report, TopicReport, UnknownWriters, unobserved_lines};
 pub use ring::Ring;
 pub use service::{Recording, Recordings, Refusal, Stage, Status, Wanted, default_name, schema};
 pub use session::{Going, Order, record};

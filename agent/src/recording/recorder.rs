@@ -4,15 +4,15 @@
 //! stream, and time comes with what it is fed. The first error of the storage ends it; what was
 //! taken before is in the bag, and what is not is counted.
 
-use std::collections::{BTreeMap, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{Guid, Timestamp};
 
-use super::announced::Announced;
-use super::filter::{Candidate, Filter};
-use super::report::Report;
+use super::announced::{Announced, SeenTopic, Sight};
+use super::filter::{Asked, Candidate, Filter};
+use super::report::{NO_SUBSCRIBER, OtherDomain, Report};
 use super::ring::Ring;
 use crate::bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
@@ -33,6 +33,8 @@ const WRITERS: usize = 256;
 pub struct Sources<'a> {
     /// What is announced at the moment of the topics of these names, in their order.
     pub announced: Box<Announcements<'a>>,
+    /// What is there at the moment, in all domains.
+    pub sight: Box<dyn FnMut() -> Sight + Send + 'a>,
     /// How messages of a type look; the type and its announced hash.
     pub schema: Box<Schemas<'a>>,
 }
@@ -46,17 +48,29 @@ pub type Schemas<'a> = dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send + 
 /// A bag in the making.
 pub struct Recorder<'a> {
     writer: Writer,
+    domain_id: u32,
+    /// What was counted when it began.
+    before: Before,
     filter: Filter,
     sources: Sources<'a>,
     topics: HashMap<String, Place>,
     /// Of those, the ones in the bag.
     order: Vec<String>,
     report: Report,
+    sampled: BTreeSet<String>,
     paused: bool,
     /// In snapshot mode: samples that wait for being asked for.
     ring: Option<Ring>,
     flushed: Timestamp,
     synced: Timestamp,
+}
+
+/// Counts at the beginning: messages of topics in other domains, and of writers that were never
+/// announced.
+#[derive(Default)]
+struct Before {
+    topics: HashMap<(u32, String), u64>,
+    unknown_writers: HashMap<String, u64>,
 }
 
 /// What was decided for a topic.
@@ -88,16 +102,39 @@ pub struct Ended {
 }
 
 impl<'a> Recorder<'a> {
-    /// Records what `filter` takes into `writer`'s bag.
+    /// Records what `filter` takes of a domain into `writer`'s bag. `before` is what was there before
+    /// the first sample.
     #[must_use]
-    pub fn new(writer: Writer, filter: Filter, sources: Sources<'a>) -> Self {
+    pub fn new(
+        writer: Writer,
+        filter: Filter,
+        domain_id: u32,
+        before: Sight,
+        sources: Sources<'a>,
+    ) -> Self {
+        let Sight {
+            topics,
+            unknown_writers,
+        } = before;
+        let topics = topics.into_iter();
+        let topics = topics.filter(|topic| topic.domain_id != domain_id);
+        let topics = topics.filter_map(|topic| {
+            let messages = topic.messages?;
+            Some(((topic.domain_id, topic.name), messages))
+        });
         Self {
+            before: Before {
+                topics: topics.collect(),
+                unknown_writers,
+            },
+            domain_id,
             writer,
             filter,
             sources,
             topics: HashMap::new(),
             order: Vec::new(),
             report: Report::default(),
+            sampled: BTreeSet::new(),
             paused: false,
             ring: None,
             flushed: Timestamp(0),
@@ -130,6 +167,49 @@ impl<'a> Recorder<'a> {
     #[must_use]
     pub const fn report(&self) -> &Report {
         &self.report
+    }
+
+    /// Of these topics, the published ones that it takes and that have no message yet although the
+    /// reason is known: by name, the reason as in [`Report::unobserved`].
+    #[must_use]
+    pub fn unobserved(&self, sight: &Sight) -> BTreeMap<String, String> {
+        let topics = sight.topics.iter();
+        let topics = topics.filter(|topic| topic.domain_id == self.domain_id && self.takes(topic));
+        let topics = topics.filter_map(|topic| {
+            let recorded = self.report.topics.get(&topic.name);
+            if recorded.is_some_and(|topic| topic.messages > 0 || topic.paused > 0) {
+                return None;
+            }
+            let why = match &topic.aside {
+                _ if !topic.subscribed => NO_SUBSCRIBER.to_owned(),
+                aside => aside.clone()?,
+            };
+            Some((topic.name.clone(), why))
+        });
+        topics.collect()
+    }
+
+    /// What was asked for.
+    #[must_use]
+    pub const fn asked(&self) -> &Asked {
+        self.filter.asked()
+    }
+
+    /// Whether this topic is recorded, in whichever domain it is.
+    #[must_use]
+    pub fn takes(&self, topic: &SeenTopic) -> bool {
+        self.filter.takes(&Candidate {
+            name: &topic.name,
+            types: &topic.message_types,
+            published: true,
+            subscribed: topic.subscribed,
+        })
+    }
+
+    /// Topics of which messages were sampled in shared memory.
+    #[must_use]
+    pub const fn sampled(&self) -> &BTreeSet<String> {
+        &self.sampled
     }
 
     /// Topics in the bag, in the order in which they came into it.
@@ -189,7 +269,7 @@ impl<'a> Recorder<'a> {
         let names: Vec<String> = topics.iter().map(|(name, _)| (*name).to_owned()).collect();
         let announced = self.ask(&names);
         for ((name, message_type), announced) in topics.into_iter().zip(announced) {
-            let place = self.decide(name, message_type, None, announced, false)?;
+            let place = self.decide(name, message_type, None, &announced, false)?;
             // One that is left out may yet be published.
             if matches!(place, Place::Taken(_)) {
                 self.topics.insert(name.to_owned(), place);
@@ -214,7 +294,10 @@ impl<'a> Recorder<'a> {
             },
             Item::Clock(now) => self.clock(*now),
             Item::Missed(missed) => {
-                if !self.paused && self.place(&missed.topic)?.is_some() {
+                if self.paused {
+                    return Ok(());
+                }
+                if self.place(&missed.topic)?.is_some() {
                     self.report.missed(missed);
                 }
                 Ok(())
@@ -236,7 +319,9 @@ impl<'a> Recorder<'a> {
         error: Option<Error>,
         compress: impl FnMut(FileCompression) -> Result<Option<Compressed>, Error>,
     ) -> Ended {
-        self.note_what_was_sent_before();
+        let sight = (self.sources.sight)();
+        self.note_what_was_sent_before(&sight);
+        self.note_what_was_not_observed(sight);
         // Before the report goes into the bag.
         self.writer.settle();
         for (topic, messages, bytes) in self.writer.unwritten() {
@@ -280,6 +365,9 @@ impl<'a> Recorder<'a> {
         self.writer
             .write(id, sample.time, sent, sample.sequence_number, payload)?;
         self.report.written(&topic.name, payload.len());
+        if sample.sampled && !self.sampled.contains(&*topic.name) {
+            self.sampled.insert(topic.name.to_string());
+        }
         Ok(())
     }
 
@@ -315,7 +403,7 @@ impl<'a> Recorder<'a> {
                 Some(_) if !self.filter.asked().ignore_leaf_topics => Announced::default(),
                 _ => self.ask_one(name),
             };
-            let place = self.decide(name, message_type, offered, announced, true)?;
+            let place = self.decide(name, message_type, offered, &announced, true)?;
             self.topics.insert(name.to_string(), place);
         }
         let Some(Place::Taken(taken)) = self.topics.get_mut(&**name) else {
@@ -355,7 +443,7 @@ impl<'a> Recorder<'a> {
         name: &str,
         message_type: &str,
         offered: Option<&Offered>,
-        announced: Announced,
+        announced: &Announced,
         came: bool,
     ) -> Result<Place, Error> {
         let known = announced
@@ -419,28 +507,56 @@ impl<'a> Recorder<'a> {
     }
 
     /// Publishers that keep samples for late joiners, of which the first ones are not in the bag.
-    fn note_what_was_sent_before(&mut self) {
-        let taken = self.order.clone();
-        let announced = self.ask(&taken);
+    fn note_what_was_sent_before(&mut self, sight: &Sight) {
         let mut names: Vec<String> = Vec::new();
-        for (name, announced) in taken.into_iter().zip(announced) {
-            let Some(Place::Taken(taken)) = self.topics.get(&name) else {
+        for topic in sight
+            .topics
+            .iter()
+            .filter(|topic| topic.domain_id == self.domain_id)
+        {
+            let Some(Place::Taken(taken)) = self.topics.get(&topic.name) else {
                 continue;
             };
-            let keepers = announced.publishers.iter();
-            let mut keepers = keepers.filter(|publisher| publisher.keeps_samples());
             let begun: HashSet<String> = taken
                 .first
                 .iter()
                 .filter(|(_, first)| **first <= 1)
                 .map(|(writer, _)| writer.to_string())
                 .collect();
-            if keepers.any(|keeper| !begun.contains(&keeper.guid)) {
-                names.push(name);
+            if topic.keepers.iter().any(|keeper| !begun.contains(keeper)) {
+                names.push(topic.name.clone());
             }
         }
         names.sort();
         self.report.sent_before = names;
+    }
+
+    /// What would have been taken, had it been seen, announced, or in this domain.
+    fn note_what_was_not_observed(&mut self, sight: Sight) {
+        let mut domains: BTreeMap<u32, OtherDomain> = BTreeMap::new();
+        self.report.unobserved = self.unobserved(&sight);
+        for topic in sight.topics {
+            if topic.domain_id == self.domain_id || !self.takes(&topic) {
+                continue;
+            }
+            let domain = domains.entry(topic.domain_id).or_default();
+            domain.domain_id = topic.domain_id;
+            domain.topics += 1;
+            if let Some(messages) = topic.messages {
+                let before = self.before.topics.get(&(topic.domain_id, topic.name));
+                let new = messages.saturating_sub(before.copied().unwrap_or(0));
+                *domain.messages.get_or_insert(0) += new;
+            }
+        }
+        self.report.other_domains = domains.into_values().collect();
+        for (writer, messages) in sight.unknown_writers {
+            let before = self.before.unknown_writers.get(&writer);
+            let new = messages.saturating_sub(before.copied().unwrap_or(0));
+            if new > 0 {
+                self.report.unknown_writers.writers += 1;
+                self.report.unknown_writers.messages += new;
+            }
+        }
     }
 }
 
@@ -459,8 +575,7 @@ mod tests {
 
     use super::*;
     use crate::bag::Options;
-    use crate::recording::Asked;
-    use crate::subscriptions::{Missed, MissedReason};
+    use crate::subscriptions::Missed;
 
     const KEEPER: &str = r#"{"reliability": "RELIABLE", "durability": "TRANSIENT_LOCAL",
         "history": "KEEP_LAST (1)", "deadline_seconds": null, "lifespan_seconds": null,
@@ -506,8 +621,32 @@ mod tests {
         serde_json::from_str(&json).unwrap()
     }
 
+    /// A publisher of `/tf_static` that keeps its samples.
+    fn static_transforms() -> Sight {
+        Sight {
+            topics: vec![SeenTopic {
+                name: "/tf_static".to_owned(),
+                subscribed: true,
+                keepers: vec![writer(1).to_string()],
+                ..SeenTopic::default()
+            }],
+            ..Sight::default()
+        }
+    }
+
     fn recorder(directory: &std::path::Path, asked: Asked) -> Recorder<'static> {
+        recorder_of(directory, asked, Sight::default(), static_transforms())
+    }
+
+    /// With what is there when it begins and when it ends.
+    fn recorder_of(
+        directory: &std::path::Path,
+        asked: Asked,
+        before: Sight,
+        after: Sight,
+    ) -> Recorder<'static> {
         let sources = Sources {
+            sight: Box::new(move || after.clone()),
             announced: Box::new(|names| {
                 let announced = names.iter().map(|name| match name.as_str() {
                     "/tf_static" => keepers(),
@@ -518,7 +657,7 @@ mod tests {
             schema: Box::new(|_, _| None),
         };
         let bag = Writer::create(directory, Options::default()).unwrap();
-        Recorder::new(bag, Filter::new(asked).unwrap(), sources)
+        Recorder::new(bag, Filter::new(asked).unwrap(), 0, before, sources)
     }
 
     fn numbers(ended: &Ended) -> Vec<(String, u32)> {
@@ -604,7 +743,9 @@ mod tests {
         let ended = recorder.finish(None);
         assert_eq!(numbers(&ended).len(), 1);
         assert_eq!(ended.report.left_out, ["/a"]);
-        assert!(ended.report.shortfalls()[0].ends_with("it has several types"));
+        assert!(
+            ended.report.shortfalls()[0].ends_with("other types than the first are not recorded")
+        );
     }
 
     #[test]
@@ -640,5 +781,50 @@ mod tests {
         let before = size();
         recorder.take(&Item::Clock(Timestamp(SECOND + 1))).unwrap();
         assert!(size() > before);
+    }
+
+    #[test]
+    fn what_was_not_observed_is_counted_from_the_beginning_of_the_recording() {
+        let topic = |domain_id, name: &str, aside: Option<&str>, messages| SeenTopic {
+            domain_id,
+            name: name.to_owned(),
+            subscribed: name != "/alone",
+            aside: aside.map(str::to_owned),
+            messages,
+            ..SeenTopic::default()
+        };
+        let sight = |writers: &[(&str, u64)], others: u64| Sight {
+            topics: vec![
+                topic(0, "/alone", None, None),
+                topic(0, "/quiet", None, None),
+                topic(0, "/a", Some("same_process"), None),
+                topic(0, "/imu", Some("same_process"), None),
+                topic(7, "/imu", None, Some(others)),
+                topic(7, "/odom", None, Some(0)),
+                topic(8, "/imu", None, None),
+            ],
+            unknown_writers: writers
+                .iter()
+                .map(|(writer, messages)| ((*writer).to_owned(), *messages))
+                .collect(),
+        };
+        let directory = tempfile::tempdir().unwrap();
+        let before = sight(&[("01", 5), ("02", 7)], 100);
+        let after = sight(&[("01", 5), ("02", 10), ("03", 1)], 140);
+        let bag = directory.path().join("bag");
+        let mut recorder = recorder_of(&bag, Asked::everything(), before, after);
+        recorder.take(&sample("/a", 1)).unwrap();
+        let report = recorder.finish(None).report;
+        let why = |name: &str| report.unobserved.get(name).map(String::as_str);
+        assert_eq!(report.unobserved.len(), 2);
+        assert_eq!(why("/alone"), Some(NO_SUBSCRIBER));
+        assert_eq!(why("/imu"), Some("same_process"));
+        let unknown = report.unknown_writers;
+        assert_eq!((unknown.writers, unknown.messages), (2, 4));
+        let others = report.other_domains.iter();
+        let others: Vec<_> = others
+            .map(|each| (each.domain_id, each.topics, each.messages))
+            .collect();
+        assert_eq!(others, [(7, 2, Some(40)), (8, 1, None)]);
     }
 }

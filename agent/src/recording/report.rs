@@ -1,5 +1,8 @@
 //! What a recording has and what it has not: counted for each topic, with the numbers of what is
 //! missing. It stands in the bag's metadata and in the answer of whoever ends the recording.
+//!
+//! `missing` counts messages of topics of the bag. What belongs to no topic, or never passes where it
+//! can be observed, is listed beside it.
 
 use std::collections::BTreeMap;
 
@@ -10,6 +13,33 @@ use crate::subscriptions::{Missed, MissedReason};
 
 /// Runs of missing samples that are named; further ones are counted.
 const RUNS: usize = 256;
+/// Topics that are named in one line.
+const NAMES: usize = 8;
+/// Nobody subscribes: the one reason in [`Report::unobserved`] by which nothing is missing.
+pub(super) const NO_SUBSCRIBER: &str = "no_subscriber";
+/// Reasons why no message of a published topic was seen, and what people read.
+const UNOBSERVED: [(&str, &str); 5] = [
+    (
+        NO_SUBSCRIBER,
+        "without a subscriber the publisher sends nothing",
+    ),
+    (
+        "shared_memory",
+        "publisher and subscriber use shared memory, which was not observed",
+    ),
+    (
+        "data_sharing",
+        "subscribers read the publisher's memory (data sharing), which cannot be observed",
+    ),
+    (
+        "same_process",
+        "publisher and subscriber share one process; nothing crosses the network",
+    ),
+    (
+        "iceoryx",
+        "messages pass through iceoryx, which cannot be observed",
+    ),
+];
 /// Under this name in the bag's custom data.
 pub const CUSTOM_DATA: &str = "ros2probe";
 
@@ -34,6 +64,38 @@ pub struct Report {
     pub sent_before: Vec<String>,
     /// Topics that are left out because they have several types; a bag holds one.
     pub left_out: Vec<String>,
+    /// Published topics without a message in the bag, where the reason is known: `no_subscriber`, or
+    /// how all messages pass: `shared_memory`, `data_sharing`, `same_process`, `iceoryx`.
+    #[serde(default)]
+    pub unobserved: BTreeMap<String, String>,
+    /// Writers that sent and were never announced.
+    #[serde(default)]
+    pub unknown_writers: UnknownWriters,
+    /// Topics that the choice would take, in other domains.
+    #[serde(default)]
+    pub other_domains: Vec<OtherDomain>,
+}
+
+/// Writers whose topics are unknown.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[schema(as = RecordingUnknownWriters)]
+pub struct UnknownWriters {
+    /// How many sent.
+    pub writers: u64,
+    /// Messages they sent while it was recorded.
+    pub messages: u64,
+}
+
+/// What passed in a domain that is not recorded.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[schema(as = RecordingOtherDomain)]
+pub struct OtherDomain {
+    /// Which one.
+    pub domain_id: u32,
+    /// Published topics.
+    pub topics: u64,
+    /// Their messages while it was recorded; null where none of them is measured.
+    pub messages: Option<u64>,
 }
 
 /// What became of one topic's messages.
@@ -149,42 +211,106 @@ impl Report {
         BTreeMap::from([(CUSTOM_DATA.to_owned(), text)])
     }
 
+    /// Whether everything that was sent is in the bag, as far as that is known. Topics without a
+    /// subscriber are: their publishers send nothing.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        self.missing == 0
+            && self.left_out.is_empty()
+            && self.unknown_writers.writers == 0
+            && self.other_domains.is_empty()
+            && self.unobserved.values().all(|why| why == NO_SUBSCRIBER)
+    }
+
     /// For people: what is missing, a line for each topic; nothing where nothing is.
     #[must_use]
     pub fn shortfalls(&self) -> Vec<String> {
         let mut lines = Vec::new();
         for (name, topic) in &self.topics {
             let counts = [
-                (topic.incomplete, "incomplete on the wire"),
-                (topic.lost, "lost on the way"),
+                (topic.incomplete, "were incomplete on the wire"),
+                (topic.lost, "were lost on the way"),
+                (topic.not_captured, "could not be captured"),
+                (topic.dropped, "were dropped, the storage was too slow"),
+                (topic.unwritten, "were not written, the storage was full"),
                 (
                     topic.unannounced,
-                    "sent before their publisher was announced",
+                    "were sent before their writer was announced",
                 ),
-                (topic.not_captured, "lost on the way to the agent"),
-                (topic.dropped, "dropped, the storage was too slow"),
-                (topic.unwritten, "not written, the storage took no more"),
             ];
-            let told: Vec<String> = counts
-                .iter()
-                .filter(|(count, _)| *count > 0)
-                .map(|(count, what)| format!("{count} {what}"))
-                .collect();
-            if !told.is_empty() {
-                let all = topic.messages;
-                lines.push(format!("{name}: {all} recorded, {}", told.join(", ")));
+            let counts = counts.into_iter().filter(|(count, _)| *count > 0);
+            let missing: u64 = counts.clone().map(|(count, _)| count).sum();
+            if missing > 0 {
+                let recorded = topic.messages;
+                let all = recorded + missing;
+                let counts: Vec<String> = counts
+                    .map(|(count, what)| format!("{count} {what}"))
+                    .collect();
+                let counts = counts.join(", ");
+                lines.push(format!(
+                    "{name}: {recorded} of {all} messages recorded; {counts}"
+                ));
             }
         }
         for name in &self.sent_before {
-            let why = "what was sent before the recording began is not in it";
             lines.push(format!(
-                "{name}: {why}; publishers keep it for subscribers that join late"
+                "{name} is transient local: messages sent before recording started are missing \
+                 (see `retain: last`)"
             ));
         }
         for name in &self.left_out {
-            lines.push(format!("{name}: left out, it has several types"));
+            lines.push(format!(
+                "{name}: other types than the first are not recorded"
+            ));
+        }
+        lines.extend(unobserved_lines(&self.unobserved));
+        let UnknownWriters { writers, messages } = self.unknown_writers;
+        if writers > 0 {
+            lines.push(format!(
+                "{messages} messages of {writers} writers are missing: their announcement was \
+                 missed, their topics are unknown"
+            ));
+        }
+        for domain in &self.other_domains {
+            let OtherDomain {
+                domain_id,
+                topics,
+                messages,
+            } = domain;
+            let messages =
+                messages.map_or_else(String::new, |count| format!(" ({count} messages)"));
+            lines.push(format!(
+                "{topics} topics of domain {domain_id} are not recorded{messages}: pass \
+                 `--domain {domain_id}`"
+            ));
         }
         lines
+    }
+}
+
+/// For people: why nothing of these topics is seen, a line for each reason.
+#[must_use]
+pub fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
+    let lines = UNOBSERVED.iter().filter_map(|(why, what)| {
+        let topics = unobserved.iter().filter(|(_, reason)| reason == why);
+        let names: Vec<&str> = topics.map(|(name, _)| name.as_str()).collect();
+        let line = format!("{}: no message recorded; {what}", few(&names));
+        (!names.is_empty()).then_some(line)
+    });
+    lines.collect()
+}
+
+/// Of a list of names the first ones.
+fn few(names: &[&str]) -> String {
+    let shown = names
+        .iter()
+        .take(NAMES)
+        .copied()
+        .collect::<Vec<_>>()
+        .join(", ");
+    match names.len().saturating_sub(NAMES) {
+        0 => shown,
+        more => format!("{shown} and {more} more"),
     }
 }
 
@@ -230,7 +356,10 @@ mod tests {
         );
         assert_eq!(
             report.shortfalls(),
-            ["/points: 1 recorded, 3 incomplete on the wire, 1 dropped, the storage was too slow"]
+            [
+                "/points: 1 of 5 messages recorded; 3 were incomplete on the wire, 1 were dropped, \
+              the storage was too slow"
+            ]
         );
     }
 
@@ -254,8 +383,37 @@ mod tests {
         report.written("/points", 100);
         report.unwritten("/points", 1, 100);
         assert_eq!((report.messages, report.bytes, report.missing), (1, 100, 1));
-        assert!(report.shortfalls()[0].ends_with("1 not written, the storage took no more"));
+        assert!(report.shortfalls()[0].ends_with("1 were not written, the storage was full"));
         let json = &report.custom_data()[CUSTOM_DATA];
         assert_eq!(serde_json::from_str::<Report>(json).unwrap(), report);
+    }
+
+    #[test]
+    fn what_belongs_to_no_topic_of_the_bag_is_named_and_makes_it_incomplete() {
+        let mut report = Report::default();
+        let unobserved = |why: &str| ("/imu".to_owned(), why.to_owned());
+        report.unobserved.extend([unobserved(NO_SUBSCRIBER)]);
+        assert!(report.is_complete());
+        report.unobserved.extend([unobserved("same_process")]);
+        assert!(!report.is_complete());
+        report.unknown_writers = UnknownWriters {
+            writers: 2,
+            messages: 90,
+        };
+        report.other_domains = vec![OtherDomain {
+            domain_id: 7,
+            topics: 3,
+            messages: Some(12),
+        }];
+        assert_eq!(
+            report.shortfalls(),
+            [
+                "/imu: no message recorded; publisher and subscriber share one process; nothing \
+                 crosses the network",
+                "90 messages of 2 writers are missing: their announcement was missed, their topics \
+                 are unknown",
+                "3 topics of domain 7 are not recorded (12 messages): pass `--domain 7`",
+            ]
+        );
     }
 }

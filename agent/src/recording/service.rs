@@ -12,7 +12,7 @@ use std::time::{Duration, SystemTime};
 use jiff::Zoned;
 use tokio::sync::Notify;
 
-use super::announced::Announced;
+use super::announced::{Announced, Sight};
 use super::filter::{Asked, Filter, FilterError};
 use super::recorder::{Ended, Recorder, Sources};
 use super::report::Report;
@@ -175,11 +175,12 @@ impl Recordings {
             self.board.limits().reached(Limit::Recordings, 1);
             return Err(Refusal::TooMany(self.places.cap()));
         };
+        let before = Sight::from(self.board.state().known());
         let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
         let writer = Writer::create(&directory, wanted.options);
         let writer = writer.map_err(|error| refusal(&name, error))?;
         let sources = self.sources(wanted.domain_id);
-        let mut recorder = Recorder::new(writer, filter, sources);
+        let mut recorder = Recorder::new(writer, filter, wanted.domain_id, before, sources);
         recorder.pause(wanted.paused);
         let known = self.board.state();
         let covered = known.known().topics.iter().filter(|topic| {
@@ -304,7 +305,9 @@ impl Recordings {
     /// What the snapshot and the library know.
     pub(super) fn sources(&self, domain_id: u32) -> Sources<'static> {
         let (board, library) = (Arc::clone(&self.board), Arc::clone(&self.library));
+        let seen = Arc::clone(&self.board);
         Sources {
+            sight: Box::new(move || Sight::from(seen.state().known())),
             announced: Box::new(move |names| {
                 let state = board.state();
                 let topics = state.known().topics.iter();

@@ -4,6 +4,7 @@
 //! Bounded in bytes and seconds; what that costs is shown. A robot that goes on failing fills no
 //! disk: one bag at most for each length of the snapshot, and a sum of bytes for all of them.
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
@@ -13,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
+use super::announced::Sight;
 use super::filter::{Asked, Filter};
 use super::recorder::Recorder;
 use super::ring::Ring;
@@ -258,8 +260,22 @@ impl Keeper {
             })?;
             let writer = Writer::create(&directory, Options::default());
             let writer = writer.map_err(|error| refusal(&name, error))?;
-            let sources = self.recordings.sources(self.settings.domain_id);
-            let mut recorder = Recorder::new(writer, filter, sources);
+            let mut sources = self.recordings.sources(self.settings.domain_id);
+            let domain_id = self.settings.domain_id;
+            // The report is about the topics in memory, not about what else is there.
+            let names = self.ring.iter().map(|sample| sample.topic.name.to_string());
+            let names: HashSet<String> = names.collect();
+            let mut all = sources.sight;
+            sources.sight = Box::new(move || {
+                let mut sight = all();
+                sight.unknown_writers.clear();
+                sight
+                    .topics
+                    .retain(|topic| topic.domain_id == domain_id && names.contains(&topic.name));
+                sight
+            });
+            let before = Sight::default();
+            let mut recorder = Recorder::new(writer, filter, domain_id, before, sources);
             let mut failed = None;
             for sample in self.ring.iter() {
                 if let Err(error) = recorder.take(&Item::Sample(Arc::clone(sample))) {

@@ -12,6 +12,12 @@ use crate::visible::visible;
 pub struct Names {
     /// Domains in which somebody is.
     pub domains: Vec<u32>,
+    /// Participants in the domain.
+    #[serde(default)]
+    pub participants: usize,
+    /// Writers that send although their announcement was missed.
+    #[serde(default)]
+    pub unknown_writers: usize,
     /// Nodes by name.
     pub nodes: Vec<NodeName>,
     /// ROS topics by name.

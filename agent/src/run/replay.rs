@@ -1,6 +1,7 @@
 //! A capture as a source: its packets at the pace asked for, in slices short enough that the agent
 //! stays responsive.
 
+use std::collections::BTreeMap;
 use std::io::IsTerminal as _;
 use std::path::Path;
 use std::sync::mpsc::{self, RecvTimeoutError};
@@ -12,7 +13,7 @@ use tokio::sync::watch;
 
 use super::Moment;
 use crate::capture::feed::Feed;
-use crate::capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed};
+use crate::capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
 use crate::model::observer::Observer;
 use crate::model::reassembly::{Limits, Reassembly};
 
@@ -72,6 +73,8 @@ pub struct Replay {
     clock: Timestamp,
     packets: u64,
     bytes: u64,
+    /// Packets of link layers that cannot be read, by number.
+    unsupported: BTreeMap<u16, u64>,
     began: Option<Timestamp>,
     progress: Option<Instant>,
     until: Option<Moment>,
@@ -94,10 +97,14 @@ impl Replay {
     /// Opens a capture.
     ///
     /// # Errors
-    /// When it cannot be read or is none.
+    /// When it cannot be read, is none, or has a link layer that cannot be read.
     pub fn open(path: &Path, speed: Speed, limits: Limits) -> Result<Self, PcapError> {
+        let reader = PcapReader::open(path)?;
+        if let Some(link) = reader.link().filter(|link| !link.is_supported()) {
+            return Err(PcapError::UnsupportedLink { link });
+        }
         Ok(Self {
-            reader: PcapReader::open(path)?,
+            reader,
             feed: Feed::new(limits),
             pacer: Pacer::new(speed),
             speed,
@@ -105,6 +112,7 @@ impl Replay {
             clock: Timestamp::default(),
             packets: 0,
             bytes: 0,
+            unsupported: BTreeMap::new(),
             began: None,
             progress: std::io::stderr().is_terminal().then(Instant::now),
             until: None,
@@ -236,6 +244,9 @@ impl Replay {
                 memory.extend_from_slice(bytes);
                 self.packets += 1;
                 self.bytes += bytes.len() as u64;
+                if !link.is_supported() {
+                    *self.unsupported.entry(link.0).or_default() += 1;
+                }
                 if self.began.is_none() {
                     (self.began, self.clock) = (Some(time), time);
                 }
@@ -250,12 +261,31 @@ impl Replay {
             }
             Ok(None) => {
                 self.finished = true;
-                Ok(())
+                for (link, packets) in &self.unsupported {
+                    let link_type = link_name(Link(*link));
+                    tracing::warn!(
+                        link_type,
+                        packets,
+                        "packets of an unsupported link type left out"
+                    );
+                }
+                self.is_readable()
             }
             Err(error) => {
                 self.finished = true;
                 Err(error)
             }
+        }
+    }
+
+    /// Fails where every packet is of a link layer that cannot be read.
+    fn is_readable(&self) -> Result<(), PcapError> {
+        match self.unsupported.first_key_value() {
+            Some((link, _)) if self.unsupported.values().sum::<u64>() == self.packets => {
+                let link = Link(*link);
+                Err(PcapError::UnsupportedLink { link })
+            }
+            _ => Ok(()),
         }
     }
 
@@ -313,6 +343,12 @@ impl Replay {
     #[must_use]
     pub const fn progress(&self) -> (u64, u64) {
         (self.packets, self.bytes)
+    }
+
+    /// Packets of link layers that cannot be read, by the layer's number.
+    #[must_use]
+    pub const fn unsupported(&self) -> &BTreeMap<u16, u64> {
+        &self.unsupported
     }
 
     /// What puts its fragments together, for its counters.

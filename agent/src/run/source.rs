@@ -143,6 +143,11 @@ impl Source {
                 let counters = reassembly.counters();
                 AgentFacts {
                     finished: replay.is_finished(),
+                    unsupported_packets: replay
+                        .unsupported()
+                        .iter()
+                        .map(|(link, packets)| (*link, *packets))
+                        .collect(),
                     interfaces: vec![InterfaceFacts {
                         name: "replay".to_owned(),
                         packets: Some(packets),

@@ -24,6 +24,8 @@ pub struct AgentFacts {
     pub capture_progress: Instant,
     /// A replay has reached its end.
     pub finished: bool,
+    /// Packets of a capture whose link layer cannot be read, by the layer's number.
+    pub unsupported_packets: Vec<(u16, u64)>,
     /// Per interface, or per network namespace where the kernel counts no finer.
     pub interfaces: Vec<InterfaceFacts>,
     /// The kernel filter's counters of events, complete and in a fixed order.
@@ -139,6 +141,7 @@ impl AgentFacts {
             at,
             capture_progress: at,
             finished: false,
+            unsupported_packets: Vec::new(),
             interfaces: Vec::new(),
             filter_events: Vec::new(),
             copied_bytes: 0,

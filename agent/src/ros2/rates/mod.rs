@@ -10,7 +10,7 @@ pub mod hz;
 pub mod table;
 pub mod window;
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fmt::Write as _;
 use std::mem;
 
@@ -57,6 +57,8 @@ pub struct Rates {
     waiting: Vec<(Arrival, usize)>,
     /// Number and time of the newest message of each writer of which not every one is seen.
     last_sampled: HashMap<String, (u64, i64)>,
+    /// Topics of which it was said that they are sampled.
+    said_sampled: HashSet<String>,
     /// When the next report of every second is due.
     next: Option<i64>,
     said: Said,
@@ -153,6 +155,7 @@ impl Rates {
             places: HashMap::new(),
             waiting: Vec::new(),
             last_sampled: HashMap::new(),
+            said_sampled: HashSet::new(),
             next: None,
             said: Said::default(),
         }
@@ -290,11 +293,12 @@ impl Rates {
         let between = origin.number.saturating_sub(number).saturating_sub(1);
         let topic = self.topics.get_mut(place);
         if let Some(watched) = topic.filter(|_| (1..=MAX_UNSEEN).contains(&between)) {
-            if !mem::replace(&mut watched.sampled, true) {
+            let is_new = !mem::replace(&mut watched.sampled, true);
+            if is_new && !self.said_sampled.contains(name) {
                 let _ = writeln!(
                     self.said.err,
-                    "rp: {name} goes through shared memory, where not every message is seen: \
-                     those between are counted by their numbers, their times are estimates"
+                    "rp: {name} is sampled in shared memory; unseen messages are counted from \
+                     sequence numbers and their times estimated"
                 );
             }
             let steps = i64::try_from(between + 1).unwrap_or(i64::MAX);
@@ -310,6 +314,13 @@ impl Rates {
             }
         }
         self.arrived(name, arrival)
+    }
+
+    /// That these topics are sampled was said before.
+    pub fn said_sampled<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
+        for name in names {
+            self.said_sampled.insert(name.to_owned());
+        }
     }
 
     /// Nothing more is given.

@@ -319,7 +319,7 @@ fn what_is_not_seen_in_shared_memory_counts_by_its_numbers() {
     let report = |window| format!("average rate: 10.000\n{report}{window}\n");
     assert_eq!(said.out, report(11) + &report(21));
     assert_eq!(
-        said.err.matches("/imu goes through shared memory").count(),
+        said.err.matches("/imu is sampled in shared memory").count(),
         1
     );
 }

@@ -27,6 +27,10 @@ struct NamesView<'a> {
     timestamp_seconds: f64,
     /// Every domain in which somebody is, also where only one was asked for.
     domains: BTreeSet<u32>,
+    /// How many participants there are.
+    participants: usize,
+    /// Writers that send although their announcement was missed; of no known domain.
+    unknown_writers: usize,
     /// Nodes by domain and name.
     nodes: Vec<NodeName<'a>>,
     /// ROS topics by domain and name; with `hidden=true` also those that actions and introspection
@@ -139,6 +143,11 @@ fn names(snapshot: &Snapshot, scope: Scope) -> NamesView<'_> {
         services.filter_map(|((domain_id, name), halves)| service(domain_id, name, &halves));
     NamesView {
         timestamp_seconds: snapshot.at.seconds(),
+        participants: participants
+            .clone()
+            .filter(|each| scope.admits(each.domain_id))
+            .count(),
+        unknown_writers: snapshot.unknown_writers.len(),
         domains: participants.map(|each| each.domain_id).collect(),
         nodes: nodes
             .filter(|node| is_shown(node.domain_id, node.hidden))
