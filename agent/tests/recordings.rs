@@ -530,10 +530,10 @@ fn what_a_late_capture_lacks_is_counted_by_topic_and_reason_and_the_exit_code_te
     );
     assert!(!said.contains("stdin"), "{said}");
     for line in [
-        "/late: 5 of 15 messages recorded; 10 were sent before their writer was announced",
+        "/late: 5 of 15 messages recorded; 10 sent before their writer was announced",
         "/inside: no message recorded; publisher and subscriber share one process",
-        "10 messages of 1 writers are missing: their announcement was missed",
-        "1 topics of domain 7 are not recorded (4 messages): pass `--domain 7`",
+        "not recorded: 10 messages of 1 unknown writer whose announcement was missed",
+        "not recorded: 1 topic of domain 7 with 4 messages (`--domain 7`)",
     ] {
         assert!(said.contains(line), "`{line}` is not in {said}");
     }

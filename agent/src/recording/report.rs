@@ -228,14 +228,14 @@ impl Report {
         let mut lines = Vec::new();
         for (name, topic) in &self.topics {
             let counts = [
-                (topic.incomplete, "were incomplete on the wire"),
-                (topic.lost, "were lost on the way"),
+                (topic.incomplete, "incomplete on the wire"),
+                (topic.lost, "lost on the way"),
                 (topic.not_captured, "could not be captured"),
-                (topic.dropped, "were dropped, the storage was too slow"),
-                (topic.unwritten, "were not written, the storage was full"),
+                (topic.dropped, "dropped, the storage was too slow"),
+                (topic.unwritten, "not written, the storage was full"),
                 (
                     topic.unannounced,
-                    "were sent before their writer was announced",
+                    "sent before their writer was announced",
                 ),
             ];
             let counts = counts.into_iter().filter(|(count, _)| *count > 0);
@@ -267,8 +267,9 @@ impl Report {
         let UnknownWriters { writers, messages } = self.unknown_writers;
         if writers > 0 {
             lines.push(format!(
-                "{messages} messages of {writers} writers are missing: their announcement was \
-                 missed, their topics are unknown"
+                "not recorded: {} of {} whose announcement was missed",
+                counted(messages, "message"),
+                counted(writers, "unknown writer")
             ));
         }
         for domain in &self.other_domains {
@@ -277,11 +278,12 @@ impl Report {
                 topics,
                 messages,
             } = domain;
-            let messages =
-                messages.map_or_else(String::new, |count| format!(" ({count} messages)"));
+            let messages = messages.map_or_else(String::new, |count| {
+                format!(" with {}", counted(count, "message"))
+            });
+            let topics = counted(*topics, "topic");
             lines.push(format!(
-                "{topics} topics of domain {domain_id} are not recorded{messages}: pass \
-                 `--domain {domain_id}`"
+                "not recorded: {topics} of domain {domain_id}{messages} (`--domain {domain_id}`)"
             ));
         }
         lines
@@ -298,6 +300,12 @@ pub fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
         (!names.is_empty()).then_some(line)
     });
     lines.collect()
+}
+
+/// A number of things.
+fn counted(count: u64, thing: &str) -> String {
+    let plural = if count == 1 { "" } else { "s" };
+    format!("{count} {thing}{plural}")
 }
 
 /// Of a list of names the first ones.
@@ -357,7 +365,7 @@ mod tests {
         assert_eq!(
             report.shortfalls(),
             [
-                "/points: 1 of 5 messages recorded; 3 were incomplete on the wire, 1 were dropped, \
+                "/points: 1 of 5 messages recorded; 3 incomplete on the wire, 1 dropped, \
               the storage was too slow"
             ]
         );
@@ -383,7 +391,7 @@ mod tests {
         report.written("/points", 100);
         report.unwritten("/points", 1, 100);
         assert_eq!((report.messages, report.bytes, report.missing), (1, 100, 1));
-        assert!(report.shortfalls()[0].ends_with("1 were not written, the storage was full"));
+        assert!(report.shortfalls()[0].ends_with("1 not written, the storage was full"));
         let json = &report.custom_data()[CUSTOM_DATA];
         assert_eq!(serde_json::from_str::<Report>(json).unwrap(), report);
     }
@@ -410,9 +418,8 @@ mod tests {
             [
                 "/imu: no message recorded; publisher and subscriber share one process; nothing \
                  crosses the network",
-                "90 messages of 2 writers are missing: their announcement was missed, their topics \
-                 are unknown",
-                "3 topics of domain 7 are not recorded (12 messages): pass `--domain 7`",
+                "not recorded: 90 messages of 2 unknown writers whose announcement was missed",
+                "not recorded: 3 topics of domain 7 with 12 messages (`--domain 7`)",
             ]
         );
     }
