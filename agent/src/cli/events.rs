@@ -169,7 +169,8 @@ fn print(
     let names: Vec<_> = topics.iter().map(|(_, name)| name.clone()).collect();
     let domain_id = target.domain()?;
     let is_replay = target.replay.is_some();
-    let mut notes = Notes::begin(agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
+    let notes = Notes::begin(agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
+    let mut notes = notes.of_parts();
     let went = follow(agent, domain_id, &names, &mut notes, |came, _| {
         if let Came::Message(sample, payload) = came
             && expected.is_none_or(|expected| expected == sample.message_type)

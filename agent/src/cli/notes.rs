@@ -31,6 +31,8 @@ pub(crate) struct Notes<'a> {
     is_replay: bool,
     /// Those that were named; none where all are wanted.
     names: Vec<String>,
+    /// One of them is enough.
+    are_parts: bool,
     /// What being sampled means here.
     consequence: &'static str,
     heard: HashSet<String>,
@@ -84,6 +86,7 @@ impl<'a> Notes<'a> {
             domain_id,
             is_replay,
             names: names.to_vec(),
+            are_parts: false,
             consequence,
             heard: HashSet::new(),
             sampled: HashSet::new(),
@@ -99,6 +102,14 @@ impl<'a> Notes<'a> {
             notes.say_sampled(&topics);
         }
         notes
+    }
+
+    /// The named topics are parts of one thing, of which not all need be there.
+    pub(crate) fn of_parts(self) -> Self {
+        Self {
+            are_parts: true,
+            ..self
+        }
     }
 
     /// Those that were said to be sampled.
@@ -171,6 +182,9 @@ impl<'a> Notes<'a> {
 
     fn explain(&mut self) -> Result<()> {
         self.is_explained = true;
+        if self.are_parts && !self.heard.is_empty() {
+            return Ok(());
+        }
         if self.names.is_empty() && self.heard.is_empty() {
             names_of(self.agent, self.domain_id)?;
         }

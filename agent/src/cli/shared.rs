@@ -130,7 +130,10 @@ fn late(names: &Names, is_replay: bool) -> Option<String> {
         ..
     } = names;
     let what = match (names.topics.is_empty(), unknown_writers) {
-        (true, _) if *participants > 0 => {
+        (true, _) if *participants == 1 => {
+            "1 participant is known, but none of its topics".to_owned()
+        }
+        (true, _) if *participants > 1 => {
             format!("{participants} participants are known, but none of their topics")
         }
         (_, 0) => return None,
@@ -142,7 +145,7 @@ fn late(names: &Names, is_replay: bool) -> Option<String> {
         ),
     };
     Some(if is_replay {
-        format!("{what}: the capture begins after them")
+        format!("{what}: the capture does not hold their announcements")
     } else {
         format!("{what}: the agent started after them; `rp discover` has them announced again")
     })
