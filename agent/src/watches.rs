@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use arc_swap::{ArcSwap, ArcSwapOption};
 
-use crate::config::{Limit, Watch, Watchlist};
+use crate::config::{Limit, ManyGlobs, Watch, Watchlist, check_globs};
 use crate::state::StateDirectory;
 use crate::surface::{AgentEvent, Board};
 use kept::Keeper;
@@ -76,9 +76,9 @@ pub enum Refused {
         "there would be more than {0} watches, which is limits.watches: use globs, or raise it"
     )]
     Full(usize),
-    /// The patterns cannot be matched together.
-    #[error("the patterns cannot be matched")]
-    Pattern(#[from] globset::Error),
+    /// Matching all globs against every topic would take too long.
+    #[error("there would be {0}")]
+    Globs(#[from] ManyGlobs),
 }
 
 /// All watches.
@@ -134,6 +134,14 @@ impl InForce {
         &self.watchlist
     }
 
+    fn globs(&self) -> impl Iterator<Item = &str> {
+        let patterns = self
+            .entries
+            .iter()
+            .map(|entry| entry.watch.pattern.as_str());
+        patterns.filter(|pattern| pattern.contains('*'))
+    }
+
     /// The watch with this pattern for this domain.
     #[must_use]
     pub fn find(&self, pattern: &str, domain_id: Option<u32>) -> Option<&Entry> {
@@ -146,7 +154,7 @@ impl Watches {
     /// What the configuration and the command line list.
     ///
     /// # Errors
-    /// They are too many, or their patterns cannot be matched together.
+    /// They are too many, or their globs are too many.
     pub fn new(
         board: Arc<Board>,
         configured: Vec<Watch>,
@@ -175,15 +183,23 @@ impl Watches {
     /// out, for want of room.
     ///
     /// # Errors
-    /// When patterns cannot be matched together; then nothing changes.
+    /// The globs are too many; then nothing changes.
     pub fn restore(&self, watches: Vec<Watch>) -> Result<usize, Refused> {
         let in_force = self.in_force();
         let mut room = self.cap().saturating_sub(in_force.entries().len());
         let asked = watches.len();
-        let fits = |watch: &Watch| {
+        let mut globs: Vec<String> = in_force.globs().map(str::to_owned).collect();
+        let mut fits = |watch: &Watch| {
             let is_there = in_force.find(&watch.pattern, watch.domain_id).is_some();
-            let fits = is_there || room > 0;
-            room -= usize::from(fits && !is_there);
+            if is_there {
+                return true;
+            }
+            globs.push(watch.pattern.clone());
+            let fits = room > 0 && check_globs(globs.iter().map(String::as_str)).is_ok();
+            if !fits {
+                globs.pop();
+            }
+            room -= usize::from(fits);
             fits
         };
         let added: Vec<_> = watches.into_iter().filter(fits).map(Arc::new).collect();
@@ -223,7 +239,7 @@ impl Watches {
     /// The configuration lists these now; what else is watched stays.
     ///
     /// # Errors
-    /// With what else is watched they are too many, or their patterns cannot be matched together;
+    /// With what else is watched they are too many, or their globs are too many;
     /// then nothing changes.
     pub fn configure(&self, watches: Vec<Watch>) -> Result<(), Refused> {
         self.change(|lists| {
@@ -334,7 +350,7 @@ impl Watches {
         let mut lists = self.lists.lock().unwrap_or_else(PoisonError::into_inner);
         let mut new = lists.clone();
         change(&mut new)?;
-        let merged = InForce::merge(&new, &self.in_force().watchlist)?;
+        let merged = InForce::merge(&new)?;
         let (count, cap) = (merged.entries.len(), self.cap());
         if count > cap {
             self.board.limits().reached(Limit::Watches, count - cap);
@@ -357,7 +373,7 @@ impl Watches {
 }
 
 impl InForce {
-    fn merge(lists: &Lists, before: &Watchlist) -> Result<Self, globset::Error> {
+    fn merge(lists: &Lists) -> Result<Self, ManyGlobs> {
         let origins = [
             (Origin::Config, &lists.configured),
             (Origin::CommandLine, &lists.command_line),
@@ -374,7 +390,7 @@ impl InForce {
             }
         }
         let watches = entries.iter().map(|entry| Arc::clone(&entry.watch));
-        let watchlist = Arc::new(before.followed_by(watches.collect())?);
+        let watchlist = Arc::new(Watchlist::of(watches.collect())?);
         Ok(Self { entries, watchlist })
     }
 }

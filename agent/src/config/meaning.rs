@@ -14,7 +14,7 @@ use super::shape::{
     ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
     WatchShape,
 };
-use super::watch::{Expectations, Retain, Watch, check_pattern};
+use super::watch::{Expectations, Retain, Watch, check_globs, check_pattern};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
     RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
@@ -202,6 +202,9 @@ impl Reader {
                 self.wrong(&key, format!("repeats watch[{first}]"));
             }
             watches.push(watch);
+        }
+        if let Err(many) = check_globs(watches.iter().map(|watch| watch.pattern.as_str())) {
+            self.wrong("watch", format!("has {many}"));
         }
         watches
     }

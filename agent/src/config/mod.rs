@@ -22,7 +22,9 @@ use serde::Deserialize;
 
 pub use limits::{Limit, Limits, Row as LimitRow, markdown as limits_markdown};
 pub use mistake::{Mistake, Mistakes, Position};
-pub use watch::{Expectations, PatternError, Retain, Watch, Watchlist, check_pattern};
+pub use watch::{
+    Expectations, ManyGlobs, PatternError, Retain, Watch, Watchlist, check_globs, check_pattern,
+};
 
 /// A larger file is no configuration.
 const MAX_BYTES: u64 = 1 << 20;

@@ -4,10 +4,11 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use globset::{GlobBuilder, GlobSet, GlobSetBuilder};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
+
+use crate::model::glob;
 
 /// One watchlist entry.
 #[derive(Clone, Debug, PartialEq)]
@@ -78,6 +79,22 @@ pub enum PatternError {
     /// Longer than DDS allows.
     #[error("is longer than 255 characters")]
     Long,
+    /// More than [`MAX_STARS`].
+    #[error("has more than {MAX_STARS} stars")]
+    ManyStars,
+}
+
+/// Why globs are not watched together: matching them against a topic takes too long.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{count} globs of {bytes} bytes; at most {MAX_GLOBS} of {MAX_GLOB_BYTES} bytes are matched: \
+     use names, or fewer and shorter globs"
+)]
+pub struct ManyGlobs {
+    /// How many there are.
+    pub count: usize,
+    /// Bytes of all of them.
+    pub bytes: usize,
 }
 
 impl Watch {
@@ -146,6 +163,13 @@ impl Expectations {
     }
 }
 
+/// Stars of one glob, `**` counted as two.
+pub const MAX_STARS: usize = 16;
+/// Globs of one watchlist, and bytes of all of them: a topic that appears is matched against each.
+pub const MAX_GLOBS: usize = 256;
+/// See [`MAX_GLOBS`].
+pub const MAX_GLOB_BYTES: usize = 16 << 10;
+
 /// The highest domain id for which RTPS has ports.
 pub const MAX_DOMAIN: u32 = 232;
 
@@ -183,6 +207,9 @@ pub fn check_pattern(pattern: &str) -> Result<(), PatternError> {
     if pattern.len() > 255 {
         return Err(PatternError::Long);
     }
+    if pattern.matches('*').count() > MAX_STARS {
+        return Err(PatternError::ManyStars);
+    }
     for token in tokens.split('/') {
         if token.is_empty() {
             return Err(PatternError::EmptyToken);
@@ -201,41 +228,47 @@ pub fn check_pattern(pattern: &str) -> Result<(), PatternError> {
     Ok(())
 }
 
-/// A watchlist, ready to be asked. Making the next one out of it costs a pointer for each entry
-/// and a look at its name; globs are compiled again only when other ones are watched.
+/// Counts `patterns` that are globs.
+///
+/// # Errors
+/// They are too many to be matched against every topic.
+pub fn check_globs<'a>(patterns: impl IntoIterator<Item = &'a str>) -> Result<(), ManyGlobs> {
+    let globs = patterns.into_iter().filter(|pattern| pattern.contains('*'));
+    let (count, bytes) = globs.fold((0, 0), |(count, bytes), glob| {
+        (count + 1, bytes + glob.len())
+    });
+    if count > MAX_GLOBS || bytes > MAX_GLOB_BYTES {
+        return Err(ManyGlobs { count, bytes });
+    }
+    Ok(())
+}
+
+/// A watchlist, ready to be asked.
 #[derive(Clone, Debug, Default)]
 pub struct Watchlist {
     watches: Vec<Arc<Watch>>,
     /// Places in `watches` of the entries with this pattern, which are for different domains.
     patterns: HashMap<String, Vec<usize>>,
-    globs: Arc<Globs>,
     /// Places in `watches` of the globs.
-    glob_places: Vec<usize>,
-}
-
-/// Patterns that are no plain names, in watchlist order.
-#[derive(Debug, Default)]
-struct Globs {
-    patterns: Vec<String>,
-    set: GlobSet,
+    globs: Vec<usize>,
 }
 
 impl Watchlist {
     /// Prepares `watches`, keeping their order.
     ///
     /// # Errors
-    /// When a pattern is no glob; patterns that passed [`check_pattern`] always are.
-    pub fn new(watches: Vec<Watch>) -> Result<Self, globset::Error> {
-        Self::default().followed_by(watches.into_iter().map(Arc::new).collect())
+    /// The globs are too many to be matched.
+    pub fn new(watches: Vec<Watch>) -> Result<Self, ManyGlobs> {
+        Self::of(watches.into_iter().map(Arc::new).collect())
     }
 
-    /// The watchlist of `watches`, made with what this one has prepared already.
+    /// As [`Self::new`], of entries that other watchlists share.
     ///
     /// # Errors
     /// As [`Self::new`].
-    pub fn followed_by(&self, watches: Vec<Arc<Watch>>) -> Result<Self, globset::Error> {
+    pub fn of(watches: Vec<Arc<Watch>>) -> Result<Self, ManyGlobs> {
+        check_globs(watches.iter().map(|watch| watch.pattern.as_str()))?;
         let mut patterns: HashMap<String, Vec<usize>> = HashMap::with_capacity(watches.len());
-        let mut glob_places = Vec::new();
         let mut globs = Vec::new();
         for (place, watch) in watches.iter().enumerate() {
             patterns
@@ -243,20 +276,13 @@ impl Watchlist {
                 .or_default()
                 .push(place);
             if !watch.is_literal() {
-                glob_places.push(place);
-                globs.push(watch.pattern.as_str());
+                globs.push(place);
             }
         }
-        let globs = if self.globs.patterns == globs {
-            Arc::clone(&self.globs)
-        } else {
-            Arc::new(Globs::new(&globs)?)
-        };
         Ok(Self {
             watches,
             patterns,
             globs,
-            glob_places,
         })
     }
 
@@ -269,8 +295,11 @@ impl Watchlist {
     /// The entries that cover this topic, as indices into [`Self::watches`].
     #[must_use]
     pub fn matching(&self, domain_id: u32, topic: &str) -> Vec<usize> {
-        let globs = self.globs.set.matches(topic).into_iter();
-        let globs = globs.filter_map(|glob| self.glob_places.get(glob).copied());
+        let covers = |place: &usize| {
+            let watch = self.watches.get(*place);
+            watch.is_some_and(|watch| glob::covers(&watch.pattern, topic))
+        };
+        let globs = self.globs.iter().copied().filter(covers);
         // A hostile topic may be called as a glob is written: then the glob has decided.
         let named = self.patterns.get(topic).into_iter().flatten().copied();
         let named =
@@ -291,19 +320,6 @@ impl Watchlist {
         places.find(|place| {
             let watch = self.watches.get(*place);
             watch.is_some_and(|watch| watch.domain_id == domain_id)
-        })
-    }
-}
-
-impl Globs {
-    fn new(patterns: &[&str]) -> Result<Self, globset::Error> {
-        let mut set = GlobSetBuilder::new();
-        for pattern in patterns {
-            set.add(GlobBuilder::new(pattern).literal_separator(true).build()?);
-        }
-        Ok(Self {
-            patterns: patterns.iter().map(|&pattern| pattern.to_owned()).collect(),
-            set: set.build()?,
         })
     }
 }
@@ -332,13 +348,8 @@ mod tests {
     }
 
     #[test]
-    fn the_next_watchlist_matches_as_one_made_anew() {
-        let first = watchlist(&["/a", "/**", "/b", "/c/*"]);
-        let watches: Vec<_> = ["/b", "/c/d", "/**", "/e", "/c/*"]
-            .map(|name| Arc::new(Watch::named(name).unwrap()))
-            .into();
-        let next = first.followed_by(watches).unwrap();
-        assert!(Arc::ptr_eq(&first.globs, &next.globs));
+    fn names_and_globs_are_found_in_the_order_of_the_list() {
+        let next = watchlist(&["/b", "/c/d", "/**", "/e", "/c/*"]);
         for (topic, places) in [
             ("/a", &[2][..]),
             ("/b", &[0, 2]),
@@ -350,6 +361,23 @@ mod tests {
         assert_eq!(next.position("/e", None), Some(3));
         assert_eq!(next.position("/e", Some(0)), None);
         assert_eq!(next.position("/a", None), None);
+    }
+
+    #[test]
+    fn globs_that_take_too_long_are_refused_together() {
+        let full_of_stars = format!("/{}", "*a".repeat(120));
+        assert_eq!(check_pattern(&full_of_stars), Err(PatternError::ManyStars));
+        let names = (0..5000).map(|number| format!("/topic_{number}"));
+        let names: Vec<_> = names.map(|name| Watch::named(&name).unwrap()).collect();
+        assert!(Watchlist::new(names).is_ok());
+        let globs = |count: usize, length: usize| {
+            let glob = |number| format!("/{}_{number}/*", "a".repeat(length));
+            let globs = (0..count).map(|number| Watch::named(&glob(number)).unwrap());
+            Watchlist::new(globs.collect())
+        };
+        assert!(globs(MAX_GLOBS, 10).is_ok());
+        assert_eq!(globs(MAX_GLOBS + 1, 10).unwrap_err().count, MAX_GLOBS + 1);
+        assert!(globs(100, 240).unwrap_err().bytes > MAX_GLOB_BYTES);
     }
 
     #[test]

@@ -14,6 +14,7 @@ pub mod diagnosis;
 pub mod discovery;
 pub mod event;
 pub mod expectation;
+pub mod glob;
 pub mod header;
 pub mod histogram;
 pub mod identity;

@@ -5,14 +5,14 @@
 
 use std::sync::Arc;
 
-use globset::{GlobBuilder, GlobMatcher};
-use regex::{Regex, RegexBuilder};
+use regex::bytes::{Regex, RegexBuilder};
 
+use super::glob;
 use super::topic::Naming;
 use crate::config::{PatternError, check_pattern};
 
-/// Largest compiled form of one regular expression, in bytes.
-const REGEX_BYTES: usize = 1 << 20;
+/// Largest compiled form of one regular expression, in bytes, and as much again while it is matched.
+const REGEX_BYTES: usize = 64 << 10;
 
 /// How much of each sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -31,7 +31,7 @@ pub enum Choice {
     /// One topic by its ROS name, hidden or not, or by its DDS name.
     Name(String),
     /// `*` within one token, `**` across tokens; hidden topics where it names a hidden token.
-    Glob(GlobMatcher),
+    Glob(String),
     /// Every topic in whose name it is found.
     Regex(Regex),
 }
@@ -46,14 +46,6 @@ pub enum ChoiceError {
         pattern: String,
         /// What is wrong with it.
         reason: PatternError,
-    },
-    /// No glob.
-    #[error("`{pattern}` is no glob")]
-    Glob {
-        /// As given.
-        pattern: String,
-        /// Why not.
-        source: globset::Error,
     },
     /// No regular expression, or one that is too large.
     #[error("`{pattern}` is no regular expression that can be used")]
@@ -106,12 +98,7 @@ impl Choice {
         if !pattern.contains('*') {
             return Ok(Self::Name(pattern.to_owned()));
         }
-        let glob = GlobBuilder::new(pattern).literal_separator(true).build();
-        let glob = glob.map_err(|source| ChoiceError::Glob {
-            pattern: pattern.to_owned(),
-            source,
-        })?;
-        Ok(Self::Glob(glob.compile_matcher()))
+        Ok(Self::Glob(pattern.to_owned()))
     }
 
     /// A regular expression, found anywhere in a name.
@@ -119,9 +106,7 @@ impl Choice {
     /// # Errors
     /// It is none, or too large.
     pub fn regex(pattern: &str) -> Result<Self, ChoiceError> {
-        let mut builder = RegexBuilder::new(pattern);
-        let regex = builder.size_limit(REGEX_BYTES).build();
-        let regex = regex.map_err(|source| ChoiceError::Regex {
+        let regex = expression(pattern).map_err(|source| ChoiceError::Regex {
             pattern: pattern.to_owned(),
             source: Box::new(source),
         })?;
@@ -133,12 +118,23 @@ impl Choice {
             Self::Name(wanted) => wanted == name || wanted == dds_name,
             _ if !is_ros => false,
             Self::All => hidden,
-            Self::Glob(glob) => {
-                (hidden || glob.glob().glob().contains("/_")) && glob.is_match(name)
-            }
-            Self::Regex(regex) => hidden && regex.is_match(name),
+            Self::Glob(glob) => (hidden || glob.contains("/_")) && glob::covers(glob, name),
+            Self::Regex(regex) => hidden && regex.is_match(name.as_bytes()),
         }
     }
+}
+
+/// Compiles a regular expression over topic names, whose characters are ASCII: the classes `\w`, `\d`
+/// and `\s` are.
+///
+/// # Errors
+/// It is none, or too large.
+pub fn expression(pattern: &str) -> Result<Regex, regex::Error> {
+    RegexBuilder::new(pattern)
+        .unicode(false)
+        .size_limit(REGEX_BYTES)
+        .dfa_size_limit(REGEX_BYTES)
+        .build()
 }
 
 impl Selection {
@@ -161,6 +157,24 @@ impl Selection {
             include: vec![Choice::All],
             ..Self::default()
         }
+    }
+
+    /// Its globs.
+    pub fn globs(&self) -> impl Iterator<Item = &str> {
+        let choices = self.include.iter().chain(&self.exclude);
+        choices.filter_map(|choice| match choice {
+            Choice::Glob(glob) => Some(glob.as_str()),
+            _ => None,
+        })
+    }
+
+    /// How many regular expressions it has.
+    #[must_use]
+    pub fn regexes(&self) -> usize {
+        let choices = self.include.iter().chain(&self.exclude);
+        choices
+            .filter(|choice| matches!(choice, Choice::Regex(_)))
+            .count()
     }
 
     /// Whether this topic is wanted. `kind` as in [`super::snapshot::TopicFacts`]: requests and

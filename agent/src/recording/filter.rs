@@ -5,7 +5,7 @@
 
 use std::collections::HashSet;
 
-use regex::Regex;
+use regex::bytes::Regex;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -19,8 +19,6 @@ const EVERY_SERVICE_EVENT: &str = "/_service_event$";
 const MAX_NAMES: usize = 1024;
 /// Characters of a regular expression.
 const MAX_EXPRESSION: usize = 1024;
-/// Bytes of a compiled one.
-const MAX_COMPILED: usize = 256 * 1024;
 
 /// What was asked for; empty asks for nothing.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -241,7 +239,7 @@ impl Filter {
         let asked = &self.asked;
         let found = |expression: &Option<Regex>, name: &str| {
             let expression = expression.as_ref();
-            expression.is_some_and(|expression| expression.is_match(name))
+            expression.is_some_and(|expression| expression.is_match(name.as_bytes()))
         };
         let only = self.only.as_ref();
         if found(&self.exclude_regex, topic.name)
@@ -280,10 +278,7 @@ fn expression(text: &str) -> Result<Regex, FilterError> {
     if text.len() > MAX_EXPRESSION {
         return Err(refuse(format!("longer than {MAX_EXPRESSION} bytes")));
     }
-    let built = regex::RegexBuilder::new(text)
-        .size_limit(MAX_COMPILED)
-        .build();
-    built.map_err(|error| {
+    crate::model::selection::expression(text).map_err(|error| {
         let text = error.to_string();
         let last = text.lines().last().unwrap_or_default();
         refuse(last.trim_start_matches("error: ").to_owned())

@@ -18,7 +18,8 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 use ros2probe_wire::Timestamp;
 use tokio_util::sync::CancellationToken;
 
-use crate::config::Watch;
+use crate::config::watch::{MAX_GLOB_BYTES, MAX_GLOBS};
+use crate::config::{Watch, check_globs};
 use crate::model::payloads::{Given, News, Sample};
 use crate::model::selection::Wish;
 use crate::surface::Board;
@@ -27,6 +28,9 @@ use retained::Retained;
 
 pub use crate::model::payloads::{Missed, MissedReason, Topic};
 pub use crate::model::selection::{Choice, ChoiceError, Depth, Selection};
+
+/// Regular expressions of all subscriptions together.
+const MAX_REGEXES: usize = 16;
 
 /// How much there may be of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,6 +73,12 @@ pub enum Refused {
     /// As many as may are open.
     #[error("{0} subscriptions are open, which is the limit (limits.subscriptions)")]
     TooMany(usize),
+    /// Matching its patterns, and those of the open ones, against every topic takes too long.
+    #[error(
+        "the open subscriptions have too many patterns together: at most {MAX_GLOBS} globs of \
+         {MAX_GLOB_BYTES} bytes and {MAX_REGEXES} regular expressions; name topics instead"
+    )]
+    Patterns,
 }
 
 /// What a reader gets.
@@ -162,13 +172,20 @@ impl Subscriptions {
     /// Gives what `request` asks for from now on; see [`Subscription::in_force`].
     ///
     /// # Errors
-    /// There are too many already.
+    /// There are too many already, or their patterns are.
     pub fn open(self: &Arc<Self>, request: Request) -> Result<Subscription, Refused> {
         let mut opened = self.changing();
         let channels = self.channels.load();
         if channels.len() >= self.caps.subscriptions {
             self.refused.fetch_add(1, Ordering::Relaxed);
             return Err(Refused::TooMany(self.caps.subscriptions));
+        }
+        let selections = channels.iter().map(|channel| channel.selection());
+        let selections = || selections.clone().chain([&request.topics]);
+        let regexes: usize = selections().map(Selection::regexes).sum();
+        if regexes > MAX_REGEXES || check_globs(selections().flat_map(Selection::globs)).is_err() {
+            self.refused.fetch_add(1, Ordering::Relaxed);
+            return Err(Refused::Patterns);
         }
         opened.count += 1;
         let channel = Arc::new(Channel::new(opened.count, request));

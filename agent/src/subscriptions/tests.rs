@@ -257,6 +257,36 @@ fn dropping_a_subscription_closes_its_interest_and_makes_room_for_another() {
     assert_eq!(all.facts().refused, 1);
 }
 
+#[test]
+fn patterns_of_all_subscriptions_together_are_bounded() {
+    let all = subscriptions(Caps {
+        subscriptions: 100,
+        ..caps()
+    });
+    let open = |include: Vec<Choice>| {
+        all.open(Request {
+            topics: Selection {
+                include,
+                ..Selection::default()
+            },
+            ..request(Depth::Arrivals, 1 << 16, Overflow::DropOldest)
+        })
+    };
+    let globs = |count| (0..count).map(|number| Choice::parse(&format!("/*a*{number}")).unwrap());
+    let names = |count| (0..count).map(|number| Choice::parse(&format!("/a{number}")).unwrap());
+    let mut readers = vec![open(globs(200).collect()).unwrap()];
+    assert_eq!(open(globs(200).collect()).unwrap_err(), Refused::Patterns);
+    readers.push(open(names(1000).collect()).unwrap());
+    for _ in 0..MAX_REGEXES {
+        readers.push(open(vec![Choice::regex("^/cam").unwrap()]).unwrap());
+    }
+    let regex = || open(vec![Choice::regex("^/cam").unwrap()]);
+    assert_eq!(regex().unwrap_err(), Refused::Patterns);
+    assert_eq!(all.facts().refused, 2);
+    readers.clear();
+    assert!(open(globs(200).collect()).is_ok() && regex().is_ok());
+}
+
 #[tokio::test]
 async fn a_reader_is_woken_told_the_end_and_then_nothing() {
     let all = subscriptions(caps());

@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::Limit;
 use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
+use crate::config::{Limit, check_globs};
 use crate::state::{Form, Found, Newer, StateDirectory, from_json};
 
 const FILE: &str = "watches.json";
@@ -106,6 +106,11 @@ pub fn load(directory: &StateDirectory) -> Kept {
     } else {
         document.watches.into_iter().map(Watch::try_from).collect()
     };
+    let watches = watches.and_then(|watches: Vec<Watch>| {
+        let patterns = watches.iter().map(|watch| watch.pattern.as_str());
+        check_globs(patterns).map_err(|many| format!("it has {many}"))?;
+        Ok(watches)
+    });
     match watches {
         Ok(watches) => Kept::These(watches),
         Err(reason) => match directory.set_aside::<Document>(FILE, reason) {
@@ -326,6 +331,24 @@ mod tests {
             assert_eq!(fs::read_to_string(aside).unwrap(), text);
             assert_eq!(load(&directory), Kept::Nothing);
         }
+    }
+
+    #[test]
+    fn a_saved_list_whose_globs_take_too_long_is_kept_aside() {
+        let (place, directory) = directory();
+        let glob = |number| format!("/{}_{number}/**", "a*".repeat(7));
+        let globs = (0..1000).map(|number| Watch::named(&glob(number)).unwrap());
+        let document = Document {
+            version: VERSION,
+            watches: globs.map(|watch| Line::from(&watch)).collect(),
+        };
+        directory.replace(FILE, &document).unwrap();
+        let Kept::Unusable { reason, aside } = load(&directory) else {
+            panic!("it was read");
+        };
+        assert!(reason.contains("it has 1000 globs of"), "{reason}");
+        assert_eq!(aside, Some(place.path().join("watches.json.corrupt")));
+        assert_eq!(load(&directory), Kept::Nothing);
     }
 
     #[test]

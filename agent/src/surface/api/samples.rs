@@ -112,7 +112,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
             content((Line = "application/x-ndjson"), (Line = "application/vnd.ros2probe.samples"))),
         (status = 422, description = "No topic requested, or an invalid topic name.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 503, description = "There are too many subscriptions already.",
+        (status = 503, description = "There are too many subscriptions already, or patterns of all of them.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -145,7 +145,7 @@ async fn samples(
         label: "GET /samples".to_owned(),
     };
     let opened = context.subscriptions.open(request);
-    let subscription = opened.map_err(|refused @ Refused::TooMany(_)| {
+    let subscription = opened.map_err(|refused: Refused| {
         Problem::new(Code::TooManySubscriptions, refused.to_string())
     })?;
     let known = if is_replay {

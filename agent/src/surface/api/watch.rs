@@ -424,7 +424,7 @@ fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
         Refused::Given { .. } => Code::WatchGiven,
         Refused::Different => Code::WatchDiffers,
         Refused::Full(_) => Code::TooManyWatches,
-        Refused::Unknown | Refused::Pattern(_) => Code::InvalidRequest,
+        Refused::Unknown | Refused::Globs(_) => Code::InvalidRequest,
     };
     Problem::new(code, detail)
 }
