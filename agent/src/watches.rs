@@ -189,7 +189,7 @@ impl Watches {
         let mut room = self.cap().saturating_sub(in_force.entries().len());
         let asked = watches.len();
         let mut globs: Vec<String> = in_force.globs().map(str::to_owned).collect();
-        let mut fits = |watch: &Watch| {
+        let fits = |watch: &Watch| {
             let is_there = in_force.find(&watch.pattern, watch.domain_id).is_some();
             if is_there {
                 return true;

@@ -118,7 +118,7 @@ pub fn shared_memory(bytes: &[u8]) {
         let mut records = Vec::new();
         let message = Message::new(segment, buffer);
         judge.judge(&message, buffer.length, Record::default(), &mut records);
-        assert!(records.len() <= usize::from(buffer.length));
+        assert!(records.len() <= buffer.length as usize);
         let mut whole = Vec::new();
         if buffer.read(segment, &mut whole) {
             assert!(whole.len() <= segment.len());

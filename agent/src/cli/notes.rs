@@ -22,7 +22,7 @@ pub(crate) const NOT_ALL_PRINTED: &str = "not every message is printed";
 /// Topics that are named in one line.
 const NAMES: usize = 8;
 /// What makes sampled topics exact.
-const SWITCH: &str = "`capture.shm.exact: uprobe` captures each message";
+const SWITCH: &str = "`capture.shm.exact: auto` captures each message";
 
 /// Notes on the topics of one verb.
 pub(crate) struct Notes<'a> {

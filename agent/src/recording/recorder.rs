@@ -575,7 +575,7 @@ mod tests {
 
     use super::*;
     use crate::bag::Options;
-    use crate::subscriptions::Missed;
+    use crate::subscriptions::{Missed, MissedReason};
 
     const KEEPER: &str = r#"{"reliability": "RELIABLE", "durability": "TRANSIENT_LOCAL",
         "history": "KEEP_LAST (1)", "deadline_seconds": null, "lifespan_seconds": null,

@@ -182,7 +182,7 @@ fn a_message_longer_than_a_datagram_ends_in_a_sample_of_any_size() {
     assert_eq!(seen, [(1, 4, 4), (2, 200_000, 200_000)]);
     let last = found.last().map(|(record, _)| record.datagram_len);
     assert_eq!(last, Some(u16::MAX));
-    let long = vec![0; MAX_MESSAGE as usize + 1];
+    let long = std::vec![0; MAX_MESSAGE as usize + 1];
     assert_eq!(walk_all(&long).0, Outcome::Malformed);
 }
 
