@@ -34,6 +34,7 @@ use ros2probe::surface::api::{self, reload};
 use ros2probe::surface::http::Server;
 use ros2probe::surface::otlp::{self, Exporter, Host, SettingsError};
 use ros2probe::surface::{Board, Exposition, Format, Settings};
+use ros2probe::visible::visible_lines;
 use ros2probe::watches::Watches;
 use tokio_util::sync::CancellationToken;
 
@@ -63,7 +64,8 @@ fn main() -> ExitCode {
             return ExitCode::from(BROKEN_PIPE);
         }
         // Where nobody can be told, the exit code is left.
-        let _ = writeln!(std::io::stderr(), "{}", message(&error));
+        // Errors quote files, names and answers.
+        let _ = writeln!(std::io::stderr(), "{}", visible_lines(&message(&error)));
         exit_code(&error)
     })
 }

@@ -3,7 +3,8 @@
 
 use std::borrow::Cow;
 
-/// Control characters, and those that turn the direction of what follows, as escapes.
+/// Control characters, and those that show nothing of their own, as escapes: two names that look the
+/// same are the same.
 #[must_use]
 pub fn visible(text: &str) -> Cow<'_, str> {
     escaped(text, commands)
@@ -36,9 +37,40 @@ fn escaped(text: &str, hides: impl Fn(char) -> bool) -> Cow<'_, str> {
 }
 
 fn commands(each: char) -> bool {
-    let turns =
-        matches!(each, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
-    each.is_control() || turns
+    each.is_control() || is_unseen(each)
+}
+
+/// Characters that show nothing, turn the direction of what follows or end a line: those of the
+/// categories Cf, Zl and Zp, and the default ignorable ones (Unicode 16, DerivedCoreProperties.txt)
+/// but the variation selectors U+FE00 to U+FE0F, which belong to emoji.
+const fn is_unseen(each: char) -> bool {
+    matches!(
+        each,
+        '\u{ad}'
+            | '\u{34f}'
+            | '\u{600}'..='\u{605}'
+            | '\u{61c}'
+            | '\u{6dd}'
+            | '\u{70f}'
+            | '\u{890}'..='\u{891}'
+            | '\u{8e2}'
+            | '\u{115f}'..='\u{1160}'
+            | '\u{17b4}'..='\u{17b5}'
+            | '\u{180b}'..='\u{180f}'
+            | '\u{200b}'..='\u{200f}'
+            | '\u{2028}'..='\u{202e}'
+            | '\u{2060}'..='\u{206f}'
+            | '\u{3164}'
+            | '\u{feff}'
+            | '\u{ffa0}'
+            | '\u{fff0}'..='\u{fffb}'
+            | '\u{110bd}'
+            | '\u{110cd}'
+            | '\u{13430}'..='\u{1343f}'
+            | '\u{1bca0}'..='\u{1bca3}'
+            | '\u{1d173}'..='\u{1d17a}'
+            | '\u{e0000}'..='\u{e0fff}'
+    )
 }
 
 #[cfg(test)]
@@ -52,7 +84,25 @@ mod tests {
             r"/a\u{1b}[2J\r\nb\u{202e}c"
         );
         assert_eq!(visible_lines("a: \u{9b}1m\n\tb\r"), "a: \\u{9b}1m\n\tb\\r");
-        for plain in ["", "/points", "Grüße 世界"] {
+        for hidden in [
+            '\u{ad}',
+            '\u{200b}',
+            '\u{200d}',
+            '\u{2028}',
+            '\u{2060}',
+            '\u{2064}',
+            '\u{206f}',
+            '\u{feff}',
+            '\u{3164}',
+            '\u{e0041}',
+            '\u{e0100}',
+        ] {
+            let name = format!("/po{hidden}ints");
+            let shown = format!("/po{}ints", hidden.escape_unicode());
+            assert_eq!(visible(&name), shown);
+            assert_eq!(visible_lines(&name), shown);
+        }
+        for plain in ["", "/points", "Grüße 世界", "\u{2600}\u{fe0f}", "e\u{301}"] {
             assert!(matches!(visible(plain), Cow::Borrowed(same) if same == plain));
         }
     }

@@ -15,6 +15,7 @@ use super::mcap::Message;
 use super::metadata::{self, File, Metadata, Topic};
 use super::read::{self, Contents, ReadError};
 use crate::ros2::Dialect;
+use crate::visible::visible;
 
 /// A bag to be told about.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -193,14 +194,20 @@ impl Bag {
         let mut line = |label: &str, value: &dyn std::fmt::Display| {
             let _ = writeln!(text, "{label:<LABEL$}{value}");
         };
-        line("Files:", &lines_of(&metadata.relative_file_paths));
+        let files = metadata.relative_file_paths.iter();
+        let files: Vec<String> = files.map(|file| visible(file).into_owned()).collect();
+        line("Files:", &lines_of(&files));
         line("Bag size:", &size(self.bytes));
-        line("Storage id:", &metadata.storage_identifier);
+        line("Storage id:", &visible(&metadata.storage_identifier));
         if dialect > Dialect::Humble {
-            let distro = metadata.ros_distro.as_str();
+            let distro = visible(&metadata.ros_distro);
             line(
                 "ROS Distro:",
-                &if distro.is_empty() { "unknown" } else { distro },
+                &if distro.is_empty() {
+                    "unknown"
+                } else {
+                    &distro
+                },
             );
         }
         let end = metadata.starting_time.saturating_add(metadata.duration);
@@ -250,7 +257,7 @@ impl Bag {
         parts
             .topics
             .iter()
-            .map(|topic| format!("{}\n", topic.name))
+            .map(|topic| format!("{}\n", visible(&topic.name)))
             .collect()
     }
 }
@@ -443,7 +450,8 @@ impl<'a> Parts<'a> {
                     )
                 }
             };
-            let format = &topic.serialization_format;
+            let [service, type_name, format] =
+                [service, type_name, &topic.serialization_format].map(visible);
             let _ = writeln!(
                 text,
                 "Service: {service} | Type: {type_name} | {counts}Serialization Format: {format}"
@@ -461,10 +469,10 @@ impl<'a> Parts<'a> {
             let _ = write!(
                 text,
                 "\n  Action: {} | Type: {} | Topics: 2 | Service: 3 | {}Serialization Format: {}",
-                action.name,
-                action.type_name,
+                visible(action.name),
+                visible(&action.type_name),
                 contribution.unwrap_or_default(),
-                action.format
+                visible(action.format)
             );
             let [feedback, status, events @ ..] = action.counts;
             let _ = write!(text, "\n    Topic: feedback | Count: {feedback}");
@@ -536,7 +544,10 @@ fn topic_line(topic: &Topic, details: Option<&Details>) -> String {
         .unwrap_or_default();
     format!(
         "Topic: {} | Type: {} | Count: {} | {contribution}Serialization Format: {}",
-        topic.name, topic.type_name, topic.message_count, topic.serialization_format
+        visible(&topic.name),
+        visible(&topic.type_name),
+        topic.message_count,
+        visible(&topic.serialization_format)
     )
 }
 

@@ -17,6 +17,7 @@ use super::metadata::{self, Metadata, Topic};
 use super::read::{self, Contents, ReadError, Scan};
 use super::writer::{Durability, FileCompression, with_suffix, write_metadata};
 use super::{Compression, Error, info};
+use crate::visible::visible;
 
 /// What was found and done.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -360,6 +361,8 @@ impl fmt::Display for FileReport {
             messages,
             found,
         } = self;
+        // The name of a file is anything but a slash.
+        let name = visible(name);
         match found {
             Found::Complete => write!(f, "{name}: complete, {messages} messages"),
             Found::NotMcap => write!(
@@ -380,7 +383,11 @@ impl fmt::Display for FileReport {
                     write!(f, ", {unreadable_chunks} chunks cannot be looked into")?;
                 }
                 match kept {
-                    Some(kept) => write!(f, ", {cut} bytes were no whole record: kept in {kept}"),
+                    Some(kept) => write!(
+                        f,
+                        ", {cut} bytes were no whole record: kept in {}",
+                        visible(kept)
+                    ),
                     None => Ok(()),
                 }
             }
