@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::{Bytes, BytesMut};
 use http_body_util::BodyExt as _;
-use hyper::body::Incoming;
+use hyper::body::{Frame, Incoming};
 use tokio::time::timeout;
 
 use super::{Agent, ClientError};
@@ -24,6 +24,9 @@ pub struct Lines<'a> {
     /// So much of the buffer has no end of a line in it.
     searched: usize,
     ended: bool,
+    /// How long the agent may be silent, and how long it was waited for since it was heard.
+    silence: Option<Duration>,
+    waited: Duration,
 }
 
 /// What came within a time.
@@ -38,13 +41,15 @@ pub enum Next {
 }
 
 impl<'a> Lines<'a> {
-    pub(super) fn new(agent: &'a Agent, body: Incoming) -> Self {
+    pub(super) fn new(agent: &'a Agent, body: Incoming, silence: Option<Duration>) -> Self {
         Self {
             agent,
             body,
             buffer: BytesMut::new(),
             searched: 0,
             ended: false,
+            silence,
+            waited: Duration::ZERO,
         }
     }
 
@@ -56,7 +61,7 @@ impl<'a> Lines<'a> {
     /// Waits for a line; `None` when the agent hung up.
     ///
     /// # Errors
-    /// The connection broke, or what comes has no lines.
+    /// The connection broke, the agent is silent, or what comes has no lines.
     pub fn line(&mut self) -> Result<Option<Bytes>, ClientError> {
         let agent = self.agent;
         agent.runtime.block_on(self.next_line())
@@ -71,7 +76,11 @@ impl<'a> Lines<'a> {
         agent.runtime.block_on(async {
             match timeout(patience, self.next_line()).await {
                 Ok(line) => Ok(line?.map_or(Next::End, Next::Line)),
-                Err(_) => Ok(Next::Nothing),
+                Err(_) => {
+                    // What is left of the silence is shorter by that.
+                    self.waited += patience;
+                    Ok(Next::Nothing)
+                }
             }
         })
     }
@@ -120,7 +129,7 @@ impl<'a> Lines<'a> {
     /// Whether anything more came.
     async fn fill(&mut self) -> Result<bool, ClientError> {
         while !self.ended {
-            match self.body.frame().await {
+            match self.frame().await? {
                 None => self.ended = true,
                 Some(Ok(frame)) => {
                     if let Ok(data) = frame.into_data()
@@ -134,5 +143,16 @@ impl<'a> Lines<'a> {
             }
         }
         Ok(false)
+    }
+
+    /// The next frame, unless the agent is silent for too long.
+    async fn frame(&mut self) -> Result<Option<Result<Frame<Bytes>, hyper::Error>>, ClientError> {
+        let Some(silence) = self.silence else {
+            return Ok(self.body.frame().await);
+        };
+        let left = silence.saturating_sub(self.waited);
+        let frame = timeout(left, self.body.frame()).await;
+        self.waited = Duration::ZERO;
+        frame.map_err(|_| self.agent.way.slow())
     }
 }

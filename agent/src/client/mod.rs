@@ -14,7 +14,7 @@ mod way;
 
 use std::time::Duration;
 
-use bytes::Bytes;
+use bytes::{Bytes, BytesMut};
 use http_body_util::{BodyExt as _, Full, Limited};
 use hyper::body::Incoming;
 use hyper::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
@@ -35,6 +35,11 @@ use way::Way;
 
 /// The longest wait for a whole answer: graphs of thousands of topics come within a second.
 const PATIENCE: Duration = Duration::from_secs(30);
+/// The longest silence of an agent: before its answer, within it, and in a stream of messages, which
+/// has a clock.
+const SILENCE: Duration = Duration::from_secs(5);
+/// The longest silence in a stream of events, which has a beat every 15 s.
+const BEATS: Duration = Duration::from_secs(40);
 /// More than any answer has; a stream is not bounded by it.
 const MAX_ANSWER: usize = 256 << 20;
 
@@ -160,7 +165,14 @@ impl Agent {
             let answer = self.send(Method::GET, path, None).await?;
             if answer.status().is_success() {
                 self.way.go_on();
-                Ok(Lines::new(self, answer.into_body()))
+                let silence = if path.starts_with("/events") {
+                    BEATS
+                } else {
+                    SILENCE
+                };
+                // A replay within this process has the pace of its capture.
+                let silence = (!self.way.is_replayed()).then_some(silence);
+                Ok(Lines::new(self, answer.into_body(), silence))
             } else {
                 let refused = self.whole(path, answer).await;
                 Err(refused.err().unwrap_or_else(|| self.way.not_an_agent()))
@@ -236,14 +248,27 @@ impl Agent {
         let request = request.map_err(|_| ClientError::Path {
             path: path.to_owned(),
         })?;
-        self.way.send(request).await
+        if self.way.is_replayed() {
+            return self.way.send(request).await;
+        }
+        let answer = timeout(SILENCE, self.way.send(request)).await;
+        answer.unwrap_or_else(|_| Err(self.way.slow()))
     }
 
     /// The whole body of an answer that is no refusal.
     async fn whole(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
         let status = answer.status();
-        let body = Limited::new(answer.into_body(), MAX_ANSWER).collect().await;
-        let body = body.map_err(|source| self.way.broke(source))?.to_bytes();
+        let mut body = Limited::new(answer.into_body(), MAX_ANSWER);
+        let mut whole = BytesMut::new();
+        loop {
+            let frame = timeout(SILENCE, body.frame()).await;
+            let Some(frame) = frame.map_err(|_| self.way.slow())? else {
+                break;
+            };
+            let frame = frame.map_err(|source| self.way.broke(source))?;
+            whole.extend_from_slice(&frame.into_data().unwrap_or_default());
+        }
+        let body = whole.freeze();
         if status.is_success() {
             return Ok(body);
         }

@@ -53,11 +53,11 @@ impl Way {
             return Ok(Self::Socket(path.clone()));
         }
         let path = Path::new(SOCKET);
-        let socket = match UnixStream::connect(path).await {
+        let socket = match within(UnixStream::connect(path)).await {
             Ok(_) => return Ok(Self::Socket(path.to_path_buf())),
             Err(error) => error,
         };
-        match TcpStream::connect(LOOPBACK).await {
+        match within(TcpStream::connect(LOOPBACK)).await {
             Ok(_) => Ok(Self::Address(LOOPBACK.to_owned())),
             Err(_) if socket.kind() == io::ErrorKind::PermissionDenied => {
                 let path = path.to_path_buf();
@@ -94,6 +94,11 @@ impl Way {
         }
     }
 
+    /// Whether it is within this process.
+    pub(super) const fn is_replayed(&self) -> bool {
+        matches!(self, Self::Replayed(_))
+    }
+
     /// What a replay waited for has begun.
     pub(super) fn go_on(&self) {
         if let Self::Replayed(replayed) = self {
@@ -113,9 +118,7 @@ impl Way {
         &self,
         connect: impl Future<Output = io::Result<S>>,
     ) -> Result<S, ClientError> {
-        let connected = timeout(PATIENCE, connect).await;
-        let connected = connected.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()));
-        connected.map_err(|source| match self {
+        within(connect).await.map_err(|source| match self {
             Self::Socket(path) if source.kind() == io::ErrorKind::PermissionDenied => {
                 ClientError::Denied { path: path.clone() }
             }
@@ -200,6 +203,11 @@ impl fmt::Display for Way {
             Self::Replayed(replayed) => write!(f, "{}", replayed.capture().display()),
         }
     }
+}
+
+async fn within<S>(connect: impl Future<Output = io::Result<S>>) -> io::Result<S> {
+    let connected = timeout(PATIENCE, connect).await;
+    connected.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
 }
 
 fn without_query(path: &str) -> String {
