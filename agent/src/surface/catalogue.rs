@@ -111,17 +111,15 @@ impl Metric {
         }
     }
 
-    /// The name without what the exposition format appends: type suffix and unit.
+    /// The name of the family in OpenMetrics: without the suffix of its samples.
     #[must_use]
-    pub fn stem(&self) -> &'static str {
-        let name = match self.kind {
+    pub fn family(&self) -> &'static str {
+        match self.kind {
             Kind::Counter => self.name.strip_suffix("_total"),
             Kind::Info => self.name.strip_suffix("_info"),
             Kind::Gauge | Kind::Histogram => None,
         }
-        .unwrap_or(self.name);
-        let without_unit = |unit| name.strip_suffix(unit)?.strip_suffix('_');
-        self.unit.and_then(without_unit).unwrap_or(name)
+        .unwrap_or(self.name)
     }
 }
 
@@ -571,9 +569,12 @@ mod tests {
 
     #[test]
     fn a_stem_and_its_suffixes_make_the_name() {
-        assert_eq!(TOPIC_BYTES.stem(), "ros2_topic");
-        assert_eq!(TOPIC_MESSAGES.stem(), "ros2_topic_messages");
-        assert_eq!(TOPIC_INTERARRIVAL.stem(), "ros2_topic_interarrival");
-        assert_eq!(NODE_INFO.stem(), "ros2_node");
+        assert_eq!(TOPIC_BYTES.family(), "ros2_topic_bytes");
+        assert_eq!(TOPIC_MESSAGES.family(), "ros2_topic_messages");
+        assert_eq!(
+            TOPIC_INTERARRIVAL.family(),
+            "ros2_topic_interarrival_seconds"
+        );
+        assert_eq!(NODE_INFO.family(), "ros2_node");
     }
 }

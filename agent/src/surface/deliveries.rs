@@ -162,7 +162,7 @@ impl<'a> Deliveries<'a> {
     }
 
     /// Each receiver once, whatever the number of its writers.
-    fn subscribers(&self, family: &mut Family<'_>) -> fmt::Result {
+    fn subscribers(&self, family: &mut Family<'_, '_>) -> fmt::Result {
         let mut subscribers: Vec<&Delivery<'_>> = self.received.iter().collect();
         // Of one receiver's deliveries the one that was seen last knows most.
         subscribers.sort_by_key(|one| (one.receiver(), Reverse(one.facts.last_seen)));

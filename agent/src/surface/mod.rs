@@ -22,6 +22,7 @@ mod page;
 mod process;
 pub mod recording_facts;
 mod robot;
+mod text;
 #[cfg(feature = "tls")]
 mod tls;
 mod walk;

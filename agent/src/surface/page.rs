@@ -1,23 +1,18 @@
-//! Families and samples, straight from facts, in the catalogue's order, as text through
-//! prometheus-client or as OTLP data points: who writes them cannot tell which.
+//! Families and samples, straight from facts, in the catalogue's order, as text or as OTLP data
+//! points: who writes them cannot tell which.
 //!
 //! Nothing is kept between two pages: what is gone from the facts is gone from the page.
 
 use std::collections::hash_map::DefaultHasher;
-use std::fmt::{self, Write as _};
+use std::fmt;
 use std::hash::{Hash as _, Hasher as _};
 use std::net::SocketAddr;
 
-use prometheus_client::encoding::{
-    CounterValueEncoder, DescriptorEncoder, EncodeCounterValue, EncodeGaugeValue, EncodeLabelSet,
-    GaugeValueEncoder, LabelEncoder, LabelSetEncoder, MetricEncoder, NoLabelSet,
-};
-use prometheus_client::metrics::MetricType;
-use prometheus_client::registry::Unit;
 use ros2probe_wire::Guid;
 
-use super::catalogue::{Kind, Metric};
+use super::catalogue::Metric;
 use super::otlp::points::Points;
+use super::text::Text;
 use crate::model::histogram::Histogram;
 
 /// Longer label values are cut. ROS allows 255 characters; what is longer is hostile.
@@ -41,51 +36,28 @@ pub(super) enum Number {
 
 /// One scrape or one export being written.
 pub(super) enum Page<'a> {
-    Text(DescriptorEncoder<'a>),
+    Text(Text<'a>),
     Points(&'a mut Points),
 }
 
 /// One family being written; its samples follow one another.
-pub(super) struct Family<'a> {
+pub(super) struct Family<'a, 'b> {
     metric: &'static Metric,
-    sink: Sink<'a>,
+    page: &'a mut Page<'b>,
 }
 
-/// Where a family's samples go.
-enum Sink<'a> {
-    Text(MetricEncoder<'a>),
-    Points(&'a mut Points),
-}
-
-impl Page<'_> {
+impl<'b> Page<'b> {
     /// Begins a family; `samples` writes what it holds.
     pub(super) fn family(
         &mut self,
         metric: &'static Metric,
-        samples: impl FnOnce(&mut Family<'_>) -> fmt::Result,
+        samples: impl FnOnce(&mut Family<'_, 'b>) -> fmt::Result,
     ) -> fmt::Result {
-        let encoder = match self {
-            Self::Text(encoder) => encoder,
-            Self::Points(points) => {
-                points.open(metric);
-                let sink = Sink::Points(points);
-                return samples(&mut Family { metric, sink });
-            }
-        };
-        let kind = match metric.kind {
-            Kind::Counter => MetricType::Counter,
-            Kind::Gauge => MetricType::Gauge,
-            Kind::Histogram => MetricType::Histogram,
-            Kind::Info => MetricType::Info,
-        };
-        // prometheus-client appends the unit only where it ends the name.
-        let stem = metric.stem();
-        let unit = metric.unit.map(|unit| Unit::Other(unit.to_owned()));
-        let sink = encoder.encode_descriptor(stem, metric.help, unit.as_ref(), kind)?;
-        samples(&mut Family {
-            metric,
-            sink: Sink::Text(sink),
-        })
+        match self {
+            Self::Text(text) => text.begin(metric)?,
+            Self::Points(points) => points.open(metric),
+        }
+        samples(&mut Family { metric, page: self })
     }
 
     /// A family with one sample and no labels.
@@ -98,29 +70,16 @@ impl Page<'_> {
     }
 }
 
-impl Family<'_> {
+impl Family<'_, '_> {
     /// One counter, gauge or info sample; an info's value is ignored.
     pub(super) fn sample(&mut self, labels: &[Label<'_>], value: impl Into<Number>) -> fmt::Result {
-        let (metric, value) = (self.metric, value.into());
-        let encoder = match &mut self.sink {
-            Sink::Text(encoder) => encoder,
-            Sink::Points(points) => {
-                points.number(labels, value);
-                return Ok(());
+        match self.page {
+            Page::Text(text) => text.sample(self.metric, labels, value.into()),
+            Page::Points(points) => {
+                points.number(labels, value.into());
+                Ok(())
             }
-        };
-        let labels = Labels::new(metric, labels);
-        if metric.kind == Kind::Info {
-            return encoder.encode_info(&labels);
         }
-        let write = |encoder: &mut MetricEncoder<'_>| match metric.kind {
-            Kind::Counter => encoder.encode_counter::<NoLabelSet, _, f64>(&value, None),
-            _ => encoder.encode_gauge(&value),
-        };
-        if labels.names.is_empty() {
-            return write(encoder);
-        }
-        write(&mut encoder.encode_family(&labels)?)
     }
 
     /// One info sample.
@@ -130,56 +89,13 @@ impl Family<'_> {
 
     /// One histogram.
     pub(super) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
-        let encoder = match &mut self.sink {
-            Sink::Text(encoder) => encoder,
-            Sink::Points(points) => {
+        match self.page {
+            Page::Text(text) => text.histogram(self.metric, labels, values),
+            Page::Points(points) => {
                 points.histogram(labels, values);
-                return Ok(());
+                Ok(())
             }
-        };
-        let buckets: Vec<(f64, u64)> = values.buckets().collect();
-        let labels = Labels::new(self.metric, labels);
-        let mut encoder = encoder.encode_family(&labels)?;
-        encoder.encode_histogram::<NoLabelSet>(values.sum(), values.count(), &buckets, None)
-    }
-}
-
-/// The catalogue's label names with one sample's values.
-#[derive(Debug)]
-struct Labels<'a> {
-    names: &'static [&'static str],
-    values: &'a [Label<'a>],
-}
-
-impl<'a> Labels<'a> {
-    fn new(metric: &'static Metric, values: &'a [Label<'a>]) -> Self {
-        let names = metric.labels;
-        debug_assert_eq!(names.len(), values.len(), "{}", metric.name);
-        Self { names, values }
-    }
-}
-
-impl EncodeLabelSet for Labels<'_> {
-    fn encode(&self, encoder: &mut LabelSetEncoder<'_>) -> fmt::Result {
-        for (name, value) in self.names.iter().zip(self.values) {
-            value.encode(name, encoder.encode_label())?;
         }
-        Ok(())
-    }
-}
-
-impl Label<'_> {
-    fn encode(self, name: &str, mut encoder: LabelEncoder<'_>) -> fmt::Result {
-        let mut key = encoder.encode_label_key()?;
-        key.write_str(name)?;
-        let mut value = key.encode_label_value()?;
-        match self {
-            Self::Text(text) => write_capped(&mut value, text)?,
-            Self::Number(number) => write!(value, "{number}")?,
-            Self::Guid(guid) => write!(value, "{guid}")?,
-            Self::Address(address) => write!(value, "{address}")?,
-        }
-        value.finish()
     }
 }
 
@@ -221,24 +137,6 @@ impl From<bool> for Number {
 impl From<f64> for Number {
     fn from(value: f64) -> Self {
         Self::Real(value)
-    }
-}
-
-impl EncodeCounterValue for Number {
-    fn encode(&self, encoder: &mut CounterValueEncoder<'_>) -> fmt::Result {
-        match self {
-            Self::Count(count) => EncodeCounterValue::encode(count, encoder),
-            Self::Real(value) => EncodeCounterValue::encode(value, encoder),
-        }
-    }
-}
-
-impl EncodeGaugeValue for Number {
-    fn encode(&self, encoder: &mut GaugeValueEncoder<'_>) -> fmt::Result {
-        match self {
-            Self::Count(count) => EncodeGaugeValue::encode(count, encoder),
-            Self::Real(value) => EncodeGaugeValue::encode(value, encoder),
-        }
     }
 }
 

@@ -231,7 +231,7 @@ fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
 }
 
 fn per_domain(
-    family: &mut Family<'_>,
+    family: &mut Family<'_, '_>,
     domains: &BTreeMap<u32, (usize, usize, usize)>,
     count: fn(&(usize, usize, usize)) -> usize,
 ) -> fmt::Result {
@@ -240,7 +240,7 @@ fn per_domain(
     })
 }
 
-fn nodes(family: &mut Family<'_>, snapshot: &Snapshot) -> fmt::Result {
+fn nodes(family: &mut Family<'_, '_>, snapshot: &Snapshot) -> fmt::Result {
     let participants: BTreeMap<_, _> = snapshot
         .participants
         .iter()
@@ -399,7 +399,7 @@ pub(super) fn writers(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings
 
 /// One sample for each topic that is measured or will be: watched ones begin with 0.
 fn measured(
-    family: &mut Family<'_>,
+    family: &mut Family<'_, '_>,
     rows: &[Row<'_>],
     value: impl Fn(&Measurement) -> Option<Number>,
 ) -> fmt::Result {
@@ -415,7 +415,7 @@ fn measured(
     Ok(())
 }
 
-fn topic_info(family: &mut Family<'_>, row: &Row<'_>) -> fmt::Result {
+fn topic_info(family: &mut Family<'_, '_>, row: &Row<'_>) -> fmt::Result {
     let Some(facts) = row.facts else {
         return Ok(());
     };
@@ -456,7 +456,7 @@ fn joined<'a>(values: impl Iterator<Item = &'a String>) -> String {
     text
 }
 
-fn each_writer(family: &mut Family<'_>, row: &Row<'_>, value: Count) -> fmt::Result {
+fn each_writer(family: &mut Family<'_, '_>, row: &Row<'_>, value: Count) -> fmt::Result {
     let mut seen = BTreeSet::new();
     for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
         let Some(measured) = &writer.measurement else {
