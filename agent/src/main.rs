@@ -40,7 +40,7 @@ use tokio_util::sync::CancellationToken;
 
 use cli::{Arguments, Command, DEFAULT_CONFIG, Said};
 use logging::Log;
-use supervise::{Supervisor, Surfaces, Worker};
+use supervise::{Responder, Supervisor, Surfaces, Worker};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
@@ -124,6 +124,7 @@ fn run(options: cli::Run) -> Result<()> {
         Source::Replay(_) => Role::Service,
     };
     let worker = Worker::start(role).context("cannot start the working thread")?;
+    let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let exporter = export.map(|settings| Exporter::start(settings, &board));
     let exporter = exporter.transpose()?;
     privilege::confine(Role::Service)?;
@@ -203,12 +204,10 @@ fn run(options: cli::Run) -> Result<()> {
         print!("{}", Exposition::new(board).render(Format::Classic)?);
         return ended;
     }
-    // Threads that block make bags for clients; the unit allows 32 threads in all.
     let runtime = tokio::runtime::Builder::new_current_thread()
-        .max_blocking_threads(4)
         .enable_all()
         .build();
-    let runtime = runtime.context("cannot start the runtime of the metrics listener")?;
+    let runtime = runtime.context("cannot start the runtime of signals")?;
     let (reloader, reloads) = reload::channel();
     let context = api::Context {
         board: Arc::clone(&board),
@@ -235,7 +234,7 @@ fn run(options: cli::Run) -> Result<()> {
         context,
         powerless,
     };
-    let ended = runtime.block_on(supervisor.run(worker, run, surfaces, options.report));
+    let ended = runtime.block_on(supervisor.run(worker, run, responder, surfaces, options.report));
     snapshots.finish();
     recordings.finish();
     watches.finish();

@@ -69,6 +69,13 @@ struct Signals {
     snapshot: Signal,
 }
 
+/// The thread that answers requests, waiting for its listeners. It is another one than the thread
+/// that feeds the watchdog, so that no page that is made delays that.
+pub(crate) struct Responder {
+    begin: oneshot::Sender<Surfaces>,
+    ended: oneshot::Receiver<Result<()>>,
+}
+
 /// The working thread, waiting for what it is to do, and the news of its end.
 pub(crate) struct Worker {
     thread: JoinHandle<()>,
@@ -89,22 +96,17 @@ impl Supervisor {
         mut self,
         worker: Worker,
         run: Run,
+        responder: Responder,
         surfaces: Surfaces,
         once: bool,
     ) -> Result<()> {
         let mut signals = Signals::listen().context("cannot listen to signals")?;
         let mut worker = worker.begin(run);
-        let mut serving = JoinSet::new();
-        let _: Powerless = surfaces.powerless;
-        if let Some(metrics) = surfaces.metrics {
-            serving.spawn(metrics.serve(self.stop.clone()));
-        }
-        surfaces.control.serve(&surfaces.context, &mut serving)?;
         let snapshots = Arc::clone(&surfaces.context.snapshots);
-        drop(surfaces.context);
+        let mut serving = responder.begin(surfaces);
         let mut watchdog = Watchdog::new();
         let mut tick = ticks(STARTING_TICK);
-        let mut working = true;
+        let (mut working, mut answering) = (true, true);
 
         let outcome = loop {
             tokio::select! {
@@ -118,8 +120,10 @@ impl Supervisor {
                     // Who asked may have gone.
                     let _ = answer.send(self.reload());
                 }
-                Some(ended) = serving.join_next() => {
-                    let ended = ended.map_err(anyhow::Error::from).and_then(|served| Ok(served?));
+                ended = &mut serving => {
+                    answering = false;
+                    let died = |_| Err(anyhow!("the thread that answers requests died"));
+                    let ended = ended.unwrap_or_else(died);
                     break Err(ended.err().unwrap_or_else(|| anyhow!("a listener ended")));
                 }
                 ended = &mut worker.ended, if working => {
@@ -148,7 +152,9 @@ impl Supervisor {
             if working {
                 let _ = (&mut worker.ended).await;
             }
-            while serving.join_next().await.is_some() {}
+            if answering {
+                let _ = (&mut serving).await;
+            }
         });
         let drained = drained.await.is_ok();
         if drained && worker.thread.join().is_err() {
@@ -238,6 +244,63 @@ impl Signals {
             hangup: signal(SignalKind::hangup())?,
             snapshot: signal(SignalKind::user_defined1())?,
         })
+    }
+}
+
+impl Responder {
+    /// Starts the thread, confined to its role already.
+    pub(crate) fn start() -> Result<Self, SpawnError> {
+        let (begin, begins) = oneshot::channel::<Surfaces>();
+        let (tell, ended) = oneshot::channel();
+        let thread = std::thread::Builder::new().name("http".to_owned());
+        privilege::spawn(Role::Serve, thread, move || {
+            // An agent that fails to start, or a report, has nothing to answer.
+            if let Ok(surfaces) = begins.blocking_recv() {
+                let _ = tell.send(surfaces.answer());
+            }
+        })?;
+        Ok(Self { begin, ended })
+    }
+
+    fn begin(self, surfaces: Surfaces) -> oneshot::Receiver<Result<()>> {
+        // The thread takes it or has died, which is heard next.
+        let _ = self.begin.send(surfaces);
+        self.ended
+    }
+}
+
+impl Surfaces {
+    /// Answers requests until the agent stops.
+    fn answer(self) -> Result<()> {
+        // Capabilities belong to threads: those of this one are read back, too.
+        let _: (Powerless, Powerless) = (self.powerless, Powerless::verify()?);
+        // Threads that block make bags for clients; the unit allows 32 threads in all.
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .max_blocking_threads(4)
+            .enable_all()
+            .build()
+            .context("cannot start the runtime of the listeners")?;
+        let stop = self.context.stop.clone();
+        let served = runtime.block_on(async {
+            let mut serving = JoinSet::new();
+            if let Some(metrics) = self.metrics {
+                serving.spawn(metrics.serve(stop.clone()));
+            }
+            self.control.serve(&self.context, &mut serving)?;
+            drop(self.context);
+            tokio::select! {
+                () = stop.cancelled() => {}
+                Some(ended) = serving.join_next() => {
+                    ended??;
+                    return Err(anyhow!("a listener ended"));
+                }
+            }
+            while serving.join_next().await.is_some() {}
+            Ok(())
+        });
+        // A bag that is being finished for a client is waited for elsewhere.
+        runtime.shutdown_background();
+        served
     }
 }
 

@@ -330,7 +330,7 @@ fn start<'a>(
     }
     let agent = Agent::start(host, file("start"), &file("ros2probe.yaml"))?;
     let names = confined(agent.process.pid(), 65534)?;
-    for name in ["rp", "capture", "shm", "state", "watches"] {
+    for name in ["rp", "http", "capture", "shm", "state", "watches"] {
         ensure!(names.contains(name), "no {name} in {names:?}");
     }
     Ok(agent)

@@ -179,7 +179,6 @@ const CHANGE: &[c_long] = &[
 /// A tokio runtime and the connections that it serves.
 const SERVE: &[c_long] = &[
     libc::SYS_accept4,
-    libc::SYS_connect,
     libc::SYS_epoll_create1,
     libc::SYS_epoll_ctl,
     libc::SYS_epoll_pwait,
@@ -190,13 +189,14 @@ const SERVE: &[c_long] = &[
     libc::SYS_pipe2,
     libc::SYS_recvfrom,
     libc::SYS_recvmsg,
-    libc::SYS_sendmsg,
-    libc::SYS_sendto,
     libc::SYS_setsockopt,
     libc::SYS_shutdown,
     #[cfg(target_arch = "x86_64")]
     libc::SYS_epoll_wait,
 ];
+
+/// Reaching others. Each of them can connect: a message to an address does with TCP Fast Open.
+const CONNECT: &[c_long] = &[libc::SYS_connect, libc::SYS_sendmsg, libc::SYS_sendto];
 
 /// Asking a name server as well: many questions at once, and musl binds before it asks.
 const RESOLVE: &[c_long] = &[libc::SYS_bind, libc::SYS_recvmmsg, libc::SYS_sendmmsg];
@@ -235,6 +235,7 @@ impl Allowed {
         let mut allowed = Self::default();
         allowed.always(EVERYWHERE).everywhere()?;
         match role {
+            Role::Serve => allowed.serve()?,
             Role::Service => allowed.service()?,
             Role::Export => {
                 allowed.service()?;
@@ -309,6 +310,15 @@ impl Allowed {
     }
 
     fn service(&mut self) -> Result<(), BackendError> {
+        self.serve()?;
+        self.always(CONNECT);
+        for kind in [libc::SOCK_STREAM, libc::SOCK_DGRAM] {
+            self.socket(libc::AF_UNIX, kind)?;
+        }
+        Ok(())
+    }
+
+    fn serve(&mut self) -> Result<(), BackendError> {
         self.always(LOOK).always(CHANGE).always(SERVE);
         // A thread, never a process, never in a namespace of its own.
         let kinds =
@@ -316,9 +326,6 @@ impl Allowed {
         let thread = SeccompCmpOp::MaskedEq(wide(kinds));
         let thread = condition(0, thread, wide(libc::CLONE_THREAD))?;
         self.when(libc::SYS_clone, &[thread])?;
-        for kind in [libc::SOCK_STREAM, libc::SOCK_DGRAM] {
-            self.socket(libc::AF_UNIX, kind)?;
-        }
         self.when(libc::SYS_socketpair, &[equal(0, libc::AF_UNIX)?])?;
         for request in request::ORDINARY {
             self.when(libc::SYS_ioctl, &[equal(1, request)?])?;

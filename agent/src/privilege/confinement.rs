@@ -30,9 +30,12 @@ pub enum Sandbox {
 /// What a thread is for, which decides what it keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
-    /// `main` and whatever it starts: HTTP, signals, reloads, state, recordings. No capability; no
+    /// `main` and whatever it starts: signals, reloads, state, snapshots. No capability; no
     /// connection of its own but to the service manager.
     Service,
+    /// HTTP, and recordings that clients begin: as [`Role::Service`], and no connection of its own
+    /// at all. A connection that was accepted cannot be led elsewhere.
+    Serve,
     /// OTLP: as [`Role::Service`], and connections to the collector.
     Export,
     /// Packets, the model, the kernel's maps: no capability where the kernel lets the maps' owner
@@ -117,7 +120,7 @@ impl Role {
 
     fn keeps(self, capability: Capability) -> bool {
         match self {
-            Self::Service | Self::Export => false,
+            Self::Service | Self::Serve | Self::Export => false,
             Self::Capture { needs_bpf } => needs_bpf && capability == Capability::CAP_BPF,
             Self::SharedMemory { needs_nice } => match capability {
                 Capability::CAP_SYS_PTRACE => true,

@@ -2,6 +2,7 @@
 
 use std::io::{Read as _, Write as _};
 use std::net::ToSocketAddrs as _;
+use std::os::fd::AsRawFd as _;
 use std::os::unix::net::UnixStream;
 
 use seccompiler::TargetArch;
@@ -9,8 +10,9 @@ use seccompiler::TargetArch;
 use super::super::{Powerless, confine};
 use super::*;
 
-const ROLES: [Role; 5] = [
+const ROLES: [Role; 6] = [
     Role::Service,
+    Role::Serve,
     Role::Export,
     Role::Capture { needs_bpf: false },
     Role::SharedMemory { needs_nice: false },
@@ -156,6 +158,63 @@ fn sockets_are_made_by_who_speaks_and_of_no_other_kind() {
     }
 }
 
+/// What a connection can be led elsewhere with: `connect` after it was disconnected, and messages to
+/// an address.
+#[test]
+fn an_accepted_connection_cannot_be_led_elsewhere() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let elsewhere = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let _client = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+    let (accepted, _) = listener.accept().unwrap();
+    let port = elsewhere.local_addr().unwrap().port();
+    let led = confined(Role::Serve, move || {
+        let socket = c_long::from(accepted.as_raw_fd());
+        let family = |family: i32| u16::try_from(family).unwrap().to_ne_bytes();
+        let mut nowhere = [0_u8; 16];
+        nowhere[..2].copy_from_slice(&family(libc::AF_UNSPEC));
+        let mut there = [0_u8; 16];
+        there[..2].copy_from_slice(&family(libc::AF_INET));
+        there[2..4].copy_from_slice(&port.to_be_bytes());
+        there[4..8].copy_from_slice(&[127, 0, 0, 1]);
+        let connect = |address: &[u8; 16]| {
+            // SAFETY: the address lives until the call returns.
+            let result = unsafe {
+                libc::syscall(libc::SYS_connect, socket, address.as_ptr(), address.len())
+            };
+            (result < 0).then(|| std::io::Error::last_os_error().raw_os_error().unwrap_or(0))
+        };
+        let fast_open = c_long::from(libc::MSG_FASTOPEN);
+        // SAFETY: the address lives until the call returns; nothing is sent.
+        let sent = unsafe {
+            let (none, length) = (std::ptr::null::<u8>(), there.len());
+            libc::syscall(
+                libc::SYS_sendto,
+                socket,
+                none,
+                0,
+                fast_open,
+                there.as_ptr(),
+                length,
+            )
+        };
+        let message = call(libc::SYS_sendmsg, [socket, 0, fast_open, 0, 0, 0]);
+        let answered = (&accepted).write_all(b"answer").is_ok();
+        (
+            connect(&nowhere),
+            connect(&there),
+            sent < 0,
+            message,
+            answered,
+        )
+    });
+    if let Some(led) = led {
+        let refused = Some(libc::EPERM);
+        assert_eq!(led, (refused, refused, true, refused, true));
+        elsewhere.set_nonblocking(true).unwrap();
+        assert!(elsewhere.accept().is_err());
+    }
+}
+
 #[test]
 fn kernel_maps_are_the_captures_and_probes_the_exact_thread_s() {
     let lookup = [LOOK_UP_MAP, 0, 0, 0, 0, 0];
@@ -182,7 +241,7 @@ fn who_looks_at_others_opens_nothing_for_writing() {
         confined(role, move || {
             let reads = std::fs::read("/proc/self/stat");
             assert!(reads.is_ok(), "{role:?}");
-            let writes = matches!(role, Role::Service | Role::Export);
+            let writes = matches!(role, Role::Service | Role::Serve | Role::Export);
             assert_eq!(std::fs::write(&file, "x").is_ok(), writes, "{role:?}");
             assert_eq!(std::fs::remove_file(&file).is_ok(), writes, "{role:?}");
         });
