@@ -66,22 +66,6 @@ fn each_page_answers_as_it_should() {
 }
 
 #[test]
-fn a_crowd_of_idle_connections_leaves_others_an_answer_and_a_place_once_it_has_gone() {
-    let mut agent = LocalAgent::start(&["--speed", "max"]);
-    agent.wait_for_log("ready");
-    let idle: Vec<_> = (0..80)
-        .map(|_| std::net::TcpStream::connect(agent.address).unwrap())
-        .collect();
-    let status = || request(agent.address, "GET", "/healthz", "").status;
-    assert_eq!(status(), 503);
-    drop(idle);
-    let deadline = Instant::now() + PATIENCE;
-    while status() != 200 {
-        assert!(Instant::now() < deadline);
-    }
-}
-
-#[test]
 fn a_reload_takes_over_what_is_right_and_keeps_what_was_when_it_is_wrong() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("config.yaml");

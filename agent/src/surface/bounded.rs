@@ -1,35 +1,35 @@
-//! A listener that cannot be used up: a limited number of connections, each closed when nothing was
-//! answered on it for a while. Who is one too many is told so at once instead of waiting unanswered.
+//! A listener that cannot be used up: a limited number of connections. Where all places are taken,
+//! the connection that waits longest for its client makes room; where none waits, a further client
+//! is answered 503 at once.
 
 use std::io;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::Duration;
 
 use axum::serve::Listener;
-use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, ReadBuf};
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::task::JoinSet;
-use tokio::time::{Sleep, sleep, timeout};
+use tokio::time::timeout;
 
 use super::board::Board;
 use super::limit_facts::{Place, Places};
+use super::pace::{Connection, Crowd};
 use crate::config::Limit;
 
-/// A connection to which nothing was answered for so long is closed.
-const IDLE: Duration = Duration::from_secs(75);
-
-/// How long somebody who is turned away may take to read why, and how many may do so at once.
+/// How long a client that is turned away may take to read why, and how many may do so at once.
 const FAREWELL: Duration = Duration::from_secs(1);
 const FAREWELLS: usize = 64;
 /// Bytes of a request that are read so that its sender sees the answer to it.
 const REQUEST: u64 = 64 << 10;
+/// How long the connection that makes room may take to go.
+const ROOM: Duration = Duration::from_millis(100);
 
 /// A listener with a limited number of connections; a further one is told so and closed.
 #[derive(Debug)]
 pub(super) struct Bounded<L> {
     listener: L,
     places: Arc<Places>,
+    crowd: Arc<Crowd>,
     board: Arc<Board>,
     limit: Limit,
     refusal: Option<Refusal>,
@@ -39,15 +39,6 @@ pub(super) struct Bounded<L> {
 /// What is answered to who is one too many, whatever was asked.
 #[derive(Clone, Debug)]
 pub(super) struct Refusal(Arc<str>);
-
-/// A connection that ends when nothing was answered on it for [`IDLE`]: requests that trickle in
-/// and readers that do not read cannot hold it.
-#[derive(Debug)]
-pub(super) struct Connection<S> {
-    stream: S,
-    deadline: Pin<Box<Sleep>>,
-    _place: Place,
-}
 
 impl<L> Bounded<L> {
     /// At most as many connections at a time as `limit` says, which is counted on `board`. Without
@@ -61,6 +52,7 @@ impl<L> Bounded<L> {
         Self {
             listener,
             places: board.limits().places(limit),
+            crowd: Arc::default(),
             board,
             limit,
             refusal,
@@ -68,9 +60,28 @@ impl<L> Bounded<L> {
         }
     }
 
+    /// A place, if need be that of a connection on which nothing is being answered.
+    async fn place(&self) -> Option<Place> {
+        if let Some(place) = self.places.take() {
+            return Some(place);
+        }
+        self.board.limits().reached(self.limit, 1);
+        if !self.crowd.make_room() {
+            return None;
+        }
+        let freed = async {
+            loop {
+                self.crowd.left().await;
+                if let Some(place) = self.places.take() {
+                    return place;
+                }
+            }
+        };
+        timeout(ROOM, freed).await.ok()
+    }
+
     /// No place for this one. It is not waited for, nor are many kept that take their time.
     fn turn_away(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
-        self.board.limits().reached(self.limit, 1);
         while self.leaving.try_join_next().is_some() {}
         if let Some(refusal) = self.refusal.clone()
             && self.leaving.len() < FAREWELLS
@@ -78,6 +89,19 @@ impl<L> Bounded<L> {
             self.leaving.spawn(async move {
                 let _ = timeout(FAREWELL, refusal.tell(stream)).await;
             });
+        }
+    }
+}
+
+impl<L: Listener> Bounded<L> {
+    /// The next connection that has a place.
+    pub(super) async fn accept(&mut self) -> Connection<L::Io> {
+        loop {
+            let (stream, _) = self.listener.accept().await;
+            match self.place().await {
+                Some(place) => return self.crowd.join(stream, place),
+                None => self.turn_away(stream),
+            }
         }
     }
 }
@@ -101,78 +125,5 @@ impl Refusal {
         // Closed with something unread, the connection would be reset and the answer perhaps lost.
         tokio::io::copy(&mut stream.take(REQUEST), &mut tokio::io::sink()).await?;
         Ok(())
-    }
-}
-
-impl<L: Listener> Listener for Bounded<L> {
-    type Io = Connection<L::Io>;
-    type Addr = L::Addr;
-
-    async fn accept(&mut self) -> (Self::Io, Self::Addr) {
-        loop {
-            let (stream, address) = self.listener.accept().await;
-            let Some(place) = self.places.take() else {
-                self.turn_away(stream);
-                continue;
-            };
-            let connection = Connection {
-                stream,
-                deadline: Box::pin(sleep(IDLE)),
-                _place: place,
-            };
-            return (connection, address);
-        }
-    }
-
-    fn local_addr(&self) -> io::Result<Self::Addr> {
-        self.listener.local_addr()
-    }
-}
-
-impl<S> Connection<S> {
-    /// `pending`, unless the time is over.
-    fn overdue<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
-        self.deadline
-            .as_mut()
-            .poll(context)
-            .map(|()| Err(io::Error::new(io::ErrorKind::TimedOut, "idle for too long")))
-    }
-}
-
-impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
-    fn poll_read(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        buffer: &mut ReadBuf<'_>,
-    ) -> Poll<io::Result<()>> {
-        match Pin::new(&mut self.stream).poll_read(context, buffer) {
-            Poll::Pending => self.overdue(context),
-            ready => ready,
-        }
-    }
-}
-
-impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
-    fn poll_write(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-        bytes: &[u8],
-    ) -> Poll<io::Result<usize>> {
-        match Pin::new(&mut self.stream).poll_write(context, bytes) {
-            Poll::Pending => self.overdue(context),
-            ready => {
-                let next = tokio::time::Instant::now() + IDLE;
-                self.deadline.as_mut().reset(next);
-                ready
-            }
-        }
-    }
-
-    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_flush(context)
-    }
-
-    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.stream).poll_shutdown(context)
     }
 }

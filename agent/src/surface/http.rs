@@ -8,24 +8,30 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::Router;
-use axum::extract::State as Extract;
-use axum::http::header::{ACCEPT, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER};
-use axum::http::{HeaderMap, Method, StatusCode};
-use axum::middleware;
+use axum::extract::{Extension, Request, State as Extract};
+use axum::http::header::{
+    ACCEPT, ACCEPT_ENCODING, CACHE_CONTROL, CONNECTION, CONTENT_ENCODING, CONTENT_LENGTH,
+    CONTENT_TYPE, HOST, RETRY_AFTER, VARY,
+};
+use axum::http::{HeaderMap, HeaderValue, Method, StatusCode};
+use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 use tokio_util::sync::CancellationToken;
 
+use super::authority;
 use super::basic_auth::{self, Gate};
 use super::board::Board;
 use super::bounded::{Bounded, Refusal};
 use super::exposition::{Exposition, Format};
 use super::large::Answers;
 use super::listen::listen;
-use super::packed::Packed;
+use super::pace::Connection;
+use super::packed::{Encoding, Packer};
+use super::serving::{self, Plain};
 #[cfg(feature = "tls")]
-use super::tls::{Acceptor, Tls};
+use super::tls::Acceptor;
 use super::web_config::{WebConfig, WebConfigError};
 use crate::config::Limit;
 
@@ -129,21 +135,45 @@ impl Server {
         let full = Some(full);
         let listener = TcpListener::from_std(self.listener)?;
         let listener = Bounded::new(listener, Arc::clone(&self.board), limit, full);
-        let stopped = async move { stop.cancelled().await };
         let mut router = router(self.board);
         if let Some(gate) = self.gate {
             router = router.layer(middleware::from_fn_with_state(gate, basic_auth::guard));
         }
+        let router = router.layer(middleware::from_fn(own_names));
         #[cfg(feature = "tls")]
         if let Some(acceptor) = self.acceptor {
-            return axum::serve(Tls::new(listener, acceptor), router)
-                .with_graceful_shutdown(stopped)
-                .await;
+            serving::serve(listener, acceptor, router, Local::of, stop).await;
+            return Ok(());
         }
-        axum::serve(listener, router)
-            .with_graceful_shutdown(stopped)
-            .await
+        serving::serve(listener, Plain, router, Local::of, stop).await;
+        Ok(())
     }
+}
+
+/// Whether a connection came over loopback.
+#[derive(Clone, Copy, Debug)]
+struct Local(bool);
+
+impl Local {
+    fn of(connection: &Connection<TcpStream>) -> Self {
+        let address = connection.stream().local_addr();
+        // A connection that is broken already is answered nothing.
+        Self(address.is_ok_and(|address| address.ip().to_canonical().is_loopback()))
+    }
+}
+
+/// Over loopback only requests for this host's own names are answered: a page in a browser of this
+/// host could make others resolve to it. Other addresses have names that the agent cannot know.
+async fn own_names(Extension(local): Extension<Local>, request: Request, next: Next) -> Response {
+    let headers = request.headers();
+    // A program without the header is no browser.
+    if local.0 && headers.contains_key(HOST) && authority::own(headers).is_err() {
+        let reason = "the request is for another host; this listener answers to localhost and \
+                      loopback addresses\n";
+        let close = [(CONNECTION, HeaderValue::from_static("close"))];
+        return (StatusCode::FORBIDDEN, close, reason).into_response();
+    }
+    next.run(request).await
 }
 
 fn router(board: Arc<Board>) -> Router {
@@ -176,9 +206,12 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
         .filter_map(|value| value.to_str().ok())
         .collect();
     let format = Format::negotiate(&accepts.join(","));
+    let encoding = encoding(&headers);
+    pages.board.refresh(REFRESH_PATIENCE).await;
     let Some(turn) = PAGES.turn().await else {
         pages.board.limits().reached(Limit::MetricsClients, 1);
-        let reason = "memory for pages is used up by slow readers\n";
+        let reason = "other clients are having pages made
+";
         return (
             StatusCode::SERVICE_UNAVAILABLE,
             [(RETRY_AFTER, "1")],
@@ -186,25 +219,78 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
         )
             .into_response();
     };
-    pages.board.refresh(REFRESH_PATIENCE).await;
-    let mut page = Packed::default();
-    if pages.exposition.write(format, &mut page).is_err() {
+    let mut packer = Packer::new(encoding);
+    let written = pages.exposition.write(format, &mut packer);
+    let (Ok(()), Ok(page)) = (written, packer.finish()) else {
         return StatusCode::INTERNAL_SERVER_ERROR.into_response();
-    }
-    (
+    };
+    let mut answer = (
         [
             (CONTENT_TYPE, format.content_type()),
             (CACHE_CONTROL, "no-store"),
+            (VARY, "accept, accept-encoding"),
         ],
         [(CONTENT_LENGTH, page.len())],
         turn.keep_packed(page),
     )
-        .into_response()
+        .into_response();
+    if encoding == Encoding::Gzip {
+        let gzip = HeaderValue::from_static("gzip");
+        answer.headers_mut().insert(CONTENT_ENCODING, gzip);
+    }
+    answer
+}
+
+/// What the client accepts (RFC 9110, 12.5.3).
+fn encoding(headers: &HeaderMap) -> Encoding {
+    let lists = headers.get_all(ACCEPT_ENCODING).iter();
+    let lists = lists.filter_map(|list| list.to_str().ok());
+    let (mut gzip, mut any) = (None, None);
+    for offer in lists.flat_map(|list| list.split(',')) {
+        let (coding, weight) = offer.split_once(';').unwrap_or((offer, ""));
+        let weight = weight.trim().strip_prefix("q=");
+        let accepted = weight.is_none_or(|weight| weight.parse().is_ok_and(|q: f32| q > 0.0));
+        match coding.trim() {
+            name if name.eq_ignore_ascii_case("gzip") => gzip = Some(accepted),
+            "*" => any = Some(accepted),
+            _ => {}
+        }
+    }
+    if gzip.or(any) == Some(true) {
+        Encoding::Gzip
+    } else {
+        Encoding::Identity
+    }
 }
 
 async fn readyz(Extract(pages): Extract<Pages>) -> Response {
     match pages.board.state().ready(Instant::now()) {
         Ok(()) => "ready\n".into_response(),
         Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, reason + "\n").into_response(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_page_is_compressed_where_the_client_accepts_that() {
+        for (accepted, expected) in [
+            ("gzip", Encoding::Gzip),
+            ("deflate, GZIP;q=0.5, br", Encoding::Gzip),
+            ("*", Encoding::Gzip),
+            ("gzip;q=0", Encoding::Identity),
+            ("gzip; q=0.0, *", Encoding::Identity),
+            ("*;q=0", Encoding::Identity),
+            ("identity", Encoding::Identity),
+            ("gzip;q=x", Encoding::Identity),
+            ("", Encoding::Identity),
+        ] {
+            let headers = [(ACCEPT_ENCODING, accepted.parse().unwrap())];
+            let headers = headers.into_iter().collect();
+            assert_eq!(encoding(&headers), expected, "{accepted}");
+        }
+        assert_eq!(encoding(&HeaderMap::new()), Encoding::Identity);
     }
 }

@@ -1,105 +1,200 @@
-//! Answers that tell everything, as a page of metrics or all topics: megabytes on a large robot, kept
-//! for as long as the reader takes. So only a few are made and kept at a time; who comes meanwhile
-//! waits for a moment and is then told to come again. Small answers wait for nobody.
+//! Answers that hold everything, as a page of metrics or all topics: megabytes on a large robot. A
+//! few are made at a time; they are kept compressed until they are read, and within a budget. A
+//! fresh answer takes the room of the one that has been read for longest.
 
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
 
-use super::packed::Packed;
+use super::packed::{Encoding, Packed, Packer};
 
-/// Large answers of one surface at once.
+/// Large answers of one surface that are made at once.
 const AT_ONCE: usize = 2;
+/// Bytes of answers of one surface that wait for their readers, compressed.
+const KEPT: usize = 4 << 20;
 /// From here on an answer is large.
 const LARGE: usize = 256 << 10;
-/// How long a place is waited for: reading an answer takes a moment, unless somebody is slow.
+/// How long a turn is waited for.
 const PATIENCE: Duration = Duration::from_secs(2);
 
-/// Places for large answers.
+/// Large answers of one surface.
 #[derive(Debug)]
 pub(super) struct Answers {
-    places: Semaphore,
+    making: Semaphore,
     patience: Duration,
+    kept: Mutex<Vec<Kept>>,
 }
 
-/// The place of one answer, from before it is made.
+/// An answer that is being read, by age.
+#[derive(Debug)]
+struct Kept {
+    bytes: usize,
+    /// Its reader gets no more.
+    given_up: CancellationToken,
+}
+
+/// The turn of one answer, while it is made.
 #[derive(Debug)]
 pub(super) struct Turn {
-    _place: SemaphorePermit<'static>,
+    of: &'static Answers,
+    _making: SemaphorePermit<'static>,
 }
 
-/// Bytes that keep their place until the last of them is sent.
-struct Kept {
-    bytes: Bytes,
-    _turn: Turn,
+/// The room of one answer, until it is read.
+#[derive(Debug)]
+pub(super) struct Room {
+    of: &'static Answers,
+    given_up: CancellationToken,
 }
 
 impl Answers {
-    /// All free.
+    /// Nothing made or kept.
     pub(super) const fn new() -> Self {
         Self {
-            places: Semaphore::const_new(AT_ONCE),
+            making: Semaphore::const_new(AT_ONCE),
             patience: PATIENCE,
+            kept: Mutex::new(Vec::new()),
         }
     }
 
-    /// A place, within a moment.
+    /// A turn, within a moment.
     pub(super) async fn turn(&'static self) -> Option<Turn> {
-        let place = timeout(self.patience, self.places.acquire()).await;
-        place.ok()?.ok().map(|place| Turn { _place: place })
+        let making = timeout(self.patience, self.making.acquire()).await;
+        let making = making.ok()?.ok()?;
+        Some(Turn {
+            of: self,
+            _making: making,
+        })
+    }
+
+    /// Room for an answer of so many bytes, that of the oldest ones where need be.
+    fn room(&'static self, bytes: usize) -> Room {
+        let given_up = CancellationToken::new();
+        let mut kept = self.lock();
+        let mut sum: usize = kept.iter().map(|each| each.bytes).sum();
+        kept.retain(|each| {
+            let stays = sum + bytes <= KEPT;
+            if !stays {
+                each.given_up.cancel();
+                sum -= each.bytes;
+            }
+            stays
+        });
+        kept.push(Kept {
+            bytes,
+            given_up: given_up.clone(),
+        });
+        Room { of: self, given_up }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Vec<Kept>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Turn {
-    /// The text as an answer, which keeps the place if it is large.
+    /// The text as an answer.
     pub(super) fn keep_packed(self, text: Packed) -> Body {
         if text.len() < LARGE {
-            return text.into_body(());
+            return text.into_body(None);
         }
-        text.into_body(self)
+        let room = self.of.room(text.kept());
+        text.into_body(Some(room))
     }
 
-    /// The answer, which keeps the place if it is large.
-    pub(super) fn keep(self, bytes: Bytes) -> Bytes {
+    /// The bytes as an answer of the same length.
+    pub(super) fn keep(self, bytes: Bytes) -> Body {
         if bytes.len() < LARGE {
-            return bytes;
+            return bytes.into();
         }
-        Bytes::from_owner(Kept { bytes, _turn: self })
+        let mut packer = Packer::new(Encoding::Identity);
+        let packed = packer.write(&bytes).and_then(|()| packer.finish());
+        match packed {
+            Ok(packed) => self.keep_packed(packed),
+            // Memory does not fail to be written.
+            Err(_) => Body::empty(),
+        }
     }
 }
 
-impl AsRef<[u8]> for Kept {
-    fn as_ref(&self) -> &[u8] {
-        &self.bytes
+impl Room {
+    /// Whether another answer has it.
+    pub(super) fn is_given_up(&self) -> bool {
+        self.given_up.is_cancelled()
+    }
+}
+
+impl Drop for Room {
+    fn drop(&mut self) {
+        self.given_up.cancel();
+        self.of.lock().retain(|each| !each.given_up.is_cancelled());
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use axum::body::to_bytes;
+
     use super::*;
 
-    #[tokio::test]
-    async fn large_answers_keep_their_places_until_they_are_sent_and_small_ones_do_not() {
-        static ANSWERS: Answers = Answers {
-            places: Semaphore::const_new(AT_ONCE),
-            patience: Duration::ZERO,
+    /// Bytes that do not become fewer when they are compressed.
+    fn noise(length: usize) -> Bytes {
+        let mut state = 1_u64;
+        let mut next = || {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            (state >> 56) as u8
         };
-        let answer = |length: usize| Bytes::from(vec![7; length]);
-        for _ in 0..3 * AT_ONCE {
-            let small = ANSWERS.turn().await.unwrap().keep(answer(LARGE - 1));
-            assert_eq!(small.len(), LARGE - 1);
+        (0..length).map(|_| next()).collect::<Vec<u8>>().into()
+    }
+
+    #[tokio::test]
+    async fn slow_readers_of_large_answers_never_keep_others_from_theirs() {
+        static ANSWERS: Answers = Answers {
+            making: Semaphore::const_new(AT_ONCE),
+            patience: Duration::ZERO,
+            kept: Mutex::new(Vec::new()),
+        };
+        let bytes = noise(1 << 20);
+        let mut bodies = Vec::new();
+        for _ in 0..12 {
+            let turn = ANSWERS.turn().await.unwrap();
+            bodies.push(turn.keep(bytes.clone()));
         }
-        let mut large = Vec::new();
-        for _ in 0..AT_ONCE {
-            large.push(ANSWERS.turn().await.unwrap().keep(answer(LARGE)));
+        let held: usize = ANSWERS.lock().iter().map(|kept| kept.bytes).sum();
+        assert!(held <= KEPT, "{held}");
+        // The last ones are whole, the first ones end early.
+        let mut whole = 0;
+        for body in bodies {
+            match to_bytes(body, usize::MAX).await {
+                Ok(read) => {
+                    assert_eq!(read, bytes);
+                    whole += 1;
+                }
+                Err(_) => assert_eq!(whole, 0),
+            }
         }
+        assert_eq!(whole, 3);
+        assert!(ANSWERS.lock().is_empty());
+    }
+
+    #[tokio::test]
+    async fn a_third_answer_waits_until_one_of_two_is_made() {
+        static ANSWERS: Answers = Answers {
+            making: Semaphore::const_new(AT_ONCE),
+            patience: Duration::ZERO,
+            kept: Mutex::new(Vec::new()),
+        };
+        let one = ANSWERS.turn().await.unwrap();
+        let _two = ANSWERS.turn().await.unwrap();
         assert!(ANSWERS.turn().await.is_none());
-        // The last part of it is still to be sent.
-        let rest = large.pop().map(|mut sent| sent.split_off(LARGE - 1));
-        assert!(ANSWERS.turn().await.is_none());
-        drop(rest);
+        let _small = one.keep(noise(LARGE - 1));
         assert!(ANSWERS.turn().await.is_some());
+        assert!(ANSWERS.lock().is_empty(), "small answers take no room");
     }
 }

@@ -4,6 +4,7 @@
 mod agent;
 pub mod agent_facts;
 pub mod api;
+mod authority;
 mod basic_auth;
 pub mod board;
 mod bounded;
@@ -17,11 +18,13 @@ mod large;
 pub mod limit_facts;
 mod listen;
 pub mod otlp;
+mod pace;
 mod packed;
 mod page;
 mod process;
 pub mod recording_facts;
 mod robot;
+mod serving;
 mod text;
 #[cfg(feature = "tls")]
 mod tls;

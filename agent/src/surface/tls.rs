@@ -10,7 +10,6 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 
-use axum::serve::Listener;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio_rustls::rustls::crypto::ring::default_provider;
 use tokio_rustls::rustls::pki_types::pem::{self, PemObject as _};
@@ -21,6 +20,8 @@ use tokio_rustls::rustls::{self, RootCertStore, ServerConfig};
 use tokio_rustls::server::TlsStream;
 use tokio_rustls::{Accept, TlsAcceptor};
 
+use super::pace::Connection;
+use super::serving::Wrap;
 use super::web_config::TlsFiles;
 
 /// Why TLS cannot be spoken.
@@ -53,12 +54,6 @@ pub enum TlsError {
 /// Certificates and key, ready to be used.
 #[derive(Clone)]
 pub(super) struct Acceptor(TlsAcceptor);
-
-/// A listener whose connections are encrypted.
-pub(super) struct Tls<L> {
-    listener: L,
-    acceptor: Acceptor,
-}
 
 /// A connection, from its first byte on.
 pub(super) enum Stream<S> {
@@ -126,24 +121,11 @@ fn read(path: &Path) -> Result<Vec<u8>, TlsError> {
     })
 }
 
-impl<L> Tls<L> {
-    pub(super) const fn new(listener: L, acceptor: Acceptor) -> Self {
-        Self { listener, acceptor }
-    }
-}
+impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Acceptor {
+    type Io = Stream<Connection<S>>;
 
-impl<L: Listener> Listener for Tls<L> {
-    type Io = Stream<L::Io>;
-    type Addr = L::Addr;
-
-    async fn accept(&mut self) -> (Self::Io, Self::Addr) {
-        let (stream, address) = self.listener.accept().await;
-        let handshake = self.acceptor.0.accept(stream);
-        (Stream::Handshake(Box::new(handshake)), address)
-    }
-
-    fn local_addr(&self) -> io::Result<Self::Addr> {
-        self.listener.local_addr()
+    fn wrap(&self, connection: Connection<S>) -> Self::Io {
+        Stream::Handshake(Box::new(self.0.accept(connection)))
     }
 }
 

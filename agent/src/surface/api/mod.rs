@@ -39,6 +39,7 @@ use std::time::Duration;
 use axum::Router;
 use axum::body::to_bytes;
 use axum::extract::{Request, State as Extract};
+use axum::http::header::CONTENT_LENGTH;
 use axum::http::{Method, StatusCode};
 use axum::middleware::{self, Next};
 use axum::response::{IntoResponse as _, Response};
@@ -128,9 +129,12 @@ async fn take_turns(Extract(context): Extract<Context>, request: Request, next: 
         let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();
     };
-    let (head, body) = next.run(request).await.into_parts();
+    let (mut head, body) = next.run(request).await.into_parts();
     match to_bytes(body, usize::MAX).await {
-        Ok(bytes) => Response::from_parts(head, turn.keep(bytes).into()),
+        Ok(bytes) => {
+            head.headers.insert(CONTENT_LENGTH, bytes.len().into());
+            Response::from_parts(head, turn.keep(bytes))
+        }
         Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
     }
 }

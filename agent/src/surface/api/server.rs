@@ -20,6 +20,7 @@ use super::{Context, router};
 use crate::config::Limit;
 use crate::surface::bounded::{Bounded, Refusal};
 use crate::surface::listen::listen;
+use crate::surface::serving::{self, Plain};
 
 /// Owner and group.
 const SOCKET_MODE: u32 = 0o660;
@@ -207,17 +208,14 @@ impl Drop for SocketFile {
 async fn serve<L>(listener: L, kind: Kind, context: Context) -> io::Result<()>
 where
     L: Listener,
-    L::Addr: std::fmt::Debug,
     L::Io: Unpin,
 {
     let router = router(&context, Arc::new(Door::new(kind)));
-    let stop = context.stop.clone();
     let limit = Limit::ApiClients;
     let full = full(context.board.limits().caps().get(limit));
     let listener = Bounded::new(listener, Arc::clone(&context.board), limit, Some(full));
-    axum::serve(listener, router)
-        .with_graceful_shutdown(async move { stop.cancelled().await })
-        .await
+    serving::serve(listener, Plain, router, |_| (), context.stop).await;
+    Ok(())
 }
 
 /// What a client is told for whom there is no place.

@@ -1,0 +1,104 @@
+//! The names under which a loopback listener answers (RFC 9112, 3.2: the Host header).
+//!
+//! A web page can make a browser of this host send requests to loopback under a name of its own
+//! (DNS rebinding). It cannot make its own name `localhost` or a loopback address.
+
+use std::net::{IpAddr, Ipv6Addr};
+
+use axum::http::HeaderMap;
+use axum::http::header::HOST;
+
+/// Whether the request has exactly one Host header, which names this host.
+///
+/// # Errors
+/// Returns what the header holds: empty where there is none, or several.
+pub(super) fn own(headers: &HeaderMap) -> Result<(), &str> {
+    let mut hosts = headers.get_all(HOST).iter();
+    let (Some(host), None) = (hosts.next(), hosts.next()) else {
+        return Err("");
+    };
+    let host = host.to_str().unwrap_or_default();
+    if is_own(host) { Ok(()) } else { Err(host) }
+}
+
+/// `localhost` or a loopback address, alone or with a port, and nothing else.
+fn is_own(host: &str) -> bool {
+    if let Some(rest) = host.strip_prefix('[') {
+        let Some((address, port)) = rest.split_once(']') else {
+            return false;
+        };
+        let address = address.parse::<Ipv6Addr>();
+        return address.is_ok_and(|address| address.is_loopback()) && is_port(port);
+    }
+    let end = host.find(':').unwrap_or(host.len());
+    let (name, port) = host.split_at(end);
+    let is_loopback = |address: IpAddr| address.is_loopback();
+    let is_here = name.eq_ignore_ascii_case("localhost") || name.parse().is_ok_and(is_loopback);
+    is_here && is_port(port)
+}
+
+/// Nothing, or a colon and a port.
+fn is_port(text: &str) -> bool {
+    let digits = |port: &str| port.bytes().all(|byte| byte.is_ascii_digit());
+    let port = |port: &str| digits(port) && port.parse::<u16>().is_ok();
+    text.is_empty() || text.strip_prefix(':').is_some_and(port)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_localhost_and_loopback_addresses_are_own_names() {
+        for host in [
+            "localhost",
+            "LOCALHOST:17401",
+            "127.0.0.1:17401",
+            "127.8.9.1",
+            "[::1]:9000",
+            "[::1]",
+        ] {
+            assert!(is_own(host), "{host}");
+        }
+        for host in [
+            "",
+            "[",
+            "[]",
+            "[::2]",
+            "[::1",
+            "[::1]evil",
+            "[::1]evil:80",
+            "[::1]:80@evil.example",
+            "[127.0.0.1]",
+            "localhost:x@evil",
+            "localhost:80@evil.example",
+            "localhost:",
+            "localhost:+80",
+            "localhost:65536",
+            "localhost:80:80",
+            "localhost.evil.example",
+            "127.0.0.1.evil.example:17401",
+            "127.0.0.1@evil.example",
+            "10.0.0.1:17401",
+            "evil.example",
+        ] {
+            assert!(!is_own(host), "{host}");
+        }
+    }
+
+    #[test]
+    fn two_host_headers_name_no_host() {
+        let named = |hosts: &[&str]| {
+            let mut headers = HeaderMap::new();
+            for host in hosts {
+                headers.append(HOST, host.parse().unwrap());
+            }
+            own(&headers).map_err(str::to_owned)
+        };
+        assert_eq!(named(&["localhost"]), Ok(()));
+        assert_eq!(named(&["evil.example"]), Err("evil.example".to_owned()));
+        for none in [&[][..], &["localhost", "localhost"]] {
+            assert_eq!(named(none), Err(String::new()));
+        }
+    }
+}

@@ -1,0 +1,189 @@
+//! Serving connections: HTTP/1.1 with bounded heads, each request watched by the [`Pace`] of its
+//! connection, and an orderly end.
+
+use std::convert::Infallible;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::{Body, Bytes, HttpBody};
+use axum::extract::Request;
+use axum::http::header::CONTENT_LENGTH;
+use axum::serve::Listener;
+use hyper::body::{Frame, Incoming, SizeHint};
+use hyper::server::conn::http1::Builder;
+use hyper::service::{Service as _, service_fn};
+use hyper_util::rt::TokioIo;
+use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+
+use super::bounded::Bounded;
+use super::pace::{Connection, Pace};
+
+/// Bytes of a request's head, and how many fields it may have.
+pub(super) const MAX_HEAD: usize = 48 << 10;
+const MAX_FIELDS: usize = 64;
+
+/// How the connections of a listener become streams of HTTP.
+pub(super) trait Wrap<S>: Send + 'static {
+    /// The stream of requests.
+    type Io: AsyncRead + AsyncWrite + Unpin + Send + 'static;
+
+    /// Of this connection.
+    fn wrap(&self, connection: Connection<S>) -> Self::Io;
+}
+
+/// As they are.
+pub(super) struct Plain;
+
+impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Plain {
+    type Io = Connection<S>;
+
+    fn wrap(&self, connection: Connection<S>) -> Connection<S> {
+        connection
+    }
+}
+
+/// Answers every connection until `stop`, then finishes the answers that have begun. `mark` adds to
+/// each request of a connection what the routes want to know of it.
+pub(super) async fn serve<L, W, M>(
+    mut listener: Bounded<L>,
+    wrap: W,
+    router: Router,
+    mark: impl Fn(&Connection<L::Io>) -> M,
+    stop: CancellationToken,
+) where
+    L: Listener,
+    L::Io: Unpin,
+    W: Wrap<L::Io>,
+    M: Clone + Send + Sync + 'static,
+{
+    let mut connections = JoinSet::new();
+    loop {
+        while connections.try_join_next().is_some() {}
+        let connection = tokio::select! {
+            () = stop.cancelled() => break,
+            connection = listener.accept() => connection,
+        };
+        let pace = Arc::clone(connection.pace());
+        let mark = mark(&connection);
+        let io = wrap.wrap(connection);
+        connections.spawn(answer(io, pace, router.clone(), mark, stop.clone()));
+    }
+    while connections.join_next().await.is_some() {}
+}
+
+/// The requests of one connection.
+async fn answer<M: Clone + Send + Sync + 'static>(
+    io: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    pace: Arc<Pace>,
+    router: Router,
+    mark: M,
+    stop: CancellationToken,
+) {
+    let router = TowerToHyperService::new(router);
+    let paced = Arc::clone(&pace);
+    let service = service_fn(move |request: Request<Incoming>| {
+        let pace = Arc::clone(&paced);
+        pace.requested(request.body().is_end_stream());
+        let mut request = request.map(|body| {
+            let pace = Arc::clone(&pace);
+            Body::new(Received { body, pace })
+        });
+        request.extensions_mut().insert(mark.clone());
+        let answer = router.call(request);
+        async move {
+            let answer = answer.await?;
+            let length = answer.body().size_hint().exact();
+            pace.answers(length.is_some() || answer.headers().contains_key(CONTENT_LENGTH));
+            Ok::<_, Infallible>(answer.map(|body| Answered { body, pace }))
+        }
+    });
+    let connection = Builder::new()
+        .max_buf_size(MAX_HEAD)
+        .max_headers(MAX_FIELDS)
+        // The pace has its own.
+        .header_read_timeout(None::<Duration>)
+        .serve_connection(TokioIo::new(io), service);
+    let mut connection = std::pin::pin!(connection);
+    tokio::select! {
+        // A client that breaks off is no concern of the log.
+        _ = connection.as_mut() => return,
+        () = pace.ended() => return,
+        () = stop.cancelled() => {}
+    }
+    if pace.is_idle() {
+        return;
+    }
+    connection.as_mut().graceful_shutdown();
+    tokio::select! {
+        _ = connection => {}
+        () = pace.ended() => {}
+    }
+}
+
+/// The body of a request; the pace hears of its end.
+struct Received {
+    body: Incoming,
+    pace: Arc<Pace>,
+}
+
+/// The body of an answer; the pace hears of its end.
+struct Answered {
+    body: Body,
+    pace: Arc<Pace>,
+}
+
+impl HttpBody for Received {
+    type Data = Bytes;
+    type Error = hyper::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, hyper::Error>>> {
+        let frame = Pin::new(&mut self.body).poll_frame(context);
+        if matches!(frame, Poll::Ready(None)) || self.body.is_end_stream() {
+            self.pace.received();
+        }
+        frame
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+impl HttpBody for Answered {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(context)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+impl Drop for Answered {
+    fn drop(&mut self) {
+        self.pace.answered();
+    }
+}
