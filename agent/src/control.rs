@@ -6,7 +6,7 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 
 use anyhow::Result;
-use ros2probe::config::{ApiSettings, SocketChoice};
+use ros2probe::config::{Access, ApiSettings, SocketChoice};
 use ros2probe::surface::api::Server;
 
 use crate::cli::Listen;
@@ -19,7 +19,13 @@ const SOCKET: &str = "api.sock";
 
 /// What the command line says goes before what the configuration says. A report is over before
 /// anybody could ask.
-pub(crate) fn choose(settings: &mut ApiSettings, asked: Option<Listen>, is_report: bool) {
+pub(crate) fn choose(
+    settings: &mut ApiSettings,
+    asked: Option<Listen>,
+    loopback: Option<Access>,
+    is_report: bool,
+) {
+    settings.loopback = loopback.unwrap_or(settings.loopback);
     match asked {
         Some(Listen(Some(address))) => settings.listen = Some(address),
         None if !is_report => {}
@@ -33,7 +39,7 @@ pub(crate) fn choose(settings: &mut ApiSettings, asked: Option<Listen>, is_repor
 /// Binds the address that is asked for, and reads the token.
 pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
     let token = settings.token_file.as_deref();
-    let mut server = Server::new(token)?;
+    let mut server = Server::new(token, settings.loopback)?;
     if let Some(path) = token
         && fs::metadata(path).is_ok_and(|file| file.permissions().mode() & 0o004 != 0)
     {

@@ -79,7 +79,12 @@ fn run(options: cli::Run) -> Result<()> {
     } else if options.report {
         config.metrics.listen = None;
     }
-    control::choose(&mut config.api, options.api, options.report);
+    control::choose(
+        &mut config.api,
+        options.api,
+        options.api_loopback,
+        options.report,
+    );
     let log = Log::start(config.log);
     let export = otlp::Settings::resolve(
         &config.otlp,

@@ -160,6 +160,151 @@ fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
     ));
 }
 
+/// Text of so many characters that the parameter may have.
+fn filler(parameter: &str, length: usize) -> String {
+    let mut text = String::new();
+    match parameter {
+        "topic" | "exclude" => {
+            while text.len() < length {
+                let left = length - text.len();
+                // The last name has two characters at least.
+                let part = if left <= 202 { left } else { 200 };
+                text += &format!("/{}", "a".repeat(part - 1));
+                if text.len() < length {
+                    text.pop();
+                    text.push(',');
+                }
+            }
+            text
+        }
+        "name" if length <= 1025 => {
+            // Blanks around a name do not count.
+            format!("{}ros2.message.lost", "+".repeat(length - 17))
+        }
+        _ => "a".repeat(length),
+    }
+}
+
+/// The status of an answer that may have no end.
+fn status(agent: &LocalAgent, method: &str, path: &str, body: &str) -> u16 {
+    use std::io::{Read as _, Write as _};
+    let mut stream = TcpStream::connect(agent.api).unwrap();
+    stream
+        .set_read_timeout(Some(local_agent::PATIENCE))
+        .unwrap();
+    let (api, length) = (agent.api, body.len());
+    let head = format!(
+        "{method} {path} HTTP/1.1\r\nHost: {api}\r\nContent-Type: application/json\r\n\
+         Content-Length: {length}\r\n\r\n{body}"
+    );
+    stream.write_all(head.as_bytes()).unwrap();
+    let mut answer = [0; 16];
+    stream.read_exact(&mut answer).unwrap();
+    let answer = String::from_utf8(answer.to_vec()).unwrap();
+    answer.split(' ').nth(1).unwrap().parse().unwrap()
+}
+
+#[test]
+fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let config = directory.path().join("config.yaml");
+    let bags = directory.path().join("bags");
+    let text = format!(
+        "recordings: {{directory: {}}}\nlimits: {{recordings: 64}}\n",
+        bags.display()
+    );
+    std::fs::write(&config, text).unwrap();
+    let mut agent = LocalAgent::start(&["--config", config.to_str().unwrap(), "--speed", "max"]);
+    agent.wait_for_log("ready");
+    let document = serde_json::to_value(ros2probe::surface::api::document()).unwrap();
+    let mut checked = 0;
+    let mut check = |what: &str, allowed: u16, beyond: u16| {
+        assert!(
+            !matches!(allowed, 400 | 422),
+            "{what}: the bound is refused: {allowed}"
+        );
+        assert!(matches!(beyond, 400 | 422), "{what}: beyond it: {beyond}");
+        checked += 1;
+    };
+    for (path, item) in document["paths"].as_object().unwrap() {
+        let Some(parameters) = item["get"]["parameters"].as_array() else {
+            continue;
+        };
+        let path = path
+            .replace("{topic}", "chatter")
+            .replace("{node}", "talker");
+        for parameter in parameters
+            .iter()
+            .filter(|parameter| parameter["in"] == "query")
+        {
+            let (name, schema) = (parameter["name"].as_str().unwrap(), &parameter["schema"]);
+            let ask = |value: &str| {
+                // Without a topic nothing is wanted.
+                let topic = match (path.as_str(), name) {
+                    ("/samples", "exclude" | "exclude_regex" | "domain_id" | "queue_bytes") => {
+                        "topic=/a&"
+                    }
+                    _ => "",
+                };
+                status(&agent, "GET", &format!("{path}?{topic}{name}={value}"), "")
+            };
+            let what = format!("{path} {name}");
+            if let Some(maximum) = schema["maximum"].as_i64() {
+                check(
+                    &what,
+                    ask(&maximum.to_string()),
+                    ask(&(maximum + 1).to_string()),
+                );
+            }
+            if let Some(minimum) = schema["minimum"].as_i64() {
+                check(
+                    &what,
+                    ask(&minimum.to_string()),
+                    ask(&(minimum - 1).to_string()),
+                );
+            }
+            if let Some(longest) = schema["maxLength"].as_u64() {
+                let longest = usize::try_from(longest).unwrap();
+                check(
+                    &what,
+                    ask(&filler(name, longest)),
+                    ask(&filler(name, longest + 1)),
+                );
+            }
+        }
+    }
+    for (method, path, schema) in [
+        ("POST", "/recordings", "RecordingRequest"),
+        ("PUT", "/watch/a", "WatchRequest"),
+    ] {
+        let properties = &document["components"]["schemas"][schema]["properties"];
+        for (name, schema) in properties.as_object().unwrap() {
+            let ask = |value: Value| {
+                let body = serde_json::json!({ name.as_str(): value }).to_string();
+                status(&agent, method, path, &body)
+            };
+            let what = format!("{path} {name}");
+            for (bound, step) in [("maximum", 1.0), ("minimum", -1.0)] {
+                if let Some(value) = schema[bound].as_f64() {
+                    // Whole numbers stay whole.
+                    let beyond = schema[bound].as_i64().map_or_else(
+                        || Value::from(value + step),
+                        |value| Value::from(value + if step > 0.0 { 1 } else { -1 }),
+                    );
+                    check(&what, ask(schema[bound].clone()), ask(beyond));
+                }
+            }
+            if let Some(longest) = schema["maxLength"].as_u64() {
+                let longest = usize::try_from(longest).unwrap();
+                let text = |length| Value::from("a".repeat(length));
+                check(&what, ask(text(longest)), ask(text(longest + 1)));
+            }
+        }
+    }
+    eprintln!("{checked} bounds");
+    assert!(checked >= 30, "{checked}");
+}
+
 #[test]
 fn a_watch_is_added_shown_replaced_and_removed() {
     let mut agent = LocalAgent::start(&["--speed", "0.5"]);

@@ -1,9 +1,14 @@
 //! The shipped configuration and its schema agree with the code.
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    reason = "a test may panic"
+)]
 
 use std::path::Path;
 
 use ros2probe::config::{Config, Limits};
+use serde_json::Value;
 
 fn shipped(name: &str) -> String {
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -137,6 +142,69 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
             "{yaml}"
         );
         assert!(Config::parse(yaml.as_bytes()).is_err(), "{yaml}");
+    }
+}
+
+/// Each number of the schema with a bound: where it stands, and the bound.
+fn bounds(schema: &Value, root: &Value, path: &str, found: &mut Vec<(String, f64, f64)>) {
+    if let Some(name) = schema["$ref"].as_str() {
+        let name = name.trim_start_matches("#/$defs/");
+        return bounds(&root["$defs"][name], root, path, found);
+    }
+    for variant in ["anyOf", "allOf", "oneOf"] {
+        for schema in schema[variant].as_array().into_iter().flatten() {
+            bounds(schema, root, path, found);
+        }
+    }
+    for (key, schema) in schema["properties"].as_object().into_iter().flatten() {
+        bounds(schema, root, &format!("{path}.{key}"), found);
+    }
+    if schema["items"].is_object() {
+        bounds(&schema["items"], root, &format!("{path}[]"), found);
+    }
+    for (bound, step) in [("minimum", -1.0), ("maximum", 1.0)] {
+        if let Some(value) = schema[bound].as_f64() {
+            found.push((path.trim_start_matches('.').to_owned(), value, step));
+        }
+    }
+}
+
+/// A file that sets this one key, with what the places around it need.
+fn with_key(path: &str, value: f64) -> String {
+    let mut text = value.to_string();
+    for part in path.rsplit('.') {
+        let (key, is_list) = match part.strip_suffix("[]") {
+            Some(key) => (key, true),
+            None => (part, false),
+        };
+        text = match (key, is_list) {
+            ("watch", true) => {
+                format!("{{watch: [{{topic: /a, {}]}}", text.trim_start_matches('{'))
+            }
+            ("snapshots", true) => {
+                let rest = text.trim_start_matches('{');
+                format!("{{snapshots: [{{name: a, topics: [/a], {rest}]}}")
+            }
+            _ => format!("{{{key}: {text}}}"),
+        };
+    }
+    text
+}
+
+#[test]
+fn every_bound_of_the_schema_is_the_agents_and_the_next_value_is_refused() {
+    let schema: Value = serde_json::from_str(&shipped("ros2probe.schema.json")).unwrap();
+    let mut found = Vec::new();
+    bounds(&schema, &schema, "", &mut found);
+    assert!(found.len() > 50, "{} bounds", found.len());
+    for (path, bound, step) in found {
+        let read = |value: f64| Config::parse(with_key(&path, value).as_bytes());
+        if let Err(error) = read(bound) {
+            // Several keys may not fit together at their bounds.
+            panic!("{}: {}", with_key(&path, bound), error.report("file"));
+        }
+        let beyond = bound + step;
+        assert!(read(beyond).is_err(), "{}", with_key(&path, beyond));
     }
 }
 

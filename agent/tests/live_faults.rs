@@ -133,7 +133,14 @@ impl<'a> Scene<'a> {
 
 fn launch(enter: &[String], configuration: &Path, errors: Stdio) -> Result<Process> {
     let program = harness::soak::program(env!("CARGO_BIN_EXE_rp"));
-    let arguments = [Path::new("run"), Path::new("--config"), configuration];
+    let arguments = [
+        Path::new("run"),
+        Path::new("--config"),
+        configuration,
+        // Recordings are asked for over loopback here.
+        Path::new("--api-loopback"),
+        Path::new("all"),
+    ];
     Process::start_with(enter, program, arguments, errors)
 }
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use ros2probe::capture::pcap::Speed;
-use ros2probe::config::Watch;
+use ros2probe::config::{Access, Watch};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -40,6 +40,15 @@ pub(crate) struct Run {
     /// configured one
     #[arg(long, value_name = "ADDR|off", value_parser = listen)]
     pub(crate) api: Option<Listen>,
+    /// What loopback clients of the control API may do without a token, instead of the configured
+    /// level
+    #[arg(
+        long,
+        value_name = "LEVEL",
+        value_enum,
+        overrides_with = "api_loopback"
+    )]
+    pub(crate) api_loopback: Option<Access>,
 }
 
 /// Where `--metrics` or `--api` wants the listener.

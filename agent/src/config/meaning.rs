@@ -253,6 +253,7 @@ impl Reader {
                 "off" => SocketChoice::Off,
                 path => SocketChoice::At(PathBuf::from(path)),
             },
+            loopback: shape.loopback,
             token_file: shape.token_file.map(PathBuf::from),
         }
     }

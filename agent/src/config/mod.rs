@@ -101,6 +101,41 @@ pub enum ShmMode {
     Off,
 }
 
+/// How far a client of the control API may go; each level has those before it.
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    PartialOrd,
+    Ord,
+    Deserialize,
+    JsonSchema,
+    clap::ValueEnum,
+)]
+#[serde(rename_all = "lowercase")]
+pub enum Access {
+    /// Graph, figures, events, and which topics are watched.
+    Read,
+    /// Also add and remove watches, and follow messages without their bytes.
+    #[default]
+    Watch,
+    /// Also message payloads, recordings, snapshots and reloads.
+    All,
+}
+
+impl std::fmt::Display for Access {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Read => "read",
+            Self::Watch => "watch",
+            Self::All => "all",
+        })
+    }
+}
+
 /// How every message into shared memory is seen, if at all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
@@ -161,6 +196,8 @@ pub struct ApiSettings {
     pub listen: Option<SocketAddr>,
     /// Which unix socket to listen on besides.
     pub socket: SocketChoice,
+    /// What loopback clients without a token may do.
+    pub loopback: Access,
     /// Holds the bearer token that clients on the network address must send.
     pub token_file: Option<PathBuf>,
 }
@@ -402,6 +439,7 @@ impl Default for Config {
             api: ApiSettings {
                 listen: defaults::API.parse().ok(),
                 socket: SocketChoice::default(),
+                loopback: Access::default(),
                 token_file: None,
             },
             otlp: OtlpSettings::default(),

@@ -10,7 +10,7 @@ use serde::Deserialize;
 
 use super::limits::LimitsShape;
 use super::watch::Retain;
-use super::{Compression, ExactChoice, Level, ShmMode, SourceChoice, defaults};
+use super::{Access, Compression, ExactChoice, Level, ShmMode, SourceChoice, defaults};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
@@ -190,6 +190,10 @@ pub(super) struct ApiShape {
     /// api.sock in `$RUNTIME_DIRECTORY` as the service manager sets it, else in /run/ros2probe if
     /// that is there.
     pub(super) socket: String,
+    /// What clients of a loopback `listen` may do without a token, be they any user of this host:
+    /// `read` graph, figures and events; `watch`: also add watches; `all`: also message payloads,
+    /// recordings, snapshots and reloads. The unix socket and a token always grant all.
+    pub(super) loopback: Access,
     /// File with the bearer token that clients of `listen` must send, as the service manager's
     /// LoadCredential= provides it.
     pub(super) token_file: Option<String>,
@@ -200,6 +204,7 @@ impl Default for ApiShape {
         Self {
             listen: defaults::API.to_owned(),
             socket: "auto".to_owned(),
+            loopback: Access::default(),
             token_file: None,
         }
     }

@@ -73,6 +73,9 @@ impl<'a> Agent<'a> {
             OsStr::new("run"),
             OsStr::new("--config"),
             configuration.as_os_str(),
+            // A test host has no service manager, and so no unix socket.
+            OsStr::new("--api-loopback"),
+            OsStr::new("all"),
         ];
         let process = Process::start_with(&host.on_network(), program, arguments, errors)?;
         let mut agent = Agent { process, host };

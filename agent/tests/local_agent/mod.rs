@@ -68,7 +68,8 @@ impl LocalAgent {
     pub fn replay(command: &mut Command, capture: &Path, arguments: &[&str]) -> Self {
         let mut child = command
             .args(["run", "--metrics", "127.0.0.1:0", "--api", "127.0.0.1:0"])
-            .arg("--replay")
+            // Each test has a host of its own, as far as it knows.
+            .args(["--api-loopback", "all", "--replay"])
             .arg(capture)
             .args(arguments)
             .stdout(Stdio::null())
@@ -101,6 +102,11 @@ impl LocalAgent {
         let address = line.split("address=").nth(1);
         let address = address.and_then(|rest| rest.split(' ').next());
         address.unwrap().trim_matches('"').parse().unwrap()
+    }
+
+    /// Its process.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
     }
 
     /// The next line of the log that contains `text`.

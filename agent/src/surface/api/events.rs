@@ -42,6 +42,9 @@ const RETRY: Duration = Duration::from_secs(2);
 const BATCH: usize = 64;
 /// Names or topics in one filter.
 const MAX_FILTERS: usize = 32;
+/// Characters of a filter by name, and by topic.
+const MAX_NAMES: usize = 1_024;
+const MAX_TOPICS: usize = 4_096;
 /// Stands for the place in front of the oldest event that is kept.
 const OLDEST: &str = "0";
 
@@ -289,12 +292,12 @@ impl Serialize for Attributes<'_> {
 impl Filter {
     fn parse(selection: &Selection) -> Result<Self, Problem> {
         let invalid = |detail: String| Problem::new(Code::InvalidRequest, detail);
-        let names = split(selection.name.as_deref())?;
+        let names = split(selection.name.as_deref(), MAX_NAMES)?;
         let unknown = |name: &&String| !EVENTS.iter().any(|event| covers(name, event.name));
         if let Some(name) = names.iter().find(unknown) {
             return Err(invalid(format!("no event has the name `{name}`")));
         }
-        let topics = split(selection.topic.as_deref())?;
+        let topics = split(selection.topic.as_deref(), MAX_TOPICS)?;
         if topics.is_empty() {
             let topics = None;
             return Ok(Self { names, topics });
@@ -321,7 +324,11 @@ impl Filter {
     }
 }
 
-fn split(list: Option<&str>) -> Result<Vec<String>, Problem> {
+fn split(list: Option<&str>, most: usize) -> Result<Vec<String>, Problem> {
+    if list.is_some_and(|list| list.chars().count() > most) {
+        let detail = format!("a filter has at most {most} characters");
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
     let parts = list.into_iter().flat_map(|list| list.split(','));
     let parts: Vec<_> = parts.map(|part| part.trim().to_owned()).collect();
     if parts.len() > MAX_FILTERS {

@@ -48,7 +48,7 @@ use utoipa_axum::router::OpenApiRouter;
 
 use super::board::{Board, State};
 use super::large::Answers;
-use crate::config::Limit;
+use crate::config::{Access, Limit};
 use crate::recording::{Recordings, Snapshots};
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
@@ -56,7 +56,7 @@ pub use openapi::document;
 pub use pipe::serve as serve_in_process;
 use problem::{Code, Problem};
 use reload::Reloader;
-use security::Door;
+use security::{Door, Needs};
 pub use server::{OpenError, Server};
 
 /// How long a reader waits for a snapshot that knows what was asked for just before.
@@ -95,15 +95,19 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         Some(context) => views.layer(middleware::from_fn_with_state(context.clone(), take_turns)),
         None => views,
     };
+    let needs = |read, change, routes: OpenApiRouter<Context>| {
+        let needs = Needs { read, change };
+        routes.layer(middleware::from_fn_with_state(needs, security::within))
+    };
     OpenApiRouter::with_openapi(openapi::head())
-        .merge(watch::routes())
+        .merge(needs(Access::Read, Access::Watch, watch::routes()))
         .merge(events::routes())
-        .merge(samples::routes())
-        .merge(recordings::routes())
-        .merge(snapshots::routes())
+        .merge(needs(Access::Watch, Access::Watch, samples::routes()))
+        .merge(needs(Access::All, Access::All, recordings::routes()))
+        .merge(needs(Access::All, Access::All, snapshots::routes()))
         .merge(turns(views()))
         .merge(health::routes())
-        .merge(reload::routes())
+        .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(openapi::routes())
 }
 

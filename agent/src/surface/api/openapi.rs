@@ -21,7 +21,10 @@ use super::{Context, nouns};
 const COMMON: [(&str, &str); 6] = [
     ("400", "The request cannot be read."),
     ("401", "The listener wants a bearer token."),
-    ("403", "Sent to a foreign name, or by a foreign web page."),
+    (
+        "403",
+        "Sent to a foreign name, by a foreign web page, or to a listener that does not grant it.",
+    ),
     ("413", "The body is too large."),
     ("429", "Too many requests."),
     ("503", "The agent is shutting down."),

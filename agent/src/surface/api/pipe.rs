@@ -9,8 +9,9 @@ use axum::serve::Listener;
 use tokio::io::DuplexStream;
 use tokio::sync::mpsc;
 
-use super::security::{Door, Kind};
+use super::security::{Door, Granted, Kind};
 use super::{Context, router};
+use crate::config::Access;
 
 /// Pipes as they are opened.
 #[derive(Debug)]
@@ -41,6 +42,7 @@ pub async fn serve(
     pipes: mpsc::UnboundedReceiver<DuplexStream>,
     context: Context,
 ) -> io::Result<()> {
-    let router = router(&context, Arc::new(Door::new(Kind::Socket)));
+    let granted = Granted::new(Access::All, None);
+    let router = router(&context, Arc::new(Door::new(Kind::Socket, granted)));
     axum::serve(Pipes(pipes), router).await
 }

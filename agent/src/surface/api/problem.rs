@@ -23,6 +23,8 @@ pub enum Code {
     ForeignHost,
     /// Sent by a web page from elsewhere.
     ForeignOrigin,
+    /// The listener does not grant it; the unix socket does.
+    NeedsSocket,
     /// No such path.
     NotFound,
     /// No such watch.
@@ -128,6 +130,11 @@ impl Code {
                 "foreign-origin",
                 StatusCode::FORBIDDEN,
                 "The request comes from a foreign web page",
+            ),
+            Self::NeedsSocket => (
+                "needs-socket",
+                StatusCode::FORBIDDEN,
+                "Only by the unix socket or with a token",
             ),
             Self::NotFound => ("not-found", StatusCode::NOT_FOUND, "No such path"),
             Self::NoSuchWatch => ("no-such-watch", StatusCode::NOT_FOUND, "No such watch"),

@@ -26,6 +26,8 @@ use crate::recording::{Asked, Order, Recording, Refusal, Report, Stage, Wanted};
 
 /// How long an answer waits for a bag to be completed.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// Longest time of one file, a year.
+const MAX_DURATION: u64 = 31_536_000;
 
 /// All recordings.
 #[derive(Debug, Serialize, ToSchema)]
@@ -289,6 +291,10 @@ fn wanted(request: RecordingRequest) -> Result<Wanted, Problem> {
         return Err(invalid(format!(
             "domain_id is {id}, must be at most {MAX_DOMAIN}"
         )));
+    }
+    if request.max_bag_duration_seconds > MAX_DURATION {
+        let detail = format!("max_bag_duration_seconds must be at most {MAX_DURATION}");
+        return Err(invalid(detail));
     }
     let asked = if request.topics == Asked::default() {
         Asked::everything()

@@ -9,7 +9,7 @@ use std::convert::Infallible;
 use std::time::Duration;
 
 use axum::body::Body;
-use axum::extract::State;
+use axum::extract::{Extension, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
@@ -24,6 +24,8 @@ use utoipa_axum::routes;
 use super::Context;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
+use super::security::Granted;
+use crate::config::Access;
 use crate::config::watch::MAX_DOMAIN;
 use crate::model::snapshot::Snapshot;
 use crate::subscriptions::line::{LINES, Line, OfferedFacts, Open, OpenTopic, SAMPLES};
@@ -32,8 +34,10 @@ use crate::subscriptions::{
 };
 use crate::surface::SourceKind;
 
-/// Names and globs in one request.
+/// Names and globs in one request, and how many characters they and a regular expression have.
 const MAX_PATTERNS: usize = 256;
+const MAX_LIST: usize = 16_384;
+const MAX_REGEX: usize = 4_096;
 /// Writers that are introduced to one client.
 const WRITERS: usize = 65_536;
 /// Lines made into one piece of the answer.
@@ -51,7 +55,7 @@ const PATIENCE: Duration = Duration::from_secs(2);
 struct Wanted {
     /// Topics, separated by commas: ROS names, globs as in a watch, or exact DDS names. Also those
     /// that appear later.
-    #[param(max_length = 65536, example = "/points,/robot1/**")]
+    #[param(max_length = 16384, example = "/points,/robot1/**")]
     topic: Option<String>,
     /// Topics in whose names this regular expression is found.
     #[param(max_length = 4096)]
@@ -59,7 +63,7 @@ struct Wanted {
     /// Every topic that `ros2 topic list` shows.
     all: bool,
     /// Except these: as `topic`.
-    #[param(max_length = 65536)]
+    #[param(max_length = 16384)]
     exclude: Option<String>,
     /// Except those in whose names this regular expression is found.
     #[param(max_length = 4096)]
@@ -72,8 +76,8 @@ struct Wanted {
     /// Whether the bytes of the messages are wanted.
     payload: bool,
     /// Bytes that may wait for this client, as far as `limits.payload_bytes` allows for all streams
-    /// together. Then the oldest message of the topic that holds most of them is dropped.
-    #[param(minimum = 65536)]
+    /// together, 64 KiB at least. Then the oldest message of the topic that holds most of them is
+    /// dropped.
     queue_bytes: Option<usize>,
 }
 
@@ -118,8 +122,12 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn samples(
     State(context): State<Context>,
+    Extension(granted): Extension<Granted>,
     Parameters(wanted): Parameters<Wanted>,
 ) -> Result<Response, Problem> {
+    if wanted.payload {
+        granted.require(Access::All)?;
+    }
     let domain_id = wanted.domain_id;
     if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
         let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
@@ -247,6 +255,12 @@ fn selection(wanted: &Wanted) -> Result<Selection, Problem> {
 }
 
 fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Problem> {
+    for (text, most) in [(names, MAX_LIST), (regex, MAX_REGEX)] {
+        if text.is_some_and(|text| text.chars().count() > most) {
+            let detail = format!("a list or an expression of more than {most} characters");
+            return Err(Problem::new(Code::InvalidRequest, detail));
+        }
+    }
     let names: Vec<_> = names.into_iter().flat_map(|list| list.split(',')).collect();
     if names.len() > MAX_PATTERNS {
         let detail = format!("at most {MAX_PATTERNS} topics can be named, use globs");

@@ -1,28 +1,31 @@
-//! What every request has to pass before a route sees it: not too fast, not too large, sent to this
-//! agent's own name, by no foreign web page, with the token where one is asked for.
+//! What every request has to pass before a route sees it: sent to this agent's own name, by no
+//! foreign web page, with the token where one is asked for, not too fast, not too large. What it
+//! may then do depends on the listener: see [`Access`].
 //!
 //! Host and Origin are looked at because a browser on this host can be made to send requests to
 //! loopback by any web page it shows (CSRF), also under a name of the page's own (DNS rebinding).
 
 use std::fs::File;
 use std::io::{self, Read as _};
-use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use axum::extract::{Request, State};
-use axum::http::header::{AUTHORIZATION, CONTENT_LENGTH, HOST, HeaderName, ORIGIN};
-use axum::http::{HeaderMap, HeaderValue};
+use axum::extract::{Extension, Request, State};
+use axum::http::header::{AUTHORIZATION, CONNECTION, CONTENT_LENGTH, HOST, HeaderName, ORIGIN};
+use axum::http::{HeaderMap, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use subtle::ConstantTimeEq as _;
 
 use super::problem::{Code, Problem};
+use crate::config::Access;
+use crate::surface::authority;
 
 /// More than any request needs.
 pub(super) const MAX_BODY: usize = 16 << 10;
-/// Requests a second that a door lets in for long, and how many at once.
+/// Requests a second that a door answers for long, and how many at once: of clients that may come
+/// in, and as many of those that may not.
 const RATE: f64 = 500.0;
 const BURST: f64 = 1_000.0;
 /// A shorter token can be guessed; a longer file is no token.
@@ -60,7 +63,24 @@ pub enum TokenError {
 #[derive(Debug)]
 pub(super) struct Door {
     kind: Kind,
-    bucket: Mutex<Bucket>,
+    granted: Granted,
+    clients: Mutex<Bucket>,
+    outsiders: Mutex<Bucket>,
+}
+
+/// How far the listener of a request lets it go.
+#[derive(Clone, Debug)]
+pub(super) struct Granted {
+    access: Access,
+    /// The agent's unix socket, which grants everything.
+    socket: Option<Arc<Path>>,
+}
+
+/// What the routes of a noun take, for reading and for changing something.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Needs {
+    pub(super) read: Access,
+    pub(super) change: Access,
 }
 
 /// Who can knock.
@@ -112,36 +132,93 @@ impl std::fmt::Debug for Token {
 }
 
 impl Door {
-    pub(super) fn new(kind: Kind) -> Self {
-        let bucket = Mutex::new(Bucket {
-            left: BURST,
-            at: Instant::now(),
-        });
-        Self { kind, bucket }
+    pub(super) fn new(kind: Kind, granted: Granted) -> Self {
+        let bucket = || {
+            Mutex::new(Bucket {
+                left: BURST,
+                at: Instant::now(),
+            })
+        };
+        Self {
+            kind,
+            granted,
+            clients: bucket(),
+            outsiders: bucket(),
+        }
     }
 
+    /// Each class of clients has its own rate: requests without the token take nothing from those
+    /// with it.
     fn let_in(&self, headers: &HeaderMap, now: Instant) -> Result<(), Problem> {
-        let mut bucket = self.bucket.lock().unwrap_or_else(PoisonError::into_inner);
+        let admitted = self.admit(headers);
+        let bucket = match &admitted {
+            Ok(()) => &self.clients,
+            Err(_) => &self.outsiders,
+        };
+        let mut bucket = bucket.lock().unwrap_or_else(PoisonError::into_inner);
         if !bucket.draw(now) {
             let detail = format!("at most {RATE} requests a second are answered");
             return Err(Problem::new(Code::TooManyRequests, detail));
         }
         drop(bucket);
+        admitted?;
+        small(headers)
+    }
+
+    fn admit(&self, headers: &HeaderMap) -> Result<(), Problem> {
         match &self.kind {
-            Kind::Socket => {}
+            Kind::Socket => Ok(()),
             Kind::Loopback(token) => {
                 own_host(headers)?;
                 own_pages(headers)?;
                 token
                     .as_ref()
-                    .map_or(Ok(()), |token| authorized(headers, token))?;
+                    .map_or(Ok(()), |token| authorized(headers, token))
             }
             Kind::Network(token) => {
                 own_pages(headers)?;
-                authorized(headers, token)?;
+                authorized(headers, token)
             }
         }
-        small(headers)
+    }
+}
+
+impl Kind {
+    /// How far clients go, with `loopback` for those of which only the host is known.
+    pub(super) const fn access(&self, loopback: Access) -> Access {
+        match self {
+            Self::Loopback(None) => loopback,
+            Self::Socket | Self::Loopback(Some(_)) | Self::Network(_) => Access::All,
+        }
+    }
+}
+
+impl Granted {
+    pub(super) const fn new(access: Access, socket: Option<Arc<Path>>) -> Self {
+        Self { access, socket }
+    }
+
+    /// Returns a problem that names the way to `needed` where the listener does not grant it.
+    pub(super) fn require(&self, needed: Access) -> Result<(), Problem> {
+        if needed <= self.access {
+            return Ok(());
+        }
+        let what = match needed {
+            Access::Read | Access::Watch => "watches and streams of messages",
+            Access::All => "message payloads, recordings, snapshots and reloads",
+        };
+        let way = match &self.socket {
+            Some(path) => format!(
+                "use the unix socket {}, open to root and its group (`sudo usermod -aG ros2probe \
+                 $USER`, then log in again)",
+                path.display()
+            ),
+            None => "configure `api.socket` or `api.token_file`".to_owned(),
+        };
+        let detail = format!(
+            "loopback gives no {what} without a token: {way}, or set `api.loopback: {needed}`"
+        );
+        Err(Problem::new(Code::NeedsSocket, detail))
     }
 }
 
@@ -158,53 +235,68 @@ impl Bucket {
     }
 }
 
-/// Answers what may not come in.
-pub(super) async fn guard(State(door): State<Arc<Door>>, request: Request, next: Next) -> Response {
+/// Answers what may not come in; such a client keeps no connection.
+pub(super) async fn guard(
+    State(door): State<Arc<Door>>,
+    mut request: Request,
+    next: Next,
+) -> Response {
     match door.let_in(request.headers(), Instant::now()) {
+        Ok(()) => {
+            request.extensions_mut().insert(door.granted.clone());
+            next.run(request).await
+        }
+        Err(problem) => {
+            let close = [(CONNECTION, HeaderValue::from_static("close"))];
+            (close, problem).into_response()
+        }
+    }
+}
+
+/// Answers what the listener does not grant.
+pub(super) async fn within(
+    State(needs): State<Needs>,
+    Extension(granted): Extension<Granted>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let needed = match *request.method() {
+        Method::GET | Method::HEAD | Method::OPTIONS => needs.read,
+        _ => needs.change,
+    };
+    match granted.require(needed) {
         Ok(()) => next.run(request).await,
         Err(problem) => problem.into_response(),
     }
 }
 
-/// A name that resolves to loopback for everybody, or a loopback address: no name that a web page
-/// could have made its own.
 fn own_host(headers: &HeaderMap) -> Result<(), Problem> {
-    let host = headers.get(HOST).and_then(|host| host.to_str().ok());
-    if host.is_some_and(is_own) && headers.get_all(HOST).iter().count() == 1 {
-        return Ok(());
-    }
-    let detail = format!(
-        "the request is for the host `{}`; this listener answers to localhost and loopback addresses",
-        host.unwrap_or_default()
-    );
-    Err(Problem::new(Code::ForeignHost, detail))
+    authority::own(headers).map_err(|host| {
+        let detail = format!(
+            "the request is for the host `{host}`; this listener answers to localhost and loopback \
+             addresses"
+        );
+        Problem::new(Code::ForeignHost, detail)
+    })
 }
 
-fn is_own(host: &str) -> bool {
-    let name = match host.strip_prefix('[') {
-        Some(rest) => rest.split(']').next().unwrap_or_default(),
-        None => host.split(':').next().unwrap_or_default(),
-    };
-    name.eq_ignore_ascii_case("localhost")
-        || name
-            .parse()
-            .is_ok_and(|address: IpAddr| address.is_loopback())
-}
-
-/// Only browsers send these headers: the page must have come from this listener itself.
+/// Only browsers send these headers: the page must have come from this listener itself. Each of
+/// several counts.
 fn own_pages(headers: &HeaderMap) -> Result<(), Problem> {
     let text = |value: &HeaderValue| value.to_str().unwrap_or_default().to_owned();
-    let site = headers.get(SEC_FETCH_SITE).map(text);
-    let cross = site.is_some_and(|site| !matches!(site.as_str(), "same-origin" | "none"));
-    let origin = headers.get(ORIGIN).map(text);
+    let cross = headers
+        .get_all(SEC_FETCH_SITE)
+        .iter()
+        .any(|site| !matches!(site.as_bytes(), b"same-origin" | b"none"));
     let own = headers
         .get(HOST)
         .map(|host| format!("http://{}", text(host)));
-    let foreign = origin.is_some() && origin != own;
-    if cross || foreign {
+    let mut origins = headers.get_all(ORIGIN).iter().map(text);
+    let foreign = origins.find(|origin| Some(origin) != own.as_ref());
+    if cross || foreign.is_some() {
         let detail = format!(
             "requests of web pages from elsewhere ({}) are not answered",
-            origin.unwrap_or_else(|| "another site".to_owned())
+            foreign.unwrap_or_else(|| "another site".to_owned())
         );
         return Err(Problem::new(Code::ForeignOrigin, detail));
     }
@@ -271,29 +363,18 @@ mod tests {
         answer.err().map(|problem| problem.code())
     }
 
+    /// A door that grants everything.
+    fn door(kind: Kind) -> Door {
+        Door::new(kind, Granted::new(Access::All, None))
+    }
+
     #[test]
     fn loopback_answers_to_its_own_names_only() {
-        let door = Door::new(Kind::Loopback(None));
-        for host in [
-            "localhost",
-            "LOCALHOST:17401",
-            "127.0.0.1:17401",
-            "127.8.9.1",
-            "[::1]:9000",
-            "[::1]",
-        ] {
+        let door = door(Kind::Loopback(None));
+        for host in ["localhost", "127.0.0.1:17401", "[::1]:9000"] {
             assert_eq!(refusal(&door, &[("host", host)]), None, "{host}");
         }
-        for host in [
-            "evil.example",
-            "localhost.evil.example",
-            "127.0.0.1.evil.example:17401",
-            "10.0.0.1:17401",
-            "[::2]",
-            "",
-            "[",
-            "127.0.0.1@evil.example",
-        ] {
+        for host in ["evil.example", "localhost:x@evil", "[::1]evil", ""] {
             let refused = refusal(&door, &[("host", host)]);
             assert_eq!(refused, Some(Code::ForeignHost), "{host}");
         }
@@ -303,11 +384,73 @@ mod tests {
     }
 
     #[test]
-    fn web_pages_from_elsewhere_are_not_answered() {
-        for door in [
-            Door::new(Kind::Loopback(None)),
-            Door::new(Kind::Network(token())),
+    fn each_of_several_origins_must_be_the_agents() {
+        let door = door(Kind::Loopback(None));
+        let own = ("origin", "http://localhost");
+        for second in [
+            ("origin", "http://evil.example"),
+            ("sec-fetch-site", "cross-site"),
         ] {
+            let site = ("sec-fetch-site", "none");
+            let request = [("host", "localhost"), own, site, second];
+            let refused = refusal(&door, &request);
+            assert_eq!(refused, Some(Code::ForeignOrigin), "{second:?}");
+        }
+        assert_eq!(refusal(&door, &[("host", "localhost"), own, own]), None);
+    }
+
+    #[test]
+    fn requests_without_the_token_take_nothing_from_those_with_it() {
+        let now = Instant::now();
+        let right = headers(&[("authorization", "Bearer 0123456789abcdef")]);
+        let foreign = headers(&[
+            ("host", "evil.example"),
+            ("authorization", "Bearer 0123456789abcdef"),
+        ]);
+        for (door, outsider, client) in [
+            (door(Kind::Network(token())), HeaderMap::new(), right),
+            (
+                door(Kind::Loopback(None)),
+                foreign,
+                headers(&[("host", "localhost")]),
+            ),
+        ] {
+            let answered = |headers: &HeaderMap| match door.let_in(headers, now) {
+                Err(problem) if problem.code() == Code::TooManyRequests => 0,
+                _ => 1,
+            };
+            let outside: u32 = (0..5_000).map(|_| answered(&outsider)).sum();
+            assert_eq!(outside, 1_000);
+            let inside: u32 = (0..370).map(|_| answered(&client)).sum();
+            assert_eq!(inside, 370);
+        }
+    }
+
+    #[test]
+    fn loopback_grants_what_is_configured_and_socket_and_token_everything() {
+        for loopback in [Access::Read, Access::Watch, Access::All] {
+            assert_eq!(Kind::Loopback(None).access(loopback), loopback);
+            for kind in [
+                Kind::Socket,
+                Kind::Loopback(Some(token())),
+                Kind::Network(token()),
+            ] {
+                assert_eq!(kind.access(loopback), Access::All);
+            }
+        }
+        let granted = Granted::new(Access::Watch, Some(Path::new("/run/a.sock").into()));
+        assert!(granted.require(Access::Read).is_ok() && granted.require(Access::Watch).is_ok());
+        let refused = granted.require(Access::All).unwrap_err();
+        assert_eq!(refused.code(), Code::NeedsSocket);
+        let refused = format!("{refused:?}");
+        for part in ["/run/a.sock", "usermod -aG ros2probe", "api.loopback: all"] {
+            assert!(refused.contains(part), "{refused}");
+        }
+    }
+
+    #[test]
+    fn web_pages_from_elsewhere_are_not_answered() {
+        for door in [door(Kind::Loopback(None)), door(Kind::Network(token()))] {
             let host = ("host", "localhost:17401");
             let bearer = ("authorization", "Bearer 0123456789abcdef");
             let answer = |pair| refusal(&door, &[host, bearer, pair]);
@@ -334,8 +477,8 @@ mod tests {
     #[test]
     fn the_network_needs_the_token_and_the_socket_nothing() {
         for door in [
-            Door::new(Kind::Network(token())),
-            Door::new(Kind::Loopback(Some(token()))),
+            door(Kind::Network(token())),
+            door(Kind::Loopback(Some(token()))),
         ] {
             let with = |value| refusal(&door, &[("host", "localhost"), ("authorization", value)]);
             assert_eq!(with("Bearer 0123456789abcdef"), None);
@@ -359,14 +502,14 @@ mod tests {
             ("host", "robot1:17401"),
             ("authorization", "Bearer 0123456789abcdef"),
         ];
-        assert_eq!(refusal(&Door::new(Kind::Network(token())), &named), None);
+        assert_eq!(refusal(&door(Kind::Network(token())), &named), None);
         let anything = [("host", "evil.example"), ("origin", "http://evil.example")];
-        assert_eq!(refusal(&Door::new(Kind::Socket), &anything), None);
+        assert_eq!(refusal(&door(Kind::Socket), &anything), None);
     }
 
     #[test]
     fn a_long_body_is_refused_before_it_is_read() {
-        let door = Door::new(Kind::Socket);
+        let door = door(Kind::Socket);
         let length = |length: &str| refusal(&door, &[("content-length", length)]);
         assert_eq!(length("16384"), None);
         assert_eq!(length("16385"), Some(Code::BodyTooLarge));
@@ -383,7 +526,7 @@ mod tests {
         assert_eq!(drawn, 1000);
         let later = start + Duration::from_millis(10);
         assert_eq!((0..100).filter(|_| bucket.draw(later)).count(), 5);
-        let door = Door::new(Kind::Socket);
+        let door = door(Kind::Socket);
         let refused = |_: &u32| door.let_in(&HeaderMap::new(), start).is_err();
         assert_eq!((0..2000).filter(refused).count(), 1000);
         let again = door.let_in(&HeaderMap::new(), start).unwrap_err();

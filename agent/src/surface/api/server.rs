@@ -15,9 +15,9 @@ use axum::serve::Listener;
 use tokio::task::JoinSet;
 
 use super::problem::{Code, MEDIA_TYPE, Problem, ProblemBody};
-use super::security::{Door, Kind, Token, TokenError};
+use super::security::{Door, Granted, Kind, Token, TokenError};
 use super::{Context, router};
-use crate::config::Limit;
+use crate::config::{Access, Limit};
 use crate::surface::bounded::{Bounded, Refusal};
 use crate::surface::listen::listen;
 use crate::surface::serving::{self, Plain};
@@ -76,6 +76,7 @@ pub enum OpenError {
 #[derive(Debug, Default)]
 pub struct Server {
     token: Option<Token>,
+    loopback: Access,
     addresses: Vec<TcpListener>,
     sockets: Vec<Socket>,
 }
@@ -96,13 +97,15 @@ struct SocketFile {
 }
 
 impl Server {
-    /// Nothing bound yet; clients on the network need the token in this file.
+    /// Nothing bound yet; clients on the network need the token in this file, those on loopback
+    /// may go as far as `loopback` without it.
     ///
     /// # Errors
     /// The file holds no token.
-    pub fn new(token: Option<&Path>) -> Result<Self, OpenError> {
+    pub fn new(token: Option<&Path>, loopback: Access) -> Result<Self, OpenError> {
         Ok(Self {
             token: token.map(Token::load).transpose()?,
+            loopback,
             ..Self::default()
         })
     }
@@ -176,6 +179,12 @@ impl Server {
     /// # Errors
     /// When the runtime cannot take a listener over.
     pub fn serve(self, context: &Context, tasks: &mut JoinSet<io::Result<()>>) -> io::Result<()> {
+        let socket = self.sockets.first();
+        let socket = socket.map(|socket| Arc::from(socket.file.path.as_path()));
+        let door = |kind: Kind| {
+            let granted = Granted::new(kind.access(self.loopback), socket.clone());
+            Arc::new(Door::new(kind, granted))
+        };
         for listener in self.addresses {
             let is_local = listener.local_addr()?.ip().is_loopback();
             let kind = match self.token.clone() {
@@ -183,11 +192,11 @@ impl Server {
                 token => Kind::Loopback(token),
             };
             let listener = tokio::net::TcpListener::from_std(listener)?;
-            tasks.spawn(serve(listener, kind, context.clone()));
+            tasks.spawn(serve(listener, door(kind), context.clone()));
         }
         for Socket { listener, file } in self.sockets {
             let listener = tokio::net::UnixListener::from_std(listener)?;
-            let serving = serve(listener, Kind::Socket, context.clone());
+            let serving = serve(listener, door(Kind::Socket), context.clone());
             tasks.spawn(async move {
                 let served = serving.await;
                 drop(file);
@@ -205,12 +214,12 @@ impl Drop for SocketFile {
     }
 }
 
-async fn serve<L>(listener: L, kind: Kind, context: Context) -> io::Result<()>
+async fn serve<L>(listener: L, door: Arc<Door>, context: Context) -> io::Result<()>
 where
     L: Listener,
     L::Io: Unpin,
 {
-    let router = router(&context, Arc::new(Door::new(kind)));
+    let router = router(&context, door);
     let limit = Limit::ApiClients;
     let full = full(context.board.limits().caps().get(limit));
     let listener = Bounded::new(listener, Arc::clone(&context.board), limit, Some(full));
@@ -277,7 +286,7 @@ mod tests {
 
     #[test]
     fn an_address_beyond_this_host_needs_a_token() {
-        let mut server = Server::new(None).unwrap();
+        let mut server = Server::new(None, Access::Watch).unwrap();
         let error = server.bind(([0, 0, 0, 0], 0).into()).unwrap_err();
         assert!(one_line(&error).contains("needs `api.token_file`"));
         assert!(server.is_empty());
@@ -285,7 +294,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let token = directory.path().join("token");
         fs::write(&token, "0123456789abcdef\n").unwrap();
-        let mut server = Server::new(Some(&token)).unwrap();
+        let mut server = Server::new(Some(&token), Access::Watch).unwrap();
         server.bind(([0, 0, 0, 0], 0).into()).unwrap();
         assert_eq!(server.doors().count(), 1);
     }
@@ -294,7 +303,10 @@ mod tests {
     fn a_busy_port_is_said_in_one_line() {
         let other = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = other.local_addr().unwrap();
-        let error = Server::new(None).unwrap().bind(address).unwrap_err();
+        let error = Server::new(None, Access::Watch)
+            .unwrap()
+            .bind(address)
+            .unwrap_err();
         assert!(one_line(&error).contains("`api.listen`"));
     }
 
@@ -304,24 +316,30 @@ mod tests {
         let path = directory.path().join("api.sock");
         // Left by an agent that was killed.
         drop(UnixListener::bind(&path).unwrap());
-        let mut server = Server::new(None).unwrap();
+        let mut server = Server::new(None, Access::Watch).unwrap();
         server.bind_socket(&path).unwrap();
         let mode = fs::metadata(&path).unwrap().permissions().mode();
         assert_eq!(mode & 0o777, SOCKET_MODE);
 
-        let error = Server::new(None).unwrap().bind_socket(&path).unwrap_err();
+        let error = Server::new(None, Access::Watch)
+            .unwrap()
+            .bind_socket(&path)
+            .unwrap_err();
         assert!(one_line(&error).contains("another agent serves the socket"));
         assert!(std::os::unix::net::UnixStream::connect(&path).is_ok());
 
         drop(server);
         assert!(!path.exists());
         fs::write(&path, "").unwrap();
-        let error = Server::new(None).unwrap().bind_socket(&path).unwrap_err();
+        let error = Server::new(None, Access::Watch)
+            .unwrap()
+            .bind_socket(&path)
+            .unwrap_err();
         assert!(one_line(&error).contains("is not a socket"));
         assert!(path.exists());
 
         let missing = directory.path().join("missing/api.sock");
-        let error = Server::new(None)
+        let error = Server::new(None, Access::Watch)
             .unwrap()
             .bind_socket(&missing)
             .unwrap_err();

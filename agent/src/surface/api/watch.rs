@@ -184,6 +184,19 @@ struct Domain {
     domain_id: Option<u32>,
 }
 
+impl Domain {
+    /// Refuses a domain that cannot be.
+    fn checked(self) -> Result<Self, Problem> {
+        match self.domain_id {
+            Some(domain_id) if domain_id > MAX_DOMAIN => {
+                let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+                Err(Problem::new(Code::MalformedRequest, detail))
+            }
+            _ => Ok(self),
+        }
+    }
+}
+
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
         .routes(routes!(list))
@@ -224,6 +237,7 @@ async fn show(
     Name(topic): Name,
     Parameters(domain): Parameters<Domain>,
 ) -> Result<Json<WatchView>, Problem> {
+    let domain = domain.checked()?;
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let entry = in_force.find(&topic, domain.domain_id);
     let entry = entry.ok_or_else(|| unknown(&topic, domain.domain_id))?;
@@ -315,6 +329,7 @@ async fn remove(
     Name(topic): Name,
     Parameters(domain): Parameters<Domain>,
 ) -> Result<StatusCode, Problem> {
+    let domain = domain.checked()?;
     let removed = context.watches.remove(&topic, domain.domain_id);
     removed.map_err(|refused| problem(&refused, &topic, domain.domain_id))?;
     Ok(StatusCode::NO_CONTENT)
