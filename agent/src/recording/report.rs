@@ -233,10 +233,7 @@ impl Report {
                 (topic.not_captured, "could not be captured"),
                 (topic.dropped, "dropped, the storage was too slow"),
                 (topic.unwritten, "not written, the storage was full"),
-                (
-                    topic.unannounced,
-                    "sent before their writer was announced",
-                ),
+                (topic.unannounced, "sent before their writer was announced"),
             ];
             let counts = counts.into_iter().filter(|(count, _)| *count > 0);
             let missing: u64 = counts.clone().map(|(count, _)| count).sum();
