@@ -13,6 +13,7 @@ use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use local_agent::{Answer, LocalAgent, PATIENCE, ask, exchange, promtool, request, rp};
@@ -118,6 +119,54 @@ fn a_body_that_does_not_come_ends_its_connection_after_ten_seconds() {
     let _ = client.read_to_string(&mut answer);
     let seconds = began.elapsed().as_secs();
     assert!((9..20).contains(&seconds), "{seconds} s: {answer}");
+}
+
+#[test]
+fn a_flood_without_the_token_takes_no_answer_from_the_client_with_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let (config, token) = (
+        directory.path().join("config.yaml"),
+        directory.path().join("token"),
+    );
+    std::fs::write(&token, "0123456789abcdef\n").unwrap();
+    std::fs::write(
+        &config,
+        format!("api: {{token_file: {}}}\n", token.display()),
+    )
+    .unwrap();
+    let mut agent = LocalAgent::start(&["--config", config.to_str().unwrap(), "--speed", "max"]);
+    agent.wait_for_log("ready");
+    let (api, is_over, answers) = (agent.api, AtomicBool::new(false), AtomicU64::new(0));
+    let flood = || {
+        while !is_over.load(Ordering::Relaxed) {
+            let mut client = TcpStream::connect(api).unwrap();
+            let request = format!("GET /topics HTTP/1.1\r\nHost: {api}\r\n\r\n");
+            let sent = client.write_all(request.as_bytes());
+            if sent.is_ok() && client.read(&mut [0; 512]).is_ok() {
+                answers.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+    };
+    let answered = std::thread::scope(|scope| {
+        for _ in 0..3 {
+            scope.spawn(flood);
+        }
+        let deadline = Instant::now() + PATIENCE;
+        // Their burst is used up.
+        while answers.load(Ordering::Relaxed) < 2_000 && Instant::now() < deadline {
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let bearer = "Authorization: Bearer 0123456789abcdef\r\n";
+        let answered = (0..370)
+            .filter(|_| request(api, "GET", "/openapi.json", bearer).status == 200)
+            .count();
+        is_over.store(true, Ordering::Relaxed);
+        answered
+    });
+    let flooded = answers.into_inner();
+    eprintln!("{answered} of 370 beside {flooded} without the token");
+    assert_eq!(answered, 370);
+    assert!(flooded >= 2_000, "{flooded}");
 }
 
 #[test]
