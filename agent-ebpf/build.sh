@@ -3,7 +3,9 @@
 #
 #   build.sh           rebuild filter.bpf.o and filter.bpf.sha256
 #   build.sh --check   fail when the committed object is not what the sources give
-#   build.sh --stale   fail when the sources have changed since the object was built (no toolchain)
+#   build.sh --stale   fail when a source has changed since the object was built (no toolchain)
+#
+# filter.bpf.sha256 lists the toolchain and every file that the compiler read, with its checksum.
 #
 # Needs nightly (or what NIGHTLY names) with rust-src, and bpf-linker: `make prerequisites` installs
 # them. LLVM_PREFIX says where LLVM's tools are, if they are not where Debian puts LLVM 22 or in PATH.
@@ -14,16 +16,8 @@ nightly=${NIGHTLY:-nightly}
 strip=${LLVM_PREFIX:-/usr/lib/llvm-22}/bin/llvm-strip
 [ -x "$strip" ] || strip=llvm-strip
 
-sources() {
-    cat Cargo.toml Cargo.lock build.sh src/*.rs ../wire/Cargo.toml \
-        ../wire/src/{cursor,filter,guid,host,lib,record,time,walk}.rs
-}
-hash_sources() { sources | sha256sum | cut -d' ' -f1; }
-# Another compiler may order instructions differently without anything being wrong.
-toolchain() { echo "$(rustc "+$nightly" --version), $(bpf-linker --version)"; }
-
 if [ "${1:-}" = --stale ]; then
-    [ "$(hash_sources)" = "$(head -n 1 filter.bpf.sha256)" ] && exit 0
+    sha256sum --check --quiet --strict filter.bpf.sha256 && exit 0
     echo "agent-ebpf/filter.bpf.o is older than its sources: run 'make ebpf' and commit the result" >&2
     exit 1
 fi
@@ -42,19 +36,40 @@ built=target/bpfel-unknown-none/release/filter
 # The linker needs the debug information to write BTF; nobody needs it afterwards.
 "$strip" --strip-debug "$built"
 
+# Cargo's dep-info names what was compiled; each file's manifest is the nearest one above it.
+sources() {
+    local file directory
+    echo build.sh
+    echo Cargo.lock
+    sed 's/^[^:]*: //; s/\([^\\]\) /\1\n/g; s/\\ / /g' "$built.d" | while read -r file; do
+        realpath --relative-to=. "$file"
+        directory=$(dirname "$file")
+        until [ -e "$directory/Cargo.toml" ]; do directory=$(dirname "$directory"); done
+        realpath --relative-to=. "$directory/Cargo.toml"
+    done
+}
+# Another compiler may order instructions differently without anything being wrong.
+toolchain() { echo "# $(rustc "+$nightly" --version), $(bpf-linker --version)"; }
+list() {
+    toolchain
+    sources | LC_ALL=C sort -u | xargs -d '\n' sha256sum
+}
+
 if [ "${1:-}" = --check ]; then
-    ./build.sh --stale
-    if [ "$(toolchain)" != "$(tail -n 1 filter.bpf.sha256)" ]; then
+    if [ "$(toolchain)" != "$(head -n 1 filter.bpf.sha256)" ]; then
+        ./build.sh --stale
         echo "agent-ebpf/filter.bpf.o: sources unchanged and they build here; the bytes are not compared,"
-        echo "    because it was built with $(tail -n 1 filter.bpf.sha256), here is $(toolchain)"
-    elif cmp -s "$built" filter.bpf.o; then
-        echo "agent-ebpf/filter.bpf.o is current"
-    else
+        echo "    because another toolchain built it: $(head -n 1 filter.bpf.sha256), here $(toolchain)"
+    elif ! cmp -s "$built" filter.bpf.o; then
         echo "agent-ebpf/filter.bpf.o is not what its sources build: run 'make ebpf' and commit it" >&2
         exit 1
+    elif ! list | cmp -s - filter.bpf.sha256; then
+        echo "agent-ebpf/filter.bpf.o is current; its list of sources is not ('make ebpf' renews it)"
+    else
+        echo "agent-ebpf/filter.bpf.o is current"
     fi
 else
     cp "$built" filter.bpf.o
-    { hash_sources; toolchain; } > filter.bpf.sha256
+    list > filter.bpf.sha256
     echo "agent-ebpf/filter.bpf.o: $(stat -c %s filter.bpf.o) bytes"
 fi

@@ -12,7 +12,7 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Scratch, copy, count, scratch},
+    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Packet, Scratch, Working, copy, count, opaque, scratch},
     runs,
     verdict::{self, progress},
 };
@@ -41,35 +41,29 @@ mod state {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
-    let Some(scratch) = scratch(slot) else {
+    let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
     count(slot, Counter::Fragments, 1);
+    let packet = &mut scratch.get().packet;
     // SAFETY: no preconditions.
-    scratch.packet.now = unsafe { bpf_ktime_get_ns() };
-    let Some(flow) = flow(slot, scratch) else {
+    packet.now = unsafe { bpf_ktime_get_ns() };
+    let Some(flow) = flow(slot, packet) else {
         count(slot, Counter::FlowTableFull, 1);
         return 0;
     };
-    let (offset, len, more) = (
-        scratch.packet.offset,
-        scratch.packet.len,
-        scratch.packet.more,
-    );
+    let (offset, len, more) = (packet.offset, packet.len, packet.more);
     if flow.state == state::DONE || flow.state == state::FOREIGN && offset != 0 {
         return 0;
     }
-    let (cell, mask) = (offset >> 9 & 127, 1_u64 << (offset >> 9 & 63));
-    let cells = if cell < 64 {
-        &mut flow.cells[0]
-    } else {
-        &mut flow.cells[1]
-    };
-    if *cells & mask != 0 {
-        count(slot, Counter::FragmentsRepeated, 1);
-        return u32::from(flow.state == state::CAPTURED || flow.state == state::HANDED_OVER);
+    let (word, mask) = (opaque(offset >> 9) & 127, 1_u64 << (offset >> 3 & 63));
+    if let Some(starts) = flow.starts.get_mut(word as usize) {
+        if *starts & mask != 0 {
+            count(slot, Counter::FragmentsRepeated, 1);
+            return u32::from(flow.state == state::CAPTURED || flow.state == state::HANDED_OVER);
+        }
+        *starts |= mask;
     }
-    *cells |= mask;
     flow.seen += len;
     if more == 0 {
         flow.expected = offset + len;
@@ -81,15 +75,14 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
         trailing(skb, slot, scratch, flow)
     };
     if complete {
-        finish(slot, scratch, flow);
+        finish(slot, scratch.get(), flow);
     }
     keep
 }
 
 /// The flow of the fragment at hand, made new when there is none or its identification is reused.
 #[inline(always)]
-fn flow(slot: u32, scratch: &mut Scratch) -> Option<&'static mut Flow> {
-    let packet = &scratch.packet;
+fn flow(slot: u32, packet: &Packet) -> Option<&'static mut Flow> {
     let key = FlowKey {
         source: packet.source,
         destination: packet.destination,
@@ -120,15 +113,16 @@ fn flow(slot: u32, scratch: &mut Scratch) -> Option<&'static mut Flow> {
 
 /// The fragment with the UDP header.
 #[inline(always)]
-fn first(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
-    if verdict::begin(skb, slot, scratch).is_none() {
+fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &mut Flow) -> u32 {
+    if verdict::begin(skb, slot, scratch.get()).is_none() {
         flow.state = state::FOREIGN;
         return 0;
     }
-    scratch.walk.record.datagram = flow.token;
+    let begun = scratch.get();
+    begun.walk.record.datagram = flow.token;
     // Any fragment seen before this one was captured: so is the whole.
-    let alone = flow.seen == scratch.packet.len;
-    let (base, present) = (scratch.packet.body + 8, scratch.packet.len - 8);
+    let alone = flow.seen == begun.packet.len;
+    let (base, present) = (begun.packet.body + 8, begun.packet.len - 8);
     let result = if alone {
         verdict::run(skb, base, present, slot)
     } else {
@@ -137,7 +131,7 @@ fn first(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Flow)
     if result >= progress::CAPTURE {
         // Also when a header is split: user space gets the datagram from its start.
         flow.state = state::CAPTURED;
-        verdict::captured(slot, scratch);
+        verdict::captured(slot, scratch.get());
         return 1;
     }
     flow.state = state::WALKING;
@@ -147,44 +141,47 @@ fn first(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Flow)
 
 /// A later fragment.
 #[inline(always)]
-fn trailing(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch, flow: &mut Flow) -> u32 {
+fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &mut Flow) -> u32 {
+    let going_on = scratch.get();
     if flow.state == state::HEADLESS {
         // Nobody may fill the packet ring with fragments of nothing.
-        return u32::from(verdict::charge(scratch.packet.len));
+        return u32::from(verdict::charge(going_on.packet.len));
     }
     if flow.state != state::WALKING {
         return 1;
     }
     // In the UDP payload, which begins 8 bytes into the IP payload.
-    let start = scratch.packet.offset - 8;
-    let end = start + scratch.packet.len;
+    let start = going_on.packet.offset - 8;
+    let end = start + going_on.packet.len;
     let next = flow.walk.offset;
     if next >= end || next + 4 > flow.walk.datagram_len {
         return 0;
     }
-    copy(&flow.walk, &mut scratch.walk);
-    scratch.count = 0;
-    scratch.unknown = 0;
+    copy(&flow.walk, &mut going_on.walk);
+    going_on.count = 0;
+    going_on.unknown = 0;
+    let base = going_on.packet.body.wrapping_sub(start);
     // The walk goes on in a fragment that has not come yet: this one is out of order.
     let result = if next < start {
         progress::SPLIT
     } else {
-        verdict::run(skb, scratch.packet.body.wrapping_sub(start), end, slot)
+        verdict::run(skb, base, end, slot)
     };
     keep_walk(slot, scratch, flow);
     if result < progress::CAPTURE {
         return 0;
     }
-    hand_over(slot, scratch, flow);
-    verdict::captured(slot, scratch);
+    hand_over(slot, scratch.get(), flow);
+    verdict::captured(slot, scratch.get());
     1
 }
 
 /// Sends ahead what was found, but for the last record, and puts the walk's state away.
 #[inline(always)]
-fn keep_walk(slot: u32, scratch: &mut Scratch, flow: &mut Flow) {
-    let found = scratch.count;
-    copy(&scratch.walk, &mut flow.walk);
+fn keep_walk(slot: u32, mut scratch: Working, flow: &mut Flow) {
+    let walked = scratch.get();
+    let found = walked.count;
+    copy(&walked.walk, &mut flow.walk);
     if found == 0 {
         return;
     }
@@ -193,7 +190,7 @@ fn keep_walk(slot: u32, scratch: &mut Scratch, flow: &mut Flow) {
         verdict::flush(found - 1, u32::from(flag::AHEAD), slot);
         flow.ahead = 1;
     }
-    if let Some(last) = scratch.records.get(found as usize - 1) {
+    if let Some(last) = scratch.get().records.get(found as usize - 1) {
         copy(last, &mut flow.pending);
         flow.has_pending = 1;
     }

@@ -171,7 +171,7 @@ fn is_within() -> bool {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -> u32 {
-    let (Some(scratch), Some(handed)) = (scratch(slot), handed(slot)) else {
+    let (Some(mut working), Some(handed)) = (scratch(slot), handed(slot)) else {
         return 0;
     };
     let zero = core::hint::black_box(0);
@@ -210,6 +210,7 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     count(slot, Counter::Messages, 1);
     // SAFETY: no preconditions.
     let now = unsafe { bpf_ktime_get_ns() };
+    let scratch = working.get();
     scratch.packet.now = now;
     scratch.packet.host = zero;
     scratch.count = zero;
@@ -247,14 +248,14 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
         submessages += 1;
     }
     if result == progress::CAPTURE && len <= MAX_CAPTURED {
-        verdict::captured(slot, scratch);
+        verdict::captured(slot, working.get());
         shm_capture(slot, len, token);
         return 1;
     }
     if result == progress::CAPTURE {
         count(slot, Counter::PiecesLost, 1);
     }
-    let records = scratch.count;
+    let records = working.get().count;
     count(
         slot,
         if records == 0 {
@@ -272,9 +273,10 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
-    let Some(scratch) = scratch(slot) else {
+    let Some(mut scratch) = scratch(slot) else {
         return progress::STOP;
     };
+    let scratch = scratch.get();
     match walk::step(&mut scratch.walk, &Message { slot }, len) {
         Step::End | Step::Later | Step::Split => progress::STOP,
         Step::Passed => progress::ON,
@@ -291,12 +293,12 @@ pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
-    let (Some(scratch), Some(buffer)) = (scratch(slot), piece(slot)) else {
+    let (Some(mut scratch), Some(buffer)) = (scratch(slot), piece(slot)) else {
         return 0;
     };
     let zero = core::hint::black_box(0);
     let piece = &mut buffer.piece;
-    piece.time = scratch.packet.now;
+    piece.time = scratch.get().packet.now;
     piece.socket = u64::from(zero);
     piece.source = [zero; 4];
     piece.destination = [zero; 4];
@@ -363,18 +365,19 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
-    let Some(handed) = handed(slot) else {
+    let Some(message) = handed(slot) else {
         return found::NOWHERE;
     };
-    if offset < handed.start {
+    if offset < message.start {
         // From the beginning again: whoever captures does that once.
         let zero = core::hint::black_box(0);
-        (handed.next, handed.start, handed.end) = (zero, zero, zero);
+        (message.next, message.start, message.end) = (zero, zero, zero);
     }
     if shm_move(slot, offset) == 0 {
         return found::NOWHERE;
     }
-    if offset + len <= handed.end {
+    // Again: `shm_move` has had a reference of its own.
+    if handed(slot).is_some_and(|message| offset + len <= message.end) {
         return found::HERE;
     }
     let mut index = 0;
@@ -443,7 +446,7 @@ pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
 
 #[inline(always)]
 fn handed(slot: u32) -> Option<&'static mut Handed> {
-    // SAFETY: as for `maps::scratch`.
+    // SAFETY: the run that has claimed the slot uses it alone, and one reference at a time.
     HANDED
         .get_ptr_mut(slot)
         .map(|handed| unsafe { &mut *handed })

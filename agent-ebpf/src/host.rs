@@ -86,22 +86,23 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         count(slot, Counter::Segmented, 1);
         return None;
     }
-    let scratch = scratch(slot)?;
-    if scratch.packet.fragmented != 0 {
+    let mut scratch = scratch(slot)?;
+    if scratch.get().packet.fragmented != 0 {
         // Made by a raw socket; what sockets receive is reassembled.
         count(slot, Counter::Fragments, 1);
         return None;
     }
-    scratch.walk.record.datagram = 0;
+    scratch.get().walk.record.datagram = 0;
     let mut capture = verdict::whole(skb, slot) != 0;
-    let (socket, token) = (scratch.walk.record.socket, scratch.walk.record.datagram);
+    let record = &scratch.get().walk.record;
+    let (socket, token) = (record.socket, record.datagram);
     if token == 0 {
         return None;
     }
     if capture {
-        scratch.count = 0;
+        scratch.get().count = 0;
         if pieces::capture(skb, slot) != 0 {
-            note(scratch);
+            note(scratch.get());
         } else {
             // User space is too slow for all of it: then what it counts for goes alone.
             capture = false;
@@ -118,6 +119,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         // What the program knows as its context is the packet itself.
         last.buffer = skb as u64;
     }
+    let scratch = scratch.get();
     if !capture && scratch.count == 0 {
         return None;
     }

@@ -182,8 +182,9 @@ pub struct Flow {
     pub seen: u32,
     /// IP payload bytes in all, 0 until the last fragment has come.
     pub expected: u32,
-    /// Starts of fragments seen, in cells of 512 bytes.
-    pub cells: [u64; 2],
+    /// Starts of fragments seen, a bit for every 8 bytes (RFC 791): a link with a smaller MTU may cut
+    /// so few off.
+    pub starts: [u64; 128],
     pub state: u32,
     pub has_pending: u32,
     /// Records were sent ahead, so user space waits to hear that the datagram is complete.
@@ -330,26 +331,38 @@ pub fn release(slot: u32) {
     }
 }
 
+/// A slot's working memory, by its address. A function that calls another one that uses it too calls
+/// [`Self::get`] again afterwards: two references are never alive at a time.
+#[derive(Clone, Copy)]
+pub struct Working(*mut Scratch);
+
+impl Working {
+    /// The working memory, until the next call of a function that looks it up by the slot.
+    #[inline(always)]
+    pub fn get(&mut self) -> &mut Scratch {
+        // SAFETY: a map value pointer checked against null by `scratch`; the run that has claimed the
+        // slot uses it alone, and ends one reference before it makes the next.
+        unsafe { &mut *self.0 }
+    }
+}
+
 /// The working memory of a slot.
 #[inline(always)]
-pub fn scratch(slot: u32) -> Option<&'static mut Scratch> {
-    // SAFETY: the run that has claimed the slot uses it alone, and one reference at a time.
-    SCRATCH
-        .get_ptr_mut(slot)
-        .map(|scratch| unsafe { &mut *scratch })
+pub fn scratch(slot: u32) -> Option<Working> {
+    SCRATCH.get_ptr_mut(slot).map(Working)
 }
 
 /// The keys of a slot.
 #[inline(always)]
 pub fn run_keys(slot: u32) -> Option<&'static mut RunKeys> {
-    // SAFETY: as for `scratch`.
+    // SAFETY: the run that has claimed the slot uses it alone, and one reference at a time.
     RUN_KEYS.get_ptr_mut(slot).map(|keys| unsafe { &mut *keys })
 }
 
 /// The piece buffer of a slot.
 #[inline(always)]
 pub fn piece(slot: u32) -> Option<&'static mut PieceBuffer> {
-    // SAFETY: as for `scratch`.
+    // SAFETY: as for `run_keys`.
     PIECE.get_ptr_mut(slot).map(|piece| unsafe { &mut *piece })
 }
 

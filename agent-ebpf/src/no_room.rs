@@ -71,10 +71,10 @@ pub fn freed(context: &RawTracePointContext) {
 pub fn unexplained(context: &RawTracePointContext) {
     let buffer: u64 = context.arg(0);
     let Some(last) = seen(buffer) else { return };
-    let Some(scratch) = scratch(last.slot) else {
+    let Some(mut scratch) = scratch(last.slot) else {
         return;
     };
-    let record = &scratch.walk.record;
+    let record = &scratch.get().walk.record;
     let mut limit = AT_ONCE_NANOSECONDS;
     if place(Layout::BufferTransportHeader) != Layout::ABSENT {
         if is_of(buffer, record).is_none() {
@@ -134,9 +134,10 @@ fn tell(last: &mut Last) {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
-    let Some(scratch) = scratch(slot) else {
+    let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
+    let scratch = scratch.get();
     if scratch.walk.record.datagram != token {
         // Preempted: the slot has gone on to another datagram.
         count_outside(Counter::NoRoomUnseen, 1);

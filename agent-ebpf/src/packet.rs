@@ -96,7 +96,7 @@ fn load_anywhere<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
 /// Whether the packet at hand is an IP fragment.
 #[inline(always)]
 pub fn is_fragment(slot: u32) -> Option<bool> {
-    Some(scratch(slot)?.packet.fragmented != 0)
+    Some(scratch(slot)?.get().packet.fragmented != 0)
 }
 
 /// Fills in the scratch packet; 1 when it is (part of) a UDP datagram. `at` is one of [`hook`].
@@ -104,10 +104,10 @@ pub fn is_fragment(slot: u32) -> Option<bool> {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
-    let Some(scratch) = scratch(slot) else {
+    let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
-    let packet = &mut scratch.packet;
+    let packet = &mut scratch.get().packet;
     // SAFETY: the verifier rewrites reads of these fields.
     let (pkt_type, protocol, interface) =
         unsafe { ((*skb).pkt_type, (*skb).protocol, (*skb).ifindex) };

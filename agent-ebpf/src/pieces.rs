@@ -28,9 +28,10 @@ const _: () = assert!(PIECE_BYTES.is_power_of_two());
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
-    let (Some(scratch), Some(buffer)) = (scratch(slot), piece(slot)) else {
+    let (Some(mut scratch), Some(buffer)) = (scratch(slot), piece(slot)) else {
         return 0;
     };
+    let scratch = scratch.get();
     let (record, packet, piece) = (&scratch.walk.record, &scratch.packet, &mut buffer.piece);
     piece.time = packet.now;
     piece.socket = record.socket;
@@ -91,7 +92,8 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
 /// Writes the piece that the buffer holds; 1 = written.
 #[inline(always)]
 pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
-    let wake = if scratch(slot).is_some_and(|scratch| scratch.walk.record.writer[3] != SPDP_WRITER)
+    let wake = if scratch(slot)
+        .is_some_and(|mut scratch| scratch.get().walk.record.writer[3] != SPDP_WRITER)
         || PIECES.query(AVAILABLE_DATA) > setting!(WAKE_PIECE_BYTES)
     {
         FORCE_WAKEUP

@@ -42,22 +42,23 @@ pub mod progress {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
-    let Some(scratch) = scratch(slot) else {
+    let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
-    if begin(skb, slot, scratch).is_none() {
+    if begin(skb, slot, scratch.get()).is_none() {
         return 0;
     }
-    if scratch.walk.datagram_len + 8 > scratch.packet.len {
+    let begun = scratch.get();
+    let (base, present) = (begun.packet.body + 8, begun.walk.datagram_len);
+    if present + 8 > begun.packet.len {
         count(slot, Counter::Malformed, 1);
         return 0;
     }
-    let (base, present) = (scratch.packet.body + 8, scratch.walk.datagram_len);
     if run(skb, base, present, slot) >= progress::CAPTURE {
-        captured(slot, scratch);
+        captured(slot, scratch.get());
         return 1;
     }
-    let records = scratch.count;
+    let records = scratch.get().count;
     count(
         slot,
         if records == 0 {
@@ -76,20 +77,22 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn meter(skb: *mut __sk_buff, slot: u32) -> u32 {
-    let Some(scratch) = scratch(slot) else {
+    let Some(mut scratch) = scratch(slot) else {
         return 0;
     };
-    let base = scratch.packet.body + 8;
+    let begun = scratch.get();
+    let base = begun.packet.body + 8;
     let Some([_magic, _version, source @ ..]): Option<[u32; 5]> = load(skb, base) else {
         return 0;
     };
-    scratch.count = 0;
-    scratch.unknown = 0;
-    scratch.repeated = 1;
-    let len = scratch.walk.datagram_len;
-    scratch.walk.begin(source, len);
+    begun.count = 0;
+    begun.unknown = 0;
+    begun.repeated = 1;
+    let len = begun.walk.datagram_len;
+    begun.walk.begin(source, len);
     run(skb, base, len, slot);
-    flush(scratch.count, 0, slot);
+    let records = scratch.get().count;
+    flush(records, 0, slot);
     0
 }
 
@@ -187,9 +190,10 @@ pub fn run(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
-    let Some(scratch) = scratch(slot) else {
+    let Some(mut scratch) = scratch(slot) else {
         return progress::STOP;
     };
+    let scratch = scratch.get();
     let before = scratch.walk.offset;
     let result = match walk::step(&mut scratch.walk, &Payload { skb, base }, present) {
         Step::End | Step::Later => progress::STOP,
@@ -331,8 +335,8 @@ pub extern "C" fn flush(records: u32, flags: u32, slot: u32) -> u32 {
 #[inline(never)]
 pub extern "C" fn flush_one(index: u32, flags: u32, slot: u32) -> u32 {
     let index = opaque(index) as usize & (RECORDS_PER_DATAGRAM as usize - 1);
-    if let Some(scratch) = scratch(slot)
-        && let Some(record) = scratch.records.get_mut(index)
+    if let Some(mut scratch) = scratch(slot)
+        && let Some(record) = scratch.get().records.get_mut(index)
     {
         record.flags |= flags as u16;
         runs::give(slot, record, flags & u32::from(flag::AHEAD) == 0);

@@ -537,6 +537,15 @@ fn fragmented(
     order: &[usize],
 ) -> (Vec<Record>, Vec<usize>) {
     let fragments = program_run::fragments(payload, 1480, ipv6, kernel.next_identification());
+    show(kernel, &fragments, order)
+}
+
+/// Shows fragments to the kernel in `order`, and gives all records found and the fragments kept.
+fn show(
+    kernel: &mut Kernel,
+    fragments: &[Vec<u8>],
+    order: &[usize],
+) -> (Vec<Record>, Vec<usize>) {
     let (mut records, mut kept) = (Vec::new(), Vec::new());
     for index in order {
         let seen = kernel.frame(&fragments[*index]);
@@ -572,6 +581,43 @@ fn samples_in_later_fragments_are_found_and_count_only_when_all_fragments_came()
         let (records, _) = fragmented(&mut kernel, &payload, ipv6, &[0, 1, 1, 2, 3, 3]);
         assert_eq!(records.len(), 9, "a repeated fragment changes nothing");
     }
+}
+
+#[test]
+fn two_fragments_that_begin_within_512_bytes_of_each_other_both_count() {
+    let writer = Guid::new(GuidPrefix(*b"\x01\x10smallcells"), EntityId([0, 0, 1, 3]));
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    let payload = program_run::message(writer, 1..=9, 472);
+    let numbers = |records: &[Record]| -> Vec<u64> {
+        records.iter().map(|record| record.sequence_number).collect()
+    };
+    let all: Vec<u64> = (1..=9).collect();
+    for ipv6 in [false, true] {
+        // Half a submessage each.
+        let id = kernel.next_identification();
+        let fragments = program_run::fragments(&payload, 248, ipv6, id);
+        let order: Vec<_> = (0..fragments.len()).collect();
+        let (records, _) = show(&mut kernel, &fragments, &order);
+        assert_eq!(numbers(&records), all, "IPv6 {ipv6}: in order");
+
+        let id = kernel.next_identification();
+        let fragments = program_run::fragments(&payload, 248, ipv6, id);
+        let twice: Vec<_> = order.iter().flat_map(|index| [*index; 2]).collect();
+        let (records, _) = show(&mut kernel, &fragments, &twice);
+        assert_eq!(numbers(&records), all, "IPv6 {ipv6}: each one twice");
+
+        let id = kernel.next_identification();
+        let fragments = program_run::fragments(&payload, 248, ipv6, id);
+        let (records, _) = show(&mut kernel, &fragments, &order[..order.len() - 1]);
+        assert!(records.is_empty(), "IPv6 {ipv6}: the last one is missing");
+    }
+    // A link that takes 8 bytes less than the one before cuts them off each fragment.
+    let id = kernel.next_identification();
+    let fragments = program_run::fragments_of(&payload, &[1472, 8], false, id);
+    let order: Vec<_> = (0..fragments.len()).collect();
+    let (records, _) = show(&mut kernel, &fragments, &order);
+    assert_eq!(numbers(&records), all, "8 bytes cut off each");
 }
 
 #[test]

@@ -154,7 +154,7 @@ pub const PARTICIPANT_CAPACITY: u32 = 4_096;
 /// Unclassified writers that the filter remembers.
 pub const UNKNOWN_CAPACITY: u32 = 1_024;
 /// Fragmented datagrams in flight.
-pub const FLOW_CAPACITY: u32 = 2_048;
+pub const FLOW_CAPACITY: u32 = 1_024;
 /// Interfaces of one network namespace.
 pub const INTERFACE_CAPACITY: u32 = 1_024;
 /// Runs of DATA_FRAGs that wait for the sample's next fragments.

@@ -410,6 +410,16 @@ pub fn datagram(payload: &[u8]) -> Vec<u8> {
 
 /// A UDP payload as IP packets that carry at most `size` bytes of IP payload.
 pub fn fragments(payload: &[u8], size: usize, ipv6: bool, identification: u32) -> Vec<Vec<u8>> {
+    fragments_of(payload, &[size], ipv6, identification)
+}
+
+/// As [`fragments`], of these sizes in turn.
+pub fn fragments_of(
+    payload: &[u8],
+    sizes: &[usize],
+    ipv6: bool,
+    identification: u32,
+) -> Vec<Vec<u8>> {
     let udp_len = u16::try_from(payload.len() + 8).unwrap();
     let udp = [
         &7411_u16.to_be_bytes()[..],
@@ -419,21 +429,24 @@ pub fn fragments(payload: &[u8], size: usize, ipv6: bool, identification: u32) -
         payload,
     ];
     let udp = udp.concat();
-    let pieces = udp.chunks(size / 8 * 8);
-    let last = pieces.len() - 1;
-    let single = last == 0;
-    pieces
-        .enumerate()
-        .map(|(index, piece)| {
-            let offset = u16::try_from(index * (size / 8 * 8)).unwrap();
-            let more = index != last;
-            if ipv6 {
-                v6(piece, offset, more, identification)
-            } else {
-                v4(piece, offset, more, identification, single)
-            }
-        })
-        .collect()
+    let (mut packets, mut at) = (Vec::new(), 0);
+    for size in sizes.iter().cycle() {
+        let rest = &udp[at..];
+        let piece = &rest[..rest.len().min(size / 8 * 8)];
+        let offset = u16::try_from(at).unwrap();
+        at += piece.len();
+        let more = at < udp.len();
+        packets.push(if ipv6 {
+            v6(piece, offset, more, identification)
+        } else {
+            let single = offset == 0 && !more;
+            v4(piece, offset, more, identification, single)
+        });
+        if !more {
+            break;
+        }
+    }
+    packets
 }
 
 fn v4(piece: &[u8], offset: u16, more: bool, identification: u32, single: bool) -> Vec<u8> {
