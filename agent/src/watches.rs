@@ -172,9 +172,9 @@ impl Watches {
             command_line: command_line.into_iter().map(Arc::new).collect(),
             added: Vec::new(),
         };
-        watches.change(|old| {
+        watches.change(|old, _| {
             *old = lists;
-            Ok(())
+            Ok(Done::Added)
         })?;
         Ok(watches)
     }
@@ -205,9 +205,9 @@ impl Watches {
         let added: Vec<_> = watches.into_iter().filter(fits).map(Arc::new).collect();
         let left_out = asked - added.len();
         self.board.limits().reached(Limit::Watches, left_out);
-        self.change(|lists| {
+        self.change(|lists, _| {
             lists.added = added;
-            Ok(())
+            Ok(Done::Added)
         })?;
         Ok(left_out)
     }
@@ -242,10 +242,11 @@ impl Watches {
     /// With what else is watched they are too many, or their globs are too many;
     /// then nothing changes.
     pub fn configure(&self, watches: Vec<Watch>) -> Result<(), Refused> {
-        self.change(|lists| {
+        self.change(|lists, _| {
             lists.configured = watches.into_iter().map(Arc::new).collect();
-            Ok(())
-        })
+            Ok(Done::Replaced)
+        })?;
+        Ok(())
     }
 
     /// Watches this too, unless it is watched already.
@@ -269,23 +270,18 @@ impl Watches {
     /// # Errors
     /// There is no such watch, or it is not a client's.
     pub fn remove(&self, pattern: &str, domain_id: Option<u32>) -> Result<(), Refused> {
-        let found = self.in_force().find(pattern, domain_id).cloned();
-        match found {
-            None => return Err(Refused::Unknown),
-            Some(Entry { origin, .. }) if origin != Origin::Api => {
-                return Err(Refused::Given { by: origin });
+        self.change(|lists, in_force| {
+            match in_force.find(pattern, domain_id) {
+                None => return Err(Refused::Unknown),
+                Some(Entry { origin, .. }) if *origin != Origin::Api => {
+                    return Err(Refused::Given { by: *origin });
+                }
+                Some(_) => {}
             }
-            Some(_) => {}
-        }
-        self.change(|lists| {
-            let before = lists.added.len();
             lists
                 .added
                 .retain(|watch| !is_for(watch, pattern, domain_id));
-            if lists.added.len() == before {
-                return Err(Refused::Unknown);
-            }
-            Ok(())
+            Ok(Done::Replaced)
         })?;
         self.board.events().tell(AgentEvent::WatchRemoved {
             watch: pattern.to_owned(),
@@ -311,26 +307,24 @@ impl Watches {
     }
 
     fn put(&self, watch: Watch, replace: bool) -> Result<Done, Refused> {
-        let in_force = self.in_force();
-        let old = in_force.find(&watch.pattern, watch.domain_id);
-        let done = match old {
-            Some(old) if *old.watch == watch => return Ok(Done::Unchanged),
-            Some(old) if old.origin != Origin::Api => {
-                return Err(Refused::Given { by: old.origin });
-            }
-            Some(_) if !replace => return Err(Refused::Different),
-            Some(_) => Done::Replaced,
-            None => Done::Added,
-        };
         let watch = Arc::new(watch);
-        self.change(|lists| {
+        let done = self.change(|lists, in_force| {
+            let done = match in_force.find(&watch.pattern, watch.domain_id) {
+                Some(old) if old.watch == watch => return Ok(Done::Unchanged),
+                Some(old) if old.origin != Origin::Api => {
+                    return Err(Refused::Given { by: old.origin });
+                }
+                Some(_) if !replace => return Err(Refused::Different),
+                Some(_) => Done::Replaced,
+                None => Done::Added,
+            };
             let same = |other: &&mut Arc<Watch>| is_for(other, &watch.pattern, watch.domain_id);
             if let Some(old) = lists.added.iter_mut().find(same) {
                 *old = Arc::clone(&watch);
             } else {
                 lists.added.push(Arc::clone(&watch));
             }
-            Ok(())
+            Ok(done)
         })?;
         if done != Done::Unchanged {
             self.board.events().tell(AgentEvent::WatchAdded {
@@ -341,15 +335,19 @@ impl Watches {
         Ok(done)
     }
 
-    /// Changes the lists, merges them and hands the outcome to whom it concerns; on an error
-    /// nothing changes.
+    /// Changes the lists, merges them and hands the outcome to whom it concerns; on an error, and
+    /// with [`Done::Unchanged`], nothing changes. `change` sees what is in force and decides under the
+    /// lock: of two clients that ask at once, one comes second.
     fn change(
         &self,
-        change: impl FnOnce(&mut Lists) -> Result<(), Refused>,
-    ) -> Result<(), Refused> {
+        change: impl FnOnce(&mut Lists, &InForce) -> Result<Done, Refused>,
+    ) -> Result<Done, Refused> {
         let mut lists = self.lists.lock().unwrap_or_else(PoisonError::into_inner);
         let mut new = lists.clone();
-        change(&mut new)?;
+        let done = change(&mut new, &self.in_force())?;
+        if done == Done::Unchanged {
+            return Ok(done);
+        }
         let merged = InForce::merge(&new)?;
         let (count, cap) = (merged.entries.len(), self.cap());
         if count > cap {
@@ -368,7 +366,7 @@ impl Watches {
         self.in_force.store(Arc::new(merged));
         drop(lists);
         self.board.ring();
-        Ok(())
+        Ok(done)
     }
 }
 
@@ -397,4 +395,39 @@ impl InForce {
 
 fn is_for(watch: &Watch, pattern: &str, domain_id: Option<u32>) -> bool {
     watch.pattern == pattern && watch.domain_id == domain_id
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Barrier;
+
+    use super::*;
+    use crate::surface::{Settings, SourceKind};
+
+    #[test]
+    fn of_two_clients_that_add_the_same_watch_at_once_one_comes_second() {
+        let board = Arc::new(Board::new(SourceKind::Host, Settings::default()));
+        let watches = Watches::new(board, Vec::new(), Vec::new()).unwrap();
+        for round in 0..200 {
+            let pattern = format!("/topic_{round}");
+            let together = Barrier::new(2);
+            let added = std::thread::scope(|scope| {
+                let add = |per_subscriber| {
+                    let (watches, pattern, together) = (&watches, &pattern, &together);
+                    scope.spawn(move || {
+                        let watch = Watch {
+                            per_subscriber,
+                            ..Watch::named(pattern).unwrap()
+                        };
+                        together.wait();
+                        matches!(watches.add(watch), Ok(Done::Added))
+                    })
+                };
+                let threads = [add(true), add(false)];
+                threads.map(|thread| thread.join().unwrap())
+            });
+            assert!(added[0] != added[1], "round {round}: {added:?}");
+            watches.remove(&pattern, None).unwrap();
+        }
+    }
 }
