@@ -181,7 +181,9 @@ impl StateDirectory {
             path: path.to_path_buf(),
             source,
         };
-        let directory = File::open(path).map_err(unusable)?;
+        let mut options = OpenOptions::new();
+        let options = options.read(true).custom_flags(libc::O_DIRECTORY);
+        let directory = options.open(path).map_err(unusable)?;
         match directory.try_lock() {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
@@ -225,7 +227,7 @@ impl StateDirectory {
         let path = self.path.join(file);
         let mut bytes = Vec::new();
         let read =
-            File::open(&path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
+            open_regular(&path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
         match read {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Found::Nothing,
             Err(error) => return self.set_aside(file, error.to_string()),
@@ -305,9 +307,29 @@ fn begins_with_version(bytes: &[u8]) -> Option<u32> {
     std::str::from_utf8(&digits).ok()?.parse().ok()
 }
 
-fn new_file(path: &Path) -> io::Result<File> {
+/// Opens what was written here: a regular file in this directory. A link is not followed, and a pipe
+/// without a writer, or a device, is not waited for.
+fn open_regular(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
-    let options = options.write(true).create(true).truncate(true).mode(0o600);
+    let flags = libc::O_NOFOLLOW | libc::O_NONBLOCK | libc::O_NOCTTY;
+    let file = options.read(true).custom_flags(flags).open(path)?;
+    if file.metadata()?.is_file() {
+        return Ok(file);
+    }
+    Err(io::Error::new(
+        io::ErrorKind::InvalidInput,
+        "it is no regular file",
+    ))
+}
+
+/// Makes the file anew: what lies there, of an agent that was killed or a link, goes first.
+fn new_file(path: &Path) -> io::Result<File> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let mut options = OpenOptions::new();
+    let options = options.write(true).create_new(true).mode(0o600);
     options.open(path)
 }
 
@@ -568,6 +590,48 @@ mod tests {
         let directory = StateDirectory::open(place.path()).unwrap();
         assert_eq!(directory.load(), Loaded::Known(Memory::default()));
         assert_eq!(fs::read_dir(place.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
+        let (place, directory) = directory();
+        let elsewhere = tempfile::tempdir().unwrap();
+        let target = elsewhere.path().join("target");
+        directory.write(Memory::default()).unwrap();
+        fs::rename(place.path().join(FILE), &target).unwrap();
+        let text = fs::read_to_string(&target).unwrap();
+        for name in [FILE, NEW_FILE] {
+            std::os::unix::fs::symlink(&target, place.path().join(name)).unwrap();
+        }
+        let reason = unusable(&directory);
+        assert!(reason.contains("symbolic links"), "{reason}");
+        directory.write(Memory::default()).unwrap();
+        assert_eq!(fs::read_to_string(&target).unwrap(), text);
+        assert!(
+            fs::symlink_metadata(place.path().join(FILE))
+                .unwrap()
+                .is_file()
+        );
+        assert_eq!(directory.load(), Loaded::Known(Memory::default()));
+    }
+
+    #[test]
+    fn a_pipe_or_a_directory_in_place_of_a_state_file_does_not_hang_the_start() {
+        let (place, directory) = directory();
+        let path = place.path().join(FILE);
+        let name = std::ffi::CString::new(path.as_os_str().as_encoded_bytes()).unwrap();
+        // SAFETY: the path ends in a zero and outlives the call.
+        assert_eq!(unsafe { libc::mkfifo(name.as_ptr(), 0o600) }, 0);
+        let (found, heard) = std::sync::mpsc::channel();
+        std::thread::spawn(move || found.send((unusable(&directory), directory)));
+        let (reason, directory) = heard.recv_timeout(Duration::from_secs(10)).unwrap();
+        assert_eq!(reason, "it is no regular file");
+        let aside = place.path().join("discovery.json.corrupt");
+        let error = StateDirectory::open(&aside).unwrap_err();
+        assert!(matches!(error, StateError::Unusable { .. }), "{error}");
+        fs::create_dir(&path).unwrap();
+        fs::remove_file(aside).unwrap();
+        assert_eq!(unusable(&directory), "it is no regular file");
     }
 
     #[test]
