@@ -38,7 +38,7 @@ pub enum InfoError {
     NoMetadata(PathBuf),
     /// metadata.yaml is none.
     #[error("Exception on parsing info file: {0}")]
-    Metadata(#[from] serde_yaml::Error),
+    Metadata(#[from] metadata::MetadataError),
     /// Another storage.
     #[error(
         "{} is in the sqlite3 storage, which rp does not read: `ros2 bag convert` makes an MCAP bag of it",
@@ -92,7 +92,7 @@ impl Bag {
             return Self::open_file(path);
         }
         let file = path.join(metadata::FILE_NAME);
-        let text = match fs::read_to_string(&file) {
+        let text = match read_text(&file) {
             Ok(text) => text,
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
                 return Err(InfoError::NoMetadata(path.to_owned()));
@@ -260,6 +260,15 @@ impl Bag {
             .map(|topic| format!("{}\n", visible(&topic.name)))
             .collect()
     }
+}
+
+/// The text of metadata.yaml; of one that is too large, enough to see that.
+pub(super) fn read_text(path: &Path) -> std::io::Result<String> {
+    let mut text = String::new();
+    let file = fs::File::open(path)?;
+    file.take(metadata::MAX_BYTES + 1)
+        .read_to_string(&mut text)?;
+    Ok(text)
 }
 
 /// A single file's, as metadata.yaml would have it.

@@ -6,12 +6,39 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
+use saphyr_parser::{Event, Parser};
 use serde::Deserialize;
 
 /// The file in every bag directory.
 pub const FILE_NAME: &str = "metadata.yaml";
+/// Larger than that of a bag with thousands of files and topics.
+pub const MAX_BYTES: u64 = 64 << 20;
+/// A bag's own goes 8 levels deep.
+const MAX_DEPTH: usize = 32;
+/// Keys, values, lists and maps: some 40 for each topic, 15 for each file.
+const MAX_EVENTS: usize = 1_000_000;
 /// `starting_time` of a bag without messages.
 pub const NO_START: u64 = i64::MAX.cast_unsigned();
+
+/// Why a text is none.
+#[derive(Debug, thiserror::Error)]
+pub enum MetadataError {
+    /// Other YAML, or none.
+    #[error(transparent)]
+    Yaml(#[from] serde_yaml::Error),
+    /// No YAML, or much deeper than that.
+    #[error(transparent)]
+    Scan(#[from] saphyr_parser::ScanError),
+    /// No bag's.
+    #[error("it is larger than {MAX_BYTES} bytes")]
+    TooLarge,
+    /// No bag's.
+    #[error("it is nested more than {MAX_DEPTH} levels deep")]
+    TooDeep,
+    /// No bag's.
+    #[error("it has more than {MAX_EVENTS} keys and values")]
+    TooMany,
+}
 
 /// What metadata.yaml holds.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -184,16 +211,41 @@ impl Metadata {
     }
 
     /// Reads the file's text.
-    pub fn read(text: &str) -> Result<Self, serde_yaml::Error> {
+    pub fn read(text: &str) -> Result<Self, MetadataError> {
+        check(text)?;
         let file: shape::File = serde_yaml::from_str(text)?;
         Ok(file.rosbag2_bagfile_information.into())
     }
 
     /// Reads the text of a metadata record.
-    pub fn read_record(text: &str) -> Result<Self, serde_yaml::Error> {
+    pub fn read_record(text: &str) -> Result<Self, MetadataError> {
+        check(text)?;
         let information: shape::Information = serde_yaml::from_str(text)?;
         Ok(information.into())
     }
+}
+
+/// Looks at a text event by event before it is read at once: what reads it takes time by the square of
+/// its depth, and memory for each event.
+fn check(text: &str) -> Result<(), MetadataError> {
+    if text.len() as u64 > MAX_BYTES {
+        return Err(MetadataError::TooLarge);
+    }
+    let mut depth = 0_usize;
+    for (number, event) in Parser::new_from_str(text).enumerate() {
+        if number >= MAX_EVENTS {
+            return Err(MetadataError::TooMany);
+        }
+        match event?.0 {
+            Event::SequenceStart(..) | Event::MappingStart(..) => depth += 1,
+            Event::SequenceEnd | Event::MappingEnd => depth = depth.saturating_sub(1),
+            _ => {}
+        }
+        if depth > MAX_DEPTH {
+            return Err(MetadataError::TooDeep);
+        }
+    }
+    Ok(())
 }
 
 /// A YAML scalar: plain where nothing can be misread, else in double quotes.
@@ -440,6 +492,29 @@ mod tests {
             Metadata::read_record(&written.record_text()).unwrap(),
             written
         );
+    }
+
+    #[test]
+    fn a_text_that_is_too_deep_or_too_large_is_refused_within_a_second() {
+        let begin = std::time::Instant::now();
+        let deep = [
+            "[".repeat(100_000),
+            "{a: ".repeat(100_000),
+            "- ".repeat(100_000),
+            format!("rosbag2_bagfile_information: {}", "[".repeat(100_000)),
+        ];
+        for text in deep {
+            let error = Metadata::read(&text).unwrap_err();
+            let too_deep = matches!(error, MetadataError::TooDeep | MetadataError::Scan(_));
+            assert!(too_deep, "{error}");
+            assert!(Metadata::read_record(&text).is_err());
+        }
+        let error = Metadata::read(&format!("[{}", "1,".repeat(MAX_EVENTS))).unwrap_err();
+        assert!(matches!(error, MetadataError::TooMany), "{error}");
+        assert!(begin.elapsed().as_secs() < 5, "{:?}", begin.elapsed());
+        let mut written = metadata(5);
+        written.files = vec![written.files[0].clone(); 10_000];
+        assert_eq!(Metadata::read(&written.file_text()).unwrap(), written);
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! Reading MCAP files: by their summary, or record by record where there is none.
 //!
 //! A file that was never finished is read as far as its records go, into the chunk that was cut.
-//! Memory is bounded by the largest record. Nothing is believed to be there that is not, and
-//! nothing is written.
+//! Memory is bounded by the largest record, and by what a file of this size may expand to. Nothing is
+//! believed to be there that is not, and nothing is written.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -17,8 +17,10 @@ use super::mcap::{
 
 /// No record is longer: a length beyond this is damage.
 const MAX_RECORD: u64 = 1 << 30;
-/// A chunk holds no more than this.
-const MAX_CHUNK: u64 = 1 << 30;
+/// What is compressed in a file may expand to so many bytes, and to [`EXPANSION`] times the file's: much
+/// more than recordings do, for which a few megabytes of the same byte are rare.
+const EXPANDED: u64 = 64 << 20;
+const EXPANSION: u64 = 1024;
 
 /// What a file holds.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
@@ -205,10 +207,18 @@ pub fn scan(path: &Path, each: &mut Each<'_>) -> Result<Scan, ReadError> {
         source,
     };
     let file = File::open(path).map_err(wrong)?;
-    let reader = compression(path).reader(BufReader::with_capacity(1 << 16, file));
+    let length = file.metadata().map_err(wrong)?.len();
+    let expands = EXPANDED.saturating_add(length.saturating_mul(EXPANSION));
+    let compression = compression(path);
+    let reader = compression.reader(BufReader::with_capacity(1 << 16, file));
     let mut records = Records {
         reader: reader.map_err(wrong)?,
         position: 0,
+        left: match compression {
+            Compression::None => u64::MAX,
+            Compression::Lz4 | Compression::Zstd => expands,
+        },
+        expands,
     };
     let mut magic = Vec::new();
     records
@@ -241,7 +251,7 @@ fn scan_records(records: &mut Records<'_>, each: &mut Each<'_>) -> io::Result<Sc
             Next::Whole(opcode) => opcode,
             Next::Cut(Opcode::CHUNK) => {
                 finish_chunk(indexed.take(), &mut scan, false);
-                scan.cut = whole_records(&content);
+                scan.cut = whole_records(&content, records.expands);
                 return Ok(scan);
             }
             Next::Cut(_) | Next::End => {
@@ -266,7 +276,7 @@ fn scan_records(records: &mut Records<'_>, each: &mut Each<'_>) -> io::Result<Sc
                 let Some(chunk) = Chunk::read(&content) else {
                     return Ok(scan);
                 };
-                let index = look_into(&chunk, &mut scan, each);
+                let index = look_into(&chunk, &mut records.expands, &mut scan, each)?;
                 indexed = Some(Indexed {
                     chunk: ChunkIndex {
                         start: chunk.start,
@@ -333,24 +343,43 @@ fn finish_chunk(indexed: Option<Indexed>, scan: &mut Scan, at_end: bool) {
     scan.chunks.push(indexed.chunk);
 }
 
+/// Of what may still be expanded, `left` goes down; a chunk beyond that ends the reading.
 fn look_into(
     chunk: &Chunk<'_>,
+    left: &mut u64,
     scan: &mut Scan,
     each: &mut Each<'_>,
-) -> BTreeMap<u16, Vec<(u64, u64)>> {
-    let limit = chunk.uncompressed_size.min(MAX_CHUNK);
+) -> io::Result<BTreeMap<u16, Vec<(u64, u64)>>> {
     let records = match Compression::named(chunk.compression) {
-        Some(Compression::None) => return take_chunk(chunk.records, scan, each),
-        Some(compression) => compression.decompressed(chunk.records, limit),
+        Some(Compression::None) => return Ok(take_chunk(chunk.records, scan, each)),
+        Some(compression) => {
+            let limit = chunk.uncompressed_size.min(*left);
+            let records = compression.decompressed(chunk.records, limit);
+            let expanded = records
+                .as_ref()
+                .map_or(limit, |records| records.len() as u64);
+            *left = left.saturating_sub(expanded);
+            if records.is_err() && limit < chunk.uncompressed_size {
+                return Err(expands_too_far());
+            }
+            records
+        }
         None => Err(io::ErrorKind::Unsupported.into()),
     };
-    match records {
+    Ok(match records {
         Ok(records) => take_chunk(&records, scan, each),
         Err(_) => {
             scan.unreadable_chunks += 1;
             BTreeMap::new()
         }
-    }
+    })
+}
+
+fn expands_too_far() -> io::Error {
+    io::Error::new(
+        io::ErrorKind::FileTooLarge,
+        format!("it expands to more than {EXPANSION} times its size"),
+    )
 }
 
 /// Takes a chunk's records, and says what its message indexes are.
@@ -385,7 +414,7 @@ fn take_message(message: &Message<'_>, scan: &mut Scan, each: &mut Each<'_>) {
 }
 
 /// The whole records at the beginning of a chunk's record that was cut.
-fn whole_records(content: &[u8]) -> Vec<u8> {
+fn whole_records(content: &[u8], limit: u64) -> Vec<u8> {
     let Some((compression, records)) = mcap::cut_chunk(content) else {
         return Vec::new();
     };
@@ -395,7 +424,7 @@ fn whole_records(content: &[u8]) -> Vec<u8> {
         Some(compression) => {
             if let Ok(reader) = compression.reader(records) {
                 // Up to where it was cut, which is an error here.
-                let _ = reader.take(MAX_CHUNK).read_to_end(&mut bytes);
+                let _ = reader.take(limit).read_to_end(&mut bytes);
             }
         }
         None => {}
@@ -415,6 +444,10 @@ fn whole_records(content: &[u8]) -> Vec<u8> {
 struct Records<'a> {
     reader: Box<dyn Read + 'a>,
     position: u64,
+    /// How much the reader may still give.
+    left: u64,
+    /// How much compressed chunks may still expand to.
+    expands: u64,
 }
 
 enum Next {
@@ -450,9 +483,14 @@ impl Records<'_> {
     /// Reads at most this much: allocated as it comes. A compressed stream that was cut just ends.
     fn read(&mut self, length: u64, into: &mut Vec<u8>) -> io::Result<u64> {
         let before = into.len();
-        let result = (&mut self.reader).take(length).read_to_end(into);
+        let limit = length.min(self.left);
+        let result = (&mut self.reader).take(limit).read_to_end(into);
         let read = (into.len() - before) as u64;
         self.position += read;
+        self.left -= read;
+        if read < length && self.left == 0 {
+            return Err(expands_too_far());
+        }
         match result {
             Err(error)
                 if !matches!(

@@ -79,7 +79,7 @@ pub enum ReindexError {
 /// Completes all files of a bag and writes its metadata.yaml.
 pub fn reindex(directory: &Path) -> Result<Report, ReindexError> {
     let mut names = files(directory)?;
-    let before = fs::read_to_string(directory.join(metadata::FILE_NAME)).ok();
+    let before = info::read_text(&directory.join(metadata::FILE_NAME)).ok();
     let before = before.and_then(|text| Metadata::read(&text).ok());
     let compression = names.iter().map(|name| read::compression(Path::new(name)));
     let compression = compression.max_by_key(|compression| *compression != Compression::None);

@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use ros2probe::bag::info::Bag;
+use ros2probe::bag::mcap::{self as records, Opcode};
 use ros2probe::bag::read;
 use ros2probe::bag::reindex::{Found, ReindexError, reindex};
 use ros2probe::bag::{Compression, Form, Options, Storage, Writer};
@@ -275,4 +277,76 @@ fn compression_of_files_that_was_interrupted_is_completed() {
     assert!(names.iter().all(|name| path.join(name).exists()));
     assert!(!path.join("bag_1.mcap").exists());
     assert_eq!(metadata(&path).compression_mode, "FILE");
+}
+
+/// A file of chunks that each expand to zeros, `bytes` in all.
+fn expanding(chunk_bytes: usize, chunks: usize, compression: Compression) -> Vec<u8> {
+    let inside = compression.compressed(&vec![0; chunk_bytes]).unwrap();
+    let mut file = records::MAGIC.to_vec();
+    records::header(&mut file, "ros2", "none");
+    for _ in 0..chunks {
+        records::record(&mut file, Opcode::CHUNK, |out| {
+            out.extend([0; 16]);
+            out.extend((chunk_bytes as u64).to_le_bytes());
+            out.extend([0; 4]);
+            out.extend(
+                u32::try_from(compression.name().len())
+                    .unwrap()
+                    .to_le_bytes(),
+            );
+            out.extend(compression.name().as_bytes());
+            out.extend((inside.len() as u64).to_le_bytes());
+            out.extend(&inside);
+        });
+    }
+    file
+}
+
+#[test]
+fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
+    let directory = tempfile::tempdir().unwrap();
+    let refused = |name: &str, file: &[u8]| {
+        let path = directory.path().join(name);
+        fs::write(&path, file).unwrap();
+        let begin = std::time::Instant::now();
+        let error = read::scan(&path, &mut |_, _| {}).unwrap_err();
+        let cause = std::error::Error::source(&error).unwrap().to_string();
+        assert_eq!(
+            cause, "it expands to more than 1024 times its size",
+            "{name}"
+        );
+        assert!(Bag::open(&path).is_err(), "{name}");
+        assert!(
+            begin.elapsed().as_secs() < 20,
+            "{name}: {:?}",
+            begin.elapsed()
+        );
+        path
+    };
+    let (one, many) = (
+        expanding(200 << 20, 1, Compression::Zstd),
+        expanding(16 << 20, 40, Compression::Zstd),
+    );
+    assert!(
+        one.len() < 64 << 10 && many.len() < 64 << 10,
+        "{} {}",
+        one.len(),
+        many.len()
+    );
+    refused("one_0.mcap", &one);
+    let path = refused("many_0.mcap", &many);
+    assert!(reindex(directory.path()).is_err());
+    assert_eq!(fs::read(path).unwrap(), many, "left as it was");
+    // A whole file that is compressed, of one record.
+    let mut whole = records::MAGIC.to_vec();
+    records::record(&mut whole, Opcode::METADATA, |out| {
+        out.resize(out.len() + (200 << 20), 0);
+    });
+    let whole = Compression::Zstd.compressed(&whole).unwrap();
+    refused("whole_0.mcap.zstd", &whole);
+    // What expands as recordings of the same picture do is read.
+    let path = directory.path().join("still_0.mcap");
+    fs::write(&path, expanding(4 << 20, 8, Compression::Lz4)).unwrap();
+    let scan = read::scan(&path, &mut |_, _| {}).unwrap();
+    assert_eq!((scan.chunks.len(), scan.unreadable_chunks), (8, 8));
 }
