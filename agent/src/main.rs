@@ -181,6 +181,7 @@ fn run(options: cli::Run) -> Result<()> {
     ));
     let recordings = Arc::new(Recordings::new(
         recordings_directory,
+        config.recordings.limits,
         caps.bytes / 2,
         Arc::clone(&board),
         Arc::clone(&subscriptions),

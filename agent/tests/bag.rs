@@ -25,6 +25,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use ros2probe::bag::metadata::Metadata;
+use ros2probe::bag::read;
 use ros2probe::bag::{
     Compression, Error, Form, Options, Schema, Storage, Summary, TopicDescription, Writer,
 };
@@ -115,6 +116,81 @@ fn messages(path: &Path) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
         )
     });
     messages.collect()
+}
+
+#[test]
+fn messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones() {
+    let directory = tempfile::tempdir().unwrap();
+    let crc = |storage| Storage {
+        chunk_crc: true,
+        data_crc: true,
+        ..storage
+    };
+    for (name, storage) in [
+        ("chunked", Storage::default()),
+        ("checked", crc(Storage::default())),
+        ("plain", crc(Storage::preset("fastwrite").unwrap())),
+        ("packed", crc(Storage::preset("zstd_fast").unwrap())),
+    ] {
+        let options = Options {
+            storage,
+            ..Options::default()
+        };
+        let mut writer = Writer::create(&directory.path().join(name), options).unwrap();
+        let id = writer
+            .topic(topic("/points", "sensor_msgs/msg/PointCloud2"))
+            .unwrap();
+        let sizes = [10, 3_000_000, 2_000_000, 20, 30, 1_000_000];
+        let data = |index: usize| vec![u8::try_from(index).unwrap(); sizes[index]];
+        for index in 0..sizes.len() {
+            let time = Timestamp(BEGIN + index as u64);
+            writer
+                .write(id, time, time, index as u64, &data(index))
+                .unwrap();
+        }
+        let summary = writer.close(BTreeMap::new()).unwrap();
+        let mut found = Vec::new();
+        read::scan(&summary.files[0], &mut |message, _| {
+            found.push((message.sequence as usize, message.data.to_vec()));
+        })
+        .unwrap();
+        let sent: Vec<_> = (0..sizes.len()).map(|index| (index, data(index))).collect();
+        assert!(found == sent, "{name}");
+        // The other reader knows no zstd here; it checks the checksums.
+        if name != "packed" {
+            let theirs = messages(&summary.files[0]).into_iter();
+            assert!(
+                theirs
+                    .map(|message| message.4)
+                    .eq(sent.into_iter().map(|sent| sent.1))
+            );
+        }
+        let indexed = read::Contents::of_summary(&summary.files[0])
+            .unwrap()
+            .unwrap();
+        assert_eq!(indexed.counts.values().sum::<u64>(), 6, "{name}");
+    }
+}
+
+#[test]
+fn a_file_is_split_when_its_index_takes_what_it_may() {
+    let directory = tempfile::tempdir().unwrap();
+    let options = Options {
+        max_index_bytes: Some(1000),
+        ..Options::default()
+    };
+    let mut writer = Writer::create(&directory.path().join("long"), options).unwrap();
+    let id = writer
+        .topic(topic("/chatter", "std_msgs/msg/String"))
+        .unwrap();
+    for index in 0..40 {
+        let time = Timestamp(BEGIN + index);
+        writer.write(id, time, time, index, &text(index)).unwrap();
+        writer.flush().unwrap();
+    }
+    let summary = writer.close(BTreeMap::new()).unwrap();
+    assert!(summary.files.len() > 2, "{summary:?}");
+    assert_eq!(summary.messages, 40);
 }
 
 #[test]

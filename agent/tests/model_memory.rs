@@ -18,6 +18,7 @@ use std::time::Instant;
 
 use forge::{Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use host::{BOB, Host, Seen};
+use ros2probe::bag::{Options, Storage, TopicDescription, Writer};
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::surface::{AgentFacts, Board, Exposition, Format, SourceKind};
@@ -187,6 +188,63 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
         all * 3 >= expected,
         "the table says far too much: {all} of {expected}"
     );
+}
+
+/// Topics as many as may be measured, messages smaller and larger than a chunk, compressed and not.
+#[test]
+fn a_recording_takes_no_more_than_the_table_of_limits_says() {
+    const BAGS: usize = 4;
+    let _alone = ALONE.lock().unwrap();
+    let place = tempfile::tempdir().unwrap();
+    let large: Vec<u8> = (0..3_000_000_u32).map(|at| (at / 7) as u8).collect();
+    let before = resident();
+    let mut most = before;
+    let mut bags: Vec<_> = (0..BAGS)
+        .map(|number| {
+            let preset = ["", "zstd_fast", "fastwrite", ""][number];
+            let mut options = Options {
+                storage: Storage::preset(preset).unwrap(),
+                max_index_bytes: Some(1 << 20),
+                ..Options::default()
+            };
+            options.storage.chunk_bytes = 1 << 20;
+            let path = place.path().join(format!("bag{number}"));
+            let mut bag = Writer::create(&path, options).unwrap();
+            let topics: Vec<_> = (0..Limits::default().topics)
+                .map(|topic| {
+                    let description = TopicDescription {
+                        name: format!("/robot/sensor_{topic:04}/data_raw"),
+                        type_name: "sensor_msgs/msg/Imu".to_owned(),
+                        type_hash: None,
+                        publishers: Vec::new(),
+                        schema: None,
+                    };
+                    bag.topic(description).unwrap()
+                })
+                .collect();
+            (bag, topics)
+        })
+        .collect();
+    for round in 0..12_u64 {
+        let at = Timestamp(host::START + round * 1_000_000_000);
+        for (bag, topics) in &mut bags {
+            for topic in topics.iter() {
+                bag.write(*topic, at, at, round, &large[..2000]).unwrap();
+            }
+            bag.write(topics[0], at, at, round, &large).unwrap();
+            bag.flush().unwrap();
+            most = most.max(resident());
+        }
+    }
+    let each = (most - before) / BAGS;
+    let row = Limit::Recordings.row();
+    println!("{} KiB each, {} in the table", each >> 10, row.bytes >> 10);
+    assert!(
+        each <= row.bytes,
+        "{each} bytes, {} in the table",
+        row.bytes
+    );
+    assert!(each * 8 >= row.bytes, "the table says far too much: {each}");
 }
 
 #[test]

@@ -145,6 +145,61 @@ fn a_headless_robot_is_told_to_record_and_tells_what_it_has() {
 }
 
 #[test]
+fn a_recording_that_meets_a_limit_ends_in_order_with_the_reason_and_none_begins_then() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(
+        directory.path(),
+        "  max_total_bytes: 1000000\n  reserve_bytes: 65536\n  reserve_percent: 0\n",
+    );
+    let api = agent.api;
+    let (_, all) = ask(api, "GET", "/recordings", "");
+    assert_eq!(all["limits"]["max_total_bytes"], 1_000_000, "{all}");
+    assert_eq!(ask(api, "POST", "/recordings", r#"{"name": "cut"}"#).0, 201);
+    wait_for(api, "cut", |recording| {
+        recording["report"]["messages"].as_u64() > Some(5)
+    });
+    let bags = directory.path().join("bags");
+    std::fs::create_dir(bags.join("other")).unwrap();
+    std::fs::write(bags.join("other/other_0.mcap"), vec![0; 1_000_000]).unwrap();
+    let ended = wait_for(api, "cut", |recording| recording["state"] == "ended");
+    let reason = ended["error"].as_str().unwrap();
+    assert!(reason.contains("recordings.max_total_bytes"), "{reason}");
+    assert_eq!(ended["report"]["limit_reached"], reason);
+    let counted = messages(&bags.join("cut"))
+        .values()
+        .map(Vec::len)
+        .sum::<usize>();
+    assert_eq!(ended["report"]["messages"], counted, "{ended}");
+    let metadata = std::fs::read_to_string(bags.join("cut/metadata.yaml")).unwrap();
+    assert!(metadata.contains("limit_reached"), "{metadata}");
+    for (path, mode) in [
+        ("cut", 0o750),
+        ("cut/cut_0.mcap", 0o640),
+        ("cut/metadata.yaml", 0o640),
+    ] {
+        let about = std::fs::metadata(bags.join(path)).unwrap();
+        assert_eq!(about.permissions().mode() & 0o777, mode, "{path}");
+    }
+    let events = local_agent::request(api, "GET", "/events?after=0&follow=false", "").body;
+    assert!(events.contains("recordings.max_total_bytes"), "{events}");
+    let (status, refused) = ask(api, "POST", "/recordings", r#"{"name": "next"}"#);
+    assert_eq!(status, 507, "{refused}");
+    assert!(!bags.join("next").exists());
+}
+
+#[test]
+fn what_is_to_stay_free_is_not_recorded_into() {
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(directory.path(), "  reserve_bytes: 1099511627776\n");
+    let (status, refused) = ask(agent.api, "POST", "/recordings", r#"{"name": "none"}"#);
+    assert_eq!(status, 507, "{refused}");
+    let detail = refused["detail"].as_str().unwrap();
+    assert!(detail.contains("recordings.reserve_bytes"), "{detail}");
+    assert!(!directory.path().join("bags/none").exists());
+}
+
+#[test]
 fn a_recording_that_cannot_be_is_refused_and_leaves_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let agent = agent(directory.path(), "");

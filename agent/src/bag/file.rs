@@ -6,7 +6,7 @@
 //! finished. Knows nothing of topics beyond their channel.
 
 use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io::{self, Read as _, Seek as _, Write as _};
 use std::os::fd::AsRawFd as _;
 use std::path::{Path, PathBuf};
@@ -65,7 +65,7 @@ struct Pending {
 impl FileWriter {
     /// Makes the file, which must not exist, and writes what it begins with.
     pub(super) fn create(path: &Path, storage: Storage, metadata: &Metadata) -> io::Result<Self> {
-        let file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        let file = super::new_file(path)?;
         let mut writer = Self {
             path: path.to_owned(),
             file,
@@ -91,7 +91,7 @@ impl FileWriter {
     /// Begins `path` with what is whole of `source`, to be gone on with and finished.
     pub(super) fn resume(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Self> {
         source.rewind()?;
-        let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
+        let mut file = super::new_file(path)?;
         let copied = io::copy(&mut source.take(scan.end), &mut file)?;
         if copied != scan.end {
             return Err(io::ErrorKind::UnexpectedEof.into());
@@ -152,8 +152,13 @@ impl FileWriter {
         message: &Message<'_>,
         channel: impl FnOnce() -> (Schema, Channel),
     ) -> io::Result<()> {
-        if self.pending.records.len() as u64 >= self.piece_bytes() {
-            self.write_pending()?;
+        // Written as it is, and not kept in memory once more.
+        let is_large = self.storage.compression == Compression::None
+            && message.data.len() as u64 >= self.piece_bytes();
+        if self.pending.records.len() as u64 >= self.piece_bytes()
+            || is_large && self.pending.messages > 0
+        {
+            self.write_pending(&[])?;
         }
         if !self.channels.contains_key(&message.channel_id) {
             let (schema, channel) = channel();
@@ -166,7 +171,11 @@ impl FileWriter {
         }
         let pending = &mut self.pending;
         let offset = pending.records.len() as u64;
-        message.write(&mut pending.records);
+        if is_large {
+            message.write_head(&mut pending.records);
+        } else {
+            message.write(&mut pending.records);
+        }
         if pending.messages == 0 {
             (pending.start, pending.end) = (message.log_time, message.log_time);
         }
@@ -175,7 +184,20 @@ impl FileWriter {
         pending.messages += 1;
         let index = pending.index.entry(message.channel_id).or_default();
         index.push((message.log_time, offset));
-        Ok(())
+        if !is_large {
+            return Ok(());
+        }
+        let written = self.write_pending(message.data);
+        if written.is_err() {
+            // Its channel waits for the next try.
+            let mut records = std::mem::take(&mut self.pending.records);
+            records.truncate(usize::try_from(offset).unwrap_or(usize::MAX));
+            self.pending = Pending {
+                records,
+                ..Pending::default()
+            };
+        }
+        written
     }
 
     /// Hands everything taken to the system: it survives the end of this process.
@@ -183,7 +205,7 @@ impl FileWriter {
         if self.pending.records.is_empty() {
             return Ok(());
         }
-        self.write_pending()
+        self.write_pending(&[])
     }
 
     /// Waits until everything flushed is on the disk: it survives the loss of power.
@@ -255,6 +277,11 @@ impl FileWriter {
         }
     }
 
+    /// Bytes of its index in memory.
+    pub(super) fn index_bytes(&self) -> u64 {
+        self.chunk_indexes.len() as u64
+    }
+
     /// Messages taken.
     pub(super) fn messages(&self) -> u64 {
         self.statistics.message_count + self.pending.messages
@@ -289,14 +316,15 @@ impl FileWriter {
         }
     }
 
-    fn write_pending(&mut self) -> io::Result<()> {
+    /// `tail`: the data of the last message, where it is not among the records.
+    fn write_pending(&mut self, tail: &[u8]) -> io::Result<()> {
         // Taken out while it is written; put back where that fails.
         let mut pending = std::mem::take(&mut self.pending);
         let written = if self.storage.chunked {
-            self.write_chunk(&pending)
+            self.write_chunk(&pending, tail)
         } else {
-            let reserved = self.reserve(pending.records.len() as u64);
-            reserved.and_then(|()| self.append(&[&pending.records]))
+            let reserved = self.reserve((pending.records.len() + tail.len()) as u64);
+            reserved.and_then(|()| self.append(&[&pending.records, tail]))
         };
         if let Err(error) = written {
             self.pending = pending;
@@ -318,14 +346,19 @@ impl FileWriter {
                 .or_default();
             *count += index.len() as u64;
         }
-        // The memory is used again.
+        // The memory is used again, but not that of a message far beyond the usual.
         pending.records.clear();
+        let usual = usize::try_from(self.piece_bytes()).unwrap_or(usize::MAX);
+        pending.records.shrink_to(usual.saturating_mul(2));
         self.pending.records = pending.records;
         Ok(())
     }
 
-    fn write_chunk(&mut self, pending: &Pending) -> io::Result<()> {
-        let compressed = self.storage.compression.compressed(&pending.records);
+    fn write_chunk(&mut self, pending: &Pending, tail: &[u8]) -> io::Result<()> {
+        let compressed = match tail {
+            [] => self.storage.compression.compressed(&pending.records),
+            _ => None,
+        };
         let compression = match &compressed {
             Some(_) => self.storage.compression.name(),
             None => "",
@@ -334,18 +367,19 @@ impl FileWriter {
         let mut uncompressed_crc = Crc::new();
         if self.storage.chunk_crc {
             uncompressed_crc.update(&pending.records);
+            uncompressed_crc.update(tail);
         }
         let chunk = Chunk {
             start: pending.start,
             end: pending.end,
-            uncompressed_size: pending.records.len() as u64,
+            uncompressed_size: (pending.records.len() + tail.len()) as u64,
             uncompressed_crc: uncompressed_crc.sum(),
             compression,
             records,
         };
         let mut head = Vec::with_capacity(64);
-        chunk.write_head(&mut head);
-        let length = (head.len() + records.len()) as u64;
+        chunk.write_head(&mut head, tail.len());
+        let length = (head.len() + records.len() + tail.len()) as u64;
         let (mut indexes, mut offsets) = (Vec::new(), BTreeMap::new());
         for (channel, entries) in &pending.index {
             offsets.insert(*channel, self.position + length + indexes.len() as u64);
@@ -359,11 +393,11 @@ impl FileWriter {
             message_indexes: offsets,
             message_indexes_length: indexes.len() as u64,
             compression: compression.to_owned(),
-            compressed_size: records.len() as u64,
+            compressed_size: (records.len() + tail.len()) as u64,
             uncompressed_size: chunk.uncompressed_size,
         };
         self.reserve(length + index.message_indexes_length)?;
-        self.append(&[&head, records, &indexes])?;
+        self.append(&[&head, records, tail, &indexes])?;
         index.write(&mut self.chunk_indexes);
         self.statistics.chunk_count += 1;
         Ok(())

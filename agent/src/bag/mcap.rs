@@ -237,13 +237,19 @@ impl<'a> Message<'a> {
     /// Appends the record.
     pub fn write(&self, out: &mut Vec<u8>) {
         out.reserve(Self::OVERHEAD + self.data.len());
-        record(out, Opcode::MESSAGE, |out| {
-            out.extend_from_slice(&self.channel_id.to_le_bytes());
-            out.extend_from_slice(&self.sequence.to_le_bytes());
-            out.extend_from_slice(&self.log_time.to_le_bytes());
-            out.extend_from_slice(&self.publish_time.to_le_bytes());
-            out.extend_from_slice(self.data);
-        });
+        self.write_head(out);
+        out.extend_from_slice(self.data);
+    }
+
+    /// Appends the record up to where [`Self::data`] follow.
+    pub fn write_head(&self, out: &mut Vec<u8>) {
+        out.push(Opcode::MESSAGE.0);
+        let content = Self::OVERHEAD - RECORD_HEADER + self.data.len();
+        out.extend_from_slice(&(content as u64).to_le_bytes());
+        out.extend_from_slice(&self.channel_id.to_le_bytes());
+        out.extend_from_slice(&self.sequence.to_le_bytes());
+        out.extend_from_slice(&self.log_time.to_le_bytes());
+        out.extend_from_slice(&self.publish_time.to_le_bytes());
     }
 
     /// From a record's content.
@@ -261,17 +267,19 @@ impl<'a> Message<'a> {
 }
 
 impl<'a> Chunk<'a> {
-    /// Appends the record up to where [`Self::records`] follow, which are written by themselves.
-    pub fn write_head(&self, out: &mut Vec<u8>) {
+    /// Appends the record up to where [`Self::records`] follow, and `more` bytes of records behind
+    /// them; both are written by themselves.
+    pub fn write_head(&self, out: &mut Vec<u8>, more: usize) {
         out.push(Opcode::CHUNK.0);
-        let content = 8 * 3 + 4 + 4 + self.compression.len() + 8 + self.records.len();
+        let records = self.records.len() + more;
+        let content = 8 * 3 + 4 + 4 + self.compression.len() + 8 + records;
         out.extend_from_slice(&(content as u64).to_le_bytes());
         out.extend_from_slice(&self.start.to_le_bytes());
         out.extend_from_slice(&self.end.to_le_bytes());
         out.extend_from_slice(&self.uncompressed_size.to_le_bytes());
         out.extend_from_slice(&self.uncompressed_crc.to_le_bytes());
         text(out, self.compression);
-        out.extend_from_slice(&(self.records.len() as u64).to_le_bytes());
+        out.extend_from_slice(&(records as u64).to_le_bytes());
     }
 
     /// From a record's content.

@@ -5,7 +5,9 @@
 //! and passes times in. Nothing here subscribes, decodes or chooses topics, and sqlite3 bags are
 //! neither written nor read.
 
+use std::fs::{File, OpenOptions};
 use std::io;
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
 pub mod compression;
@@ -58,6 +60,9 @@ pub enum Error {
         /// As the system says it.
         source: io::Error,
     },
+    /// What a recording may take is used up.
+    #[error("{0}")]
+    Limit(String),
     /// Anything else that writing can meet.
     #[error("cannot write {}", path.display())]
     Write {
@@ -79,6 +84,12 @@ pub enum Error {
         /// The one refused.
         second: String,
     },
+}
+
+/// Makes a file of a bag, which must not exist: for its owner, and for the group to read.
+fn new_file(path: &Path) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    options.write(true).create_new(true).mode(0o640).open(path)
 }
 
 impl Error {

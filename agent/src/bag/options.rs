@@ -26,6 +26,8 @@ pub struct Options {
     pub max_file_bytes: Option<u64>,
     /// A file is split before the message that is later than its first by more than this.
     pub max_file_duration: Option<Duration>,
+    /// A file is split when its index, which is kept in memory, takes this many bytes.
+    pub max_index_bytes: Option<u64>,
     /// Also written into metadata.yaml.
     pub custom_data: BTreeMap<String, String>,
 }

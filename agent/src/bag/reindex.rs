@@ -246,7 +246,7 @@ fn keep_aside(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<
     }
     let rest = with_suffix(path, "rest");
     remove(&rest)?;
-    let mut file = File::options().write(true).create_new(true).open(&rest)?;
+    let mut file = super::new_file(&rest)?;
     source.seek(SeekFrom::Start(scan.end))?;
     io::copy(source, &mut file)?;
     file.sync_data()?;

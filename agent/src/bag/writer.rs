@@ -6,8 +6,9 @@
 //! files, is handed out as work for another thread.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, DirBuilder, File};
 use std::io::{self, Write as _};
+use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -151,7 +152,8 @@ impl Writer {
         if let Some(parent) = directory.parent() {
             fs::create_dir_all(parent).map_err(|error| Error::creating(parent, error))?;
         }
-        fs::create_dir(directory).map_err(|error| match error.kind() {
+        let made = DirBuilder::new().mode(0o750).create(directory);
+        made.map_err(|error| match error.kind() {
             std::io::ErrorKind::AlreadyExists => Error::Exists(directory.to_owned()),
             _ => Error::creating(directory, error),
         })?;
@@ -398,6 +400,13 @@ impl Writer {
         current + self.done.iter().map(|file| file.bytes).sum::<u64>()
     }
 
+    /// As [`Self::bytes`], with what waits to be written.
+    #[must_use]
+    pub fn expected_bytes(&self) -> u64 {
+        let current = self.current.as_ref().map_or(0, FileWriter::expected_bytes);
+        current + self.done.iter().map(|file| file.bytes).sum::<u64>()
+    }
+
     /// Files begun so far.
     #[must_use]
     pub fn files(&self) -> usize {
@@ -413,7 +422,9 @@ impl Writer {
         };
         let bytes = self.options.max_file_bytes;
         let duration = self.options.max_file_duration;
+        let index = self.options.max_index_bytes;
         bytes.is_some_and(|limit| current.expected_bytes() >= limit)
+            || index.is_some_and(|limit| current.index_bytes() >= limit)
             || duration.is_some_and(|limit| {
                 u128::from(log_time.0.saturating_sub(start)) > limit.as_nanos()
             })
@@ -636,10 +647,7 @@ impl FileCompression {
         let wrong = |error| Error::writing(&part, error);
         let done = || {
             let source = File::open(&self.path)?;
-            let target = OpenOptions::new()
-                .write(true)
-                .create_new(true)
-                .open(&part)?;
+            let target = super::new_file(&part)?;
             self.compression.compress_file(&source, &target, progress)?;
             target.sync_data()?;
             let bytes = target.metadata()?.len();
@@ -749,10 +757,7 @@ pub(super) fn write_metadata(
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
             _ => {}
         }
-        let mut file = OpenOptions::new()
-            .write(true)
-            .create_new(true)
-            .open(&part)?;
+        let mut file = super::new_file(&part)?;
         file.write_all(metadata.file_text().as_bytes())?;
         if durability == Durability::Power {
             file.sync_data()?;

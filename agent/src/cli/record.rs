@@ -347,6 +347,7 @@ impl Record {
             storage,
             file_compression: bag::options::file_compression(mode, format)?,
             max_file_bytes: bag::options::max_file_bytes(self.max_bag_size)?,
+            max_index_bytes: None,
             max_file_duration: seconds.map(Duration::from_secs),
             custom_data: self.custom_data.iter().cloned().collect::<BTreeMap<_, _>>(),
         })

@@ -158,6 +158,7 @@ impl Replayed {
         // A capture is recorded by `rp bag record`, not by the agent that replays it.
         let recordings = Arc::new(Recordings::new(
             None,
+            crate::config::RecordingLimits::default(),
             caps.bytes,
             Arc::clone(&board),
             Arc::clone(&subscriptions),

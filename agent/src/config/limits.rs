@@ -214,7 +214,7 @@ impl Limit {
                 what: "Bags that the agent writes at once on request",
                 reached: "the next one is refused (409)",
                 told_by: "",
-                bytes: 1 << 20,
+                bytes: 6 << 20,
             },
             Self::ApiClients => Row {
                 key: "api_clients",

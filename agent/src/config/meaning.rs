@@ -17,7 +17,8 @@ use super::shape::{
 use super::watch::{Expectations, Retain, Watch, check_globs, check_pattern};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
-    RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
+    RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice,
+    StateChoice,
 };
 use crate::surface::otlp::endpoint;
 
@@ -169,6 +170,12 @@ impl Reader {
         RecordingSettings {
             directory: state(&shape.directory),
             snapshots,
+            limits: RecordingLimits {
+                max_bytes: shape.max_bytes,
+                max_total_bytes: shape.max_total_bytes,
+                reserve_percent: shape.reserve_percent,
+                reserve_bytes: shape.reserve_bytes,
+            },
         }
     }
 

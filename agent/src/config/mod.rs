@@ -222,6 +222,32 @@ pub struct RecordingSettings {
     pub directory: StateChoice,
     /// The last seconds of topics, kept in memory.
     pub snapshots: Vec<SnapshotSettings>,
+    /// What bags may take of the disk.
+    pub limits: RecordingLimits,
+}
+
+/// What bags may take of the disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct RecordingLimits {
+    /// Bytes of each; `None` = any.
+    pub max_bytes: Option<u64>,
+    /// Bytes of all in the directory; `None` = any.
+    pub max_total_bytes: Option<u64>,
+    /// Of the file system stays free: the larger one of these percent and those bytes.
+    pub reserve_percent: u8,
+    /// Likewise.
+    pub reserve_bytes: u64,
+}
+
+impl Default for RecordingLimits {
+    fn default() -> Self {
+        Self {
+            max_bytes: None,
+            max_total_bytes: None,
+            reserve_percent: 5,
+            reserve_bytes: 512 << 20,
+        }
+    }
 }
 
 impl RecordingSettings {

@@ -217,6 +217,18 @@ impl Default for ApiShape {
 pub(super) struct RecordingsShape {
     /// Where: an absolute path to a directory, `off`, or `auto`: `recordings` in the state directory.
     pub(super) directory: String,
+    /// How large a recording may become, in bytes; it ends there with the reason. Any size when left out.
+    #[schemars(range(min = 65_536))]
+    pub(super) max_bytes: Option<u64>,
+    /// How much all bags in the directory may take, in bytes; recordings end there. Any amount when left out.
+    #[schemars(range(min = 65_536))]
+    pub(super) max_total_bytes: Option<u64>,
+    /// How much of the file system stays free, in percent: recordings end there.
+    #[schemars(range(min = 0, max = 99))]
+    pub(super) reserve_percent: u8,
+    /// Likewise in bytes; the larger one counts.
+    #[schemars(range(min = 0, max = 1_099_511_627_776_u64))]
+    pub(super) reserve_bytes: u64,
     /// Topics of which the last seconds are kept in memory, and written when something happens.
     pub(super) snapshots: Option<Vec<SnapshotShape>>,
 }
@@ -250,8 +262,13 @@ pub(super) struct SnapshotShape {
 
 impl Default for RecordingsShape {
     fn default() -> Self {
+        let limits = super::RecordingLimits::default();
         Self {
             directory: "auto".to_owned(),
+            max_bytes: None,
+            max_total_bytes: None,
+            reserve_percent: limits.reserve_percent,
+            reserve_bytes: limits.reserve_bytes,
             snapshots: None,
         }
     }

@@ -14,6 +14,7 @@ use super::announced::{Announced, SeenTopic, Sight};
 use super::filter::{Asked, Candidate, Filter};
 use super::report::{NO_SUBSCRIBER, OtherDomain, Report};
 use super::ring::Ring;
+use super::room::Room;
 use crate::bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
 };
@@ -61,6 +62,8 @@ pub struct Recorder<'a> {
     paused: bool,
     /// In snapshot mode: samples that wait for being asked for.
     ring: Option<Ring>,
+    /// What it may take of the disk.
+    room: Option<Room>,
     flushed: Timestamp,
     synced: Timestamp,
 }
@@ -137,6 +140,7 @@ impl<'a> Recorder<'a> {
             sampled: BTreeSet::new(),
             paused: false,
             ring: None,
+            room: None,
             flushed: Timestamp(0),
             synced: Timestamp(0),
         }
@@ -147,6 +151,15 @@ impl<'a> Recorder<'a> {
     pub fn waiting_in(self, ring: Ring) -> Self {
         Self {
             ring: Some(ring),
+            ..self
+        }
+    }
+
+    /// Ends with an error when the room is used up.
+    #[must_use]
+    pub fn within(self, room: Room) -> Self {
+        Self {
+            room: Some(room),
             ..self
         }
     }
@@ -319,6 +332,9 @@ impl<'a> Recorder<'a> {
         error: Option<Error>,
         compress: impl FnMut(FileCompression) -> Result<Option<Compressed>, Error>,
     ) -> Ended {
+        if let Some(Error::Limit(limit)) = &error {
+            self.report.limit_reached = Some(limit.clone());
+        }
         let sight = (self.sources.sight)();
         self.note_what_was_sent_before(&sight);
         self.note_what_was_not_observed(sight);
@@ -361,6 +377,9 @@ impl<'a> Recorder<'a> {
             taken.first.insert(sample.writer, sample.sequence_number);
             self.introduce(topic, sample.writer)?;
         }
+        if let Some(room) = &mut self.room {
+            room.take(self.writer.expected_bytes(), payload.len() as u64)?;
+        }
         let sent = sample.source_timestamp.unwrap_or(sample.time);
         self.writer
             .write(id, sample.time, sent, sample.sequence_number, payload)?;
@@ -376,6 +395,11 @@ impl<'a> Recorder<'a> {
             (self.flushed, self.synced) = (now, now);
         }
         let since = |before: Timestamp| now.0.abs_diff(before.0);
+        if since(self.flushed) >= FLUSH
+            && let Some(room) = &self.room
+        {
+            room.check()?;
+        }
         if since(self.synced) >= SYNC {
             (self.flushed, self.synced) = (now, now);
             self.writer.sync()
@@ -707,6 +731,36 @@ mod tests {
             std::fs::read_to_string(metadata)
                 .unwrap()
                 .contains("first_sequence_number")
+        );
+    }
+
+    #[test]
+    fn a_recording_ends_at_its_size_with_the_limit_in_its_report() {
+        let directory = tempfile::tempdir().unwrap();
+        let limits = crate::config::RecordingLimits {
+            max_bytes: Some(10_000),
+            ..Default::default()
+        };
+        let room = Room::new(directory.path(), limits);
+        let mut recorder =
+            recorder(&directory.path().join("bag"), Asked::everything()).within(room);
+        let refused = (1..).find_map(|number| recorder.take(&sample("/a", number)).err());
+        let ended = recorder.finish(refused);
+        let limit = ended.report.limit_reached.clone().unwrap();
+        assert!(limit.contains("recordings.max_bytes"), "{limit}");
+        assert_eq!(ended.report.missing, 0);
+        assert_eq!(numbers(&ended).len() as u64, ended.report.messages);
+        assert!(
+            (50..250).contains(&ended.report.messages),
+            "{:?}",
+            ended.report
+        );
+        assert!(
+            ended
+                .report
+                .shortfalls()
+                .concat()
+                .contains("ended by a limit")
         );
     }
 

@@ -74,6 +74,9 @@ pub struct Report {
     /// Topics that the choice would take, in other domains.
     #[serde(default)]
     pub other_domains: Vec<OtherDomain>,
+    /// Which limit ended it, if one did.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub limit_reached: Option<String>,
 }
 
 /// Writers whose topics are unknown.
@@ -282,6 +285,9 @@ impl Report {
             lines.push(format!(
                 "not recorded: {topics} of domain {domain_id}{messages} (`--domain {domain_id}`)"
             ));
+        }
+        if let Some(limit) = &self.limit_reached {
+            lines.push(format!("ended by a limit: {limit}"));
         }
         lines
     }

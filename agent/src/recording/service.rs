@@ -16,11 +16,12 @@ use super::announced::{Announced, Sight};
 use super::filter::{Asked, Filter, FilterError};
 use super::recorder::{Ended, Recorder, Sources};
 use super::report::Report;
+use super::room::Room;
 use super::session::{self, Going, Order};
 use crate::bag::{self, Options, Schema, Writer};
 use crate::capture::system::give_back_memory;
 use crate::client::Got;
-use crate::config::Limit;
+use crate::config::{Limit, RecordingLimits};
 use crate::message::Library;
 use crate::subscriptions::{
     ChoiceError, Depth, Overflow, Refused, Request, Selection, Subscription, Subscriptions,
@@ -29,6 +30,9 @@ use crate::surface::{AgentEvent, Board, Place, Places};
 
 /// Ended ones whose report is kept.
 const ENDED: usize = 16;
+/// A larger chunk of a bag is not kept in memory, nor a larger index of a file.
+const CHUNK_BYTES: u64 = 1 << 20;
+const INDEX_BYTES: u64 = 1 << 20;
 /// Longest name of a recording.
 const NAME: usize = 128;
 
@@ -37,6 +41,7 @@ const NAME: usize = 128;
 pub struct Recordings {
     /// Where they are written; `None` = nowhere.
     directory: Option<PathBuf>,
+    limits: RecordingLimits,
     queue_bytes: usize,
     board: Arc<Board>,
     subscriptions: Arc<Subscriptions>,
@@ -142,10 +147,12 @@ pub enum Refusal {
 }
 
 impl Recordings {
-    /// None yet. They are written below `directory`, and `queue_bytes` of each may wait for that.
+    /// None yet. They are written below `directory` within `limits`, and `queue_bytes` of each may wait
+    /// for that.
     #[must_use]
     pub fn new(
         directory: Option<PathBuf>,
+        limits: RecordingLimits,
         queue_bytes: usize,
         board: Arc<Board>,
         subscriptions: Arc<Subscriptions>,
@@ -154,6 +161,7 @@ impl Recordings {
         let places = board.limits().places(Limit::Recordings);
         Self {
             directory,
+            limits,
             queue_bytes,
             places,
             board,
@@ -175,12 +183,18 @@ impl Recordings {
             self.board.limits().reached(Limit::Recordings, 1);
             return Err(Refusal::TooMany(self.places.cap()));
         };
+        let room = self.room(&directory);
+        room.check().map_err(|error| refusal(&name, error))?;
         let before = Sight::from(self.board.state().known());
         let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
-        let writer = Writer::create(&directory, wanted.options);
+        let mut options = wanted.options;
+        options.storage.chunk_bytes = options.storage.chunk_bytes.min(CHUNK_BYTES);
+        options.max_index_bytes = Some(INDEX_BYTES);
+        let writer = Writer::create(&directory, options);
         let writer = writer.map_err(|error| refusal(&name, error))?;
         let sources = self.sources(wanted.domain_id);
-        let mut recorder = Recorder::new(writer, filter, wanted.domain_id, before, sources);
+        let mut recorder =
+            Recorder::new(writer, filter, wanted.domain_id, before, sources).within(room);
         recorder.pause(wanted.paused);
         let known = self.board.state();
         let covered = known.known().topics.iter().filter(|topic| {
@@ -273,6 +287,17 @@ impl Recordings {
     #[must_use]
     pub fn directory(&self) -> Option<&Path> {
         self.directory.as_deref()
+    }
+
+    /// What they may take of the disk.
+    #[must_use]
+    pub const fn limits(&self) -> RecordingLimits {
+        self.limits
+    }
+
+    /// The room of a bag that is to lie there.
+    pub(super) fn room(&self, bag: &Path) -> Room {
+        Room::new(bag.parent().unwrap_or(bag), self.limits)
     }
 
     /// Opens what `filter` takes, of one domain.

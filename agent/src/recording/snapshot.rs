@@ -258,6 +258,8 @@ impl Keeper {
                 all_services: true,
                 ..Asked::everything()
             })?;
+            let room = self.recordings.room(&directory);
+            room.check().map_err(|error| refusal(&name, error))?;
             let writer = Writer::create(&directory, Options::default());
             let writer = writer.map_err(|error| refusal(&name, error))?;
             let mut sources = self.recordings.sources(self.settings.domain_id);
@@ -275,7 +277,7 @@ impl Keeper {
                 sight
             });
             let before = Sight::default();
-            let mut recorder = Recorder::new(writer, filter, domain_id, before, sources);
+            let mut recorder = Recorder::new(writer, filter, domain_id, before, sources).within(room);
             let mut failed = None;
             for sample in self.ring.iter() {
                 if let Err(error) = recorder.take(&Item::Sample(Arc::clone(sample))) {

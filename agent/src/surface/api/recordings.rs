@@ -21,6 +21,7 @@ use super::body::Body;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
 use crate::bag::{self, Form, Options, Storage};
+use crate::config::RecordingLimits;
 use crate::config::watch::MAX_DOMAIN;
 use crate::recording::{Asked, Order, Recording, Refusal, Report, Stage, Wanted};
 
@@ -36,6 +37,22 @@ struct RecordingList {
     directory: Option<String>,
     /// Those under way, and the last ones that ended.
     recordings: Vec<RecordingView>,
+    /// What they may take of the disk.
+    limits: RecordingLimitsView,
+}
+
+/// What recordings may take of the disk; one ends in order where it meets a limit.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = RecordingLimits)]
+struct RecordingLimitsView {
+    /// Bytes of each; null = any.
+    max_bytes: Option<u64>,
+    /// Bytes of all bags in the directory; null = any.
+    max_total_bytes: Option<u64>,
+    /// Of the file system stays free: the larger one of these percent and those bytes.
+    reserve_percent: u8,
+    /// Likewise.
+    reserve_bytes: u64,
 }
 
 /// One recording.
@@ -119,6 +136,7 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     Json(RecordingList {
         directory: directory.map(|directory| directory.display().to_string()),
         recordings: recordings.iter().map(|each| view(each)).collect(),
+        limits: context.recordings.limits().into(),
     })
 }
 
@@ -337,6 +355,23 @@ fn problem(refusal: &Refusal) -> Problem {
         Refusal::Storage { .. } => Code::StorageRefuses,
     };
     Problem::new(code, refusal.to_string())
+}
+
+impl From<RecordingLimits> for RecordingLimitsView {
+    fn from(limits: RecordingLimits) -> Self {
+        let RecordingLimits {
+            max_bytes,
+            max_total_bytes,
+            reserve_percent,
+            reserve_bytes,
+        } = limits;
+        Self {
+            max_bytes,
+            max_total_bytes,
+            reserve_percent,
+            reserve_bytes,
+        }
+    }
 }
 
 fn view(recording: &Recording) -> RecordingView {
