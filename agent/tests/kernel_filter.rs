@@ -541,11 +541,7 @@ fn fragmented(
 }
 
 /// Shows fragments to the kernel in `order`, and gives all records found and the fragments kept.
-fn show(
-    kernel: &mut Kernel,
-    fragments: &[Vec<u8>],
-    order: &[usize],
-) -> (Vec<Record>, Vec<usize>) {
+fn show(kernel: &mut Kernel, fragments: &[Vec<u8>], order: &[usize]) -> (Vec<Record>, Vec<usize>) {
     let (mut records, mut kept) = (Vec::new(), Vec::new());
     for index in order {
         let seen = kernel.frame(&fragments[*index]);
@@ -590,7 +586,10 @@ fn two_fragments_that_begin_within_512_bytes_of_each_other_both_count() {
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
     let payload = program_run::message(writer, 1..=9, 472);
     let numbers = |records: &[Record]| -> Vec<u64> {
-        records.iter().map(|record| record.sequence_number).collect()
+        records
+            .iter()
+            .map(|record| record.sequence_number)
+            .collect()
     };
     let all: Vec<u64> = (1..=9).collect();
     for ipv6 in [false, true] {
@@ -781,4 +780,48 @@ fn a_sender_that_moves_to_another_cpu_leaves_no_fragments_behind() {
         .collect();
     assert_eq!(runs, [(1, 7), (8, 7), (15, 6)]);
     assert!(kernel.take_stalled().is_empty());
+}
+
+#[test]
+fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let object = root.join("agent-ebpf");
+    let list = std::fs::read_to_string(object.join("filter.bpf.sha256")).unwrap();
+    let listed: BTreeSet<_> = list
+        .lines()
+        .filter_map(|line| Some(line.split_once("  ")?.1))
+        .collect();
+    for entry in std::fs::read_dir(object.join("src")).unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        assert!(listed.contains(&*format!("src/{name}")), "{name}");
+    }
+    // Files that a list kept by hand left out for long.
+    for name in ["frame.rs", "parameters.rs", "rtps/submessage.rs"] {
+        assert!(listed.contains(&*format!("../wire/src/{name}")), "{name}");
+    }
+    let place = tempfile::tempdir().unwrap();
+    for name in listed.iter().copied().chain(["filter.bpf.sha256"]) {
+        let copy = place.path().join("agent-ebpf").join(name);
+        let parts: PathBuf = copy.components().fold(PathBuf::new(), |path, part| {
+            if part == std::path::Component::ParentDir {
+                return path.parent().unwrap().to_path_buf();
+            }
+            path.join(part)
+        });
+        std::fs::create_dir_all(parts.parent().unwrap()).unwrap();
+        std::fs::copy(object.join(name), parts).unwrap();
+    }
+    let copied = place.path().join("agent-ebpf");
+    let run = |program: &str, arguments: &str| {
+        let mut command = std::process::Command::new(program);
+        let command = command.args(["-c", arguments]).current_dir(&copied);
+        command.output().unwrap().status.success()
+    };
+    // As it would be just after it was built.
+    let sums = "{ head -n 1 filter.bpf.sha256; sed 1d filter.bpf.sha256 | cut -c67- | xargs sha256sum; } \
+                > new && mv new filter.bpf.sha256";
+    assert!(run("bash", sums));
+    assert!(run("bash", "./build.sh --stale"));
+    std::fs::write(place.path().join("wire/src/frame.rs"), "// changed").unwrap();
+    assert!(!run("bash", "./build.sh --stale"));
 }
