@@ -7,7 +7,6 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow};
-use ros2probe::capture::system::{give_back_program, part_program};
 use ros2probe::config::{Config, ConfigError};
 use ros2probe::privilege::{self, Powerless, Role, SpawnError};
 use ros2probe::run::{Run, RunError};
@@ -30,9 +29,6 @@ use crate::logging::Log;
 /// How often readiness is looked at until the agent is ready, and the watchdog from then on.
 const STARTING_TICK: Duration = Duration::from_millis(100);
 const TICK: Duration = Duration::from_secs(2);
-/// How often the program's pages are let go of. What is needed again within that time is a few hundred,
-/// and having them again takes the kernel a millisecond.
-const GIVE_BACK: Duration = Duration::from_secs(10);
 /// For answers that have begun and the working thread's last round.
 const DRAIN: Duration = Duration::from_secs(3);
 
@@ -344,8 +340,6 @@ struct Watchdog {
     period: Option<Duration>,
     fed: Option<Instant>,
     ready: bool,
-    /// When the program's pages were let go of.
-    given_back: Instant,
     sight: Sight,
 }
 
@@ -357,7 +351,6 @@ impl Watchdog {
             period,
             fed: None,
             ready: false,
-            given_back: Instant::now(),
             sight: Sight::default(),
         }
     }
@@ -377,12 +370,7 @@ impl Watchdog {
         if first {
             self.ready = true;
             tracing::info!("ready");
-            part_program();
             let _ = sd_notify::notify(&[NotifyState::Ready]);
-        }
-        if first || now.saturating_duration_since(self.given_back) >= GIVE_BACK {
-            self.given_back = now;
-            give_back_program();
         }
         let Some(period) = self.period else {
             return first;

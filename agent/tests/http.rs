@@ -14,6 +14,25 @@ const PROMETHEUS_ACCEPTS: &str = "Accept: application/openmetrics-text;version=1
     application/openmetrics-text;version=0.0.1;q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1\r\n";
 
 #[test]
+fn the_program_is_mapped_as_it_was_loaded_and_its_memory_is_told() {
+    let mut agent = LocalAgent::start(&["--speed", "max"]);
+    agent.wait_for_log("ready");
+    let page = agent.get("/metrics").body;
+    let pid = agent.id();
+    let program = std::fs::read_link(format!("/proc/{pid}/exe")).unwrap();
+    let maps = std::fs::read_to_string(format!("/proc/{pid}/maps")).unwrap();
+    let of_program = maps
+        .lines()
+        .filter(|line| line.ends_with(program.to_str().unwrap()));
+    // One for each segment of the file.
+    let mappings = of_program.count();
+    assert!((2..10).contains(&mappings), "{mappings}");
+    let own = metric(&page, "process_unreclaimable_memory_bytes").unwrap();
+    let resident = metric(&page, "process_resident_memory_bytes").unwrap();
+    assert!((1e6..resident).contains(&own), "{own} of {resident}");
+}
+
+#[test]
 fn each_page_answers_as_it_should() {
     let mut agent = LocalAgent::start(&["--speed", "max"]);
     agent.wait_for_log("ready");

@@ -171,7 +171,7 @@ fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>
         let page = agent.scrape()?;
         well_formed(&page);
         oldest = oldest.max(page.sum("ros2probe_snapshot_age_seconds", &[]));
-        largest = largest.max(Usage::of(agent.process.pid())?.pss);
+        largest = largest.max(Usage::of(agent.process.pid())?.memory.unreclaimable);
         std::thread::sleep(Duration::from_millis(300));
     }
     publisher.wait_sent(Duration::from_secs(60))?;
@@ -179,9 +179,9 @@ fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>
     let sent = storm.end()?;
     let ended = Instant::now();
     let page = agent.settled_scrape("/real", stream.count)?;
-    largest = largest.max(Usage::of(agent.process.pid())?.pss);
+    largest = largest.max(Usage::of(agent.process.pid())?.memory.unreclaimable);
     well_formed(&page);
-    let growth = largest.saturating_sub(before.pss);
+    let growth = largest.saturating_sub(before.memory.unreclaimable);
     eprintln!(
         "{sent} datagrams forged, {cpu:?} of CPU, {} KiB more memory, oldest page {oldest} s, {} frames \
          and {} records dropped",

@@ -162,9 +162,9 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     let mut spent = Usage::of(echo.child.id())?;
     let before = (shown(), Instant::now(), spent);
     wait_until("a hundred clouds are shown", || {
-        of_agent = of_agent.max(Usage::of(agent.process.pid())?.pss);
+        of_agent = of_agent.max(Usage::of(agent.process.pid())?.memory.unreclaimable);
         spent = Usage::of(echo.child.id())?;
-        of_client = of_client.max(spent.pss);
+        of_client = of_client.max(spent.memory.unreclaimable);
         Ok(shown() >= 100)
     })?;
     eprintln!(

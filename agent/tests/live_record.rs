@@ -144,7 +144,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         publisher.go()?;
     }
     let page = settled(&robot, &pairs, 2)?;
-    let memory = Usage::of(robot.agent.process.pid())?.pss;
+    let memory = Usage::of(robot.agent.process.pid())?.memory.unreclaimable;
     let queued = page.sum("ros2probe_queued_bytes", &[]);
     eprintln!("agent {} MB with {queued} bytes queued", memory >> 20);
     ensure!(memory < 160 << 20, "{memory} bytes");

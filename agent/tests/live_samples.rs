@@ -572,9 +572,9 @@ fn what_a_stream_of_point_clouds_costs() -> Result<()> {
         let label = [("topic", "/points")];
         let page = observed.agent.settled_scrape("/points", stream.count)?;
         println!(
-            "{stack:?} 2.72 MB @ {rate} Hz: agent {:.2} s CPU in {WINDOW:?}, PSS {:.1} MB, counted {} of {}, {}",
+            "{stack:?} 2.72 MB @ {rate} Hz: agent {:.2} s CPU in {WINDOW:?}, {:.1} MB unreclaimable, counted {} of {}, {}",
             used.cpu.as_secs_f64(),
-            used.pss as f64 / 1e6,
+            used.memory.unreclaimable as f64 / 1e6,
             page.sum("ros2_topic_messages_total", &label),
             stream.count,
             page.doubts(),

@@ -32,7 +32,7 @@ struct Step {
     what: &'static str,
     entries: u32,
     /// Of the agent, with this many and all before them.
-    pss: u64,
+    unreclaimable: u64,
 }
 
 /// Fills the tables of an agent on the wire and prints what it takes.
@@ -51,7 +51,7 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
         .collect();
     let settled = || -> Result<u64> {
         std::thread::sleep(Duration::from_secs(2));
-        Ok(Usage::of(agent.process.pid())?.pss)
+        Ok(Usage::of(agent.process.pid())?.memory.unreclaimable)
     };
     let mut send = |messages: &mut dyn Iterator<Item = Vec<u8>>| -> Result<()> {
         for (number, message) in messages.enumerate() {
@@ -66,13 +66,13 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
     let mut steps = vec![Step {
         what: "nothing",
         entries: 1,
-        pss: settled()?,
+        unreclaimable: settled()?,
     }];
     send(&mut talkers.iter().map(Talker::participant))?;
     steps.push(Step {
         what: "participants",
         entries: PARTICIPANTS,
-        pss: settled()?,
+        unreclaimable: settled()?,
     });
     let numbered: Vec<_> = talkers.iter().zip(0..).collect();
     for group in numbered.chunks(GROUP) {
@@ -82,7 +82,7 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
     steps.push(Step {
         what: "endpoints, and 1000 topics of theirs",
         entries: PARTICIPANTS * (READERS + 2),
-        pss: settled()?,
+        unreclaimable: settled()?,
     });
     for round in 0..ROUNDS {
         // What they send keeps them alive, but says nothing of their leases.
@@ -94,31 +94,45 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
     steps.push(Step {
         what: "measured topics with messages",
         entries: PARTICIPANTS,
-        pss: settled()?,
+        unreclaimable: settled()?,
     });
     let page = scraped(&agent)?;
-    println!("| entries | how many | PSS MB | bytes each |\n| --- | ---: | ---: | ---: |");
+    println!(
+        "| entries | how many | MB unreclaimable | bytes each |\n| --- | ---: | ---: | ---: |"
+    );
     let mut before = None;
-    for Step { what, entries, pss } in steps {
+    for Step {
+        what,
+        entries,
+        unreclaimable,
+    } in steps
+    {
         let each = before.map_or_else(
             || "-".to_owned(),
-            |before| (pss.saturating_sub(before) / u64::from(entries)).to_string(),
+            |before| (unreclaimable.saturating_sub(before) / u64::from(entries)).to_string(),
         );
-        println!("| {what} | {entries} | {:.1} | {each} |", pss as f64 / 1e6);
-        before = Some(pss);
+        println!(
+            "| {what} | {entries} | {:.1} | {each} |",
+            unreclaimable as f64 / 1e6
+        );
+        before = Some(unreclaimable);
     }
-    let Scraped { pss, bytes, known } = page;
+    let Scraped {
+        unreclaimable,
+        bytes,
+        known,
+    } = page;
     println!(
         "\nthe most while it answers a scrape of {:.1} MB: {:.1} MB; known: {known}\n",
         bytes as f64 / 1e6,
-        pss as f64 / 1e6,
+        unreclaimable as f64 / 1e6,
     );
     Ok(())
 }
 
 /// The most memory in the course of a scrape, and what the page told.
 struct Scraped {
-    pss: u64,
+    unreclaimable: u64,
     bytes: usize,
     known: String,
 }
@@ -127,9 +141,9 @@ fn scraped(agent: &Agent<'_>) -> Result<Scraped> {
     let (pid, host) = (agent.process.pid(), agent.host);
     std::thread::scope(|scope| {
         let scraping = scope.spawn(move || get(host, &format!("{METRICS}/metrics")));
-        let (mut pss, began) = (0, Instant::now());
+        let (mut unreclaimable, began) = (0, Instant::now());
         while !scraping.is_finished() && began.elapsed() < Duration::from_secs(60) {
-            pss = Usage::of(pid)?.pss.max(pss);
+            unreclaimable = Usage::of(pid)?.memory.unreclaimable.max(unreclaimable);
         }
         let page = scraping.join();
         let page = page.map_err(|_| anyhow::anyhow!("the thread that scrapes panicked"))??;
@@ -139,7 +153,7 @@ fn scraped(agent: &Agent<'_>) -> Result<Scraped> {
             format!("{limit} {used}")
         });
         Ok(Scraped {
-            pss,
+            unreclaimable,
             bytes: page.0.len(),
             known: known.join(", "),
         })

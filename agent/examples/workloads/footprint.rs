@@ -1,6 +1,7 @@
 //! How small the shipped agent is: its file, how soon it is there, and its memory while there is
 //! nothing to see and nobody asks, and while it measures 200 topics with a scrape every 5 s, with the
-//! default configuration. Memory does not depend on how busy the machine is: too much of it fails.
+//! default configuration. What counts is memory that cannot be reclaimed; it does not depend on how
+//! busy the machine is: too much of it fails.
 
 use std::fmt;
 use std::fs;
@@ -18,7 +19,7 @@ use crate::harness::agent::{Agent, METRICS, get};
 use crate::harness::network::{Link, Namespace};
 use crate::harness::peer::robot;
 use crate::harness::process::Process;
-use crate::harness::usage::Usage;
+use crate::harness::usage::Memory;
 use crate::report::Miss;
 
 /// The configuration as it is shipped.
@@ -34,7 +35,8 @@ const SETTLED: Duration = Duration::from_secs(10);
 const STARTS: usize = 5;
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What the agent may take while there is nothing to see, and while it measures [`TOPICS`].
+/// What the agent may take that cannot be reclaimed, while there is nothing to see, and while it
+/// measures [`TOPICS`].
 const IDLE: u64 = 8_000_000;
 const BUSY: u64 = 16_000_000;
 
@@ -65,19 +67,6 @@ struct Start {
     scrape: Duration,
 }
 
-/// Proportional set size by what it is for, at the moment at which there was most.
-#[derive(Clone, Copy, Default)]
-struct Memory {
-    /// Pages of the program's file, as they are there.
-    program: u64,
-    /// Pages of the program that its start or its run changed.
-    data: u64,
-    /// Shared with the kernel.
-    rings: u64,
-    /// Heap and stacks.
-    heap: u64,
-}
-
 /// A process that ends with its value.
 struct Killed(Child);
 
@@ -97,9 +86,12 @@ impl Footprint {
                 ("idle", &source.idle, IDLE),
                 ("with 200 topics", &source.busy, BUSY),
             ] {
-                if memory.sum() >= most {
+                if memory.unreclaimable >= most {
                     let megabytes = most / 1_000_000;
-                    let what = format!("{}: PSS {what} is not below {megabytes} MB", source.name);
+                    let what = format!(
+                        "{}: what cannot be reclaimed is not below {megabytes} MB {what}",
+                        source.name
+                    );
                     missed.push(Miss::failing(what));
                 }
             }
@@ -122,7 +114,7 @@ impl OfSource {
 
         let agent = Agent::start(&link.robot, program, &configuration)?;
         std::thread::sleep(SETTLED);
-        let idle = Memory::most_during(length, &agent, false)?;
+        let idle = most_during(length, &agent, false)?;
         let _crowd = crowd(&link)?;
         let counted = |agent: &Agent<'_>| -> Result<usize> {
             let page = agent.scrape()?;
@@ -133,7 +125,7 @@ impl OfSource {
         while counted(&agent)? < TOPICS && Instant::now() < deadline {
             std::thread::sleep(Duration::from_secs(1));
         }
-        let busy = Memory::most_during(length, &agent, true)?;
+        let busy = most_during(length, &agent, true)?;
         Ok(OfSource {
             name,
             start,
@@ -204,70 +196,31 @@ impl Start {
     }
 }
 
-impl Memory {
-    /// Of the agent, `scraped` meanwhile or left alone.
-    fn most_during(length: Duration, agent: &Agent<'_>, scraped: bool) -> Result<Memory> {
-        let began = Instant::now();
-        let host = agent.host;
-        std::thread::scope(|scope| {
-            let scraping = scope.spawn(move || -> Result<()> {
-                while scraped && began.elapsed() < length {
-                    get(host, &format!("{METRICS}/metrics"))?;
-                    std::thread::sleep(SCRAPES.min(length.saturating_sub(began.elapsed())));
-                }
-                Ok(())
-            });
-            let pid = agent.process.pid();
-            let (mut most, mut pss) = (Memory::default(), 0);
-            while began.elapsed() < length || !scraping.is_finished() {
-                let now = Usage::of(pid)?.pss;
-                if now > pss {
-                    (most, pss) = (Memory::of(pid)?, now);
-                    // It may have shrunk between the two looks; the sum is what was seen.
-                    most.heap += pss.saturating_sub(most.sum());
-                }
-                std::thread::sleep(SAMPLING);
+/// The agent's at the moment at which there was most of it, `scraped` meanwhile or left alone.
+fn most_during(length: Duration, agent: &Agent<'_>, scraped: bool) -> Result<Memory> {
+    let began = Instant::now();
+    let host = agent.host;
+    std::thread::scope(|scope| {
+        let scraping = scope.spawn(move || -> Result<()> {
+            while scraped && began.elapsed() < length {
+                get(host, &format!("{METRICS}/metrics"))?;
+                std::thread::sleep(SCRAPES.min(length.saturating_sub(began.elapsed())));
             }
-            let scraped = scraping.join();
-            scraped.map_err(|_| anyhow::anyhow!("the thread that scrapes panicked"))??;
-            Ok(most)
-        })
-    }
-
-    fn of(pid: u32) -> Result<Memory> {
-        let program = fs::read_link(format!("/proc/{pid}/exe"))?;
-        let program = program.display().to_string();
-        let maps = fs::read_to_string(format!("/proc/{pid}/smaps"))?;
-        let mut memory = Memory::default();
-        let (mut name, mut pss) = (String::new(), 0);
-        for line in maps.lines() {
-            let words: Vec<_> = line.split_whitespace().collect();
-            let bytes = words.get(1).and_then(|word| word.parse::<u64>().ok());
-            match (words.first().copied().unwrap_or_default(), bytes) {
-                ("Pss:", Some(kilobytes)) => pss = kilobytes * 1024,
-                ("Anonymous:", Some(kilobytes)) => {
-                    let changed = (kilobytes * 1024).min(pss);
-                    if name.starts_with("anon_inode:bpf") || name.starts_with("socket:") {
-                        memory.rings += pss;
-                    } else if name == program || name.contains(".so") {
-                        memory.data += changed;
-                        memory.program += pss - changed;
-                    } else {
-                        memory.heap += pss;
-                    }
-                }
-                (first, _) if first.contains('-') => {
-                    name = words.get(5).copied().unwrap_or_default().to_owned();
-                }
-                _ => {}
+            Ok(())
+        });
+        let pid = agent.process.pid();
+        let mut most = Memory::default();
+        while began.elapsed() < length || !scraping.is_finished() {
+            let now = Memory::of(pid)?;
+            if now.unreclaimable > most.unreclaimable {
+                most = now;
             }
+            std::thread::sleep(SAMPLING);
         }
-        Ok(memory)
-    }
-
-    const fn sum(&self) -> u64 {
-        self.program + self.data + self.rings + self.heap
-    }
+        let scraped = scraping.join();
+        scraped.map_err(|_| anyhow::anyhow!("the thread that scrapes panicked"))??;
+        Ok(most)
+    })
 }
 
 impl fmt::Display for Footprint {
@@ -278,41 +231,40 @@ impl fmt::Display for Footprint {
         }
         writeln!(
             formatter,
-            "\n| source | ready, first scrape after ms | state | PSS MB | program | its data | rings | heap and stacks |"
+            "\n| source | ready, first scrape after ms | state | MB unreclaimable | of these: rings | changed program | heap and stacks | RSS | PSS |"
         )?;
         writeln!(
             formatter,
-            "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: |"
+            "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |"
         )?;
         for source in &self.sources {
             let Start { ready, scrape } = source.start;
             let busy = format!("{} topics", source.topics);
             for (state, memory) in [("idle", &source.idle), (&*busy, &source.busy)] {
-                writeln!(
+                let Memory { rings, program, .. } = *memory;
+                let heap = memory.unreclaimable.saturating_sub(rings + program);
+                write!(
                     formatter,
-                    "| {} | {}, {} | {state} | {memory} |",
+                    "| {} | {}, {} | {state} |",
                     source.name,
                     ready.as_millis(),
                     scrape.as_millis(),
                 )?;
+                let all = [
+                    memory.unreclaimable,
+                    rings,
+                    program,
+                    heap,
+                    memory.rss,
+                    memory.pss,
+                ];
+                for bytes in all {
+                    write!(formatter, " {:.2} |", bytes as f64 / 1e6)?;
+                }
+                writeln!(formatter)?;
             }
         }
         Ok(())
-    }
-}
-
-impl fmt::Display for Memory {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let megabytes = |bytes: u64| bytes as f64 / 1e6;
-        write!(
-            formatter,
-            "{:.2} | {:.2} | {:.2} | {:.2} | {:.2}",
-            megabytes(self.sum()),
-            megabytes(self.program),
-            megabytes(self.data),
-            megabytes(self.rings),
-            megabytes(self.heap),
-        )
     }
 }
 

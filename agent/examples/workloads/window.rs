@@ -9,7 +9,7 @@ use crate::harness::agent::{Agent, Scrape};
 use crate::harness::network::{INTERFACE, Link, Namespace};
 use crate::harness::peer::{Peer, Role, Stack, Stream};
 use crate::harness::run;
-use crate::harness::usage::{Usage, machine_idle, softirq_cpu};
+use crate::harness::usage::{Memory, Usage, machine_idle, softirq_cpu};
 
 /// Time for discovery to settle and caches to fill before the window opens.
 const WARM_UP: Duration = Duration::from_secs(3);
@@ -39,7 +39,7 @@ pub(crate) struct Window {
     /// CPU seconds of the observer, per 20 s.
     pub(crate) cpu: f64,
     /// The most memory of the observer seen in the window.
-    pub(crate) pss: u64,
+    pub(crate) memory: Memory,
     /// Samples written, from the publishers' first to their last.
     pub(crate) sent: u64,
     /// What the agent says at the end.
@@ -147,7 +147,7 @@ impl Window {
             machine: spent.machine,
             workload: spent.workload,
             cpu: spent.cpu,
-            pss: spent.pss,
+            memory: spent.memory,
             sent,
             told: scrape.map(|scrape| Told::of(&scrape, streams, traffic)),
         })
@@ -175,15 +175,16 @@ struct Spent {
     machine: f64,
     workload: f64,
     cpu: f64,
-    pss: u64,
+    memory: Memory,
 }
 
 impl Spent {
     fn during(length: Duration, watching: &[u32], parts: &[u32]) -> Result<Spent> {
         let look = || {
-            watching.iter().try_fold((Duration::ZERO, 0), |sum, pid| {
+            let nothing = (Duration::ZERO, Memory::default());
+            watching.iter().try_fold(nothing, |sum, pid| {
                 let usage = Usage::of(*pid)?;
-                anyhow::Ok((sum.0 + usage.cpu, sum.1 + usage.pss))
+                anyhow::Ok((sum.0 + usage.cpu, sum.1.plus(usage.memory)))
             })
         };
         let rest = || {
@@ -195,11 +196,11 @@ impl Spent {
         let (rest_before, first) = (rest()?, look()?);
         let (idle, began) = (machine_idle()?, Instant::now());
         let mut last = first;
-        let mut pss = 0;
+        let mut memory = Memory::default();
         while let Some(left) = length.checked_sub(began.elapsed()) {
             std::thread::sleep(left.min(SAMPLING));
             last = look()?;
-            pss = last.1.max(pss);
+            memory = last.1.max(memory);
         }
         let elapsed = began.elapsed().as_secs_f64();
         let unit = UNIT_SECONDS / elapsed;
@@ -210,7 +211,7 @@ impl Spent {
             machine: (elapsed * cpus.get() as f64 - idle).max(0.0) * unit,
             workload: (rest + cpu).as_secs_f64() * unit,
             cpu: cpu.as_secs_f64() * unit,
-            pss,
+            memory,
         })
     }
 }

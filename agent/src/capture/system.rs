@@ -1,13 +1,12 @@
 //! The system calls that live capture needs beside its sockets: waiting, the clocks, free memory.
 
-use std::ffi::{CString, c_void};
+use std::ffi::CString;
 use std::fs::File;
 use std::io::{self, Read as _};
 use std::os::fd::{AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 use std::os::unix::ffi::OsStrExt as _;
 use std::path::Path;
 use std::ptr;
-use std::slice;
 use std::time::Duration;
 
 use libc::c_int;
@@ -166,80 +165,6 @@ pub fn give_back_memory() {
     }
 }
 
-/// Lets go of the program's own pages in memory, most of which are needed now and then: at the start, for
-/// a newcomer, for a command. What runs on is mapped again as it is used, from the page cache. (A
-/// debugger's breakpoints are lost by this.)
-pub fn give_back_program() {
-    for_constant_segments(|start, end| advise(start, end, libc::MADV_DONTNEED));
-}
-
-/// Makes each of the program's pages a mapping of its own, which costs the kernel 192 bytes: it maps 64 KiB
-/// around a fault, or what is cached in one piece up to 2 MiB, but nothing beyond a mapping's end.
-pub fn part_program() {
-    let page = u64::from(page_size());
-    for_constant_segments(|start, end| {
-        // Every other page is left out of core dumps, as all are by default, to part their mappings.
-        let mut at = start;
-        while at < end {
-            advise(at, at + page, libc::MADV_DONTDUMP);
-            at += 2 * page;
-        }
-    });
-}
-
-/// Whole pages of the program that nothing writes to, from one address to another.
-fn for_constant_segments(mut work: impl FnMut(u64, u64)) {
-    let mut work: &mut dyn FnMut(u64, u64) = &mut work;
-    let data = (&raw mut work).cast();
-    // SAFETY: the function takes this as its data, and is called on this thread until this returns.
-    unsafe { libc::dl_iterate_phdr(Some(constant_segments), data) };
-}
-
-/// Called with what is loaded, first the program. Ends after that.
-unsafe extern "C" fn constant_segments(
-    info: *mut libc::dl_phdr_info,
-    _size: libc::size_t,
-    work: *mut c_void,
-) -> c_int {
-    // SAFETY: [`for_constant_segments`] hands this over, and waits.
-    let work = unsafe { &mut *work.cast::<&mut dyn FnMut(u64, u64)>() };
-    // SAFETY: the caller, the C library, hands over what describes one loaded object.
-    let info = unsafe { &*info };
-    // SAFETY: it says where that object's program headers are, and how many.
-    let headers = unsafe { slice::from_raw_parts(info.dlpi_phdr, info.dlpi_phnum.into()) };
-    let page = u64::from(page_size());
-    // What can be written has been changed by the start, and would come back as it was before.
-    let constant = headers
-        .iter()
-        .filter(|header| header.p_type == libc::PT_LOAD && header.p_flags & libc::PF_W == 0);
-    for header in constant {
-        // Whole pages only: the others may belong to what can be written, too.
-        let start = (info.dlpi_addr + header.p_vaddr).next_multiple_of(page);
-        let end = (info.dlpi_addr + header.p_vaddr + header.p_memsz) / page * page;
-        work(start, end);
-    }
-    1
-}
-
-/// Of pages of the program's file that cannot be written.
-fn advise(start: u64, end: u64, advice: c_int) {
-    let (Ok(address), Ok(length)) = (
-        usize::try_from(start),
-        usize::try_from(end.saturating_sub(start)),
-    ) else {
-        return;
-    };
-    let address = ptr::with_exposed_provenance_mut(address);
-    // SAFETY: nobody can have changed these pages: with the next access they are what they were.
-    unsafe { libc::madvise(address, length, advice) };
-}
-
-fn page_size() -> u32 {
-    // SAFETY: sysconf has no preconditions.
-    let size = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
-    u32::try_from(size).unwrap_or(65_536)
-}
-
 /// What comes has waited no longer than this, unless this process was held up.
 const RECENT_NANOSECONDS: i64 = 1_000_000_000;
 
@@ -360,16 +285,6 @@ mod tests {
 
     use super::*;
 
-    /// Bytes of files that are mapped and in memory, as the kernel counts them.
-    fn of_files() -> u64 {
-        let status = std::fs::read_to_string("/proc/self/status").unwrap();
-        let line = status
-            .lines()
-            .find_map(|line| line.strip_prefix("RssFile:"));
-        let kilobytes = line.unwrap().trim().trim_end_matches(" kB");
-        kilobytes.parse::<u64>().unwrap() * 1024
-    }
-
     #[test]
     fn waiting_ends_with_the_time_and_with_data() {
         let (mut one, two) = UnixStream::pair().unwrap();
@@ -382,36 +297,6 @@ mod tests {
         let waited = wait(&descriptors, Duration::from_secs(60)).unwrap();
         assert_eq!(waited, Some(1));
         assert!(start.elapsed() < Duration::from_secs(30));
-    }
-
-    #[test]
-    fn the_program_is_let_go_of_comes_back_page_by_page_and_goes_on() {
-        let resident = || {
-            let maps = std::fs::read_to_string("/proc/self/smaps").unwrap();
-            let own = std::env::current_exe().unwrap().display().to_string();
-            let mut of_program = false;
-            let mut kilobytes = 0_u64;
-            for line in maps.lines() {
-                if let Some(rest) = line.strip_prefix("Rss:").filter(|_| of_program) {
-                    kilobytes += rest.trim_end_matches("kB").trim().parse::<u64>().unwrap();
-                } else if line.contains('-') && line.contains('/') {
-                    of_program = line.contains(" r-xp ") && line.ends_with(&own);
-                }
-            }
-            kilobytes
-        };
-        // As the agent does: what is cached in one piece comes back in one piece otherwise.
-        part_program();
-        let before = (resident(), of_files());
-        give_back_program();
-        let after = (resident(), of_files());
-        assert!(
-            after.0 < before.0,
-            "{} kB were there before, {} after",
-            before.0,
-            after.0
-        );
-        assert!(after.1 + 1_000_000 < before.1, "{before:?} {after:?}");
     }
 
     #[test]

@@ -307,6 +307,7 @@ pub(super) fn process(page: &mut Page<'_>) -> fmt::Result {
     let Process {
         cpu_seconds,
         resident_bytes,
+        unreclaimable_bytes,
         virtual_bytes,
         open_fds,
         max_fds,
@@ -315,6 +316,7 @@ pub(super) fn process(page: &mut Page<'_>) -> fmt::Result {
     for (metric, value) in [
         (&metric::PROCESS_CPU, cpu_seconds),
         (&metric::PROCESS_RESIDENT, resident_bytes),
+        (&metric::PROCESS_UNRECLAIMABLE, unreclaimable_bytes),
         (&metric::PROCESS_VIRTUAL, virtual_bytes),
         (&metric::PROCESS_OPEN_FDS, open_fds),
         (&metric::PROCESS_MAX_FDS, max_fds),

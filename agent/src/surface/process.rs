@@ -8,6 +8,7 @@ use std::fs;
 pub(super) struct Process {
     pub(super) cpu_seconds: Option<f64>,
     pub(super) resident_bytes: Option<f64>,
+    pub(super) unreclaimable_bytes: Option<f64>,
     pub(super) virtual_bytes: Option<f64>,
     pub(super) open_fds: Option<f64>,
     pub(super) max_fds: Option<f64>,
@@ -30,6 +31,7 @@ impl Process {
                 .zip(field(15))
                 .map(|(user, system)| (user + system) / ticks),
             resident_bytes: field(24).map(|pages| pages * page_bytes()),
+            unreclaimable_bytes: unreclaimable_bytes(),
             virtual_bytes: field(23),
             #[expect(clippy::cast_precision_loss, reason = "far below 2^53")]
             open_fds: fs::read_dir("/proc/self/fd")
@@ -41,6 +43,34 @@ impl Process {
                 .map(|(start, boot)| boot + start / ticks),
         }
     }
+}
+
+/// What the kernel cannot have back while the process runs: its own pages (anonymous, changed, swapped)
+/// and the rings that it shares with the kernel, whose pages look like those of files.
+fn unreclaimable_bytes() -> Option<f64> {
+    let maps = fs::read_to_string("/proc/self/smaps").ok()?;
+    let mut bytes = 0.0;
+    let mut is_ring = false;
+    for line in maps.lines() {
+        let mut words = line.split_ascii_whitespace();
+        let key = words.next().unwrap_or_default();
+        let counts = match key {
+            // They are mapped twice, one behind the other: RSS counts them twice.
+            "Pss:" => is_ring,
+            "Anonymous:" | "Swap:" => !is_ring,
+            address if address.contains('-') => {
+                let name = words.nth(4).unwrap_or_default();
+                is_ring = name.starts_with("anon_inode:bpf") || name.starts_with("socket:");
+                false
+            }
+            _ => false,
+        };
+        if counts {
+            let kilobytes = words.next().and_then(|word| word.parse::<f64>().ok());
+            bytes += kilobytes? * 1024.0;
+        }
+    }
+    Some(bytes)
 }
 
 fn boot_time() -> Option<f64> {
@@ -90,6 +120,8 @@ mod tests {
         let process = Process::read();
         assert!(process.resident_bytes.unwrap() > 100_000.0);
         assert!(process.virtual_bytes >= process.resident_bytes);
+        let own = process.unreclaimable_bytes.unwrap();
+        assert!(own > 10_000.0 && Some(own) < process.virtual_bytes, "{own}");
         assert!(process.open_fds.unwrap() >= 3.0 && process.open_fds <= process.max_fds);
         let now = std::time::SystemTime::UNIX_EPOCH
             .elapsed()

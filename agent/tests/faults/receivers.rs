@@ -109,10 +109,10 @@ fn receivers_and_scrapers_that_misbehave_cost_counters_and_no_message() -> Resul
     let mut most = 0;
     for _ in 0..rounds {
         counted.talk(320, 200)?;
-        most = most.max(Usage::of(scene.pid())?.pss);
+        most = most.max(Usage::of(scene.pid())?.memory.unreclaimable);
     }
     counted.check(&scene.agent)?;
-    let growth = most.saturating_sub(before.pss);
+    let growth = most.saturating_sub(before.memory.unreclaimable);
     ensure!(growth < GROWTH, "{growth} bytes more");
     let page = scene.agent.scrape_until("all failures", |page| {
         ["metrics", "events"].iter().all(|signal| {
@@ -178,7 +178,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_goes_again() -> Result<()> {
         "{descriptors} descriptors became {most}"
     );
     ensure!(
-        after.pss < before.pss + GROWTH,
+        after.memory.unreclaimable < before.memory.unreclaimable + GROWTH,
         "{before:?} became {after:?}"
     );
 
@@ -210,7 +210,11 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_goes_again() -> Result<()> {
             "{} connections held, {} KiB more memory, every message counted, all answered again when they go; the \
              second agent says which port is taken; ended in {took:?}",
             most - descriptors,
-            after.pss.saturating_sub(before.pss) >> 10
+            after
+                .memory
+                .unreclaimable
+                .saturating_sub(before.memory.unreclaimable)
+                >> 10
         ),
     )
 }

@@ -52,7 +52,7 @@ pub(crate) struct Need {
     pub(crate) seconds: f64,
     pub(crate) participants: f64,
     pub(crate) topics: f64,
-    pub(crate) pss: u64,
+    pub(crate) unreclaimable: u64,
     pub(crate) cpu: f64,
     pub(crate) descriptors: usize,
     pub(crate) threads: usize,
@@ -75,7 +75,7 @@ impl Need {
             seconds: since.elapsed().as_secs_f64(),
             participants: page.sum("ros2_participants", &[]),
             topics: page.sum("ros2_topics", &[]),
-            pss: usage.pss,
+            unreclaimable: usage.memory.unreclaimable,
             cpu: usage.cpu.as_secs_f64(),
             descriptors: count("fd")?,
             threads: count("task")?,
@@ -150,11 +150,11 @@ impl Curve {
         let late = self.needs.iter().filter(|need| need.seconds >= skipped);
         for need in late.filter(|need| need.participants >= large) {
             let minute = minutes.entry((need.seconds / 60.0) as u64).or_default();
-            minute.push(need.pss as f64);
+            minute.push(need.unreclaimable as f64);
         }
         let points = minutes.into_iter();
         points
-            .map(|(minute, pss)| (minute as f64, median(pss)))
+            .map(|(minute, unreclaimable)| (minute as f64, median(unreclaimable)))
             .collect()
     }
 
@@ -169,10 +169,11 @@ impl Curve {
             slopes.extend(later.map(|other| (other.1 - one.1) / (other.0 - one.0)));
         }
         let tenth = (minutes.len() / 10).max(1);
-        let pss = |part: &[(f64, f64)]| median(part.iter().map(|point| point.1).collect());
+        let unreclaimable =
+            |part: &[(f64, f64)]| median(part.iter().map(|point| point.1).collect());
         let (begin, end) = (
-            pss(minutes.get(..tenth)?),
-            pss(minutes.get(minutes.len() - tenth..)?),
+            unreclaimable(minutes.get(..tenth)?),
+            unreclaimable(minutes.get(minutes.len() - tenth..)?),
         );
         (!slopes.is_empty()).then(|| {
             let slope = median(slopes) * (last.0 - first.0) / begin;
@@ -219,12 +220,12 @@ impl std::fmt::Display for Need {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(
             formatter,
-            "{:.0} s, {} participants, {} topics, {:.2} MB PSS, {:.1} s CPU, {} descriptors, {} threads, \
+            "{:.0} s, {} participants, {} topics, {:.2} MB unreclaimable, {:.1} s CPU, {} descriptors, {} threads, \
              {:.1} MB BPF, page {} KB, {} dropped, {:.1} s old",
             self.seconds,
             self.participants,
             self.topics,
-            self.pss as f64 / 1e6,
+            self.unreclaimable as f64 / 1e6,
             self.cpu,
             self.descriptors,
             self.threads,
@@ -239,9 +240,10 @@ impl std::fmt::Display for Need {
 /// Writes `memory.csv` and `memory.svg`.
 pub(crate) fn publish(curves: &[Curve]) -> Result<()> {
     let directory = results()?;
-    let mut table = "agent,seconds,participants,topics,pss_bytes,cpu_seconds,descriptors,threads,\
+    let mut table =
+        "agent,seconds,participants,topics,unreclaimable_bytes,cpu_seconds,descriptors,threads,\
                      bpf_bytes,page_bytes,dropped,age_seconds\n"
-        .to_owned();
+            .to_owned();
     for curve in curves {
         for need in &curve.needs {
             writeln!(
@@ -251,7 +253,7 @@ pub(crate) fn publish(curves: &[Curve]) -> Result<()> {
                 need.seconds,
                 need.participants,
                 need.topics,
-                need.pss,
+                need.unreclaimable,
                 need.cpu,
                 need.descriptors,
                 need.threads,
@@ -275,7 +277,7 @@ fn picture(curves: &[Curve]) -> Result<String> {
     let all = || curves.iter().flat_map(|curve| &curve.needs);
     let most = |what: fn(&Need) -> f64| all().map(what).fold(1.0, f64::max);
     let (seconds, participants) = (most(|need| need.seconds), most(|need| need.participants));
-    let megabytes = (most(|need| need.pss as f64) / 1e6 * 1.15).ceil();
+    let megabytes = (most(|need| need.unreclaimable as f64) / 1e6 * 1.15).ceil();
     let mut svg = "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 760 330\" \
                    font-family=\"sans-serif\" font-size=\"12\">\n\
                    <rect width=\"760\" height=\"330\" fill=\"#fff\"/>\n"
@@ -328,14 +330,14 @@ fn picture(curves: &[Curve]) -> Result<String> {
             need.participants / participants
         })?;
         line(&curve.needs, colour, &|need| {
-            need.pss as f64 / 1e6 / megabytes
+            need.unreclaimable as f64 / 1e6 / megabytes
         })?;
     }
     for (index, (curve, colour)) in curves.iter().zip(COLOURS).enumerate() {
         let x = left + 160.0 * index as f64;
         writeln!(
             svg,
-            "<text x=\"{x}\" y=\"320\" fill=\"{colour}\">PSS {}</text>",
+            "<text x=\"{x}\" y=\"320\" fill=\"{colour}\">unreclaimable {}</text>",
             curve.name
         )?;
     }

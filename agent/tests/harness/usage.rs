@@ -4,7 +4,7 @@ use std::fs;
 use std::path::Path;
 use std::time::Duration;
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, ensure};
 
 /// Length of the kernel's clock tick, fixed by the user-space ABI.
 const TICK: Duration = Duration::from_millis(10);
@@ -13,7 +13,22 @@ const TICK: Duration = Duration::from_millis(10);
 pub(crate) struct Usage {
     /// Time on a CPU of all its threads, to the nanosecond.
     pub(crate) cpu: Duration,
-    /// Its memory, shared pages divided among their users.
+    pub(crate) memory: Memory,
+}
+
+/// Its memory in bytes.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Memory {
+    /// What the kernel cannot have back without the process: its own pages (anonymous, changed, swapped)
+    /// and the rings that it shares with the kernel. The rest is pages of files, as the program's.
+    pub(crate) unreclaimable: u64,
+    /// Of that, what belongs to the rings.
+    pub(crate) rings: u64,
+    /// Of that, pages of the program that its start or its run changed.
+    pub(crate) program: u64,
+    /// All pages in memory.
+    pub(crate) rss: u64,
+    /// Likewise, shared pages divided among their users.
     pub(crate) pss: u64,
 }
 
@@ -26,29 +41,117 @@ impl Usage {
         for task in tasks.flatten() {
             cpu += run_time(&task.path());
         }
-        let memory = fs::read_to_string(format!("/proc/{pid}/smaps_rollup"))
-            .with_context(|| format!("cannot read the memory of process {pid}"))?;
-        let kilobytes: u64 = memory
-            .lines()
-            .find_map(|line| {
-                line.strip_prefix("Pss:")?
-                    .split_whitespace()
-                    .next()?
-                    .parse()
-                    .ok()
-            })
-            .context("no Pss in smaps_rollup")?;
-        Ok(Usage {
-            cpu,
-            pss: kilobytes * 1024,
-        })
+        let memory = Memory::of(pid)?;
+        Ok(Usage { cpu, memory })
     }
 
     /// The CPU time between two looks, and the memory at the later one.
     pub(crate) fn since(&self, earlier: &Usage) -> Usage {
         Usage {
             cpu: self.cpu.saturating_sub(earlier.cpu),
-            pss: self.pss,
+            memory: self.memory,
+        }
+    }
+}
+
+impl Memory {
+    /// The most of each.
+    pub(crate) fn max(self, other: Memory) -> Memory {
+        self.with(other, u64::max)
+    }
+
+    /// Of several processes together.
+    pub(crate) fn plus(self, other: Memory) -> Memory {
+        self.with(other, u64::saturating_add)
+    }
+
+    /// In MB (10^6): unreclaimable, RSS, PSS.
+    pub(crate) fn megabytes(&self) -> String {
+        let megabytes = |bytes: u64| bytes as f64 / 1e6;
+        let (own, rss, pss) = (self.unreclaimable, self.rss, self.pss);
+        format!(
+            "{:.1} / {:.1} / {:.1}",
+            megabytes(own),
+            megabytes(rss),
+            megabytes(pss)
+        )
+    }
+
+    fn with(self, other: Memory, both: fn(u64, u64) -> u64) -> Memory {
+        Memory {
+            unreclaimable: both(self.unreclaimable, other.unreclaimable),
+            rings: both(self.rings, other.rings),
+            program: both(self.program, other.program),
+            rss: both(self.rss, other.rss),
+            pss: both(self.pss, other.pss),
+        }
+    }
+
+    /// At this moment.
+    pub(crate) fn of(pid: u32) -> Result<Memory> {
+        let maps = fs::read_to_string(format!("/proc/{pid}/smaps"))
+            .with_context(|| format!("cannot read the memory of process {pid}"))?;
+        let memory = Memory::parse(&maps);
+        ensure!(memory.rss > 0, "process {pid} has no memory");
+        Ok(memory)
+    }
+
+    fn parse(maps: &str) -> Memory {
+        let mut memory = Memory::default();
+        let mut mapping = Mapping::default();
+        for line in maps.lines() {
+            let mut words = line.split_whitespace();
+            let first = words.next().unwrap_or_default();
+            let value = words.next().and_then(|word| word.parse::<u64>().ok());
+            let bytes = value.unwrap_or(0) * 1024;
+            match first {
+                "Rss:" => mapping.rss = bytes,
+                "Pss:" => mapping.pss = bytes,
+                "Shared_Dirty:" | "Private_Dirty:" => mapping.dirty += bytes,
+                "Anonymous:" => mapping.anonymous = bytes,
+                "Swap:" => mapping.swapped = bytes,
+                address if address.contains('-') => {
+                    mapping.add_to(&mut memory);
+                    let name = words.nth(3).unwrap_or_default();
+                    mapping = Mapping {
+                        is_ring: name.starts_with("anon_inode:bpf") || name.starts_with("socket:"),
+                        is_file: name.starts_with('/'),
+                        ..Mapping::default()
+                    };
+                }
+                _ => {}
+            }
+        }
+        mapping.add_to(&mut memory);
+        memory
+    }
+}
+
+#[derive(Default)]
+struct Mapping {
+    is_ring: bool,
+    is_file: bool,
+    rss: u64,
+    pss: u64,
+    dirty: u64,
+    anonymous: u64,
+    swapped: u64,
+}
+
+impl Mapping {
+    fn add_to(&self, memory: &mut Memory) {
+        memory.rss += self.rss;
+        memory.pss += self.pss;
+        let own = if self.is_ring {
+            // The kernel's rings are mapped twice, one behind the other: RSS counts them twice.
+            memory.rings += self.pss;
+            self.pss
+        } else {
+            self.anonymous.max(self.dirty) + self.swapped
+        };
+        memory.unreclaimable += own;
+        if self.is_file {
+            memory.program += own;
         }
     }
 }
@@ -87,4 +190,47 @@ fn run_time(task: &Path) -> Duration {
         .next()
         .and_then(|run| run.parse().ok());
     Duration::from_nanos(run.unwrap_or(0))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pages_of_files_do_not_count_as_the_process_s_own_and_rings_do() {
+        let maps = "00400000-00e00000 r-xp 00000000 fe:00 12 /usr/bin/rp
+Rss:               10000 kB
+Pss:                5000 kB
+Shared_Dirty:          0 kB
+Private_Dirty:         0 kB
+Anonymous:             0 kB
+00e00000-00e80000 rw-p 00a00000 fe:00 12 /usr/bin/rp
+Rss:                 500 kB
+Pss:                 500 kB
+Private_Dirty:       400 kB
+Anonymous:           400 kB
+7f0000000000-7f0000400000 r--s 00000000 00:09 7 anon_inode:bpf-map
+Rss:                8192 kB
+Pss:                4096 kB
+Private_Dirty:         0 kB
+Anonymous:             0 kB
+7f1000000000-7f1000100000 rw-p 00000000 00:00 0
+Rss:                 900 kB
+Pss:                 900 kB
+Private_Dirty:       900 kB
+Anonymous:           900 kB
+Swap:                100 kB
+VmFlags: rd wr mr mw me ac
+";
+        let memory = Memory::parse(maps);
+        let kilobytes = [
+            memory.unreclaimable,
+            memory.rings,
+            memory.program,
+            memory.rss,
+            memory.pss,
+        ]
+        .map(|bytes| bytes >> 10);
+        assert_eq!(kilobytes, [400 + 4096 + 1000, 4096, 400, 19_592, 10_496]);
+    }
 }

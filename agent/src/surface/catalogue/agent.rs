@@ -333,6 +333,12 @@ pub(in crate::surface) const PROCESS_CPU: Metric = Metric::counter(
 .unit("seconds");
 pub(in crate::surface) const PROCESS_RESIDENT: Metric =
     Metric::gauge("process_resident_memory_bytes", &[], "Resident memory.").unit("bytes");
+pub(in crate::surface) const PROCESS_UNRECLAIMABLE: Metric = Metric::gauge(
+    "process_unreclaimable_memory_bytes",
+    &[],
+    "Memory that the kernel cannot have back: anonymous and changed pages, swap, rings.",
+)
+.unit("bytes");
 pub(in crate::surface) const PROCESS_VIRTUAL: Metric =
     Metric::gauge("process_virtual_memory_bytes", &[], "Virtual memory.").unit("bytes");
 pub(in crate::surface) const PROCESS_OPEN_FDS: Metric =
