@@ -277,7 +277,8 @@ impl Keeper {
                 sight
             });
             let before = Sight::default();
-            let mut recorder = Recorder::new(writer, filter, domain_id, before, sources).within(room);
+            let mut recorder =
+                Recorder::new(writer, filter, domain_id, before, sources).within(room);
             let mut failed = None;
             for sample in self.ring.iter() {
                 if let Err(error) = recorder.take(&Item::Sample(Arc::clone(sample))) {
