@@ -12,7 +12,7 @@ use super::topic::Naming;
 use crate::config::{PatternError, check_pattern};
 
 /// Largest compiled form of one regular expression, in bytes, and as much again while it is matched.
-const REGEX_BYTES: usize = 64 << 10;
+const REGEX_BYTES: usize = 256 << 10;
 
 /// How much of each sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
