@@ -56,7 +56,7 @@ fn check(scenarios: &[Scenario]) {
         let code = if told.is_complete() { 0 } else { 3 };
         assert_eq!(output.status.code(), Some(code), "{name}: {stderr}");
         assert!(!stderr.contains("stdin"), "{name}: {stderr}");
-        let (complete, incomplete) = on_the_wire(scenario);
+        let (complete, incomplete, gaps) = on_the_wire(scenario);
         let found = in_the_bag(&name, &bag);
         if name.contains("cli-observed") || name.contains("fastrtps-default/lifecycle") {
             // They begin late, or announcements went through shared memory: what a writer sent
@@ -67,14 +67,18 @@ fn check(scenarios: &[Scenario]) {
         }
         assert_eq!(found, complete, "{name}");
         let report = report(&bag);
-        assert_eq!(report["missing"], incomplete, "{name}: {stderr}");
+        let lost = |topic: &Value| topic["lost"].as_u64().unwrap();
+        let topics = report["topics"].as_object().unwrap();
+        let counted: u64 = topics.values().map(lost).sum();
+        assert_eq!(counted, gaps, "{name}: {stderr}");
+        assert_eq!(report["missing"], incomplete + gaps, "{name}: {stderr}");
         let named: u64 = report["missing_runs"]
             .as_array()
             .unwrap()
             .iter()
             .map(samples)
             .sum();
-        assert_eq!(named, incomplete, "{name}");
+        assert_eq!(named, incomplete + gaps, "{name}");
         if !found.is_empty() {
             bags.push(bag);
         }
@@ -113,16 +117,17 @@ fn samples(run: &Value) -> u64 {
 }
 
 /// Complete samples of each topic by the independent decoder, and all that were incomplete.
-fn on_the_wire(scenario: &Scenario) -> (BTreeMap<String, u64>, u64) {
-    let (mut complete, mut incomplete) = (BTreeMap::new(), 0);
+fn on_the_wire(scenario: &Scenario) -> (BTreeMap<String, u64>, u64, u64) {
+    let (mut complete, mut incomplete, mut gaps) = (BTreeMap::new(), 0, 0);
     for writer in scenario.facts().writers.values() {
         if let Some(topic) = writer.topic.strip_prefix("rt/") {
             *complete.entry(format!("/{topic}")).or_default() += writer.complete();
             incomplete += writer.frag_samples_incomplete;
+            gaps += writer.missing_in_range.len() as u64;
         }
     }
     complete.retain(|_, count| *count > 0);
-    (complete, incomplete)
+    (complete, incomplete, gaps)
 }
 
 fn in_the_bag(name: &str, bag: &Path) -> BTreeMap<String, u64> {
