@@ -432,6 +432,9 @@ impl<'a> Robot<'a> {
         all.insert("state_directory".to_owned(), json!(directory.path()));
         let recordings = all.entry("recordings").or_insert(json!({}));
         recordings["directory"] = json!(&bags);
+        // Disks are filled to the last byte here.
+        recordings["reserve_percent"] = json!(0);
+        recordings["reserve_bytes"] = json!(0);
         let configuration = directory.path().join("ros2probe.yaml");
         fs::write(&configuration, serde_json::to_string(&all)?)?;
         let arguments = [Path::new("run"), Path::new("--config"), &configuration];

@@ -120,7 +120,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     let place = directory.path().join("disk");
     fs::create_dir(&place)?;
     let configuration = format!(
-        "watch: [/**]\nstate_directory: {0}/state\nrecordings:\n  directory: {0}/bags\n  \
+        "watch: [/**]\nstate_directory: {0}/state\nrecordings:\n  directory: {0}/bags\n  reserve_percent: 0\n  reserve_bytes: 0\n  \
          snapshots: [{{name: incident, topics: [/counted_1], seconds: 60}}]\n{ON_THE_WIRE}",
         place.display()
     );
