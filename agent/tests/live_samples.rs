@@ -413,8 +413,6 @@ fn on_demand_every_sample_is_seen_and_the_breakpoint_goes_with_the_last_reader()
     let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
     observed.wait_for_view("exact")?;
     ensure!(is_attached(&publisher)?, "a sample is to be read");
-    // Until the next round of the capture, shared memory is looked at, too.
-    std::thread::sleep(Duration::from_millis(500));
     publisher.go()?;
     let (whole, missed) = given(&mut lines, &stream)?;
     ensure!((whole, missed) == (stream.count, 0), "{whole} {missed}");

@@ -184,13 +184,13 @@ impl Reception {
         });
     }
 
-    /// Another view takes over: samples of which a part came are its, and no losses. How many.
-    pub fn abandon(&mut self) -> u64 {
-        let mut partial = 0;
+    /// Another view takes over: samples of which a part came are its, and no losses. Their numbers.
+    pub fn abandon(&mut self) -> Vec<u64> {
+        let mut partial = Vec::new();
         for number in self.sequence.settled()..self.sequence.next() {
             if self.samples.is_partial(number) && !self.sequence.has(number) {
                 self.sequence.know(number);
-                partial += 1;
+                partial.push(number);
             }
         }
         partial

@@ -118,10 +118,40 @@ impl Sampled {
         takes
     }
 
-    /// It is seen otherwise from now on.
-    pub fn end(&mut self) {
+    /// It is seen otherwise from now on. Samples under way may still come, until [`Self::look`]
+    /// settles them.
+    pub const fn end(&mut self) {
         (self.last, self.left) = (Timestamp(0), true);
-        self.settle_all();
+    }
+
+    /// Whether this sample is sent and still waited for.
+    #[must_use]
+    pub fn awaits(&self, number: u64) -> bool {
+        let bit = self.bit(number, self.next);
+        number >= self.settled && bit.is_some_and(|bit| self.finished & bit == 0)
+    }
+
+    /// Takes in a sample that [`Self::awaits`], or a fragment of one, after [`Self::end`].
+    pub fn catch_up(&mut self, number: u64, seen: Seen) -> News {
+        News {
+            finished: self.sight(number, seen),
+            ..News::default()
+        }
+    }
+
+    /// Takes over these samples, counted already, of which another view saw a part. `next` is the
+    /// number after the newest.
+    pub fn take_over(&mut self, partial: &[u64], next: u64, now: Timestamp) {
+        self.follow(next, now);
+        for &number in partial {
+            match self.bit(number, next) {
+                Some(bit) => {
+                    self.finished &= !bit;
+                    self.settled = self.settled.min(number);
+                }
+                None => self.leave_out(number, number),
+            }
+        }
     }
 
     /// Waits no longer for what was missing at the last look and is still.
@@ -208,16 +238,7 @@ impl Sampled {
         let samples = self.advance(number.saturating_add(1), true, now, sequence);
         self.span += samples;
         let below = sequence.next().saturating_sub(number).saturating_sub(1);
-        let bit = self.bit(number, sequence.next()).unwrap_or(0);
-        if self.sighted & bit != bit {
-            self.sighted |= bit;
-            self.seen += 1;
-        }
-        let is_open = number >= self.settled && self.finished & bit != bit;
-        let finished = seen != Seen::Part && is_open;
-        if finished {
-            self.finished |= bit;
-        }
+        let finished = self.sight(number, seen);
         let mut news = News {
             samples,
             alike: samples.saturating_add(std::mem::take(&mut self.unmeasured)),
@@ -275,6 +296,20 @@ impl Sampled {
         self.head
             .filter(|(head, _)| *head == number)
             .map(|(_, stamp)| stamp)
+    }
+
+    /// Marks a sample as seen: whether nothing more of it is waited for, for the first time.
+    fn sight(&mut self, number: u64, seen: Seen) -> bool {
+        let bit = self.bit(number, self.next).unwrap_or(0);
+        if self.sighted & bit != bit {
+            self.sighted |= bit;
+            self.seen += 1;
+        }
+        let finished = seen != Seen::Part && self.awaits(number);
+        if finished {
+            self.finished |= bit;
+        }
+        finished
     }
 
     /// The bit of a number among those below `next`.
@@ -537,7 +572,9 @@ mod tests {
         view.see(1);
         view.see(3);
         view.sampled.end();
-        assert_eq!(view.sampled.take_unseen(), [(2, 2)]);
+        // It may still come, and is left out when the view begins again.
+        assert_eq!(view.sampled.take_unseen(), []);
+        assert!(view.sampled.awaits(2) && !view.sampled.awaits(3));
         let now = Timestamp(view.now);
         for number in 4..500 {
             view.sequence.exists(number, now, &mut |_| {});
@@ -545,7 +582,7 @@ mod tests {
         view.see(500);
         view.see(502);
         view.sampled.settle_all();
-        assert_eq!(view.sampled.take_unseen(), [(501, 501)]);
+        assert_eq!(view.sampled.take_unseen(), [(2, 2), (501, 501)]);
     }
 
     #[test]

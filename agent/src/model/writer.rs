@@ -160,6 +160,9 @@ impl Writer {
     pub fn has(&self, record: &Record) -> bool {
         let (number, at) = (record.sequence_number, record_time(record));
         let sequence = self.reception.sequence();
+        if self.is_under_way(record) {
+            return false;
+        }
         if is_looked_at(record) && self.is_exact(at) {
             return true;
         }
@@ -206,7 +209,11 @@ impl Writer {
         let is_sampled = is_looked_at(record);
         if is_exact {
             self.exact = self.exact.max(Some(at));
-        } else if is_sampled && self.is_exact(at) {
+        }
+        if self.is_under_way(record) {
+            return self.catch_up(record, scene);
+        }
+        if is_sampled && self.is_exact(at) {
             // It has been seen already, or is on its way.
             return None;
         }
@@ -417,6 +424,14 @@ impl Writer {
         }
     }
 
+    /// Whether it is of a sample that was under way when the sampled view ended.
+    fn is_under_way(&self, record: &Record) -> bool {
+        matches!(record.kind, kind::DATA | kind::DATA_FRAG)
+            && self.sampled.as_ref().is_some_and(|sampled| {
+                !sampled.is_current(record_time(record)) && sampled.awaits(record.sequence_number)
+            })
+    }
+
     fn is_exact(&self, now: Timestamp) -> bool {
         let last = self.exact;
         last.is_some_and(|last| last.0.saturating_add(EXACT_FOR) > now.0)
@@ -435,12 +450,15 @@ impl Writer {
         scene: &mut Scene<'_>,
     ) -> Option<Counted> {
         let now = record_time(record);
-        if self.sampled.is_none() || !self.is_sampled(now) {
-            self.tally.messages += self.reception.abandon();
-        }
+        let abandoned = match self.is_sampled(now) {
+            true => Vec::new(),
+            false => self.reception.abandon(),
+        };
+        self.tally.messages += abandoned.len() as u64;
         let sampled = self
             .sampled
             .get_or_insert_with(|| Box::new(Sampled::new(now)));
+        sampled.take_over(&abandoned, self.reception.sequence().next(), now);
         if is_sampled {
             sampled.touch(now);
         }
@@ -455,7 +473,8 @@ impl Writer {
             kind::DATA | kind::DATA_FRAG => {
                 let seen = match is_whole {
                     true => Seen::Whole,
-                    false if record.ends_sample() => Seen::Tail,
+                    // What is read in shared memory may come after what is seen in the process.
+                    false if record.ends_sample() && record.flags & flag::EXACT == 0 => Seen::Tail,
                     false => Seen::Part,
                 };
                 let source = record.source_timestamp().timestamp();
@@ -475,6 +494,19 @@ impl Writer {
         self.tally.messages += told;
         self.tally.window.current(now).messages += told;
         None
+    }
+
+    /// Takes in a part of a sample that was under way when the sampled view ended, by whatever way
+    /// it comes.
+    fn catch_up(&mut self, record: &Record, scene: &mut Scene<'_>) -> Option<Counted> {
+        let is_whole = record.kind == kind::DATA || self.reception.assemble(record, scene.budget);
+        let seen = if is_whole { Seen::Whole } else { Seen::Part };
+        let news = self
+            .sampled
+            .as_mut()?
+            .catch_up(record.sequence_number, seen);
+        let now = record_time(record);
+        self.sampled_sample(record, &news, (now, scene.calendar.shown(now)))
     }
 
     fn sampled_sample(

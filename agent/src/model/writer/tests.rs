@@ -25,6 +25,12 @@ impl Bench {
     }
 
     fn put(&mut self, record: Record) -> &mut Self {
+        self.take(record);
+        self
+    }
+
+    /// As [`Self::put`]: what it completed.
+    fn take(&mut self, record: Record) -> Option<Counted> {
         let record = Record {
             time: self.now,
             ..record
@@ -35,8 +41,7 @@ impl Bench {
             journal: &mut self.journal,
             calendar: Calendar::default(),
         };
-        self.writer.record(&record, self.opened, &mut scene);
-        self
+        self.writer.record(&record, self.opened, &mut scene)
     }
 
     fn data(&mut self, number: u64) -> &mut Self {
@@ -463,4 +468,116 @@ fn when_a_writer_is_no_longer_seen_in_its_process_shared_memory_counts_at_once()
     let sampled = facts.sampled.unwrap();
     assert_eq!((facts.messages, facts.lost, facts.duplicates), (6, 0, 0));
     assert_eq!((sampled.seen, sampled.span), (2, 3));
+}
+
+/// Of a sample in three fragments.
+fn third(number: u64, start: u32) -> Record {
+    Record {
+        sample_size: 2500,
+        ..fragment(number, start)
+    }
+}
+
+/// Records of the samples `1..=4` in three fragments each.
+fn thirds() -> Vec<Record> {
+    let starts = |number| (1..=3).map(move |start| third(number, start));
+    (1..=4).flat_map(starts).collect()
+}
+
+/// Feeds two views' records in every order that mixes them; each sample is to be given once, or
+/// reported as not captured once.
+fn every_sample_is_given_or_missed(
+    before: &[Record],
+    after: &[Record],
+    between: fn(&mut Bench),
+    mixed: bool,
+) -> [u64; 4] {
+    let mut fewest = [1; 4];
+    let shifts = if mixed { after.len() } else { 0 };
+    for shift in 0..=shifts {
+        // The first record is of the first view, the next `shift` of the second one may overtake.
+        for at in 1..=before.len() {
+            let mut bench = Bench::new(RELIABLE);
+            let (early, late) = before.split_at(at);
+            let (overtaking, rest) = after.split_at(shift);
+            let mut given = [0; 4];
+            let mut put = |bench: &mut Bench, records: &[Record]| {
+                for record in records {
+                    bench.now += MILLISECOND;
+                    // A record of which the bytes are not kept cannot complete a sample.
+                    let time = bench.now;
+                    let has = bench.writer.has(&Record { time, ..*record });
+                    if let Some(counted) = bench.take(*record) {
+                        assert!(!has, "{record:?}");
+                        given[usize::try_from(counted.number).unwrap() - 1] += 1;
+                    }
+                }
+            };
+            put(&mut bench, early);
+            if overtaking.is_empty() {
+                put(&mut bench, late);
+                between(&mut bench);
+            } else {
+                put(&mut bench, overtaking);
+                put(&mut bench, late);
+            }
+            put(&mut bench, rest);
+            bench.wait(60_000);
+            let facts = bench.facts();
+            assert_eq!((facts.messages, facts.lost), (4, 0), "{shift} {at}");
+            let mut accounted = given;
+            for missing in bench.journal.take_missing() {
+                assert_eq!(missing.reason, MissedReason::NotCaptured);
+                for number in missing.first..=missing.last {
+                    accounted[usize::try_from(number).unwrap() - 1] += 1;
+                }
+            }
+            assert_eq!(accounted, [1; 4], "{shift} {at}");
+            fewest = std::array::from_fn(|index| fewest[index].min(given[index]));
+        }
+    }
+    fewest
+}
+
+#[test]
+fn a_sample_under_way_when_its_process_is_seen_is_given() {
+    let records = thirds();
+    let looked: Vec<_> = records.iter().copied().map(in_shared_memory).collect();
+    let exact: Vec<_> = records.into_iter().map(in_its_process).collect();
+    for begins in 0..exact.len() {
+        for ends in begins.max(1)..exact.len() {
+            let fewest =
+                every_sample_is_given_or_missed(&looked[..ends], &exact[begins..], |_| {}, true);
+            assert_eq!(fewest, [1; 4], "{begins} {ends}");
+        }
+    }
+}
+
+#[test]
+fn a_sample_under_way_when_its_process_is_seen_counts_as_not_captured_if_a_part_stays_away() {
+    let records = thirds();
+    let looked = [in_shared_memory(records[0])];
+    let exact: Vec<_> = records[2..].iter().copied().map(in_its_process).collect();
+    let fewest = every_sample_is_given_or_missed(&looked, &exact, |_| {}, false);
+    assert_eq!(fewest, [0, 1, 1, 1]);
+}
+
+#[test]
+fn a_sample_under_way_when_its_process_is_seen_no_longer_is_given_by_looking() {
+    let records = thirds();
+    for ends in 1..records.len() {
+        let exact: Vec<_> = records[..ends]
+            .iter()
+            .copied()
+            .map(in_its_process)
+            .collect();
+        let looked: Vec<_> = records[ends..]
+            .iter()
+            .copied()
+            .map(in_shared_memory)
+            .collect();
+        let end = |bench: &mut Bench| bench.writer.seen_exactly_no_longer();
+        let fewest = every_sample_is_given_or_missed(&exact, &looked, end, false);
+        assert_eq!(fewest, [1; 4], "{ends}");
+    }
 }
