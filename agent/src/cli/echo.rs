@@ -102,7 +102,7 @@ impl Echo {
         // What a capture has is known when it has been read.
         let is_waiting = self.target.replay.is_some();
         let known = topic(&agent, domain_id, &name)?;
-        let expected = match &known {
+        let mut expected = match &known {
             Some(known) => {
                 if !self.matching.any() {
                     output.write(&mixed_offers(&known.publishers))?;
@@ -126,7 +126,7 @@ impl Echo {
         let mut echo = echo::Echo::new(options);
         let mut lost = Lost::default();
         let mut start = None;
-        let mut is_seen = known.is_some();
+        let mut is_seen = false;
         let names = std::slice::from_ref(&name);
         let mut notes = Notes::begin(&agent, domain_id, is_waiting, names, NOT_ALL_PRINTED);
         let went = follow(&agent, domain_id, names, &mut notes, |came, now| {
@@ -137,6 +137,13 @@ impl Echo {
                 Came::Clock => {}
                 Came::Missed(missed) => text = lost.missed(missed),
                 Came::Message(sample, payload) => {
+                    if !is_seen
+                        && known.is_none()
+                        && self.message_type.is_none()
+                        && let Some(known) = topic(&agent, domain_id, &name)?
+                    {
+                        expected = self.expected(&known)?;
+                    }
                     is_seen = true;
                     let wanted = self.message_type.as_ref().or(expected.as_ref());
                     if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
@@ -162,17 +169,11 @@ impl Echo {
                 .is_some_and(|timeout| elapsed(start, now) >= timeout);
             Ok(if is_enough { Went::Enough } else { Went::On })
         })?;
-        if matches!(went, Went::ToTheEnd | Went::Cut) {
-            let is_known = is_seen || self.message_type.is_some();
-            if !is_known
-                && topic(
-                    &agent,
-                    domain_id,
-                    &full_name(&self.topic_name).map_err(said)?,
-                )?
-                .is_none()
-            {
-                return self.unknown(&agent, domain_id, &mut output);
+        let is_over = matches!(went, Went::ToTheEnd | Went::Cut);
+        if is_over && !is_seen && known.is_none() && self.message_type.is_none() {
+            match topic(&agent, domain_id, &name)? {
+                Some(known) => drop(self.expected(&known)?),
+                None => return self.unknown(&agent, domain_id, &mut output),
             }
         }
         if echo.unreadable() > 1 {

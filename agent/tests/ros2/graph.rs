@@ -92,6 +92,26 @@ fn a_node_has_the_types_of_its_own_endpoints_where_a_topic_has_several() {
     assert_eq!(count, 12);
 }
 
+/// As of a topic that is known at the start: a replay knows it when it has been read.
+#[test]
+fn a_topic_of_two_types_is_not_echoed_from_a_capture() {
+    let capture = own().join("mixed.pcap.gz");
+    let capture = capture.to_str().unwrap();
+    let output = run(&["topic", "echo", "/mixed/value", "--replay", capture]);
+    assert_eq!(
+        (stdout(&output).as_str(), output.status.code()),
+        ("", Some(1))
+    );
+    assert_eq!(
+        stderr(&output),
+        "Cannot echo topic '/mixed/value', as it contains more than one type: [std_msgs/msg/Int32, \
+         std_msgs/msg/String]\n"
+    );
+    let chosen = ["topic", "echo", "/mixed/value", "std_msgs/msg/String"];
+    let output = run(&[&chosen[..], &["--replay", capture]].concat());
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+}
+
 /// What the original prints of `/robot1/sensor_node` as `//r/o/b/o/t/1sensor_node`.
 #[test]
 fn the_nodes_of_an_action_bear_their_names() {
