@@ -122,7 +122,8 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
     Ok(names)
 }
 
-/// What was announced before the agent, or the capture, began: endpoints are announced once.
+/// What was announced before the agent, or the capture, began, or not at all: endpoints are announced
+/// once, and to other participants.
 fn late(names: &Names, is_replay: bool) -> Option<String> {
     let Names {
         participants,
@@ -131,7 +132,16 @@ fn late(names: &Names, is_replay: bool) -> Option<String> {
     } = names;
     let what = match (names.topics.is_empty(), unknown_writers) {
         (true, _) if *participants == 1 => {
-            "1 participant is known, but none of its topics".to_owned()
+            let what =
+                "1 participant is known, but none of its topics: a participant that is alone";
+            return Some(if is_replay {
+                format!("{what} announces none")
+            } else {
+                format!(
+                    "{what} announces them when a second one starts; `rp discover --all` asks for \
+                     them"
+                )
+            });
         }
         (true, _) if *participants > 1 => {
             format!("{participants} participants are known, but none of their topics")

@@ -23,6 +23,7 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
         processes,
         answers.topics.topics.len(),
     )];
+    findings.extend(alone(participants));
     findings.extend(names(participants));
     findings.extend(restored(participants));
     findings.extend(unknown_writers(answers));
@@ -80,11 +81,42 @@ fn overview(participants: &[Participant], processes: Option<usize>, topics: usiz
     )
 }
 
+/// The only participant of a domain, with nothing announced: endpoints are announced to other
+/// participants.
+fn is_alone(participant: &Participant, participants: &[Participant]) -> bool {
+    let has_nothing = participant.writers == 0 && participant.readers == 0;
+    let others = participants.iter();
+    let neighbours = others.filter(|other| other.domain_id == participant.domain_id);
+    has_nothing && !participant.secured && neighbours.count() == 1
+}
+
+fn alone(participants: &[Participant]) -> Option<Finding> {
+    let is_alone = |each: &&Participant| is_alone(each, participants);
+    let alone: Vec<_> = participants.iter().filter(is_alone).collect();
+    let domains: Vec<_> = alone
+        .iter()
+        .map(|each| each.domain_id.to_string())
+        .collect();
+    let s = if domains.len() == 1 { "" } else { "s" };
+    if domains.is_empty() {
+        return None;
+    }
+    let sentence = format!(
+        "one participant is alone in domain{s} {} and announces its topics to no other; they appear \
+         when a second one starts",
+        domains.join(", ")
+    );
+    let finding = Finding::new(AREA, "alone", Verdict::Note, sentence);
+    let finding = finding.seen(domains.len().to_string(), "GET /participants");
+    Some(finding.remedy("sudo rp discover --all    # asks it for them: a few packets"))
+}
+
 /// Those that were there before the agent.
 fn names(participants: &[Participant]) -> Option<Finding> {
     let is_nameless = |each: &&Participant| {
         let has_nothing = each.writers == 0 && each.readers == 0;
-        !each.secured && (has_nothing || each.enclave.is_some() && each.nodes.is_empty())
+        let is_nameless = has_nothing || each.enclave.is_some() && each.nodes.is_empty();
+        !each.secured && is_nameless && !is_alone(each, participants)
     };
     let count = participants.iter().filter(is_nameless).count();
     if count == 0 {
@@ -371,6 +403,37 @@ mod tests {
             Some(Verdict::Warning)
         );
         assert_eq!(verdict(&findings, "secured"), Some(Verdict::Note));
+    }
+
+    #[test]
+    fn a_participant_that_is_alone_in_its_domain_announces_nothing() {
+        let of = |participants: &str| {
+            let participants = format!(r#"{{"participants":[{participants}]}}"#);
+            check(&answers(&participants, "", ""), None)
+        };
+        let lone = of(r#"{"domain_id":3,"enclave":"/","nodes":[]}"#);
+        let finding = lone.iter().find(|each| each.check == "alone").unwrap();
+        assert_eq!(
+            finding.sentence,
+            "one participant is alone in domain 3 and announces its topics to no other; they appear \
+             when a second one starts"
+        );
+        assert!(
+            finding.remedies[0]
+                .line
+                .starts_with("sudo rp discover --all")
+        );
+        assert_eq!(verdict(&lone, "names"), None);
+        // With a second one in its domain its announcements were missed.
+        let two = of(r#"{"domain_id":3},{"domain_id":3,"writers":2}"#);
+        assert_eq!(verdict(&two, "alone"), None);
+        assert_eq!(verdict(&two, "names"), Some(Verdict::Warning));
+        // Known, or not to be known.
+        assert_eq!(verdict(&of(r#"{"readers":1}"#), "alone"), None);
+        assert_eq!(verdict(&of(r#"{"secured":true}"#), "alone"), None);
+        let apart = of(r#"{"domain_id":1},{"domain_id":2}"#);
+        let finding = apart.iter().find(|each| each.check == "alone").unwrap();
+        assert!(finding.sentence.contains("in domains 1, 2 and"));
     }
 
     #[test]
