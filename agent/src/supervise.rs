@@ -359,11 +359,13 @@ impl Watchdog {
     /// become ready.
     fn look(&mut self, board: &Board) -> bool {
         let now = Instant::now();
-        let ready = board.state().ready(now);
+        let state = board.state();
+        let ready = state.ready(now);
         if let Some(event) = self.sight.look(&ready, now) {
             board.events().tell(event);
         }
-        if ready.is_err() {
+        // A restart does not bring back what is gone.
+        if state.progresses(now).is_err() || (ready.is_err() && !self.ready) {
             return false;
         }
         let first = !self.ready;

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use harness::PREFIX;
-use harness::agent::Agent;
+use harness::agent::{Agent, get};
 use harness::bpf::{self, Direction, Manners};
 use harness::cgroup::Cgroup;
 use harness::network::{Link, Namespace};
@@ -128,6 +128,60 @@ fn where_a_stranger_wants_to_be_alone_the_agent_looks_at_the_wire_and_says_why()
     drop(agent);
     ensure!(bpf::attached(above.path(), Direction::Egress)? == 1);
     ensure_nothing_attached(link.cgroup(), 0)
+}
+
+#[test]
+fn a_cgroup_that_is_made_anew_is_seen_again_and_missed_meanwhile() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let name = format!("{PREFIX}-{}-anew", std::process::id());
+    // The agent is in none of the groups that go.
+    let elsewhere = Namespace::alone()?;
+    let above = Cgroup::create(&name)?;
+    let configuration = Configuration::at(above.path())?;
+    let mut agent = configuration.start(&elsewhere)?;
+    for round in 1..=2 {
+        let topic = format!("/round{round}");
+        let link = Link::below(&above)?;
+        let stream = Stream {
+            topic: topic.clone(),
+            ..Stream::small(200)
+        };
+        talk(&link, &stream)?;
+        let scrape = agent.settled_scrape(&topic, 200)?;
+        let counted = scrape.sum("ros2_topic_messages_total", &[("topic", &topic)]);
+        ensure!(counted == 200.0, "counted {counted} in round {round}");
+        drop(link);
+        remove_until(above.path(), || agent.request("/readyz").is_err())?;
+        let scrape = agent.scrape()?;
+        ensure!(scrape.value("ros2probe_ready", &[]) == Some(0.0), "ready");
+        let able = scrape.sum("ros2probe_capture_ability", &[]);
+        ensure!(able == 0.0, "{able} abilities without a cgroup");
+        let health = agent.request("/healthz");
+        ensure!(health.is_ok(), "the agent is gone: {health:?}");
+        std::fs::create_dir(above.path())?;
+        agent.wait_ready(PATIENCE)?;
+        for direction in DIRECTIONS {
+            let attached = bpf::attached(above.path(), direction)?;
+            ensure!(attached == 1, "{attached} programs are attached");
+        }
+    }
+    let url = "http://127.0.0.1:17401/events?after=0&follow=false";
+    let events = get(&elsewhere, url)?;
+    for event in ["ros2probe.capture.blind", "ros2probe.capture.seeing"] {
+        ensure!(events.contains(event), "no {event} in {events}");
+    }
+    ensure!(events.contains("was removed"), "no reason in {events}");
+    agent.process.terminate()?;
+    ensure_nothing_attached(above.path(), 0)
+}
+
+/// Removes a cgroup that has no processes any more, and waits.
+fn remove_until(cgroup: &Path, noticed: impl Fn() -> bool) -> Result<()> {
+    eventually(|| Ok(std::fs::remove_dir(cgroup)?))?;
+    eventually(|| {
+        ensure!(noticed(), "nothing is noticed");
+        Ok(())
+    })
 }
 
 /// What the agent is told.

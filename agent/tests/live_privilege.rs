@@ -28,6 +28,9 @@ const SAMPLES: u64 = 400;
 /// No capability, and `CAP_BPF` alone, as /proc shows them.
 const NOTHING: &str = "0000000000000000";
 const BPF_ALONE: &str = "0000008000000000";
+/// `CAP_NET_ADMIN` alone, and with `CAP_BPF`.
+const NET_ADMIN_ALONE: &str = "0000000000001000";
+const NET_ADMIN_AND_BPF: &str = "0000008000001000";
 /// What the package's user and group are in the test.
 const USER: u32 = 64_123;
 
@@ -360,9 +363,15 @@ fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
         let name = value("Name")?;
         for set in ["CapInh", "CapPrm", "CapEff", "CapAmb"] {
             let left = value(set)?;
-            // Before Linux 5.19 that is what changing maps takes.
-            let keeps = name == "capture" && matches!(set, "CapPrm" | "CapEff");
-            ensure!(left == NOTHING || (keeps && left == BPF_ALONE), "{status}");
+            let may_keep = matches!(set, "CapPrm" | "CapEff");
+            let kept: &[&str] = match name {
+                // Before Linux 5.19 that is what changing maps takes.
+                "capture" if may_keep => &[NOTHING, BPF_ALONE],
+                // It attaches to a control group that is made anew.
+                "cgroup" if may_keep => &[NET_ADMIN_ALONE, NET_ADMIN_AND_BPF],
+                _ => &[NOTHING],
+            };
+            ensure!(kept.contains(&left), "{status}");
         }
         names.insert(name.to_owned());
     }

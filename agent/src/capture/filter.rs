@@ -21,7 +21,7 @@ use zerocopy::FromBytes;
 use super::inside::Places;
 
 pub use handed::{Form, Probe, Probes};
-pub use host::CapturedPiece;
+pub use host::{CapturedPiece, Links};
 
 /// The object `agent-ebpf/build.sh` made. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
@@ -58,7 +58,7 @@ pub enum FilterError {
     Probe(#[source] ProgramError),
     /// The cgroup takes no program.
     #[error("the host hook does not attach to the cgroup")]
-    Attach(#[source] ProgramError),
+    Attach(#[source] io::Error),
     /// The object lacks a part that this binary needs.
     #[error("the kernel filter object has no {0}")]
     Missing(&'static str),

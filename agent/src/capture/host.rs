@@ -11,9 +11,11 @@ use super::filter::{Filter, FilterError, FilterSettings};
 use super::hierarchy::{self, Cgroup, HierarchyError};
 use super::inside::Abilities;
 use super::intake::Intake;
+use super::reattach::{self, Reattach};
 use super::sockets::Sockets;
 use super::system::Clocks;
 use crate::model::observer::Observer;
+use crate::privilege::SpawnError;
 
 /// Why the host hook is not in place.
 #[derive(Debug, thiserror::Error)]
@@ -24,6 +26,17 @@ pub enum HostError {
     /// The kernel programs.
     #[error(transparent)]
     Filter(#[from] FilterError),
+}
+
+/// Why the control group is not followed.
+#[derive(Debug, thiserror::Error)]
+pub enum FollowError {
+    /// The kernel programs.
+    #[error(transparent)]
+    Filter(#[from] FilterError),
+    /// The thread.
+    #[error(transparent)]
+    Spawn(#[from] SpawnError),
 }
 
 /// Which sockets are looked at, and with how much memory.
@@ -42,6 +55,8 @@ pub struct HostTap {
     cgroup: Cgroup,
     intake: Intake,
     sockets: Sockets,
+    /// For a control group that can be removed.
+    reattach: Option<Reattach>,
 }
 
 impl HostTap {
@@ -72,7 +87,36 @@ impl HostTap {
             sockets: Sockets::new(hierarchy),
             cgroup,
             intake: Intake::new(filter),
+            reattach: None,
         })
+    }
+
+    /// Follows the control group from now on: the hook is attached again when the group is made
+    /// anew. The topmost one stays.
+    ///
+    /// # Errors
+    /// There can be no thread for it.
+    pub fn start(&mut self) -> Result<(), FollowError> {
+        let Some(attached) = reattach::of(self.cgroup.directory()) else {
+            return Ok(());
+        };
+        if !self.is_whole_host() {
+            let links = self.filter().links()?;
+            self.reattach = Some(Reattach::start(self.cgroup.path(), attached, links)?);
+        }
+        Ok(())
+    }
+
+    /// Why the hook is attached to nothing.
+    #[must_use]
+    pub fn detached(&self) -> Option<String> {
+        self.reattach.as_ref()?.detached()
+    }
+
+    /// Whether the hook was attached to another control group since the last call.
+    #[must_use]
+    pub fn take_anew(&self) -> bool {
+        self.reattach.as_ref().is_some_and(Reattach::take_anew)
     }
 
     /// The control group whose sockets are looked at.

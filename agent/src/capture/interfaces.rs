@@ -74,6 +74,8 @@ pub struct Interfaces {
 pub struct Selection {
     include: GlobSet,
     exclude: GlobSet,
+    /// Interfaces included by their name, not by a pattern.
+    named: BTreeSet<String>,
 }
 
 impl Interfaces {
@@ -242,6 +244,7 @@ impl Selection {
         Ok(Self {
             include: set(include)?,
             exclude: set(exclude)?,
+            named: include.iter().cloned().collect(),
         })
     }
 
@@ -249,6 +252,12 @@ impl Selection {
     #[must_use]
     pub fn accepts(&self, name: &str) -> bool {
         (self.include.is_empty() || self.include.is_match(name)) && !self.exclude.is_match(name)
+    }
+
+    /// Whether the configuration names this very interface.
+    #[must_use]
+    pub fn names(&self, name: &str) -> bool {
+        self.named.contains(name) && self.accepts(name)
     }
 
     /// Whether to look at an interface whose name is not known yet. Those that nobody asked for

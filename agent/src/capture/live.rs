@@ -179,6 +179,12 @@ impl LiveSource {
             let reason = in_words(&error);
             tracing::warn!(reason, "uprobes are not attached to libraries loaded later");
         }
+        if let Some(host) = &mut self.host
+            && let Err(error) = host.start()
+        {
+            let reason = in_words(&error);
+            tracing::warn!(reason, "a cgroup that is made anew is not seen");
+        }
         self.start_shared_memory();
     }
 
@@ -254,6 +260,7 @@ impl LiveSource {
             host.take_in(&clocks, observer);
             settle = intake::SETTLE_NANOSECONDS;
         }
+        self.leave_exact_mode(&clocks, observer);
         if let Some(exact) = &mut self.exact {
             exact.take_in(&clocks, observer);
             settle = intake::SETTLE_NANOSECONDS;
@@ -449,6 +456,26 @@ impl LiveSource {
     #[must_use]
     pub fn without_exact(&self) -> Option<&str> {
         self.without_exact.as_deref()
+    }
+
+    /// What is looked at and is gone, in plain words: nothing is seen there.
+    #[must_use]
+    pub fn gone(&self) -> Option<String> {
+        let cgroup = self.host.as_ref().and_then(HostTap::detached);
+        cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
+    }
+
+    /// The programs for messages into shared memory know their control group by a number, which a
+    /// group made anew does not have. Shared memory is sampled from then on.
+    fn leave_exact_mode(&mut self, clocks: &Clocks, observer: &mut Observer) {
+        let is_anew = self.host.as_ref().is_some_and(HostTap::take_anew);
+        if is_anew && let Some(mut exact) = self.exact.take() {
+            exact.drain(clocks, observer);
+            observer.seen_exactly_no_longer();
+            let reason = "the cgroup was made anew: restart to see its messages one by one";
+            tracing::warn!(reason, "shared memory is sampled");
+            self.without_exact = Some(reason.to_owned());
+        }
     }
 
     fn intakes(&self) -> impl Iterator<Item = &Intake> {

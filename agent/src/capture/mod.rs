@@ -15,6 +15,7 @@ pub mod netns;
 pub mod order;
 pub mod owners;
 pub mod pcap;
+pub mod reattach;
 pub mod ring;
 pub mod set_clock;
 pub mod shm;

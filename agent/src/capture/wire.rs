@@ -4,9 +4,8 @@
 //! Frames and records come through two rings, either may be the quicker one; both wait until they
 //! are taken in by time. Nothing is ever sent.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::os::fd::{AsFd as _, BorrowedFd};
-use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -18,6 +17,7 @@ use ros2probe_wire::{Reason, Record, Timestamp, WireError};
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
 use super::order::{Next, Order};
+use super::reattach::{Identity, identity};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::Clocks;
 use crate::model::ahead::{Ahead, Ready};
@@ -63,7 +63,7 @@ pub struct WireSettings {
 pub struct WireTap {
     path: Option<PathBuf>,
     /// Device and inode of what was at the path; `None` = it has been said that it is gone.
-    identity: Option<(u64, u64)>,
+    identity: Option<Identity>,
     ring: Ring,
     filter: Filter,
     interfaces: Interfaces,
@@ -72,6 +72,7 @@ pub struct WireTap {
     packets: BTreeMap<u32, u64>,
     intake: Intake,
     refused_interfaces: u64,
+    named: Named,
 }
 
 impl WireTap {
@@ -96,6 +97,8 @@ impl WireTap {
         for interface in interfaces.iter() {
             filter.accept_interface(interface.index, selection.accepts(&interface.name))?;
         }
+        let mut named = Named::default();
+        named.look(&selection, &interfaces);
         let ring = Ring::open(
             ring::Settings::with_memory(settings.ring_bytes),
             Some(filter.program()),
@@ -116,6 +119,7 @@ impl WireTap {
                 copied_bytes: 0,
             },
             refused_interfaces: 0,
+            named,
         })
     }
 
@@ -136,6 +140,26 @@ impl WireTap {
                 "the network namespace was removed or replaced: restart to observe the current one"
             );
         }
+    }
+
+    /// What is gone, in plain words: the namespace, or an interface that the configuration names.
+    #[must_use]
+    pub fn gone(&self) -> Option<String> {
+        if let (Some(path), None) = (&self.path, self.identity) {
+            let path = path.display();
+            return Some(format!(
+                "the network namespace {path} was removed or replaced: restart to observe the \
+                 current one"
+            ));
+        }
+        let interface = self.named.missing()?;
+        Some(match &self.path {
+            Some(path) => format!(
+                "the interface {interface} of the network namespace {} is gone",
+                path.display()
+            ),
+            None => format!("the interface {interface} is gone"),
+        })
     }
 
     /// Readable when there is something to take in.
@@ -237,7 +261,11 @@ impl WireTap {
     /// A list that cannot be read now is read the next time. Of an interface that is gone nothing
     /// is kept: containers come and go for years.
     fn follow_interfaces(&mut self) {
-        for change in self.interfaces.changes().unwrap_or_default() {
+        let changes = self.interfaces.changes().unwrap_or_default();
+        if !changes.is_empty() {
+            self.named.look(&self.selection, &self.interfaces);
+        }
+        for change in changes {
             let told = match change {
                 Change::Present(Interface { index, name, .. }) => {
                     let accept = self.selection.accepts(&name);
@@ -280,10 +308,31 @@ impl WireTap {
     }
 }
 
-/// Device and inode.
-fn identity(path: &Path) -> Option<(u64, u64)> {
-    let metadata = std::fs::metadata(path).ok()?;
-    Some((metadata.dev(), metadata.ino()))
+/// Interfaces that the configuration names and that were there, with whether they are now.
+#[derive(Debug, Default)]
+struct Named(BTreeMap<String, bool>);
+
+impl Named {
+    fn look(&mut self, selection: &Selection, interfaces: &Interfaces) {
+        let there: BTreeSet<_> = interfaces.iter().map(|it| it.name.as_str()).collect();
+        for (name, was_there) in &mut self.0 {
+            let is_there = there.contains(name.as_str());
+            if *was_there && !is_there {
+                tracing::warn!(interface = name, "the interface is gone");
+            } else if is_there && !*was_there {
+                tracing::info!(interface = name, "the interface is there again");
+            }
+            *was_there = is_there;
+        }
+        for name in there.into_iter().filter(|name| selection.names(name)) {
+            self.0.entry(name.to_owned()).or_insert(true);
+        }
+    }
+
+    fn missing(&self) -> Option<&str> {
+        let mut missing = self.0.iter().filter(|(_, is_there)| !**is_there);
+        missing.next().map(|(name, _)| name.as_str())
+    }
 }
 
 /// One tap's frames and records on their way to the model.

@@ -253,6 +253,10 @@ impl Allowed {
                 allowed.bpf(commands.chain([command::ITERATOR_CREATE]))?;
                 allowed.end_perf_events()?;
             }
+            Role::Reattach { .. } => {
+                allowed.always(LOOK).always(NOTICE).open_for_reading()?;
+                allowed.bpf([command::LINK_CREATE].into_iter())?;
+            }
             Role::SharedMemory { .. } => {
                 allowed.always(LOOK).always(NOTICE).open_for_reading()?;
                 for policy in [libc::SCHED_FIFO, libc::SCHED_OTHER] {

@@ -50,6 +50,12 @@ pub enum Role {
         /// As [`Role::shared_memory`] found out.
         needs_nice: bool,
     },
+    /// Attaches the host hook to a control group that is made anew: `CAP_NET_ADMIN`, and `CAP_BPF`
+    /// where the kernel wants it. Creates links, and opens nothing for writing, and no socket.
+    Reattach {
+        /// As [`Role::reattach`] found out.
+        needs_bpf: bool,
+    },
     /// Attaches to libraries: `CAP_SYS_ADMIN` and `CAP_SYS_PTRACE`.
     Exact,
 }
@@ -111,6 +117,13 @@ impl Role {
         Self::Capture { needs_bpf }
     }
 
+    /// That of the thread that attaches the host hook again, on this kernel.
+    #[must_use]
+    pub fn reattach() -> Self {
+        let needs_bpf = map_updates_need_bpf();
+        Self::Reattach { needs_bpf }
+    }
+
     /// That of the thread that looks at shared memory. Raises a limit of the process.
     #[must_use]
     pub fn shared_memory() -> Self {
@@ -122,6 +135,11 @@ impl Role {
         match self {
             Self::Service | Self::Serve | Self::Export => false,
             Self::Capture { needs_bpf } => needs_bpf && capability == Capability::CAP_BPF,
+            Self::Reattach { needs_bpf } => match capability {
+                Capability::CAP_NET_ADMIN => true,
+                Capability::CAP_BPF => needs_bpf,
+                _ => false,
+            },
             Self::SharedMemory { needs_nice } => match capability {
                 Capability::CAP_SYS_PTRACE => true,
                 Capability::CAP_SYS_NICE => needs_nice,

@@ -194,6 +194,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         packets: Some(messages),
         dropped: None,
     }));
+    let gone = live.gone();
     let counters = live.counters().unwrap_or_default();
     let value = |wanted: Counter| {
         counters
@@ -219,6 +220,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         source_reason: live.without_host().map(str::to_owned),
         abilities: abilities(live),
         blind: blind(live),
+        gone,
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
         shared_memory: live.shared_memory().map(shared_memory),
@@ -277,6 +279,13 @@ fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
 /// What this source can see on this kernel and with this configuration.
 fn abilities(live: &LiveSource) -> Vec<Ability> {
     let mut abilities = kind(live).abilities().to_vec();
+    if live.host().is_some_and(|host| host.detached().is_some()) {
+        // Its sockets, its processes and their shared memory are gone with the cgroup.
+        return match live.is_on_the_wire() {
+            true => vec![Ability::Forwarded],
+            false => Vec::new(),
+        };
+    }
     if live.host().is_some_and(HostTap::is_whole_host) {
         abilities.push(Ability::Containers);
     }
@@ -296,6 +305,11 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
 
 /// Why it cannot see the rest, where that is known.
 fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
+    if let Some(reason) = live.host().and_then(HostTap::detached) {
+        let able = abilities(live);
+        let lost = Ability::ALL.into_iter().filter(|one| !able.contains(one));
+        return lost.map(|ability| (ability, reason.clone())).collect();
+    }
     let inside = inside(live).into_iter().flatten();
     let mut blind: Vec<_> = inside
         .filter_map(|(ability, able)| Some((ability, able.as_ref().err()?.clone())))

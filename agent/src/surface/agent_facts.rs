@@ -18,6 +18,8 @@ pub struct AgentFacts {
     pub abilities: Vec<Ability>,
     /// Why it cannot see what it otherwise could, in words; not of every ability it lacks.
     pub blind: Vec<(Ability, String)>,
+    /// What it looks at and is gone, in words: nothing is seen there.
+    pub gone: Option<String>,
     /// When this was filled in.
     pub at: Instant,
     /// When the source last came back from waiting for packets, with or without any.
@@ -138,6 +140,7 @@ impl AgentFacts {
             source_reason: None,
             abilities: source.abilities().to_vec(),
             blind: Vec::new(),
+            gone: None,
             at,
             capture_progress: at,
             finished: false,

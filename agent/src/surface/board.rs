@@ -304,6 +304,15 @@ impl State {
     /// # Errors
     /// The reason why it does not.
     pub fn ready(&self, now: Instant) -> Result<(), String> {
+        self.progresses(now)?;
+        self.agent.gone.clone().map_or(Ok(()), Err)
+    }
+
+    /// Whether the capture works, also while what it looks at is gone.
+    ///
+    /// # Errors
+    /// The reason why it does not.
+    pub fn progresses(&self, now: Instant) -> Result<(), String> {
         if self.snapshot.is_none() {
             return Err("starting: nothing captured yet".to_owned());
         }
@@ -362,6 +371,25 @@ mod tests {
             board.state().ready(later).unwrap_err(),
             "the last snapshot is 60 s old"
         );
+    }
+
+    #[test]
+    fn an_agent_whose_cgroup_is_gone_works_and_is_not_ready() {
+        let start = Instant::now();
+        let gone = "the cgroup /robot was removed".to_owned();
+        let mut state = State {
+            snapshot: Some(Snapshot::default()),
+            agent: AgentFacts {
+                gone: Some(gone.clone()),
+                ..AgentFacts::new(SourceKind::Host, start)
+            },
+        };
+        assert_eq!(state.ready(start), Err(gone));
+        assert_eq!(state.progresses(start), Ok(()));
+        let later = start + Duration::from_hours(1);
+        assert!(state.progresses(later).is_err());
+        state.agent.gone = None;
+        assert_eq!(state.ready(start), Ok(()));
     }
 
     #[test]

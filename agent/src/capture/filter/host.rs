@@ -4,28 +4,27 @@
 //! behind however the process ends. Links stand beside other people's programs on the same cgroup.
 
 use std::fs::File;
+use std::io;
+use std::mem::size_of_val;
 use std::ops::Deref;
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 
 use aya::Ebpf;
 use aya::maps::ring_buf::RingBufItem;
 use aya::maps::{HashMap, MapData, MapError, RingBuf};
-use aya::programs::links::FdLink;
-use aya::programs::{CgroupAttachMode, CgroupSkb, CgroupSkbAttachType, ProgramError, ProgramFd};
+use aya::programs::ProgramFd;
 use ros2probe_wire::host::{Piece, Socket};
 use zerocopy::FromBytes;
 
 use super::super::inside::{Inside, Places};
 use super::{
-    Filter, FilterError, FilterSettings, UNUSED, failed, load_program, not_permitted, open,
-    ring_size, take,
+    Filter, FilterError, FilterSettings, UNUSED, failed, load_program, open, ring_size, take,
 };
 
-/// The host hook's programs by direction.
-const PROGRAMS: [(&str, CgroupSkbAttachType); 2] = [
-    ("host_ingress", CgroupSkbAttachType::Ingress),
-    ("host_egress", CgroupSkbAttachType::Egress),
-];
+/// `BPF_LINK_CREATE` and the attach types of linux/bpf.h.
+const LINK_CREATE: libc::c_int = 28;
+const INGRESS: u32 = 0;
+const EGRESS: u32 = 1;
 
 /// What the host hook has besides what both hooks have.
 pub(super) struct Hook {
@@ -34,9 +33,15 @@ pub(super) struct Hook {
     places: Places,
     inside: Option<Inside>,
     egress: ProgramFd,
-    links: Vec<FdLink>,
+    links: Vec<OwnedFd>,
     /// Values are [`Socket`]s.
     sockets: HashMap<MapData, u64, [u64; 2]>,
+}
+
+/// The host hook's programs, to be linked to a cgroup.
+pub struct Links {
+    ingress: OwnedFd,
+    egress: OwnedFd,
 }
 
 /// One piece of a captured datagram, in place in the ring: the ring has its room again when this is
@@ -92,31 +97,25 @@ impl Filter {
     /// directory is no such cgroup, or another program on it excludes further ones. Then nothing is
     /// attached.
     pub fn attach(&mut self, cgroup: &File) -> Result<(), FilterError> {
-        let Some(host) = &mut self.host else {
-            return Err(FilterError::Missing("host hook"));
-        };
-        let mut links = Vec::new();
-        let programs = host.programs.as_mut();
-        let programs = programs.ok_or(FilterError::Missing("object any more"))?;
-        for (name, direction) in PROGRAMS {
-            let program: &mut CgroupSkb = programs
-                .program_mut(name)
-                .ok_or(FilterError::Missing(name))?
-                .try_into()
-                .map_err(FilterError::Program)?;
-            // A link takes no flags: links always stand beside others.
-            let link = program
-                .attach(cgroup, direction, CgroupAttachMode::Single)
-                .and_then(|id| program.take_link(id))
-                .map_err(attach_failed)?;
-            // What is not a link would outlive the process; the kernels that have the maps we need
-            // (5.8) have links (5.7).
-            let link = FdLink::try_from(link)
-                .map_err(|_| FilterError::Attach(ProgramError::NotAttached))?;
-            links.push(link);
+        let mut links = self.links()?.create(cgroup)?;
+        if let Some(host) = &mut self.host {
+            host.links.append(&mut links);
         }
-        host.links.append(&mut links);
         Ok(())
+    }
+
+    /// What attaches the host hook to another cgroup, also after this filter is gone.
+    ///
+    /// # Errors
+    /// On the wire hook, and when there can be no more descriptors.
+    pub fn links(&self) -> Result<Links, FilterError> {
+        let host = self.host.as_ref();
+        let host = host.ok_or(FilterError::Missing("host hook"))?;
+        let own = |program: BorrowedFd<'_>| program.try_clone_to_owned();
+        Ok(Links {
+            ingress: own(self.program()).map_err(FilterError::Attach)?,
+            egress: own(host.egress.as_fd()).map_err(FilterError::Attach)?,
+        })
     }
 
     /// Attaches the programs that look further inside the kernel, as many as it allows. `whole_host`:
@@ -185,9 +184,48 @@ impl Filter {
     }
 }
 
-fn attach_failed(error: ProgramError) -> FilterError {
-    match not_permitted(&error) {
-        Some(error) => FilterError::AttachNotPermitted(error),
-        None => FilterError::Attach(error),
+impl Links {
+    /// Links the programs to a cgroup (version 2), given by its directory. They are detached when
+    /// the descriptors are closed, and stand beside other programs on the cgroup.
+    ///
+    /// # Errors
+    /// As [`Filter::attach`].
+    pub fn create(&self, cgroup: &File) -> Result<Vec<OwnedFd>, FilterError> {
+        let programs = [(&self.ingress, INGRESS), (&self.egress, EGRESS)];
+        let links = programs.map(|(program, direction)| link(program, cgroup, direction));
+        links
+            .into_iter()
+            .collect::<io::Result<_>>()
+            .map_err(|error| match error.raw_os_error() {
+                Some(libc::EPERM) => FilterError::AttachNotPermitted(error),
+                _ => FilterError::Attach(error),
+            })
     }
+}
+
+/// What is not a link would outlive the process; the kernels that have the maps we need (5.8) have
+/// links (5.7).
+fn link(program: &OwnedFd, cgroup: &File, direction: u32) -> io::Result<OwnedFd> {
+    // Program, target, attach type, flags.
+    let attributes = [
+        program.as_raw_fd().cast_unsigned(),
+        cgroup.as_raw_fd().cast_unsigned(),
+        direction,
+        0,
+    ];
+    // SAFETY: the attributes' size is given and they outlive the call.
+    let link = unsafe {
+        libc::syscall(
+            libc::SYS_bpf,
+            LINK_CREATE,
+            attributes.as_ptr(),
+            size_of_val(&attributes),
+        )
+    };
+    let link = libc::c_int::try_from(link).map_err(io::Error::other)?;
+    if link < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: a descriptor just made, which nobody else owns.
+    Ok(unsafe { OwnedFd::from_raw_fd(link) })
 }

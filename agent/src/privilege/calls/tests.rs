@@ -10,11 +10,12 @@ use seccompiler::TargetArch;
 use super::super::{Powerless, confine};
 use super::*;
 
-const ROLES: [Role; 6] = [
+const ROLES: [Role; 7] = [
     Role::Service,
     Role::Serve,
     Role::Export,
     Role::Capture { needs_bpf: false },
+    Role::Reattach { needs_bpf: false },
     Role::SharedMemory { needs_nice: false },
     Role::Exact,
 ];
