@@ -7,6 +7,7 @@
 
 pub mod cell;
 mod inbox;
+mod listing;
 mod owner;
 pub mod pace;
 pub mod port;
@@ -255,7 +256,8 @@ fn look(shared: &Shared, places: Places, budget: Budget) {
                     host");
             }
         }
-        let Some(watch) = &mut watch else {
+        // Where files come without end, the news of them wait as well.
+        let Some(watch) = watch.as_mut().filter(|_| tap.may_list(now)) else {
             std::thread::sleep(sleep);
             continue;
         };
@@ -266,7 +268,9 @@ fn look(shared: &Shared, places: Places, budget: Budget) {
             }
             watched = directories;
         }
+        let before = thread_cpu();
         if watch.wait(sleep, |name| Name::parse(name).is_some()) {
+            tap.spend(thread_cpu().saturating_sub(before));
             tap.somebody_comes();
             pace.newcomer(at);
         }

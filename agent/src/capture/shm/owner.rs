@@ -10,7 +10,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 /// Suffixes of the files that bear the locks.
-const LOCKED: [&str; 2] = ["_el", "_sl"];
+pub(super) const LOCKED: [&str; 2] = ["_el", "_sl"];
 /// The inode of the host's own process namespace (`PROC_PID_INIT_INO`). In others, `/proc/locks`
 /// leaves out the locks of processes that are not in them.
 const HOST_PROCESSES: u64 = 0xefff_fffc;
@@ -37,13 +37,21 @@ impl Locks {
         }
     }
 
+    /// Whether somebody holds the lock that the file with this device and inode bears; `None` where
+    /// that cannot be told.
+    #[must_use]
+    pub fn is_held(&self, device: u64, inode: u64) -> Option<bool> {
+        let held = self.held.as_ref()?;
+        Some(held.contains(&(libc::major(device), libc::minor(device), inode)))
+    }
+
     /// Whether the process that made this file of shared memory is dead for sure: the file that
     /// bears its lock is there, and nobody holds the lock.
     #[must_use]
     pub fn is_abandoned(&self, path: &Path) -> bool {
-        let Some(held) = &self.held else {
+        if self.held.is_none() {
             return false;
-        };
+        }
         let mut bears_lock = false;
         for suffix in LOCKED {
             let mut name = path.as_os_str().to_owned();
@@ -51,8 +59,7 @@ impl Locks {
             let Ok(metadata) = fs::symlink_metadata(&name) else {
                 continue;
             };
-            let device = metadata.dev();
-            if held.contains(&(libc::major(device), libc::minor(device), metadata.ino())) {
+            if self.is_held(metadata.dev(), metadata.ino()) == Some(true) {
                 return false;
             }
             bears_lock = true;

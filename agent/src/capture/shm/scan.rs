@@ -4,13 +4,14 @@
 //! are new. What is behind `/proc/<pid>/root` belongs to somebody else: links are not followed
 //! there.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs::{self, Metadata};
 use std::os::unix::fs::{DirEntryExt as _, MetadataExt as _};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::cell::SegmentId;
+use super::owner::{LOCKED, Locks};
 
 /// Where shared memory is.
 const SHARED_MEMORY: &str = "/dev/shm";
@@ -20,6 +21,8 @@ const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
 const MAX_PLACES: usize = 64;
 /// Files of one of them.
 const MAX_FILES: usize = 2048;
+/// Entries of one of them that are looked through for those.
+const MAX_LISTED: usize = 65_536;
 /// A directory that changed so lately may change again without its time telling.
 const COARSE: Duration = Duration::from_secs(1);
 /// A process that was met no more often than this may still be mounting what it needs; an older
@@ -126,6 +129,12 @@ impl Name {
             *byte = digit(*high) << 4 | digit(*low);
         }
         is_id.then_some(Self::Segment(generation, SegmentId(id)))
+    }
+
+    /// Of the file whose lock this file bears.
+    fn of_lock(name: &str) -> Option<Self> {
+        let suffix = |suffix: &&str| name.strip_suffix(*suffix).and_then(Self::parse);
+        LOCKED.iter().find_map(suffix)
     }
 
     /// The file's name.
@@ -270,19 +279,66 @@ impl Place {
         let Ok(entries) = fs::read_dir(&self.path) else {
             return true;
         };
-        for entry in entries.flatten() {
+        let (mut files, mut locks) = (Vec::new(), Vec::new());
+        let mut entries = entries.flatten();
+        for entry in entries.by_ref().take(MAX_LISTED) {
             let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
             let name = entry.file_name();
-            let Some(name) = name.to_str().filter(|_| is_file).and_then(Name::parse) else {
+            let Some(name) = name.to_str().filter(|_| is_file) else {
                 continue;
             };
-            if self.files.len() >= MAX_FILES {
-                *left_out += 1;
-                break;
+            if let Some(name) = Name::parse(name) {
+                files.push((name, entry.ino()));
+            } else if let Some(name) = Name::of_lock(name) {
+                locks.push((name, entry.ino()));
             }
-            self.files.insert(name, entry.ino());
         }
+        *left_out += u64::from(entries.next().is_some());
+        *left_out += files.len().saturating_sub(MAX_FILES) as u64;
+        if files.len() > MAX_FILES {
+            files = self.choose(files, &locks);
+        }
+        self.files.extend(files);
         true
+    }
+
+    /// Of too many files those whose processes live, and of those that are left as many of each
+    /// user, the oldest first: a user who makes many hides none of another's.
+    fn choose(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
+        let device = fs::metadata(&self.path).map_or(0, |metadata| metadata.dev());
+        let held = Locks::read();
+        let locks = locks.iter();
+        let locks = locks.filter(|(_, inode)| held.is_held(device, *inode) == Some(true));
+        let alive: HashSet<Name> = locks.map(|(name, _)| *name).collect();
+        let (mut chosen, others) = files
+            .into_iter()
+            .partition::<Vec<_>, _>(|(name, _)| alive.contains(name));
+        if chosen.len() > MAX_FILES {
+            return self.share(chosen, MAX_FILES);
+        }
+        chosen.extend(self.share(others, MAX_FILES - chosen.len()));
+        chosen
+    }
+
+    /// So many of them, an equal number of each user's.
+    fn share(&self, files: Vec<(Name, u64)>, room: usize) -> Vec<(Name, u64)> {
+        let files = files.into_iter().filter_map(|(name, inode)| {
+            let metadata = fs::symlink_metadata(self.path.join(name.file_name())).ok()?;
+            let age = (metadata.ctime(), metadata.ctime_nsec());
+            Some((metadata.uid(), age, inode, name))
+        });
+        let mut files: Vec<_> = files.collect();
+        files.sort_unstable_by_key(|(user, age, inode, _)| (*user, *age, *inode));
+        let mut taken: HashMap<u32, usize> = HashMap::new();
+        let turns = files.into_iter().map(|(user, age, inode, name)| {
+            let turn = taken.entry(user).or_default();
+            *turn += 1;
+            (*turn, age, name, inode)
+        });
+        let mut turns: Vec<_> = turns.collect();
+        turns.sort_unstable_by_key(|(turn, age, _, inode)| (*turn, *age, *inode));
+        let chosen = turns.into_iter().take(room);
+        chosen.map(|(_, _, name, inode)| (name, inode)).collect()
     }
 }
 
@@ -366,6 +422,77 @@ mod tests {
         drop(directory);
         places.find();
         assert!(places.places.is_empty());
+    }
+
+    fn files(places: &Places) -> HashSet<Name> {
+        let files = places.places.values().flat_map(|place| place.files.keys());
+        files.copied().collect()
+    }
+
+    #[test]
+    fn files_of_living_processes_are_found_among_more_forged_ones_than_are_kept() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = |name: &str| fs::File::create(directory.path().join(name)).unwrap();
+        for number in 0..MAX_FILES + 500 {
+            file(&format!("fastrtps_{number:016x}"));
+        }
+        let real = ["fastrtps_port7411", "fastrtps_ffffffffffffffff"];
+        let locks = real.map(|name| {
+            file(name);
+            let lock = file(&format!("{name}_el"));
+            lock.try_lock().unwrap();
+            lock
+        });
+        for number in 0..MAX_FILES + 500 {
+            file(&format!("fastrtps_port{}", 20_000 + number));
+        }
+        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        places.find();
+        places.list();
+        let found = files(&places);
+        assert_eq!(found.len(), MAX_FILES);
+        for name in real {
+            assert!(found.contains(&Name::parse(name).unwrap()), "{name}");
+        }
+        assert!(places.left_out > 0);
+        drop(locks);
+    }
+
+    #[test]
+    fn a_user_who_makes_too_many_files_hides_none_of_another_user() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = |name: &str| directory.path().join(name);
+        for number in 0..MAX_FILES + 500 {
+            fs::write(file(&format!("fastrtps_{number:016x}")), "").unwrap();
+        }
+        let real = Name::parse("fastrtps_port7411").unwrap();
+        fs::write(file("fastrtps_port7411"), "").unwrap();
+        std::os::unix::fs::chown(file("fastrtps_port7411"), Some(64_123), None).unwrap();
+        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        places.find();
+        places.list();
+        let found = files(&places);
+        assert!(found.len() == MAX_FILES && found.contains(&real));
+    }
+
+    #[test]
+    fn a_directory_that_another_is_mounted_over_is_left_for_the_other() {
+        let above = tempfile::tempdir().unwrap();
+        let path = above.path().join("shm");
+        fs::create_dir(&path).unwrap();
+        fs::write(path.join("fastrtps_port7411"), "").unwrap();
+        let mut places = Places::new(Scope::Directories(vec![path.clone()]));
+        let mut look = |name: &str| {
+            places.find();
+            places.list();
+            assert_eq!(files(&places), HashSet::from([Name::parse(name).unwrap()]));
+        };
+        look("fastrtps_port7411");
+        // Another directory with the same path, as after a mount.
+        fs::rename(&path, above.path().join("below")).unwrap();
+        fs::create_dir(&path).unwrap();
+        fs::write(path.join("fastrtps_port7413"), "").unwrap();
+        look("fastrtps_port7413");
     }
 
     #[test]

@@ -11,12 +11,14 @@ use ros2probe_wire::record::{Record, flag};
 
 use super::cell::{Descriptor, SegmentId};
 use super::inbox::Item;
+use super::listing::Allowance;
 use super::owner::Locks;
 use super::port::Port;
 use super::scan::{Generation, Name, PlaceId, Places};
 use super::segment::{Buffer, Message, Refusal};
 use super::source::SharedFile;
 use super::verdict::{Judge, Judgement};
+use crate::capture::system::thread_cpu;
 
 /// Ports and segments that are open at once.
 const MAX_PORTS: usize = 512;
@@ -67,6 +69,9 @@ pub struct Tap {
     announced: Vec<Descriptor>,
     latest: HashMap<(SegmentId, u32), usize>,
     records: Vec<Record>,
+    allowance: Allowance,
+    /// The port that is looked at first.
+    turn: usize,
 }
 
 /// What the tap met.
@@ -171,7 +176,19 @@ impl Tap {
             announced: Vec::new(),
             latest: HashMap::new(),
             records: Vec::new(),
+            allowance: Allowance::default(),
+            turn: 0,
         }
+    }
+
+    /// Whether directories are listed at `now`, or listing has used up its share of the CPU.
+    pub fn may_list(&mut self, now: u64) -> bool {
+        self.allowance.is_left(now)
+    }
+
+    /// So many nanoseconds of CPU time went into noticing files.
+    pub const fn spend(&mut self, nanoseconds: u64) {
+        self.allowance.spend(nanoseconds);
     }
 
     /// Lists directories with the next look, and looks at every port however silent it was.
@@ -234,11 +251,17 @@ impl Tap {
     pub fn look(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
         self.judge.refill(now);
-        if now.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0 {
-            self.listed = now;
-            self.scan(now, found);
-        } else if !self.unborn.is_empty() && now.saturating_sub(self.tried) >= TRY_EVERY {
-            self.attach(now, found);
+        let lists = now.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0;
+        let tries = !self.unborn.is_empty() && now.saturating_sub(self.tried) >= TRY_EVERY;
+        if (lists || tries) && self.may_list(now) {
+            let before = thread_cpu();
+            if lists {
+                self.listed = now;
+                self.scan(now, found);
+            } else {
+                self.attach(now, found);
+            }
+            self.spend(thread_cpu().saturating_sub(before));
         }
         let most = if self.is_hurried {
             PER_LOOK_IN_A_HURRY
@@ -246,10 +269,15 @@ impl Tap {
             PER_LOOK
         };
         let mut announced = 0;
-        for index in 0..self.ports.len() {
+        let ports = self.ports.len();
+        let first = std::mem::take(&mut self.turn);
+        for step in 0..ports {
+            let index = (first + step) % ports;
             if self.ports.get(index).is_some_and(|open| open.due <= now) {
                 announced += self.look_at(index, now, found);
                 if announced >= most {
+                    // A flood at one port must not keep the others from being read.
+                    self.turn = index + 1;
                     break;
                 }
             }

@@ -12,6 +12,7 @@ use ros2probe_wire::record::{Verdict, kind};
 use tempfile::TempDir;
 
 use super::super::image::{PortImage, SegmentImage};
+use super::super::listing::{SAVINGS, SHARE};
 use super::super::scan::Scope;
 use super::*;
 
@@ -368,6 +369,49 @@ fn a_hundred_and_twenty_eight_idle_ports_are_looked_at_seldom_and_missed_by_nobo
     ports[77].push(segment.put(&sample(6)));
     assert_eq!(host.look_after(MILLISECOND), [6]);
     assert_eq!(host.tap.counters().ports, 128);
+}
+
+#[test]
+fn a_flood_at_one_port_does_not_starve_the_others() {
+    let mut host = Host::new();
+    let mut flooded = PortImage::new(7400, 256, 0x100).in_directory(host.path());
+    let (mut other, mut segment) = (host.port(7411), host.segment(1));
+    host.look_after(SECOND);
+    host.tap.is_hurried = true;
+    let descriptor = segment.put(&sample(1));
+    let mut found = Vec::new();
+    for round in 0..4 {
+        for _ in 0..2 * PER_LOOK_IN_A_HURRY {
+            flooded.push(descriptor);
+        }
+        if round == 0 {
+            other.push(segment.put(&sample(2)));
+        }
+        found.extend(host.look_after(MILLISECOND));
+    }
+    assert!(found.contains(&2), "{found:?}");
+}
+
+#[test]
+fn files_that_come_and_go_without_end_cost_no_more_than_listing_may() {
+    let mut host = Host::new();
+    for number in 0..2000 {
+        fs::write(host.path().join(format!("fastrtps_port{number}")), "").unwrap();
+    }
+    host.look_after(SECOND);
+    let (before, began) = (thread_cpu(), host.now);
+    while host.now < began + 20 * SECOND {
+        host.tap.somebody_comes();
+        host.look_after(10 * MILLISECOND);
+    }
+    let spent = thread_cpu() - before;
+    let most = SAVINGS + (host.now - began) / SHARE;
+    assert!(spent < 2 * most, "{spent} {most}");
+    // A new port is opened all the same, when the share allows it.
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    host.look_after(100 * SECOND);
+    port.push(segment.put(&sample(5)));
+    assert_eq!(host.look_after(MILLISECOND), [5]);
 }
 
 #[test]
