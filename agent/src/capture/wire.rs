@@ -481,3 +481,32 @@ fn take_in_rest(rest: &Reassembled, observer: &mut Observer) {
     let envelope = Envelope::of_handover(&record, rest.last_seen);
     observer.datagram(&envelope, rest.payload(), Some(&record.handover()));
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::netns::tests::{in_new_namespace, ip};
+
+    #[test]
+    fn an_interface_that_the_configuration_names_is_missed_until_it_is_there_again() {
+        in_new_namespace(|| {
+            let names = ["one", "never", "patt*"].map(str::to_owned);
+            let selection = Selection::new(&names, &[]).unwrap();
+            let mut interfaces = Interfaces::open().unwrap();
+            let mut named = Named::default();
+            let mut look = |command: &str| {
+                ip(command);
+                interfaces.changes().unwrap();
+                named.look(&selection, &interfaces);
+                named.missing().map(str::to_owned)
+            };
+            assert_eq!(look("link add one type veth peer name pattern"), None);
+            let missing = Some("one".to_owned());
+            assert_eq!(look("link set one name other"), missing);
+            assert_eq!(look("link set other name one"), None);
+            // The other end goes with it: a pattern names no interface.
+            assert_eq!(look("link delete one"), missing);
+            assert_eq!(look("link add one type veth peer name far"), None);
+        });
+    }
+}
