@@ -41,6 +41,21 @@ struct Reader {
 }
 
 impl Acknowledgements {
+    /// Readers at most.
+    pub const CAP: usize = READERS;
+
+    /// Readers.
+    #[must_use]
+    pub const fn len(&self) -> usize {
+        self.readers.len()
+    }
+
+    /// Whether nobody acknowledged.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.readers.is_empty()
+    }
+
     /// Takes in an ACKNACK.
     pub fn record(&mut self, record: &Record) {
         let guid = record.reader();

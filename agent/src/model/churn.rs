@@ -78,6 +78,21 @@ pub struct Churn {
 }
 
 impl Churn {
+    /// Counters at most: of every domain that UDP has ports for, each entity and event.
+    pub const CAP: usize = 233 * 4 * 5;
+
+    /// Counters.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.counts.len()
+    }
+
+    /// Whether nothing was counted.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.counts.is_empty()
+    }
+
     /// Counts one.
     pub fn count(&mut self, domain_id: u32, entity: Entity, event: Event) {
         *self.counts.entry((domain_id, entity, event)).or_default() += 1;

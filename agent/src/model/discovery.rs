@@ -18,7 +18,7 @@ use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::rtps::Locator;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
-use facts::domain;
+use facts::{ADDRESSES, domain, named};
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, Portrait};
 use graveyard::Graveyard;
 pub use memory::{Memory, hexadecimal};
@@ -26,6 +26,7 @@ use subject::Subject;
 
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
+use super::size::Size;
 
 const SECOND: u64 = 1_000_000_000;
 /// A participant that was seen over this span is no forgery of the moment.
@@ -39,6 +40,9 @@ const FORSAKEN: u64 = 90 * SECOND;
 const SEARCH: u64 = SECOND / 10;
 /// Endpoints and nodes whose participant is not known yet: how many and how long.
 const PENDING: usize = 1024;
+const PENDING_NODES: usize = PENDING / 8;
+/// Bytes of those nodes together.
+const PENDING_NODE_BYTES: usize = 1 << 20;
 const PENDING_FOR: u64 = 60 * SECOND;
 /// Longest topic or type name: `string<256>` in the builtin topics of DDS. What is longer is no
 /// name but an attempt on our memory.
@@ -83,6 +87,7 @@ struct PendingNodes {
     writer: Guid,
     sequence_number: u64,
     nodes: Vec<Node>,
+    bytes: usize,
 }
 
 /// All participants, endpoints and nodes.
@@ -97,6 +102,8 @@ pub struct Discovery {
     pending_nodes: HashMap<GuidPrefix, PendingNodes>,
     graveyard: Graveyard,
     node_count: usize,
+    /// Writers and readers that nodes name.
+    named: usize,
     changes: Vec<Change>,
     /// Counters of events.
     pub churn: Churn,
@@ -128,6 +135,7 @@ impl Discovery {
             pending_nodes: HashMap::new(),
             graveyard: Graveyard::default(),
             node_count: 0,
+            named: 0,
             changes: Vec::new(),
             churn: Churn::default(),
             evictions: Evictions::default(),
@@ -164,6 +172,69 @@ impl Discovery {
     #[must_use]
     pub const fn evictions(&self) -> Evictions {
         self.evictions
+    }
+
+    /// Entries and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            caps,
+            participants,
+            endpoints,
+            pending_endpoints,
+            pending_nodes,
+            graveyard,
+            node_count,
+            named,
+            changes,
+            churn,
+            evictions: _,
+            search_after: _,
+            revision: _,
+        } = self;
+        let waiting = self.pending_node_bytes();
+        let most = |count: fn(&Participant) -> usize| {
+            let each = participants.values();
+            each.map(|participant| count(participant))
+                .max()
+                .unwrap_or(0)
+        };
+        let of_one = most(|participant| participant.endpoints.len());
+        let addresses = most(|participant| {
+            let Addresses {
+                metatraffic,
+                default,
+            } = &participant.addresses;
+            metatraffic.len().max(default.len())
+        });
+        vec![
+            Size::new(
+                "discovery.participants",
+                participants.len(),
+                caps.participants,
+            ),
+            Size::new("discovery.participant.endpoints", of_one, PER_PARTICIPANT),
+            Size::new("discovery.participant.addresses", addresses, ADDRESSES),
+            Size::new("discovery.endpoints", endpoints.len(), caps.endpoints),
+            Size::new(
+                "discovery.pending_endpoints",
+                pending_endpoints.len(),
+                PENDING,
+            ),
+            Size::new(
+                "discovery.pending_nodes",
+                pending_nodes.len(),
+                PENDING_NODES,
+            ),
+            Size::new("discovery.pending_nodes.bytes", waiting, PENDING_NODE_BYTES),
+            Size::new("discovery.graveyard", graveyard.len(), Graveyard::CAP),
+            Size::new("discovery.nodes", *node_count, caps.nodes),
+            Size::new("discovery.nodes.named", *named, caps.endpoints),
+            // Taken after each datagram.
+            Size::new("discovery.changes", changes.len(), caps.endpoints),
+            Size::new("discovery.churn", churn.len(), Churn::CAP),
+        ]
     }
 
     /// Whether this endpoint was disposed of a moment ago: what it sent may still be on its way.
@@ -308,17 +379,22 @@ impl Discovery {
             return;
         }
         let room = self.caps.nodes.saturating_sub(self.node_count);
-        let known = self
-            .participants
-            .get(&prefix)
-            .map_or(0, |known| known.nodes.len());
-        let nodes: Vec<Node> = entities
+        let known: &[Node] = match self.participants.get(&prefix) {
+            Some(known) => &known.nodes,
+            None => &[],
+        };
+        let mut names = self.caps.endpoints.saturating_sub(self.named) + named(known);
+        names = names.min(PER_PARTICIPANT);
+        let mut nodes: Vec<Node> = entities
             .nodes
             .iter()
-            .take(room + known)
+            .take(room + known.len())
             .map(Node::of)
             .collect();
         self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
+        for node in &mut nodes {
+            self.evictions.nodes += u64::from(node.cut(&mut names));
+        }
         if self.participants.contains_key(&prefix) {
             self.set_nodes(
                 prefix,
@@ -336,15 +412,18 @@ impl Discovery {
         if self.pending_nodes.get(&prefix).is_some_and(older) {
             return;
         }
-        if self.pending_nodes.len() >= PENDING / 8 && !self.pending_nodes.contains_key(&prefix) {
-            let oldest = self
-                .pending_nodes
-                .iter()
-                .min_by_key(|(_, pending)| pending.at);
-            if let Some(oldest) = oldest.map(|(prefix, _)| *prefix) {
-                self.pending_nodes.remove(&oldest);
-                self.evictions.nodes += 1;
-            }
+        self.pending_nodes.remove(&prefix);
+        let bytes = nodes.iter().map(Node::bytes).sum();
+        while self.pending_nodes.len() >= PENDING_NODES
+            || self.pending_node_bytes() + bytes > PENDING_NODE_BYTES
+        {
+            let pending = self.pending_nodes.iter();
+            let oldest = pending.min_by_key(|(_, pending)| pending.at);
+            let Some(oldest) = oldest.map(|(prefix, _)| *prefix) else {
+                break;
+            };
+            self.pending_nodes.remove(&oldest);
+            self.evictions.nodes += 1;
         }
         let sequence_number = origin.sequence_number;
         let pending = PendingNodes {
@@ -352,6 +431,7 @@ impl Discovery {
             writer,
             sequence_number,
             nodes,
+            bytes,
         };
         self.pending_nodes.insert(prefix, pending);
     }
@@ -385,6 +465,13 @@ impl Discovery {
             self.pending_endpoints.pop_front();
         }
         self.pending_nodes.retain(|_, pending| fresh(pending.at));
+    }
+
+    fn pending_node_bytes(&self) -> usize {
+        self.pending_nodes
+            .values()
+            .map(|pending| pending.bytes)
+            .sum()
     }
 
     /// Puts an announced endpoint into its known participant.
@@ -492,6 +579,7 @@ impl Discovery {
         participant.nodes_from = Some((writer, sequence_number));
         let domain_id = participant.domain_id;
         let before = std::mem::replace(&mut participant.nodes, nodes);
+        self.named = self.named.saturating_sub(named(&before)) + named(&participant.nodes);
         let after: Vec<_> = participant
             .nodes
             .iter()
@@ -535,6 +623,7 @@ impl Discovery {
             self.drop_endpoint(endpoint, cascade, at, journal);
         }
         self.node_count = self.node_count.saturating_sub(participant.nodes.len());
+        self.named = self.named.saturating_sub(named(&participant.nodes));
         if let Some(event) = cascade {
             for node in participant.nodes {
                 let subject = Subject::node(domain_id, guid, &node.name);

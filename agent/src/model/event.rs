@@ -16,6 +16,7 @@ use ros2probe_wire::{Guid, Timestamp};
 use super::churn;
 use super::diagnosis::Diagnosis;
 use super::journal::Loss;
+use super::size::Size;
 use super::snapshot::WatchState;
 
 const SECOND: u64 = 1_000_000_000;
@@ -216,6 +217,23 @@ impl Events {
         }
         room.in_second += 1;
         self.waiting.push(Event { at, kind });
+    }
+
+    /// Entries and cap of every list. They are taken when [`MANY`] wait, and one datagram or tick adds
+    /// at most [`MOST`] of each class and second.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new list does not compile before it has a place here.
+        let Self {
+            waiting,
+            classes,
+            bursts,
+        } = self;
+        let room = MANY + classes.len() * usize::from(MOST);
+        vec![
+            Size::new("events.waiting", waiting.len(), room),
+            Size::new("events.bursts", bursts.len(), BURSTS),
+        ]
     }
 
     /// So many wait to be taken that nothing more should be given to the model before.

@@ -7,6 +7,8 @@
 use std::collections::{BTreeSet, HashMap};
 
 use ros2probe_wire::Guid;
+
+use super::size::Size;
 use ros2probe_wire::record::Verdict;
 
 /// The table of verdicts.
@@ -25,6 +27,23 @@ struct Entry {
 }
 
 impl Interest {
+    /// Entries and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            entries,
+            changed,
+            limit,
+            evictions: _,
+        } = self;
+        // Those that go wait for the kernel to be told.
+        vec![
+            Size::new("interest.entries", entries.len(), 2 * limit),
+            Size::new("interest.changed", changed.len(), 2 * limit),
+        ]
+    }
+
     /// Empty, for at most `limit` entries.
     #[must_use]
     pub fn new(limit: usize) -> Self {

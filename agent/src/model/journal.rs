@@ -9,6 +9,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 use super::cause::LossCause;
 use super::event::Events;
 use super::payloads::MissedReason;
+use super::size::Size;
 
 /// Entries kept of discovery events and of writers' losses each.
 const LIMIT: usize = 1024;
@@ -93,6 +94,31 @@ pub struct Journal {
 }
 
 impl Journal {
+    /// Entries and cap of every list.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new list does not compile before it has a place here.
+        let Self {
+            discovery,
+            losses,
+            delivery_losses,
+            missing,
+            events,
+        } = self;
+        let mut sizes = events.sizes();
+        sizes.extend([
+            Size::new("journal.discovery", discovery.len(), LIMIT),
+            Size::new("journal.losses", losses.len(), LIMIT),
+            Size::new(
+                "journal.delivery_losses",
+                delivery_losses.len(),
+                DELIVERY_LIMIT,
+            ),
+            Size::new("journal.missing", missing.len(), LIMIT),
+        ]);
+        sizes
+    }
+
     /// Discovery events, oldest first.
     pub fn discovery(&self) -> impl Iterator<Item = &DiscoveryEvent> {
         self.discovery.iter()

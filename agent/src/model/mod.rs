@@ -35,6 +35,7 @@ pub mod sampled;
 pub mod samples;
 pub mod selection;
 pub mod sequence;
+pub mod size;
 pub mod snapshot;
 pub mod sockets;
 pub mod subscribers;

@@ -33,6 +33,7 @@ use super::profiler::{Measured, Profiler, Sighting, UNDELIVERED};
 use super::rate::Slot;
 use super::receivers::{Around, Receivers};
 use super::selection::Wish;
+use super::size::Size;
 use super::snapshot::{Snapshot, SocketFacts, WatchState};
 use super::topic::{Naming, Topic, TopicId, Topics, Watched};
 use super::trace::{Spans, Subject, Tracer};
@@ -183,7 +184,7 @@ impl Observer {
             pieces: Pieces::default(),
             payloads: Payloads::new(settings.payload_bytes, settings.telling),
             wishes: Arc::default(),
-            receivers: Receivers::new(settings.deliveries),
+            receivers: Receivers::new(settings.deliveries, settings.participants),
             tracer: Tracer::new(settings.directed),
             examiner: Examiner::default(),
             decode_errors: BTreeMap::new(),
@@ -248,6 +249,43 @@ impl Observer {
     #[must_use]
     pub const fn has_much_to_give(&self) -> bool {
         self.payloads.is_full() || self.journal.events.are_many()
+    }
+
+    /// Entries, or bytes, and cap of every table of the model, by name.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new component does not compile before it has a place here.
+        let Self {
+            settings,
+            watchlist: _,
+            discovery,
+            topics,
+            interest,
+            profiler,
+            pieces,
+            payloads,
+            wishes: _,
+            receivers,
+            tracer,
+            examiner,
+            decode_errors: _,
+            datagrams: _,
+            records: _,
+            journal,
+            clock: _,
+            calendar: _,
+        } = self;
+        let mut sizes = discovery.sizes();
+        sizes.extend(topics.sizes(settings.endpoints, settings.topics));
+        sizes.extend(interest.sizes());
+        sizes.extend(profiler.sizes(settings.endpoints));
+        sizes.extend(pieces.sizes());
+        sizes.extend(payloads.sizes(settings.endpoints, settings.unknown_writers));
+        sizes.extend(receivers.sizes());
+        sizes.extend(tracer.sizes());
+        sizes.extend(examiner.sizes(settings.endpoints));
+        sizes.extend(journal.sizes());
+        sizes
     }
 
     /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`
@@ -493,6 +531,14 @@ impl Observer {
             if known.is_some_and(|known| known.topic.is_none()) {
                 let wishes = self.wishes.iter().map(|wish| wish.id);
                 let number = counted.number;
+                // Those that the profiler gave up since the last second make room.
+                if self.payloads.strangers() >= self.settings.unknown_writers {
+                    let profiler = &self.profiler;
+                    self.payloads.retain_strangers(|writer| {
+                        let known = profiler.get(writer);
+                        known.is_some_and(|known| known.topic.is_none())
+                    });
+                }
                 self.payloads.counted_of_stranger(writer, number, wishes);
             }
             return;
@@ -710,7 +756,10 @@ impl Observer {
                     .iter()
                     .chain(&announcement.metatraffic_unicast);
                 let places = unicast.filter_map(|locator| locator.udp().map(Place::from));
-                self.receivers.announce(announcement.guid.prefix, places);
+                let prefix = announcement.guid.prefix;
+                if self.discovery.participants().contains_key(&prefix) {
+                    self.receivers.announce(prefix, places);
+                }
             }
             discovery::Discovery::Gone { guid, .. } => {
                 self.discovery

@@ -16,6 +16,7 @@ use ros2probe_wire::{Guid, Record, Timestamp};
 use super::assembly::Assembly;
 use super::in_order::{Due, InOrder, Progress};
 use super::journal::Missing;
+use super::size::Size;
 use super::topic::Wished;
 use super::writer::Counted;
 
@@ -211,6 +212,37 @@ impl Payloads {
         }
     }
 
+    /// Entries, or bytes, and cap of every table: so many writers may be wished for, so many be
+    /// strangers.
+    #[must_use]
+    pub fn sizes(&self, endpoints: usize, strangers: usize) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            writers,
+            telling: _,
+            deep: _,
+            assembly,
+            strangers: known,
+            given,
+            given_bytes,
+            waiting_bytes,
+            refused: _,
+        } = self;
+        let (bytes, limit, _) = assembly.size();
+        let earlier = known.values().map(|earlier| earlier.numbers.len());
+        vec![
+            Size::new("payloads.writers", writers.len(), endpoints),
+            Size::new("payloads.strangers", known.len(), strangers),
+            Size::new(
+                "payloads.strangers.numbers",
+                earlier.max().unwrap_or(0),
+                EARLIER,
+            ),
+            Size::new("payloads.given", given.len(), WAITING),
+            Size::new("payloads.bytes", bytes + given_bytes + waiting_bytes, limit),
+        ]
+    }
+
     /// Bytes held, their cap, and what found no room.
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
@@ -399,6 +431,12 @@ impl Payloads {
             let (first, _, count) = earlier.before.unwrap_or((lowest, lowest, 0));
             earlier.before = Some((first.min(lowest), lowest, count + 1));
         }
+    }
+
+    /// Strangers remembered.
+    #[must_use]
+    pub fn strangers(&self) -> usize {
+        self.strangers.len()
     }
 
     /// Forgets unannounced writers that are no more.

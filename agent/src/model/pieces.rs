@@ -8,6 +8,8 @@ use std::collections::{BTreeMap, VecDeque};
 
 use ros2probe_wire::{Guid, Record};
 
+use super::size::Size;
+
 /// Largest sample kept; far more than any discovery data.
 const MAX_SAMPLE: u32 = 256 * 1024;
 /// All samples together.
@@ -36,6 +38,15 @@ struct Sample {
 }
 
 impl Pieces {
+    /// Entries, or bytes, and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        vec![
+            Size::new("pieces.samples", self.samples.len(), SAMPLES),
+            Size::new("pieces.bytes", self.bytes, BUDGET),
+        ]
+    }
+
     /// Whether fragments of this sample were kept.
     #[must_use]
     pub fn holds(&self, record: &Record) -> bool {
@@ -120,6 +131,7 @@ impl Pieces {
 
 #[cfg(test)]
 mod tests {
+    use super::size::Size;
     use super::*;
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {

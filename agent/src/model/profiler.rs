@@ -10,15 +10,18 @@ use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, Timestamp};
 
+use super::acknowledgement::Acknowledgements;
 use super::calendar::Calendar;
 use super::delivery::Totals;
 use super::in_order::Progress;
 use super::journal::Journal;
 use super::receivers::Around;
 use super::samples::Budget;
+use super::size::Size;
 use super::snapshot::Measurement;
 use super::subscribers::{Room, Sight, Stage, Subscribers};
 use super::topic::TopicId;
+use super::ways::Ways;
 use super::writer::{Counted, Scene, Traits, Writer};
 
 const SECOND: u64 = 1_000_000_000;
@@ -145,6 +148,56 @@ impl Profiler {
             },
             search_after: Timestamp(0),
         }
+    }
+
+    /// Entries, or bytes, and cap of every table; of what writers have each, of the largest.
+    #[must_use]
+    pub fn sizes(&self, endpoints: usize) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            writers,
+            strangers,
+            stranger_limit,
+            stranger_evictions: _,
+            shared,
+            search_after: _,
+        } = self;
+        let Shared {
+            budget,
+            strangers_budget,
+            deliveries_budget,
+            room,
+        } = shared;
+        let own = writers.len() - strangers;
+        let mut sizes = vec![
+            Size::new("profiler.writers", own, endpoints),
+            Size::new("profiler.strangers", *strangers, *stranger_limit),
+            Size::new("profiler.samples.bytes", budget.bytes, budget.limit),
+            Size::new(
+                "profiler.strangers.samples.bytes",
+                strangers_budget.bytes,
+                strangers_budget.limit,
+            ),
+            Size::new(
+                "profiler.deliveries.samples.bytes",
+                deliveries_budget.bytes,
+                deliveries_budget.limit,
+            ),
+            Size::new("profiler.deliveries", room.used, room.limit),
+        ];
+        let all = writers
+            .values()
+            .filter_map(|each| each.subscribers.as_ref());
+        let [mut ways, mut readers] = [0, 0];
+        for subscribers in all {
+            let (own_ways, own_readers) = subscribers.sizes();
+            ways = ways.max(own_ways);
+            readers = readers.max(own_readers);
+        }
+        sizes.push(Size::new("subscribers.ways", ways, Ways::CAP));
+        let cap = Acknowledgements::CAP;
+        sizes.push(Size::new("subscribers.acknowledgements", readers, cap));
+        sizes
     }
 
     /// One of them.

@@ -9,13 +9,18 @@
 //! nobody: what is directed at one member reaches all. Where nothing tells, or two participants
 //! share a socket, the answer is "unknown", never a guess.
 
+mod places;
+
 use std::collections::{HashMap, HashSet, VecDeque};
 
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
+use places::Places;
+
 use super::calendar::Calendar;
 use super::discovery::Discovery;
+use super::size::Size;
 use super::snapshot::SocketFacts;
 use super::sockets::Sockets;
 use super::topic::{Topic, Topics};
@@ -34,7 +39,7 @@ pub struct Receivers {
     sockets: Sockets,
     learned: HashMap<u64, Learned>,
     processes: HashMap<u32, Owners>,
-    places: HashMap<Place, Holder>,
+    places: Places,
     closed: HashSet<u64>,
     closings: VecDeque<u64>,
     limit: usize,
@@ -77,23 +82,15 @@ struct Learned {
 #[derive(Debug, Default)]
 struct Owners(Vec<GuidPrefix>);
 
-#[derive(Clone, Copy, Debug)]
-struct Holder {
-    prefix: GuidPrefix,
-    previous: Option<GuidPrefix>,
-    /// Two participants announce it in turn.
-    contested: bool,
-}
-
 impl Receivers {
-    /// Nothing known; at most `limit` sockets.
+    /// Nothing known; at most `limit` sockets, and the addresses of so many participants.
     #[must_use]
-    pub fn new(limit: usize) -> Self {
+    pub fn new(limit: usize, participants: usize) -> Self {
         Self {
             sockets: Sockets::new(limit),
             learned: HashMap::new(),
             processes: HashMap::new(),
-            places: HashMap::new(),
+            places: Places::new(participants.saturating_mul(PLACES / 2), PLACES),
             closed: HashSet::new(),
             closings: VecDeque::new(),
             limit,
@@ -153,7 +150,9 @@ impl Receivers {
         if !is_new || process == before {
             return;
         }
-        if let (Some(process), Some(learned)) = (process, self.learned.get(&cookie)) {
+        if let (Some(process), Some(learned)) = (process, self.learned.get(&cookie))
+            && (self.processes.len() < self.limit || self.processes.contains_key(&process))
+        {
             let known = self.processes.entry(process).or_default();
             let senders = learned.senders.0.iter();
             senders.for_each(|owner| known.add(*owner));
@@ -212,7 +211,9 @@ impl Receivers {
         if is_sent {
             known.senders.add(owner);
             let facts = self.sockets.get(record.socket);
-            if let Some(process) = facts.and_then(|facts| facts.process_id) {
+            if let Some(process) = facts.and_then(|facts| facts.process_id)
+                && (self.processes.len() < self.limit || self.processes.contains_key(&process))
+            {
                 self.processes.entry(process).or_default().add(owner);
             }
         } else {
@@ -224,29 +225,46 @@ impl Receivers {
     /// A participant announces where it is reached by unicast.
     pub fn announce(&mut self, prefix: GuidPrefix, places: impl Iterator<Item = Place>) {
         for place in places.take(PLACES) {
-            let Some(holder) = self.places.get_mut(&place) else {
-                let holder = Holder {
-                    prefix,
-                    previous: None,
-                    contested: false,
-                };
-                self.places.insert(place, holder);
-                self.generation += 1;
-                continue;
-            };
-            if holder.prefix != prefix {
-                holder.contested |= holder.previous == Some(prefix);
-                holder.previous = Some(holder.prefix);
-                holder.prefix = prefix;
-                self.generation += 1;
-            }
+            self.generation += u64::from(self.places.put(prefix, place));
         }
+    }
+
+    /// Addresses, their cap, and those given up because of it.
+    #[must_use]
+    pub fn addresses(&self) -> (usize, usize, u64) {
+        self.places.size()
+    }
+
+    /// Entries and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            sockets,
+            learned,
+            processes,
+            places,
+            closed,
+            closings,
+            limit,
+            generation: _,
+        } = self;
+        let (known, known_limit, _) = sockets.size();
+        let (addresses, addresses_limit, _) = places.size();
+        vec![
+            Size::new("receivers.sockets", known, known_limit),
+            Size::new("receivers.learned", learned.len(), *limit),
+            Size::new("receivers.processes", processes.len(), *limit),
+            Size::new("receivers.places", addresses, addresses_limit),
+            Size::new("receivers.closed", closed.len(), CLOSED),
+            Size::new("receivers.closings", closings.len(), CLOSED),
+        ]
     }
 
     /// Forgets what participants said that are no more.
     pub fn tidy(&mut self, discovery: &Discovery) {
         let is_there = |prefix: &GuidPrefix| discovery.participants().contains_key(prefix);
-        self.places.retain(|_, holder| is_there(&holder.prefix));
+        self.places.retain(is_there);
         for learned in self.learned.values_mut() {
             learned.senders.0.retain(is_there);
             learned.addressed.0.retain(is_there);
@@ -293,9 +311,9 @@ impl Receivers {
                 return Some(owner);
             }
         }
-        let holder = self.places.get(&way.place)?;
-        let is_known = discovery.participants().contains_key(&holder.prefix);
-        (is_known && !holder.contested && !way.place.is_multicast()).then_some(holder.prefix)
+        let prefix = self.places.owner(&way.place)?;
+        let is_known = discovery.participants().contains_key(&prefix);
+        (is_known && !way.place.is_multicast()).then_some(prefix)
     }
 }
 

@@ -336,6 +336,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     let (writers, unknown, unknown_limit, unknown_evictions) = profiler.size();
     let (interest, interest_limit, interest_evictions) = observer.interest.size();
     let (sockets, sockets_limit, sockets_evictions) = observer.receivers.sockets().size();
+    let (addresses, addresses_limit, addresses_evictions) = observer.receivers.addresses();
     let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
     let (spans, spans_limit, spans_evictions) = observer.tracer.size();
     let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
@@ -388,6 +389,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
             room.evictions + refused,
         ),
         table("sockets", sockets, sockets_limit, sockets_evictions),
+        table("addresses", addresses, addresses_limit, addresses_evictions),
         table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
         table("spans", spans, spans_limit, spans_evictions),
         table("payloads", payloads, payloads_limit, payloads_evictions),

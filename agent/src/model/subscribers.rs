@@ -105,6 +105,25 @@ pub struct Stage<'a> {
 }
 
 impl Subscribers {
+    /// Ways, and readers that acknowledge. Its deliveries are in [`Room`].
+    #[must_use]
+    pub fn sizes(&self) -> (usize, usize) {
+        // A new list does not compile before it has a place here or in what is bounded by itself.
+        let Self {
+            ways,
+            deliveries: _,
+            open: _,
+            totals: _,
+            departures: _,
+            acknowledgements,
+            reassembled: _,
+            at_socket: _,
+            generation: _,
+            sure_from: _,
+        } = self;
+        (ways.iter().count(), acknowledgements.len())
+    }
+
     /// None yet, of a writer that the kernel meters from `sure_from` on.
     #[must_use]
     pub fn new(sure_from: Timestamp) -> Self {

@@ -14,6 +14,7 @@ use ros2probe_wire::{Guid, Timestamp};
 use super::delivery::Totals;
 use super::expectation::Judgement;
 use super::selection::{Depth, Wish};
+use super::size::Size;
 use super::snapshot::Measurement;
 use crate::config::Watchlist;
 
@@ -249,6 +250,29 @@ impl Topics {
     #[must_use]
     pub fn ids(&self) -> Vec<TopicId> {
         self.index.values().copied().collect()
+    }
+
+    /// Entries and cap of every table; there may be as many topics as endpoints.
+    #[must_use]
+    pub fn sizes(&self, endpoints: usize, measured: usize) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            topics,
+            index,
+            vanished,
+            vanished_watched,
+            created: _,
+            watched,
+            rejected: _,
+            evictions: _,
+        } = self;
+        vec![
+            Size::new("topics.topics", topics.len(), endpoints),
+            Size::new("topics.index", index.len(), endpoints),
+            Size::new("topics.vanished", vanished.len(), endpoints),
+            Size::new("topics.vanished_watched", vanished_watched.len(), measured),
+            Size::new("topics.watched", *watched, measured),
+        ]
     }
 
     /// How many.

@@ -14,6 +14,7 @@ use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::identity::Identity;
 use super::samples::{Budget, Progress, Samples};
+use super::size::Size;
 use super::way::Place;
 
 /// Writers whose messages may be sampled.
@@ -238,6 +239,30 @@ impl Tracer {
     /// What was finished since the last call.
     pub fn take(&mut self) -> Spans {
         std::mem::take(&mut self.ledger.finished)
+    }
+
+    /// Entries, or bytes, and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            wanted: _,
+            directed: _,
+            writers,
+            ledger,
+        } = self;
+        let Ledger {
+            budget,
+            open,
+            evictions: _,
+            finished,
+        } = ledger;
+        vec![
+            Size::new("trace.writers", writers.len(), MAX_WRITERS),
+            Size::new("trace.bytes", budget.bytes, budget.limit),
+            Size::new("trace.open", *open, MAX_OPEN),
+            Size::new("trace.finished", finished.spans.len(), MAX_FINISHED),
+        ]
     }
 
     /// Messages under way or waiting, their cap, and those given up for it.

@@ -54,6 +54,9 @@ pub struct Known {
 }
 
 impl Ways {
+    /// Ways at most.
+    pub const CAP: usize = LIMIT;
+
     /// All of them.
     pub fn iter(&self) -> impl Iterator<Item = &Known> {
         self.ways.iter()

@@ -8,6 +8,7 @@ use ros2probe_wire::{Guid, Timestamp};
 use super::endpoints::{Lonely, Lookout};
 use super::{Diagnoses, Diagnosis, QosPairs, nodes};
 use crate::model::discovery::Discovery;
+use crate::model::size::Size;
 use crate::model::topic::Topics;
 
 const SECOND: u64 = 1_000_000_000;
@@ -59,6 +60,24 @@ impl Examiner {
     pub fn size(&self) -> (usize, usize, u64) {
         let limit = PER_KIND * Diagnosis::KINDS.len();
         (self.current.list.len(), limit, self.left_out)
+    }
+
+    /// Entries and cap of every table.
+    #[must_use]
+    pub fn sizes(&self, endpoints: usize) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            revision: _,
+            due: _,
+            alone,
+            current: _,
+            left_out: _,
+        } = self;
+        let (list, cap, _) = self.size();
+        vec![
+            Size::new("examiner.alone", alone.len(), endpoints),
+            Size::new("examiner.list", list, cap),
+        ]
     }
 
     /// Looks again the next time, whatever discovery says of itself.

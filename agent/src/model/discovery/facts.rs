@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 /// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
 pub(super) const MAX_DOMAIN: u32 = 232;
 /// Addresses kept of one participant and kind.
-const ADDRESSES: usize = 16;
+pub(super) const ADDRESSES: usize = 16;
 
 /// How sure a participant's domain is, least first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -185,6 +185,29 @@ impl Node {
             readers: node.readers.clone(),
         }
     }
+
+    /// Leaves it so many of its writers and readers at most; whether some had to go.
+    pub(super) fn cut(&mut self, left: &mut usize) -> bool {
+        let mut is_cut = false;
+        for list in [&mut self.writers, &mut self.readers] {
+            is_cut |= list.len() > *left;
+            list.truncate(*left);
+            *left -= list.len();
+        }
+        is_cut
+    }
+
+    /// What it takes.
+    pub(super) fn bytes(&self) -> usize {
+        let guids = self.writers.len() + self.readers.len();
+        size_of::<Self>() + self.name.len() + guids * size_of::<Guid>()
+    }
+}
+
+/// Writers and readers that these nodes name.
+pub(super) fn named(nodes: &[Node]) -> usize {
+    let named = |node: &Node| node.writers.len() + node.readers.len();
+    nodes.iter().map(named).sum()
 }
 
 /// The participant's domain: as announced, else by the port its announcement went to (RTPS 2.5,

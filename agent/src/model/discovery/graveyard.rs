@@ -21,6 +21,14 @@ pub(super) struct Graveyard {
 }
 
 impl Graveyard {
+    /// Graves at most.
+    pub(super) const CAP: usize = BURIALS;
+
+    /// Graves.
+    pub(super) fn len(&self) -> usize {
+        self.graves.len()
+    }
+
     pub(super) fn bury(&mut self, guid: Guid, origin: &Origin) {
         if self.graves.len() >= BURIALS {
             self.graves.pop_front();

@@ -18,7 +18,9 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 use serde::{Deserialize, Serialize};
 
-use super::facts::{Addresses, DomainSource, Endpoint, MAX_DOMAIN, Node, Participant, Portrait};
+use super::facts::{
+    Addresses, DomainSource, Endpoint, MAX_DOMAIN, Node, Participant, Portrait, named,
+};
 use super::{Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT};
 
 /// Everybody that was there.
@@ -133,6 +135,12 @@ impl Discovery {
             self.evictions.nodes += participant.nodes.len().saturating_sub(room) as u64;
             participant.nodes.truncate(room);
             self.node_count += participant.nodes.len();
+            let mut names = self.caps.endpoints.saturating_sub(self.named);
+            names = names.min(PER_PARTICIPANT);
+            for node in &mut participant.nodes {
+                self.evictions.nodes += u64::from(node.cut(&mut names));
+            }
+            self.named += named(&participant.nodes);
             for endpoint in remembered.endpoints.iter().take(PER_PARTICIPANT) {
                 let domain_id = participant.domain_id;
                 let Some((guid, endpoint)) = endpoint.endpoint(prefix, domain_id, now) else {

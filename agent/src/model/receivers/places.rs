@@ -1,0 +1,171 @@
+//! Who announces which address.
+//!
+//! Bounded twice: of one participant the addresses that were announced last are kept, for who
+//! forges its announcements may name a new one each time; of all together likewise.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use ros2probe_wire::GuidPrefix;
+
+use crate::model::way::Place;
+
+/// All addresses.
+#[derive(Debug)]
+pub(super) struct Places {
+    holders: HashMap<Place, Holder>,
+    /// By the age of the announcement.
+    ages: BTreeMap<u64, Place>,
+    /// The same ages, by participant.
+    own: BTreeSet<(GuidPrefix, u64)>,
+    age: u64,
+    limit: usize,
+    each: usize,
+    evictions: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Holder {
+    prefix: GuidPrefix,
+    previous: Option<GuidPrefix>,
+    /// Two participants announce it in turn.
+    contested: bool,
+    age: u64,
+}
+
+impl Places {
+    /// None; at most `limit`, and `each` of one participant.
+    pub(super) fn new(limit: usize, each: usize) -> Self {
+        Self {
+            holders: HashMap::new(),
+            ages: BTreeMap::new(),
+            own: BTreeSet::new(),
+            age: 0,
+            limit,
+            each,
+            evictions: 0,
+        }
+    }
+
+    /// This participant announces this address; whether an answer may have changed.
+    pub(super) fn put(&mut self, prefix: GuidPrefix, place: Place) -> bool {
+        self.age += 1;
+        let before = self.holders.get(&place).copied();
+        let (previous, contested) = match before {
+            Some(before) if before.prefix == prefix => (before.previous, before.contested),
+            Some(before) => (
+                Some(before.prefix),
+                before.contested || before.previous == Some(prefix),
+            ),
+            None => (None, false),
+        };
+        if let Some(before) = before {
+            self.ages.remove(&before.age);
+            self.own.remove(&(before.prefix, before.age));
+        }
+        let age = self.age;
+        let holder = Holder {
+            prefix,
+            previous,
+            contested,
+            age,
+        };
+        self.holders.insert(place, holder);
+        self.ages.insert(age, place);
+        self.own.insert((prefix, age));
+        let own = || self.own.range((prefix, 0)..=(prefix, u64::MAX));
+        let oldest = own().next().filter(|_| own().count() > self.each);
+        if let Some((_, age)) = oldest.copied() {
+            self.give_up(age);
+        }
+        if self.ages.len() > self.limit
+            && let Some((age, _)) = self.ages.first_key_value()
+        {
+            self.give_up(*age);
+        }
+        before.is_none_or(|before| before.prefix != prefix)
+    }
+
+    /// Forgets those of participants that are no more.
+    pub(super) fn retain(&mut self, is_there: impl Fn(&GuidPrefix) -> bool) {
+        self.holders.retain(|_, holder| is_there(&holder.prefix));
+        self.own.retain(|(prefix, _)| is_there(prefix));
+        let holders = &self.holders;
+        self.ages.retain(|_, place| holders.contains_key(place));
+    }
+
+    /// The participant that alone announces this address.
+    pub(super) fn owner(&self, place: &Place) -> Option<GuidPrefix> {
+        let holder = self.holders.get(place)?;
+        (!holder.contested).then_some(holder.prefix)
+    }
+
+    /// Entries, cap, and addresses given up because of a cap.
+    pub(super) fn size(&self) -> (usize, usize, u64) {
+        (self.holders.len(), self.limit, self.evictions)
+    }
+
+    fn give_up(&mut self, age: u64) {
+        let holder = self
+            .ages
+            .remove(&age)
+            .and_then(|place| self.holders.remove(&place));
+        if let Some(holder) = holder {
+            self.own.remove(&(holder.prefix, age));
+            self.evictions += 1;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ALICE: GuidPrefix = GuidPrefix([1; 12]);
+    const BOB: GuidPrefix = GuidPrefix([2; 12]);
+
+    fn at(port: u16) -> Place {
+        Place {
+            port,
+            ..Place::default()
+        }
+    }
+
+    #[test]
+    fn a_participant_whose_address_is_another_each_time_pushes_out_its_own_alone() {
+        let mut places = Places::new(100, 16);
+        places.put(BOB, at(7411));
+        (8000..9000).for_each(|port| assert!(places.put(ALICE, at(port))));
+        assert_eq!(places.size(), (17, 100, 1000 - 16));
+        assert_eq!(places.owner(&at(7411)), Some(BOB));
+        assert_eq!(places.owner(&at(8999)), Some(ALICE));
+        assert_eq!(places.owner(&at(8000)), None);
+        assert_eq!((places.ages.len(), places.own.len()), (17, 17));
+    }
+
+    #[test]
+    fn of_all_participants_together_the_oldest_address_goes_first() {
+        let mut places = Places::new(4, 2);
+        for number in 0..100 {
+            let prefix = GuidPrefix([number; 12]);
+            places.put(prefix, at(number.into()));
+            places.put(BOB, at(7411));
+        }
+        assert_eq!(places.size(), (4, 4, 97));
+        assert_eq!(places.owner(&at(7411)), Some(BOB));
+        places.retain(|prefix| *prefix == BOB);
+        assert_eq!(places.size().0, 1);
+        assert_eq!((places.ages.len(), places.own.len()), (1, 1));
+    }
+
+    #[test]
+    fn an_address_that_two_announce_in_turn_is_nobody_s() {
+        let mut places = Places::new(4, 2);
+        places.put(ALICE, at(1));
+        assert!(places.put(BOB, at(1)));
+        assert_eq!(places.owner(&at(1)), Some(BOB));
+        assert!(!places.put(BOB, at(1)));
+        assert!(places.put(ALICE, at(1)));
+        assert_eq!(places.owner(&at(1)), None);
+        assert_eq!(places.size(), (1, 4, 0));
+    }
+}
