@@ -687,7 +687,7 @@ fn a_silent_topic_is_explained_once_on_stderr() {
     let inside = "rp: no message on /inside: publisher and subscriber share one process; nothing \
                   crosses the network";
     let alone = "rp: no message on /alone: it has no subscriber";
-    let unknown = "rp: no message on /nothing: nobody has /nothing";
+    let unknown = "rp: no message on /nothing: no endpoint on /nothing";
     for (verb, topic, why) in [
         ("echo", "/inside", inside),
         ("hz", "/inside", inside),

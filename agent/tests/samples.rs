@@ -92,6 +92,10 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
     take(&mut observer);
     let mut snapshot = observer.snapshot(feed.last());
     snapshot.tables.retain(|table| table.table != "payloads");
+    // It says that samples are wanted, and is no number.
+    for topic in &mut snapshot.topics {
+        topic.is_read = false;
+    }
     (snapshot, news)
 }
 

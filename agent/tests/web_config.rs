@@ -106,7 +106,7 @@ fn refused(web: &Web) -> String {
 fn a_file_that_would_leave_the_listener_open_does_not_start_the_agent() {
     let said = refused(&Web::new("basic_auth_users:\n  alice: secret\n"));
     assert!(
-        said.contains("the hash of `alice` is no bcrypt hash"),
+        said.contains("the hash of `alice` is not a bcrypt hash"),
         "{said}"
     );
     let web = Web::new("");

@@ -1,6 +1,7 @@
 //! What the verbs of the graph share: options that the original has and that change nothing here,
 //! and asking for names and for one thing by its name.
 
+use std::sync::Once;
 use std::process::ExitCode;
 
 use anyhow::Result;
@@ -105,7 +106,10 @@ impl Graph {
     }
 }
 
-/// All names in a domain, also hidden ones. Why they are lacking, stderr says.
+/// Whether stderr says already why names are lacking.
+static EXPLAINED: Once = Once::new();
+
+/// All names in a domain, also hidden ones. Why they are lacking, stderr says once.
 pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
     let names: Names = agent.get(&format!("/names?domain_id={domain_id}&hidden=true"))?;
     let others = names.domains.iter().filter(|other| **other != domain_id);
@@ -117,7 +121,7 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
         );
     }
     if let Some(text) = late(&names, agent.is_replay()) {
-        eprintln!("rp: {text}");
+        EXPLAINED.call_once(|| eprintln!("rp: {text}"));
     }
     Ok(names)
 }

@@ -191,7 +191,10 @@ impl Recorded {
         let (out, err) = self.replayed(capture, tolerance);
         let name = &self.name;
         // Beside what the original says stands why nothing came.
-        let why = |line: &&str| !line.starts_with("rp: no message on ");
+        let why = |line: &&str| {
+            let reasons = ["rp: no message on ", "whose announcement was missed"];
+            !reasons.iter().any(|reason| line.contains(reason))
+        };
         let err: String = err.split_inclusive('\n').filter(why).collect();
         assert_eq!(err, self.err, "{name}");
         let said = format!("{name} said\n{out}and the original\n{}", self.out);
