@@ -1,8 +1,8 @@
 //! What the verbs of the graph share: options that the original has and that change nothing here,
 //! and asking for names and for one thing by its name.
 
-use std::sync::Once;
 use std::process::ExitCode;
+use std::sync::Once;
 
 use anyhow::Result;
 use clap::Args;

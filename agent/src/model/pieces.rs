@@ -131,7 +131,6 @@ impl Pieces {
 
 #[cfg(test)]
 mod tests {
-    use super::size::Size;
     use super::*;
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
