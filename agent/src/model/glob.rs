@@ -7,17 +7,24 @@
 /// Between two runs of tokens.
 const ANY_TOKENS: &str = "/**";
 
-/// Returns whether `pattern` covers `name`; none covers a name that is not absolute. What a pattern
-/// covers that [`crate::config::check_pattern`] refuses is not specified.
+/// Returns whether `pattern` covers `name`: both are absolute, or begin alike before the first slash,
+/// as DDS names do (`rq/**`). What a pattern covers that [`crate::config::check_pattern`] refuses is not specified.
 ///
 /// `**` at the end covers at least one token, elsewhere also none: `/a/**` does not cover `/a`,
 /// `/a/**/b` covers `/a/b`.
 #[must_use]
 pub fn covers(pattern: &str, name: &str) -> bool {
+    let beginning = |text: &str| text.find('/').unwrap_or(text.len());
+    let (prefix, pattern) = pattern.split_at(beginning(pattern));
+    let (head, name) = name.split_at(beginning(name));
+    covers_token(prefix, head) && covers_tokens(pattern, name)
+}
+
+fn covers_tokens(pattern: &str, name: &str) -> bool {
     let Some((first, others)) = pattern.split_once(ANY_TOKENS) else {
         return strip_tokens(name, pattern) == Some("");
     };
-    let Some(mut rest) = strip_tokens(name, first).filter(|_| name.starts_with('/')) else {
+    let Some(mut rest) = strip_tokens(name, first) else {
         return false;
     };
     let (between, last) = others.rsplit_once(ANY_TOKENS).unwrap_or(("", others));
@@ -129,6 +136,8 @@ mod tests {
             ("/**", "/a", true),
             ("/**", "/a/b/c", true),
             ("/**", "rq/addRequest", false),
+            ("rq/**", "rq/addRequest", true),
+            ("rq/**", "/addRequest", false),
             ("/a/**", "/a", false),
             ("/a/**", "/a/b", true),
             ("/a/**/b", "/a/b", true),
