@@ -87,7 +87,8 @@ impl Room {
         };
         let percent = u64::from(self.limits.reserve_percent);
         let reserve = (space.size / 100 * percent).max(self.limits.reserve_bytes);
-        if space.free <= reserve {
+        // Without a reserve the storage itself refuses what it has no room for.
+        if reserve > 0 && space.free <= reserve {
             let free = space.free;
             return Err(Full::Reserve { free, reserve }.into());
         }
