@@ -43,6 +43,8 @@ fn captures() -> Vec<PathBuf> {
     );
     // Captures with a shortened frame length cannot be given to the kernel as frames.
     found.retain(|path| !path.to_string_lossy().contains("snap256"));
+    // It has a datagram of 300 submessages, more than a program follows: user space gets its rest.
+    found.retain(|path| !path.to_string_lossy().contains("announced-late"));
     found.sort();
     found
 }
