@@ -9,6 +9,8 @@ use tokio::time::timeout;
 
 use super::{Agent, ClientError};
 
+/// How long what has come is looked for when the silence is over.
+const GRACE: Duration = Duration::from_millis(500);
 /// Longer than any line.
 const MAX_LINE: usize = 1 << 20;
 
@@ -151,7 +153,11 @@ impl<'a> Lines<'a> {
             return Ok(self.body.frame().await);
         };
         let left = silence.saturating_sub(self.waited);
-        let frame = timeout(left, self.body.frame()).await;
+        let mut frame = timeout(left, self.body.frame()).await;
+        if frame.is_err() {
+            // This process may have been stopped meanwhile: what has come is read first.
+            frame = timeout(GRACE, self.body.frame()).await;
+        }
         self.waited = Duration::ZERO;
         frame.map_err(|_| self.agent.way.slow())
     }
