@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use forge::{Message, SEDP_WRITERS, SPDP};
+use forge::{Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use local_agent::LocalAgent;
 use ros2probe::capture::feed::Feed;
 use ros2probe::capture::pcap::PcapReader;
@@ -398,6 +398,74 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
         robot.given(),
         [given(8), (ALICE, 6, Err(MissedReason::NotCaptured))]
     );
+}
+
+#[test]
+fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
+    let mut robot = Robot::new(Settings::default());
+    let reader = Guid::new(BOB, EntityId([0, 0, 0x12, 0x04]));
+    let subscription = forge::endpoint(reader, "rt/points", "a::msg::dds_::B_", true);
+    robot.put(Message::from(BOB).data(SEDP_READERS, 1, &subscription));
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    let mut times = BTreeMap::new();
+    // 3 is sent again, 5 was not seen.
+    for number in [1, 2, 4, 6, 3, 7] {
+        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+        times.insert(number, robot.at);
+    }
+    let now = Timestamp(robot.at + SECOND / 20);
+    robot.observer.advance(now);
+    let end = Timestamp(robot.at + SECOND);
+    let mut given = Vec::new();
+    for now in [now, end] {
+        robot.observer.advance(now);
+        for each in robot.observer.take_given() {
+            match each.news {
+                News::Sample(sample) => given.push((sample.sequence_number, Some(sample.time.0))),
+                News::Missed(missed) => given.push((missed.first, None)),
+            }
+        }
+    }
+    // A reader gets 4 with 3, and 6 when it came: it may have had 5.
+    let repaired = times[&3];
+    let expected = [
+        (1, Some(times[&1])),
+        (2, Some(times[&2])),
+        (3, Some(repaired)),
+        (4, Some(repaired + 1)),
+        (5, None),
+        (6, Some(repaired + 2)),
+        (7, Some(times[&7])),
+    ];
+    assert_eq!(given, expected);
+}
+
+#[test]
+fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_reader() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    robot.look(Message::from(ALICE).data(WRITER, 1, &small));
+    // INFO_DST and ACKNACK: all below 4.
+    let body = [
+        &[0, 0, 0x12, 0x04][..],
+        &WRITER.0,
+        &[0, 0, 0, 0, 4, 0, 0, 0],
+        &[0; 8],
+    ];
+    let acknowledgement = Message::from(BOB).submessage(0x0e, 0x01, &ALICE.0);
+    robot.look(acknowledgement.submessage(0x06, 0x03, &body.concat()));
+    robot.observer.advance(Timestamp(robot.at + SECOND / 20));
+    robot.observer.advance(Timestamp(robot.at + SECOND));
+    let mut missed = 0;
+    for each in robot.observer.take_given() {
+        if let News::Missed(each) = each.news {
+            assert_eq!(each.reason, MissedReason::NotCaptured);
+            missed += each.samples;
+        }
+    }
+    assert_eq!(missed, 2);
 }
 
 #[test]

@@ -180,10 +180,13 @@ impl InOrder {
 
     fn give(&mut self, due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
         self.bytes -= due.bytes();
+        let came = due.sample.time;
+        // Its reader may have the lower one that was not seen in shared memory: then it did not wait.
+        let now = if due.sample.sampled { came } else { now };
         // Players order by time: those that waited for the same repair are a nanosecond apart.
-        let after = match due.sample.time < now {
+        let after = match came < now.max(self.last) {
             true => Timestamp(self.last.0.saturating_add(1)),
-            false => due.sample.time,
+            false => came,
         };
         give(self.pass(due, now.max(after)));
     }

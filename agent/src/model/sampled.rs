@@ -30,7 +30,7 @@ pub struct Sampled {
     span: u64,
     seen: u64,
     uncertain: u64,
-    /// Messages that a HEARTBEAT told of, and whose size nothing has told yet.
+    /// Messages that a HEARTBEAT or an ACKNACK told of, and whose size nothing has told yet.
     unmeasured: u64,
     /// Bit `i`: the number `i + 1` below the next one was seen, or needs not be.
     sighted: u128,
@@ -171,10 +171,17 @@ impl Sampled {
     /// Since when a sample is waited for.
     #[must_use]
     pub fn unseen_since(&self) -> Option<Timestamp> {
+        self.unseen().map(|_| self.looked.0)
+    }
+
+    /// The lowest number of a sample that is waited for.
+    #[must_use]
+    pub fn unseen(&self) -> Option<u64> {
         let open = self.next.saturating_sub(self.settled);
         let open = u32::try_from(open).unwrap_or(u32::MAX);
         let open = 1_u128.checked_shl(open).map_or(u128::MAX, |bit| bit - 1);
-        (!self.finished & open != 0).then_some(self.looked.0)
+        let highest = (!self.finished & open).checked_ilog2()?;
+        self.next.checked_sub(u64::from(highest) + 1)
     }
 
     /// Runs of numbers that were sent and not seen, first and last, each once.
@@ -257,7 +264,7 @@ impl Sampled {
         news
     }
 
-    /// Samples up to `last` exist, as a HEARTBEAT says. How many that was not known of.
+    /// Samples up to `last` exist, as a HEARTBEAT or an ACKNACK says. How many that was not known of.
     pub fn exist(&mut self, last: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
         let end = last.saturating_add(1);
         if !sequence.started() || end.saturating_sub(sequence.next()) > MAX_AHEAD {

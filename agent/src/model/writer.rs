@@ -274,14 +274,18 @@ impl Writer {
 
     /// How far its samples are decided; `acknowledged` = by readers that acknowledge.
     pub fn progress(&mut self, acknowledged: bool, now: Timestamp) -> Progress {
+        let waits = self.traits.reliable && acknowledged;
         let reliable = self.traits.reliable && !self.is_sampled(now);
+        // A repair may pass by shared memory, too, as long as a sample is looked for there.
+        let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
+        let unseen = unseen.filter(|_| waits).unwrap_or(u64::MAX);
         let sequence = self.reception.sequence_mut();
-        if !reliable || !acknowledged {
+        if !waits {
             sequence.skip(sequence.next());
         }
         Progress {
             incarnation: sequence.incarnation(),
-            complete: sequence.complete(),
+            complete: sequence.complete().min(unseen),
             awaited: sequence.awaited(),
             reliable,
             acknowledged,
@@ -489,6 +493,8 @@ impl Writer {
                 let end = record.second_sequence_number();
                 sampled.skip(number, end, now, sequence)
             }
+            // The reader has all below.
+            kind::ACKNACK => sampled.exist(number.saturating_sub(1), now, sequence),
             _ => 0,
         };
         self.tally.messages += told;
