@@ -22,6 +22,7 @@ pub(crate) fn listen(code: u8) -> io::Result<()> {
     };
     let wait = move || {
         runtime.block_on(interrupts.recv());
+        super::notes::end();
         std::process::exit(code.into());
     };
     let thread = std::thread::Builder::new().name("interrupt".to_owned());

@@ -2,6 +2,7 @@
 //! nothing comes. Each at the moment it is known, and once; stdout stays the original's.
 
 use std::collections::{BTreeMap, HashSet};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
@@ -39,13 +40,21 @@ pub(crate) struct Notes<'a> {
     sampled: HashSet<String>,
     begun: Instant,
     is_explained: bool,
-    missing: BTreeMap<(String, &'static str), Missing>,
 }
 
-/// Messages of a topic that are missing for one reason.
-struct Missing {
-    untold: u64,
-    told: Option<Instant>,
+/// Messages that are missing and not reported yet: a process has one verb, which Ctrl-C may end.
+static MISSING: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
+
+/// Missing messages by topic and reason: how many are not reported yet, and the time of the last
+/// report.
+struct Missing(BTreeMap<(String, &'static str), (u64, Option<Instant>)>);
+
+/// Reports what is missing: the process ends.
+pub(crate) fn end() {
+    // The thread that holds it waits for stderr.
+    if let Ok(mut missing) = MISSING.try_lock() {
+        missing.report(true);
+    }
 }
 
 /// What an agent can see.
@@ -92,7 +101,6 @@ impl<'a> Notes<'a> {
             sampled: HashSet::new(),
             begun: Instant::now(),
             is_explained: false,
-            missing: BTreeMap::new(),
         };
         // A capture of the network has nothing of shared memory.
         if !is_replay && samples_shared_memory(agent) {
@@ -136,18 +144,14 @@ impl<'a> Notes<'a> {
             // The verb itself reports what its subscriber lost.
             Reason::Incomplete | Reason::Lost => return,
         };
-        let key = (missed.topic.clone(), why);
-        let missing = self.missing.entry(key).or_insert(Missing {
-            untold: 0,
-            told: None,
-        });
-        missing.untold += missed.samples;
-        self.tell_missing(false);
+        let mut missing = Missing::all();
+        missing.add((missed.topic.clone(), why), missed.samples);
+        missing.report(false);
     }
 
     /// Time passes: says why nothing came, once.
     pub(crate) fn now(&mut self) -> Result<()> {
-        self.tell_missing(false);
+        Missing::all().report(false);
         if self.is_replay || self.is_explained || self.begun.elapsed() < SILENT {
             return Ok(());
         }
@@ -156,28 +160,11 @@ impl<'a> Notes<'a> {
 
     /// Nothing more will come.
     pub(crate) fn end(&mut self) -> Result<()> {
-        self.tell_missing(true);
+        Missing::all().report(true);
         if self.is_explained {
             return Ok(());
         }
         self.explain()
-    }
-
-    fn tell_missing(&mut self, at_end: bool) {
-        for ((topic, why), missing) in &mut self.missing {
-            let is_due = missing.told.is_none_or(|told| told.elapsed() >= PAUSE);
-            if missing.untold > 0 && (is_due || at_end) {
-                let (count, topic) = (missing.untold, visible(topic));
-                let messages = if count == 1 { "message" } else { "messages" };
-                let why = if count == 1 {
-                    why.replacen("were", "was", 1)
-                } else {
-                    (*why).to_owned()
-                };
-                eprintln!("rp: {count} {messages} on {topic} {why}");
-                (missing.untold, missing.told) = (0, Some(Instant::now()));
-            }
-        }
     }
 
     fn explain(&mut self) -> Result<()> {
@@ -275,6 +262,39 @@ impl<'a> Notes<'a> {
     }
 }
 
+impl Missing {
+    fn all() -> MutexGuard<'static, Self> {
+        MISSING.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn add(&mut self, key: (String, &'static str), samples: u64) {
+        self.0.entry(key).or_insert((0, None)).0 += samples;
+    }
+
+    fn report(&mut self, at_end: bool) {
+        for line in self.due(at_end) {
+            eprintln!("rp: {line}");
+        }
+    }
+
+    fn due(&mut self, at_end: bool) -> Vec<String> {
+        let mut lines = Vec::new();
+        for ((topic, why), (count, reported)) in &mut self.0 {
+            let is_due = reported.is_none_or(|reported| reported.elapsed() >= PAUSE);
+            if *count == 0 || !is_due && !at_end {
+                continue;
+            }
+            let topic = visible(topic);
+            lines.push(match *count {
+                1 => format!("1 message on {topic} {}", why.replacen("were", "was", 1)),
+                count => format!("{count} messages on {topic} {why}"),
+            });
+            (*count, *reported) = (0, Some(Instant::now()));
+        }
+        lines
+    }
+}
+
 /// Whether the agent sees messages in shared memory, but not each of them.
 pub(crate) fn samples_shared_memory(agent: &Agent) -> bool {
     let Ok(Health { abilities }) = agent.get("/health") else {
@@ -318,6 +338,19 @@ fn path(name: &str, domain_id: u32) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_missing_since_the_last_report_is_reported_at_the_end() {
+        let mut missing = Missing(BTreeMap::new());
+        let mut miss = |samples| {
+            missing.add(("/t".to_owned(), "were dropped"), samples);
+            missing.due(false)
+        };
+        assert_eq!(miss(2), ["2 messages on /t were dropped"]);
+        assert!(miss(1).is_empty());
+        assert_eq!(missing.due(true), ["1 message on /t was dropped"]);
+        assert!(missing.due(true).is_empty());
+    }
 
     #[test]
     fn a_long_list_of_sampled_topics_is_one_line() {
