@@ -313,6 +313,25 @@ impl Watchlist {
         matching
     }
 
+    /// Whether any entry is an exact name.
+    #[must_use]
+    pub fn has_names(&self) -> bool {
+        self.watches.len() > self.globs.len()
+    }
+
+    /// Whether an entry is this exact name, for this domain or, with `None`, for any.
+    #[must_use]
+    pub fn names(&self, domain_id: Option<u32>, topic: &str) -> bool {
+        let mut places = self.patterns.get(topic).into_iter().flatten();
+        places.any(|place| {
+            let watch = self.watches.get(*place);
+            watch.is_some_and(|watch| {
+                let domains = domain_id.zip(watch.domain_id);
+                watch.is_literal() && domains.is_none_or(|(one, other)| one == other)
+            })
+        })
+    }
+
     /// Where the entry with this pattern for this domain stands.
     #[must_use]
     pub fn position(&self, pattern: &str, domain_id: Option<u32>) -> Option<usize> {

@@ -3,18 +3,23 @@
 //! Identity comes from payloads. A participant lives until it is disposed or its lease ends; with
 //! it go its endpoints and nodes. An endpoint's life is its own: that its participant is announced
 //! again says nothing about it. Every table is capped: what was there before a flood of forgeries
-//! stays, newcomers are refused until there is room.
+//! stays, and a newcomer that is worth no more is refused until there is room.
 
 mod facts;
 mod graveyard;
 mod memory;
+mod room;
 mod subject;
+mod waiting;
+mod worth;
 
-use std::collections::{BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap};
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, Role};
 use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::rtps::Locator;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -22,24 +27,22 @@ use facts::{ADDRESSES, domain, named};
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, Portrait};
 use graveyard::Graveyard;
 pub use memory::{Memory, hexadecimal};
+use room::{FORSAKEN, Newcomer, Table, Victims};
 use subject::Subject;
+use waiting::Waiting;
+pub use worth::Worth;
 
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
 use super::size::Size;
+use super::topic::Naming;
+use crate::config::Watchlist;
 
 const SECOND: u64 = 1_000_000_000;
-/// A participant that was seen over this span is no forgery of the moment.
-const ESTABLISHED: u64 = 2 * SECOND;
-/// One that is not established makes room after this long without a word.
-const DOUBTFUL: u64 = 5 * SECOND;
-/// Any participant makes room after this long without a word, whatever its lease: real ones repeat
-/// themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
-const FORSAKEN: u64 = 90 * SECOND;
-/// How often a full table is searched for room.
-const SEARCH: u64 = SECOND / 10;
 /// Endpoints and nodes whose participant is not known yet: how many and how long.
 const PENDING: usize = 1024;
+/// Participants for which there was no room.
+const APPLICANTS: usize = 128;
 const PENDING_NODES: usize = PENDING / 8;
 /// Bytes of those nodes together.
 const PENDING_NODE_BYTES: usize = 1 << 20;
@@ -72,7 +75,7 @@ pub enum Change {
     Gone(Guid, Box<Endpoint>),
 }
 
-/// An endpoint that came before its participant.
+/// An endpoint that came before its participant, or for which there was no room.
 #[derive(Debug)]
 struct PendingEndpoint {
     at: Timestamp,
@@ -84,6 +87,7 @@ struct PendingEndpoint {
 #[derive(Debug)]
 struct PendingNodes {
     at: Timestamp,
+    worth: Worth,
     writer: Guid,
     sequence_number: u64,
     nodes: Vec<Node>,
@@ -96,9 +100,11 @@ struct PendingNodes {
 #[derive(Debug)]
 pub struct Discovery {
     caps: Caps,
+    watchlist: Arc<Watchlist>,
     participants: HashMap<GuidPrefix, Box<Participant>>,
     endpoints: HashMap<Guid, Box<Endpoint>>,
-    pending_endpoints: VecDeque<PendingEndpoint>,
+    applicants: Waiting<GuidPrefix, Box<Participant>>,
+    pending_endpoints: Waiting<Guid, PendingEndpoint>,
     pending_nodes: HashMap<GuidPrefix, PendingNodes>,
     graveyard: Graveyard,
     node_count: usize,
@@ -108,7 +114,9 @@ pub struct Discovery {
     /// Counters of events.
     pub churn: Churn,
     evictions: Evictions,
-    search_after: Timestamp,
+    participant_victims: Victims,
+    endpoint_victims: Victims,
+    node_victims: Victims,
     revision: u64,
 }
 
@@ -129,9 +137,11 @@ impl Discovery {
     pub fn new(caps: Caps) -> Self {
         Self {
             caps,
+            watchlist: Arc::default(),
             participants: HashMap::new(),
             endpoints: HashMap::new(),
-            pending_endpoints: VecDeque::new(),
+            applicants: Waiting::new(APPLICANTS),
+            pending_endpoints: Waiting::new(PENDING),
             pending_nodes: HashMap::new(),
             graveyard: Graveyard::default(),
             node_count: 0,
@@ -139,7 +149,9 @@ impl Discovery {
             changes: Vec::new(),
             churn: Churn::default(),
             evictions: Evictions::default(),
-            search_after: Timestamp(0),
+            participant_victims: Victims::default(),
+            endpoint_victims: Victims::default(),
+            node_victims: Victims::default(),
             revision: 0,
         }
     }
@@ -180,8 +192,10 @@ impl Discovery {
         // A new table does not compile before it has a place here.
         let Self {
             caps,
+            watchlist: _,
             participants,
             endpoints,
+            applicants,
             pending_endpoints,
             pending_nodes,
             graveyard,
@@ -190,7 +204,9 @@ impl Discovery {
             changes,
             churn,
             evictions: _,
-            search_after: _,
+            participant_victims,
+            endpoint_victims,
+            node_victims,
             revision: _,
         } = self;
         let waiting = self.pending_node_bytes();
@@ -217,9 +233,31 @@ impl Discovery {
             Size::new("discovery.participant.endpoints", of_one, PER_PARTICIPANT),
             Size::new("discovery.participant.addresses", addresses, ADDRESSES),
             Size::new("discovery.endpoints", endpoints.len(), caps.endpoints),
+            Size::new("discovery.applicants", applicants.len(), APPLICANTS),
+            Size::new(
+                "discovery.applicants.places",
+                applicants.places(),
+                APPLICANTS,
+            ),
+            Size::new(
+                "discovery.participant_victims",
+                participant_victims.len(),
+                Victims::CAP,
+            ),
+            Size::new(
+                "discovery.endpoint_victims",
+                endpoint_victims.len(),
+                Victims::CAP,
+            ),
+            Size::new("discovery.node_victims", node_victims.len(), Victims::CAP),
             Size::new(
                 "discovery.pending_endpoints",
                 pending_endpoints.len(),
+                PENDING,
+            ),
+            Size::new(
+                "discovery.pending_endpoints.places",
+                pending_endpoints.places(),
                 PENDING,
             ),
             Size::new(
@@ -248,18 +286,79 @@ impl Discovery {
         std::mem::take(&mut self.changes)
     }
 
-    /// Something of this participant was seen: its lease begins anew.
-    pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp) {
+    /// Whether this participant is there, or something of it waits for room.
+    #[must_use]
+    pub fn knows(&self, prefix: GuidPrefix) -> bool {
+        let mut waiting = self.pending_endpoints.range(endpoints_of(prefix));
+        self.participants.contains_key(&prefix)
+            || self.applicants.worth(&prefix).is_some()
+            || waiting.next().is_some()
+    }
+
+    /// Topics that these name are worth more than others.
+    pub fn watch(&mut self, watchlist: Arc<Watchlist>) {
+        self.watchlist = watchlist;
+        let prefixes: Vec<_> = self.participants.keys().copied().collect();
+        for prefix in prefixes {
+            self.rate(prefix);
+        }
+        let watchlist = &self.watchlist;
+        self.pending_endpoints.rate(|worth, pending| Worth {
+            watched: is_named(watchlist, None, &pending.announcement.topic),
+            ..worth
+        });
+        self.participant_victims = Victims::default();
+        self.endpoint_victims = Victims::default();
+        self.node_victims = Victims::default();
+    }
+
+    /// Something of this participant was seen: its lease begins anew. Returns whether it is worth
+    /// more by that than it was: see [`Self::learn`].
+    pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp, evidence: Worth) -> bool {
+        let worth = match self.participants.get_mut(&prefix) {
+            Some(participant) => {
+                participant.seen(at);
+                Some(participant.worth())
+            }
+            None if evidence == Worth::NOTHING => None,
+            None => self.applicants.worth(&prefix),
+        };
+        worth.is_some_and(|worth| worth.or(evidence) != worth)
+    }
+
+    /// A participant is worth more than it was. Returns whether it finds room by that.
+    pub fn learn(
+        &mut self,
+        prefix: GuidPrefix,
+        evidence: Worth,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) -> bool {
         if let Some(participant) = self.participants.get_mut(&prefix) {
-            participant.seen(at);
+            participant.local |= evidence.local;
+            participant.sends |= evidence.sends;
+            self.adopt_pending(prefix, at, journal);
+            return false;
+        }
+        let Some((worth, participant)) = self.applicants.remove(&prefix) else {
+            return false;
+        };
+        self.enter(prefix, participant, worth.or(evidence), at, journal)
+    }
+
+    /// Asks anew which participants a socket of this host sends for.
+    pub fn locate(&mut self, is_local: impl Fn(&GuidPrefix) -> bool) {
+        for (prefix, participant) in &mut self.participants {
+            participant.local = is_local(prefix);
         }
     }
 
-    /// SPDP: it is there.
+    /// SPDP: it is there. `evidence` is what is known in its favour.
     pub fn participant(
         &mut self,
         announcement: &ParticipantAnnouncement,
         origin: &Origin,
+        evidence: Worth,
         journal: &mut Journal,
     ) {
         let guid = announcement.guid;
@@ -283,31 +382,31 @@ impl Discovery {
                 self.note(&subject, Event::Changed, origin.at, journal);
             }
             self.move_to(guid.prefix, domain_id, source);
+            self.learn(guid.prefix, evidence, origin.at, journal);
             return;
         }
-        if self.participants.len() >= self.caps.participants && !self.make_room(origin.at) {
-            self.evictions.participants += 1;
-            return;
-        }
-        self.participants.insert(
-            guid.prefix,
-            Box::new(Participant {
-                portrait: portrait.clone(),
-                addresses: Addresses::of(announcement),
-                restored: None,
-                domain_id,
-                first_seen: origin.at,
-                last_seen: origin.at,
-                endpoints: BTreeSet::new(),
-                nodes: Vec::new(),
-                readers_told: false,
-                domain_source: source,
-                nodes_from: None,
-            }),
-        );
-        let subject = Subject::participant(domain_id, guid, &portrait);
-        self.note(&subject, Event::Appeared, origin.at, journal);
-        self.adopt_pending(guid.prefix, origin.at, journal);
+        let waiting = self.pending_endpoints.range(endpoints_of(guid.prefix));
+        let known = waiting.map(|(_, worth)| worth);
+        let known = known.fold(evidence, Worth::or);
+        let before = self.applicants.remove(&guid.prefix);
+        let worth = before.map_or(known, |(worth, _)| worth.or(known));
+        let participant = Box::new(Participant {
+            portrait,
+            addresses: Addresses::of(announcement),
+            restored: None,
+            domain_id,
+            first_seen: origin.at,
+            last_seen: origin.at,
+            endpoints: BTreeSet::new(),
+            nodes: Vec::new(),
+            readers_told: false,
+            watched: 0,
+            local: false,
+            sends: false,
+            domain_source: source,
+            nodes_from: None,
+        });
+        self.enter(guid.prefix, participant, worth, origin.at, journal);
     }
 
     /// SPDP: it says goodbye.
@@ -316,61 +415,72 @@ impl Discovery {
             return;
         }
         self.graveyard.bury(guid, origin);
+        self.applicants.remove(&guid.prefix);
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
 
-    /// SEDP: an endpoint is there.
+    /// SEDP: an endpoint is there. `evidence` is what is known in its participant's favour. Returns
+    /// whether the participant finds room by that.
     pub fn endpoint(
         &mut self,
         announcement: EndpointAnnouncement,
         origin: &Origin,
+        evidence: Worth,
         journal: &mut Journal,
-    ) {
+    ) -> bool {
         let names = [announcement.topic.as_str(), announcement.type_name.as_str()];
         if names.iter().any(|name| name.len() > MAX_NAME_LEN) {
             self.evictions.endpoints += 1;
-            return;
+            return false;
         }
         if self.graveyard.is_stale(announcement.guid, origin) {
-            return;
-        }
-        let tells_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
-        if let Some(participant) = self.participants.get_mut(&announcement.guid.prefix) {
-            participant.readers_told |= tells_readers;
-            self.admit(announcement, origin.at, journal);
-            return;
+            return false;
         }
         let guid = announcement.guid;
-        self.pending_endpoints
-            .retain(|pending| pending.announcement.guid != guid);
-        if self.pending_endpoints.len() >= PENDING {
-            self.pending_endpoints.pop_front();
-            self.evictions.endpoints += 1;
-        }
-        self.pending_endpoints.push_back(PendingEndpoint {
+        let tells_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
+        let pending = PendingEndpoint {
             at: origin.at,
             tells_readers,
             announcement: Box::new(announcement),
-        });
+        };
+        let is_known = self.participants.contains_key(&guid.prefix);
+        let pending = match is_known {
+            true => self.admit(pending, origin.at, journal),
+            false => Some(pending),
+        };
+        let Some(pending) = pending else {
+            self.pending_endpoints.remove(&guid);
+            return false;
+        };
+        let watched = is_named(&self.watchlist, None, &pending.announcement.topic);
+        let worth = Worth {
+            watched,
+            ..evidence
+        };
+        let is_crowded = self.pending_endpoints.put(guid, worth, pending);
+        self.evictions.endpoints += u64::from(is_known || is_crowded);
+        let is_more = !is_known && self.seen(guid.prefix, origin.at, worth);
+        is_more && self.learn(guid.prefix, worth, origin.at, journal)
     }
 
     /// SEDP: an endpoint says goodbye.
     pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
         self.graveyard.bury(guid, origin);
-        self.pending_endpoints
-            .retain(|pending| pending.announcement.guid != guid);
+        self.pending_endpoints.remove(&guid);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.remove(&guid);
         }
         self.drop_endpoint(guid, Some(Event::Disposed), origin.at, journal);
     }
 
-    /// `ros_discovery_info`: these are the participant's nodes now.
+    /// `ros_discovery_info`: these are the participant's nodes now. `evidence` is what is known in its
+    /// favour.
     pub fn entities(
         &mut self,
         entities: &ParticipantEntities,
         writer: Guid,
         origin: &Origin,
+        evidence: Worth,
         journal: &mut Journal,
     ) {
         // A participant tells of its own nodes only.
@@ -378,19 +488,24 @@ impl Discovery {
         if prefix != writer.prefix {
             return;
         }
-        let room = self.caps.nodes.saturating_sub(self.node_count);
-        let known: &[Node] = match self.participants.get(&prefix) {
-            Some(known) => &known.nodes,
-            None => &[],
+        let worth = self.participants.get(&prefix).map(|known| known.worth());
+        let guid = entities.participant;
+        let (room, mut names) = loop {
+            let (room, names) = self.room_for_nodes(prefix);
+            let nodes = entities.nodes.iter();
+            let wanted: usize = nodes
+                .map(|node| node.writers.len() + node.readers.len())
+                .sum();
+            let fits = entities.nodes.len() <= room && wanted.min(PER_PARTICIPANT) <= names;
+            let newcomer = worth.map(|worth| Newcomer { guid, worth });
+            let newcomer = newcomer.filter(|_| !fits);
+            let is_more =
+                newcomer.is_some_and(|newcomer| self.make_room(Table::Nodes, newcomer, origin.at));
+            if !is_more {
+                break (room, names.min(PER_PARTICIPANT));
+            }
         };
-        let mut names = self.caps.endpoints.saturating_sub(self.named) + named(known);
-        names = names.min(PER_PARTICIPANT);
-        let mut nodes: Vec<Node> = entities
-            .nodes
-            .iter()
-            .take(room + known.len())
-            .map(Node::of)
-            .collect();
+        let mut nodes: Vec<Node> = entities.nodes.iter().take(room).map(Node::of).collect();
         self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
         for node in &mut nodes {
             self.evictions.nodes += u64::from(node.cut(&mut names));
@@ -414,20 +529,23 @@ impl Discovery {
         }
         self.pending_nodes.remove(&prefix);
         let bytes = nodes.iter().map(Node::bytes).sum();
+        let waiting = self.pending_endpoints.range(endpoints_of(prefix));
+        let worth = waiting.fold(evidence, |worth, (_, other)| worth.or(other));
         while self.pending_nodes.len() >= PENDING_NODES
             || self.pending_node_bytes() + bytes > PENDING_NODE_BYTES
         {
-            let pending = self.pending_nodes.iter();
-            let oldest = pending.min_by_key(|(_, pending)| pending.at);
-            let Some(oldest) = oldest.map(|(prefix, _)| *prefix) else {
-                break;
-            };
-            self.pending_nodes.remove(&oldest);
             self.evictions.nodes += 1;
+            let pending = self.pending_nodes.iter();
+            let oldest = pending.min_by_key(|(_, pending)| (pending.worth, pending.at));
+            match oldest.map(|(prefix, pending)| (*prefix, pending.worth)) {
+                Some((oldest, least)) if least <= worth => self.pending_nodes.remove(&oldest),
+                _ => return,
+            };
         }
         let sequence_number = origin.sequence_number;
         let pending = PendingNodes {
             at: origin.at,
+            worth,
             writer,
             sequence_number,
             nodes,
@@ -457,14 +575,23 @@ impl Discovery {
             self.remove(prefix, Timestamp(end), Some(Event::Expired), journal);
         }
         let fresh = |at: Timestamp| at.0.saturating_add(PENDING_FOR) > now.0;
-        while self
-            .pending_endpoints
-            .front()
-            .is_some_and(|pending| !fresh(pending.at))
-        {
-            self.pending_endpoints.pop_front();
-        }
+        let participants = &self.participants;
+        self.pending_endpoints
+            .retain(|guid, pending| fresh(pending.at) || participants.contains_key(&guid.prefix));
+        self.applicants
+            .retain(|_, applicant| fresh(applicant.last_seen));
         self.pending_nodes.retain(|_, pending| fresh(pending.at));
+    }
+
+    /// How many nodes this participant may have, and how many endpoints these may name.
+    fn room_for_nodes(&self, prefix: GuidPrefix) -> (usize, usize) {
+        let known: &[Node] = match self.participants.get(&prefix) {
+            Some(known) => &known.nodes,
+            None => &[],
+        };
+        let room = self.caps.nodes.saturating_sub(self.node_count);
+        let names = self.caps.endpoints.saturating_sub(self.named);
+        (room + known.len(), names + named(known))
     }
 
     fn pending_node_bytes(&self) -> usize {
@@ -474,12 +601,42 @@ impl Discovery {
             .sum()
     }
 
-    /// Puts an announced endpoint into its known participant.
-    fn admit(&mut self, announcement: EndpointAnnouncement, at: Timestamp, journal: &mut Journal) {
+    /// Takes in a participant that is new; whether there is room for it. Else it waits for that.
+    fn enter(
+        &mut self,
+        prefix: GuidPrefix,
+        mut participant: Box<Participant>,
+        worth: Worth,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) -> bool {
+        let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+        let is_full = self.participants.len() >= self.caps.participants;
+        if is_full && !self.make_room(Table::Participants, Newcomer { guid, worth }, at) {
+            self.evictions.participants += 1;
+            self.applicants.put(prefix, worth, participant);
+            return false;
+        }
+        (participant.local, participant.sends) = (worth.local, worth.sends);
+        let portrait = participant.portrait.clone();
+        let subject = Subject::participant(participant.domain_id, guid, &portrait);
+        self.participants.insert(prefix, participant);
+        self.note(&subject, Event::Appeared, at, journal);
+        self.adopt_pending(prefix, at, journal);
+        true
+    }
+
+    /// Puts an announced endpoint into its known participant; gives it back where it finds no room.
+    fn admit(
+        &mut self,
+        pending: PendingEndpoint,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) -> Option<PendingEndpoint> {
+        let announcement = &pending.announcement;
         let guid = announcement.guid;
-        let Some(participant) = self.participants.get(&guid.prefix) else {
-            return;
-        };
+        let participant = self.participants.get_mut(&guid.prefix)?;
+        participant.readers_told |= pending.tells_readers;
         let domain_id = participant.domain_id;
         if let Some(known) = self.endpoints.get_mut(&guid) {
             if *known.topic == *announcement.topic.as_str() {
@@ -488,7 +645,7 @@ impl Discovery {
                     known.qos.clone(),
                     Arc::clone(&known.message_type),
                 );
-                known.qos = announcement.qos;
+                known.qos = announcement.qos.clone();
                 known.type_hash = announcement.type_hash;
                 known.message_type = announcement.type_name.message().as_str().into();
                 let unchanged = before.0 == known.type_hash
@@ -499,20 +656,26 @@ impl Discovery {
                     self.changes.push(Change::Changed(guid));
                     self.note(&subject, Event::Changed, at, journal);
                 }
-                return;
+                return None;
             }
             // The same GUID on another topic: its dispose was missed.
+            participant.endpoints.remove(&guid);
             self.drop_endpoint(guid, Some(Event::Disposed), at, journal);
         }
-        let own = self
-            .participants
-            .get(&guid.prefix)
-            .map_or(0, |known| known.endpoints.len());
-        let full = self.endpoints.len() >= self.caps.endpoints && !self.make_room(at);
-        if full || own >= PER_PARTICIPANT {
-            self.evictions.endpoints += 1;
-            return;
+        let participant = self.participants.get(&guid.prefix)?;
+        let watched = is_named(&self.watchlist, Some(domain_id), &announcement.topic);
+        let worth = Worth {
+            watched,
+            ..participant.worth()
+        };
+        if participant.endpoints.len() >= PER_PARTICIPANT {
+            return Some(pending);
         }
+        let is_full = self.endpoints.len() >= self.caps.endpoints;
+        if is_full && !self.make_room(Table::Endpoints, Newcomer { guid, worth }, at) {
+            return Some(pending);
+        }
+        let announcement = pending.announcement;
         let unicast = &announcement.unicast;
         let shared_memory =
             (!unicast.is_empty()).then(|| unicast.iter().any(Locator::is_shared_memory));
@@ -526,28 +689,30 @@ impl Discovery {
             first_seen: at,
             shared_memory,
             data_sharing: announcement.datasharing,
+            watched,
         };
         let subject = Subject::endpoint(guid, &endpoint);
         self.endpoints.insert(guid, Box::new(endpoint));
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.insert(guid);
+            participant.watched += usize::from(watched);
         }
         self.changes.push(Change::Appeared(guid));
         self.note(&subject, Event::Appeared, at, journal);
+        None
     }
 
-    /// What waited for this participant.
+    /// What waited for this participant, or for room.
     fn adopt_pending(&mut self, prefix: GuidPrefix, at: Timestamp, journal: &mut Journal) {
-        let (adopted, waiting) = std::mem::take(&mut self.pending_endpoints)
-            .into_iter()
-            .partition(|pending| pending.announcement.guid.prefix == prefix);
-        self.pending_endpoints = waiting;
-        let adopted: VecDeque<PendingEndpoint> = adopted;
-        for pending in adopted {
-            if let Some(participant) = self.participants.get_mut(&prefix) {
-                participant.readers_told |= pending.tells_readers;
+        let waiting = self.pending_endpoints.range(endpoints_of(prefix));
+        let waiting: Vec<_> = waiting.map(|(guid, _)| guid).collect();
+        for guid in waiting {
+            let Some((worth, pending)) = self.pending_endpoints.remove(&guid) else {
+                continue;
+            };
+            if let Some(pending) = self.admit(pending, at, journal) {
+                self.pending_endpoints.put(guid, worth, pending);
             }
-            self.admit(*pending.announcement, at, journal);
         }
         if let Some(pending) = self.pending_nodes.remove(&prefix) {
             let PendingNodes {
@@ -607,8 +772,11 @@ impl Discovery {
         journal: &mut Journal,
     ) {
         self.pending_nodes.remove(&prefix);
-        self.pending_endpoints
-            .retain(|pending| pending.announcement.guid.prefix != prefix);
+        let waiting = self.pending_endpoints.range(endpoints_of(prefix));
+        let waiting: Vec<_> = waiting.map(|(guid, _)| guid).collect();
+        for guid in waiting {
+            self.pending_endpoints.remove(&guid);
+        }
         let Some(participant) = self.participants.remove(&prefix) else {
             return;
         };
@@ -642,6 +810,9 @@ impl Discovery {
         let Some(endpoint) = self.endpoints.remove(&guid) else {
             return;
         };
+        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
+            participant.watched -= usize::from(endpoint.watched);
+        }
         if let Some(event) = event {
             self.note(&Subject::endpoint(guid, &endpoint), event, at, journal);
         }
@@ -669,35 +840,24 @@ impl Discovery {
                 self.changes.push(Change::Appeared(*guid));
             }
         }
+        self.rate(prefix);
     }
 
-    /// Gives up a participant that said something once and nothing since.
-    fn make_room(&mut self, now: Timestamp) -> bool {
-        if now < self.search_after {
-            return false;
-        }
-        let doubtful = self.participants.iter().filter(|(_, participant)| {
-            let span = participant
-                .last_seen
-                .0
-                .saturating_sub(participant.first_seen.0);
-            let patience = if span < ESTABLISHED {
-                DOUBTFUL
-            } else {
-                FORSAKEN
-            };
-            participant.last_seen.0.saturating_add(patience) <= now.0
-        });
-        let oldest = doubtful.min_by_key(|(prefix, participant)| (participant.last_seen, **prefix));
-        let Some(prefix) = oldest.map(|(prefix, _)| *prefix) else {
-            self.search_after = Timestamp(now.0.saturating_add(SEARCH));
-            return false;
+    /// Asks anew which of a participant's endpoints are watched by name.
+    fn rate(&mut self, prefix: GuidPrefix) {
+        let Some(participant) = self.participants.get_mut(&prefix) else {
+            return;
         };
-        self.evictions.participants += 1;
-        self.revision += 1;
-        self.remove(prefix, now, None, &mut Journal::default());
-        self.participants.len() < self.caps.participants
-            && self.endpoints.len() < self.caps.endpoints
+        participant.watched = 0;
+        for guid in &participant.endpoints {
+            if let Some(endpoint) = self.endpoints.get_mut(guid) {
+                let domain_id = Some(endpoint.domain_id);
+                let topic = DdsTopic::parse(&endpoint.topic);
+                let is_named = |topic| is_named(&self.watchlist, domain_id, &topic);
+                endpoint.watched = topic.is_ok_and(is_named);
+                participant.watched += usize::from(endpoint.watched);
+            }
+        }
     }
 
     fn note(&mut self, subject: &Subject<'_>, event: Event, at: Timestamp, journal: &mut Journal) {
@@ -713,6 +873,17 @@ impl Discovery {
         });
         journal.events.push(at, subject.happened(event));
     }
+}
+
+/// All endpoints that this participant may have.
+pub(super) const fn endpoints_of(prefix: GuidPrefix) -> RangeInclusive<Guid> {
+    let [first, last] = [EntityId([0; 4]), EntityId([0xff; 4])];
+    Guid::new(prefix, first)..=Guid::new(prefix, last)
+}
+
+/// Whether the DDS topic is watched by its exact name, in this domain or, with `None`, in any.
+fn is_named(watchlist: &Watchlist, domain_id: Option<u32>, topic: &DdsTopic) -> bool {
+    watchlist.has_names() && Naming::of(topic).is_named_by(domain_id, watchlist)
 }
 
 /// Names of `one` that are not in `other`, each as often as it is missing there.

@@ -20,7 +20,7 @@ use ros2probe_wire::{
 
 use super::calendar::Calendar;
 use super::diagnosis::{self, Examiner};
-use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin};
+use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin, Worth, endpoints_of};
 use super::event::{EventKind, Taken, bounded, bounded_finding, bounded_shared};
 use super::expectation::Evidence;
 use super::header::begins_with_header;
@@ -207,6 +207,7 @@ impl Observer {
         };
         let moved: Vec<_> = before.watches().iter().map(moved).collect();
         self.topics.renumber(&moved);
+        self.discovery.watch(Arc::clone(&self.watchlist));
         let watches = self.watchlist.watches();
         self.tracer
             .restart(watches.iter().any(|watch| watch.trace > 0.0));
@@ -361,7 +362,8 @@ impl Observer {
     /// These participants were last seen then, as the kernel filter knows without a record.
     pub fn participants_alive(&mut self, alive: impl IntoIterator<Item = (GuidPrefix, Timestamp)>) {
         for (prefix, at) in alive {
-            self.discovery.seen(prefix, self.calendar.even(at));
+            let at = self.calendar.even(at);
+            self.discovery.seen(prefix, at, Worth::NOTHING);
         }
     }
 
@@ -411,11 +413,9 @@ impl Observer {
         let now = self.calendar.even(now);
         self.discovery.restore(memory, now);
         self.examiner.forget();
-        for (prefix, participant) in self.discovery.participants() {
-            let addresses = &participant.addresses;
-            let places = addresses.default.iter().chain(&addresses.metatraffic);
-            self.receivers
-                .announce(*prefix, places.copied().map(Place::from));
+        let prefixes: Vec<_> = self.discovery.participants().keys().copied().collect();
+        for prefix in prefixes {
+            self.announce(prefix);
         }
         self.follow_up(now);
     }
@@ -478,15 +478,30 @@ impl Observer {
         let moved = self.calendar.even_record(record);
         let record = moved.as_ref().unwrap_or(record);
         let (writer, at) = (record.writer(), Timestamp(record.time));
-        if record.kind == kind::ACKNACK {
-            self.discovery.seen(record.reader().prefix, at);
+        let sender = if record.kind == kind::ACKNACK {
+            record.reader().prefix
         } else {
-            self.discovery.seen(writer.prefix, at);
-        }
+            writer.prefix
+        };
         if record.kind == kind::HANDOVER || record.kind == kind::UNDELIVERED {
+            self.discovery.seen(sender, at, Worth::NOTHING);
             return;
         }
         self.receivers.learn(record);
+        let evidence = Worth {
+            watched: false,
+            local: self.receivers.is_local(&sender),
+            sends: matches!(record.kind, kind::DATA | kind::DATA_FRAG)
+                && record.flags & UNDELIVERED == 0
+                && !writer.entity.is_builtin(),
+        };
+        if self.discovery.seen(sender, at, evidence) {
+            let journal = &mut self.journal;
+            if self.discovery.learn(sender, evidence, at, journal) {
+                self.announce(sender);
+            }
+            self.follow_up(at);
+        }
         if writer.entity.is_builtin() {
             return;
         }
@@ -749,17 +764,12 @@ impl Observer {
     ) -> Result<(), WireError> {
         match discovery::participant(vendor, payload, inline_qos)? {
             discovery::Discovery::Alive(announcement) => {
-                self.discovery
-                    .participant(&announcement, origin, &mut self.journal);
-                let unicast = announcement
-                    .default_unicast
-                    .iter()
-                    .chain(&announcement.metatraffic_unicast);
-                let places = unicast.filter_map(|locator| locator.udp().map(Place::from));
                 let prefix = announcement.guid.prefix;
-                if self.discovery.participants().contains_key(&prefix) {
-                    self.receivers.announce(prefix, places);
-                }
+                let evidence = self.evidence(prefix);
+                let journal = &mut self.journal;
+                self.discovery
+                    .participant(&announcement, origin, evidence, journal);
+                self.announce(prefix);
             }
             discovery::Discovery::Gone { guid, .. } => {
                 self.discovery
@@ -785,8 +795,15 @@ impl Observer {
         };
         match discovery::endpoint(role, vendor, payload, inline_qos)? {
             discovery::Discovery::Alive(announcement) => {
-                self.discovery
-                    .endpoint(announcement, origin, &mut self.journal);
+                let prefix = announcement.guid.prefix;
+                let evidence = self.evidence(prefix);
+                let journal = &mut self.journal;
+                if self
+                    .discovery
+                    .endpoint(announcement, origin, evidence, journal)
+                {
+                    self.announce(prefix);
+                }
             }
             discovery::Discovery::Gone { guid, .. } => {
                 self.discovery
@@ -803,9 +820,30 @@ impl Observer {
         origin: &Origin,
     ) -> Result<(), WireError> {
         let entities = ParticipantEntities::parse(payload.bytes())?;
+        let evidence = self.evidence(writer.prefix);
+        let journal = &mut self.journal;
         self.discovery
-            .entities(&entities, writer, origin, &mut self.journal);
+            .entities(&entities, writer, origin, evidence, journal);
         Ok(())
+    }
+
+    /// What is known in favour of a participant of which something is announced.
+    fn evidence(&self, prefix: GuidPrefix) -> Worth {
+        Worth {
+            watched: false,
+            local: self.receivers.is_local(&prefix),
+            sends: self.profiler.has_stranger(endpoints_of(prefix)),
+        }
+    }
+
+    /// A participant that is known is reached where it announces.
+    fn announce(&mut self, prefix: GuidPrefix) {
+        if let Some(participant) = self.discovery.participants().get(&prefix) {
+            let addresses = &participant.addresses;
+            let places = addresses.default.iter().chain(&addresses.metatraffic);
+            self.receivers
+                .announce(prefix, places.copied().map(Place::from));
+        }
     }
 
     /// Lets topics, interest and measurement follow discovery.
@@ -901,8 +939,18 @@ impl Observer {
 
     /// Asks the watchlist and the wishes about a topic and lets its endpoints follow.
     fn consult(&mut self, id: TopicId, now: Timestamp) {
-        self.topics
-            .consult(id, &self.watchlist, &self.wishes, self.settings.topics, now);
+        let displaced =
+            self.topics
+                .consult(id, &self.watchlist, &self.wishes, self.settings.topics, now);
+        if let Some(id) = displaced {
+            self.apply_all(id, now);
+            self.topics.forget_measurement(id);
+        }
+        self.apply_all(id, now);
+    }
+
+    /// Lets the endpoints of a topic follow it.
+    fn apply_all(&mut self, id: TopicId, now: Timestamp) {
         let Some(topic) = self.topics.get(id) else {
             return;
         };
@@ -999,6 +1047,8 @@ impl Observer {
             });
             self.topics.expire(now, self.settings.topic_grace);
             self.receivers.tidy(&self.discovery);
+            self.discovery
+                .locate(|prefix| self.receivers.is_local(prefix));
             self.promote();
             self.judge(now);
             self.tell_losses();

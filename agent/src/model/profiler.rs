@@ -4,7 +4,8 @@
 //! Strangers are few: beyond the cap a new one is refused until one has been silent for a while.
 //! What was there before a flood of invented GUIDs keeps its place.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
+use std::ops::RangeInclusive;
 
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{flag, kind};
@@ -71,7 +72,7 @@ pub struct Measured {
 #[derive(Debug)]
 pub struct Profiler {
     writers: HashMap<Guid, Measured>,
-    strangers: usize,
+    strangers: BTreeSet<Guid>,
     stranger_limit: usize,
     stranger_evictions: u64,
     shared: Shared,
@@ -132,7 +133,7 @@ impl Profiler {
     pub fn new(stranger_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
         Self {
             writers: HashMap::new(),
-            strangers: 0,
+            strangers: BTreeSet::new(),
             stranger_limit,
             stranger_evictions: 0,
             shared: Shared {
@@ -168,10 +169,10 @@ impl Profiler {
             deliveries_budget,
             room,
         } = shared;
-        let own = writers.len() - strangers;
+        let own = writers.len() - strangers.len();
         let mut sizes = vec![
             Size::new("profiler.writers", own, endpoints),
-            Size::new("profiler.strangers", *strangers, *stranger_limit),
+            Size::new("profiler.strangers", strangers.len(), *stranger_limit),
             Size::new("profiler.samples.bytes", budget.bytes, budget.limit),
             Size::new(
                 "profiler.strangers.samples.bytes",
@@ -230,10 +231,10 @@ impl Profiler {
     /// Writers of topics, strangers, the strangers' cap, and strangers refused or forgotten for it.
     #[must_use]
     pub fn size(&self) -> (usize, usize, usize, u64) {
-        let known = self.writers.len() - self.strangers;
+        let known = self.writers.len() - self.strangers.len();
         (
             known,
-            self.strangers,
+            self.strangers.len(),
             self.stranger_limit,
             self.stranger_evictions,
         )
@@ -325,6 +326,12 @@ impl Profiler {
         }
     }
 
+    /// Whether one of these writers sends without being announced.
+    #[must_use]
+    pub fn has_stranger(&self, writers: RangeInclusive<Guid>) -> bool {
+        self.strangers.range(writers).next().is_some()
+    }
+
     /// Takes in a record of a writer nobody announced.
     pub fn stranger(
         &mut self,
@@ -338,11 +345,11 @@ impl Profiler {
             return Sighting::Unmeasured;
         }
         let now = Timestamp(record.time);
-        if self.strangers >= self.stranger_limit && !self.make_room(now, around) {
+        if self.strangers.len() >= self.stranger_limit && !self.make_room(now, around) {
             self.stranger_evictions += 1;
             return Sighting::Unmeasured;
         }
-        self.strangers += 1;
+        self.strangers.insert(guid);
         self.writers.insert(
             guid,
             Measured::new(Writer::new(guid, Traits::default()), None, now),
@@ -368,7 +375,7 @@ impl Profiler {
                 known
                     .writer
                     .transfer(&mut self.shared.strangers_budget, &mut self.shared.budget);
-                self.strangers -= 1;
+                self.strangers.remove(&guid);
                 known.doubt(now);
             }
             known.topic = Some(topic);
@@ -407,7 +414,7 @@ impl Profiler {
         measured
             .writer
             .settle(&mut self.shared.scene(subject, now, journal, around.calendar));
-        self.strangers -= usize::from(measured.topic.is_none());
+        self.strangers.remove(&guid);
         let subscribers = measured.subscribers.take();
         let totals = subscribers.map(|subscribers| {
             subscribers.stop(&mut self.shared.stage(subject, now, journal, around))

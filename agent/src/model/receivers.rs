@@ -39,6 +39,8 @@ pub struct Receivers {
     sockets: Sockets,
     learned: HashMap<u64, Learned>,
     processes: HashMap<u32, Owners>,
+    /// Participants for which a socket of this host sends, since the last [`Self::tidy`] at most.
+    local: HashSet<GuidPrefix>,
     places: Places,
     closed: HashSet<u64>,
     closings: VecDeque<u64>,
@@ -90,6 +92,7 @@ impl Receivers {
             sockets: Sockets::new(limit),
             learned: HashMap::new(),
             processes: HashMap::new(),
+            local: HashSet::new(),
             places: Places::new(participants.saturating_mul(PLACES / 2), PLACES),
             closed: HashSet::new(),
             closings: VecDeque::new(),
@@ -174,6 +177,12 @@ impl Receivers {
         self.generation += 1;
     }
 
+    /// Whether a socket of this host sends for this participant.
+    #[must_use]
+    pub fn is_local(&self, prefix: &GuidPrefix) -> bool {
+        self.local.contains(prefix)
+    }
+
     /// Learns from a record whose socket it is.
     pub fn learn(&mut self, record: &Record) {
         if record.flags & flag::HOST == 0 || record.socket == 0 {
@@ -210,6 +219,9 @@ impl Receivers {
         let known = self.learned.entry(record.socket).or_default();
         if is_sent {
             known.senders.add(owner);
+            if self.local.len() < self.limit * OWNERS {
+                self.local.insert(owner);
+            }
             let facts = self.sockets.get(record.socket);
             if let Some(process) = facts.and_then(|facts| facts.process_id)
                 && (self.processes.len() < self.limit || self.processes.contains_key(&process))
@@ -243,6 +255,7 @@ impl Receivers {
             sockets,
             learned,
             processes,
+            local,
             places,
             closed,
             closings,
@@ -255,15 +268,16 @@ impl Receivers {
             Size::new("receivers.sockets", known, known_limit),
             Size::new("receivers.learned", learned.len(), *limit),
             Size::new("receivers.processes", processes.len(), *limit),
+            Size::new("receivers.local", local.len(), *limit * OWNERS),
             Size::new("receivers.places", addresses, addresses_limit),
             Size::new("receivers.closed", closed.len(), CLOSED),
             Size::new("receivers.closings", closings.len(), CLOSED),
         ]
     }
 
-    /// Forgets what participants said that are no more.
+    /// Forgets what participants said that are no more and do not wait for room.
     pub fn tidy(&mut self, discovery: &Discovery) {
-        let is_there = |prefix: &GuidPrefix| discovery.participants().contains_key(prefix);
+        let is_there = |prefix: &GuidPrefix| discovery.knows(*prefix);
         self.places.retain(is_there);
         for learned in self.learned.values_mut() {
             learned.senders.0.retain(is_there);
@@ -275,6 +289,10 @@ impl Receivers {
             owners.0.retain(is_there);
         }
         self.processes.retain(|_, owners| !owners.0.is_empty());
+        let sockets = self.learned.values();
+        self.local = sockets
+            .flat_map(|learned| learned.senders.0.iter().copied())
+            .collect();
     }
 
     /// The participant that receives what comes this way.

@@ -103,6 +103,8 @@ pub struct Topics {
     vanished: BTreeSet<(Timestamp, TopicId)>,
     /// Those of them that hold a measuring place.
     vanished_watched: BTreeSet<(Timestamp, TopicId)>,
+    /// Those that are measured and not watched by their exact names.
+    yielding: BTreeSet<TopicId>,
     created: u64,
     watched: usize,
     /// How often the cap kept out a topic that somebody wanted.
@@ -157,14 +159,8 @@ impl Naming {
     /// their DDS names. A hidden topic is covered when an entry names a hidden token itself, so
     /// `/**` is every topic that `ros2 topic list` shows.
     fn covered_by(&self, domain_id: u32, watchlist: &Watchlist) -> Vec<usize> {
-        let is_service = matches!(self.kind, "service_request" | "service_reply");
-        let name = if is_service {
-            &self.dds_name
-        } else {
-            &self.name
-        };
-        let mut covering = watchlist.matching(domain_id, name);
-        if self.hidden && !is_service {
+        let mut covering = watchlist.matching(domain_id, self.watched_as());
+        if self.hidden && !self.is_service() {
             let names_hidden = |index: &usize| {
                 watchlist
                     .watches()
@@ -174,6 +170,24 @@ impl Naming {
             covering.retain(names_hidden);
         }
         covering
+    }
+
+    /// Whether it is watched by its exact name, in this domain or, with `None`, in any.
+    pub(super) fn is_named_by(&self, domain_id: Option<u32>, watchlist: &Watchlist) -> bool {
+        watchlist.names(domain_id, self.watched_as())
+    }
+
+    fn is_service(&self) -> bool {
+        matches!(self.kind, "service_request" | "service_reply")
+    }
+
+    /// The name that watches are about.
+    fn watched_as(&self) -> &str {
+        if self.is_service() {
+            &self.dds_name
+        } else {
+            &self.name
+        }
     }
 
     /// Who wants its samples.
@@ -261,6 +275,7 @@ impl Topics {
             index,
             vanished,
             vanished_watched,
+            yielding,
             created: _,
             watched,
             rejected: _,
@@ -271,6 +286,7 @@ impl Topics {
             Size::new("topics.index", index.len(), endpoints),
             Size::new("topics.vanished", vanished.len(), endpoints),
             Size::new("topics.vanished_watched", vanished_watched.len(), measured),
+            Size::new("topics.yielding", yielding.len(), measured),
             Size::new("topics.watched", *watched, measured),
         ]
     }
@@ -358,7 +374,8 @@ impl Topics {
         }
     }
 
-    /// Asks the watchlist and the wishes about one topic, within the cap.
+    /// Asks the watchlist and the wishes about one topic, within the cap. One that is watched by its
+    /// exact name takes the place of the latest of the others, which is returned.
     pub fn consult(
         &mut self,
         id: TopicId,
@@ -366,26 +383,30 @@ impl Topics {
         wishes: &[Wish],
         cap: usize,
         now: Timestamp,
-    ) {
-        let Some(topic) = self.topics.get(&id) else {
-            return;
-        };
+    ) -> Option<TopicId> {
+        let topic = self.topics.get(&id)?;
+        let is_named = topic.naming.is_named_by(Some(topic.domain_id), watchlist);
         let covering = topic.naming.covered_by(topic.domain_id, watchlist);
         let wished = topic.naming.wished_by(topic.domain_id, wishes);
         let before = topic.watched;
+        let mut displaced = None;
         let after = if covering.is_empty() && wished.is_none() {
             Watched::No
         } else if before == Watched::Yes || self.watched < cap || self.give_up_vanished(id) {
             Watched::Yes
         } else {
-            Watched::Rejected
+            displaced = is_named.then(|| self.displace()).flatten();
+            displaced.map_or(Watched::Rejected, |_| Watched::Yes)
         };
         self.watched += usize::from(after == Watched::Yes);
         self.watched -= usize::from(before == Watched::Yes);
         self.rejected += u64::from(after == Watched::Rejected && before != Watched::Rejected);
-        let Some(topic) = self.topics.get_mut(&id) else {
-            return;
-        };
+        if after == Watched::Yes && !is_named {
+            self.yielding.insert(id);
+        } else {
+            self.yielding.remove(&id);
+        }
+        let topic = self.topics.get_mut(&id)?;
         if after == Watched::Yes && before != Watched::Yes {
             topic.published = now;
             topic.retired.get_or_insert_default();
@@ -409,6 +430,15 @@ impl Topics {
             }
             _ => Vec::new(),
         };
+        displaced
+    }
+
+    /// Forgets what was measured of a topic that is measured no more: numbers that stand still would
+    /// look like silence.
+    pub fn forget_measurement(&mut self, id: TopicId) {
+        if let Some(topic) = self.topics.get_mut(&id) {
+            (topic.retired, topic.retired_totals) = (None, None);
+        }
     }
 
     /// Whether one more topic can be measured: a place is free, or a vanished topic has it.
@@ -479,7 +509,20 @@ impl Topics {
         true
     }
 
+    /// Takes its measuring place from the latest topic that is not watched by its exact name: what
+    /// was there before a flood stays.
+    fn displace(&mut self) -> Option<TopicId> {
+        let id = self.yielding.pop_last()?;
+        let topic = self.topics.get_mut(&id)?;
+        (topic.watched, topic.wished) = (Watched::Rejected, None);
+        topic.judgements.clear();
+        self.watched -= 1;
+        self.rejected += 1;
+        Some(id)
+    }
+
     fn forget(&mut self, id: TopicId) {
+        self.yielding.remove(&id);
         if let Some(topic) = self.topics.remove(&id) {
             self.watched -= usize::from(topic.watched == Watched::Yes);
             if let Some(at) = topic.vanished {

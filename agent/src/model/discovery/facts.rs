@@ -11,6 +11,8 @@ use ros2probe_wire::rtps::{Locator, VendorId};
 use ros2probe_wire::{Duration, Guid, GuidPrefix, Timestamp};
 use serde::{Deserialize, Serialize};
 
+use super::worth::Worth;
+
 /// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
 pub(super) const MAX_DOMAIN: u32 = 232;
 /// Addresses kept of one participant and kind.
@@ -96,6 +98,12 @@ pub struct Participant {
     pub nodes: Vec<Node>,
     /// Its announcements of readers were seen from the first on.
     pub readers_told: bool,
+    /// Its endpoints whose topics are watched by their exact names.
+    pub(super) watched: usize,
+    /// A socket of this host sends for it.
+    pub(super) local: bool,
+    /// It has sent user data.
+    pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
     /// The `ros_discovery_info` sample that told the nodes.
     pub(super) nodes_from: Option<(Guid, u64)>,
@@ -133,6 +141,8 @@ pub struct Endpoint {
     pub shared_memory: Option<bool>,
     /// It can share its history in memory with endpoints of its host.
     pub data_sharing: bool,
+    /// Its topic is watched by its exact name.
+    pub(super) watched: bool,
 }
 
 impl Portrait {
@@ -174,6 +184,15 @@ impl Participant {
             self.restored = None;
         }
         self.last_seen = self.last_seen.max(at);
+    }
+
+    /// What it is worth when there is no room.
+    pub(super) const fn worth(&self) -> Worth {
+        Worth {
+            watched: self.watched > 0,
+            local: self.local,
+            sends: self.sends,
+        }
     }
 }
 

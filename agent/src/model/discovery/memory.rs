@@ -156,6 +156,7 @@ impl Discovery {
                 }
             }
             self.participants.insert(prefix, Box::new(participant));
+            self.rate(prefix);
         }
     }
 }
@@ -219,6 +220,9 @@ impl Remembered {
             nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
             // Readers may have come while nobody looked.
             readers_told: false,
+            watched: 0,
+            local: false,
+            sends: false,
             domain_source: self.domain_source,
             nodes_from: nodes_from
                 .and_then(|(writer, number)| Some((guid(writer, prefix)?, *number))),
@@ -329,6 +333,7 @@ impl RememberedEndpoint {
             first_seen: now,
             shared_memory: self.shared_memory,
             data_sharing: self.data_sharing,
+            watched: false,
         };
         Some((guid, endpoint))
     }
@@ -441,6 +446,7 @@ mod tests {
             first_seen: Timestamp(1),
             shared_memory: None,
             data_sharing: false,
+            watched: false,
         };
         let back = |kept: &serde_json::Value| {
             let kept: RememberedEndpoint = serde_json::from_value(kept.clone()).unwrap();
