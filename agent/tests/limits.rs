@@ -514,6 +514,37 @@ fn fragments_beyond_the_bytes_push_out_the_oldest() {
 }
 
 #[test]
+fn an_agent_at_a_limit_says_so_on_readyz_on_the_page_in_health_and_to_rp_doctor() {
+    let directory = tempfile::tempdir().unwrap();
+    let limits = "participants: 1, recordings: 1";
+    let mut agent = agent_on(&local_agent::capture(), directory.path(), "max", limits);
+    agent.wait_for_log("ready");
+    let at_limit = |limit: &str| format!("ros2probe_at_limit{{limit=\"{limit}\"}}");
+    agent.wait_for_metric(&at_limit("participants"), |value| value == 1.0);
+    let page = agent.get("/metrics").body;
+    assert_eq!(metric(&page, &at_limit("topics")), Some(0.0));
+    let answer = agent.get("/readyz");
+    assert_eq!(answer.status, 200);
+    let degraded = answer.body.strip_prefix("ready\ndegraded: ").unwrap();
+    let reason = "at a limit: participants (1 of 1, ";
+    assert!(degraded.starts_with(reason), "{degraded}");
+    let (_, health) = ask(agent.api, "GET", "/health", "");
+    assert_eq!(health["ready"], true);
+    assert_eq!(health["degraded"], degraded.trim_end());
+    assert_eq!(health["limits"][0]["at_limit"], true, "{health:#}");
+    assert_eq!(health["limits"][2]["at_limit"], false, "{health:#}");
+    let address = agent.api.to_string();
+    let doctor = ["doctor", "--json", "--host", &address];
+    let output = local_agent::rp().args(doctor).output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["verdict"], "problem");
+    let findings = report["findings"].as_array().unwrap();
+    let found = findings.iter().find(|found| found["check"] == "limits");
+    assert_eq!(found.unwrap()["verdict"], "problem", "{report:#}");
+}
+
+#[test]
 fn every_limit_of_the_configuration_is_on_the_page_and_in_the_answer_on_health() {
     let directory = tempfile::tempdir().unwrap();
     let mut caps = String::new();

@@ -124,7 +124,8 @@ impl Limit {
                 range: (1, 100_000),
                 what: "DDS participants",
                 reached: "one that is no longer heard makes room (for 5 s, if it was there for \
-                    less than 2 s, else for 90 s); otherwise the newcomer is left out",
+                    less than 2 s, else for 90 s), or the least worthy one for a newcomer that is \
+                    worth more; otherwise the newcomer is left out",
                 told_by: "ros2probe_table_evictions_total",
                 bytes: 2 << 10,
             },
@@ -133,8 +134,9 @@ impl Limit {
                 default: 8_192,
                 range: (1, 1_000_000),
                 what: "Writers and readers",
-                reached: "a participant that is no longer heard makes room with all its entries; \
-                    otherwise the newcomer is left out",
+                reached: "a participant that is no longer heard makes room with all its entries, \
+                    or the least worthy entry for a newcomer that is worth more; otherwise the \
+                    newcomer waits until there is room",
                 told_by: "ros2probe_table_evictions_total",
                 bytes: 5_632,
             },
@@ -143,8 +145,9 @@ impl Limit {
                 default: 1_000,
                 range: (1, 100_000),
                 what: "Measured topics with series of their own",
-                reached: "one that has vanished makes room; otherwise the newcomer is listed but \
-                    not measured until an entry is free",
+                reached: "one that has vanished makes room, or the latest one that is not watched \
+                    by its exact name for one that is; otherwise the newcomer is listed but not \
+                    measured until an entry is free",
                 told_by: "ros2probe_topics_rejected_total",
                 bytes: 15 << 10,
             },
@@ -241,6 +244,20 @@ impl Limit {
     #[must_use]
     pub const fn key(self) -> &'static str {
         self.row().key
+    }
+
+    /// Whether part of the robot is not seen while it is reached.
+    #[must_use]
+    pub const fn blinds(self) -> bool {
+        matches!(
+            self,
+            Self::Participants
+                | Self::Endpoints
+                | Self::Topics
+                | Self::UnknownWriters
+                | Self::Flows
+                | Self::ReassemblyBytes
+        )
     }
 
     /// The one with this key.

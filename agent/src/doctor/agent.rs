@@ -173,6 +173,7 @@ fn limits(health: &Health) -> Vec<Finding> {
             cap,
             used,
             reached,
+            at_limit,
         } = limit;
         let now = match used >= cap {
             true => "is reached",
@@ -182,20 +183,31 @@ fn limits(health: &Health) -> Vec<Finding> {
             0 => format!("limits.{key} {now}: {used} of {cap}, nothing refused so far"),
             reached => format!("limits.{key} {now} ({cap}): {reached} refused or evicted so far"),
         };
-        let finding = Finding::new(AREA, "limits", Verdict::Warning, sentence);
+        let known = config::Limit::find(key);
+        let blinds = *at_limit && known.is_some_and(config::Limit::blinds);
+        let (verdict, sentence) = match blinds {
+            true => (
+                Verdict::Problem,
+                format!("{sentence}; part of the robot may not be seen"),
+            ),
+            false => (Verdict::Warning, sentence),
+        };
+        let finding = Finding::new(AREA, "limits", verdict, sentence);
         let finding = finding.seen(
             format!("{used} used, {reached} refused or evicted"),
             format!("{FROM} limits {key}"),
         );
-        let most = config::Limit::find(key).map_or(u64::MAX, |limit| limit.row().range.1 as u64);
+        let most = known.map_or(u64::MAX, |limit| limit.row().range.1 as u64);
+        let twice = cap.saturating_mul(2).min(most);
+        let price = known.map_or(0, |limit| limit.row().bytes as u64);
+        let price = price.saturating_mul(twice.saturating_sub(*cap)) as f64 / f64::from(1 << 20);
         finding.configure(format!(
-            "limits: {{{key}: {}}}    # {}",
-            cap.saturating_mul(2).min(most),
+            "limits: {{{key}: {twice}}}    # up to {price:.1} MiB more memory{}",
             match key.as_str() {
                 "participants" | "endpoints" | "unknown_writers" =>
-                    "forged participants also cause this",
-                "topics" | "watches" => "or fewer watches",
-                _ => "raises memory use: systemctl show ros2probe -p MemoryMax",
+                    "; forged participants also cause this",
+                "topics" | "watches" => "; or fewer watches",
+                _ => "",
             }
         ))
     })
@@ -506,6 +518,44 @@ mod tests {
             let line = &finding.remedies[0].line;
             assert!(Config::parse(line.as_bytes()).is_ok(), "{line}");
         }
+    }
+
+    #[test]
+    fn an_agent_that_has_no_room_for_newcomers_is_a_problem_with_the_price_of_more() {
+        let full = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
+            "limits":[{"limit":"participants","cap":1000,"used":1000,"reached":345,"at_limit":true},
+            {"limit":"topics","cap":1000,"used":900,"reached":3,"at_limit":false},
+            {"limit":"recordings","cap":4,"used":4,"reached":0,"at_limit":true}]}"#;
+        let findings = check(&answers(full, WATCHED), "here", "1.0.0");
+        let found: Vec<_> = findings
+            .iter()
+            .filter(|each| each.check == "limits")
+            .map(|each| (each.verdict, each.sentence.as_str()))
+            .collect();
+        assert_eq!(
+            found,
+            [
+                (
+                    Verdict::Problem,
+                    "limits.participants is reached (1000): 345 refused or evicted so far; part of \
+                     the robot may not be seen"
+                ),
+                (
+                    Verdict::Warning,
+                    "limits.topics was reached (1000): 3 refused or evicted so far"
+                ),
+                (
+                    Verdict::Warning,
+                    "limits.recordings is reached: 4 of 4, nothing refused so far"
+                ),
+            ]
+        );
+        let first = findings.iter().find(|each| each.check == "limits");
+        assert_eq!(
+            first.unwrap().remedies[0].line,
+            "limits: {participants: 2000}    # up to 2.0 MiB more memory; forged participants also \
+             cause this"
+        );
     }
 
     #[test]

@@ -122,6 +122,8 @@ pub struct Limit {
     pub used: u64,
     /// Refused or given up because of it.
     pub reached: u64,
+    /// There is no room, or was none a moment ago.
+    pub at_limit: bool,
 }
 
 /// All participants.

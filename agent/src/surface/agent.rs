@@ -168,10 +168,11 @@ pub(super) fn model(
 /// The caps of the configuration.
 fn limits(page: &mut Page<'_>, figures: &LimitFigures, state: &State) -> fmt::Result {
     type Read = fn(&LimitFacts) -> u64;
-    let families: [(_, Read); 3] = [
+    let families: [(_, Read); 4] = [
         (&metric::LIMIT, |facts| facts.cap),
         (&metric::LIMIT_USED, |facts| facts.used),
         (&metric::LIMIT_REACHED, |facts| facts.reached),
+        (&metric::AT_LIMIT, |facts| facts.at_limit.into()),
     ];
     for (metric, read) in families {
         page.family(metric, |family| {

@@ -140,10 +140,12 @@ impl Board {
 
     /// Pins a new state.
     pub fn publish(&self, snapshot: Snapshot, agent: AgentFacts) {
-        self.state.store(Arc::new(State {
+        let state = State {
             snapshot: Some(snapshot),
             agent,
-        }));
+        };
+        self.limits.note(&state);
+        self.state.store(Arc::new(state));
         self.asked.store(false, Ordering::Relaxed);
         self.news.notify_waiters();
     }

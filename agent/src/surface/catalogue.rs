@@ -467,6 +467,7 @@ pub const CATALOGUE: &[Metric] = &[
     LIMIT,
     LIMIT_USED,
     LIMIT_REACHED,
+    AT_LIMIT,
     TRACKED_TOPICS,
     TOPICS_REJECTED,
     TOPICS_HIDDEN,

@@ -264,8 +264,12 @@ fn encoding(headers: &HeaderMap) -> Encoding {
 }
 
 async fn readyz(Extract(pages): Extract<Pages>) -> Response {
-    match pages.board.state().ready(Instant::now()) {
-        Ok(()) => "ready\n".into_response(),
+    let state = pages.board.state();
+    match state.ready(Instant::now()) {
+        Ok(()) => match pages.board.limits().degraded(&state) {
+            Some(reason) => format!("ready\ndegraded: {reason}\n").into_response(),
+            None => "ready\n".into_response(),
+        },
         Err(reason) => (StatusCode::SERVICE_UNAVAILABLE, reason + "\n").into_response(),
     }
 }

@@ -5,11 +5,14 @@
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::{Duration, Instant};
 
 use super::board::State;
 use crate::config::{Limit, Limits};
 
 const LIMITS: usize = Limit::ALL.len();
+/// An agent is at a limit for so long after something was refused or given up because of it.
+const LATELY: Duration = Duration::from_secs(60);
 
 /// One cap of the configuration, at one moment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,6 +25,8 @@ pub struct LimitFacts {
     pub used: u64,
     /// Refused, or given up to make room, since the start.
     pub reached: u64,
+    /// There is no room, or there was none within the last minute.
+    pub at_limit: bool,
 }
 
 /// The caps in force, and what is counted where the model does not.
@@ -31,7 +36,15 @@ pub struct LimitFigures {
     /// What is not handed out as places.
     used: [AtomicU64; LIMITS],
     reached: [AtomicU64; LIMITS],
+    rises: Mutex<[Rise; LIMITS]>,
     places: Mutex<Vec<(Limit, Weak<Places>)>>,
+}
+
+/// When the count of what was refused or given up rose last.
+#[derive(Clone, Copy, Debug, Default)]
+struct Rise {
+    count: u64,
+    at: Option<Instant>,
 }
 
 /// Places of which only so many can be taken at once.
@@ -55,6 +68,7 @@ impl LimitFigures {
             caps,
             used: std::array::from_fn(|_| AtomicU64::new(0)),
             reached: std::array::from_fn(|_| AtomicU64::new(0)),
+            rises: Mutex::default(),
             places: Mutex::default(),
         }
     }
@@ -92,18 +106,54 @@ impl LimitFigures {
         }
     }
 
+    /// Notes what was refused or given up until `state`.
+    pub(super) fn note(&self, state: &State) {
+        let mut rises = self.rises.lock().unwrap_or_else(PoisonError::into_inner);
+        for (rise, limit) in rises.iter_mut().zip(Limit::ALL) {
+            let (_, count) = self.usage(limit, state);
+            if count > rise.count {
+                rise.at = Some(state.agent.at);
+            }
+            rise.count = count;
+        }
+    }
+
     /// All caps as they stand; what the model counts is of `state`.
     #[must_use]
     pub fn facts(&self, state: &State) -> [LimitFacts; LIMITS] {
+        let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_recent = |at: Instant| state.agent.at.saturating_duration_since(at) < LATELY;
         Limit::ALL.map(|limit| {
             let (used, reached) = self.usage(limit, state);
+            let cap = self.caps.get(limit) as u64;
+            let rise = rises.get(limit as usize).and_then(|rise| rise.at);
             LimitFacts {
                 limit,
-                cap: self.caps.get(limit) as u64,
+                cap,
                 used,
                 reached,
+                at_limit: used >= cap || rise.is_some_and(is_recent),
             }
         })
+    }
+
+    /// Which limits keep part of the robot from being seen, in words.
+    #[must_use]
+    pub fn degraded(&self, state: &State) -> Option<String> {
+        let all = self.facts(state).into_iter();
+        let reached = all.filter(|facts| facts.at_limit && facts.limit.blinds());
+        let reached = reached.map(|facts| {
+            let LimitFacts {
+                limit, cap, used, ..
+            } = facts;
+            let refused = match facts.reached {
+                0 => String::new(),
+                count => format!(", {count} refused or evicted"),
+            };
+            format!("{} ({used} of {cap}{refused})", limit.key())
+        });
+        let reached: Vec<_> = reached.collect();
+        (!reached.is_empty()).then(|| format!("at a limit: {}", reached.join(", ")))
     }
 
     fn usage(&self, limit: Limit, state: &State) -> (u64, u64) {
@@ -183,6 +233,8 @@ impl Drop for Place {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::snapshot::{Snapshot, TableFacts};
+    use crate::surface::agent_facts::{AgentFacts, SourceKind};
 
     #[test]
     fn places_are_as_many_as_the_cap_and_come_back() {
@@ -198,6 +250,45 @@ mod tests {
         drop(taken);
         assert_eq!(figures.own(Limit::Recordings), (0, 1));
         assert!(places.take().is_some());
+    }
+
+    #[test]
+    fn a_limit_is_reached_while_there_is_no_room_and_for_a_minute_after_a_refusal() {
+        let figures = LimitFigures::new(Limits {
+            participants: 10,
+            ..Limits::default()
+        });
+        let start = Instant::now();
+        let at = |seconds: u64, size: u64, evictions: u64| {
+            let at = start + Duration::from_secs(seconds);
+            let table = TableFacts {
+                table: "participants",
+                size,
+                limit: 10,
+                evictions,
+            };
+            let snapshot = Snapshot {
+                tables: vec![table],
+                ..Snapshot::default()
+            };
+            let state = State {
+                snapshot: Some(snapshot),
+                agent: AgentFacts::new(SourceKind::Wire, at),
+            };
+            figures.note(&state);
+            figures.degraded(&state)
+        };
+        let full = Some("at a limit: participants (10 of 10)".to_owned());
+        assert_eq!(at(0, 9, 0), None);
+        assert_eq!(at(1, 10, 0), full);
+        assert_eq!(at(2, 9, 0), None);
+        assert!(at(3, 10, 5).is_some());
+        let lately = "at a limit: participants (9 of 10, 5 refused or evicted)";
+        assert_eq!(at(62, 9, 5).as_deref(), Some(lately));
+        assert_eq!(at(63, 9, 5), None);
+        // What clients hand in hides nothing of the robot.
+        figures.set_used(Limit::Watches, 1_000);
+        assert_eq!(at(64, 9, 5), None);
     }
 
     #[test]

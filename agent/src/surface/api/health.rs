@@ -29,6 +29,10 @@ pub(super) struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     reason: Option<String>,
+    /// Why part of the robot is not seen although it is ready: which limits are reached.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    degraded: Option<String>,
     /// Name of its host.
     host: Option<String>,
     /// Version of the agent.
@@ -150,6 +154,8 @@ struct LimitView {
     used: u64,
     /// What was refused, or given up to make room, because of it.
     reached: u64,
+    /// There is no room, or there was none within the last minute.
+    at_limit: bool,
 }
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -184,6 +190,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
     Json(Health {
         ready: ready.is_ok(),
         reason: ready.err(),
+        degraded: context.board.limits().degraded(&state),
         host: HOST.clone(),
         version: env!("CARGO_PKG_VERSION"),
         source: agent.source.label(),
@@ -223,6 +230,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
                 cap: facts.cap,
                 used: facts.used,
                 reached: facts.reached,
+                at_limit: facts.at_limit,
             })
             .into(),
         capabilities: held.into_iter().collect(),

@@ -154,6 +154,12 @@ pub(in crate::surface) const LIMIT_REACHED: Metric = Metric::counter(
     "Entries refused or evicted because of each cap; tables, topics, subscriptions and messages \
      also have metrics of their own.",
 );
+pub(in crate::surface) const AT_LIMIT: Metric = Metric::gauge(
+    "ros2probe_at_limit",
+    &["limit"],
+    "1 while there is no room below a cap, and for a minute after something was refused or evicted \
+     because of it.",
+);
 pub(in crate::surface) const TRACKED_TOPICS: Metric = Metric::gauge(
     "ros2probe_tracked_topics",
     &[],
