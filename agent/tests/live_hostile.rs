@@ -18,13 +18,14 @@ mod local_agent;
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
 use forged::frames::Wire;
 use forged::storm::{Dice, Storm, forgery};
-use forged::{Sender, Talker, introduce, talk};
-use harness::agent::{Agent, ON_THE_WIRE, Scrape};
+use forged::{Carrier, Sender, Talker, introduce, talk};
+use harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
 use harness::usage::Usage;
@@ -105,6 +106,18 @@ fn a_crowd_of_forgeries_that_fills_every_table_leaves_memory_bounded_and_goes_wi
 }
 
 #[test]
+fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_on_a_topic_watched_by_name()
+-> Result<()> {
+    behind_a_flood(|_| ON_THE_WIRE.to_owned())
+}
+
+#[test]
+fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_at_the_sockets() -> Result<()>
+{
+    behind_a_flood(|link| at_the_sockets_of(&link.robot))
+}
+
+#[test]
 fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
@@ -141,6 +154,74 @@ fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()>
     assert!(metered > 400.0, "{metered} of 500 metered");
     assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
     Ok(())
+}
+
+/// More participants than the agent has room for, each of which repeats itself every other second as
+/// a real one would; and a robot that is started meanwhile.
+fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("ros2probe.yaml");
+    let configuration = format!("watch: [/**, /real]\n{}", capture(&link));
+    std::fs::write(&file, configuration)?;
+    let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &file)?;
+    // At the sockets a datagram is seen where one receives it.
+    let to = format!("{}:{NOBODY}", link.robot.address());
+    let _receiver = link.robot.hold(|| Sender::new(&link.robot, &to, &to))?;
+    let from = format!("{}:0", link.monitor.address());
+    let sender = Sender::new(&link.monitor, &from, &to)?;
+    let flood = Storm::of_a_crowd(Paced(sender), 1500, 4);
+    std::thread::sleep(Duration::from_secs(6));
+    let full = [("limit", "participants")];
+    let page = agent.scrape()?;
+    assert_eq!(page.sum("ros2probe_at_limit", &full), 1.0, "{}", page.0);
+
+    let stream = Stream {
+        topic: "/real".to_owned(),
+        ..Stream::small(600)
+    };
+    let start = |host: &Namespace, role| Peer::start(host, Stack::Cyclone, role, &stream, &["/n"]);
+    let came = Instant::now();
+    let mut subscriber = start(&link.monitor, Role::Subscriber)?;
+    let mut publisher = start(&link.robot, Role::Publisher)?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+    let real = [("topic", "/real")];
+    agent.scrape_until("/real is there", |page| {
+        page.sum("ros2_topic_publishers", &real) == 1.0
+    })?;
+    eprintln!("the newcomer is seen after {:?}", came.elapsed());
+    publisher.go()?;
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let page = agent.settled_scrape("/real", stream.count)?;
+    let counted = page.sum("ros2_topic_messages_total", &real);
+    assert_eq!(counted, stream.count as f64, "{}", agent.scrape()?.0);
+    assert_eq!(page.sum("ros2_topic_lost_messages_total", &real), 0.0);
+
+    let readiness = agent.request("/readyz")?;
+    let said = "ready\ndegraded: at a limit: participants (1000 of 1000, ";
+    assert!(readiness.starts_with(said), "{readiness}");
+    let [program, arguments @ ..] = &link.robot.outside();
+    let doctor = Command::new(program)
+        .args(arguments)
+        .arg(env!("CARGO_BIN_EXE_rp"))
+        .args(["doctor", "--json", "--host", "127.0.0.1:17401"])
+        .output()?;
+    let report: serde_json::Value = serde_json::from_slice(&doctor.stdout)?;
+    assert_eq!(report["verdict"], "problem", "{report:#}");
+    let sent = flood.end()?;
+    eprintln!("{sent} datagrams forged");
+    Ok(())
+}
+
+/// Some 2000 datagrams a second.
+struct Paced(Sender);
+
+impl Carrier for Paced {
+    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+        std::thread::sleep(Duration::from_micros(400));
+        self.0.carry(payload)
+    }
 }
 
 /// What must hold of an agent on the robot while a storm comes in, and after so long a silence.

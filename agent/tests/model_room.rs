@@ -209,6 +209,27 @@ fn a_newcomer_with_a_socket_on_this_host_is_seen_among_1000_forged_participants(
 }
 
 #[test]
+fn a_socket_of_this_host_that_sends_for_many_participants_speaks_for_eight_of_them() {
+    let mut world = World::new(&["/points"], &Limits::default());
+    world.crowd(1000);
+    for number in 0..500 {
+        world.spdp(forged(5000 + number));
+        world.leaves(forged(5000 + number), 77);
+        world.wait(10);
+    }
+    let known = |world: &World| {
+        (0..500)
+            .filter(|number| world.knows(forged(5000 + number)))
+            .count()
+    };
+    assert_eq!(known(&world), 8);
+    // From then on for none, and another socket is as good as ever.
+    world.leaves(ALICE, 78);
+    world.spdp(ALICE);
+    assert!(world.knows(ALICE));
+}
+
+#[test]
 fn a_newcomer_that_sends_user_data_is_seen_among_1000_forged_participants() {
     let mut world = World::new(&["/**"], &Limits::default());
     world.crowd(1000);

@@ -551,10 +551,11 @@ mod tests {
             ]
         );
         let first = findings.iter().find(|each| each.check == "limits");
+        let remedy = &first.unwrap().remedies[0];
+        assert_eq!(remedy.line, "limits: {participants: 2000}");
         assert_eq!(
-            first.unwrap().remedies[0].line,
-            "limits: {participants: 2000}    # up to 2.0 MiB more memory; forged participants also \
-             cause this"
+            remedy.comment.as_deref(),
+            Some("up to 2.0 MiB more memory; forged participants also cause this")
         );
     }
 

@@ -487,10 +487,9 @@ impl Observer {
             self.discovery.seen(sender, at, Worth::NOTHING);
             return;
         }
-        self.receivers.learn(record);
         let evidence = Worth {
             watched: false,
-            local: self.receivers.is_local(&sender),
+            local: self.receivers.learn(record),
             sends: matches!(record.kind, kind::DATA | kind::DATA_FRAG)
                 && record.flags & UNDELIVERED == 0
                 && !writer.entity.is_builtin(),

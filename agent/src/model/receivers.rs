@@ -79,6 +79,8 @@ struct Learned {
     senders: Owners,
     /// Something directed to them came to it.
     addressed: Owners,
+    /// It sent for more participants than are remembered: who forges does that.
+    is_crowded: bool,
 }
 
 #[derive(Debug, Default)]
@@ -183,10 +185,11 @@ impl Receivers {
         self.local.contains(prefix)
     }
 
-    /// Learns from a record whose socket it is.
-    pub fn learn(&mut self, record: &Record) {
+    /// Learns from a record whose socket it is. Returns whether a socket of this host sent it that
+    /// sends for few participants.
+    pub fn learn(&mut self, record: &Record) -> bool {
         if record.flags & flag::HOST == 0 || record.socket == 0 {
-            return;
+            return false;
         }
         // Who told that it was closed may have lost sight of it only.
         if !self.closed.is_empty() {
@@ -199,7 +202,7 @@ impl Receivers {
         };
         let is_sent = record.flags & flag::OUTGOING != 0;
         if !is_sent && (directed == GuidPrefix::UNKNOWN || Place::of(record).is_multicast()) {
-            return;
+            return false;
         }
         let owner = if is_sent { sender } else { directed };
         let known = self.learned.get(&record.socket);
@@ -211,15 +214,18 @@ impl Receivers {
             }
         });
         if list.is_some_and(|list| list.0.contains(&owner)) {
-            return;
+            return is_sent && known.is_some_and(|known| !known.is_crowded);
         }
         if known.is_none() && self.learned.len() >= self.limit {
-            return;
+            return false;
         }
         let known = self.learned.entry(record.socket).or_default();
+        let mut is_local = false;
         if is_sent {
+            known.is_crowded |= known.senders.0.len() >= OWNERS;
             known.senders.add(owner);
-            if self.local.len() < self.limit * OWNERS {
+            is_local = !known.is_crowded && self.local.len() < self.limit * OWNERS;
+            if is_local {
                 self.local.insert(owner);
             }
             let facts = self.sockets.get(record.socket);
@@ -232,6 +238,7 @@ impl Receivers {
             known.addressed.add(owner);
         }
         self.generation += 1;
+        is_local
     }
 
     /// A participant announces where it is reached by unicast.
@@ -289,7 +296,7 @@ impl Receivers {
             owners.0.retain(is_there);
         }
         self.processes.retain(|_, owners| !owners.0.is_empty());
-        let sockets = self.learned.values();
+        let sockets = self.learned.values().filter(|learned| !learned.is_crowded);
         self.local = sockets
             .flat_map(|learned| learned.senders.0.iter().copied())
             .collect();

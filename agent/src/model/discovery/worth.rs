@@ -8,7 +8,7 @@
 pub struct Worth {
     /// Its topic is watched by its exact name; of a participant, that of one of its endpoints.
     pub watched: bool,
-    /// A socket of this host sends for its participant: none who forges from elsewhere has that.
+    /// A socket of this host sends for its participant: no forger elsewhere has one.
     pub local: bool,
     /// Its participant has sent user data.
     pub sends: bool,
