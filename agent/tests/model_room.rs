@@ -487,6 +487,7 @@ fn a_flood_against_full_tables_takes_no_longer_than_one_against_empty_ones() {
         began.elapsed()
     };
     let (empty, full) = (run(0), run(1024));
+    println!("{FLOOD} forged participants: {empty:?} into empty tables, {full:?} into full ones");
     assert!(
         full < empty * 3 + Duration::from_secs(1),
         "{full:?}, {empty:?}"

@@ -13,6 +13,7 @@ mod subject;
 mod waiting;
 mod worth;
 
+use std::cmp::Reverse;
 use std::collections::{BTreeSet, HashMap};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
@@ -490,14 +491,13 @@ impl Discovery {
         }
         let worth = self.participants.get(&prefix).map(|known| known.worth());
         let guid = entities.participant;
+        let newcomer = worth.map(|worth| Newcomer { guid, worth });
+        let wanted = entities.nodes.iter();
+        let wanted = wanted.map(|node| node.writers.len() + node.readers.len());
+        let wanted = wanted.sum::<usize>().min(PER_PARTICIPANT);
         let (room, mut names) = loop {
             let (room, names) = self.room_for_nodes(prefix);
-            let nodes = entities.nodes.iter();
-            let wanted: usize = nodes
-                .map(|node| node.writers.len() + node.readers.len())
-                .sum();
-            let fits = entities.nodes.len() <= room && wanted.min(PER_PARTICIPANT) <= names;
-            let newcomer = worth.map(|worth| Newcomer { guid, worth });
+            let fits = entities.nodes.len() <= room && wanted <= names;
             let newcomer = newcomer.filter(|_| !fits);
             let is_more =
                 newcomer.is_some_and(|newcomer| self.make_room(Table::Nodes, newcomer, origin.at));
@@ -702,16 +702,18 @@ impl Discovery {
         None
     }
 
-    /// What waited for this participant, or for room.
+    /// What waited for this participant, or for room, until there is none for what is worth most.
     fn adopt_pending(&mut self, prefix: GuidPrefix, at: Timestamp, journal: &mut Journal) {
         let waiting = self.pending_endpoints.range(endpoints_of(prefix));
-        let waiting: Vec<_> = waiting.map(|(guid, _)| guid).collect();
-        for guid in waiting {
-            let Some((worth, pending)) = self.pending_endpoints.remove(&guid) else {
+        let mut waiting: Vec<_> = waiting.collect();
+        waiting.sort_by_key(|(_, worth)| Reverse(*worth));
+        for (guid, worth) in waiting {
+            let Some((_, pending)) = self.pending_endpoints.remove(&guid) else {
                 continue;
             };
             if let Some(pending) = self.admit(pending, at, journal) {
                 self.pending_endpoints.put(guid, worth, pending);
+                break;
             }
         }
         if let Some(pending) = self.pending_nodes.remove(&prefix) {
@@ -811,7 +813,8 @@ impl Discovery {
             return;
         };
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
-            participant.watched -= usize::from(endpoint.watched);
+            let watched = usize::from(endpoint.watched);
+            participant.watched = participant.watched.saturating_sub(watched);
         }
         if let Some(event) = event {
             self.note(&Subject::endpoint(guid, &endpoint), event, at, journal);
