@@ -749,6 +749,49 @@ fn the_cap_on_watched_topics_rejects_and_counts() {
 }
 
 #[test]
+fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
+    const TOPICS: u16 = 400;
+    let mut world = World::new(&["/chatter"]);
+    world.spdp(ALICE, 100);
+    world.sedp(alice(WRITER), "rt/chatter");
+    for number in 0..TOPICS {
+        let [high, low] = number.to_be_bytes();
+        let entity = EntityId([1 + high, low, 0x21, 3]);
+        world.sedp(alice(entity), &format!("rt/topic_{number}"));
+    }
+    let globs = (0..250).map(|number| format!("/{}{number}", "*a".repeat(15)));
+    let mut patterns: Vec<_> = globs.collect();
+    patterns.push("/topic_*".to_owned());
+    let patterns: Vec<&str> = patterns.iter().map(String::as_str).collect();
+    world.observer.set_watchlist(watchlist(&patterns));
+    assert!(!world.observer.has_asked_all());
+    let is_measured = |topic: &TopicFacts| topic.measurement.is_some();
+    let some = world
+        .snapshot()
+        .topics
+        .iter()
+        .filter(|it| is_measured(it))
+        .count();
+    assert!(some < usize::from(TOPICS) / 2, "{some}");
+    // It goes on being counted.
+    world.sample(alice(WRITER), 1);
+    let mut rounds = 0;
+    while !world.observer.ask_more() {
+        rounds += 1;
+    }
+    assert!((2..10).contains(&rounds), "{rounds}");
+    let snapshot = world.snapshot();
+    let topics = snapshot
+        .topics
+        .iter()
+        .filter(|it| it.name.starts_with("/topic_"));
+    assert_eq!(
+        topics.filter(|it| is_measured(it)).count(),
+        usize::from(TOPICS)
+    );
+}
+
+#[test]
 fn what_was_counted_survives_writers_and_watchlists() {
     let mut world = World::new(&["/chatter"]);
     world.spdp(ALICE, 100);

@@ -292,6 +292,12 @@ impl Watchlist {
         &self.watches
     }
 
+    /// How many globs each topic's name is matched against.
+    #[must_use]
+    pub const fn globs(&self) -> usize {
+        self.globs.len()
+    }
+
     /// The entries that cover this topic, as indices into [`Self::watches`].
     #[must_use]
     pub fn matching(&self, domain_id: u32, topic: &str) -> Vec<usize> {

@@ -46,6 +46,8 @@ const SECOND: u64 = 1_000_000_000;
 const TICK: u64 = SECOND / 10;
 /// A clock that jumps further than this is set, not followed tick by tick.
 const JUMP: u64 = 3600 * SECOND;
+/// Names matched against globs in one go: a few milliseconds.
+const MATCHES_AT_ONCE: usize = 20_000;
 
 /// Caps and times.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -144,6 +146,8 @@ pub struct Observer {
     pub(super) watchlist: Arc<Watchlist>,
     pub(super) discovery: Discovery,
     pub(super) topics: Topics,
+    /// Topics about which the lists are still to be asked, the next one last.
+    unasked: Vec<TopicId>,
     pub(super) interest: Interest,
     pub(super) profiler: Profiler,
     pub(super) pieces: Pieces,
@@ -175,6 +179,7 @@ impl Observer {
             watchlist: Arc::default(),
             discovery: Discovery::new(caps),
             topics: Topics::default(),
+            unasked: Vec::new(),
             interest: Interest::new(settings.interest),
             profiler: Profiler::new(
                 settings.unknown_writers,
@@ -196,7 +201,7 @@ impl Observer {
         }
     }
 
-    /// Watches these from now on. What was counted of a topic that is no more watched stays, and so
+    /// Watches these from now on, once [`Self::ask_more`] has come to all topics. What was counted of a topic that is no more watched stays, and so
     /// does how a topic stands with an entry that is in the new list as it was.
     pub fn set_watchlist(&mut self, watchlist: impl Into<Arc<Watchlist>>) {
         let before = std::mem::replace(&mut self.watchlist, watchlist.into());
@@ -214,7 +219,8 @@ impl Observer {
         self.consult_all();
     }
 
-    /// Gives the samples that these wish for from now on, and no others. Their topics are measured
+    /// Gives the samples that these wish for, and no others, once [`Self::ask_more`] has come to all
+    /// topics. Their topics are measured
     /// meanwhile, whether they are watched or not; what was counted stays.
     pub fn set_wishes(&mut self, wishes: Arc<Vec<Wish>>) {
         self.wishes = wishes;
@@ -261,6 +267,7 @@ impl Observer {
             watchlist: _,
             discovery,
             topics,
+            unasked,
             interest,
             profiler,
             pieces,
@@ -278,6 +285,11 @@ impl Observer {
         } = self;
         let mut sizes = discovery.sizes();
         sizes.extend(topics.sizes(settings.endpoints, settings.topics));
+        sizes.push(Size::new(
+            "observer.unasked",
+            unasked.len(),
+            settings.endpoints,
+        ));
         sizes.extend(interest.sizes());
         sizes.extend(profiler.sizes(settings.endpoints));
         sizes.extend(pieces.sizes());
@@ -925,15 +937,38 @@ impl Observer {
 
     /// Asks about every topic.
     fn consult_all(&mut self) {
+        let is_watched = |id: &TopicId| {
+            let topic = self.topics.get(*id);
+            topic.is_some_and(|topic| topic.watched == Watched::Yes)
+        };
+        let (watched, others): (Vec<_>, Vec<_>) =
+            self.topics.ids().into_iter().partition(is_watched);
         // First give places back, then hand them out.
-        for pass in [Watched::Yes, Watched::No] {
-            for id in self.topics.ids() {
-                let watched = self.topics.get(id).map(|topic| topic.watched);
-                if (watched == Some(Watched::Yes)) == (pass == Watched::Yes) {
-                    self.consult(id, self.clock);
-                }
-            }
+        self.unasked = others.into_iter().rev().collect();
+        self.unasked.extend(watched.into_iter().rev());
+        self.ask_more();
+    }
+
+    /// Asks the watchlist and the wishes about further topics, as many as take some milliseconds.
+    /// Until a topic's turn comes, what was decided by the lists before holds. Returns whether all
+    /// topics had their turn.
+    pub fn ask_more(&mut self) -> bool {
+        if self.has_asked_all() {
+            return true;
         }
+        let wished = |wish: &Wish| wish.selection.globs().count() + wish.selection.regexes();
+        let patterns = self.watchlist.globs() + self.wishes.iter().map(wished).sum::<usize>();
+        for _ in 0..(MATCHES_AT_ONCE / patterns.max(1)).max(1) {
+            let Some(id) = self.unasked.pop() else { break };
+            self.consult(id, self.clock);
+        }
+        self.has_asked_all()
+    }
+
+    /// Whether the lists were asked about all topics since they last changed.
+    #[must_use]
+    pub const fn has_asked_all(&self) -> bool {
+        self.unasked.is_empty()
     }
 
     /// Asks the watchlist and the wishes about a topic and lets its endpoints follow.

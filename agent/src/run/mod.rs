@@ -16,6 +16,7 @@ use crate::capture::live::{CaptureError, LiveSource};
 use crate::capture::pcap::PcapError;
 use crate::capture::system::give_back_memory;
 use crate::model::observer::Observer;
+use crate::model::selection::Wish;
 use crate::model::snapshot::Snapshot;
 use crate::state::Keeper;
 use crate::subscriptions::Subscriptions;
@@ -58,6 +59,8 @@ pub struct Run {
     drops: Drops,
     watches: Arc<Watches>,
     subscriptions: Arc<Subscriptions>,
+    /// Those that subscriptions wait for to be in force.
+    wishes: Option<Arc<Vec<Wish>>>,
     /// The time that subscriptions were last told.
     told: Timestamp,
     stop: CancellationToken,
@@ -83,6 +86,7 @@ impl Run {
             drops: Drops::default(),
             watches,
             subscriptions,
+            wishes: None,
             told: Timestamp::default(),
             stop,
             keeper: None,
@@ -118,7 +122,9 @@ impl Run {
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
             let subscribed = self.subscriptions.is_open();
-            let slice = if self.board.is_asked() {
+            let slice = if !self.observer.has_asked_all() {
+                Duration::ZERO
+            } else if self.board.is_asked() {
                 PUBLISH_ASKED
             } else if subscribed {
                 SLICE_SUBSCRIBED
@@ -182,22 +188,39 @@ impl Run {
         self.subscriptions.deliver(given, news);
     }
 
-    /// Watches and gives what is asked for since the last look. The kernel knows it before the next packets.
+    /// Watches and gives what is asked for since the last look. The kernel knows it before the next
+    /// packets. Where many topics are matched against many globs, packets are taken in between, and
+    /// lists that change meanwhile wait.
     fn take_watches(&mut self) {
-        if let Some(watchlist) = self.watches.take_news() {
-            self.subscriptions.retain(watchlist.watches());
-            self.observer.set_watchlist(watchlist);
-            self.tell_interest();
+        if self.ask() {
+            if let Some(watchlist) = self.watches.take_news() {
+                self.subscriptions.retain(watchlist.watches());
+                self.observer.set_watchlist(watchlist);
+            }
+            if let Some(wishes) = self.subscriptions.take_news() {
+                self.observer.set_wishes(Arc::clone(&wishes));
+                self.wishes = Some(wishes);
+            }
         }
-        if let Some(wishes) = self.subscriptions.take_news() {
-            self.observer.set_wishes(Arc::clone(&wishes));
-            self.tell_interest();
+        let has_asked_all = self.ask();
+        self.tell_interest();
+        if has_asked_all && let Some(wishes) = self.wishes.take() {
             self.subscriptions.in_force(&wishes);
             if wishes.is_empty() {
                 // Those of large messages are gone, and it may be long until somebody asks again.
                 give_back_memory();
             }
         }
+    }
+
+    /// Goes on with what new lists say of each topic; whether that is done. A replay waits for it.
+    fn ask(&mut self) -> bool {
+        while !self.observer.ask_more() {
+            if let Source::Live(_) = self.source {
+                return false;
+            }
+        }
+        true
     }
 
     fn tell_interest(&mut self) {
