@@ -361,7 +361,7 @@ impl Watchdog {
         let now = Instant::now();
         let state = board.state();
         let ready = state.ready(now);
-        if let Some(event) = self.sight.look(&ready, now) {
+        for event in self.sight.look(&ready, state.agent.attached_anew, now) {
             board.events().tell(event);
         }
         // A restart does not bring back what is gone.

@@ -183,6 +183,39 @@ fn a_cgroup_that_is_made_anew_is_seen_again_and_missed_meanwhile() -> Result<()>
     ensure_nothing_attached(above.path(), 0)
 }
 
+#[test]
+fn a_cgroup_that_is_gone_for_a_moment_is_told_and_seen_again() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let elsewhere = Namespace::alone()?;
+    let above = Cgroup::create(&format!("{PREFIX}-{}-moment", std::process::id()))?;
+    let configuration = Configuration::at(above.path())?;
+    let mut agent = configuration.start(&elsewhere)?;
+    for round in 1..=2 {
+        std::fs::remove_dir(above.path())?;
+        std::fs::create_dir(above.path())?;
+        eventually(|| {
+            let page = agent.scrape()?;
+            for name in ["ros2probe.capture.blind", "ros2probe.capture.seeing"] {
+                let told = page.sum("ros2probe_events_total", &[("name", name)]);
+                ensure!(told == f64::from(round), "{told} of {round} {name}");
+            }
+            Ok(())
+        })?;
+    }
+    for direction in DIRECTIONS {
+        let attached = bpf::attached(above.path(), direction)?;
+        ensure!(attached == 1, "{attached} programs are attached");
+    }
+    let link = Link::below(&above)?;
+    talk(&link, &Stream::small(200))?;
+    let scrape = agent.settled_scrape("/imu", 200)?;
+    let counted = scrape.sum("ros2_topic_messages_total", &[("topic", "/imu")]);
+    ensure!(counted == 200.0, "counted {counted}");
+    drop(link);
+    agent.process.terminate()?;
+    ensure_nothing_attached(above.path(), 0)
+}
+
 /// Removes a cgroup that has no processes any more, and waits.
 fn remove_until(cgroup: &Path, noticed: impl Fn() -> bool) -> Result<()> {
     eventually(|| Ok(std::fs::remove_dir(cgroup)?))?;

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use harness::agent::{Agent, Scrape};
+use harness::agent::{Agent, Scrape, get};
 use harness::code::{self, Code};
 use harness::network::Namespace;
 use harness::peer::{Peer, Role, Stack, Stream};
@@ -140,9 +140,74 @@ fn without_what_it_takes_shared_memory_is_sampled_and_the_reason_is_told() -> Re
     wait_until("everything is covered again", is_able)
 }
 
+#[test]
+fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> {
+    let mut host = Host::new()?;
+    let observed = host.network.cgroup().join("observed");
+    fs::create_dir(&observed)?;
+    host.cgroup.clone_from(&observed);
+    let directory = tempfile::tempdir()?;
+    let mut agent = start_agent_at(&host.network, &observed, directory.path(), &[])?;
+    let able = |agent: &Agent<'_>, name: &str| -> Result<bool> {
+        let ability = [("ability", name)];
+        Ok(agent.scrape()?.sum("ros2probe_capture_ability", &ability) == 1.0)
+    };
+    wait_until("it is exact", || able(&agent, "shared_memory_exact"))?;
+    fs::remove_dir(&observed)?;
+    fs::create_dir(&observed)?;
+    wait_until("it is exact no longer", || {
+        Ok(!able(&agent, "shared_memory_exact")?)
+    })?;
+    agent.wait_ready(PATIENCE)?;
+    assert!(able(&agent, "shared_memory")?);
+    let health = get(&host.network, "http://127.0.0.1:17401/health")?;
+    assert!(health.contains("the cgroup was made anew"), "{health}");
+
+    // Who is in the new one is seen by looking, and nobody is believed to have lost anything.
+    let stream = Stream {
+        count: SAMPLES,
+        linger: 60.0,
+        ..shared("/imu")
+    };
+    let is_there = || -> Result<bool> {
+        let page = agent.scrape()?;
+        Ok(page.sum("ros2_topic_publishers", &[("topic", "/imu")]) == 1.0)
+    };
+    // What is said once can be missed by looking: other nodes of the same names say it again.
+    let (mut publisher, mut subscriber) = host.pair(&stream)?;
+    let began = Instant::now();
+    while !is_there()? {
+        ensure!(began.elapsed() < PATIENCE, "the publisher is not known");
+        std::thread::sleep(Duration::from_secs(3));
+        if !is_there()? {
+            drop((publisher, subscriber));
+            (publisher, subscriber) = host.pair(&stream)?;
+        }
+    }
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    assert_eq!(received(&mut subscriber, 0, SAMPLES)?, SAMPLES);
+    let page = agent.settled_scrape("/imu", SAMPLES)?;
+    let topic = [("topic", "/imu")];
+    let counted = page.sum("ros2_topic_messages_total", &topic);
+    let lost = page.sum("ros2_topic_lost_messages_total", &topic);
+    // The last ones may have been overwritten before a look.
+    ensure!(
+        (0.9..=1.0).contains(&(counted / SAMPLES as f64)) && lost == 0.0,
+        "{counted} of {SAMPLES}, {lost} lost: {}",
+        telling(&page)
+    );
+    drop(publisher);
+    drop(subscriber);
+    agent.process.terminate()?;
+    fs::remove_dir(&observed).context("the observed cgroup")
+}
+
 /// A host with a `/dev/shm` of its own.
 struct Host {
     network: Namespace,
+    /// That its nodes are in.
+    cgroup: PathBuf,
     /// Keeps the mount namespace.
     keeper: Process,
 }
@@ -154,7 +219,11 @@ impl Host {
         let arguments = ["--mount", "sh", "-c", script];
         let mut keeper = Process::start(&network.on_network(), "unshare", arguments)?;
         keeper.wait_for("ready", Duration::from_secs(10))?;
-        Ok(Host { network, keeper })
+        Ok(Host {
+            cgroup: network.cgroup().to_owned(),
+            network,
+            keeper,
+        })
     }
 
     /// A publisher and its subscriber that know each other.
@@ -171,7 +240,9 @@ impl Host {
     fn launch(&self, role: Role, stream: &Stream) -> Result<Peer> {
         let mut enter = self.network.on_network();
         let mounts = format!("--mount=/proc/{}/ns/mnt", self.keeper.pid());
-        enter.extend(["nsenter".to_owned(), mounts]);
+        let inside = format!("echo 0 >{}/cgroup.procs", self.cgroup.display());
+        let inside = format!("{inside} && exec \"$0\" \"$@\"");
+        enter.extend(["sh", "-c", &inside, "nsenter", &mounts].map(str::to_owned));
         let node = match role {
             Role::Publisher => "/talker",
             Role::Subscriber => "/listener",
@@ -192,8 +263,18 @@ fn shared(topic: &str) -> Stream {
 
 /// An agent behind some words of its own.
 fn start_agent<'a>(host: &'a Namespace, directory: &Path, words: &[String]) -> Result<Agent<'a>> {
+    start_agent_at(host, host.cgroup(), directory, words)
+}
+
+/// As [`start_agent`], for what is in a cgroup.
+fn start_agent_at<'a>(
+    host: &'a Namespace,
+    cgroup: &Path,
+    directory: &Path,
+    words: &[String],
+) -> Result<Agent<'a>> {
     let configuration = directory.join("ros2probe.yaml");
-    let cgroup = host.cgroup().display();
+    let cgroup = cgroup.display();
     let text = format!(
         "watch: [/imu, /burst]\n\
          capture: {{source: host, cgroup: {cgroup}, record_ring_bytes: {RING}, \

@@ -113,10 +113,10 @@ impl HostTap {
         self.reattach.as_ref()?.detached()
     }
 
-    /// Whether the hook was attached to another control group since the last call.
+    /// How often the hook was attached to another control group since the start.
     #[must_use]
-    pub fn take_anew(&self) -> bool {
-        self.reattach.as_ref().is_some_and(Reattach::take_anew)
+    pub fn attached_anew(&self) -> u64 {
+        self.reattach.as_ref().map_or(0, Reattach::attached_anew)
     }
 
     /// The control group whose sockets are looked at.

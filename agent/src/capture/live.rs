@@ -465,11 +465,18 @@ impl LiveSource {
         cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
     }
 
+    /// How often the hook at the sockets was attached to a control group that was made anew.
+    #[must_use]
+    pub fn attached_anew(&self) -> u64 {
+        self.host.as_ref().map_or(0, HostTap::attached_anew)
+    }
+
     /// The programs for messages into shared memory know their control group by a number, which a
     /// group made anew does not have. Shared memory is sampled from then on.
     fn leave_exact_mode(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        let is_anew = self.host.as_ref().is_some_and(HostTap::take_anew);
-        if is_anew && let Some(mut exact) = self.exact.take() {
+        if self.attached_anew() > 0
+            && let Some(mut exact) = self.exact.take()
+        {
             exact.drain(clocks, observer);
             observer.seen_exactly_no_longer();
             let reason = "the cgroup was made anew: restart to see its messages one by one";

@@ -9,7 +9,7 @@ use std::io::{self, PipeReader, PipeWriter};
 use std::os::fd::{AsFd as _, OwnedFd};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{Builder, JoinHandle};
 use std::time::Duration;
@@ -38,8 +38,8 @@ pub struct Reattach {
 struct Shared {
     /// Why the hook is attached to nothing.
     detached: Mutex<Option<String>>,
-    /// Attached again since this was last asked.
-    is_anew: AtomicBool,
+    /// How often the hook was attached again.
+    attached_anew: AtomicU64,
 }
 
 /// What the thread works with.
@@ -95,10 +95,10 @@ impl Reattach {
         detached.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Whether the hook was attached to another group since the last call.
+    /// How often the hook was attached to another group since the start.
     #[must_use]
-    pub fn take_anew(&self) -> bool {
-        self.shared.is_anew.swap(false, Ordering::AcqRel)
+    pub fn attached_anew(&self) -> u64 {
+        self.shared.attached_anew.load(Ordering::Acquire)
     }
 }
 
@@ -151,7 +151,7 @@ impl Follow {
         }
         match self.attach() {
             Ok(()) => {
-                self.shared.is_anew.store(true, Ordering::Release);
+                self.shared.attached_anew.fetch_add(1, Ordering::Release);
                 *self.detached() = None;
                 tracing::info!(
                     cgroup = %self.path.display(),

@@ -221,6 +221,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         abilities: abilities(live),
         blind: blind(live),
         gone,
+        attached_anew: live.attached_anew(),
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
         shared_memory: live.shared_memory().map(shared_memory),

@@ -20,6 +20,8 @@ pub struct AgentFacts {
     pub blind: Vec<(Ability, String)>,
     /// What it looks at and is gone, in words: nothing is seen there.
     pub gone: Option<String>,
+    /// How often the control group that it looks at was made anew.
+    pub attached_anew: u64,
     /// When this was filled in.
     pub at: Instant,
     /// When the source last came back from waiting for packets, with or without any.
@@ -141,6 +143,7 @@ impl AgentFacts {
             abilities: source.abilities().to_vec(),
             blind: Vec::new(),
             gone: None,
+            attached_anew: 0,
             at,
             capture_progress: at,
             finished: false,

@@ -21,9 +21,10 @@ type Losses = [(&'static str, u64); 4];
 /// Whether the agent sees.
 #[derive(Debug, Default)]
 pub struct Sight {
-    /// It saw before: an agent that is starting is not blind.
-    has_seen: bool,
     blind_since: Option<Instant>,
+    /// When it was last looked at and saw. Until then it is starting, not blind.
+    saw: Option<Instant>,
+    attached_anew: u64,
 }
 
 impl Drops {
@@ -62,22 +63,37 @@ fn losses(facts: &AgentFacts) -> Losses {
 }
 
 impl Sight {
-    /// Whether it sees at `now`, or why not; the event if that is news.
-    pub fn look(&mut self, ready: &Result<(), String>, now: Instant) -> Option<AgentEvent> {
+    /// Whether it sees at `now`, or why not, and how often the hook was attached anew; the events if
+    /// that is news. A control group that went and came between two looks makes both events, with the
+    /// time between the looks.
+    pub fn look(
+        &mut self,
+        ready: &Result<(), String>,
+        attached_anew: u64,
+        now: Instant,
+    ) -> Vec<AgentEvent> {
+        let is_anew = attached_anew > std::mem::replace(&mut self.attached_anew, attached_anew);
+        let mut events = Vec::new();
         match ready {
             Ok(()) => {
-                self.has_seen = true;
-                let since = self.blind_since.take()?;
-                let blind_seconds = now.saturating_duration_since(since).as_secs_f64();
-                Some(AgentEvent::Seeing { blind_seconds })
+                let saw = self.saw.replace(now).filter(|_| is_anew);
+                if self.blind_since.is_none() && saw.is_some() {
+                    let reason = "the cgroup was removed and made anew".to_owned();
+                    events.push(AgentEvent::Blind { reason });
+                }
+                if let Some(since) = self.blind_since.take().or(saw) {
+                    let blind_seconds = now.saturating_duration_since(since).as_secs_f64();
+                    events.push(AgentEvent::Seeing { blind_seconds });
+                }
             }
-            Err(reason) if self.has_seen && self.blind_since.is_none() => {
+            Err(reason) if self.saw.is_some() && self.blind_since.is_none() => {
                 self.blind_since = Some(now);
                 let reason = reason.clone();
-                Some(AgentEvent::Blind { reason })
+                events.push(AgentEvent::Blind { reason });
             }
-            Err(_) => None,
+            Err(_) => {}
         }
+        events
     }
 }
 
@@ -116,17 +132,33 @@ mod tests {
         let start = Instant::now();
         let mut sight = Sight::default();
         let blind = Err("stuck".to_owned());
-        assert_eq!(sight.look(&blind, start), None);
-        assert_eq!(sight.look(&Ok(()), start), None);
+        assert_eq!(sight.look(&blind, 0, start), []);
+        assert_eq!(sight.look(&Ok(()), 0, start), []);
         let reason = "stuck".to_owned();
-        assert_eq!(
-            sight.look(&blind, start),
-            Some(AgentEvent::Blind { reason })
-        );
-        assert_eq!(sight.look(&blind, start), None);
+        assert_eq!(sight.look(&blind, 0, start), [AgentEvent::Blind { reason }]);
+        assert_eq!(sight.look(&blind, 0, start), []);
         let later = start + Duration::from_secs(3);
         let seeing = AgentEvent::Seeing { blind_seconds: 3.0 };
-        assert_eq!(sight.look(&Ok(()), later), Some(seeing));
-        assert_eq!(sight.look(&Ok(()), later), None);
+        assert_eq!(sight.look(&Ok(()), 0, later), [seeing]);
+        assert_eq!(sight.look(&Ok(()), 0, later), []);
+    }
+
+    #[test]
+    fn a_cgroup_that_is_made_anew_between_two_looks_is_told_once() {
+        let start = Instant::now();
+        let second = |number| start + Duration::from_secs(number);
+        let mut sight = Sight::default();
+        assert_eq!(sight.look(&Ok(()), 0, start), []);
+        let events = sight.look(&Ok(()), 1, second(2));
+        let reason = "the cgroup was removed and made anew".to_owned();
+        let seeing = |blind_seconds| AgentEvent::Seeing { blind_seconds };
+        assert_eq!(events, [AgentEvent::Blind { reason }, seeing(2.0)]);
+        assert_eq!(sight.look(&Ok(()), 1, second(4)), []);
+
+        // Noticed while it was gone: that is told already.
+        let gone = Err("the cgroup /robot was removed".to_owned());
+        assert_eq!(sight.look(&gone, 1, second(6)).len(), 1);
+        assert_eq!(sight.look(&Ok(()), 2, second(9)), [seeing(3.0)]);
+        assert_eq!(sight.look(&Ok(()), 2, second(10)), []);
     }
 }
