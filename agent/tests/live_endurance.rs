@@ -329,6 +329,7 @@ fn a_network_namespace_that_goes_is_told_and_takes_nothing_along() -> Result<()>
     talk(&mut talker, &mut inside, [320; 50])?;
     robot.agent.settled_scrape("/inside", 50)?;
     drop(inside);
+    let name = other.name().to_owned();
     drop(other);
     harness::wait_until("the namespace is not missed", || {
         Ok(robot
@@ -346,6 +347,11 @@ fn a_network_namespace_that_goes_is_told_and_takes_nothing_along() -> Result<()>
         "{}",
         page.0
     );
+    // Another one at the path is not the one that is captured.
+    run(&format!("ip netns add {}", name))?;
+    std::thread::sleep(Duration::from_secs(2));
+    ensure!(robot.readiness()? == "503", "another namespace is observed");
+    run(&format!("ip netns delete {}", name))?;
     // The robot's whole network goes: the cable with it.
     drop(sender);
     run(&format!("ip -n {} link delete eth0", link.robot.name()))?;

@@ -22,8 +22,9 @@ use forged::{Carrier, Sender, Talker, introduce, talk};
 use harness::agent::{Agent, Scrape};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
-use harness::run;
+use harness::process::Process;
 use harness::usage::Usage;
+use harness::{run, wait_until};
 use tempfile::TempDir;
 
 const WATCH_ALL: &str = "watch: [/**]\ncapture:\n  source: wire\n";
@@ -281,6 +282,41 @@ fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
     let inside = format!("{}:lo", path.display());
     assert!(interfaces.contains(&inside), "{interfaces:?}");
     Ok(())
+}
+
+#[test]
+fn a_network_namespace_whose_path_is_gone_for_a_while_is_missed_meanwhile() -> Result<()> {
+    let link = Link::new()?;
+    let path = forged::path(&link.robot);
+    let place = path.display();
+    let capture =
+        format!("watch: [/**]\ncapture: {{source: wire, network_namespaces: [{place}]}}\n");
+    let observed = Observed::start(&link.monitor, &capture)?;
+    let is_ready = || observed.agent.request("/readyz").is_ok();
+    // A process keeps the namespace while its name is gone.
+    let words = ["-c", "echo inside && exec sleep 1000"];
+    let mut keeper = Process::start(&link.robot.on_network(), "sh", words)?;
+    keeper.wait_for("inside", Duration::from_secs(60))?;
+    for round in 0..2 {
+        run(&format!("umount {place}"))?;
+        wait_until("missed", || Ok(!is_ready()))?;
+        let page = observed.agent.scrape()?;
+        assert_eq!(page.value("ros2probe_ready", &[]), Some(0.0));
+        run(&format!(
+            "mount --bind /proc/{}/ns/net {place}",
+            keeper.pid()
+        ))?;
+        wait_until("seen again", || Ok(is_ready()))?;
+        for name in ["ros2probe.capture.blind", "ros2probe.capture.seeing"] {
+            wait_until(name, || {
+                let page = observed.agent.scrape()?;
+                let told = page.sum("ros2probe_events_total", &[("name", name)]);
+                Ok(told == f64::from(round + 1))
+            })?;
+        }
+    }
+    let mut sender = Sender::new(&link.robot, "127.0.0.1:0", "127.0.0.1:7400")?;
+    observed.counts_each_sample_once("/inside", &mut sender)
 }
 
 #[test]

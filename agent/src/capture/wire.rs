@@ -62,8 +62,11 @@ pub struct WireSettings {
 /// One network namespace.
 pub struct WireTap {
     path: Option<PathBuf>,
-    /// Device and inode of what was at the path; `None` = it has been said that it is gone.
+    /// Device and inode of what was at the path. The socket keeps the namespace, so that the kernel
+    /// gives no other one the same.
     identity: Option<Identity>,
+    /// Something else is at the path, or nothing.
+    is_gone: bool,
     ring: Ring,
     filter: Filter,
     interfaces: Interfaces,
@@ -105,6 +108,7 @@ impl WireTap {
         )?;
         Ok(Self {
             identity: path.as_deref().and_then(identity),
+            is_gone: false,
             path,
             ring,
             filter,
@@ -129,23 +133,30 @@ impl WireTap {
         self.path.as_deref()
     }
 
-    /// Says once that the namespace at the path is another one by now, or none: its frames are not
-    /// seen, and entering it would take privileges that were given up.
+    /// Logs when another namespace is at the path by now, or none: its frames are not seen, and
+    /// entering it would take privileges that were given up. Logs when the first one is there again.
     pub fn look_for_namespace(&mut self) {
         let Some(path) = &self.path else { return };
-        if self.identity.is_some() && identity(path) != self.identity {
-            self.identity = None;
+        let is_gone = identity(path) != self.identity;
+        if is_gone == self.is_gone {
+            return;
+        }
+        self.is_gone = is_gone;
+        let namespace = path.display();
+        if is_gone {
             tracing::warn!(
-                namespace = %path.display(),
+                %namespace,
                 "the network namespace was removed or replaced: restart to observe the current one"
             );
+        } else {
+            tracing::info!(%namespace, "the network namespace is there again");
         }
     }
 
     /// What is gone, in plain words: the namespace, or an interface that the configuration names.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
-        if let (Some(path), None) = (&self.path, self.identity) {
+        if let (Some(path), true) = (&self.path, self.is_gone) {
             let path = path.display();
             return Some(format!(
                 "the network namespace {path} was removed or replaced: restart to observe the \
