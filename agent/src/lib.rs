@@ -10,6 +10,7 @@ pub mod client;
 pub mod config;
 pub mod discover;
 pub mod doctor;
+pub mod file;
 pub mod message;
 pub mod model;
 pub mod privilege;

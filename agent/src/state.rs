@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
+use crate::file;
 use crate::model::discovery::Memory;
 
 /// The form that is written. What was added to it so far may be lacking in a file and has a default
@@ -226,8 +227,8 @@ impl StateDirectory {
         let file = form.file;
         let path = self.path.join(file);
         let mut bytes = Vec::new();
-        let read =
-            open_regular(&path).and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
+        let read = file::open_no_link(&path)
+            .and_then(|file| file.take(MAX_BYTES + 1).read_to_end(&mut bytes));
         match read {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Found::Nothing,
             Err(error) => return self.set_aside(file, error.to_string()),
@@ -305,21 +306,6 @@ fn begins_with_version(bytes: &[u8]) -> Option<u32> {
     let digits = rest.iter().take_while(|byte| byte.is_ascii_digit());
     let digits: Vec<u8> = digits.take(10).copied().collect();
     std::str::from_utf8(&digits).ok()?.parse().ok()
-}
-
-/// Opens what was written here: a regular file in this directory. A link is not followed, and a pipe
-/// without a writer, or a device, is not waited for.
-fn open_regular(path: &Path) -> io::Result<File> {
-    let mut options = OpenOptions::new();
-    let flags = libc::O_NOFOLLOW | libc::O_NONBLOCK | libc::O_NOCTTY;
-    let file = options.read(true).custom_flags(flags).open(path)?;
-    if file.metadata()?.is_file() {
-        return Ok(file);
-    }
-    Err(io::Error::new(
-        io::ErrorKind::InvalidInput,
-        "it is no regular file",
-    ))
 }
 
 /// Makes the file anew: what lies there, of an agent that was killed or a link, goes first.
@@ -625,13 +611,13 @@ mod tests {
         let (found, heard) = std::sync::mpsc::channel();
         std::thread::spawn(move || found.send((unusable(&directory), directory)));
         let (reason, directory) = heard.recv_timeout(Duration::from_secs(10)).unwrap();
-        assert_eq!(reason, "it is no regular file");
+        assert_eq!(reason, "not a regular file");
         let aside = place.path().join("discovery.json.corrupt");
         let error = StateDirectory::open(&aside).unwrap_err();
         assert!(matches!(error, StateError::Unusable { .. }), "{error}");
         fs::create_dir(&path).unwrap();
         fs::remove_file(aside).unwrap();
-        assert_eq!(unusable(&directory), "it is no regular file");
+        assert_eq!(unusable(&directory), "not a regular file");
     }
 
     #[test]

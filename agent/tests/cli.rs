@@ -8,7 +8,8 @@ use std::net::TcpListener;
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::os::unix::net::UnixDatagram;
 use std::path::PathBuf;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 use local_agent::{LocalAgent, PATIENCE, capture, metric, promtool, rp};
 
@@ -268,4 +269,61 @@ fn the_service_manager_hears_of_start_progress_reload_and_stop() {
     agent.signal("-TERM");
     wait_for("STOPPING=1");
     assert!(agent.wait().success());
+}
+
+#[test]
+fn a_pipe_in_place_of_a_file_is_refused_at_once() {
+    let directory = tempfile::tempdir().unwrap();
+    let pipe = |name: &str| {
+        let path = directory.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        let made = Command::new("mkfifo").arg(&path).status();
+        assert!(made.unwrap().success());
+        path.to_str().unwrap().to_owned()
+    };
+    let metadata = pipe("described/metadata.yaml");
+    let described = metadata.trim_end_matches("/metadata.yaml");
+    let file = pipe("bare/bag_0.mcap");
+    let bare = file.trim_end_matches("/bag_0.mcap");
+    let compressed = pipe("bag_0.mcap.zstd");
+    let configuration = pipe("ros2probe.yaml");
+    let storage = pipe("storage.yaml");
+    for arguments in [
+        &["bag", "info", described][..],
+        &["bag", "info", &file],
+        &["bag", "info", &compressed],
+        &["bag", "reindex", bare],
+        &["check-config", &configuration],
+        &["run", "--config", &configuration],
+        &["discover", "--config", &configuration],
+        &["doctor", "--config", &configuration],
+        &[
+            "bag",
+            "record",
+            "--storage-config-file",
+            &storage,
+            "/chatter",
+        ],
+    ] {
+        let mut rp = rp();
+        rp.args(arguments).current_dir(directory.path());
+        let (output, time) = within(rp, Duration::from_secs(10));
+        let said = String::from_utf8_lossy(&output.stderr);
+        let said = said.into_owned() + &String::from_utf8_lossy(&output.stdout);
+        println!("{arguments:?} after {time:?}: {said}");
+        assert!(!output.status.success(), "{arguments:?}: {said}");
+        assert!(said.contains("not a regular file"), "{arguments:?}: {said}");
+    }
+}
+
+/// Runs it; kills it when it takes longer.
+fn within(mut command: Command, most: Duration) -> (Output, Duration) {
+    let begin = Instant::now();
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    while child.try_wait().unwrap().is_none() && begin.elapsed() < most {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    child.kill().unwrap();
+    (child.wait_with_output().unwrap(), begin.elapsed())
 }

@@ -119,7 +119,7 @@ impl Bag {
             source,
         };
         let mut begin = Vec::new();
-        let mut file = fs::File::open(path).map_err(wrong)?;
+        let mut file = crate::file::open(path).map_err(wrong)?;
         (&mut file)
             .take(16)
             .read_to_end(&mut begin)
@@ -265,7 +265,7 @@ impl Bag {
 /// The text of metadata.yaml; of one that is too large, enough to see that.
 pub(super) fn read_text(path: &Path) -> std::io::Result<String> {
     let mut text = String::new();
-    let file = fs::File::open(path)?;
+    let file = crate::file::open(path)?;
     file.take(metadata::MAX_BYTES + 1)
         .read_to_string(&mut text)?;
     Ok(text)

@@ -85,7 +85,7 @@ impl Contents {
             path: path.to_owned(),
             source,
         };
-        let mut file = File::open(path).map_err(wrong)?;
+        let mut file = crate::file::open(path).map_err(wrong)?;
         let mut magic = [0; mcap::MAGIC.len()];
         if file.read_exact(&mut magic).is_err() || magic != mcap::MAGIC {
             return Err(ReadError::NotMcap(path.to_owned()));
@@ -206,7 +206,7 @@ pub fn scan(path: &Path, each: &mut Each<'_>) -> Result<Scan, ReadError> {
         path: path.to_owned(),
         source,
     };
-    let file = File::open(path).map_err(wrong)?;
+    let file = crate::file::open(path).map_err(wrong)?;
     let length = file.metadata().map_err(wrong)?.len();
     let expands = EXPANDED.saturating_add(length.saturating_mul(EXPANSION));
     let compression = compression(path);

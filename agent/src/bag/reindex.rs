@@ -191,7 +191,7 @@ fn rewrite(path: &Path, scan: &Scan) -> io::Result<Found> {
 }
 
 fn write_part(path: &Path, part: &Path, scan: &Scan) -> io::Result<Found> {
-    let mut source = File::open(path)?;
+    let mut source = crate::file::open(path)?;
     let mut writer = FileWriter::resume(part, &mut source, scan)?;
     let mut salvaged = 0;
     let mut known = scan.contents.clone();

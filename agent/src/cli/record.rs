@@ -334,7 +334,7 @@ impl Record {
         }
         let mut storage = Storage::preset(&self.storage_preset_profile)?;
         if let Some(path) = &self.storage_config_file {
-            let text = std::fs::read_to_string(path);
+            let text = ros2probe::file::read_text(path, 1 << 20);
             let text = text.with_context(|| format!("cannot read {}", path.display()))?;
             storage = storage.overlaid(&text)?;
         }

@@ -11,8 +11,7 @@ mod shape;
 pub mod watch;
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{self, Read as _};
+use std::io;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -374,14 +373,7 @@ impl Config {
     /// # Errors
     /// When it cannot be read or has mistakes; then all of them.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let read = || {
-            let mut bytes = Vec::new();
-            File::open(path)?
-                .take(MAX_BYTES + 1)
-                .read_to_end(&mut bytes)?;
-            Ok(bytes)
-        };
-        let bytes = read().map_err(|source| ConfigError::Read {
+        let bytes = crate::file::read(path, MAX_BYTES).map_err(|source| ConfigError::Read {
             path: path.into(),
             source,
         })?;

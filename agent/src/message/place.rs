@@ -1,8 +1,6 @@
 //! A place that may have definitions: a directory, an installed ROS, or the program.
 
-use std::fs::{File, OpenOptions};
-use std::io::{self, Read as _};
-use std::os::unix::fs::OpenOptionsExt as _;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -10,6 +8,7 @@ use super::definition::{Definition, TypeName};
 use super::embedded;
 use super::library::NotFound;
 use super::parse::{MAX_TEXT, ParseError, Problem};
+use crate::file;
 use crate::ros2::Dialect;
 
 /// The extension of what defines a type where nothing else does.
@@ -106,22 +105,11 @@ fn read(path: &Path) -> Result<Option<String>, NotFound> {
         path: path.to_owned(),
         mistake: ParseError { line, problem },
     };
-    let mut options = OpenOptions::new();
-    let file: File = match options.read(true).custom_flags(libc::O_NONBLOCK).open(path) {
-        Ok(file) => file,
+    let bytes = match file::read(path, MAX_TEXT as u64) {
+        Ok(bytes) => bytes,
         Err(error) if is_absent(&error) => return Ok(None),
         Err(error) => return Err(unreadable(error)),
     };
-    if !file.metadata().map_err(unreadable)?.is_file() {
-        return Err(unreadable(io::Error::new(
-            io::ErrorKind::InvalidInput,
-            "not a regular file",
-        )));
-    }
-    let mut bytes = Vec::new();
-    file.take(MAX_TEXT as u64 + 1)
-        .read_to_end(&mut bytes)
-        .map_err(unreadable)?;
     if bytes.len() > MAX_TEXT {
         return Err(mistake(1, Problem::TooLong));
     }

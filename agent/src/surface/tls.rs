@@ -3,7 +3,6 @@
 //! A handshake takes place while the connection is read, so that a slow client holds up itself
 //! alone; the limits of the connection below hold for it as well.
 
-use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
@@ -23,6 +22,9 @@ use tokio_rustls::{Accept, TlsAcceptor};
 use super::pace::Connection;
 use super::serving::Wrap;
 use super::web_config::TlsFiles;
+
+/// Longest file of certificates or a key.
+const MAX_BYTES: u64 = 1 << 20;
 
 /// Why TLS cannot be spoken.
 #[derive(Debug, thiserror::Error)]
@@ -115,10 +117,12 @@ fn certificates(path: &Path) -> Result<Vec<CertificateDer<'static>>, TlsError> {
 }
 
 fn read(path: &Path) -> Result<Vec<u8>, TlsError> {
-    fs::read(path).map_err(|source| TlsError::Read {
-        path: path.to_path_buf(),
-        source,
-    })
+    let text = crate::file::read_text(path, MAX_BYTES);
+    text.map(String::into_bytes)
+        .map_err(|source| TlsError::Read {
+            path: path.to_path_buf(),
+            source,
+        })
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Acceptor {

@@ -6,7 +6,6 @@
 //! read once, at the start.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -92,16 +91,11 @@ impl WebConfig {
     /// # Errors
     /// It cannot be read, says what is not known, or asks for what this program cannot do.
     pub fn load(path: &Path) -> Result<Self, WebConfigError> {
-        let read = || {
-            if fs::metadata(path)?.len() > MAX_BYTES {
-                return Err(io::Error::other("it is larger than 1 MiB"));
-            }
-            fs::read_to_string(path)
-        };
-        let text = read().map_err(|source| WebConfigError::Read {
-            path: path.to_path_buf(),
-            source,
-        })?;
+        let text =
+            crate::file::read_text(path, MAX_BYTES).map_err(|source| WebConfigError::Read {
+                path: path.to_path_buf(),
+                source,
+            })?;
         let directory = path.parent().unwrap_or(Path::new("/"));
         let config = Self::parse(&text, directory).map_err(|reason| WebConfigError::Invalid {
             path: path.to_path_buf(),

@@ -8,9 +8,9 @@
 //! what one returns was read after what the one before it returned; the checks that read a word
 //! before and after a copy rest on that.
 
-use std::fs::{File, OpenOptions};
+use std::fs::File;
 use std::io;
-use std::os::unix::fs::{FileExt as _, MetadataExt as _, OpenOptionsExt as _};
+use std::os::unix::fs::{FileExt as _, MetadataExt as _};
 use std::path::Path;
 
 /// Bytes at offsets.
@@ -59,18 +59,9 @@ impl SharedFile {
     /// # Errors
     /// It is not there, is no regular file, or is not for us to read.
     pub fn open(path: &Path) -> io::Result<Self> {
-        let file = OpenOptions::new()
-            .read(true)
-            .custom_flags(libc::O_NOFOLLOW | libc::O_NONBLOCK | libc::O_NOCTTY)
-            .open(path)?;
-        let metadata = file.metadata()?;
-        if !metadata.is_file() {
-            return Err(io::ErrorKind::InvalidInput.into());
-        }
-        Ok(Self {
-            file,
-            inode: metadata.ino(),
-        })
+        let file = crate::file::open_no_link(path)?;
+        let inode = file.metadata()?.ino();
+        Ok(Self { file, inode })
     }
 
     /// Which file it is, whatever its name means by now.

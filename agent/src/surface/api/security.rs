@@ -5,7 +5,6 @@
 //! Host and Origin are looked at because a browser on this host can be made to send requests to
 //! loopback by any web page it shows (CSRF), also under a name of the page's own (DNS rebinding).
 
-use std::fs::File;
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -106,7 +105,8 @@ impl Token {
     pub(super) fn load(path: &Path) -> Result<Self, TokenError> {
         let mut bytes = Vec::new();
         let limit = *TOKEN_BYTES.end() as u64 + 2;
-        let read = File::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes));
+        let read =
+            crate::file::open(path).and_then(|file| file.take(limit).read_to_end(&mut bytes));
         read.map_err(|source| TokenError::Read {
             path: path.to_path_buf(),
             source,

@@ -18,6 +18,8 @@ const INTERVAL: Duration = Duration::from_secs(15);
 const TIMEOUT: Duration = Duration::from_secs(10);
 /// Where receivers listen.
 const PORT: u16 = 4317;
+/// Longest file of headers.
+const HEADERS_BYTES: u64 = 1 << 20;
 
 /// Where a signal goes and how.
 #[derive(Clone, Debug)]
@@ -262,9 +264,11 @@ fn headers(
         add("otlp.headers", name, value)?;
     }
     if let Some(path) = &file.headers_file {
-        let text = std::fs::read_to_string(path).map_err(|source| SettingsError::HeadersFile {
-            path: path.clone(),
-            source,
+        let text = crate::file::read_text(path, HEADERS_BYTES).map_err(|source| {
+            SettingsError::HeadersFile {
+                path: path.clone(),
+                source,
+            }
         })?;
         let place = path.display().to_string();
         for line in text.lines().map(str::trim) {

@@ -1,0 +1,101 @@
+//! Files that others name, or leave in a directory: opened without waiting for them.
+//!
+//! Opening a pipe without a writer waits for ever, and so may reading a device. What is no regular
+//! file is refused. It is asked of the open file, so nobody can exchange it in between.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, Read as _};
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::Path;
+
+/// Opens a regular file to read it.
+///
+/// # Errors
+/// It cannot be opened, or is no regular file.
+pub fn open(path: &Path) -> io::Result<File> {
+    open_with(path, 0)
+}
+
+/// As [`open`]; does not follow a link in place of the file.
+///
+/// # Errors
+/// It cannot be opened, or is a link or no regular file.
+pub fn open_no_link(path: &Path) -> io::Result<File> {
+    open_with(path, libc::O_NOFOLLOW)
+}
+
+/// Reads a regular file; of one longer than `limit`, one byte more than that.
+///
+/// # Errors
+/// It cannot be read, or is no regular file.
+pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?
+        .take(limit.saturating_add(1))
+        .read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// Reads a text of at most `limit` bytes.
+///
+/// # Errors
+/// It cannot be read, is no regular file, is longer or no UTF-8.
+pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
+    let bytes = read(path, limit)?;
+    if bytes.len() as u64 > limit {
+        let problem = format!("it is larger than {limit} bytes");
+        return Err(io::Error::new(io::ErrorKind::FileTooLarge, problem));
+    }
+    String::from_utf8(bytes).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+}
+
+fn open_with(path: &Path, flags: i32) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    let flags = flags | libc::O_NONBLOCK | libc::O_NOCTTY;
+    let file = options.read(true).custom_flags(flags).open(path)?;
+    if file.metadata()?.is_file() {
+        return Ok(file);
+    }
+    Err(io::Error::new(
+        io::ErrorKind::InvalidInput,
+        "not a regular file",
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    #[test]
+    fn what_is_no_regular_file_is_refused_without_waiting() {
+        let directory = tempfile::tempdir().unwrap();
+        let pipe = directory.path().join("pipe");
+        assert!(
+            Command::new("mkfifo")
+                .arg(&pipe)
+                .status()
+                .unwrap()
+                .success()
+        );
+        for path in [pipe.as_path(), directory.path(), Path::new("/dev/zero")] {
+            let refused = read(path, 10).unwrap_err();
+            assert_eq!(refused.to_string(), "not a regular file");
+        }
+    }
+
+    #[test]
+    fn a_text_as_long_as_may_be_is_read_and_a_longer_one_refused() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("text");
+        std::fs::write(&file, "0123456789").unwrap();
+        assert_eq!(read_text(&file, 10).unwrap(), "0123456789");
+        let refused = read_text(&file, 9).unwrap_err();
+        assert_eq!(refused.kind(), io::ErrorKind::FileTooLarge);
+        let link = directory.path().join("link");
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        assert_eq!(read(&link, 10).unwrap(), b"0123456789");
+        assert!(open_no_link(&link).is_err());
+    }
+}
