@@ -9,6 +9,7 @@ use std::collections::VecDeque;
 use ros2probe_wire::record::flag;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
+use super::size::Size;
 use super::snapshot::AcknowledgementFacts;
 
 /// Times of samples that are kept of one writer.
@@ -41,13 +42,19 @@ struct Reader {
 }
 
 impl Acknowledgements {
-    /// Readers at most.
-    pub const CAP: usize = READERS;
-
-    /// Readers.
+    /// Entries and cap of every list.
     #[must_use]
-    pub const fn len(&self) -> usize {
-        self.readers.len()
+    pub fn sizes(&self) -> [Size; 2] {
+        // A new list does not compile before it has a place here.
+        let Self {
+            readers,
+            times,
+            refused: _,
+        } = self;
+        [
+            Size::new("acknowledgements.readers", readers.len(), READERS),
+            Size::new("acknowledgements.times", times.len(), TIMES),
+        ]
     }
 
     /// Whether nobody acknowledged.

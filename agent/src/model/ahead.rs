@@ -10,11 +10,14 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::{Record, flag, kind};
 
 use super::reassembly::Reassembled;
+use super::size::Size;
 
 /// Datagrams waited for; more push out the oldest.
 const DATAGRAMS: usize = 1024;
 /// Records held of one datagram. A UDP payload has room for at most 2,047 empty submessages.
 const RECORDS_PER_DATAGRAM: usize = 2048;
+/// Bytes of all of them together, records and rests.
+const BYTES: usize = 4 << 20;
 /// Linux gives up a fragmented datagram after 30 seconds (`ipfrag_time`).
 const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
 
@@ -32,6 +35,7 @@ pub enum Ready {
 pub struct Ahead {
     waiting: HashMap<Token, Waiting>,
     oldest: VecDeque<(Timestamp, Token)>,
+    bytes: usize,
     given_up: u64,
 }
 
@@ -48,6 +52,24 @@ struct Waiting {
 }
 
 impl Ahead {
+    /// Entries, or bytes, and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 3] {
+        // A new table does not compile before it has a place here.
+        let Self {
+            waiting,
+            oldest,
+            bytes: _,
+            given_up: _,
+        } = self;
+        let bytes = waiting.values().map(Waiting::bytes).sum();
+        [
+            Size::new("ahead.waiting", waiting.len(), DATAGRAMS),
+            Size::new("ahead.oldest", oldest.len(), DATAGRAMS),
+            Size::new("ahead.bytes", bytes, BYTES),
+        ]
+    }
+
     /// Takes in a record of source `namespace`. Handovers are the caller's to pass on to the
     /// reassembly; here they only say that a rest will come.
     pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(Ready)) {
@@ -63,16 +85,17 @@ impl Ahead {
             }
             return;
         }
-        let waiting = self.entry(token, Timestamp(record.time));
-        match record.kind {
-            kind::HANDOVER => waiting.handed_over = true,
-            kind::COMPLETE => {}
-            _ if waiting.records.len() < RECORDS_PER_DATAGRAM => waiting.records.push(record),
-            _ => {}
-        }
-        if record.flags & flag::AHEAD == 0 {
-            waiting.complete = Some(record.time);
-        }
+        self.change(token, Timestamp(record.time), |waiting| {
+            match record.kind {
+                kind::HANDOVER => waiting.handed_over = true,
+                kind::COMPLETE => {}
+                _ if waiting.records.len() < RECORDS_PER_DATAGRAM => waiting.records.push(record),
+                _ => {}
+            }
+            if record.flags & flag::AHEAD == 0 {
+                waiting.complete = Some(record.time);
+            }
+        });
         self.settle(token, ready);
     }
 
@@ -82,9 +105,10 @@ impl Ahead {
             return;
         };
         let token = (namespace, handover.datagram);
-        let waiting = self.entry(token, rest.last_seen);
-        waiting.handed_over = true;
-        waiting.rest = Some(rest);
+        self.change(token, rest.last_seen, |waiting| {
+            waiting.handed_over = true;
+            waiting.rest = Some(rest);
+        });
         self.settle(token, ready);
     }
 
@@ -94,7 +118,7 @@ impl Ahead {
             && now.nanoseconds_since(born) > LIFETIME_NANOSECONDS
         {
             self.oldest.pop_front();
-            self.given_up += u64::from(self.waiting.remove(&token).is_some());
+            self.given_up += u64::from(self.remove(token).is_some());
         }
     }
 
@@ -104,16 +128,33 @@ impl Ahead {
         self.given_up
     }
 
-    fn entry(&mut self, token: Token, at: Timestamp) -> &mut Waiting {
+    /// Changes what is held of a datagram, and makes room for it.
+    fn change(&mut self, token: Token, at: Timestamp, change: impl FnOnce(&mut Waiting)) {
         if !self.waiting.contains_key(&token) {
-            if self.oldest.len() >= DATAGRAMS
-                && let Some((_, oldest)) = self.oldest.pop_front()
-            {
-                self.given_up += u64::from(self.waiting.remove(&oldest).is_some());
+            if self.oldest.len() >= DATAGRAMS {
+                self.give_up_oldest();
             }
             self.oldest.push_back((at, token));
         }
-        self.waiting.entry(token).or_default()
+        let waiting = self.waiting.entry(token).or_default();
+        let before = waiting.bytes();
+        change(waiting);
+        self.bytes = self.bytes + waiting.bytes() - before;
+        while self.bytes > BYTES && !self.oldest.is_empty() {
+            self.give_up_oldest();
+        }
+    }
+
+    fn give_up_oldest(&mut self) {
+        if let Some((_, oldest)) = self.oldest.pop_front() {
+            self.given_up += u64::from(self.remove(oldest).is_some());
+        }
+    }
+
+    fn remove(&mut self, token: Token) -> Option<Waiting> {
+        let waiting = self.waiting.remove(&token)?;
+        self.bytes -= waiting.bytes();
+        Some(waiting)
     }
 
     fn settle(&mut self, token: Token, mut ready: impl FnMut(Ready)) {
@@ -124,7 +165,7 @@ impl Ahead {
         if waiting.handed_over && waiting.rest.is_none() {
             return;
         }
-        let Some(waiting) = self.waiting.remove(&token) else {
+        let Some(waiting) = self.remove(token) else {
             return;
         };
         for record in waiting.records {
@@ -137,6 +178,21 @@ impl Ahead {
         if let Some(rest) = waiting.rest {
             ready(Ready::Rest(rest));
         }
+    }
+}
+
+impl Waiting {
+    /// Bytes held.
+    fn bytes(&self) -> usize {
+        // A new list does not compile before it has a place here.
+        let Self {
+            records,
+            handed_over: _,
+            rest,
+            complete: _,
+        } = self;
+        let rest = rest.as_ref().map_or(0, Reassembled::held);
+        records.capacity() * size_of::<Record>() + rest
     }
 }
 
@@ -204,5 +260,19 @@ mod tests {
             taken(&mut ahead, record(token, kind::DATA, flag::AHEAD, 1));
         }
         assert!(ahead.waiting.len() <= DATAGRAMS && ahead.oldest.len() <= DATAGRAMS);
+    }
+
+    #[test]
+    fn a_storm_of_long_datagrams_that_never_end_stays_within_its_bytes() {
+        let mut ahead = Ahead::default();
+        for token in 1..1000 {
+            for time in 1..2000 {
+                taken(&mut ahead, record(token, kind::DATA, flag::AHEAD, time));
+            }
+        }
+        let [waiting, _, bytes] = ahead.sizes();
+        assert!(bytes.entries <= bytes.cap, "{bytes:?}");
+        assert!(bytes.entries * 10 >= bytes.cap * 9, "{bytes:?}");
+        assert_eq!(ahead.given_up(), 999 - waiting.entries as u64);
     }
 }

@@ -12,6 +12,7 @@ use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::reception::is_message;
+use super::size::Size;
 
 /// What keeping one sample or one fragment that came too early costs besides its bytes.
 const OVERHEAD: usize = 128;
@@ -63,6 +64,39 @@ impl Assembly {
             limit,
             evictions: 0,
         }
+    }
+
+    /// Entries, or bytes, and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 3] {
+        // A new table does not compile before it has a place here.
+        let Self {
+            parts,
+            ages,
+            begun: _,
+            bytes: _,
+            limit,
+            evictions: _,
+        } = self;
+        let held = |part: &Part| {
+            let Part {
+                age: _,
+                size: _,
+                fragment_size: _,
+                head,
+                next: _,
+                ahead,
+                ahead_bytes: _,
+                touched: _,
+            } = part;
+            let ahead = ahead.values().map(|bytes| bytes.len() + OVERHEAD);
+            OVERHEAD + head.capacity() + ahead.sum::<usize>()
+        };
+        [
+            Size::new("assembly.parts", parts.len(), SAMPLES),
+            Size::new("assembly.ages", ages.len(), SAMPLES),
+            Size::new("assembly.bytes", parts.values().map(held).sum(), *limit),
+        ]
     }
 
     /// Bytes held, their cap, and samples given up because of it.

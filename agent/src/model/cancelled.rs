@@ -11,6 +11,8 @@ use std::collections::VecDeque;
 use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;
 
+use super::size::Size;
+
 /// What waits for its arrival at one receiver: more than the datagrams of a large sample.
 const LIMIT: usize = 4096;
 /// Clock readings of the two reports may be converted this far apart, nanoseconds.
@@ -36,6 +38,14 @@ struct Cancellation {
 }
 
 impl Cancelled {
+    /// Entries and cap.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 1] {
+        // A new list does not compile before it has a place here.
+        let Self { waiting } = self;
+        [Size::new("cancelled.waiting", waiting.len(), LIMIT)]
+    }
+
     /// Whether nothing waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
@@ -70,8 +80,8 @@ impl Cancelled {
         is_full
     }
 
-    /// The parts of an arrival that were delivered, in order.
-    pub fn delivered(&mut self, record: &Record) -> Vec<Record> {
+    /// The parts of an arrival that were delivered, in order; counts older ones that had to go.
+    pub fn delivered(&mut self, record: &Record, evictions: &mut u64) -> Vec<Record> {
         let mut parts = vec![range(record)];
         let (begin, end) = span(record);
         let mut left = Vec::new();
@@ -102,6 +112,10 @@ impl Cancelled {
             each.start < each.end
         });
         self.waiting.extend(left);
+        while self.waiting.len() > LIMIT {
+            self.waiting.pop_front();
+            *evictions += 1;
+        }
         if record.kind != kind::DATA_FRAG {
             return if parts.is_empty() {
                 Vec::new()
@@ -192,12 +206,12 @@ mod tests {
         cancelled.note(&fragments(8, 2, 17 * MILLISECOND, 0));
         let run = fragments(1, 10, 20 * MILLISECOND, 10_000_000);
         assert_eq!(
-            ranges(&cancelled.delivered(&run)),
+            ranges(&cancelled.delivered(&run, &mut 0)),
             [(1, 3), (5, 8), (10, 11)]
         );
         assert!(cancelled.is_empty());
         let again = fragments(3, 2, 40 * MILLISECOND, 0);
-        assert_eq!(ranges(&cancelled.delivered(&again)), [(3, 5)]);
+        assert_eq!(ranges(&cancelled.delivered(&again, &mut 0)), [(3, 5)]);
     }
 
     #[test]
@@ -205,7 +219,7 @@ mod tests {
         let mut cancelled = Cancelled::default();
         cancelled.note(&fragments(3, 1, 12 * MILLISECOND, 0));
         let later = fragments(3, 1, 40 * MILLISECOND, 0);
-        assert_eq!(ranges(&cancelled.delivered(&later)), [(3, 4)]);
+        assert_eq!(ranges(&cancelled.delivered(&later, &mut 0)), [(3, 4)]);
         cancelled.expire(13 * MILLISECOND + LIFETIME);
         assert!(cancelled.is_empty());
     }
@@ -218,9 +232,9 @@ mod tests {
             cancelled.note(&fragments(fragment, 1, time, 0));
         }
         let first = fragments(1, 5, 15 * MILLISECOND, 4_000_000);
-        assert_eq!(ranges(&cancelled.delivered(&first)), [(1, 4)]);
+        assert_eq!(ranges(&cancelled.delivered(&first, &mut 0)), [(1, 4)]);
         let second = fragments(6, 5, 20 * MILLISECOND, 4_000_000);
-        assert_eq!(ranges(&cancelled.delivered(&second)), [(8, 11)]);
+        assert_eq!(ranges(&cancelled.delivered(&second, &mut 0)), [(8, 11)]);
         assert!(cancelled.is_empty());
     }
 
@@ -233,9 +247,9 @@ mod tests {
         };
         cancelled.note(&data);
         let elsewhere = Record { socket: 2, ..data };
-        assert_eq!(cancelled.delivered(&elsewhere).len(), 1);
-        assert!(cancelled.delivered(&data).is_empty());
-        assert_eq!(cancelled.delivered(&data).len(), 1);
+        assert_eq!(cancelled.delivered(&elsewhere, &mut 0).len(), 1);
+        assert!(cancelled.delivered(&data, &mut 0).is_empty());
+        assert_eq!(cancelled.delivered(&data, &mut 0).len(), 1);
     }
 
     #[test]
@@ -250,5 +264,19 @@ mod tests {
             cancelled.note(&data);
         }
         assert!(cancelled.waiting.len() <= LIMIT);
+    }
+
+    #[test]
+    fn arrivals_that_take_out_the_middle_of_what_had_no_room_stay_bounded() {
+        let mut cancelled = Cancelled::default();
+        let mut evictions = 0;
+        let time = 20 * MILLISECOND;
+        cancelled.note(&fragments(1, 60_000, time, 0));
+        for fragment in 1..20_000 {
+            cancelled.delivered(&fragments(3 * fragment, 1, time, 0), &mut evictions);
+        }
+        let [waiting] = cancelled.sizes();
+        assert_eq!(waiting.entries, waiting.cap);
+        assert_eq!(evictions, 20_000 - LIMIT as u64);
     }
 }

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use ros2probe_wire::discovery::Role;
 
+use super::size::Size;
 use super::snapshot::ChurnCount;
 
 /// Who.
@@ -78,19 +79,13 @@ pub struct Churn {
 }
 
 impl Churn {
-    /// Counters at most: of every domain that UDP has ports for, each entity and event.
-    pub const CAP: usize = 233 * 4 * 5;
-
-    /// Counters.
+    /// Entries and cap: of every domain that UDP has ports for, each entity and event.
     #[must_use]
-    pub fn len(&self) -> usize {
-        self.counts.len()
-    }
-
-    /// Whether nothing was counted.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.counts.is_empty()
+    pub fn sizes(&self) -> [Size; 1] {
+        // A new table does not compile before it has a place here.
+        let Self { counts } = self;
+        let cap = 233 * 4 * 5;
+        [Size::new("discovery.churn", counts.len(), cap)]
     }
 
     /// Counts one.

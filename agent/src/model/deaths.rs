@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use ros2probe_wire::Timestamp;
 
 use super::cause::LossCause;
+use super::size::Size;
 
 /// Samples remembered of one receiver: a few seconds of a busy topic's losses.
 const SAMPLES: usize = 8192;
@@ -41,6 +42,17 @@ struct Run {
 }
 
 impl Deaths {
+    /// Entries and cap of both lists.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 2] {
+        // A new list does not compile before it has a place here.
+        let Self { known, pending } = self;
+        [
+            Size::new("deaths.known", known.len(), SAMPLES),
+            Size::new("deaths.pending", pending.len(), RUNS),
+        ]
+    }
+
     /// Some or all of this sample died; whether an older one had to be forgotten for it.
     pub fn note(&mut self, number: u64, cause: LossCause, at: Timestamp) -> bool {
         let death = self.known.entry(number).or_insert(Death { cause, at });
@@ -113,13 +125,15 @@ impl Deaths {
             .map(|(first, run)| (first, run.last))
     }
 
-    /// Whether this one was pending; it is no more.
+    /// Whether this one was pending; it is no more. One in the middle of a run stays where that would
+    /// make a run too many: its cause is decided with the others'.
     pub fn resolve(&mut self, number: u64) -> bool {
         let Some((first, run)) = self.pending.range(..=number).next_back() else {
             return false;
         };
         let (first, run) = (*first, *run);
-        if number > run.last {
+        let splits = first < number && number < run.last;
+        if number > run.last || splits && self.pending.len() >= RUNS {
             return false;
         }
         self.pending.remove(&first);
@@ -204,5 +218,20 @@ mod tests {
         assert_eq!(forgotten.count(), 10_000 - SAMPLES);
         let told = (0..2000).filter_map(|number| deaths.wait(2 * number, 2 * number, at(1)));
         assert_eq!(told.count(), 2000 - RUNS);
+    }
+
+    #[test]
+    fn resolving_every_other_sample_of_a_long_run_makes_no_more_runs_than_there_may_be() {
+        let mut deaths = Deaths::default();
+        deaths.wait(1, 100_000, at(1));
+        let resolved = (1..50_000).filter(|number| deaths.resolve(2 * number));
+        assert_eq!(resolved.count(), RUNS - 1);
+        let [_, pending] = deaths.sizes();
+        assert_eq!(pending.entries, pending.cap);
+        // At the ends of a run there is no split, and a hole makes room for none.
+        assert!(deaths.resolve(1));
+        let left = deaths.due(at(1)).into_iter();
+        let left: u64 = left.map(|(first, last)| last - first + 1).sum();
+        assert_eq!(left, 100_000 - RUNS as u64);
     }
 }

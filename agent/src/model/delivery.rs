@@ -21,6 +21,7 @@ use super::deaths::{Deaths, REASSEMBLY};
 use super::journal::Journal;
 use super::reception::{Outcome, Reception, Whole};
 use super::samples::Budget;
+use super::size::Size;
 use super::snapshot::{Delivered, Direction};
 use super::way::Way;
 use super::writer::settle_window;
@@ -111,6 +112,28 @@ impl Delivery {
             best_effort: false,
             proven: false,
         }
+    }
+
+    /// Entries, or bytes, and cap of every list.
+    pub fn sizes(&self) -> impl Iterator<Item = Size> {
+        // A new list does not compile before it has a place here.
+        let Self {
+            receiver: _,
+            main: _,
+            reception,
+            tally: _,
+            cancelled,
+            deaths,
+            first_seen: _,
+            last_seen: _,
+            opened: _,
+            waiting: _,
+            told: _,
+            best_effort: _,
+            proven: _,
+        } = self;
+        let sizes = reception.sizes().chain(cancelled.sizes());
+        sizes.chain(deaths.sizes())
     }
 
     /// Samples in fragments that begin before this may lack some that nobody lost.
@@ -219,7 +242,10 @@ impl Delivery {
             return self.take(record, scene);
         }
         let (mut again, mut whole) = (false, None);
-        for part in self.cancelled.delivered(record) {
+        let parts = self
+            .cancelled
+            .delivered(record, &mut scene.budget.evictions);
+        for part in parts {
             let (came_again, completed) = self.take(&part, scene);
             again |= came_again;
             whole = completed.or(whole);

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 
 use ros2probe_wire::Timestamp;
 
+use super::size::Size;
 use super::way::Place;
 
 /// Departures remembered: a sample is under way for a moment, to a few destinations.
@@ -26,6 +27,14 @@ struct Departure {
 }
 
 impl Departures {
+    /// Entries and cap of the list.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 1] {
+        // A new list does not compile before it has a place here.
+        let Self { latest, newest: _ } = self;
+        [Size::new("departures.latest", latest.len(), LIMIT)]
+    }
+
     /// Whether nothing of the sample of this source time has left before: for this destination or
     /// another, or as a retransmission.
     pub fn is_first(&mut self, source: Timestamp) -> bool {

@@ -200,8 +200,8 @@ impl Discovery {
             pending_endpoints,
             pending_nodes,
             graveyard,
-            node_count,
-            named,
+            node_count: _,
+            named: _,
             changes,
             churn,
             evictions: _,
@@ -210,22 +210,24 @@ impl Discovery {
             node_victims,
             revision: _,
         } = self;
-        let waiting = self.pending_node_bytes();
-        let most = |count: fn(&Participant) -> usize| {
-            let each = participants.values();
-            each.map(|participant| count(participant))
-                .max()
-                .unwrap_or(0)
+        let held = |pending: &PendingNodes| {
+            let PendingNodes {
+                at: _,
+                writer: _,
+                sequence_number: _,
+                nodes,
+                bytes: _,
+                worth: _,
+            } = pending;
+            nodes.iter().map(Node::bytes).sum::<usize>()
         };
-        let of_one = most(|participant| participant.endpoints.len());
-        let addresses = most(|participant| {
-            let Addresses {
-                metatraffic,
-                default,
-            } = &participant.addresses;
-            metatraffic.len().max(default.len())
-        });
-        vec![
+        let waiting = pending_nodes.values().map(held).sum();
+        let each = || participants.values().map(|each| each.lists());
+        let nodes = each().map(|lists| lists.nodes).sum();
+        let named = each().map(|lists| lists.named).sum();
+        let of_one = each().map(|lists| lists.endpoints).max().unwrap_or(0);
+        let addresses = each().map(|lists| lists.addresses).max().unwrap_or(0);
+        let mut sizes = vec![
             Size::new(
                 "discovery.participants",
                 participants.len(),
@@ -267,13 +269,14 @@ impl Discovery {
                 PENDING_NODES,
             ),
             Size::new("discovery.pending_nodes.bytes", waiting, PENDING_NODE_BYTES),
-            Size::new("discovery.graveyard", graveyard.len(), Graveyard::CAP),
-            Size::new("discovery.nodes", *node_count, caps.nodes),
-            Size::new("discovery.nodes.named", *named, caps.endpoints),
+            Size::new("discovery.nodes", nodes, caps.nodes),
+            Size::new("discovery.nodes.named", named, caps.endpoints),
             // Taken after each datagram.
             Size::new("discovery.changes", changes.len(), caps.endpoints),
-            Size::new("discovery.churn", churn.len(), Churn::CAP),
-        ]
+        ];
+        sizes.extend(graveyard.sizes());
+        sizes.extend(churn.sizes());
+        sizes
     }
 
     /// Whether this endpoint was disposed of a moment ago: what it sent may still be on its way.

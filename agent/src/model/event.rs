@@ -187,6 +187,18 @@ struct Burst {
     told: LossBurst,
 }
 
+impl Class {
+    /// All of them.
+    pub const ALL: [Self; 6] = [
+        Self::Participant,
+        Self::Endpoint,
+        Self::Node,
+        Self::Loss,
+        Self::Expectation,
+        Self::Diagnosis,
+    ];
+}
+
 impl EventKind {
     /// Its class.
     #[must_use]
@@ -232,6 +244,7 @@ impl Events {
         let room = MANY + classes.len() * usize::from(MOST);
         vec![
             Size::new("events.waiting", waiting.len(), room),
+            Size::new("events.classes", classes.len(), Class::ALL.len()),
             Size::new("events.bursts", bursts.len(), BURSTS),
         ]
     }

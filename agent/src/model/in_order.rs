@@ -12,7 +12,8 @@ use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
 
-use super::payloads::{Given, Sample};
+use super::payloads::{EARLIER, Given, Sample};
+use super::size::Size;
 
 const SECOND: u64 = 1_000_000_000;
 /// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three seconds
@@ -22,6 +23,8 @@ const PATIENCE: u64 = 4 * SECOND;
 const WAITING: usize = 4096;
 /// Samples from before the announcement come again within this time, or not at all.
 const AGAIN: u64 = 10 * SECOND;
+/// What keeping a sample costs besides its payload.
+const OVERHEAD: usize = size_of::<Due>() + 64;
 /// How long the first ACKNACK may take after the announcement.
 const MATCHING: u64 = SECOND;
 
@@ -71,16 +74,40 @@ impl Due {
     pub fn bytes(&self) -> usize {
         self.sample.payload.as_ref().map_or(0, bytes::Bytes::len)
     }
+
+    /// Bytes that it takes while it waits.
+    pub fn cost(&self) -> usize {
+        OVERHEAD + self.bytes()
+    }
 }
 
 impl InOrder {
+    /// Entries and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 2] {
+        // A new table does not compile before it has a place here.
+        let Self {
+            waiting,
+            bytes: _,
+            incarnation: _,
+            hole: _,
+            last: _,
+            earlier,
+            announced: _,
+        } = self;
+        [
+            Size::new("in_order.waiting", waiting.len(), WAITING),
+            Size::new("in_order.earlier", earlier.len(), EARLIER),
+        ]
+    }
+
     /// Whether anything waits, or may come again.
     #[must_use]
     pub fn is_idle(&self) -> bool {
         self.waiting.is_empty() && self.earlier.is_empty()
     }
 
-    /// Bytes of payloads that wait.
+    /// Bytes that wait.
     #[must_use]
     pub const fn bytes(&self) -> usize {
         self.bytes
@@ -115,9 +142,9 @@ impl InOrder {
     pub fn put(&mut self, due: Due) {
         let number = due.sample.sequence_number;
         self.earlier.remove(&number);
-        self.bytes += due.bytes();
+        self.bytes += due.cost();
         if let Some(before) = self.waiting.insert(number, due) {
-            self.bytes -= before.bytes();
+            self.bytes -= before.cost();
         }
     }
 
@@ -179,7 +206,7 @@ impl InOrder {
     }
 
     fn give(&mut self, due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
-        self.bytes -= due.bytes();
+        self.bytes -= due.cost();
         let came = due.sample.time;
         // Its reader may have the lower one that was not seen in shared memory: then it did not wait.
         let now = if due.sample.sampled { came } else { now };

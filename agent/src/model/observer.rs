@@ -264,7 +264,7 @@ impl Observer {
         // A new component does not compile before it has a place here.
         let Self {
             settings,
-            watchlist: _,
+            watchlist,
             discovery,
             topics,
             unasked,
@@ -272,11 +272,11 @@ impl Observer {
             profiler,
             pieces,
             payloads,
-            wishes: _,
+            wishes,
             receivers,
             tracer,
             examiner,
-            decode_errors: _,
+            decode_errors,
             datagrams: _,
             records: _,
             journal,
@@ -284,20 +284,27 @@ impl Observer {
             calendar: _,
         } = self;
         let mut sizes = discovery.sizes();
-        sizes.extend(topics.sizes(settings.endpoints, settings.topics));
         sizes.push(Size::new(
             "observer.unasked",
             unasked.len(),
             settings.endpoints,
         ));
+        sizes.extend(topics.sizes(
+            settings.endpoints,
+            settings.topics,
+            watchlist.watches().len(),
+        ));
         sizes.extend(interest.sizes());
         sizes.extend(profiler.sizes(settings.endpoints));
         sizes.extend(pieces.sizes());
-        sizes.extend(payloads.sizes(settings.endpoints, settings.unknown_writers));
+        sizes.extend(payloads.sizes(settings.endpoints, settings.unknown_writers, wishes.len()));
         sizes.extend(receivers.sizes());
         sizes.extend(tracer.sizes());
         sizes.extend(examiner.sizes(settings.endpoints));
         sizes.extend(journal.sizes());
+        // Of each stage every reason.
+        let reasons = Size::new("observer.decode_errors", decode_errors.len(), 64);
+        sizes.push(reasons);
         sizes
     }
 

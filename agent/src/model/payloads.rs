@@ -16,14 +16,14 @@ use ros2probe_wire::{Guid, Record, Timestamp};
 use super::assembly::Assembly;
 use super::in_order::{Due, InOrder, Progress};
 use super::journal::Missing;
-use super::size::Size;
+use super::size::{Size, largest};
 use super::topic::Wished;
 use super::writer::Counted;
 
 /// Entries that wait to be taken: a round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
 /// Numbers of one unannounced writer that are remembered.
-const EARLIER: usize = 1024;
+pub(super) const EARLIER: usize = 1024;
 /// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
 /// not told of.
 pub const TELLING: u64 = 400_000_000;
@@ -213,9 +213,9 @@ impl Payloads {
     }
 
     /// Entries, or bytes, and cap of every table: so many writers may be wished for, so many be
-    /// strangers.
+    /// strangers, and there are so many wishes.
     #[must_use]
-    pub fn sizes(&self, endpoints: usize, strangers: usize) -> Vec<Size> {
+    pub fn sizes(&self, endpoints: usize, strangers: usize, wishes: usize) -> Vec<Size> {
         // A new table does not compile before it has a place here.
         let Self {
             writers,
@@ -229,18 +229,41 @@ impl Payloads {
             refused: _,
         } = self;
         let (bytes, limit, _) = assembly.size();
-        let earlier = known.values().map(|earlier| earlier.numbers.len());
-        vec![
+        let interested = |interested: &Interested| {
+            let Interested {
+                topic: _,
+                to: _,
+                payloads: _,
+                arrivals: _,
+                begins,
+                since: _,
+                first_whole: _,
+                order,
+            } = interested;
+            let begins = Size::new("payloads.writers.begins", begins.len(), wishes);
+            order.sizes().into_iter().chain([begins])
+        };
+        let earlier = |earlier: &Earlier| {
+            let Earlier {
+                numbers,
+                begins,
+                before: _,
+            } = earlier;
+            [
+                Size::new("payloads.strangers.numbers", numbers.len(), EARLIER),
+                Size::new("payloads.strangers.begins", begins.len(), wishes),
+            ]
+        };
+        let mut sizes = largest(writers.values().flat_map(interested));
+        sizes.extend(largest(known.values().flat_map(earlier)));
+        sizes.extend(assembly.sizes());
+        sizes.extend([
             Size::new("payloads.writers", writers.len(), endpoints),
             Size::new("payloads.strangers", known.len(), strangers),
-            Size::new(
-                "payloads.strangers.numbers",
-                earlier.max().unwrap_or(0),
-                EARLIER,
-            ),
-            Size::new("payloads.given", given.len(), WAITING),
+            Size::new("payloads.given", given.len(), 2 * WAITING),
             Size::new("payloads.bytes", bytes + given_bytes + waiting_bytes, limit),
-        ]
+        ]);
+        sizes
     }
 
     /// Bytes held, their cap, and what found no room.
@@ -377,7 +400,7 @@ impl Payloads {
         order.begin(progress.incarnation, counted.at, &mut |due| {
             before.push(due);
         });
-        self.waiting_bytes += due.bytes();
+        self.waiting_bytes += due.cost();
         if order.is_idle() && counted.number < progress.complete {
             let due = order.pass(due, counted.at);
             before.push(due);
@@ -419,7 +442,9 @@ impl Payloads {
         wishes: impl Iterator<Item = u64>,
     ) {
         let earlier = self.strangers.entry(writer).or_default();
-        for id in wishes {
+        let ids: Vec<_> = wishes.collect();
+        earlier.begins.retain(|(known, _)| ids.contains(known));
+        for id in ids {
             if !earlier.begins.iter().any(|(known, _)| *known == id) {
                 earlier.begins.push((id, number));
             }
@@ -566,7 +591,7 @@ impl Payloads {
 
     fn give_due(&mut self, due: Due) {
         let bytes = due.bytes();
-        self.waiting_bytes -= bytes;
+        self.waiting_bytes -= due.cost();
         if !due.to.is_empty() {
             let sample = Given {
                 to: due.to,

@@ -11,18 +11,16 @@ use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, Timestamp};
 
-use super::acknowledgement::Acknowledgements;
 use super::calendar::Calendar;
 use super::delivery::Totals;
 use super::in_order::Progress;
 use super::journal::Journal;
 use super::receivers::Around;
 use super::samples::Budget;
-use super::size::Size;
+use super::size::{Size, largest};
 use super::snapshot::Measurement;
 use super::subscribers::{Room, Sight, Stage, Subscribers};
 use super::topic::TopicId;
-use super::ways::Ways;
 use super::writer::{Counted, Scene, Traits, Writer};
 
 const SECOND: u64 = 1_000_000_000;
@@ -127,6 +125,26 @@ pub struct Strangers {
     pub forgotten: Vec<Guid>,
 }
 
+impl Measured {
+    fn sizes(&self) -> impl Iterator<Item = Size> {
+        // A new list does not compile before it has a place here.
+        let Self {
+            writer,
+            subscribers,
+            topic: _,
+            first_seen: _,
+            last_seen: _,
+            metered: _,
+            sent_from: _,
+            opened: _,
+            unacknowledged: _,
+            sure_from: _,
+        } = self;
+        let subscribers = subscribers.iter().flat_map(|each| each.sizes());
+        writer.sizes().chain(subscribers)
+    }
+}
+
 impl Profiler {
     /// Nobody measured.
     #[must_use]
@@ -186,18 +204,7 @@ impl Profiler {
             ),
             Size::new("profiler.deliveries", room.used, room.limit),
         ];
-        let all = writers
-            .values()
-            .filter_map(|each| each.subscribers.as_ref());
-        let [mut ways, mut readers] = [0, 0];
-        for subscribers in all {
-            let (own_ways, own_readers) = subscribers.sizes();
-            ways = ways.max(own_ways);
-            readers = readers.max(own_readers);
-        }
-        sizes.push(Size::new("subscribers.ways", ways, Ways::CAP));
-        let cap = Acknowledgements::CAP;
-        sizes.push(Size::new("subscribers.acknowledgements", readers, cap));
+        sizes.extend(largest(writers.values().flat_map(Measured::sizes)));
         sizes
     }
 

@@ -19,6 +19,8 @@ use ros2probe_wire::{Cursor, Endianness, Timestamp};
 
 use flow::{Flow, Placed};
 
+use super::size::Size;
+
 const UDP_HEADER: u32 = 8;
 
 /// How much may be kept, and for how long.
@@ -90,6 +92,23 @@ pub struct Reassembled {
 }
 
 impl Reassembled {
+    /// Bytes held.
+    #[must_use]
+    pub fn held(&self) -> usize {
+        // A new list does not compile before it has a place here.
+        let Self {
+            transport,
+            handover: _,
+            start: _,
+            length: _,
+            first_seen: _,
+            last_seen: _,
+            source_port: _,
+            destination_port: _,
+        } = self;
+        transport.capacity()
+    }
+
     /// The payload up to the first byte that the capture did not keep.
     #[must_use]
     pub fn payload(&self) -> &[u8] {
@@ -184,6 +203,35 @@ impl Reassembly {
             finished_order: VecDeque::new(),
             counters: Counters::default(),
         }
+    }
+
+    /// Entries, or bytes, and cap of every table.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 5] {
+        // A new table does not compile before it has a place here.
+        let Self {
+            limits,
+            flows,
+            order,
+            opened: _,
+            bytes: _,
+            finished,
+            finished_order,
+            counters: _,
+        } = self;
+        let bytes = flows.values().map(Flow::held).sum();
+        let remembered = limits.remembered;
+        [
+            Size::new("reassembly.flows", flows.len(), limits.flows),
+            Size::new("reassembly.order", order.len(), limits.flows),
+            Size::new("reassembly.bytes", bytes, limits.bytes),
+            Size::new("reassembly.finished", finished.len(), remembered),
+            Size::new(
+                "reassembly.finished_order",
+                finished_order.len(),
+                remembered,
+            ),
+        ]
     }
 
     /// Takes a fragment; gives the datagram it completes.

@@ -269,17 +269,27 @@ impl Receivers {
             limit,
             generation: _,
         } = self;
-        let (known, known_limit, _) = sockets.size();
-        let (addresses, addresses_limit, _) = places.size();
-        vec![
-            Size::new("receivers.sockets", known, known_limit),
+        let owners = |Owners(owners): &Owners| owners.len();
+        let learned_owners = learned.values().map(|learned| {
+            let Learned {
+                senders,
+                addressed,
+                is_crowded: _,
+            } = learned;
+            owners(senders).max(owners(addressed))
+        });
+        let of_one = learned_owners.chain(processes.values().map(owners)).max();
+        let mut sizes = Vec::from(sockets.sizes());
+        sizes.extend(places.sizes());
+        sizes.extend([
             Size::new("receivers.learned", learned.len(), *limit),
             Size::new("receivers.processes", processes.len(), *limit),
             Size::new("receivers.local", local.len(), *limit * OWNERS),
-            Size::new("receivers.places", addresses, addresses_limit),
+            Size::new("receivers.owners", of_one.unwrap_or(0), OWNERS),
             Size::new("receivers.closed", closed.len(), CLOSED),
             Size::new("receivers.closings", closings.len(), CLOSED),
-        ]
+        ]);
+        sizes
     }
 
     /// Forgets what participants said that are no more and do not wait for room.

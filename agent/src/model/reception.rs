@@ -9,6 +9,7 @@ use ros2probe_wire::{Record, RtpsTime, Timestamp};
 
 use super::samples::{Budget, Progress, Samples};
 use super::sequence::{Arrival, Manner, Sequence, Settled};
+use super::size::Size;
 
 /// A fragment that completes its sample this late after the sample's last one was retransmitted.
 const REPAIR: i64 = 5_000_000;
@@ -75,6 +76,13 @@ pub enum Decision {
 }
 
 impl Reception {
+    /// Entries, or bytes, and cap of every list.
+    pub fn sizes(&self) -> impl Iterator<Item = Size> {
+        // A new list does not compile before it has a place here.
+        let Self { sequence, samples } = self;
+        sequence.sizes().into_iter().chain(samples.sizes())
+    }
+
     /// The numbers.
     #[must_use]
     pub const fn sequence(&self) -> &Sequence {

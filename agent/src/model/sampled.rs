@@ -9,6 +9,7 @@
 use ros2probe_wire::Timestamp;
 
 use super::sequence::{MAX_WINDOW, Sequence};
+use super::size::Size;
 use super::snapshot::SampledFacts;
 
 /// A writer that was not seen in shared memory for so long is not sampled any more.
@@ -96,6 +97,29 @@ impl Sampled {
             arrived: None,
             head: None,
         }
+    }
+
+    /// Entries and cap; it is taken after each record.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 1] {
+        // A new list does not compile before it has a place here.
+        let Self {
+            last: _,
+            left: _,
+            span: _,
+            seen: _,
+            uncertain: _,
+            unmeasured: _,
+            sighted: _,
+            finished: _,
+            next: _,
+            settled: _,
+            looked: _,
+            unseen,
+            arrived: _,
+            head: _,
+        } = self;
+        [Size::new("sampled.unseen", unseen.len(), 0)]
     }
 
     /// A record came from shared memory.

@@ -7,6 +7,8 @@
 
 use ros2probe_wire::{Record, RtpsTime, Timestamp};
 
+use super::size::Size;
+
 /// Most fragments of one sample: 88 MB of Cyclone DDS fragments, 4 GB of Fast DDS ones.
 pub const MAX_FRAGMENTS: u32 = 65_536;
 /// Samples of one writer under way at once.
@@ -96,6 +98,39 @@ pub enum Progress {
 }
 
 impl Samples {
+    /// Entries and cap; bytes of the largest bitmap. All of them together are in the [`Budget`].
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 2] {
+        // A new list does not compile before it has a place here.
+        let Self {
+            partial,
+            sure_from: _,
+            last_doubtful: _,
+        } = self;
+        let bitmap = |partial: &Partial| {
+            let Partial {
+                number: _,
+                size: _,
+                fragment_size: _,
+                seen: _,
+                bitmap,
+                tail: _,
+                latest: _,
+                facts: _,
+            } = partial;
+            bitmap.len() * 8
+        };
+        let largest = partial.iter().map(bitmap).max().unwrap_or(0);
+        [
+            Size::new("samples.partial", partial.len(), MAX_PER_WRITER),
+            Size::new(
+                "samples.partial.bitmap",
+                largest,
+                MAX_FRAGMENTS as usize / 8,
+            ),
+        ]
+    }
+
     /// Takes in one DATA_FRAG.
     pub fn fragment(&mut self, record: &Record, now: Timestamp, budget: &mut Budget) -> Progress {
         let (start, count) = (record.fragment_start, record.fragments_in_submessage());

@@ -10,6 +10,8 @@ use std::collections::VecDeque;
 
 use ros2probe_wire::Timestamp;
 
+use super::size::Size;
+
 /// Undecided and recently decided sequence numbers remembered at the start.
 const MIN_WINDOW: u64 = 512;
 /// And at most: 8 KiB of bitmaps; about 3000 messages a second over the reliable settle window.
@@ -30,6 +32,10 @@ const INCARNATION: u64 = 100_000_000;
 const STALE: u32 = 1024;
 /// Settling advances in this many steps per window.
 const STEPS: u64 = 16;
+/// So many checkpoints at most: two windows of different lengths, and one that is held.
+const CHECKPOINTS: usize = 3 * STEPS as usize;
+/// Words of a bitmap.
+const WORDS: usize = MAX_WINDOW as usize / 64;
 
 /// State of one writer's sequence numbers.
 #[derive(Debug, Default)]
@@ -107,6 +113,36 @@ pub enum Settled {
 }
 
 impl Sequence {
+    /// Entries, or bytes, and cap of every list.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 4] {
+        // A new list does not compile before it has a place here.
+        let Self {
+            first: _,
+            settled: _,
+            next: _,
+            available: _,
+            withdrawn: _,
+            acknowledged: _,
+            complete: _,
+            incarnation: _,
+            received,
+            excused,
+            checkpoints,
+            gaps,
+            newest_source: _,
+            stale: _,
+            last_advance: _,
+        } = self;
+        let length = |Bitmap { words }: &Bitmap| words.len();
+        [
+            Size::new("sequence.received", length(received), WORDS),
+            Size::new("sequence.excused", length(excused), WORDS),
+            Size::new("sequence.checkpoints", checkpoints.len(), CHECKPOINTS),
+            Size::new("sequence.gaps", gaps.len(), GAPS),
+        ]
+    }
+
     /// Whether any sample was seen.
     #[must_use]
     pub const fn started(&self) -> bool {
@@ -380,7 +416,9 @@ impl Sequence {
             && at.0.saturating_add(window) <= now.0
         {
             limit = limit.max(Some(next));
-            if hold.is_some_and(|hold| hold < next) {
+            let later = self.checkpoints.get(1);
+            let is_last = later.is_none_or(|(at, _)| at.0.saturating_add(window) > now.0);
+            if is_last && hold.is_some_and(|hold| hold < next) {
                 break;
             }
             self.checkpoints.pop_front();

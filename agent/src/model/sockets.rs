@@ -6,6 +6,7 @@
 
 use std::collections::BTreeMap;
 
+use super::size::Size;
 use super::snapshot::SocketFacts;
 
 /// All known sockets.
@@ -25,6 +26,18 @@ impl Sockets {
             limit,
             evictions: 0,
         }
+    }
+
+    /// Entries and cap.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 1] {
+        // A new table does not compile before it has a place here.
+        let Self {
+            sockets,
+            limit,
+            evictions: _,
+        } = self;
+        [Size::new("receivers.sockets", sockets.len(), *limit)]
     }
 
     /// Takes in what is known of one; whether that is new.

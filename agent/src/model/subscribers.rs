@@ -25,6 +25,7 @@ use super::journal::Journal;
 use super::receivers::{Around, Matched};
 use super::reception::Whole;
 use super::samples::Budget;
+use super::size::Size;
 use super::snapshot::{AcknowledgementFacts, Breakdown, Direction};
 use super::topic::{Topic, TopicId};
 use super::way::Way;
@@ -105,23 +106,25 @@ pub struct Stage<'a> {
 }
 
 impl Subscribers {
-    /// Ways, and readers that acknowledge. Its deliveries are in [`Room`].
-    #[must_use]
-    pub fn sizes(&self) -> (usize, usize) {
-        // A new list does not compile before it has a place here or in what is bounded by itself.
+    /// Entries, or bytes, and cap of every list; of what deliveries have each, one after the other.
+    /// How many deliveries there may be is in [`Room`].
+    pub fn sizes(&self) -> impl Iterator<Item = Size> {
+        // A new list does not compile before it has a place here.
         let Self {
             ways,
-            deliveries: _,
+            deliveries,
             open: _,
             totals: _,
-            departures: _,
+            departures,
             acknowledgements,
             reassembled: _,
             at_socket: _,
             generation: _,
             sure_from: _,
         } = self;
-        (ways.iter().count(), acknowledgements.len())
+        let own = ways.sizes().into_iter().chain(departures.sizes());
+        let own = own.chain(acknowledgements.sizes());
+        own.chain(deliveries.iter().flat_map(Delivery::sizes))
     }
 
     /// None yet, of a writer that the kernel meters from `sure_from` on.

@@ -268,7 +268,7 @@ impl Topics {
 
     /// Entries and cap of every table; there may be as many topics as endpoints.
     #[must_use]
-    pub fn sizes(&self, endpoints: usize, measured: usize) -> Vec<Size> {
+    pub fn sizes(&self, endpoints: usize, measured: usize, watches: usize) -> Vec<Size> {
         // A new table does not compile before it has a place here.
         let Self {
             topics,
@@ -281,7 +281,32 @@ impl Topics {
             rejected: _,
             evictions: _,
         } = self;
+        let lists = |topic: &Topic| {
+            let Topic {
+                domain_id: _,
+                naming: _,
+                writers,
+                readers,
+                beside,
+                last_type: _,
+                watched: _,
+                judgements,
+                wished: _,
+                retired: _,
+                retired_totals: _,
+                reader_appeared: _,
+                published: _,
+                vanished: _,
+            } = topic;
+            let members = writers.len() + readers.len() + beside.len();
+            (members, judgements.len())
+        };
+        let each = || topics.values().map(|topic| lists(topic));
+        let members = each().map(|(members, _)| members).max().unwrap_or(0);
+        let judgements = each().map(|(_, judgements)| judgements).max().unwrap_or(0);
         vec![
+            Size::new("topic.members", members, endpoints),
+            Size::new("topic.judgements", judgements, watches),
             Size::new("topics.topics", topics.len(), endpoints),
             Size::new("topics.index", index.len(), endpoints),
             Size::new("topics.vanished", vanished.len(), endpoints),

@@ -14,7 +14,7 @@ use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::identity::Identity;
 use super::samples::{Budget, Progress, Samples};
-use super::size::Size;
+use super::size::{Size, largest};
 use super::way::Place;
 
 /// Writers whose messages may be sampled.
@@ -257,12 +257,15 @@ impl Tracer {
             evictions: _,
             finished,
         } = ledger;
-        vec![
+        let Spans { spans, lost: _ } = finished;
+        let mut sizes = largest(writers.values().flatten().flat_map(|each| each.sizes()));
+        sizes.extend([
             Size::new("trace.writers", writers.len(), MAX_WRITERS),
             Size::new("trace.bytes", budget.bytes, budget.limit),
             Size::new("trace.open", *open, MAX_OPEN),
-            Size::new("trace.finished", finished.spans.len(), MAX_FINISHED),
-        ]
+            Size::new("trace.finished", spans.len(), MAX_FINISHED),
+        ]);
+        sizes
     }
 
     /// Messages under way or waiting, their cap, and those given up for it.
@@ -292,6 +295,41 @@ fn numbered(mut identity: Identity, sequence_number: u64) -> u128 {
 }
 
 impl Traced {
+    fn sizes(&self) -> impl Iterator<Item = Size> {
+        // A new list does not compile before it has a place here.
+        let Self {
+            subject: _,
+            identity: _,
+            threshold: _,
+            samples,
+            is_local: _,
+            under_way,
+            arrived,
+            waiting,
+            done,
+        } = self;
+        let readers = |each: &Waiting| {
+            let Waiting {
+                message: _,
+                at: _,
+                readers,
+            } = each;
+            readers.len()
+        };
+        let of_one = waiting.iter().map(readers).max().unwrap_or(0);
+        let own = [
+            Size::new("trace.writer.under_way", under_way.len(), MAX_UNDER_WAY),
+            Size::new(
+                "trace.writer.open",
+                arrived.len() + waiting.len(),
+                MAX_OPEN_OF_WRITER,
+            ),
+            Size::new("trace.writer.done", done.len(), REMEMBERED),
+            Size::new("trace.message.readers", of_one, MAX_READERS),
+        ];
+        own.into_iter().chain(samples.sizes())
+    }
+
     /// `None`: nothing of it is wanted.
     fn new(writer: Guid, subject: Subject, ratio: f64) -> Option<Self> {
         if ratio.is_nan() || ratio <= 0.0 {

@@ -8,6 +8,7 @@ use std::collections::VecDeque;
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
 use super::receivers::{Around, Matched};
+use super::size::Size;
 use super::snapshot::Direction;
 use super::topic::Topic;
 use super::way::{Place, Way};
@@ -54,8 +55,36 @@ pub struct Known {
 }
 
 impl Ways {
-    /// Ways at most.
-    pub const CAP: usize = LIMIT;
+    /// Entries and cap of every list.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 2] {
+        // A new list does not compile before it has a place here.
+        let Self {
+            ways,
+            last: _,
+            evictions: _,
+        } = self;
+        let left = |known: &Known| {
+            let Known {
+                way: _,
+                owner: _,
+                told: _,
+                matched: _,
+                delivery: _,
+                last_seen: _,
+                brought: _,
+                at_socket: _,
+                has_data: _,
+                left,
+            } = known;
+            left.len()
+        };
+        let left = ways.iter().map(left).max().unwrap_or(0);
+        [
+            Size::new("ways.ways", ways.len(), LIMIT),
+            Size::new("ways.left", left, MOMENTS),
+        ]
+    }
 
     /// All of them.
     pub fn iter(&self) -> impl Iterator<Item = &Known> {

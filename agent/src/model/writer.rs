@@ -17,6 +17,7 @@ use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception, is_message};
 use super::sampled::{News, Sampled, Seen};
 use super::samples::Budget;
+use super::size::Size;
 use super::snapshot::Measurement;
 
 /// How long a gap of a best-effort writer may fill by reordering.
@@ -121,6 +122,26 @@ impl Writer {
             sampled: None,
             exact: None,
         }
+    }
+
+    /// Entries, or bytes, and cap of every list.
+    pub fn sizes(&self) -> impl Iterator<Item = Size> {
+        // A new list does not compile before it has a place here.
+        let Self {
+            guid: _,
+            traits: _,
+            reception,
+            tally: _,
+            interarrival: _,
+            source_latency: _,
+            header_latency: _,
+            last_message: _,
+            negative_latency: _,
+            sampled,
+            exact: _,
+        } = self;
+        let sampled = sampled.iter().flat_map(|sampled| sampled.sizes());
+        reception.sizes().chain(sampled)
     }
 
     /// Discovery says more.

@@ -225,8 +225,56 @@ impl Node {
 
 /// Writers and readers that these nodes name.
 pub(super) fn named(nodes: &[Node]) -> usize {
-    let named = |node: &Node| node.writers.len() + node.readers.len();
+    let named = |node: &Node| {
+        let Node {
+            name: _,
+            writers,
+            readers,
+        } = node;
+        writers.len() + readers.len()
+    };
     nodes.iter().map(named).sum()
+}
+
+/// Lengths of a participant's lists.
+pub(super) struct Lists {
+    pub(super) endpoints: usize,
+    pub(super) nodes: usize,
+    pub(super) named: usize,
+    /// Of the longer list.
+    pub(super) addresses: usize,
+}
+
+impl Participant {
+    pub(super) fn lists(&self) -> Lists {
+        // A new list does not compile before it has a place here.
+        let Self {
+            portrait: _,
+            addresses,
+            restored: _,
+            domain_id: _,
+            first_seen: _,
+            last_seen: _,
+            endpoints,
+            nodes,
+            readers_told: _,
+            domain_source: _,
+            nodes_from: _,
+            watched: _,
+            local: _,
+            sends: _,
+        } = self;
+        let Addresses {
+            metatraffic,
+            default,
+        } = addresses;
+        Lists {
+            endpoints: endpoints.len(),
+            nodes: nodes.len(),
+            named: named(nodes),
+            addresses: metatraffic.len().max(default.len()),
+        }
+    }
 }
 
 /// The participant's domain: as announced, else by the port its announcement went to (RTPS 2.5,

@@ -6,6 +6,7 @@ use std::collections::VecDeque;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::facts::Origin;
+use crate::model::size::Size;
 
 /// Announcements older than a disposal are stale, for this long after it.
 const BURIED: u64 = 500_000_000;
@@ -21,12 +22,11 @@ pub(super) struct Graveyard {
 }
 
 impl Graveyard {
-    /// Graves at most.
-    pub(super) const CAP: usize = BURIALS;
-
-    /// Graves.
-    pub(super) fn len(&self) -> usize {
-        self.graves.len()
+    /// Entries and cap.
+    pub(super) fn sizes(&self) -> [Size; 1] {
+        // A new table does not compile before it has a place here.
+        let Self { graves } = self;
+        [Size::new("discovery.graveyard", graves.len(), BURIALS)]
     }
 
     pub(super) fn bury(&mut self, guid: Guid, origin: &Origin) {

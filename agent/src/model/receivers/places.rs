@@ -7,6 +7,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use ros2probe_wire::GuidPrefix;
 
+use crate::model::size::Size;
 use crate::model::way::Place;
 
 /// All addresses.
@@ -97,6 +98,29 @@ impl Places {
     pub(super) fn owner(&self, place: &Place) -> Option<GuidPrefix> {
         let holder = self.holders.get(place)?;
         (!holder.contested).then_some(holder.prefix)
+    }
+
+    /// Entries and cap of every table.
+    pub(super) fn sizes(&self) -> [Size; 4] {
+        // A new table does not compile before it has a place here.
+        let Self {
+            holders,
+            ages,
+            own,
+            age: _,
+            limit,
+            each,
+            evictions: _,
+        } = self;
+        let chunks: Vec<_> = own.iter().map(|(prefix, _)| prefix).collect();
+        let of_one = chunks.chunk_by(|before, after| before == after);
+        let of_one = of_one.map(<[_]>::len).max().unwrap_or(0);
+        [
+            Size::new("receivers.places", holders.len(), *limit),
+            Size::new("receivers.places.ages", ages.len(), *limit),
+            Size::new("receivers.places.own", own.len(), *limit),
+            Size::new("receivers.places.participant", of_one, *each),
+        ]
     }
 
     /// Entries, cap, and addresses given up because of a cap.

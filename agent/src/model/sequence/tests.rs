@@ -330,3 +330,21 @@ fn ranges_of_a_bitmap_are_set_and_cleared_to_the_bit_also_around_its_end() {
         }
     }
 }
+
+#[test]
+fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
+    const SECOND: u64 = 1_000_000_000;
+    let mut sequence = Sequence::default();
+    let mut lost = 0;
+    let mut count = |settled| lost += u64::from(matches!(settled, Settled::Lost(_)));
+    for step in 1..10_000_u64 {
+        let now = Timestamp(step * SECOND / 10);
+        sequence.receive(2 * step, Manner::BestEffort, now, &mut count);
+        sequence.advance(now, (SECOND, SECOND), Some(100), &mut count);
+        let [.., checkpoints, _] = sequence.sizes();
+        assert!(checkpoints.entries <= checkpoints.cap, "{checkpoints:?}");
+    }
+    let end = Timestamp(2000 * SECOND);
+    sequence.advance(end, (SECOND, SECOND), None, &mut count);
+    assert_eq!(lost, 9_998);
+}
