@@ -398,6 +398,51 @@ fn one_writer(observer: &mut Observer, dice: &mut Dice, now: u64) {
     }
 }
 
+/// Crowds of forty participants that fill the tables of endpoints and nodes, newcomers of a topic that
+/// is watched by its exact name, and a watchlist that changes.
+fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
+    let step = (now - START) / 1_000_000;
+    if step % 4_000 == 1 {
+        // So many that not all topics are matched at once.
+        let globs = (0..20).map(|number| format!("/g{number}/**"));
+        let names = globs.chain(["/exact".to_owned()]);
+        let watches = names.map(|name| Watch::named(&name).unwrap()).collect();
+        observer.set_watchlist(Watchlist::new(watches).unwrap());
+    }
+    let is_newcomer = dice.pick(20) == 0;
+    let mut prefix = [if is_newcomer { 8 } else { 9 }; 12];
+    prefix[11] = dice.pick(40) as u8;
+    let prefix = GuidPrefix(prefix);
+    let [_, a, b, c, ..] = dice.roll().to_ne_bytes();
+    let guid = Guid::new(prefix, EntityId([a, b, c, 3]));
+    let (number, message) = (1 + step, Message::from(prefix));
+    let message = match (dice.pick(12), is_newcomer) {
+        (0, _) => message.data(
+            SPDP,
+            number,
+            &forge::participant(prefix, 1_000_000, Some(0)),
+        ),
+        (1, _) => {
+            let names: Vec<_> = (0..60).map(|each| format!("n{step}_{each}")).collect();
+            let nodes: Vec<_> = names
+                .iter()
+                .map(|name| ("/", name.as_str(), guid))
+                .collect();
+            let payload = forge::entities(prefix, 24, &nodes);
+            message.data(DISCOVERY_INFO, number, &payload)
+        }
+        (_, true) => {
+            let payload = forge::endpoint(guid, "rt/exact", "a::msg::dds_::B_", true);
+            message.data(SEDP_WRITERS, number, &payload)
+        }
+        (_, false) => {
+            let payload = forge::endpoint(guid, &dice.name(), "a::msg::dds_::B_", true);
+            message.data(SEDP_WRITERS, number, &payload)
+        }
+    };
+    observer.datagram(&forge::multicast(now, 0), &message.bytes(), None);
+}
+
 /// The names of all tables in these sources.
 fn tables(directory: &Path, into: &mut BTreeSet<String>) {
     for entry in fs::read_dir(directory).unwrap() {
@@ -442,7 +487,12 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
     );
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    for (table, (entries, cap)) in of_one {
+    let (crowded, half, whole) = drive(MESSAGES * 2 / 5, 1_000_000, &mut newcomers_in_a_crowd);
+    println!("{half} bytes after half of it, {whole} at the end\n{crowded:#?}");
+    assert_filled(&crowded, &["discovery.endpoints", "discovery.nodes"]);
+    assert!(whole < 96 << 20, "{whole} bytes");
+
+    for (table, (entries, cap)) in of_one.into_iter().chain(crowded) {
         let seen = largest.entry(table).or_insert((0, cap));
         seen.0 = seen.0.max(entries);
     }
