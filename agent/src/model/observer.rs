@@ -201,8 +201,9 @@ impl Observer {
         }
     }
 
-    /// Watches these from now on, once [`Self::ask_more`] has come to all topics. What was counted of a topic that is no more watched stays, and so
-    /// does how a topic stands with an entry that is in the new list as it was.
+    /// Watches these from now on, once [`Self::ask_more`] has come to all topics. What was counted of
+    /// a topic that is no more watched stays, and so does how a topic stands with an entry that is in
+    /// the new list as it was.
     pub fn set_watchlist(&mut self, watchlist: impl Into<Arc<Watchlist>>) {
         let before = std::mem::replace(&mut self.watchlist, watchlist.into());
         let moved = |watch: &Arc<Watch>| {
