@@ -13,10 +13,14 @@
 mod forged;
 mod harness;
 
+#[path = "faults/clients.rs"]
+mod clients;
 #[path = "faults/descriptors.rs"]
 mod descriptors;
 #[path = "faults/disk.rs"]
 mod disk;
+#[path = "faults/everything.rs"]
+mod everything;
 #[path = "faults/killed.rs"]
 mod killed;
 #[path = "faults/log.rs"]
@@ -25,8 +29,10 @@ mod log;
 mod memory;
 #[path = "faults/receivers.rs"]
 mod receivers;
+#[path = "faults/unit.rs"]
+mod unit;
 
-use std::io::{Read as _, Write as _};
+use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
@@ -209,13 +215,23 @@ impl Counted {
 }
 
 /// One request on a connection that stays open.
-fn ask(stream: &mut TcpStream, method: &str, path: &str, body: &str) -> Result<(u16, Value)> {
+fn ask(
+    stream: &mut (impl Read + Write),
+    method: &str,
+    path: &str,
+    body: &str,
+) -> Result<(u16, Value)> {
     let (status, body) = request(stream, method, path, body)?;
     let value = serde_json::from_str(&body).unwrap_or(Value::String(body));
     Ok((status, value))
 }
 
-fn request(stream: &mut TcpStream, method: &str, path: &str, body: &str) -> Result<(u16, String)> {
+fn request(
+    stream: &mut (impl Read + Write),
+    method: &str,
+    path: &str,
+    body: &str,
+) -> Result<(u16, String)> {
     let length = body.len();
     write!(
         stream,
@@ -242,7 +258,7 @@ fn request(stream: &mut TcpStream, method: &str, path: &str, body: &str) -> Resu
     Ok((status, String::from_utf8_lossy(&bytes[head..]).into_owned()))
 }
 
-fn read_more(stream: &mut TcpStream, bytes: &mut Vec<u8>) -> Result<()> {
+fn read_more(stream: &mut impl Read, bytes: &mut Vec<u8>) -> Result<()> {
     let mut piece = [0; 16 << 10];
     let count = stream.read(&mut piece)?;
     ensure!(count > 0, "closed: {}", String::from_utf8_lossy(bytes));

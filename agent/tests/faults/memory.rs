@@ -2,11 +2,11 @@
 
 use std::fs;
 use std::io::Write as _;
-use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result, bail, ensure};
+use anyhow::{Result, ensure};
 
+use super::unit::{Allowance, Confined, mebibytes};
 use super::{API_PORT, Counted, PATIENCE, Scene};
 use crate::forged::storm::{Storm, forgery};
 use crate::forged::{Carrier, Sender};
@@ -15,136 +15,32 @@ use crate::harness::network::Link;
 use crate::harness::soak::{long, outcome};
 
 /// What nobody on the robot listens to.
-const NOBODY: u16 = 7399;
-
-/// A control group that holds memory to a limit, of whichever version is there.
-struct Bounded {
-    path: PathBuf,
-    is_second: bool,
-}
-
-impl Bounded {
-    fn create(limit: u64) -> Result<Bounded> {
-        let name = format!("r2p-{}-memory", std::process::id());
-        let mounts = fs::read_to_string("/proc/self/mounts")?;
-        let mount = |kind: &str, option: &str| {
-            mounts.lines().find_map(|line| {
-                let words: Vec<_> = line.split(' ').collect();
-                let fits = words.get(2) == Some(&kind)
-                    && words
-                        .get(3)?
-                        .split(',')
-                        .any(|it| option.is_empty() || it == option);
-                fits.then(|| PathBuf::from(words[1]))
-            })
-        };
-        if let Some(first) = mount("cgroup", "memory") {
-            let path = first.join(name);
-            fs::create_dir(&path).with_context(|| format!("cannot create {}", path.display()))?;
-            let group = Bounded {
-                path,
-                is_second: false,
-            };
-            group.set("memory.limit_in_bytes", limit)?;
-            // Nothing of sockets is counted where no limit is set.
-            group.set("memory.kmem.tcp.limit_in_bytes", limit)?;
-            return Ok(group);
-        }
-        let second = mount("cgroup2", "").context("no control groups are mounted")?;
-        let controllers = fs::read_to_string(second.join("cgroup.controllers"))?;
-        if !controllers.split_whitespace().any(|it| it == "memory") {
-            bail!(
-                "no memory controller in {}: boot with `cgroup_enable=memory`, or mount it with `mount -t cgroup \
-                 -o memory none /sys/fs/cgroup/memory`",
-                second.display()
-            );
-        }
-        fs::write(second.join("cgroup.subtree_control"), "+memory")
-            .context("the memory controller cannot be handed down: run as root on the host")?;
-        let path = second.join(name);
-        fs::create_dir(&path)?;
-        let group = Bounded {
-            path,
-            is_second: true,
-        };
-        group.set("memory.max", limit)?;
-        // Absent where the kernel has no swap.
-        let _ = group.set("memory.swap.max", 0);
-        Ok(group)
-    }
-
-    fn set(&self, file: &str, value: u64) -> Result<()> {
-        let path = self.path.join(file);
-        fs::write(&path, value.to_string())
-            .with_context(|| format!("cannot write {}", path.display()))
-    }
-
-    fn read(&self, file: &str) -> Result<String> {
-        let path = self.path.join(file);
-        fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))
-    }
-
-    /// A value of a file with a name and a number in each line.
-    fn value(&self, file: &str, name: &str) -> Result<u64> {
-        let text = self.read(file)?;
-        let value = text.lines().find_map(|line| {
-            let (key, value) = line.split_once(' ')?;
-            (key == name).then(|| value.trim().parse().ok())?
-        });
-        value.with_context(|| format!("no {name} in {file}"))
-    }
-
-    /// What cannot be taken back: neither the page cache nor what is mapped from files.
-    fn needed(&self) -> Result<u64> {
-        if self.is_second {
-            let used: u64 = self.read("memory.current")?.trim().parse()?;
-            return Ok(used.saturating_sub(self.value("memory.stat", "file")?));
-        }
-        let used: u64 = self.read("memory.usage_in_bytes")?.trim().parse()?;
-        // Counted apart there, and with the rest in the second version.
-        let sockets: u64 = self
-            .read("memory.kmem.tcp.usage_in_bytes")?
-            .trim()
-            .parse()?;
-        Ok((used + sockets).saturating_sub(self.value("memory.stat", "cache")?))
-    }
-
-    fn kills(&self) -> Result<u64> {
-        match self.is_second {
-            true => self.value("memory.events", "oom_kill"),
-            false => self.value("memory.oom_control", "oom_kill"),
-        }
-    }
-}
-
-impl Drop for Bounded {
-    fn drop(&mut self) {
-        let deadline = Instant::now() + Duration::from_secs(5);
-        while let Err(error) = fs::remove_dir(&self.path) {
-            if Instant::now() > deadline {
-                return eprintln!("cannot remove {}: {error}", self.path.display());
-            }
-            std::thread::sleep(Duration::from_millis(10));
-        }
-    }
-}
+pub(super) const NOBODY: u16 = 7399;
 
 /// Leaves other tests some of the machine.
-struct Breathing {
+pub(super) struct Breathing {
     sender: Sender,
     carried: u32,
-    /// How many a millisecond.
+    /// How many between two rests.
     pace: u32,
+    rest: Duration,
 }
 
 impl Breathing {
-    fn start(link: &Link, pace: u32) -> Result<Breathing> {
+    /// So many a millisecond.
+    pub(super) fn start(link: &Link, pace: u32) -> Result<Breathing> {
+        Breathing::resting(link, pace, Duration::from_millis(1))
+    }
+
+    /// So many between two rests.
+    pub(super) fn resting(link: &Link, pace: u32, rest: Duration) -> Result<Breathing> {
         let source = format!("{}:0", link.monitor.address());
         let target = format!("{}:{NOBODY}", link.robot.address());
         Ok(Breathing {
             sender: Sender::new(&link.monitor, &source, &target)?,
             carried: 0,
             pace,
+            rest,
         })
     }
 }
@@ -153,7 +49,7 @@ impl Carrier for Breathing {
     fn carry(&mut self, payload: &[u8]) -> Result<()> {
         self.carried += 1;
         if self.carried.is_multiple_of(self.pace) {
-            std::thread::sleep(Duration::from_millis(1));
+            std::thread::sleep(self.rest);
         }
         self.sender.carry(payload)
     }
@@ -161,8 +57,8 @@ impl Carrier for Breathing {
 
 #[test]
 fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
-    let limit = unit_limit()?;
-    let group = Bounded::create(limit)?;
+    let limit = Allowance::of_the_unit()?.memory;
+    let group = Confined::to_memory(limit)?;
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let place = directory.path().display();
@@ -171,10 +67,7 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
         "watch: [{{topic: /**, per_subscriber: true}}]\nlog: warn\nstate_directory: {place}/state\n\
          recordings: {{directory: {place}/bags}}\n{ON_THE_WIRE}"
     );
-    let enter = format!(
-        "echo 0 >{}/cgroup.procs && exec \"$0\" \"$@\"",
-        group.path.display()
-    );
+    let enter = group.enter();
     let words = ["sh", "-c", &enter];
     let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
     let idle = group.needed()?;
@@ -192,22 +85,21 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
     let (more, again) = storm(&scene, &group, &link, span / 2, 0.0)?;
     ensure!(again < limit, "{again} bytes with what sockets take");
     scene.end()?;
-    let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     outcome(
         &format!(
             "every cap at once in {} MiB (MemoryMax, no swap)",
-            mib(limit)
+            mebibytes(limit)
         ),
         &format!(
             "{} hostile datagrams, 12 readers that do not read, 4 recordings: {:.1} MiB at most ({:.1} MiB \
              before), not killed; ended in {took:?}; started again with a state of {:.1} MiB: {:.1} MiB, {:.1} MiB \
              at most",
             sent + more,
-            mib(peak),
-            mib(idle),
-            mib(state),
-            mib(restarted),
-            mib(again)
+            mebibytes(peak),
+            mebibytes(idle),
+            mebibytes(state),
+            mebibytes(restarted),
+            mebibytes(again)
         ),
     )
 }
@@ -216,7 +108,7 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
 /// the most memory needed.
 fn storm(
     scene: &Scene<'_>,
-    group: &Bounded,
+    group: &Confined,
     link: &Link,
     span: Duration,
     filled: f64,
@@ -264,15 +156,4 @@ fn storm(
     }
     ensure!(group.kills()? == 0, "killed at the end");
     Ok((sent, peak))
-}
-
-/// `MemoryMax` of the unit.
-fn unit_limit() -> Result<u64> {
-    let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join("../systemd/ros2probe.service");
-    let text = fs::read_to_string(unit)?;
-    let limit = text.lines().find_map(|line| {
-        let value = line.strip_prefix("MemoryMax=")?.strip_suffix('M')?;
-        value.parse::<u64>().ok()
-    });
-    Ok(limit.context("no MemoryMax in the unit")? << 20)
 }

@@ -61,12 +61,21 @@ impl Talker {
 
     /// SPDP.
     pub(crate) fn participant(&self) -> Vec<u8> {
+        self.participant_at(&[])
+    }
+
+    /// SPDP with locators (RTPS 2.5, 9.4.2.10).
+    pub(crate) fn participant_at(&self, locators: &[[u8; 24]]) -> Vec<u8> {
         let mut list = Parameters::new();
         list.add(0x15, &[2, 3, 0, 0]);
         list.add(0x16, &[1, 0x0f, 0, 0]);
         list.add(0x50, &[&self.prefix[..], &PARTICIPANT].concat());
         list.add(0x02, &[FINITE_LEASE_SECONDS.to_le_bytes(), [0; 4]].concat());
         list.add(0x0f, &[0; 4]);
+        for locator in locators {
+            list.add(0x31, locator);
+            list.add(0x32, locator);
+        }
         self.message(SPDP_WRITER, 1, &list.finish())
     }
 

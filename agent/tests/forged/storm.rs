@@ -81,6 +81,25 @@ impl Storm {
         })
     }
 
+    /// Announces the same participants again and again, each time at other addresses.
+    pub(crate) fn of_addresses(carrier: impl Carrier + Send + 'static) -> Storm {
+        const UDP_V4: u8 = 1;
+        let mut dice = Dice::new(7);
+        let talkers: Vec<_> = (0..64)
+            .map(|number| Talker::new(2_000_000 + number, "/moving"))
+            .collect();
+        let mut next = (0..talkers.len()).cycle();
+        Storm::run(carrier, move |bytes| {
+            let mut locators = [[0; 24]; 4];
+            for locator in &mut locators {
+                locator[0] = UDP_V4;
+                locator[4..8].copy_from_slice(&(dice.pick(1 << 16) as u32).to_le_bytes());
+                locator[20..].copy_from_slice(&dice.bytes(4));
+            }
+            *bytes = talkers[next.next().unwrap_or(0)].participant_at(&locators);
+        })
+    }
+
     /// Announces writers of messages with much in them: half of them whole, of 50 kB, the others of
     /// 4 MB, of which one part in a hundred comes.
     pub(crate) fn of_large_samples(mut carrier: impl Carrier + Send + 'static) -> Result<Storm> {
