@@ -9,14 +9,17 @@
 
 mod local_agent;
 
+use std::collections::BTreeMap;
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::os::unix::net::UnixStream;
+use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use local_agent::{Answer, LocalAgent, PATIENCE, ask, exchange, promtool, request, rp};
+use seccompiler::{BpfProgram, SeccompAction, SeccompFilter};
 use serde_json::Value;
 
 /// KiB of a line of `/proc/PID/status`.
@@ -167,6 +170,36 @@ fn a_flood_without_the_token_takes_no_answer_from_the_client_with_it() {
     eprintln!("{answered} of 370 beside {flooded} without the token");
     assert_eq!(answered, 370);
     assert!(flooded >= 2_000, "{flooded}");
+}
+
+#[test]
+fn an_agent_without_filters_of_system_calls_says_so_everywhere() {
+    // A kernel without them.
+    let refused = BTreeMap::from([(libc::SYS_seccomp, Vec::new())]);
+    let filter = SeccompFilter::new(
+        refused,
+        SeccompAction::Allow,
+        SeccompAction::Errno(libc::ENOSYS.cast_unsigned()),
+        std::env::consts::ARCH.try_into().unwrap(),
+    );
+    let filter = BpfProgram::try_from(filter.unwrap()).unwrap();
+    let mut command = rp();
+    // SAFETY: what is done between fork and exec is two system calls on memory that was there before.
+    unsafe {
+        command.pre_exec(move || seccompiler::apply_filter(&filter).map_err(std::io::Error::other));
+    }
+    let mut agent = LocalAgent::start_as(&mut command, &["--speed", "max"]);
+    agent.wait_for_log("ready");
+    let log = agent.log();
+    assert!(log.contains("system calls are not filtered"), "{log}");
+    let page = agent.get("/metrics").body;
+    let shown = page
+        .lines()
+        .find(|line| line.starts_with("ros2probe_sandbox_info{"));
+    let shown = shown.unwrap_or_default();
+    assert!(shown.contains("system_calls=\"all\""), "{shown}");
+    let health = ask(agent.api, "GET", "/health", "").1;
+    assert!(health["unfiltered_reason"].is_string(), "{health}");
 }
 
 #[test]

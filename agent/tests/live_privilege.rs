@@ -168,8 +168,10 @@ fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> 
     for name in ["state", "run"] {
         for entry in std::fs::read_dir(file(name))? {
             let entry = entry?;
-            let owner = entry.metadata()?.uid();
+            let about = entry.metadata()?;
+            let (owner, mode) = (about.uid(), about.mode() & 0o777);
             ensure!(owner == USER, "{:?} is {owner}'s", entry.path());
+            ensure!(mode == 0o600, "{:?} is {mode:o}", entry.path());
             files.push(entry.file_name());
         }
     }

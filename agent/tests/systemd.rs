@@ -59,48 +59,51 @@ fn systemd_understands_every_line() {
 }
 
 #[test]
-fn every_test_that_the_threat_model_names_is_there() {
+fn each_claim_of_the_threat_model_names_tests_that_exist() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let mut sources = String::new();
-    for directory in ["agent/src", "agent/tests", "wire/src", "wire/tests"] {
-        read_sources(&root.join(directory), &mut sources).unwrap();
-    }
-    let model = std::fs::read_to_string(root.join("SECURITY.md")).unwrap();
-    let quoted = model.split('`').skip(1).step_by(2);
-    let is_test = |name: &&str| {
-        let letters = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
-        name.matches('_').count() >= 2 && name.chars().all(letters)
+    let places = ["agent/tests", "agent/src", "wire/src", "wire/tests"];
+    let source = |file: &str| {
+        let mut paths = places
+            .iter()
+            .map(|place| root.join(place).join(format!("{file}.rs")));
+        paths.find_map(|path| std::fs::read_to_string(path).ok())
     };
-    let not_tests = ["no_new_privs", "ros2probe_sandbox_info"];
-    let named: Vec<&str> = quoted
-        .filter(is_test)
-        .filter(|name| !not_tests.contains(name))
-        .chain(["captures_survive"])
-        .collect();
-    assert!(named.len() > 40, "{named:?}");
-    for name in named {
-        let function = sources.find(&format!("fn {name}("));
-        let before = function.map(|at| sources.get(..at).unwrap_or_default());
-        let attribute = before.is_some_and(|before| {
-            let lines = before.lines().rev().take(4);
-            lines
-                .map(str::trim)
-                .any(|line| line.starts_with("#[test]") || line.starts_with("#[tokio::test"))
-        });
-        assert!(attribute, "SECURITY.md names {name}, which is no test");
-    }
-}
-
-fn read_sources(directory: &Path, into: &mut String) -> std::io::Result<()> {
-    for entry in std::fs::read_dir(directory)? {
-        let path = entry?.path();
-        if path.is_dir() {
-            read_sources(&path, into)?;
-        } else if path.extension().is_some_and(|extension| extension == "rs") {
-            into.push_str(&std::fs::read_to_string(path)?);
+    let is_test = |source: &str, function: &str| {
+        let at = source.find(&format!("fn {function}("));
+        let before = at.and_then(|at| source.get(..at)).unwrap_or_default();
+        // Attributes stand between the last item and the function.
+        let lines = before.lines().rev().take(4).map(str::trim);
+        let mut attributes = lines.take_while(|line| !line.starts_with('}'));
+        attributes.any(|line| line.starts_with("#[test]") || line.starts_with("#[tokio::test"))
+    };
+    let model = std::fs::read_to_string(root.join("SECURITY.md")).unwrap();
+    let (mut claims, mut named, mut is_claim) = (0, 0, false);
+    for line in model.lines() {
+        is_claim = line == "| claim | shown by |" || is_claim && line.starts_with('|');
+        let row = line
+            .strip_prefix("| ")
+            .and_then(|row| row.strip_suffix(" |"));
+        let Some((claim, tests)) = row.and_then(|row| row.rsplit_once(" | ")) else {
+            continue;
+        };
+        if !is_claim || tests == "shown by" || claim.starts_with("---") {
+            continue;
+        }
+        claims += 1;
+        let tests: Vec<_> = tests.split('`').skip(1).step_by(2).collect();
+        assert!(!tests.is_empty(), "no test shows: {claim}");
+        for test in tests {
+            let (file, function) = test.split_once("::").unwrap_or_default();
+            let source = source(file);
+            let exists = source.is_some_and(|source| is_test(&source, function));
+            assert!(exists, "SECURITY.md names {test}, which is no test");
+            named += 1;
         }
     }
-    Ok(())
+    assert!(
+        claims > 40 && named > 60,
+        "{named} tests of {claims} claims"
+    );
 }
 
 #[test]
@@ -119,6 +122,11 @@ fn the_agent_may_do_what_it_needs_and_nothing_else() {
         "User=ros2probe",
         "Group=ros2probe",
         "LimitRTPRIO=1",
+        "UMask=0077",
+        "StateDirectoryMode=0750",
+        "NoNewPrivileges=yes",
+        "IPAddressDeny=any",
+        "IPAddressAllow=localhost link-local 10.0.0.0/8 172.16.0.0/12 192.168.0.0/16 100.64.0.0/10 fc00::/7",
     ] {
         assert!(text.lines().any(|other| other == line), "{line}");
     }

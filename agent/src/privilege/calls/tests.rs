@@ -249,6 +249,33 @@ fn who_looks_at_others_opens_nothing_for_writing() {
     }
 }
 
+/// What single threads may beyond the others: links, news of directories, their own scheduling.
+#[test]
+fn links_news_of_files_and_scheduling_are_of_the_threads_that_need_them() {
+    // A link to no program, and no parameters to take.
+    let link = [command::LINK_CREATE.into(), 0, 0, 0, 0, 0];
+    let running_first = [0, libc::SCHED_FIFO.into(), 0, 0, 0, 0];
+    let when_idle = [0, libc::SCHED_IDLE.into(), 0, 0, 0, 0];
+    let refused = Some(libc::EPERM);
+    for role in ROLES {
+        let role = match role {
+            Role::Reattach { .. } => Role::reattach(),
+            other => other,
+        };
+        confined(role, move || {
+            let attaches = matches!(role, Role::Reattach { .. } | Role::Exact);
+            let schedules = matches!(role, Role::SharedMemory { .. });
+            assert_eq!(call(libc::SYS_bpf, link) != refused, attaches, "{role:?}");
+            let notices = call(libc::SYS_inotify_init1, [0; 6]) != refused;
+            assert_eq!(notices, attaches || schedules, "{role:?}");
+            let scheduled = call(libc::SYS_sched_setscheduler, running_first) != refused;
+            assert_eq!(scheduled, schedules, "{role:?}");
+            let idle = call(libc::SYS_sched_setscheduler, when_idle);
+            assert_eq!(idle, refused, "{role:?}");
+        });
+    }
+}
+
 #[test]
 fn threads_begin_names_are_resolved_and_memory_grows_as_before() {
     confined(Role::Export, || {
