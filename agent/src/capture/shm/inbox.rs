@@ -238,4 +238,18 @@ mod tests {
         inbox.put(&mut flood);
         assert_eq!((inbox.take().len(), inbox.refused()), (MAX_RECORDS, 4));
     }
+
+    #[test]
+    fn messages_beyond_the_bytes_that_may_wait_are_refused_and_counted() {
+        let inbox = Inbox::default();
+        let message = || Item::Message {
+            time: 1,
+            port: 7400,
+            bytes: vec![0; 1 << 20],
+        };
+        inbox.put(&mut (0..20).map(|_| message()).collect());
+        assert_eq!((inbox.take().len(), inbox.refused()), (16, 4));
+        inbox.put(&mut vec![message()]);
+        assert_eq!((inbox.take().len(), inbox.refused()), (1, 4));
+    }
 }

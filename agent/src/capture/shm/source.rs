@@ -51,6 +51,7 @@ impl Source for [u8] {
 pub struct SharedFile {
     file: File,
     inode: u64,
+    user: u32,
 }
 
 impl SharedFile {
@@ -60,14 +61,24 @@ impl SharedFile {
     /// It is not there, is no regular file, or is not for us to read.
     pub fn open(path: &Path) -> io::Result<Self> {
         let file = crate::file::open_no_link(path)?;
-        let inode = file.metadata()?.ino();
-        Ok(Self { file, inode })
+        let metadata = file.metadata()?;
+        Ok(Self {
+            file,
+            inode: metadata.ino(),
+            user: metadata.uid(),
+        })
     }
 
     /// Which file it is, whatever its name means by now.
     #[must_use]
     pub const fn inode(&self) -> u64 {
         self.inode
+    }
+
+    /// The user whose file it is.
+    #[must_use]
+    pub const fn user(&self) -> u32 {
+        self.user
     }
 
     /// Whether no name leads to it any more: whoever keeps it open keeps its memory.

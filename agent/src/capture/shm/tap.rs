@@ -493,13 +493,13 @@ impl Tap {
         self.tried = now;
         let mut attached = Vec::new();
         for (key, path) in std::mem::take(&mut self.unborn) {
-            if self.ports.len() >= MAX_PORTS {
-                self.counters.left_out += 1;
-                break;
-            }
             let Ok(file) = SharedFile::open(&path) else {
                 continue;
             };
+            if self.ports.len() + attached.len() >= MAX_PORTS && !self.make_room(file.user()) {
+                self.counters.left_out += 1;
+                continue;
+            }
             let (_, _, number) = key;
             let Some((port, backlog)) = Port::attach(&file, number, now) else {
                 // Not laid out yet, or not as known.
@@ -548,6 +548,29 @@ impl Tap {
             self.ports.insert(at, open);
             self.met = true;
         }
+    }
+
+    /// Closes a port for one of this user, if another user has more than this one would have: of
+    /// that user's the one that has been idle longest. So nobody's ports keep out another's.
+    fn make_room(&mut self, user: u32) -> bool {
+        let mut open: HashMap<u32, usize> = HashMap::new();
+        for port in &self.ports {
+            *open.entry(port.file.user()).or_default() += 1;
+        }
+        let own = open.get(&user).copied().unwrap_or(0);
+        let most = open.into_iter().max_by_key(|(user, count)| (*count, *user));
+        let Some((other, _)) = most.filter(|(_, count)| *count > own + 1) else {
+            return false;
+        };
+        let ports = self.ports.iter().enumerate();
+        let theirs = ports.filter(|(_, port)| port.file.user() == other);
+        let idle = theirs.min_by_key(|(_, port)| port.busy);
+        let Some((index, _)) = idle else {
+            return false;
+        };
+        self.ports.remove(index);
+        self.counters.left_out += 1;
+        true
     }
 
     /// Whether the process that made this segment is dead.

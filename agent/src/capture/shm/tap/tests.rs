@@ -468,3 +468,29 @@ proptest! {
         prop_assert!(host.descriptors() <= 2);
     }
 }
+
+#[test]
+fn ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_other_s() {
+    let mut host = Host::new();
+    let crowd: Vec<_> = (0..600).map(|number| host.port(20_000 + number)).collect();
+    host.look_after(SECOND);
+    assert_eq!(host.tap.ports.len(), MAX_PORTS);
+    assert!(host.tap.counters.left_out >= 600 - MAX_PORTS as u64);
+
+    let real = host.port(7411);
+    for path in [7411].map(|number| host.path().join(format!("fastrtps_port{number}"))) {
+        std::os::unix::fs::chown(path, Some(64_123), None).unwrap();
+    }
+    host.look_after(SECOND);
+    assert_eq!(host.tap.ports.len(), MAX_PORTS);
+    assert!(host.tap.ports.iter().any(|open| open.key.2 == 7411));
+    drop((crowd, real));
+
+    let (place, generation, _) = host.tap.ports[0].key;
+    for number in 0..600_u64 {
+        let id = number.to_be_bytes();
+        host.tap
+            .open_segment((place, generation, SegmentId(id)), host.now);
+    }
+    assert_eq!(host.tap.segments.len(), MAX_SEGMENTS);
+}
