@@ -653,4 +653,12 @@ mod tests {
         let directory = StateDirectory::open(place.path()).unwrap();
         assert_eq!(directory.load(), Loaded::Known(Memory::default()));
     }
+
+    #[test]
+    fn a_file_of_more_bytes_than_are_read_is_kept_aside() {
+        let (place, directory) = directory();
+        let file = File::create(place.path().join(FILE)).unwrap();
+        file.set_len(MAX_BYTES + 1).unwrap();
+        println!("{}", unusable(&directory));
+    }
 }

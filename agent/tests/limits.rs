@@ -15,7 +15,10 @@ mod forge;
 mod host;
 mod local_agent;
 
-use std::collections::BTreeMap;
+#[path = "limits/driven.rs"]
+mod driven;
+
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -588,6 +591,55 @@ fn the_table_of_fixed_caps_says_what_the_sources_say() {
             left.split(' ').next_back() == Some(name) && right.trim_end_matches([';', ',']) == value
         });
         assert!(is_said, "{path}: {name} is not {value}");
+    }
+}
+
+/// Asserts that this file has a test of this name.
+fn assert_test(path: &str, name: &str) {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let source = std::fs::read_to_string(root.join(path)).unwrap();
+    let mut lines = source.lines().map(str::trim);
+    let is_begun = |line: &str| line.contains(&format!("fn {name}("));
+    let mut before = Vec::new();
+    let found = lines.by_ref().find(|line| {
+        before.push(*line);
+        is_begun(line)
+    });
+    assert!(found.is_some(), "{path} has no test {name}");
+    let attributes = before.iter().rev().skip(1).take(3);
+    let mut attributes = attributes.filter(|line| line.starts_with("#["));
+    assert!(
+        attributes.any(|line| line.contains("test")),
+        "{path}: {name} is no test"
+    );
+}
+
+#[test]
+fn every_cap_names_the_test_that_drives_it_over() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let page = std::fs::read_to_string(root.join("docs/limits.md")).unwrap();
+    let rows = page.lines().filter(|line| line.starts_with("| "));
+    let rows = rows.filter_map(|line| {
+        let (name, path) = line.split(" | ").nth(2)?.split_once("` in `")?;
+        Some((name.trim_matches('`'), path.trim_matches('`')))
+    });
+    let rows: BTreeSet<_> = rows.collect();
+    let fixed = driven::FIXED.iter().map(|[name, path, ..]| (*name, *path));
+    let not_driven = driven::NOT_DRIVEN.iter();
+    let not_driven = not_driven.map(|[name, path, _]| (*name, *path));
+    let named: Vec<_> = fixed.chain(not_driven).collect();
+    let once: BTreeSet<_> = named.iter().copied().collect();
+    assert_eq!(named.len(), once.len(), "a cap is named twice");
+    assert_eq!(rows, once);
+    assert!(driven::NOT_DRIVEN.len() <= 4);
+    for [_, _, path, test] in driven::FIXED {
+        assert_test(path, test);
+    }
+    let keys: Vec<_> = driven::KEYS.iter().map(|[key, _]| *key).collect();
+    assert_eq!(keys.len(), Limit::ALL.len());
+    assert!(Limit::ALL.iter().all(|limit| keys.contains(&limit.key())));
+    for [_, test] in driven::KEYS {
+        assert_test("agent/tests/limits.rs", test);
     }
 }
 

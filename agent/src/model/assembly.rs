@@ -435,4 +435,14 @@ mod tests {
         }
         assert_eq!(assembly.take(writer(2), 1), None);
     }
+
+    #[test]
+    fn more_samples_than_may_be_put_together_at_once_push_out_the_oldest() {
+        let mut assembly = Assembly::new(1 << 30);
+        for number in 0..SAMPLES as u64 + 100 {
+            let record = fragment(writer(1), number, 1, 1, 2_000, 1000);
+            assembly.put(&record, &[0; 1000], 0);
+        }
+        assert_eq!((assembly.parts.len(), assembly.evictions), (SAMPLES, 100));
+    }
 }

@@ -183,4 +183,18 @@ mod tests {
         }
         assert!(pieces.bytes <= BUDGET && pieces.evictions > 0);
     }
+
+    #[test]
+    fn large_samples_that_never_end_keep_within_the_bytes() {
+        let mut pieces = Pieces::default();
+        for number in 0..1000 {
+            pieces.put(&fragment(number, 1, 500, 200_000), &[0; 50_000]);
+        }
+        let [_, bytes] = pieces.sizes().try_into().unwrap();
+        assert!(
+            (BUDGET * 8 / 10..=BUDGET).contains(&bytes.entries),
+            "{bytes:?}"
+        );
+        assert!(pieces.evictions > 900);
+    }
 }

@@ -278,4 +278,13 @@ mod tests {
         assert!(Choice::regex("(").is_err());
         assert!(Choice::regex("((a{100}){100}){100}").is_err());
     }
+
+    #[test]
+    fn a_regular_expression_that_takes_too_many_bytes_is_refused() {
+        assert!(expression("/camera_[0-9]{1,8}/.*").is_ok());
+        assert!(matches!(
+            expression("(/[a-z]{1,100}){1,100}"),
+            Err(regex::Error::CompiledTooBig(REGEX_BYTES))
+        ));
+    }
 }

@@ -244,20 +244,16 @@ impl Recordings {
         })?;
         *locked(&recording.thread) = Some(thread);
         list.push(Arc::clone(&recording));
-        let mut surplus = list.iter().filter(|each| each.is_over()).count();
-        surplus = surplus.saturating_sub(ENDED);
-        list.retain(|each| {
-            let goes = surplus > 0 && each.is_over();
-            surplus -= usize::from(goes);
-            !goes
-        });
+        forget_ended(&mut list);
         Ok(recording)
     }
 
     /// All of them, as they began.
     #[must_use]
     pub fn all(&self) -> Vec<Arc<Recording>> {
-        self.list().clone()
+        let mut list = self.list();
+        forget_ended(&mut list);
+        list.clone()
     }
 
     /// The one of this name.
@@ -518,4 +514,15 @@ pub(super) fn causes(error: &bag::Error) -> String {
         cause = next.source();
     }
     text
+}
+
+/// Keeps the latest of those that ended.
+fn forget_ended(list: &mut Vec<Arc<Recording>>) {
+    let mut surplus = list.iter().filter(|each| each.is_over()).count();
+    surplus = surplus.saturating_sub(ENDED);
+    list.retain(|each| {
+        let goes = surplus > 0 && each.is_over();
+        surplus -= usize::from(goes);
+        !goes
+    });
 }
