@@ -21,6 +21,7 @@ use super::deaths::{Deaths, REASSEMBLY};
 use super::journal::Journal;
 use super::reception::{Outcome, Reception, Whole};
 use super::samples::Budget;
+use super::sequence::REACH;
 use super::size::Size;
 use super::snapshot::{Delivered, Direction};
 use super::way::Way;
@@ -38,8 +39,6 @@ const SILENCE: u64 = 18_000_000_000;
 const FIRST_MOMENTS: u64 = 5_000_000_000;
 /// Samples that are lost in one go and wait for their cause when two deliveries become one.
 const LONG_RUN: u64 = 256;
-/// Numbers that may be told to exist beyond the highest one seen.
-const MAX_AHEAD: u64 = 4096;
 
 /// Who gets the samples.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -262,8 +261,16 @@ impl Delivery {
         }
         let number = record.sequence_number;
         let is_tail = record.kind == kind::DATA_FRAG && record.fragment_start != 1 && number > 1;
+        let (reception, budget, mut deciding) = self.split(scene);
+        let is_believed =
+            reception.recognise(record, budget, &mut |decision| deciding.take(decision));
+        if !is_believed {
+            // Its cause, should its number be believed later.
+            let is_full = self.deaths.note(number, LossCause::SocketBuffer, scene.now);
+            scene.budget.evictions += u64::from(is_full);
+            return;
+        }
         let sequence = self.reception.sequence_mut();
-        sequence.recognise(number, record.source_timestamp().timestamp());
         sequence.begin(number.saturating_add(u64::from(is_tail)));
         self.die(number, LossCause::SocketBuffer, scene);
     }
@@ -272,7 +279,7 @@ impl Delivery {
     pub fn not_reassembled(&mut self, number: u64, scene: &mut Scene<'_>) {
         self.proven = true;
         let sequence = self.reception.sequence();
-        if !sequence.started() || number > sequence.next().saturating_add(MAX_AHEAD) {
+        if !sequence.started() || number > sequence.next().saturating_add(REACH) {
             return;
         }
         if self.deaths.resolve(number) {
@@ -429,7 +436,9 @@ impl Delivery {
         self.begin_anew(number, scene);
         let sequence = self.reception.sequence();
         let is_sent = self.direction() == Direction::Sent;
-        if !is_sent && self.misses(number) && number < sequence.settled() {
+        let source = record.source_timestamp().timestamp();
+        let is_late = self.misses(number) && number < sequence.settled();
+        if !is_sent && is_late && !sequence.doubts(number, source, REACH) {
             return self.late(record, scene);
         }
         let before = (sequence.next(), sequence.last_advance());
@@ -465,7 +474,7 @@ impl Delivery {
 
     fn whole(&mut self, whole: &Whole, scene: &mut Scene<'_>) {
         let sequence = self.reception.sequence();
-        let is_history = whole.number < sequence.first();
+        let is_history = whole.number < sequence.first() && !whole.doubted;
         let missed = sequence.missed_since(whole.number);
         let death = self.deaths.forget(whole.number);
         let recovered = (whole.recovered || death.is_some()) && !is_history;

@@ -7,7 +7,7 @@
 use ros2probe_wire::Timestamp;
 
 /// Stamps further than this from the capture time are not the same clock.
-const PLAUSIBLE: u64 = 3_600_000_000_000;
+pub const PLAUSIBLE: u64 = 3_600_000_000_000;
 
 /// Types outside `sensor_msgs` and `geometry_msgs`.
 const OTHERS: [&str; 37] = [

@@ -604,6 +604,7 @@ impl Observer {
             at,
             began: at,
             sampled: false,
+            doubted: false,
         };
         let progress = self.profiler.progress(writer, at, around!(self));
         if let Some(progress) = progress.filter(|_| is_last || self.payloads.wants_bytes(writer)) {

@@ -401,7 +401,7 @@ impl Payloads {
             before.push(due);
         });
         self.waiting_bytes += due.cost();
-        if order.is_idle() && counted.number < progress.complete {
+        if counted.doubted || order.is_idle() && counted.number < progress.complete {
             let due = order.pass(due, counted.at);
             before.push(due);
             before.into_iter().for_each(|due| self.give_due(due));

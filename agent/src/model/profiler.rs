@@ -284,6 +284,9 @@ impl Profiler {
         if measured.topic.is_none() && record.flags & LEFT == LEFT {
             measured.sent_from = record.socket;
         }
+        if record.kind == kind::ACKNACK && measured.writer.refuses(record) {
+            return Sighting::Measured;
+        }
         let subject = measured.subject(guid);
         let mut sight = Sight::New;
         // What is announced in shared memory is read by whom it concerns or not: nobody sees that.

@@ -7,8 +7,8 @@
 use ros2probe_wire::record::kind;
 use ros2probe_wire::{Record, RtpsTime, Timestamp};
 
-use super::samples::{Budget, Progress, Samples};
-use super::sequence::{Arrival, Manner, Sequence, Settled};
+use super::samples::{Budget, Facts, Progress, Samples};
+use super::sequence::{Arrival, Belief, Manner, REACH, Sequence, Settled};
 use super::size::Size;
 
 /// A fragment that completes its sample this late after the sample's last one was retransmitted.
@@ -38,6 +38,8 @@ pub struct Whole {
     pub recovered: bool,
     /// It is the newest so far, so its delay is a delivery delay and not a repetition's.
     pub newest: bool,
+    /// Its number is not believed to be the writer's.
+    pub doubted: bool,
     /// INFO_TS.
     pub source: RtpsTime,
     /// What lies where a header's stamp would.
@@ -101,10 +103,12 @@ impl Reception {
     }
 
     /// Takes in a DATA_FRAG of a view in which samples may be missing: whether it completes its
-    /// sample. Samples far below it are waited for no longer.
-    pub fn assemble(&mut self, record: &Record, budget: &mut Budget) -> bool {
-        let oldest = record.sequence_number.saturating_sub(UNDER_WAY);
-        self.samples.forget_below(oldest, budget);
+    /// sample. Samples far below it are waited for no longer, unless it is `doubted`.
+    pub fn assemble(&mut self, record: &Record, doubted: bool, budget: &mut Budget) -> bool {
+        if !doubted {
+            let oldest = record.sequence_number.saturating_sub(UNDER_WAY);
+            self.samples.forget_below(oldest, budget);
+        }
         let progress = self
             .samples
             .fragment(record, Timestamp(record.time), budget);
@@ -130,12 +134,35 @@ impl Reception {
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        let source = record.source_timestamp().timestamp();
-        self.sequence.recognise(record.sequence_number, source);
+        if !self.recognise(record, budget, decide) {
+            return self.doubted(record, budget);
+        }
         if record.kind == kind::DATA_FRAG {
             self.fragment(record, reliable, budget, decide)
         } else {
             self.data(record, reliable, budget, decide)
+        }
+    }
+
+    /// Whether the number of this DATA or DATA_FRAG is believed to be the writer's.
+    pub fn recognise(
+        &mut self,
+        record: &Record,
+        budget: &mut Budget,
+        decide: &mut impl FnMut(Decision),
+    ) -> bool {
+        let (number, now) = (record.sequence_number, Timestamp(record.time));
+        let source = record.source_timestamp().timestamp();
+        let Self { sequence, samples } = self;
+        match sequence.recognise(number, source, REACH, now) {
+            Belief::Live => true,
+            Belief::Doubted { .. } => false,
+            Belief::Believed(run) => {
+                sequence.accept(&run, now, &mut |settled| {
+                    decide(decision(settled, samples, budget));
+                });
+                true
+            }
         }
     }
 
@@ -226,7 +253,7 @@ impl Reception {
         decide: &mut impl FnMut(Decision),
     ) {
         let Self { sequence, samples } = self;
-        let hold = samples.growing(now, window);
+        let hold = samples.growing(now, window, sequence.settled());
         sequence.advance(now, (window, grace), hold, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
@@ -263,15 +290,31 @@ impl Reception {
             return Outcome::Again;
         };
         Outcome::Whole(Whole {
-            number,
-            bytes: record.payload_len.into(),
-            is_message: is_message(record),
             recovered,
             newest,
-            source: record.source_timestamp(),
-            stamp: record.header_stamp(),
-            began: now,
-            repaired_after: 0,
+            ..whole_data(record)
+        })
+    }
+
+    /// Takes in a DATA or DATA_FRAG whose number is not believed.
+    fn doubted(&mut self, record: &Record, budget: &mut Budget) -> Outcome {
+        let (number, now) = (record.sequence_number, Timestamp(record.time));
+        if self.sequence.has_doubted(number) {
+            return Outcome::Again;
+        }
+        let whole = match record.kind {
+            kind::DATA_FRAG => match self.samples.fragment(record, now, budget) {
+                Progress::Complete(facts) => whole_fragments(record, &facts),
+                Progress::Duplicate => return Outcome::Again,
+                _ => return Outcome::Open,
+            },
+            _ => whole_data(record),
+        };
+        self.sequence.complete_doubted(number);
+        Outcome::Whole(Whole {
+            newest: false,
+            doubted: true,
+            ..whole
         })
     }
 
@@ -320,19 +363,42 @@ impl Reception {
         let Arrival::New { recovered, .. } = arrival else {
             return Outcome::Open;
         };
-        let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
         let repaired = reliable && facts.repaired_after >= REPAIR;
         Outcome::Whole(Whole {
-            number,
-            bytes: facts.size.into(),
-            is_message: !is_key && record.status_info == 0,
             recovered: recovered || repaired,
-            newest: true,
-            source: facts.source,
-            stamp: facts.stamp,
-            began: facts.began,
-            repaired_after: facts.repaired_after,
+            ..whole_fragments(record, &facts)
         })
+    }
+}
+
+const fn whole_data(record: &Record) -> Whole {
+    Whole {
+        number: record.sequence_number,
+        bytes: record.payload_len as u64,
+        is_message: is_message(record),
+        recovered: false,
+        newest: true,
+        doubted: false,
+        source: record.source_timestamp(),
+        stamp: record.header_stamp(),
+        began: Timestamp(record.time),
+        repaired_after: 0,
+    }
+}
+
+const fn whole_fragments(record: &Record, facts: &Facts) -> Whole {
+    let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
+    Whole {
+        number: record.sequence_number,
+        bytes: facts.size as u64,
+        is_message: !is_key && record.status_info == 0,
+        recovered: false,
+        newest: true,
+        doubted: false,
+        source: facts.source,
+        stamp: facts.stamp,
+        began: facts.began,
+        repaired_after: facts.repaired_after,
     }
 }
 

@@ -8,14 +8,12 @@
 
 use ros2probe_wire::Timestamp;
 
-use super::sequence::{MAX_WINDOW, Sequence};
+use super::sequence::{Belief, MAX_WINDOW, Run, Sequence};
 use super::size::Size;
 use super::snapshot::SampledFacts;
 
 /// A writer that was not seen in shared memory for so long is not sampled any more.
 const HOLD: u64 = 10_000_000_000;
-/// HEARTBEAT and GAP may run ahead of what was seen by at most this.
-const MAX_AHEAD: u64 = 4096;
 /// How long a sample that was not seen may still come by another way before it is left out.
 const PATIENCE: u64 = 200_000_000;
 /// Numbers below the next one of which it is known one by one whether they were seen.
@@ -64,6 +62,8 @@ pub struct News {
     pub arrived: bool,
     /// Nothing more of it is waited for, for the first time.
     pub finished: bool,
+    /// Its number is not believed to be the writer's.
+    pub doubted: bool,
 }
 
 /// What was seen of a sample, its latest record included.
@@ -237,12 +237,12 @@ impl Sampled {
                 .is_none_or(|bit| self.finished & bit != 0)
     }
 
-    /// Takes in a sample or a fragment of one.
+    /// Takes in a sample or a fragment of one: its number, how much of it, its source time. Up to
+    /// `reach` numbers before it may have been missed.
     pub fn sample(
         &mut self,
-        number: u64,
-        source: Option<Timestamp>,
-        seen: Seen,
+        (number, seen, source): (u64, Seen, Option<Timestamp>),
+        reach: u64,
         now: Timestamp,
         sequence: &mut Sequence,
     ) -> News {
@@ -254,11 +254,19 @@ impl Sampled {
         let is_told_only = self
             .bit(number, before)
             .is_some_and(|bit| self.sighted & bit == 0);
-        match source {
+        let belief = match source {
             // It is late and not of a writer that begins anew.
-            Some(source) if is_told_only => sequence.sourced(source),
-            source => sequence.recognise(number, source),
-        }
+            Some(source) if is_told_only => {
+                sequence.sourced(number, source);
+                Belief::Live
+            }
+            source => sequence.recognise(number, source, reach, now),
+        };
+        let run = match belief {
+            Belief::Live => Run::default(),
+            Belief::Doubted { new } => return self.doubted((number, seen), new, sequence),
+            Belief::Believed(run) => run,
+        };
         sequence.begin(number);
         if sequence.next() != before {
             // It begins, perhaps anew.
@@ -266,7 +274,10 @@ impl Sampled {
             self.begin(sequence.next(), now);
             self.arrived = None;
         }
-        let samples = self.advance(number.saturating_add(1), true, now, sequence);
+        let end = run.numbers.iter().map(|(number, _)| *number).max();
+        let end = end.unwrap_or(0).max(number).saturating_add(1);
+        let samples = self.advance(end, true, now, sequence);
+        let samples = self.confirm(&run, samples);
         self.span += samples;
         let below = sequence.next().saturating_sub(number).saturating_sub(1);
         let finished = self.sight(number, seen);
@@ -289,13 +300,24 @@ impl Sampled {
     }
 
     /// Samples up to `last` exist, as a HEARTBEAT or an ACKNACK says. How many that was not known of.
-    pub fn exist(&mut self, last: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
+    pub fn exist(&mut self, last: u64, reach: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
         let end = last.saturating_add(1);
-        if !sequence.started() || end.saturating_sub(sequence.next()) > MAX_AHEAD {
+        if !sequence.started() {
             return 0;
         }
+        let (is_believed, run) = sequence.claim(end, reach, now);
         self.follow(sequence.next(), now);
+        if !is_believed {
+            return 0;
+        }
         let samples = self.advance(end, true, now, sequence);
+        let samples = match run {
+            Some(run) => {
+                self.arrived = None;
+                self.confirm(&run, samples)
+            }
+            None => samples,
+        };
         self.span += samples;
         self.unmeasured += samples;
         samples
@@ -303,13 +325,19 @@ impl Sampled {
 
     /// The numbers `start..end` were never sent, as a GAP says. How many before them were that was
     /// not known of.
-    pub fn skip(&mut self, start: u64, end: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
+    pub fn skip(
+        &mut self,
+        (start, end): (u64, u64),
+        reach: u64,
+        now: Timestamp,
+        sequence: &mut Sequence,
+    ) -> u64 {
         if start == 0 {
             return 0;
         }
-        let samples = self.exist(start - 1, now, sequence);
+        let samples = self.exist(start - 1, reach, now, sequence);
         let ahead = end.saturating_sub(sequence.next());
-        if sequence.started() && start <= sequence.next() && ahead <= MAX_AHEAD {
+        if sequence.started() && start <= sequence.next() && ahead <= reach {
             let skipped = self.advance(end, false, now, sequence);
             let bits = u32::try_from(skipped).unwrap_or(u32::MAX);
             let skipped = 1_u128.checked_shl(bits).map_or(u128::MAX, |bit| bit - 1);
@@ -327,6 +355,33 @@ impl Sampled {
         self.head
             .filter(|(head, _)| *head == number)
             .map(|(_, stamp)| stamp)
+    }
+
+    /// Takes in a sample whose number is not believed.
+    fn doubted(&mut self, (number, seen): (u64, Seen), new: bool, sequence: &mut Sequence) -> News {
+        let samples = u64::from(new);
+        self.span += samples;
+        self.seen += samples;
+        News {
+            samples,
+            alike: samples,
+            finished: seen != Seen::Part && sequence.complete_doubted(number),
+            doubted: true,
+            ..News::default()
+        }
+    }
+
+    /// Marks the samples of a run that is believed as seen. Returns how many of `samples` new numbers
+    /// were not counted while it was doubted.
+    fn confirm(&mut self, run: &Run, samples: u64) -> u64 {
+        for &(number, is_whole) in &run.numbers {
+            let bit = self.bit(number, self.next).unwrap_or(0);
+            self.sighted |= bit;
+            if is_whole {
+                self.finished |= bit;
+            }
+        }
+        samples.saturating_sub(run.numbers.len() as u64)
     }
 
     /// Marks a sample as seen: whether nothing more of it is waited for, for the first time.
@@ -412,7 +467,7 @@ impl Sampled {
 
 #[cfg(test)]
 mod tests {
-    use super::super::sequence::Settled;
+    use super::super::sequence::{FAR, REACH, Settled};
     use super::*;
 
     const SECOND: u64 = 1_000_000_000;
@@ -440,7 +495,7 @@ mod tests {
             self.now += SECOND / 100;
             let now = Timestamp(self.now);
             self.sampled
-                .sample(number, Some(now), seen, now, &mut self.sequence)
+                .sample((number, seen, Some(now)), FAR, now, &mut self.sequence)
         }
 
         fn counts(&self) -> (u64, u64) {
@@ -504,7 +559,7 @@ mod tests {
         // Too long ago to be waited for; what a GAP passes over is not waited for either.
         assert!(has(&view, 300) && !has(&view, 499));
         let now = Timestamp(view.now);
-        view.sampled.skip(501, 503, now, &mut view.sequence);
+        view.sampled.skip((501, 503), FAR, now, &mut view.sequence);
         assert!(has(&view, 502) && !has(&view, 499));
     }
 
@@ -521,20 +576,20 @@ mod tests {
     fn a_heartbeat_tells_of_the_last_ones_and_a_gap_of_those_that_never_were() {
         let mut view = View::new();
         let now = Timestamp(view.now);
-        assert_eq!(view.sampled.exist(7, now, &mut view.sequence), 0);
+        assert_eq!(view.sampled.exist(7, FAR, now, &mut view.sequence), 0);
         view.see(5);
-        assert_eq!(view.sampled.exist(7, now, &mut view.sequence), 2);
-        assert_eq!(view.sampled.exist(6, now, &mut view.sequence), 0);
+        assert_eq!(view.sampled.exist(7, FAR, now, &mut view.sequence), 2);
+        assert_eq!(view.sampled.exist(6, FAR, now, &mut view.sequence), 0);
         assert_eq!(view.counts(), (1, 3));
         // 8 was sent, 9 to 11 were not.
-        assert_eq!(view.sampled.skip(9, 12, now, &mut view.sequence), 1);
+        assert_eq!(view.sampled.skip((9, 12), FAR, now, &mut view.sequence), 1);
         assert_eq!(view.counts(), (1, 4));
         let news = view.see(12);
         // With 6 and 7 and 8, whose size is not known either.
         assert_eq!((news.samples, news.alike), (1, 4));
         view.see(7);
         assert_eq!(view.counts(), (3, 5));
-        let forged = view.sampled.exist(1 << 40, now, &mut view.sequence);
+        let forged = view.sampled.exist(1 << 40, FAR, now, &mut view.sequence);
         assert_eq!((forged, view.counts()), (0, (3, 5)));
         assert_eq!(view.losses(), []);
     }
@@ -555,7 +610,7 @@ mod tests {
         let mut view = View::new();
         view.see(1);
         let now = Timestamp(view.now);
-        assert_eq!(view.sampled.exist(5, now, &mut view.sequence), 4);
+        assert_eq!(view.sampled.exist(5, FAR, now, &mut view.sequence), 4);
         view.now += SECOND;
         for seen in [Seen::Part, Seen::Part, Seen::Whole] {
             assert_eq!(view.part(4, seen).samples, 0);
@@ -584,9 +639,9 @@ mod tests {
         // A part is nothing, and neither is what a HEARTBEAT says was sent.
         view.part(6, Seen::Part);
         let now = Timestamp(view.now);
-        view.sampled.exist(8, now, &mut view.sequence);
+        view.sampled.exist(8, FAR, now, &mut view.sequence);
         // What a GAP says was never sent is not missing.
-        view.sampled.skip(9, 200, now, &mut view.sequence);
+        view.sampled.skip((9, 200), FAR, now, &mut view.sequence);
         assert_eq!(look(&mut view), [(6, 8)]);
         assert_eq!(look(&mut view), []);
         assert_eq!(
@@ -619,12 +674,38 @@ mod tests {
     #[test]
     fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
         let mut view = View::new();
-        view.see(1);
-        assert_eq!(view.see(1_000_000).samples, 999_999);
+        for number in 1..=6 {
+            view.see(number);
+        }
+        // Each counts alone until the jump is believed; then all that it passed over count, too.
+        let samples: Vec<_> = (1..=6).map(|n| view.see(1_000_000 + n).samples).collect();
+        assert_eq!(samples, [1, 1, 1, 1, 999_995, 1]);
         assert_eq!(view.losses(), []);
         view.see(u64::MAX);
         view.see(0);
-        assert_eq!(view.counts(), (2, 1_000_000));
+        assert_eq!(view.counts(), (12, 1_000_006));
+        assert!((1..=6).all(|n| view.sampled.has(1_000_000 + n, view.sequence.next())));
+    }
+
+    #[test]
+    fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
+        let mut view = View::new();
+        for number in 1..=5 {
+            view.see(number);
+        }
+        view.part(6, Seen::Part);
+        let forged = view.part(1 << 40, Seen::Part);
+        assert_eq!((forged.samples, forged.finished), (1, false));
+        assert!(view.part(1 << 40, Seen::Whole).finished);
+        assert!(!view.part(1 << 40, Seen::Whole).finished);
+        assert!(view.part(6, Seen::Whole).finished);
+        assert_eq!(view.see(7).samples, 1);
+        let now = Timestamp(view.now);
+        let told = view.sampled.exist(3000, REACH, now, &mut view.sequence);
+        let passed = view
+            .sampled
+            .skip((2000, 3000), REACH, now, &mut view.sequence);
+        assert_eq!((told, passed, view.counts()), (0, 0, (8, 8)));
     }
 
     #[test]

@@ -206,13 +206,14 @@ impl Samples {
         number <= self.last_doubtful && self.is_partial(number)
     }
 
-    /// The oldest sample that still gets fragments: it and what follows is not decided yet.
+    /// The oldest sample from `first` on that still gets fragments: it and what follows is not decided
+    /// yet.
     #[must_use]
-    pub fn growing(&self, now: Timestamp, window: u64) -> Option<u64> {
+    pub fn growing(&self, now: Timestamp, window: u64, first: u64) -> Option<u64> {
         let growing = self
             .partial
             .iter()
-            .filter(|each| each.latest.0.saturating_add(window) > now.0);
+            .filter(|each| each.number >= first && each.latest.0.saturating_add(window) > now.0);
         growing.map(|each| each.number).min()
     }
 
@@ -475,8 +476,8 @@ mod tests {
     fn stalled_samples_expire() {
         let (mut samples, mut budget) = (Samples::default(), budget());
         samples.fragment(&fragment(4, 1, 1, 9000), Timestamp(100), &mut budget);
-        assert_eq!(samples.growing(Timestamp(150), 100), Some(4));
-        assert_eq!(samples.growing(Timestamp(250), 100), None);
+        assert_eq!(samples.growing(Timestamp(150), 100, 0), Some(4));
+        assert_eq!(samples.growing(Timestamp(250), 100, 0), None);
         assert_eq!(samples.expire(Timestamp(250), 100, &mut budget), 1);
         assert_eq!(budget.bytes, 0);
     }

@@ -6,11 +6,15 @@
 //! has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory is two bitmaps that grow with the number of undecided sequence numbers, up
 //! to [`MAX_WINDOW`]. It knows no payloads and no time but the one it is given.
 
+mod doubt;
+
 use std::collections::VecDeque;
 
 use ros2probe_wire::Timestamp;
 
 use super::size::Size;
+pub use doubt::Run;
+use doubt::{Doubted, HANDFUL};
 
 /// Undecided and recently decided sequence numbers remembered at the start.
 const MIN_WINDOW: u64 = 512;
@@ -18,8 +22,10 @@ const MIN_WINDOW: u64 = 512;
 pub const MAX_WINDOW: u64 = 32_768;
 /// A jump beyond this is a new incarnation or a forgery, not a million losses.
 const MAX_JUMP: u64 = 1 << 20;
-/// HEARTBEAT and GAP may run ahead of the data by at most this.
-const MAX_AHEAD: u64 = 4096;
+/// HEARTBEAT and GAP may run ahead of the data by at most this, also when two agree.
+pub const FAR: u64 = 4096;
+/// A number that is further ahead is doubted, and so is what a single HEARTBEAT or GAP says of it.
+pub const REACH: u64 = 64;
 /// A gap that fills this soon, unasked, was reordering. Retransmissions that no ACKNACK was seen
 /// for take longer: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before they answer a
 /// HEARTBEAT.
@@ -62,9 +68,32 @@ pub struct Sequence {
     checkpoints: VecDeque<(Timestamp, u64)>,
     gaps: VecDeque<Gap>,
     newest_source: Timestamp,
+    /// The sample of that time.
+    newest: u64,
+    /// Consecutive samples after it that are older.
+    older: u8,
     stale: u32,
     /// When the last one that moved `next` came.
     last_advance: Timestamp,
+    /// Samples that continued this incarnation, up to a handful.
+    followed: u8,
+    doubted: Option<Box<Doubted>>,
+    /// Runs, HEARTBEATs, GAPs and ACKNACKs that were doubted.
+    jumps: u64,
+}
+
+/// Whether a sample's number is its writer's.
+#[derive(Debug)]
+pub enum Belief {
+    /// It belongs to the live run.
+    Live,
+    /// It counts as a message and moves no other number.
+    Doubted {
+        /// Nothing of this sample was seen before.
+        new: bool,
+    },
+    /// It continues a run that is believed from here on, with the samples that came before it.
+    Believed(Run),
 }
 
 /// One run of missing numbers, for telling reordering from retransmission.
@@ -115,7 +144,7 @@ pub enum Settled {
 impl Sequence {
     /// Entries, or bytes, and cap of every list.
     #[must_use]
-    pub fn sizes(&self) -> [Size; 4] {
+    pub fn sizes(&self) -> [Size; 5] {
         // A new list does not compile before it has a place here.
         let Self {
             first: _,
@@ -131,15 +160,22 @@ impl Sequence {
             checkpoints,
             gaps,
             newest_source: _,
+            newest: _,
+            older: _,
             stale: _,
             last_advance: _,
+            followed: _,
+            doubted,
+            jumps: _,
         } = self;
         let length = |Bitmap { words }: &Bitmap| words.len();
+        let doubted = doubted.as_ref().map_or(0, |doubted| doubted.len());
         [
             Size::new("sequence.received", length(received), WORDS),
             Size::new("sequence.excused", length(excused), WORDS),
             Size::new("sequence.checkpoints", checkpoints.len(), CHECKPOINTS),
             Size::new("sequence.gaps", gaps.len(), GAPS),
+            Size::new("sequence.doubted", doubted, Doubted::CAP),
         ]
     }
 
@@ -175,7 +211,7 @@ impl Sequence {
         now: Timestamp,
         settled: &mut impl FnMut(Settled),
     ) -> Arrival {
-        if number == 0 || number > u64::MAX >> 1 {
+        if !is_number(number) {
             return Arrival::Duplicate;
         }
         if !self.started() {
@@ -206,28 +242,112 @@ impl Sequence {
         }
     }
 
-    /// Looks at number and source time of a sample before anything else does: a writer that begins
-    /// anew under its old GUID is recognised here, and all numbers count afresh.
-    pub fn recognise(&mut self, number: u64, source: Option<Timestamp>) {
-        if number == 0 || number > u64::MAX >> 1 {
-            return;
+    /// Looks at number and source time of a sample before anything else does: a writer that jumps, or
+    /// begins anew under its old GUID, is recognised here. Numbers up to `reach` ahead are not doubted.
+    pub fn recognise(
+        &mut self,
+        number: u64,
+        source: Option<Timestamp>,
+        reach: u64,
+        now: Timestamp,
+    ) -> Belief {
+        if !is_number(number) {
+            return Belief::Live;
         }
-        if self.is_new_incarnation(number, source) {
+        if self.doubts(number, source, reach) {
+            let doubted = self.doubted.get_or_insert_default();
+            let (opens, new) = doubted.note(number, now);
+            self.jumps += u64::from(opens);
+            if !doubted.is_believed() {
+                return Belief::Doubted { new };
+            }
+            let mut run = self.believe();
+            run.numbers.retain(|(known, _)| *known != number);
+            if let Some(source) = source {
+                self.sourced(number, source);
+            }
+            return Belief::Believed(run);
+        }
+        if self.stale >= STALE && number < self.floor() {
             self.restart(number);
         }
-        if let Some(source) = source {
-            self.sourced(source);
+        if number >= self.next && self.started() {
+            self.followed = self.followed.saturating_add(1);
+            self.contradict();
         }
+        if let Some(source) = source {
+            self.sourced(number, source);
+        }
+        Belief::Live
     }
 
-    /// A sample was said at this time, which is later than all before or is of no matter.
-    pub fn sourced(&mut self, source: Timestamp) {
-        self.newest_source = self.newest_source.max(source);
+    /// Whether a sample of this number and source time does not belong to the live run.
+    #[must_use]
+    pub fn doubts(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
+        if !self.started() || !is_number(number) {
+            return false;
+        }
+        if number >= self.next {
+            return number - self.next > reach;
+        }
+        let newer = source.is_some_and(|source| {
+            self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
+        });
+        // A writer that begins anew fills no gaps of the run before.
+        let doubted = self.doubted.as_ref();
+        let continues = || doubted.is_some_and(|doubted| doubted.is_continued(number, self.next));
+        // What came first may have been forged just as well; what lies less far below it is history.
+        let is_young = self.followed < HANDFUL;
+        newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
+    }
+
+    /// Marks a doubted sample as whole. Returns whether that is new.
+    pub fn complete_doubted(&mut self, number: u64) -> bool {
+        let doubted = self.doubted.as_mut();
+        doubted.is_some_and(|doubted| doubted.complete(number))
+    }
+
+    /// Whether a doubted sample came whole.
+    #[must_use]
+    pub fn has_doubted(&self, number: u64) -> bool {
+        let doubted = self.doubted.as_ref();
+        doubted.is_some_and(|doubted| doubted.is_whole(number))
+    }
+
+    /// Takes in the samples of a run that is believed.
+    pub fn accept(&mut self, run: &Run, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+        for &(number, is_whole) in &run.numbers {
+            self.exists(number, now, settled);
+            if is_whole {
+                self.received.set(number);
+            }
+        }
+        let (start, end) = run.gap;
+        self.excuse(start, end);
+    }
+
+    /// How often something was doubted.
+    #[must_use]
+    pub const fn jumps(&self) -> u64 {
+        self.jumps
+    }
+
+    /// Takes in a sample's source time.
+    pub fn sourced(&mut self, number: u64, source: Timestamp) {
+        if number <= self.newest {
+            return;
+        }
+        self.older += 1;
+        // Many that are older: the newest was forged, or the writer's clock was set back.
+        if source >= self.newest_source || self.older >= HANDFUL {
+            (self.newest_source, self.newest, self.older) = (source, number, 0);
+        }
     }
 
     /// A sample of this number exists, for some of its fragments came.
     pub fn exists(&mut self, number: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
-        if self.started() && number >= self.next && number <= u64::MAX >> 1 {
+        let is_ahead = number >= self.next && number - self.next <= MAX_JUMP;
+        if self.started() && is_ahead && is_number(number) {
             self.extend(number, number + 1, now, settled);
         }
     }
@@ -266,7 +386,7 @@ impl Sequence {
         if !self.started() || !other.started() {
             return;
         }
-        if other.next > self.next && other.next - self.next <= MAX_AHEAD {
+        if other.next > self.next && other.next - self.next <= FAR {
             self.extend(other.next - 1, other.next, now, settled);
         }
         for number in self.floor().max(other.floor())..self.next.min(other.next) {
@@ -295,7 +415,14 @@ impl Sequence {
             return;
         }
         let next = last.saturating_add(1);
-        if next > self.next && next - self.next <= MAX_AHEAD {
+        let (is_believed, run) = self.claim(next, REACH, now);
+        if let Some(run) = run {
+            self.accept(&run, now, settled);
+        }
+        if !is_believed {
+            return;
+        }
+        if next > self.next {
             self.note_gap(self.next, next, now);
             self.extend(next - 1, next, now, settled);
         }
@@ -304,6 +431,36 @@ impl Sequence {
             self.available = available;
             self.withdrawn.get_or_insert((now, available));
         }
+    }
+
+    /// Takes in a HEARTBEAT's lastSN, `next - 1`. Returns whether it is believed, and the doubted run
+    /// that it confirms.
+    pub fn claim(&mut self, next: u64, reach: u64, now: Timestamp) -> (bool, Option<Run>) {
+        let live = self.next;
+        let doubted = self.doubted.as_mut();
+        if doubted.is_some_and(|doubted| doubted.agrees(next, live, now)) {
+            return (true, Some(self.believe()));
+        }
+        let ahead = next.saturating_sub(live);
+        if ahead <= reach {
+            if next >= live {
+                self.contradict();
+            }
+            return (true, None);
+        }
+        let doubted = self.doubted.get_or_insert_default();
+        if ahead <= FAR && doubted.is_claimed(next, reach, now) {
+            return (true, None);
+        }
+        self.jumps += 1;
+        (false, None)
+    }
+
+    /// Whether an ACKNACK acknowledges numbers that are not known to exist.
+    pub const fn refuses(&mut self, base: u64) -> bool {
+        let refuses = self.started() && base.saturating_sub(self.next) > FAR;
+        self.jumps += refuses as u64;
+        refuses
     }
 
     /// ACKNACK: the readers have all below `base`, also what was not seen here, except samples that
@@ -357,9 +514,17 @@ impl Sequence {
         if !self.started() || start == 0 || base < start {
             return;
         }
+        let ahead = base.saturating_sub(self.next);
+        if ahead > REACH {
+            self.jumps += 1;
+            if ahead <= MAX_JUMP {
+                self.doubted.get_or_insert_default().pass_over(start, base);
+            }
+            return;
+        }
         let mut one = |sequence: &mut Self, start: u64, end: u64| {
             if end > sequence.next {
-                if end - sequence.next > MAX_AHEAD {
+                if end - sequence.next > REACH {
                     return;
                 }
                 sequence.extend(end - 1, end, now, settled);
@@ -445,6 +610,32 @@ impl Sequence {
         self.next.saturating_sub(self.received.len())
     }
 
+    /// The doubted run is the writer's: the numbers jump there, or begin anew.
+    fn believe(&mut self) -> Run {
+        let doubted = self.doubted.take();
+        let run = doubted.map_or_else(Run::default, |doubted| doubted.into_run());
+        let Some((first, _)) = run.numbers.first() else {
+            return run;
+        };
+        let jump = first.checked_sub(self.next);
+        // What was hardly seen before lost nothing that is far from it.
+        let most = match self.followed < HANDFUL {
+            true => FAR,
+            false => MAX_JUMP,
+        };
+        if jump.is_none_or(|jump| jump > most) {
+            self.restart(*first);
+        }
+        run
+    }
+
+    /// The live run went on.
+    fn contradict(&mut self) {
+        if let Some(doubted) = &mut self.doubted {
+            doubted.contradict();
+        }
+    }
+
     fn restart(&mut self, number: u64) {
         *self = Self {
             first: number,
@@ -452,25 +643,13 @@ impl Sequence {
             next: number,
             newest_source: self.newest_source,
             last_advance: self.last_advance,
+            jumps: self.jumps,
             complete: number,
             incarnation: self.incarnation.wrapping_add(1),
             received: Bitmap::with_len(MIN_WINDOW),
             excused: Bitmap::with_len(MIN_WINDOW),
             ..Self::default()
         };
-    }
-
-    fn is_new_incarnation(&self, number: u64, source: Option<Timestamp>) -> bool {
-        if !self.started() {
-            return false;
-        }
-        if number >= self.next {
-            return number - self.next > MAX_JUMP;
-        }
-        let newer = source.is_some_and(|source| {
-            self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
-        });
-        newer && self.has(number) || self.stale >= STALE && number < self.floor()
     }
 
     /// Raises `next` to `end`; `start..end` came, what lies before it is a gap.
@@ -539,6 +718,11 @@ impl Sequence {
         }
         self.settled = self.settled.max(limit.min(self.next));
     }
+}
+
+/// Whether it can be a sequence number: those are signed (RTPS 2.5, 9.3.2).
+const fn is_number(number: u64) -> bool {
+    number > 0 && number <= u64::MAX >> 1
 }
 
 /// A ring of bits, a power of two of them, addressed by sequence number.

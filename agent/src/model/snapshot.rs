@@ -268,6 +268,11 @@ pub struct Measurement {
     pub header_latency: Histogram,
     /// Samples whose time lay after their capture time (clocks apart); not in the histograms.
     pub negative_latency: u64,
+    /// Samples whose INFO_TS lies more than an hour before or after their capture time (a clock that
+    /// was never set, or a forgery); not in the histograms.
+    pub implausible_latency: u64,
+    /// How often the writer's numbers left their run, and one record did not suffice to believe it.
+    pub sequence_jumps: u64,
     /// Present when some of this was read from shared memory, which is a sampled view: messages are
     /// then counted by the span of their numbers, and times are those of the samples that were seen.
     pub sampled: Option<SampledFacts>,
@@ -301,6 +306,8 @@ impl Measurement {
         self.source_latency.merge(&other.source_latency);
         self.header_latency.merge(&other.header_latency);
         self.negative_latency += other.negative_latency;
+        self.implausible_latency += other.implausible_latency;
+        self.sequence_jumps += other.sequence_jumps;
         if let Some(other) = &other.sampled {
             let sampled = self.sampled.get_or_insert_default();
             sampled.seen += other.seen;

@@ -21,6 +21,7 @@ use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 use super::acknowledgement::Acknowledgements;
 use super::delivery::{Delivery, Receiver, Scene, Totals, seconds};
 use super::departures::Departures;
+use super::header::PLAUSIBLE;
 use super::journal::Journal;
 use super::receivers::{Around, Matched};
 use super::reception::Whole;
@@ -236,13 +237,16 @@ impl Subscribers {
         self.totals.seen[1] = true;
         let source = record.source_timestamp().timestamp();
         let begins = record.kind == kind::DATA || record.fragment_start == 1;
-        if let Some(source) = source.filter(|source| begins && self.departures.is_first(*source)) {
-            let began = record.time.saturating_sub(record.elapsed.into());
-            let began = stage.around.calendar.shown(Timestamp(began));
+        let began = record.time.saturating_sub(record.elapsed.into());
+        let began = stage.around.calendar.shown(Timestamp(began));
+        // One clock: what leaves before its timestamp, or hours after, is no matter of sending.
+        if let Some(source) = source.filter(|_| begins)
+            && let Ok(delay) = u64::try_from(began.nanoseconds_since(source))
+            && delay <= PLAUSIBLE
+            && self.departures.is_first(source)
+        {
             let delay = began.nanoseconds_since(source);
-            if delay >= 0 {
-                self.breakdown().send_delay.observe(seconds(delay));
-            }
+            self.breakdown().send_delay.observe(seconds(delay));
         }
         let Some(place) = self.delivery(index, Receiver::Way(way), stage) else {
             return false;

@@ -8,7 +8,7 @@ use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::calendar::Calendar;
-use super::header::stamp_time;
+use super::header::{PLAUSIBLE, stamp_time};
 use super::histogram::Histogram;
 use super::in_order::Progress;
 use super::journal::{Journal, Loss, Missing};
@@ -17,6 +17,7 @@ use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception, is_message};
 use super::sampled::{News, Sampled, Seen};
 use super::samples::Budget;
+use super::sequence::{FAR, REACH};
 use super::size::Size;
 use super::snapshot::Measurement;
 
@@ -72,6 +73,8 @@ pub struct Counted {
     pub began: Timestamp,
     /// It was seen where not every message is seen.
     pub sampled: bool,
+    /// Its number is not believed to be the writer's: it has no place in an order.
+    pub doubted: bool,
 }
 
 /// One measured writer.
@@ -86,6 +89,7 @@ pub struct Writer {
     header_latency: Histogram,
     last_message: Option<Timestamp>,
     negative_latency: u64,
+    implausible_latency: u64,
     /// Of a writer that was seen in shared memory.
     sampled: Option<Box<Sampled>>,
     /// Of a writer that was seen in the process that it belongs to: its last record from there.
@@ -119,6 +123,7 @@ impl Writer {
             header_latency: Histogram::default(),
             last_message: None,
             negative_latency: 0,
+            implausible_latency: 0,
             sampled: None,
             exact: None,
         }
@@ -137,6 +142,7 @@ impl Writer {
             header_latency: _,
             last_message: _,
             negative_latency: _,
+            implausible_latency: _,
             sampled,
             exact: _,
         } = self;
@@ -187,10 +193,19 @@ impl Writer {
         if is_looked_at(record) && self.is_exact(at) {
             return true;
         }
+        if self.doubts(record) {
+            return sequence.has_doubted(number);
+        }
         match &self.sampled {
             Some(sampled) if sampled.is_current(at) => sampled.has(number, sequence.next()),
             _ => sequence.has(number),
         }
+    }
+
+    /// Whether this ACKNACK acknowledges samples that are not known to exist.
+    pub const fn refuses(&mut self, acknack: &Record) -> bool {
+        let sequence = self.reception.sequence_mut();
+        sequence.refuses(acknack.sequence_number)
     }
 
     /// Messages counted.
@@ -378,6 +393,8 @@ impl Writer {
             source_latency: self.source_latency,
             header_latency: self.header_latency,
             negative_latency: self.negative_latency,
+            implausible_latency: self.implausible_latency,
+            sequence_jumps: self.reception.sequence().jumps(),
             sampled: self.sampled.as_ref().map(|sampled| sampled.facts()),
         }
     }
@@ -420,7 +437,9 @@ impl Writer {
                 self.count(now, whole.bytes, whole.recovered);
                 let calendar = scene.calendar.shown(now);
                 let (source, stamp) = (whole.source, whole.stamp);
-                self.delays(whole.number, whole.newest, (source, stamp), (now, calendar));
+                if !whole.doubted {
+                    self.delays(whole.number, whole.newest, (source, stamp), (now, calendar));
+                }
                 return Some(Counted {
                     number: whole.number,
                     bytes: whole.bytes,
@@ -429,6 +448,7 @@ impl Writer {
                     at: now,
                     began: whole.began,
                     sampled: false,
+                    doubted: whole.doubted,
                 });
             }
             Outcome::Whole(_) => {}
@@ -455,6 +475,13 @@ impl Writer {
             && self.sampled.as_ref().is_some_and(|sampled| {
                 !sampled.is_current(record_time(record)) && sampled.awaits(record.sequence_number)
             })
+    }
+
+    /// Whether the number of this DATA or DATA_FRAG is away from those that the writer uses.
+    fn doubts(&self, record: &Record) -> bool {
+        let source = record.source_timestamp().timestamp();
+        let sequence = self.reception.sequence();
+        sequence.doubts(record.sequence_number, source, reach(record))
     }
 
     fn is_exact(&self, now: Timestamp) -> bool {
@@ -488,9 +515,13 @@ impl Writer {
             sampled.touch(now);
         }
         let number = record.sequence_number;
-        let has = sampled.has(number, self.reception.sequence().next());
+        let sequence = self.reception.sequence();
+        let source = record.source_timestamp().timestamp();
+        let reach = reach(record);
+        let doubted = sequence.doubts(number, source, reach);
+        let has = !doubted && sampled.has(number, sequence.next());
         let is_whole = match record.kind {
-            kind::DATA_FRAG => !has && self.reception.assemble(record, scene.budget),
+            kind::DATA_FRAG => !has && self.reception.assemble(record, doubted, scene.budget),
             _ => true,
         };
         let sequence = self.reception.sequence_mut();
@@ -502,20 +533,20 @@ impl Writer {
                     false if record.ends_sample() && record.flags & flag::EXACT == 0 => Seen::Tail,
                     false => Seen::Part,
                 };
-                let source = record.source_timestamp().timestamp();
-                let news = sampled.sample(number, source, seen, now, sequence);
+                let what = (number, seen, source);
+                let news = sampled.sample(what, reach, now, sequence);
                 return self.sampled_sample(record, &news, (now, scene.calendar.shown(now)));
             }
             kind::HEARTBEAT => {
                 self.traits.reliable = true;
-                sampled.exist(record.second_sequence_number(), now, sequence)
+                sampled.exist(record.second_sequence_number(), reach, now, sequence)
             }
             kind::GAP => {
                 let end = record.second_sequence_number();
-                sampled.skip(number, end, now, sequence)
+                sampled.skip((number, end), reach, now, sequence)
             }
             // The reader has all below.
-            kind::ACKNACK => sampled.exist(number.saturating_sub(1), now, sequence),
+            kind::ACKNACK => sampled.exist(number.saturating_sub(1), reach, now, sequence),
             _ => 0,
         };
         self.tally.messages += told;
@@ -526,7 +557,8 @@ impl Writer {
     /// Takes in a part of a sample that was under way when the sampled view ended, by whatever way
     /// it comes.
     fn catch_up(&mut self, record: &Record, scene: &mut Scene<'_>) -> Option<Counted> {
-        let is_whole = record.kind == kind::DATA || self.reception.assemble(record, scene.budget);
+        let is_whole =
+            record.kind == kind::DATA || self.reception.assemble(record, false, scene.budget);
         let seen = if is_whole { Seen::Whole } else { Seen::Part };
         let news = self
             .sampled
@@ -578,6 +610,7 @@ impl Writer {
                 at: now,
                 began: now,
                 sampled: true,
+                doubted: news.doubted,
             });
         }
         None
@@ -618,8 +651,10 @@ impl Writer {
         let mut negative = false;
         if let Some(source) = source {
             let delay = calendar.nanoseconds_since(source);
+            let is_plausible = source.0.abs_diff(calendar.0) <= PLAUSIBLE;
+            self.implausible_latency += u64::from(!is_plausible);
             negative |= delay < 0;
-            if delay >= 0 {
+            if delay >= 0 && is_plausible {
                 self.source_latency.observe(seconds(delay));
                 let slot = self.tally.window.current(now);
                 slot.delayed += 1;
@@ -686,6 +721,11 @@ impl Settling<'_> {
             last,
         });
     }
+}
+
+/// How far ahead of those that came the numbers of a record may be: looks at shared memory miss more.
+const fn reach(record: &Record) -> u64 {
+    if is_looked_at(record) { FAR } else { REACH }
 }
 
 /// Whether it was read in shared memory, where others may have been missed.

@@ -297,6 +297,18 @@ pub(super) const TOPIC_NEGATIVE_LATENCY: Metric = Metric::counter(
     TOPIC,
     "Messages stamped after their capture: clocks are apart. They are in no latency histogram.",
 );
+pub(super) const TOPIC_IMPLAUSIBLE_LATENCY: Metric = Metric::counter(
+    "ros2_topic_implausible_latency_messages_total",
+    TOPIC,
+    "Messages stamped more than an hour before or after their capture: the sender's clock was never \
+     set, or the timestamp is forged. They are in no latency histogram.",
+);
+pub(super) const TOPIC_DOUBTED_JUMPS: Metric = Metric::counter(
+    "ros2_topic_doubted_sequence_jumps_total",
+    TOPIC,
+    "Jumps of a writer's sequence numbers, ahead by more than 64 or back, that one datagram does not \
+     prove: its writer restarted, the agent missed messages, or the datagram is forged.",
+);
 
 pub(super) const TOPIC_SAMPLED: Metric = Metric::counter(
     "ros2_topic_sampled_messages_total",
@@ -394,6 +406,8 @@ pub const CATALOGUE: &[Metric] = &[
     TOPIC_RATE,
     TOPIC_BANDWIDTH,
     TOPIC_NEGATIVE_LATENCY,
+    TOPIC_IMPLAUSIBLE_LATENCY,
+    TOPIC_DOUBTED_JUMPS,
     TOPIC_SAMPLED,
     TOPIC_SAMPLED_SEEN,
     TOPIC_SAMPLED_UNCERTAIN,

@@ -314,9 +314,22 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
     page.family(&metric::TOPIC_BANDWIDTH, |family| {
         measured(family, rows, |facts| Some(facts.bandwidth.into()))
     })?;
-    page.family(&metric::TOPIC_NEGATIVE_LATENCY, |family| {
-        measured(family, rows, |facts| Some(facts.negative_latency.into()))
-    })?;
+    let doubts: [(&Metric, Count); 3] = [
+        (&metric::TOPIC_NEGATIVE_LATENCY, |measured| {
+            measured.negative_latency
+        }),
+        (&metric::TOPIC_IMPLAUSIBLE_LATENCY, |measured| {
+            measured.implausible_latency
+        }),
+        (&metric::TOPIC_DOUBTED_JUMPS, |measured| {
+            measured.sequence_jumps
+        }),
+    ];
+    for (metric, value) in doubts {
+        page.family(metric, |family| {
+            measured(family, rows, |facts| Some(value(facts).into()))
+        })?;
+    }
     sampled(page, rows)?;
     let histograms: [(&Metric, Values); 3] = [
         (&metric::TOPIC_INTERARRIVAL, |measured| {

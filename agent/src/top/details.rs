@@ -144,6 +144,20 @@ fn measured(topic: &Topic, lines: &mut Vec<Styled>) {
         );
         lines.push((line, Kind::Problem));
     }
+    if counted.implausible_latency_messages > 0 {
+        let line = format!(
+            "clock not set: {} messages have timestamps more than an hour from their arrival",
+            counted.implausible_latency_messages
+        );
+        lines.push((line, Kind::Problem));
+    }
+    if counted.doubted_sequence_jumps > 0 {
+        let line = format!(
+            "sequence numbers jumped {} times: restarts, missed messages or forged ones",
+            counted.doubted_sequence_jumps
+        );
+        lines.push((line, Kind::Plain));
+    }
 }
 
 fn counts(counted: &Measurement) -> String {

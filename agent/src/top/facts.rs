@@ -85,6 +85,8 @@ pub struct Measurement {
     pub latency: Option<Distribution>,
     pub header_latency: Option<Distribution>,
     pub negative_latency_messages: u64,
+    pub implausible_latency_messages: u64,
+    pub doubted_sequence_jumps: u64,
     pub sampled: Option<Sampled>,
 }
 

@@ -387,6 +387,12 @@ pub const FIXED: &[[&str; 4]] = &[
         "a_storm_of_datagrams_that_never_end_stays_bounded",
     ],
     [
+        "KEPT",
+        "agent/src/model/sequence/doubt.rs",
+        "agent/src/model/sequence/doubt.rs",
+        "the_oldest_numbers_of_a_long_run_are_forgotten",
+    ],
+    [
         "RUNS",
         "agent/src/model/deaths.rs",
         "agent/src/model/deaths.rs",

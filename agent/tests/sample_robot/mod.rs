@@ -336,6 +336,8 @@ fn measurement() -> Measurement {
         source_latency: histogram,
         header_latency: histogram,
         negative_latency: 0,
+        implausible_latency: 0,
+        sequence_jumps: 0,
         sampled: Some(SampledFacts {
             seen: 123_000,
             span: 123_456,

@@ -40,6 +40,11 @@ pub(super) struct MeasurementView {
     header_latency: Option<Distribution>,
     /// Messages stamped after their capture: clocks are apart.
     negative_latency_messages: u64,
+    /// Messages stamped more than an hour before or after their capture: the sender's clock was never
+    /// set, or the timestamp is forged.
+    implausible_latency_messages: u64,
+    /// Jumps of sequence numbers that one datagram does not prove.
+    doubted_sequence_jumps: u64,
     /// Present when some of this was read from shared memory, which is a sampled view.
     sampled: Option<SampledView>,
 }
@@ -163,6 +168,8 @@ impl From<&Measurement> for MeasurementView {
             latency: Distribution::of(&facts.source_latency),
             header_latency: Distribution::of(&facts.header_latency),
             negative_latency_messages: facts.negative_latency,
+            implausible_latency_messages: facts.implausible_latency,
+            doubted_sequence_jumps: facts.sequence_jumps,
             sampled: facts.sampled.as_ref().map(|sampled| SampledView {
                 seen_messages: sampled.seen,
                 existing_messages: sampled.span,
