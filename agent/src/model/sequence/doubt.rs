@@ -108,8 +108,8 @@ impl Doubted {
         self.claim = (0, Timestamp(0));
     }
 
-    /// Whether a HEARTBEAT with lastSN `next - 1` confirms the run, where the live run's next number
-    /// is `live`. Of a run below that, a HEARTBEAT that reaches `live` is the live writer's.
+    /// Whether a HEARTBEAT with lastSN `next - 1` confirms the run. The live run's next number
+    /// is `live`. A run below `live` is not confirmed by a HEARTBEAT that reaches it.
     pub(super) fn agrees(&self, next: u64, live: u64, now: Timestamp) -> bool {
         let end = self.end();
         let is_ahead = end > live;
