@@ -353,6 +353,27 @@ fn a_topic_watched_by_name_is_measured_among_as_many_as_may_be() {
     );
 }
 
+#[test]
+fn a_topic_watched_by_name_stays_measured_when_its_publisher_is_gone_and_a_crowd_comes() {
+    let limits = Limits {
+        topics: 4,
+        ..Limits::default()
+    };
+    let mut world = World::new(&["/**", "/points"], &limits);
+    world.spdp(ALICE);
+    world.sedp(writer(ALICE), "rt/points");
+    (1..=5).for_each(|number| world.sample(writer(ALICE), number));
+    world.put(Message::from(ALICE).dispose_by_hash(SEDP_WRITERS, 9, writer(ALICE)));
+    world.spdp(BOB);
+    for number in 0..9 {
+        let name = format!("rt/crowd_{number}");
+        world.sedp(Guid::new(BOB, entity(number, 3)), &name);
+    }
+    world.wait(2000);
+    assert_eq!(world.messages("/points"), Some(5));
+    assert_eq!(world.snapshot().topics_measured, 4);
+}
+
 /// What a flood may know: names of topics that are watched. Every packet under another GUID.
 fn flood(world: &mut World, rounds: std::ops::Range<u32>, with_data: bool) {
     for number in rounds {

@@ -417,7 +417,10 @@ impl Topics {
         let mut displaced = None;
         let after = if covering.is_empty() && wished.is_none() {
             Watched::No
-        } else if before == Watched::Yes || self.watched < cap || self.give_up_vanished(id) {
+        } else if before == Watched::Yes
+            || self.watched < cap
+            || self.give_up_vanished(id, is_named)
+        {
             Watched::Yes
         } else {
             displaced = is_named.then(|| self.displace()).flatten();
@@ -523,10 +526,13 @@ impl Topics {
         id
     }
 
-    /// Frees the measuring place of the topic that vanished first.
-    fn give_up_vanished(&mut self, keep: TopicId) -> bool {
-        let mut places = self.vanished_watched.iter().map(|(_, id)| *id);
-        let Some(id) = places.find(|id| *id != keep) else {
+    /// Frees the measuring place of the topic that vanished first; one that is watched by its exact name
+    /// keeps it, unless the newcomer is, too.
+    fn give_up_vanished(&mut self, keep: TopicId, is_named: bool) -> bool {
+        let places = || self.vanished_watched.iter().map(|(_, id)| *id);
+        let unnamed = places().find(|id| *id != keep && self.yielding.contains(id));
+        let any = || places().find(|id| *id != keep && is_named);
+        let Some(id) = unnamed.or_else(any) else {
             return false;
         };
         self.forget(id);
