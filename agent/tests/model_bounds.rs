@@ -464,6 +464,7 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
     assert_filled(
         &largest,
         &[
+            "discovery.applicants",
             "discovery.participants",
             "discovery.pending_endpoints",
             "discovery.pending_nodes",

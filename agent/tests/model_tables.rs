@@ -121,7 +121,12 @@ fn grows(kind: &str, file: &str, growing: &BTreeSet<(String, String)>, all: &[St
 
 /// The fields with which this struct is taken apart somewhere in a function about sizes.
 fn taken_apart(each: &Struct, texts: &BTreeMap<String, String>) -> Option<String> {
-    let own = texts[&each.file].split("\nimpl ").skip(1);
+    let own = texts[&each.file].split("\nimpl").skip(1);
+    // Behind generic parameters.
+    let own = own.map(|part| match part.starts_with('<') {
+        true => part.split_once("> ").map_or(part, |(_, rest)| rest),
+        false => part.trim_start(),
+    });
     let own = own.filter(|part| words(part).next() == Some(&each.name));
     let selves = own.flat_map(|part| after(part, "let Self {"));
     let mut all: Vec<_> = selves.collect();

@@ -222,6 +222,7 @@ impl Discovery {
             nodes.iter().map(Node::bytes).sum::<usize>()
         };
         let waiting = pending_nodes.values().map(held).sum();
+        let (applicants, pending_endpoints) = (applicants.sizes(), pending_endpoints.sizes());
         let each = || participants.values().map(|each| each.lists());
         let nodes = each().map(|lists| lists.nodes).sum();
         let named = each().map(|lists| lists.named).sum();
@@ -236,12 +237,8 @@ impl Discovery {
             Size::new("discovery.participant.endpoints", of_one, PER_PARTICIPANT),
             Size::new("discovery.participant.addresses", addresses, ADDRESSES),
             Size::new("discovery.endpoints", endpoints.len(), caps.endpoints),
-            Size::new("discovery.applicants", applicants.len(), APPLICANTS),
-            Size::new(
-                "discovery.applicants.places",
-                applicants.places(),
-                APPLICANTS,
-            ),
+            Size::new("discovery.applicants", applicants.0, APPLICANTS),
+            Size::new("discovery.applicants.places", applicants.1, APPLICANTS),
             Size::new(
                 "discovery.participant_victims",
                 participant_victims.len(),
@@ -253,14 +250,10 @@ impl Discovery {
                 Victims::CAP,
             ),
             Size::new("discovery.node_victims", node_victims.len(), Victims::CAP),
-            Size::new(
-                "discovery.pending_endpoints",
-                pending_endpoints.len(),
-                PENDING,
-            ),
+            Size::new("discovery.pending_endpoints", pending_endpoints.0, PENDING),
             Size::new(
                 "discovery.pending_endpoints.places",
-                pending_endpoints.places(),
+                pending_endpoints.1,
                 PENDING,
             ),
             Size::new(

@@ -73,7 +73,14 @@ pub(super) enum Table {
 impl Victims {
     /// Entries that were found and are still there to go.
     pub(super) fn len(&self) -> usize {
-        self.doubtful.len() + self.others.len()
+        let Self {
+            doubtful,
+            others,
+            claims: _,
+            watched_claims: _,
+            search_after: _,
+        } = self;
+        doubtful.len() + others.len()
     }
 
     /// Most that there may be.

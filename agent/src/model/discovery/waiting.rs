@@ -36,14 +36,15 @@ impl<K: Copy + Ord, T> Waiting<K, T> {
         }
     }
 
-    /// Entries.
-    pub(super) fn len(&self) -> usize {
-        self.entries.len()
-    }
-
-    /// Places in their order.
-    pub(super) fn places(&self) -> usize {
-        self.order.len()
+    /// Entries, and places in their order.
+    pub(super) fn sizes(&self) -> (usize, usize) {
+        let Self {
+            cap: _,
+            entries,
+            order,
+            age: _,
+        } = self;
+        (entries.len(), order.len())
     }
 
     /// Puts an entry in place of the one with this key; whether one had to go for that, which is
@@ -119,7 +120,7 @@ mod tests {
         assert!(waiting.put(5, WATCHED, 'e') && waiting.put(6, WATCHED, 'f'));
         assert!(waiting.put(7, Worth::NOTHING, 'g'));
         let left: Vec<_> = waiting.range(0..=9).map(|(key, _)| key).collect();
-        assert_eq!((left, waiting.places()), (vec![1, 5, 6], 3));
+        assert_eq!((left, waiting.sizes()), (vec![1, 5, 6], (3, 3)));
         // In its own place it makes nobody go.
         assert!(!waiting.put(5, Worth::NOTHING, 'h'));
         assert_eq!(waiting.worth(&5), Some(Worth::NOTHING));
@@ -136,6 +137,6 @@ mod tests {
             (None, Some(WATCHED))
         );
         waiting.retain(|key, _| *key == 8);
-        assert_eq!((waiting.len(), waiting.places()), (1, 1));
+        assert_eq!(waiting.sizes(), (1, 1));
     }
 }

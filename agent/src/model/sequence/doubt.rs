@@ -43,12 +43,13 @@ impl Doubted {
     /// Numbers of the run.
     pub(super) const fn len(&self) -> usize {
         let Self {
-            run: Run { numbers, gap: _ },
+            run,
             evidence: _,
             since: _,
             latest: _,
             claim: _,
         } = self;
+        let Run { numbers, gap: _ } = run;
         numbers.len()
     }
 
