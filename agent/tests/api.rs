@@ -210,7 +210,7 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
     let config = directory.path().join("config.yaml");
     let bags = directory.path().join("bags");
     let text = format!(
-        "recordings: {{directory: {}}}\nlimits: {{recordings: 64}}\n",
+        "recordings: {{directory: {}, reserve_percent: 0, reserve_bytes: 0}}\nlimits: {{recordings: 64}}\n",
         bags.display()
     );
     std::fs::write(&config, text).unwrap();

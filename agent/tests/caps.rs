@@ -316,7 +316,10 @@ fn of_recordings_that_ended_the_latest_are_listed() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("ros2probe.yaml");
     let bags = directory.path().join("bags");
-    let text = format!("recordings: {{directory: {}}}\n", bags.display());
+    let text = format!(
+        "recordings: {{directory: {}, reserve_percent: 0, reserve_bytes: 0}}\n",
+        bags.display()
+    );
     std::fs::write(&file, text).unwrap();
     let agent = LocalAgent::start(&["--speed", "0.2", "--config", file.to_str().unwrap()]);
     for number in 0..20 {
@@ -340,7 +343,8 @@ fn a_snapshot_is_not_written_while_its_bags_take_what_they_may() {
     zeros(&old.join("bag_0.mcap"), 1 << 30);
     let file = directory.path().join("ros2probe.yaml");
     let text = format!(
-        "recordings:\n  directory: {}\n  snapshots: [{{name: last, topics: ['/**'], seconds: 10}}]\n",
+        "recordings:\n  directory: {}\n  reserve_percent: 0\n  reserve_bytes: 0\n  \
+         snapshots: [{{name: last, topics: ['/**'], seconds: 10}}]\n",
         bags.display()
     );
     std::fs::write(&file, text).unwrap();

@@ -349,7 +349,8 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, limits: &str) -> Loca
     let configuration = directory.join("ros2probe.yaml");
     let bags = directory.join("bags");
     let text = format!(
-        "limits: {{{limits}}}\nrecordings: {{directory: {}}}\nwatch: [/a, /b]\n",
+        "limits: {{{limits}}}\nwatch: [/a, /b]\n\
+         recordings: {{directory: {}, reserve_percent: 0, reserve_bytes: 0}}\n",
         bags.display()
     );
     std::fs::write(&configuration, text).unwrap();

@@ -25,7 +25,8 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
     );
     fs::create_dir(&state)?;
     let configuration = format!(
-        "watch: [/**]\nstate_directory: {}\nrecordings: {{directory: {}}}\n{ON_THE_WIRE}",
+        "watch: [/**]\nstate_directory: {}\n\
+         recordings: {{directory: {}, reserve_percent: 0, reserve_bytes: 0}}\n{ON_THE_WIRE}",
         state.display(),
         bags.display()
     );

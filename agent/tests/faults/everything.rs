@@ -57,7 +57,8 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     fs::write(directory.path().join("token"), TOKEN)?;
     let configuration = format!(
         "watch: [/real, /cloud, {{topic: /**, per_subscriber: true}}]\nlog: warn\n\
-         state_directory: {home}/state\nrecordings: {{directory: {home}/bags}}\n\
+         state_directory: {home}/state\n\
+         recordings: {{directory: {home}/bags, reserve_percent: 0, reserve_bytes: 0}}\n\
          api: {{listen: '0.0.0.0:17401', token_file: {home}/token, socket: {home}/api.sock}}\n{}",
         capture(&link)
     );

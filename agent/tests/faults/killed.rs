@@ -135,7 +135,7 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     let configuration = format!(
         "capture: {{source: host, cgroup: {}, mirror_interfaces: [eth0], shm: {{exact: uprobe}}}}\n\
          watch: [/**]\nlog: warn\nstate_directory: {}\napi: {{socket: {}/api.sock}}\nrecordings:\n  \
-         directory: {}\n  snapshots: [{{name: incident, topics: [/counted_1], seconds: 2}}]\n",
+         directory: {}\n  reserve_percent: 0\n  reserve_bytes: 0\n  snapshots: [{{name: incident, topics: [/counted_1], seconds: 2}}]\n",
         link.robot.cgroup().display(),
         places.state.display(),
         places.runtime.display(),

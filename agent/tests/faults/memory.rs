@@ -65,7 +65,8 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
     fs::create_dir(directory.path().join("state"))?;
     let configuration = format!(
         "watch: [{{topic: /**, per_subscriber: true}}]\nlog: warn\nstate_directory: {place}/state\n\
-         recordings: {{directory: {place}/bags}}\n{ON_THE_WIRE}"
+         recordings: {{directory: {place}/bags, reserve_percent: 0, reserve_bytes: 0}}\n\
+         {ON_THE_WIRE}"
     );
     let enter = group.enter();
     let words = ["sh", "-c", &enter];
