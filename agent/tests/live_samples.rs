@@ -16,7 +16,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 use harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use harness::network::{Link, Namespace};
 use harness::peer::{Peer, Role, Stack, Stream};
-use harness::process::Process;
+use harness::shared_memory::SharedMemory;
 use harness::usage::Usage;
 use harness::wait_until;
 use ros2probe::client;
@@ -81,7 +81,11 @@ fn payloads_are_what_was_sent(
         while received.len() as u64 + missed < stream.count {
             let next = next(&mut lines);
             let next = next.with_context(|| match observed.agent.scrape() {
-                Ok(page) => format!("{stack:?} {size}: {}", page.doubts()),
+                Ok(page) => format!(
+                    "{stack:?} {size}: after {:?} and {missed} missed: {}",
+                    received.keys(),
+                    page.doubts()
+                ),
                 Err(error) => error.to_string(),
             });
             let (sample, payload) = match next?.context("the stream ended")? {
@@ -356,7 +360,7 @@ impl Drop for Reader {
 /// What passes by shared memory is read in the process that sends it, whole.
 #[test]
 fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
-    let host = SharedMemory::new()?;
+    let host = Host::new()?;
     let observed = host.observe("exact: uprobe")?;
     let stream = in_shared_memory(60_000, 40);
     let (mut publisher, _subscriber) = host.pair(&stream)?;
@@ -372,7 +376,7 @@ fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
 /// of them were seen.
 #[test]
 fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
-    let host = SharedMemory::new()?;
+    let host = Host::new()?;
     let observed = host.observe("mode: auto")?;
     let stream = Stream {
         rate: 10.0,
@@ -396,7 +400,7 @@ fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
 /// With `exact: auto` the breakpoint is there while samples are read, and no longer.
 #[test]
 fn on_demand_every_sample_is_seen_and_the_breakpoint_goes_with_the_last_reader() -> Result<()> {
-    let host = SharedMemory::new()?;
+    let host = Host::with_its_own_fast_dds()?;
     let observed = host.observe("exact: auto")?;
     let stream = in_shared_memory(150_000, 40);
     let (mut publisher, _subscriber) = host.known_pair(&observed, &stream)?;
@@ -425,28 +429,37 @@ fn on_demand_every_sample_is_seen_and_the_breakpoint_goes_with_the_last_reader()
 }
 
 /// A host with a `/dev/shm` of its own.
-struct SharedMemory {
+struct Host {
     network: Namespace,
     enter: Vec<String>,
-    /// Keeps the mount namespace.
-    _keeper: Process,
+    _shared_memory: SharedMemory,
+    /// With a copy of Fast DDS, if it has one.
+    _libraries: Option<TempDir>,
 }
 
-impl SharedMemory {
+impl Host {
     fn new() -> Result<Self> {
         let network = Namespace::alone()?;
-        let script = "mount -t tmpfs -o size=64m,mode=1777 shm /dev/shm && echo ready && exec cat";
-        let arguments = ["--mount", "sh", "-c", script];
-        let mut keeper = Process::start(&network.on_network(), "unshare", arguments)?;
-        keeper.wait_for("ready", PATIENCE)?;
-        let mut enter = network.on_network();
-        let mounts = format!("--mount=/proc/{}/ns/mnt", keeper.pid());
-        enter.extend(["nsenter".to_owned(), mounts]);
+        let shared_memory = SharedMemory::of(&network, 64)?;
         Ok(Self {
+            enter: shared_memory.inside(&network),
             network,
-            enter,
-            _keeper: keeper,
+            _shared_memory: shared_memory,
+            _libraries: None,
         })
+    }
+
+    /// Breakpoints are in a file's pages, for all who map it: other tests' are not in this copy.
+    fn with_its_own_fast_dds() -> Result<Self> {
+        let mut host = Self::new()?;
+        let library = Stack::Fast.library("libfastrtps.so")?;
+        let libraries = tempfile::tempdir()?;
+        let name = library.file_name().context("a library without a name")?;
+        std::fs::copy(&library, libraries.path().join(name))?;
+        let path = format!("LD_LIBRARY_PATH={}", libraries.path().display());
+        host.enter.extend(["env".to_owned(), path]);
+        host._libraries = Some(libraries);
+        Ok(host)
     }
 
     /// An agent at its sockets, with this of `capture.shm`.

@@ -1,6 +1,7 @@
 //! Real DDS participants: one command line for three stacks (see `agent/tests/peers/peer.hpp`).
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
@@ -67,6 +68,16 @@ impl Stack {
             Stack::Cyclone => built("cyclonedds"),
             Stack::Rust => is_there(robot()?, "cargo build --example robot"),
         }
+    }
+
+    /// The library of this name that its program loads, as the dynamic linker finds it.
+    pub(crate) fn library(self, name: &str) -> Result<PathBuf> {
+        let list = Command::new("ldd").arg(self.program()?).output()?;
+        let list = String::from_utf8_lossy(&list.stdout).into_owned();
+        let line = list.lines().find(|line| line.contains(name));
+        let path = line.and_then(|line| line.split_ascii_whitespace().nth(2));
+        path.map(PathBuf::from)
+            .with_context(|| format!("{name} is not in {list}"))
     }
 }
 
