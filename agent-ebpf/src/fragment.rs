@@ -8,7 +8,7 @@
 use aya_ebpf::{bindings::__sk_buff, helpers::bpf_ktime_get_ns};
 use ros2probe_wire::{
     filter::Counter,
-    record::{Record, flag, kind},
+    record::{flag, kind},
 };
 
 use crate::{
@@ -53,22 +53,26 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     };
     let (offset, len, more) = (packet.offset, packet.len, packet.more);
-    if flow.state == state::DONE || flow.state == state::FOREIGN && offset != 0 {
+    let state = flow.state.get();
+    if state == state::DONE || state == state::FOREIGN && offset != 0 {
         return 0;
     }
     let (word, mask) = (opaque(offset >> 9) & 127, 1_u64 << (offset >> 3 & 63));
-    if let Some(starts) = flow.starts.get_mut(word as usize) {
-        if *starts & mask != 0 {
+    if let Some(starts) = flow.starts.get(word as usize) {
+        let before = starts.get();
+        if before & mask != 0 {
             count(slot, Counter::FragmentsRepeated, 1);
-            return u32::from(flow.state == state::CAPTURED || flow.state == state::HANDED_OVER);
+            return u32::from(state == state::CAPTURED || state == state::HANDED_OVER);
         }
-        *starts |= mask;
+        starts.set(before | mask);
     }
-    flow.seen += len;
+    let seen = flow.seen.get() + len;
+    flow.seen.set(seen);
     if more == 0 {
-        flow.expected = offset + len;
+        flow.expected.set(offset + len);
     }
-    let complete = flow.expected != 0 && flow.expected == flow.seen;
+    let expected = flow.expected.get();
+    let complete = expected != 0 && expected == seen;
     let keep = if offset == 0 {
         first(skb, slot, scratch, flow)
     } else {
@@ -80,48 +84,46 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
     keep
 }
 
-/// The flow of the fragment at hand, made new when there is none or its identification is reused.
+/// The flow of the fragment at hand, made new when there is none or its identification is reused. An
+/// LRU entry may be given to another key while we hold it, and fragments of one datagram may come on
+/// two CPUs: then flows are miscounted.
 #[inline(always)]
-fn flow(slot: u32, packet: &Packet) -> Option<&'static mut Flow> {
+fn flow(slot: u32, packet: &Packet) -> Option<&'static Flow> {
     let key = FlowKey {
         source: packet.source,
         destination: packet.destination,
         identification: packet.identification,
         interface: packet.interface | packet.outgoing << 31,
     };
-    if let Some(flow) = FLOWS.get_ptr_mut(key) {
-        // SAFETY: a map value pointer checked against null. An LRU entry may be given to another
-        // key while we hold it; then two flows are miscounted, no memory is.
-        let flow = unsafe { &mut *flow };
-        let reused = flow.state == state::DONE && packet.offset == 0;
-        if !reused && packet.now.wrapping_sub(flow.born) < FLOW_LIFETIME_NANOSECONDS {
+    // SAFETY: the memory of an LRU entry stays, whomever it is given to.
+    if let Some(flow) = unsafe { FLOWS.get(key) } {
+        let reused = flow.state.get() == state::DONE && packet.offset == 0;
+        if !reused && packet.now.wrapping_sub(flow.born.get()) < FLOW_LIFETIME_NANOSECONDS {
             return Some(flow);
         }
     }
     if packet.offset != 0 {
         count(slot, Counter::FragmentsWithoutFlow, 1);
     }
-    // SAFETY: NEW_FLOW is never written, so it stays all zero.
-    let empty = unsafe { &*NEW_FLOW.get_ptr(0)? };
-    FLOWS.insert(key, empty, 0).ok()?;
+    FLOWS.insert(key, NEW_FLOW.get(0)?, 0).ok()?;
     // SAFETY: as above.
-    let flow = unsafe { &mut *FLOWS.get_ptr_mut(key)? };
-    flow.born = packet.now;
-    flow.token = packet.now as u32 | 1;
+    let flow = unsafe { FLOWS.get(key) }?;
+    flow.born.set(packet.now);
+    flow.token.set(packet.now as u32 | 1);
     Some(flow)
 }
 
 /// The fragment with the UDP header.
 #[inline(always)]
-fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &mut Flow) -> u32 {
+fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u32 {
     if verdict::begin(skb, slot, scratch.get()).is_none() {
-        flow.state = state::FOREIGN;
+        flow.state.set(state::FOREIGN);
         return 0;
     }
     let begun = scratch.get();
-    begun.walk.record.datagram = flow.token;
+    begun.walk.record.datagram = flow.token.get();
     // Any fragment seen before this one was captured: so is the whole.
-    let alone = flow.seen == begun.packet.len;
+    let alone = flow.seen.get() == begun.packet.len;
     let (base, present) = (begun.packet.body + 8, begun.packet.len - 8);
     let result = if alone {
         verdict::run(skb, base, present, slot)
@@ -130,34 +132,35 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &mut Flow) 
     };
     if result >= progress::CAPTURE {
         // Also when a header is split: user space gets the datagram from its start.
-        flow.state = state::CAPTURED;
+        flow.state.set(state::CAPTURED);
         verdict::captured(slot, scratch.get());
         return 1;
     }
-    flow.state = state::WALKING;
+    flow.state.set(state::WALKING);
     keep_walk(slot, scratch, flow);
     0
 }
 
 /// A later fragment.
 #[inline(always)]
-fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &mut Flow) -> u32 {
+fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u32 {
     let going_on = scratch.get();
-    if flow.state == state::HEADLESS {
+    let state = flow.state.get();
+    if state == state::HEADLESS {
         // Nobody may fill the packet ring with fragments of nothing.
         return u32::from(verdict::charge(going_on.packet.len));
     }
-    if flow.state != state::WALKING {
+    if state != state::WALKING {
         return 1;
     }
     // In the UDP payload, which begins 8 bytes into the IP payload.
     let start = going_on.packet.offset - 8;
     let end = start + going_on.packet.len;
-    let next = flow.walk.offset;
-    if next >= end || next + 4 > flow.walk.datagram_len {
+    let next = flow.next.get();
+    if next >= end {
         return 0;
     }
-    copy(&flow.walk, &mut going_on.walk);
+    flow.walk.load(&mut going_on.walk);
     going_on.count = 0;
     going_on.unknown = 0;
     let base = going_on.packet.body.wrapping_sub(start);
@@ -178,42 +181,45 @@ fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &mut Flo
 
 /// Sends ahead what was found, but for the last record, and puts the walk's state away.
 #[inline(always)]
-fn keep_walk(slot: u32, mut scratch: Working, flow: &mut Flow) {
+fn keep_walk(slot: u32, mut scratch: Working, flow: &Flow) {
     let walked = scratch.get();
     let found = walked.count;
-    copy(&walked.walk, &mut flow.walk);
+    flow.walk.store(&walked.walk);
+    let next = walked.walk.offset;
+    let is_over = next + 4 > walked.walk.datagram_len;
+    flow.next.set(if is_over { u32::MAX } else { next });
     if found == 0 {
         return;
     }
-    send_pending(slot, flow, flag::AHEAD);
+    send_pending(slot, walked, flow);
     if found > 1 {
         verdict::flush(found - 1, u32::from(flag::AHEAD), slot);
-        flow.ahead = 1;
+        flow.ahead.set(1);
     }
     if let Some(last) = scratch.get().records.get(found as usize - 1) {
-        copy(last, &mut flow.pending);
-        flow.has_pending = 1;
+        flow.pending.store(last);
+        flow.has_pending.set(1);
     }
 }
 
 #[inline(always)]
-fn send_pending(slot: u32, flow: &mut Flow, flags: u16) {
-    if flow.has_pending != 0 {
-        flow.has_pending = 0;
-        flow.pending.flags |= flags;
-        flow.ahead = 1;
-        runs::give(slot, &flow.pending, false);
+fn send_pending(slot: u32, scratch: &mut Scratch, flow: &Flow) {
+    if flow.has_pending.get() != 0 {
+        flow.has_pending.set(0);
+        flow.ahead.set(1);
+        flow.pending.load(&mut scratch.pending);
+        scratch.pending.flags |= flag::AHEAD;
+        runs::give(slot, &scratch.pending, false);
     }
 }
 
 /// Tells user space how to go on with the datagram.
 #[inline(always)]
-fn hand_over(slot: u32, scratch: &Scratch, flow: &mut Flow) {
-    send_pending(slot, flow, flag::AHEAD);
-    flow.state = state::HANDED_OVER;
-    flow.ahead = 1;
-    let (walk, packet) = (&scratch.walk, &scratch.packet);
-    let record = &mut flow.pending;
+fn hand_over(slot: u32, scratch: &mut Scratch, flow: &Flow) {
+    send_pending(slot, scratch, flow);
+    flow.state.set(state::HANDED_OVER);
+    flow.ahead.set(1);
+    let (walk, packet, record) = (&scratch.walk, &scratch.packet, &mut scratch.pending);
     copy(&walk.record, record);
     record.time = packet.now;
     record.kind = kind::HANDOVER;
@@ -237,21 +243,21 @@ fn hand_over(slot: u32, scratch: &Scratch, flow: &mut Flow) {
     record.sample_size = 0;
     record.status_info = 0;
     count(slot, Counter::HandedOver, 1);
-    verdict::write(slot, &flow.pending);
+    verdict::write(slot, record);
+    flow.pending.store(record);
 }
 
 /// All fragments have come.
 #[inline(always)]
-fn finish(slot: u32, scratch: &Scratch, flow: &mut Flow) {
-    let (walked, handed_over) = (
-        flow.state == state::WALKING,
-        flow.state == state::HANDED_OVER,
-    );
-    flow.state = state::DONE;
+fn finish(slot: u32, scratch: &mut Scratch, flow: &Flow) {
+    let state = flow.state.get();
+    let (walked, handed_over) = (state == state::WALKING, state == state::HANDED_OVER);
+    flow.state.set(state::DONE);
     if !walked && !handed_over {
         return;
     }
-    let metered = flow.has_pending != 0 || flow.ahead != 0;
+    let (pending, ahead) = (flow.has_pending.get() != 0, flow.ahead.get() != 0);
+    let metered = pending || ahead;
     if walked {
         count(
             slot,
@@ -267,21 +273,16 @@ fn finish(slot: u32, scratch: &Scratch, flow: &mut Flow) {
         return;
     }
     count(slot, Counter::FragmentedComplete, 1);
-    if flow.has_pending == 0 {
+    let record = &mut scratch.pending;
+    flow.pending.load(record);
+    if !pending {
         // Everything was sent ahead: say that it counts now.
-        complete(flow);
+        record.kind = kind::COMPLETE;
+        record.datagram = flow.token.get();
+        record.flags &= !flag::AHEAD;
     }
-    flow.has_pending = 0;
-    flow.pending.time = scratch.packet.now;
+    flow.has_pending.set(0);
+    record.time = scratch.packet.now;
     // After records that were sent ahead, this one is the sign that the datagram is complete.
-    runs::give(slot, &flow.pending, flow.ahead == 0);
-}
-
-#[inline(always)]
-fn complete(flow: &mut Flow) {
-    let token = flow.token;
-    let record: &mut Record = &mut flow.pending;
-    record.kind = kind::COMPLETE;
-    record.datagram = token;
-    record.flags &= !flag::AHEAD;
+    runs::give(slot, record, !ahead);
 }

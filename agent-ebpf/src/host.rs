@@ -40,9 +40,9 @@ pub extern "C" fn look(skb: *mut __sk_buff, at: u32) -> u32 {
     }
     let incoming = at == hook::INGRESS;
     if incoming && let Some(last) = last() {
-        last.socket = 0;
-        last.token = 0;
-        last.told = 0;
+        last.socket.set(0);
+        last.token.set(0);
+        last.told.set(0);
     }
     let claimed = if incoming {
         claim_incoming()
@@ -112,12 +112,12 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     if at == hook::INGRESS
         && let Some(last) = last()
     {
-        last.socket = socket;
-        last.token = token;
-        last.slot = slot;
-        last.captured = u32::from(capture);
+        last.socket.set(socket);
+        last.token.set(token);
+        last.slot.set(slot);
+        last.captured.set(u32::from(capture));
         // What the program knows as its context is the packet itself.
-        last.buffer = skb as u64;
+        last.buffer.set(skb as u64);
     }
     let scratch = scratch.get();
     if !capture && scratch.count == 0 {
@@ -166,14 +166,14 @@ pub fn captured_before(slot: u32, scratch: &mut Scratch) -> bool {
     let Some(recent) = noted(scratch) else {
         return false;
     };
-    let same = scratch.packet.now.wrapping_sub(recent.time) < COPY_NANOSECONDS
-        && recent.sequence_number == record.sequence_number
-        && recent.fragment_start == record.fragment_start
-        && recent.datagram_len == scratch.walk.datagram_len
-        && recent.writer[3] == record.writer[3]
-        && recent.writer[2] == record.writer[2]
-        && recent.writer[1] == record.writer[1]
-        && recent.writer[0] == record.writer[0];
+    let same = scratch.packet.now.wrapping_sub(recent.time.get()) < COPY_NANOSECONDS
+        && recent.sequence_number.get() == record.sequence_number
+        && recent.fragment_start.get() == record.fragment_start
+        && recent.datagram_len.get() == scratch.walk.datagram_len
+        && recent.writer[3].get() == record.writer[3]
+        && recent.writer[2].get() == record.writer[2]
+        && recent.writer[1].get() == record.writer[1]
+        && recent.writer[0].get() == record.writer[0];
     if same {
         scratch.repeated = 1;
         count(slot, Counter::CopiesNotCaptured, 1);
@@ -188,15 +188,18 @@ fn note(scratch: &Scratch) {
         return;
     };
     let record = &scratch.walk.record;
-    recent.time = scratch.packet.now;
-    recent.sequence_number = record.sequence_number;
-    recent.writer = record.writer;
-    recent.fragment_start = record.fragment_start;
-    recent.datagram_len = scratch.walk.datagram_len;
+    recent.time.set(scratch.packet.now);
+    recent.sequence_number.set(record.sequence_number);
+    recent.writer[0].set(record.writer[0]);
+    recent.writer[1].set(record.writer[1]);
+    recent.writer[2].set(record.writer[2]);
+    recent.writer[3].set(record.writer[3]);
+    recent.fragment_start.set(record.fragment_start);
+    recent.datagram_len.set(scratch.walk.datagram_len);
 }
 
 #[inline(always)]
-fn noted(scratch: &Scratch) -> Option<&'static mut Recent> {
+fn noted(scratch: &Scratch) -> Option<&'static Recent> {
     let record = &scratch.walk.record;
     recent(
         record.writer[2]

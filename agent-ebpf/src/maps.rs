@@ -1,6 +1,6 @@
 //! The filter's maps and per-CPU state.
 
-use core::arch::asm;
+use core::{arch::asm, cell::UnsafeCell};
 
 use aya_ebpf::{
     macros::map,
@@ -82,10 +82,11 @@ pub static PARTICIPANTS: HashMap<[u32; 3], u64> =
     HashMap::with_max_entries(PARTICIPANT_CAPACITY, NO_PREALLOC);
 /// Unclassified writers: bytes captured so far.
 #[map]
-pub static UNKNOWN: LruHashMap<[u32; 4], u32> = LruHashMap::with_max_entries(UNKNOWN_CAPACITY, 0);
+pub static UNKNOWN: LruHashMap<[u32; 4], Shared<u32>> =
+    LruHashMap::with_max_entries(UNKNOWN_CAPACITY, 0);
 /// What unclassified writers may still cost, by `filter::Budget`.
 #[map]
-pub static BUDGET: Array<i64> = Array::with_max_entries(2, 0);
+pub static BUDGET: Array<Shared<i64>> = Array::with_max_entries(2, 0);
 /// Interfaces by index: 1 = look, 0 = leave out.
 #[map]
 pub static INTERFACES: HashMap<u32, u32> =
@@ -131,6 +132,51 @@ static RECENT: PerCpuArray<Recent> = PerCpuArray::with_max_entries(RECENT_CAPACI
 #[map]
 static LAST: PerCpuArray<Last> = PerCpuArray::with_max_entries(1, 0);
 
+/// A value that other runs of programs read and write at the same time, on this CPU or on others:
+/// there is no reference to it, only copies of it come and go.
+#[repr(transparent)]
+pub struct Shared<T>(UnsafeCell<T>);
+
+// SAFETY: map values live in the kernel's memory, all zero or copied there. Runs that race may see
+// each other's values or lose their own; each use says what that costs.
+unsafe impl<T> Sync for Shared<T> {}
+
+impl<T: Copy> Shared<T> {
+    /// A value to be put into a map.
+    #[inline(always)]
+    pub const fn new(value: T) -> Self {
+        Self(UnsafeCell::new(value))
+    }
+
+    /// A number.
+    #[inline(always)]
+    pub fn get(&self) -> T {
+        // SAFETY: valid and aligned, as `self` is.
+        unsafe { self.0.get().read_volatile() }
+    }
+
+    /// Replaces a number.
+    #[inline(always)]
+    pub fn set(&self, value: T) {
+        // SAFETY: as above.
+        unsafe { self.0.get().write_volatile(value) }
+    }
+
+    /// Copies a whole value out.
+    #[inline(always)]
+    pub fn load(&self, to: &mut T) {
+        // SAFETY: as above; an exclusive reference is to something else.
+        unsafe { core::ptr::copy_nonoverlapping(self.0.get(), to, 1) }
+    }
+
+    /// Copies a whole value in.
+    #[inline(always)]
+    pub fn store(&self, from: &T) {
+        // SAFETY: as above; a reference to what never changes is to something else.
+        unsafe { core::ptr::copy_nonoverlapping(from, self.0.get(), 1) }
+    }
+}
+
 /// Names one fragmented datagram (RFC 791, RFC 8200 4.5), per interface and direction.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -163,33 +209,36 @@ pub struct RunKey {
     pub cpu: u32,
 }
 
-/// Where [`RunKey`]s are put together.
+/// Where [`RunKey`]s are put together, and the run that is worked on.
 #[repr(C)]
 pub struct RunKeys {
     pub here: RunKey,
     pub elsewhere: RunKey,
+    pub run: Record,
 }
 
 /// What is known of a fragmented datagram so far.
 #[repr(C)]
-#[derive(Clone, Copy)]
 pub struct Flow {
-    pub walk: Walk,
+    pub walk: Shared<Walk>,
     /// The last record found, written once the datagram is complete.
-    pub pending: Record,
-    pub born: u64,
+    pub pending: Shared<Record>,
+    pub born: Shared<u64>,
     /// IP payload bytes seen.
-    pub seen: u32,
+    pub seen: Shared<u32>,
     /// IP payload bytes in all, 0 until the last fragment has come.
-    pub expected: u32,
+    pub expected: Shared<u32>,
     /// Starts of fragments seen, a bit for every 8 bytes (RFC 791): a link with a smaller MTU may cut
     /// so few off.
-    pub starts: [u64; 128],
-    pub state: u32,
-    pub has_pending: u32,
+    pub starts: [Shared<u64>; 128],
+    pub state: Shared<u32>,
+    pub has_pending: Shared<u32>,
     /// Records were sent ahead, so user space waits to hear that the datagram is complete.
-    pub ahead: u32,
-    pub token: u32,
+    pub ahead: Shared<u32>,
+    pub token: Shared<u32>,
+    /// Where in the UDP payload the walk goes on; `u32::MAX` = nowhere.
+    pub next: Shared<u32>,
+    pub unused: u32,
 }
 
 /// The IP packet at hand.
@@ -222,6 +271,8 @@ pub struct Scratch {
     pub walk: Walk,
     pub packet: Packet,
     pub records: [Record; RECORDS_PER_DATAGRAM as usize],
+    /// A record of a fragmented datagram on its way to user space.
+    pub pending: Record,
     /// How many of `records` are filled.
     pub count: u32,
     /// The capture is owed to an unclassified writer.
@@ -242,11 +293,11 @@ pub struct Scratch {
 /// A datagram that was captured, by the submessage that asked for it.
 #[repr(C)]
 pub struct Recent {
-    pub time: u64,
-    pub sequence_number: u64,
-    pub writer: [u32; 4],
-    pub fragment_start: u32,
-    pub datagram_len: u32,
+    pub time: Shared<u64>,
+    pub sequence_number: Shared<u64>,
+    pub writer: [Shared<u32>; 4],
+    pub fragment_start: Shared<u32>,
+    pub datagram_len: Shared<u32>,
 }
 
 /// What the host hook leaves for a program that learns, directly afterwards and on the same CPU,
@@ -255,18 +306,18 @@ pub struct Recent {
 #[repr(C)]
 pub struct Last {
     /// The receiving socket; 0 = the datagram was not RTPS.
-    pub socket: u64,
+    pub socket: Shared<u64>,
     /// The datagram's name, as in `scratch(slot).walk.record.datagram` unless that has moved on.
-    pub token: u32,
+    pub token: Shared<u32>,
     /// Of the working memory with its records, see `Scratch::count`.
-    pub slot: u32,
+    pub slot: Shared<u32>,
     /// 1 = captured, then there are no records.
-    pub captured: u32,
+    pub captured: Shared<u32>,
     pub unused: u32,
     /// Address of the kernel's packet, by which its end is known.
-    pub buffer: u64,
+    pub buffer: Shared<u64>,
     /// The socket of which it has been told that it had no room.
-    pub told: u64,
+    pub told: Shared<u64>,
 }
 
 /// A piece with room for the longest.
@@ -366,22 +417,25 @@ pub fn piece(slot: u32) -> Option<&'static mut PieceBuffer> {
     PIECE.get_ptr_mut(slot).map(|piece| unsafe { &mut *piece })
 }
 
-/// Where a capture with this hash is noted.
+/// What there is so far of a run.
 #[inline(always)]
-pub fn recent(hash: u32) -> Option<&'static mut Recent> {
-    // SAFETY: a map value pointer checked against null. Runs that interrupt each other here may
-    // capture a copy more or note a capture that is half another's: that matches nothing.
-    RECENT
-        .get_ptr_mut(hash & (RECENT_CAPACITY - 1))
-        .map(|recent| unsafe { &mut *recent })
+pub fn run(key: &RunKey) -> Option<&'static Shared<Record>> {
+    // SAFETY: a map value pointer checked against null; a `Shared<Record>` is laid out as a `Record`.
+    RUNS.get_ptr_mut(key).map(|run| unsafe { &*run.cast() })
 }
 
-/// This CPU's last datagram on its way in.
+/// Where a capture with this hash is noted. Runs that interrupt each other here may capture a copy
+/// more or note a capture that is half another's: that matches nothing.
 #[inline(always)]
-pub fn last() -> Option<&'static mut Last> {
-    // SAFETY: a map value pointer checked against null; datagrams on their way in are handled one
-    // after the other on a CPU.
-    LAST.get_ptr_mut(0).map(|last| unsafe { &mut *last })
+pub fn recent(hash: u32) -> Option<&'static Recent> {
+    RECENT.get(hash & (RECENT_CAPACITY - 1))
+}
+
+/// This CPU's last datagram on its way in: those are handled one after the other on a CPU. Packets
+/// that are thrown away between two of them may look, too.
+#[inline(always)]
+pub fn last() -> Option<&'static Last> {
+    LAST.get(0)
 }
 
 /// Adds to a counter of this CPU and slot.

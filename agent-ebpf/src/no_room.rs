@@ -30,7 +30,7 @@ const COMPARED_NANOSECONDS: u64 = 10_000_000;
 #[inline(always)]
 pub fn refused(context: &RawTracePointContext) {
     let Some(last) = last() else { return };
-    let seen = last.socket;
+    let seen = last.socket.get();
     let mut socket = seen;
     if place(Layout::SocketCookie) != Layout::ABSENT {
         let sk: u64 = context.arg(1);
@@ -38,7 +38,7 @@ pub fn refused(context: &RawTracePointContext) {
     }
     if seen == 0 {
         // Not RTPS, or told already.
-        if last.told != socket {
+        if last.told.get() != socket {
             refusal(socket);
         }
         return;
@@ -71,7 +71,7 @@ pub fn freed(context: &RawTracePointContext) {
 pub fn unexplained(context: &RawTracePointContext) {
     let buffer: u64 = context.arg(0);
     let Some(last) = seen(buffer) else { return };
-    let Some(mut scratch) = scratch(last.slot) else {
+    let Some(mut scratch) = scratch(last.slot.get()) else {
         return;
     };
     let record = &scratch.get().walk.record;
@@ -103,14 +103,15 @@ fn is_of(buffer: u64, record: &Record) -> Option<()> {
 
 /// The hook's last datagram, if this is it and nothing has been told of its end.
 #[inline(always)]
-fn seen(buffer: u64) -> Option<&'static mut Last> {
-    last().filter(|last| last.socket != 0 && last.buffer == buffer)
+fn seen(buffer: u64) -> Option<&'static Last> {
+    last().filter(|last| last.socket.get() != 0 && last.buffer.get() == buffer)
 }
 
 #[inline(always)]
-fn end(last: &mut Last) {
-    refusal(last.socket);
-    last.told = last.socket;
+fn end(last: &Last) {
+    let socket = last.socket.get();
+    refusal(socket);
+    last.told.set(socket);
     tell(last);
 }
 
@@ -124,10 +125,10 @@ fn refusal(socket: u64) {
 }
 
 #[inline(always)]
-fn tell(last: &mut Last) {
-    last.socket = 0;
+fn tell(last: &Last) {
+    last.socket.set(0);
     count_outside(Counter::NoRoom, 1);
-    undelivered(last.slot, last.token, last.captured);
+    undelivered(last.slot.get(), last.token.get(), last.captured.get());
 }
 
 /// Writes what the hook left in `slot` again.

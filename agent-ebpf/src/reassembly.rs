@@ -65,7 +65,7 @@ struct Incomplete {
 
 #[inline(always)]
 fn incomplete() -> Option<&'static mut Incomplete> {
-    // SAFETY: one program run at a time uses a CPU's entry, see `INCOMPLETE`.
+    // SAFETY: the run that has claimed a CPU's entry uses it alone, and one reference at a time.
     INCOMPLETE
         .get_ptr_mut(0)
         .map(|incomplete| unsafe { &mut *incomplete })
@@ -123,12 +123,15 @@ pub fn unexplained(context: &RawTracePointContext) {
 
 #[inline(always)]
 fn look(skb: u64, why: Why) {
-    let Some(this) = incomplete() else { return };
-    let claims = &raw mut this.claims;
+    let Some(this) = INCOMPLETE.get_ptr_mut(0) else {
+        return;
+    };
+    // SAFETY: a map value pointer checked against null.
+    let claims = unsafe { &raw mut (*this).claims };
     add(claims, 1);
     // SAFETY: a field of a map value; see `maps::claim`.
     if unsafe { core::ptr::read_volatile(claims) } == 1 {
-        let _ = fragment(skb, why, this);
+        let _ = fragment(skb, why);
     } else {
         count_outside(Counter::Contended, 1);
     }
@@ -136,7 +139,8 @@ fn look(skb: u64, why: Why) {
 }
 
 #[inline(always)]
-fn fragment(skb: u64, why: Why, this: &mut Incomplete) -> Option<()> {
+fn fragment(skb: u64, why: Why) -> Option<()> {
+    let this = incomplete()?;
     let head: u64 = member(skb, Layout::BufferHead)?;
     let tail: u32 = member(skb, Layout::BufferTail)?;
     let network: u16 = member(skb, Layout::BufferNetworkHeader)?;

@@ -9,7 +9,7 @@ use aya_ebpf::helpers::bpf_get_smp_processor_id;
 use ros2probe_wire::record::{Record, flag, kind};
 
 use crate::{
-    maps::{RUN_CPUS, RUNS, RunKeys, copy, run_keys},
+    maps::{RUN_CPUS, RUNS, RunKeys, copy, run, run_keys},
     verdict::write,
 };
 
@@ -33,22 +33,24 @@ pub fn give(slot: u32, record: &Record, joins: bool) {
     // SAFETY: no preconditions.
     keys.here.cpu = unsafe { bpf_get_smp_processor_id() } as u32;
     let mut goes_on = false;
-    if let Some(run) = RUNS.get_ptr_mut(&keys.here) {
-        // SAFETY: a map value pointer checked against null; the key names this CPU, and packet taps
-        // run with bottom halves disabled, so nobody else adds to it. A task that sends may be
-        // preempted here: should another send fragments of the same writer from the same socket
-        // then, fragments are counted in two records or not at all, but memory is not at stake.
-        let run = unsafe { &mut *run };
+    // The key names this CPU, and packet taps run with bottom halves disabled, so nobody else adds to
+    // it. A task that sends may be preempted here: should another send fragments of the same writer
+    // from the same socket then, fragments are counted in two records or not at all.
+    if let Some(known) = run(&keys.here) {
+        let run = &mut keys.run;
+        known.load(run);
         if joins && run.extend(record) {
             if run.ends_sample() {
                 write(slot, run);
                 let _ = RUNS.remove(&keys.here);
+            } else {
+                known.store(run);
             }
             return;
         }
         write(slot, run);
         if joins && begins(record) {
-            copy(record, run);
+            known.store(record);
             return;
         }
         let _ = RUNS.remove(&keys.here);
@@ -86,13 +88,13 @@ fn take_over(slot: u32, keys: &mut RunKeys, record: &Record) -> bool {
     unsafe { *last = keys.here.cpu };
     copy(&keys.here.stream, &mut keys.elsewhere.stream);
     keys.elsewhere.cpu = before;
-    let Some(run) = RUNS.get_ptr_mut(&keys.elsewhere) else {
+    // The other CPU has nothing to add to this run, whose next fragment is here; should it write the
+    // run at this very moment too, fragments are seen twice, which counts nothing.
+    let Some(known) = run(&keys.elsewhere) else {
         return false;
     };
-    // SAFETY: a map value pointer checked against null. The other CPU has nothing to add to this
-    // run, whose next fragment is here; should it write the run at this very moment too, fragments
-    // are seen twice, which counts nothing.
-    let run = unsafe { &mut *run };
+    let run = &mut keys.run;
+    known.load(run);
     let goes_on = run.is_followed_by(record);
     write(slot, run);
     let _ = RUNS.remove(&keys.elsewhere);

@@ -10,8 +10,8 @@ use ros2probe_wire::{
 use crate::{
     host,
     maps::{
-        BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, UNKNOWN, copy,
-        count, count_outside, opaque, scratch, setting,
+        BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, Shared, UNKNOWN,
+        copy, count, count_outside, opaque, scratch, setting,
     },
     packet::{Payload, load},
     runs,
@@ -259,20 +259,22 @@ pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
 #[inline(always)]
 fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     let len = scratch.walk.datagram_len;
-    let used = match UNKNOWN.get_ptr_mut(key) {
+    // SAFETY: an LRU entry may be given to another key while we hold it, its memory stays: then two
+    // writers are charged for each other.
+    let used = match unsafe { UNKNOWN.get(key) } {
         Some(used) => used,
         None => {
-            let _ = UNKNOWN.insert(key, 0, 0);
-            match UNKNOWN.get_ptr_mut(key) {
+            let _ = UNKNOWN.insert(key, Shared::new(0), 0);
+            // SAFETY: as above.
+            match unsafe { UNKNOWN.get(key) } {
                 Some(used) => used,
                 None => return progress::ON,
             }
         }
     };
-    // SAFETY: a map value pointer checked against null.
-    let used = unsafe { &mut *used };
-    if *used < UNKNOWN_CAPTURE_BYTES && !host::captured_before(slot, scratch) && charge(len) {
-        *used += len;
+    let so_far = used.get();
+    if so_far < UNKNOWN_CAPTURE_BYTES && !host::captured_before(slot, scratch) && charge(len) {
+        used.set(so_far + len);
         scratch.unknown = 1;
         return progress::CAPTURE;
     }
@@ -290,20 +292,18 @@ pub fn charge(len: u32) -> bool {
     spend(Budget::CaptureBytes, len)
 }
 
-/// Takes from a budget, if there is anything left.
+/// Takes from a budget, if there is anything left. It is a budget, not an account: CPUs that race may
+/// overdraw it by a datagram.
 #[inline(always)]
 pub fn spend(budget: Budget, amount: u32) -> bool {
-    let Some(left) = BUDGET.get_ptr_mut(budget as u32) else {
+    let Some(budget) = BUDGET.get(budget as u32) else {
         return false;
     };
-    // SAFETY: a map value pointer checked against null. It is a budget, not an account: CPUs that
-    // race may overdraw it by a datagram.
-    let left = unsafe { &mut *left };
-    let granted = *left > 0;
-    if granted {
-        *left -= i64::from(amount);
+    let left = budget.get();
+    if left > 0 {
+        budget.set(left - i64::from(amount));
     }
-    granted
+    left > 0
 }
 
 /// Counts a datagram that goes to user space.
