@@ -12,7 +12,9 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Packet, Scratch, Working, copy, count, opaque, scratch},
+    maps::{
+        FLOWS, Flow, FlowKey, NEW_FLOW, Packet, Scratch, Working, copy, count, opaque, scratch,
+    },
     runs,
     verdict::{self, progress},
 };

@@ -27,6 +27,8 @@ use crate::{
 /// copies of one datagram one after the other, in microseconds; a writer that repeats itself waits
 /// for an answer first.
 const COPY_NANOSECONDS: u64 = 1_000_000;
+/// How long a socket that goes on alone is not looked for: a table that others fill forgets it.
+const MET_NANOSECONDS: u64 = 500_000_000;
 const TCP: u8 = 6;
 const ICMPV6: u8 = 58;
 const UDP: u8 = 17;
@@ -123,10 +125,11 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     if !capture && scratch.count == 0 {
         return None;
     }
-    if scratch.met == socket {
+    let now = scratch.packet.now;
+    if scratch.met == socket && now.wrapping_sub(scratch.met_at) < MET_NANOSECONDS {
         return None;
     }
-    scratch.met = socket;
+    (scratch.met, scratch.met_at) = (socket, now);
     if SOCKETS.get_ptr(socket).is_none() {
         let met = Socket {
             // SAFETY: `skb` is the program's context.

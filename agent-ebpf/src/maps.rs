@@ -282,8 +282,9 @@ pub struct Scratch {
     /// The participant that was last heard, and when that was noted in [`PARTICIPANTS`].
     pub heard: [u32; 3],
     pub heard_at: u64,
-    /// Host hook: the socket that was last looked for in [`SOCKETS`].
+    /// Host hook: the socket that was last looked for in [`SOCKETS`], and when.
     pub met: u64,
+    pub met_at: u64,
     /// Host hook: datagrams that this slot has named.
     pub named: u32,
     /// Runs that hold this slot or are about to notice that they do not.

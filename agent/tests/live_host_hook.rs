@@ -28,10 +28,12 @@ use harness::network::{Link, Namespace};
 use harness::{PREFIX, run};
 use ros2probe::capture::filter::{Filter, FilterSettings};
 use ros2probe::capture::netns;
+use ros2probe::capture::sockets::Sockets;
+use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_wire::filter::Counter;
-use ros2probe_wire::host::Piece;
+use ros2probe_wire::host::{Piece, SOCKET_CAPACITY};
 use ros2probe_wire::record::{Record, Verdict, flag, kind};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 const WRITER: Guid = Guid::new(GuidPrefix(*b"\x01\x0fhosthookho"), EntityId([0, 0, 1, 3]));
 const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
@@ -356,6 +358,76 @@ fn a_full_ring_costs_captures_and_nothing_else() -> Result<()> {
     assert_eq!(whole, 17, "as many as a ring of a megabyte holds");
     let attempts = observed.counter(Counter::Captured)?;
     assert_eq!(attempts, whole as u64 + lost, "each is told");
+    Ok(())
+}
+
+#[test]
+fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go() -> Result<()> {
+    const AT_ONCE: usize = 500;
+    const SECOND: u64 = 1_000_000_000;
+    let cpus = std::thread::available_parallelism()?.get();
+    ensure!(
+        cpus >= 2,
+        "others are not met on another CPU: run this on two"
+    );
+    let host = Namespace::alone()?;
+    let mut observed = Observed::new(Verdict::Meter)?;
+    let bind = || UdpSocket::bind("127.0.0.1:0");
+    let sender = netns::within(&forged::path(&host), bind)??;
+    let used = observed.socket(&host, "127.0.0.1:0")?;
+    let mut numbers = 1..;
+    let mut arrives = |observed: &mut Observed, cpu, socket: &UdpSocket| -> Result<()> {
+        // Whom a CPU delivers to alone, it need not look for each time.
+        program_run::go_to_cpu(cpu);
+        sender.send_to(&payload(numbers.next().unwrap(), 64), socket.local_addr()?)?;
+        socket.recv(&mut [0; 64])?;
+        let records = observed.records();
+        assert_eq!(records.len(), 1, "what arrives counts as before");
+        assert_eq!(records[0].socket, cookie(socket));
+        Ok(())
+    };
+    let mut sockets = Sockets::new(observed.cgroup.path().to_owned());
+    let mut observer = Observer::new(Settings::default());
+    let (mut met, mut now) = (1, 0);
+    let mut forgotten = |observed: &Observed| {
+        now += 3 * SECOND;
+        sockets.follow(&observed.filter, now, &mut observer);
+        let snapshot = observer.snapshot(Timestamp(now));
+        let table = snapshot
+            .tables
+            .iter()
+            .find(|table| table.table == "sockets");
+        table.unwrap().evictions
+    };
+    arrives(&mut observed, 0, &used)?;
+    assert_eq!(forgotten(&observed), 0);
+    while met < 2 * SOCKET_CAPACITY as usize {
+        let make = || (0..AT_ONCE).map(|_| bind()).collect::<io::Result<Vec<_>>>();
+        let others = observed.make(&host, make)??;
+        for other in &others {
+            arrives(&mut observed, 1, other)?;
+        }
+        met += others.len();
+        arrives(&mut observed, 0, &used)?;
+        let count = observed.filter.sockets().count();
+        assert!(
+            count <= met.min(SOCKET_CAPACITY as usize),
+            "{count} of {met}"
+        );
+        forgotten(&observed);
+    }
+    let told = forgotten(&observed) as usize;
+    println!("{told} of {met} forgotten");
+    let room = SOCKET_CAPACITY as usize;
+    assert!(
+        (met - room..=met - room * 3 / 4).contains(&told),
+        "{told} of {met}"
+    );
+    let deadline = Instant::now() + Duration::from_secs(5);
+    while observed.filter.socket(cookie(&used))?.is_none() {
+        ensure!(Instant::now() < deadline, "a socket in use is not met anew");
+        arrives(&mut observed, 0, &used)?;
+    }
     Ok(())
 }
 

@@ -92,7 +92,11 @@ impl Sockets {
         self.known.retain(|cookie, known| {
             let stays = met.contains_key(cookie);
             if !stays && known.told.is_some() {
-                observer.socket_closed(*cookie);
+                if known.may_be_open() {
+                    observer.socket_forgotten(*cookie);
+                } else {
+                    observer.socket_closed(*cookie);
+                }
             }
             stays
         });
@@ -153,6 +157,11 @@ impl Sockets {
 }
 
 impl Known {
+    /// Somebody has it open, or nobody can say.
+    const fn may_be_open(&self) -> bool {
+        self.owner.is_some() || self.questions < MOST_QUESTIONS
+    }
+
     /// What the socket dropped beyond what was named.
     fn unnamed(&self, socket: &Socket) -> Option<u64> {
         let dropped = u64::from(self.owner.as_ref()?.drops?);

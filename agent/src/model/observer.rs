@@ -428,6 +428,11 @@ impl Observer {
         self.receivers.socket_closed(cookie);
     }
 
+    /// This socket may be open, but the kernel remembers others in its place.
+    pub fn socket_forgotten(&mut self, cookie: u64) {
+        self.receivers.socket_forgotten(cookie);
+    }
+
     /// Takes over what was known before the start, until one lease from `now` on at most.
     pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
         let now = self.calendar.even(now);

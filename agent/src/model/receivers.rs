@@ -165,6 +165,12 @@ impl Receivers {
         self.generation += 1;
     }
 
+    /// This socket may be open, but the kernel remembers others in its place.
+    pub fn socket_forgotten(&mut self, cookie: u64) {
+        self.sockets.forget(cookie);
+        self.socket_closed(cookie);
+    }
+
     /// This socket is no more.
     pub fn socket_closed(&mut self, cookie: u64) {
         self.sockets.remove(cookie);

@@ -59,13 +59,19 @@ impl Sockets {
         self.sockets.remove(&cookie).is_some()
     }
 
+    /// One that is open was forgotten where sockets are told from: others took its place.
+    pub fn forget(&mut self, cookie: u64) {
+        self.evictions += 1;
+        self.remove(cookie);
+    }
+
     /// One of them.
     #[must_use]
     pub fn get(&self, cookie: u64) -> Option<&SocketFacts> {
         self.sockets.get(&cookie)
     }
 
-    /// Entries, cap, and sockets refused because of it.
+    /// Entries, cap, and sockets refused or forgotten because of one.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
         (self.sockets.len(), self.limit, self.evictions)
@@ -90,5 +96,7 @@ mod tests {
         assert_eq!(sockets.get(2).map(|each| each.unidentified_drops), Some(7));
         assert_eq!((sockets.get(3), sockets.size()), (None, (2, 2, 1)));
         assert!(sockets.remove(1) && sockets.put(socket(3, 0)));
+        sockets.forget(3);
+        assert_eq!((sockets.get(3), sockets.size()), (None, (1, 2, 2)));
     }
 }
