@@ -275,7 +275,7 @@ impl Place {
             return false;
         }
         self.changed = changed.filter(|_| settled);
-        self.files.clear();
+        let known = std::mem::take(&mut self.files);
         let Ok(entries) = fs::read_dir(&self.path) else {
             return true;
         };
@@ -293,13 +293,30 @@ impl Place {
                 locks.push((name, entry.ino()));
             }
         }
-        *left_out += u64::from(entries.next().is_some());
+        if entries.next().is_some() {
+            *left_out += 1;
+            files = self.keep(files, known);
+        }
         *left_out += files.len().saturating_sub(MAX_FILES) as u64;
         if files.len() > MAX_FILES {
             files = self.choose(files, &locks);
         }
         self.files.extend(files);
         true
+    }
+
+    /// Of a directory that was not looked through to its end the files that were `listed`, and those
+    /// `known` before that are still there.
+    fn keep(&self, listed: Vec<(Name, u64)>, known: HashMap<Name, u64>) -> Vec<(Name, u64)> {
+        let mut files: HashMap<Name, u64> = listed.into_iter().collect();
+        for (name, inode) in known {
+            let metadata = || fs::symlink_metadata(self.path.join(name.file_name()));
+            let is_same = |metadata: Metadata| metadata.is_file() && metadata.ino() == inode;
+            if !files.contains_key(&name) && metadata().is_ok_and(is_same) {
+                files.insert(name, inode);
+            }
+        }
+        files.into_iter().collect()
     }
 
     /// Of too many files those whose processes live, and of those that are left as many of each
@@ -456,6 +473,47 @@ mod tests {
         }
         assert!(places.left_out > 0);
         drop(locks);
+    }
+
+    #[test]
+    fn of_more_entries_than_are_looked_through_those_of_files_that_were_known_stay() {
+        let directory = tempfile::tempdir_in(SHARED_MEMORY).unwrap();
+        let path = |name: &str| directory.path().join(name);
+        let flood = |numbers: std::ops::Range<usize>| {
+            for number in numbers {
+                fs::File::create(path(&format!("fastrtps_{number:016x}"))).unwrap();
+            }
+        };
+        let real = ["fastrtps_port7411", "fastrtps_port7413"];
+        let make = |name: &str| {
+            fs::File::create(path(name)).unwrap();
+            std::os::unix::fs::chown(path(name), Some(64_123), None).unwrap();
+        };
+        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        places.find();
+        // Whichever end of the directory the file system lists first.
+        make(real[0]);
+        flood(0..MAX_LISTED - real.len());
+        make(real[1]);
+        places.list();
+        assert_eq!(places.left_out, (MAX_LISTED - MAX_FILES) as u64);
+        let has_real = |places: &Places| {
+            let found = files(places);
+            assert_eq!(found.len(), MAX_FILES);
+            real.map(|name| found.contains(&Name::parse(name).unwrap()))
+        };
+        assert_eq!(has_real(&places), [true; 2]);
+        flood(MAX_LISTED..MAX_LISTED + 2 * MAX_FILES);
+        places.left_out = 0;
+        places.list();
+        // One for all entries that were not looked at, and the files beyond those that are kept.
+        let left_out = usize::try_from(places.left_out).unwrap();
+        let bound = 1 + MAX_LISTED - MAX_FILES..=1 + MAX_LISTED;
+        assert!(bound.contains(&left_out), "{left_out}");
+        assert_eq!(has_real(&places), [true; 2]);
+        fs::remove_file(path(real[0])).unwrap();
+        places.list();
+        assert_eq!(has_real(&places), [false, true]);
     }
 
     #[test]
