@@ -11,13 +11,16 @@ mod program_run;
 
 use std::collections::BTreeMap;
 
-use program_run::Kernel;
+use program_run::{Hook, Kernel};
+use ros2probe::capture::intake::{Intake, MAX_WAITING};
+use ros2probe::capture::system::Clocks;
+use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_wire::filter::{
     Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,
     RUN_CAPACITY, UNKNOWN_CAPACITY, UNKNOWN_CAPTURE_BYTES,
 };
 use ros2probe_wire::record::Verdict;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
 fn prefix(number: u32) -> GuidPrefix {
     let mut prefix = [6; 12];
@@ -137,4 +140,55 @@ fn runs_beyond_the_table_are_a_record_for_each_fragment() {
     println!("{written} written, {waiting} waiting");
     assert_eq!(written + waiting, 2 * capacity);
     assert!(waiting <= capacity && waiting * 10 >= capacity * 9);
+}
+
+#[test]
+fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted() {
+    const SECOND: u64 = 1_000_000_000;
+    const SAMPLES: u32 = 32;
+    let mut kernel = Kernel::load_hook(Hook::Ingress);
+    kernel.set_interest(&BTreeMap::from([(writer(0), Verdict::Meter)]));
+    let mut intake = Intake::new(kernel.filter);
+    let mut observer = Observer::new(Settings::default());
+    let counter = |intake: &Intake, which| {
+        let counters = intake.filter().counters().unwrap();
+        let found = counters.iter().find(|(counter, _)| *counter == which);
+        found.unwrap().1
+    };
+    let mut sent = 0;
+    let mut send = |intake: &Intake| {
+        let message = program_run::message(writer(0), sent + 1..=sent + SAMPLES, 16);
+        program_run::run(
+            intake.filter().program(),
+            &program_run::datagram(&message),
+            1,
+        );
+        sent += SAMPLES;
+        sent
+    };
+    // All that comes is younger than this, so none of it is settled.
+    let before = Clocks::read();
+    while counter(&intake, Counter::RecordsLost) == 0 {
+        for _ in 0..50 {
+            send(&intake);
+        }
+        intake.take_in(&before, &mut observer);
+    }
+    let taken = intake.copied_bytes() as usize / size_of::<Record>();
+    assert_eq!(taken, MAX_WAITING);
+    assert_eq!(observer.snapshot(before.now).records, 0);
+
+    // Once they count there is room again: what was in the ring counts too, and what comes.
+    let mut later = Clocks::read();
+    later.now = Timestamp(later.now.0 + SECOND);
+    later.monotonic += SECOND;
+    intake.take_in(&later, &mut observer);
+    let lost = counter(&intake, Counter::RecordsLost);
+    let sent = u64::from(send(&intake));
+    later.monotonic += SECOND;
+    intake.take_in(&later, &mut observer);
+    let counted = observer.snapshot(later.now).records;
+    println!("{sent} sent, {lost} lost, {counted} counted");
+    assert_eq!(counter(&intake, Counter::RecordsLost), lost);
+    assert_eq!(counted, sent - lost);
 }

@@ -33,7 +33,7 @@ const PIECES_PER_ROUND: usize = 32_768;
 /// records before are counted.
 const RECORDS_BETWEEN: usize = 1024;
 /// Records that wait at most, 18 MB; more stay in the ring, and are lost where they find no room.
-const MAX_WAITING: usize = 131_072;
+pub const MAX_WAITING: usize = 131_072;
 
 /// One filter's maps and what they held.
 pub struct Intake {

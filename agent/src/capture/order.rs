@@ -92,7 +92,7 @@ impl Order {
     /// Records of the kernel's ring that wait.
     #[must_use]
     pub fn waiting(&self) -> usize {
-        self.kernel.len()
+        self.kernel.len() + self.no_room.len()
     }
 
     /// The oldest record, if it is not younger than `until` in the kernel's clock.

@@ -283,63 +283,68 @@ impl Kernel {
         instructions
     }
 
-    /// BPF_PROG_TEST_RUN: what the program returns, and the mean time it takes.
+    /// As [`run`], of this hook's program.
     pub fn run(&self, packet: &[u8], repeat: u32) -> (u32, Duration) {
-        /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
-        #[repr(C)]
-        #[derive(Default)]
-        struct TestRun {
-            prog_fd: u32,
-            retval: u32,
-            data_size_in: u32,
-            data_size_out: u32,
-            data_in: u64,
-            data_out: u64,
-            repeat: u32,
-            duration: u32,
-            ctx_size_in: u32,
-            ctx_size_out: u32,
-            ctx_in: u64,
-            ctx_out: u64,
-        }
-        const BPF_PROG_TEST_RUN: libc::c_int = 10;
-        let ether_type = if packet[0] >> 4 == 4 {
-            [0x08, 0x00]
-        } else {
-            [0x86, 0xdd]
-        };
-        let frame = [
-            &[2, 0, 0, 0, 0, 1, 2, 0, 0, 0, 0, 2][..],
-            &ether_type,
-            packet,
-        ]
-        .concat();
-        let mut attributes = TestRun {
-            prog_fd: self.program().as_raw_fd().cast_unsigned(),
-            data_size_in: u32::try_from(frame.len()).unwrap(),
-            data_in: frame.as_ptr() as u64,
-            repeat,
-            ..TestRun::default()
-        };
-        // SAFETY: the attribute's size is given, and `frame` outlives the call.
-        let result = unsafe {
-            libc::syscall(
-                libc::SYS_bpf,
-                BPF_PROG_TEST_RUN,
-                &raw mut attributes,
-                size_of::<TestRun>(),
-            )
-        };
-        assert!(
-            result >= 0,
-            "BPF_PROG_TEST_RUN: {}",
-            io::Error::last_os_error()
-        );
-        (
-            attributes.retval,
-            Duration::from_nanos(attributes.duration.into()),
-        )
+        run(self.program(), packet, repeat)
     }
+}
+
+/// BPF_PROG_TEST_RUN: what the program returns, and the mean time it takes.
+pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duration) {
+    /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
+    #[repr(C)]
+    #[derive(Default)]
+    struct TestRun {
+        prog_fd: u32,
+        retval: u32,
+        data_size_in: u32,
+        data_size_out: u32,
+        data_in: u64,
+        data_out: u64,
+        repeat: u32,
+        duration: u32,
+        ctx_size_in: u32,
+        ctx_size_out: u32,
+        ctx_in: u64,
+        ctx_out: u64,
+    }
+    const BPF_PROG_TEST_RUN: libc::c_int = 10;
+    let ether_type = if packet[0] >> 4 == 4 {
+        [0x08, 0x00]
+    } else {
+        [0x86, 0xdd]
+    };
+    let frame = [
+        &[2, 0, 0, 0, 0, 1, 2, 0, 0, 0, 0, 2][..],
+        &ether_type,
+        packet,
+    ]
+    .concat();
+    let mut attributes = TestRun {
+        prog_fd: program.as_raw_fd().cast_unsigned(),
+        data_size_in: u32::try_from(frame.len()).unwrap(),
+        data_in: frame.as_ptr() as u64,
+        repeat,
+        ..TestRun::default()
+    };
+    // SAFETY: the attribute's size is given, and `frame` outlives the call.
+    let result = unsafe {
+        libc::syscall(
+            libc::SYS_bpf,
+            BPF_PROG_TEST_RUN,
+            &raw mut attributes,
+            size_of::<TestRun>(),
+        )
+    };
+    assert!(
+        result >= 0,
+        "BPF_PROG_TEST_RUN: {}",
+        io::Error::last_os_error()
+    );
+    (
+        attributes.retval,
+        Duration::from_nanos(attributes.duration.into()),
+    )
 }
 
 /// Keeps this thread on the CPU that it is on, which another test may leave alone.

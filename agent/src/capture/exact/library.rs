@@ -279,7 +279,7 @@ fn array<const N: usize>(file: &File, offset: u64) -> Result<[u8; N], LibraryErr
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use std::io::Write as _;
 
     use super::*;
@@ -334,6 +334,11 @@ mod tests {
         bytes.resize(0x500, 0);
         bytes.extend(names);
         bytes
+    }
+
+    /// A 2.x library that can be attached to.
+    pub fn library() -> Vec<u8> {
+        image(&format!("{FUNCTION}{OF_2}"), &[0x41, 0x54, 0x55, 0x53])
     }
 
     fn found(bytes: &[u8]) -> Result<Entry, LibraryError> {

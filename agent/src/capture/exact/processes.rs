@@ -123,6 +123,20 @@ impl Processes {
         }
     }
 
+    /// One process, found already.
+    #[cfg(test)]
+    pub(super) fn of(process: u32, use_of_it: Use) -> Self {
+        let known = Process {
+            met: 1,
+            use_of_it,
+            is_closed: false,
+        };
+        Self {
+            scope: Scope::Directories(Vec::new()),
+            known: HashMap::from([(process, known)]),
+        }
+    }
+
     /// Looks which there are. `all`: also at those that had nothing to do with Fast DDS lately.
     pub fn find(&mut self, all: bool) {
         let mut before = std::mem::take(&mut self.known);

@@ -452,3 +452,72 @@ fn attach(probes: &mut Probes, path: &Path) -> Result<Probe, Refusal> {
     let entry = library::find(&file)?;
     Ok(probes.attach(&file, entry.offset, entry.form)?)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::os::fd::AsRawFd as _;
+
+    use super::super::processes::Use;
+    use super::*;
+    use crate::capture::filter::{Filter, FilterSettings};
+
+    /// Maps a file into this process, for good.
+    fn map(file: &fs::File) {
+        // SAFETY: a new private mapping at an address of the kernel's choice; nothing refers to it.
+        let mapped = unsafe {
+            libc::mmap(
+                std::ptr::null_mut(),
+                1,
+                libc::PROT_READ,
+                libc::MAP_PRIVATE,
+                file.as_raw_fd(),
+                0,
+            )
+        };
+        assert_ne!(mapped, libc::MAP_FAILED, "{}", io::Error::last_os_error());
+    }
+
+    #[test]
+    fn a_library_beyond_the_cap_is_said_to_be_uncovered_until_another_is_no_longer_used() {
+        let directory = tempfile::tempdir().unwrap();
+        for number in 0..=MAX_LIBRARIES {
+            let path = directory.path().join(format!("library.{number}"));
+            fs::write(&path, library::tests::library()).unwrap();
+            map(&fs::File::open(&path).unwrap());
+        }
+        // Other tests expect this process to use none of Fast DDS.
+        let maps = fs::read_to_string("/proc/self/maps").unwrap();
+        let mut used = Use::parse(&maps.replace("/library.", "/libfastdds.so."));
+        assert_eq!(used.libraries.len(), MAX_LIBRARIES + 1);
+        let process = std::process::id();
+        let all = Processes::of(process, used.clone());
+        let (_filter, probes) = Filter::load_handed(&FilterSettings::default(), None)
+            .expect("loading the kernel filter needs root: run the tests with sudo");
+        let mut attachments = Attachments {
+            probes,
+            libraries: BTreeMap::new(),
+        };
+        let start = Instant::now();
+        attachments.follow(&all, start);
+        attachments.follow(&all, start + RETRY);
+        let facts = attachments.facts(&all);
+        assert_eq!(facts.libraries.len(), MAX_LIBRARIES);
+        let refused = facts.libraries.iter().find_map(|each| each.refused.clone());
+        assert_eq!(refused, None);
+        let uncovered = facts.uncovered.unwrap();
+        assert!(
+            uncovered.ends_with(": too many libraries are in use"),
+            "{uncovered}"
+        );
+
+        // The last one has none; the first is given up, and what it leaves is taken.
+        used.libraries.remove(0);
+        let fewer = Processes::of(process, used);
+        let later = start + RETRY + LINGER + EVERY;
+        attachments.follow(&fewer, later);
+        attachments.follow(&fewer, later + EVERY);
+        let facts = attachments.facts(&fewer);
+        assert_eq!(facts.libraries.len(), MAX_LIBRARIES);
+        assert_eq!(facts.uncovered, None);
+    }
+}
