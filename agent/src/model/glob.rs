@@ -1,14 +1,15 @@
 //! Globs over topic names: `*` stands for any characters within one token, `**` for whole tokens.
 //!
-//! Matching reads the pattern's text and the name and allocates nothing. Within a token it takes time
-//! in proportion to both lengths; a run of tokens between two `**` is tried at each token of the name.
-//! So a pattern costs no more memory than its text, whoever sends it.
+//! Matching reads the pattern's text and the name and allocates nothing. Within a token it takes
+//! time in proportion to both lengths; a run of tokens between two `**` is tried at each token of
+//! the name. So a pattern costs no more memory than its text, whoever sends it.
 
 /// Between two runs of tokens.
 const ANY_TOKENS: &str = "/**";
 
-/// Returns whether `pattern` covers `name`: both are absolute, or begin alike before the first slash,
-/// as DDS names do (`rq/**`). What a pattern covers that [`crate::config::check_pattern`] refuses is not specified.
+/// Returns whether `pattern` covers `name`: both are absolute, or begin alike before the first
+/// slash, as DDS names do (`rq/**`). What a pattern covers that [`crate::config::check_pattern`]
+/// refuses is not specified.
 ///
 /// `**` at the end covers at least one token, elsewhere also none: `/a/**` does not cover `/a`,
 /// `/a/**/b` covers `/a/b`.
@@ -44,7 +45,8 @@ fn covers_tokens(pattern: &str, name: &str) -> bool {
     strip_tokens(after, last) == Some("") && strip_runs(rest, between).is_some()
 }
 
-/// What is left of `name` behind the first places where these runs of tokens match, one after another.
+/// What is left of `name` behind the first places where these runs of tokens match, one after
+/// another.
 fn strip_runs<'a>(name: &'a str, runs: &str) -> Option<&'a str> {
     let mut rest = name;
     for run in runs.split(ANY_TOKENS).filter(|run| !run.is_empty()) {

@@ -2,9 +2,10 @@
 //!
 //! A gap is not a loss yet: it stays open for the settle window, so that reordering and
 //! retransmission can fill it. What GAP, an ACKNACK or the moment of first sight excuses is never a
-//! loss. HEARTBEAT's firstSN excuses nothing: a sample that never came and that the writer no longer
-//! has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory is two bitmaps that grow with the number of undecided sequence numbers, up
-//! to [`MAX_WINDOW`]. It knows no payloads and no time but the one it is given.
+//! loss. HEARTBEAT's firstSN excuses nothing: a sample that never came and that the writer no
+//! longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory is two bitmaps that grow
+//! with the number of undecided sequence numbers, up to [`MAX_WINDOW`]. It knows no payloads and no
+//! time but the one it is given.
 
 mod doubt;
 
@@ -242,8 +243,9 @@ impl Sequence {
         }
     }
 
-    /// Looks at number and source time of a sample before anything else does: a writer that jumps, or
-    /// begins anew under its old GUID, is recognised here. Numbers up to `reach` ahead are not doubted.
+    /// Looks at number and source time of a sample before anything else does: a writer that jumps,
+    /// or begins anew under its old GUID, is recognised here. Numbers up to `reach` ahead are not
+    /// doubted.
     pub fn recognise(
         &mut self,
         number: u64,
@@ -296,7 +298,8 @@ impl Sequence {
         // A writer that begins anew fills no gaps of the run before.
         let doubted = self.doubted.as_ref();
         let continues = || doubted.is_some_and(|doubted| doubted.is_continued(number, self.next));
-        // What came first may have been forged just as well; what lies less far below it is history.
+        // What came first may have been forged just as well; what lies less far below it is
+        // history.
         let is_young = self.followed < HANDFUL;
         newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
     }
@@ -402,8 +405,8 @@ impl Sequence {
         self.first
     }
 
-    /// HEARTBEAT: the writer has `first..=last`. It will send nothing below `first` again; all up to
-    /// `last` exist.
+    /// HEARTBEAT: the writer has `first..=last`. It will send nothing below `first` again; all up
+    /// to `last` exist.
     pub fn heartbeat(
         &mut self,
         first: u64,
@@ -433,8 +436,8 @@ impl Sequence {
         }
     }
 
-    /// Takes in a HEARTBEAT's lastSN, `next - 1`. Returns whether it is believed, and the doubted run
-    /// that it confirms.
+    /// Takes in a HEARTBEAT's lastSN, `next - 1`. Returns whether it is believed, and the doubted
+    /// run that it confirms.
     pub fn claim(&mut self, next: u64, reach: u64, now: Timestamp) -> (bool, Option<Run>) {
         let live = self.next;
         let doubted = self.doubted.as_mut();
@@ -557,8 +560,8 @@ impl Sequence {
         self.excused.set_all(start, end.min(self.next));
     }
 
-    /// Decides what has been open for `window`, and what the writer withdrew `grace` ago, but nothing
-    /// from `hold` on.
+    /// Decides what has been open for `window`, and what the writer withdrew `grace` ago, but
+    /// nothing from `hold` on.
     pub fn advance(
         &mut self,
         now: Timestamp,
