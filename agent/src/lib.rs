@@ -5,6 +5,7 @@
 //! `ros2` is the text that people know.
 
 pub mod bag;
+pub mod bell;
 pub mod capture;
 pub mod client;
 pub mod config;

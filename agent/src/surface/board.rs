@@ -3,9 +3,7 @@
 //! A reader takes the latest state, the writer replaces it; neither holds the other up. A reader
 //! may ask for a newer state and wait for it, as long as it has patience.
 
-use std::io::{self, Read as _, Write as _};
-use std::os::fd::{AsFd as _, BorrowedFd};
-use std::os::unix::net::UnixStream;
+use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
@@ -18,6 +16,7 @@ use super::events::{AgentEvent, EventLog};
 use super::limit_facts::LimitFigures;
 use super::otlp::{Exports, Reason, Signal, SpanQueue};
 use super::recording_facts::RecordingFigures;
+use crate::bell::Bell;
 use crate::config::{Config, Limits, Watch};
 use crate::model::snapshot::Snapshot;
 use crate::model::trace::Spans;
@@ -39,15 +38,9 @@ pub struct Board {
     limits: LimitFigures,
     /// Somebody waits for a newer state.
     asked: AtomicBool,
+    /// Wakes the capture thread while it waits for packets.
     bell: Option<Bell>,
     news: Notify,
-}
-
-/// Wakes the capture thread while it waits for packets.
-#[derive(Debug)]
-struct Bell {
-    ringer: UnixStream,
-    listener: UnixStream,
 }
 
 /// What the capture thread found out.
@@ -159,21 +152,20 @@ impl Board {
     /// Readable when somebody has asked since [`Self::hear`].
     #[must_use]
     pub fn bell(&self) -> Option<BorrowedFd<'_>> {
-        Some(self.bell.as_ref()?.listener.as_fd())
+        Some(self.bell.as_ref()?.descriptor())
     }
 
     /// Silences the bell. Whether somebody waits is still told by [`Self::is_asked`].
     pub fn hear(&self) {
         if let Some(bell) = &self.bell {
-            let _ = (&bell.listener).read(&mut [0; 64]);
+            bell.silence();
         }
     }
 
     /// Wakes the capture thread.
     pub fn ring(&self) {
         if let Some(bell) = &self.bell {
-            // A full pipe has been rung often enough.
-            let _ = (&bell.ringer).write(&[1]);
+            bell.ring();
         }
     }
 
@@ -284,15 +276,6 @@ impl Board {
     }
 }
 
-impl Bell {
-    fn new() -> io::Result<Self> {
-        let (ringer, listener) = UnixStream::pair()?;
-        ringer.set_nonblocking(true)?;
-        listener.set_nonblocking(true)?;
-        Ok(Self { ringer, listener })
-    }
-}
-
 impl State {
     /// The robot; nothing at all until the first snapshot.
     #[must_use]
@@ -339,6 +322,7 @@ impl State {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::capture::system::wait;
 
     #[test]
     fn an_agent_is_ready_only_while_it_sees() {
@@ -429,8 +413,8 @@ mod tests {
     async fn asking_rings_the_bell_until_it_is_heard() {
         let board = Board::new(SourceKind::Wire, Settings::default());
         let rings = || {
-            let mut listener = &board.bell.as_ref().unwrap().listener;
-            listener.read(&mut [0; 1]).is_ok()
+            let listener = board.bell().unwrap();
+            wait(&[listener], Duration::ZERO).unwrap() == Some(0)
         };
         assert!(!rings());
         for _ in 0..3 {

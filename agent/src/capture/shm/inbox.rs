@@ -1,11 +1,11 @@
 //! What the tap found, on its way to the working thread: bounded, and counted where it overflows.
 
-use std::io::{self, Read as _, Write as _};
-use std::os::fd::{AsFd as _, BorrowedFd};
-use std::os::unix::net::UnixStream;
+use std::os::fd::BorrowedFd;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use ros2probe_wire::record::{Record, kind};
+
+use crate::bell::Bell;
 
 /// Records, and bytes of captured messages, that wait at most.
 const MAX_RECORDS: usize = 16_384;
@@ -35,14 +35,8 @@ pub enum Item {
 #[derive(Debug, Default)]
 pub struct Inbox {
     waiting: Mutex<Waiting>,
+    /// Wakes the working thread.
     bell: Option<Bell>,
-}
-
-/// Wakes the working thread.
-#[derive(Debug)]
-struct Bell {
-    ringer: UnixStream,
-    listener: UnixStream,
 }
 
 #[derive(Debug, Default)]
@@ -66,7 +60,7 @@ impl Inbox {
     /// Readable when much waits.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
-        Some(self.bell.as_ref()?.listener.as_fd())
+        Some(self.bell.as_ref()?.descriptor())
     }
 
     /// Takes over what `found` holds, and leaves it empty.
@@ -83,8 +77,7 @@ impl Inbox {
             && !had_much
             && waiting.bytes >= MUCH
         {
-            // Full: it rings already.
-            let _ = (&bell.ringer).write(&[1]);
+            bell.ring();
         }
     }
 
@@ -93,7 +86,7 @@ impl Inbox {
     pub fn take(&self) -> Vec<Item> {
         let waiting = &mut *self.waiting();
         if let Some(bell) = self.bell.as_ref().filter(|_| waiting.bytes >= MUCH) {
-            let _ = (&bell.listener).read(&mut [0; 8]);
+            bell.silence();
         }
         waiting.bytes = 0;
         std::mem::take(&mut waiting.items)
@@ -108,15 +101,6 @@ impl Inbox {
     /// Nothing that is done under this lock can fail.
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl Bell {
-    fn new() -> io::Result<Self> {
-        let (ringer, listener) = UnixStream::pair()?;
-        ringer.set_nonblocking(true)?;
-        listener.set_nonblocking(true)?;
-        Ok(Self { ringer, listener })
     }
 }
 
