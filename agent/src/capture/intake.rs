@@ -44,6 +44,8 @@ pub struct Intake {
     fresh: VecDeque<(Piece, Vec<u8>)>,
     datagrams: u64,
     copied_bytes: u64,
+    /// When the latest record was written, in the kernel's clock.
+    recorded: u64,
 }
 
 impl Intake {
@@ -57,6 +59,7 @@ impl Intake {
             fresh: VecDeque::new(),
             datagrams: 0,
             copied_bytes: 0,
+            recorded: 0,
         }
     }
 
@@ -70,14 +73,17 @@ impl Intake {
 
     /// Takes in all there is, and gives the model what is [`SETTLE_NANOSECONDS`] old. What datagrams
     /// announce it gets at once, what they count for in its turn. Before each datagram it gets what
-    /// is older: a writer's last samples count before its farewell is read.
+    /// is older: a writer's last samples count before its farewell is read. Where a flood leaves
+    /// one ring behind, the other waits for it: what a writer's records and its captured datagrams
+    /// say would otherwise come out of order, as losses that are none.
     pub fn take_in(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        self.take_records();
-        let before = clocks.monotonic.saturating_sub(FRESH_NANOSECONDS);
-        self.take_datagrams(clocks, before, observer);
+        let recorded = self.take_records();
+        let fresh = clocks.monotonic.saturating_sub(FRESH_NANOSECONDS);
+        let captured = self.take_datagrams(clocks, fresh.min(recorded), observer);
         let stalled = clocks.monotonic.saturating_sub(STALLED_NANOSECONDS);
         self.take_stalled(stalled);
         let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
+        let settled = settled.min(recorded).min(captured);
         while !deliver(&mut self.order, clocks, settled, observer, RECORDS_BETWEEN) {
             self.take_records();
         }
@@ -129,17 +135,20 @@ impl Intake {
     }
 
     /// A flood may fill the ring as fast as it is emptied: what is left is taken the next time.
-    fn take_records(&mut self) {
+    /// Returns up to which time all were taken, `u64::MAX` where none is left.
+    fn take_records(&mut self) -> u64 {
         for _ in 0..RECORDS_PER_ROUND {
             if self.order.waiting() >= MAX_WAITING {
-                return;
+                return self.recorded;
             }
             let Some(record) = self.filter.next_record() else {
-                return;
+                return u64::MAX;
             };
             self.copied_bytes += size_of::<Record>() as u64;
+            self.recorded = record.time;
             self.order.kernel(record);
         }
+        self.recorded
     }
 
     /// Takes runs of fragments that nobody has continued since `before` in the kernel's clock.
@@ -150,21 +159,28 @@ impl Intake {
         }
     }
 
-    /// Those up to `before` in the kernel's clock.
-    fn take_datagrams(&mut self, clocks: &Clocks, before: u64, observer: &mut Observer) {
+    /// Those up to `before` in the kernel's clock. Returns up to which time all were taken, if not
+    /// up to `before`; else `u64::MAX`.
+    fn take_datagrams(&mut self, clocks: &Clocks, before: u64, observer: &mut Observer) -> u64 {
         while let Some((piece, bytes)) = self.fresh.pop_front_if(|(piece, _)| piece.time <= before)
         {
             take_in_datagram(&piece, &bytes, clocks, &mut self.order, observer);
         }
+        let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
+            // What is left is younger still.
+            if self.fresh.len() >= MAX_FRESH {
+                return u64::MAX;
+            }
             let Some(captured) = self.filter.next_piece() else {
-                return;
+                return u64::MAX;
             };
             let Some((piece, bytes)) = captured.read() else {
                 observer.decode_error("piece", Reason::BadLength);
                 continue;
             };
             self.copied_bytes += (size_of::<Piece>() + bytes.len()) as u64;
+            newest = piece.time;
             let Some((piece, bytes)) = self.wholes.piece(&piece, bytes) else {
                 continue;
             };
@@ -176,12 +192,8 @@ impl Intake {
             // Behind those that wait: one that overtook them would let a sample count by the copies
             // of fragments whose bytes are still there.
             self.fresh.push_back((piece, bytes.into_owned()));
-            while self.fresh.len() > MAX_FRESH
-                && let Some((piece, bytes)) = self.fresh.pop_front()
-            {
-                take_in_datagram(&piece, &bytes, clocks, &mut self.order, observer);
-            }
         }
+        newest
     }
 }
 

@@ -315,9 +315,10 @@ impl Real {
             "ros2probe_events_total",
             &[("name", "ros2probe.capture.dropped")],
         );
+        let datagrams = page.sum("ros2probe_dropped_datagrams_total", &[]);
         ensure!(
-            (told > 0.0) == (dropped > 0.0),
-            "{dropped} dropped, {told} events"
+            (told > 0.0) == (dropped + datagrams > 0.0),
+            "{dropped} records or frames and {datagrams} datagrams dropped, {told} events"
         );
         Ok(format!(
             "{} counted, {dropped} records or frames dropped",

@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail};
@@ -55,7 +56,9 @@ impl Confined {
     }
 
     fn create(name: &str, memory: u64, cpu_percent: Option<u64>) -> Result<Confined> {
-        let name = format!("r2p-{}-{name}", std::process::id());
+        static CREATED: AtomicU32 = AtomicU32::new(0);
+        let number = CREATED.fetch_add(1, Ordering::Relaxed);
+        let name = format!("r2p-{}-{name}-{number}", std::process::id());
         let period = PERIOD.as_micros() as u64;
         let quota = cpu_percent.map(|percent| period * percent / 100);
         let make = |path: PathBuf| -> Result<PathBuf> {
