@@ -1,0 +1,169 @@
+// Numbers, times and names as the page prints them.
+//
+// Every function returns text and never markup. An absent value prints as an en dash, so that
+// "not measured" is never read as zero.
+
+/** Printed for an absent value. */
+export const NOTHING = '–';
+
+const PREFIXES = ['', 'k', 'M', 'G', 'T'];
+
+/**
+ * Three significant digits, without an exponent.
+ * @param {number} value
+ * @returns {string}
+ */
+function digits(value) {
+  const size = Math.abs(value);
+  if (size >= 100) return value.toFixed(0);
+  if (size >= 10) return value.toFixed(1);
+  return value.toFixed(2);
+}
+
+/**
+ * A quantity with a decimal prefix: 12345 and "B" give "12.3 kB".
+ * @param {number|null|undefined} value
+ * @param {string} unit
+ * @returns {string}
+ */
+function scaled(value, unit) {
+  if (value == null || !Number.isFinite(value)) return NOTHING;
+  let power = 0;
+  while (Math.abs(value) >= 999.5 && power < PREFIXES.length - 1) {
+    value /= 1000;
+    power += 1;
+  }
+  const text = power === 0 && Number.isInteger(value) ? String(value) : digits(value);
+  return `${text} ${PREFIXES[power]}${unit}`;
+}
+
+/** Messages a second. @param {number|null|undefined} hertz */
+export function rate(hertz) {
+  return scaled(hertz, 'Hz');
+}
+
+/** @param {number|null|undefined} count */
+export function bytes(count) {
+  return scaled(count, 'B');
+}
+
+/** @param {number|null|undefined} count bytes a second */
+export function bandwidth(count) {
+  return count == null ? NOTHING : scaled(count, 'B/s');
+}
+
+/**
+ * A whole number with separators between thousands.
+ * @param {number|null|undefined} value
+ */
+export function count(value) {
+  if (value == null || !Number.isFinite(value)) return NOTHING;
+  return Math.round(value).toString().replace(/\B(?=(\d{3})+$)/g, ',');
+}
+
+/**
+ * A duration in seconds: "350 µs", "1.25 ms", "4.0 s", "3 min 5 s", "2 h 5 min", "3 d 4 h".
+ * @param {number|null|undefined} seconds
+ */
+export function duration(seconds) {
+  if (seconds == null || !Number.isFinite(seconds)) return NOTHING;
+  const sign = seconds < 0 ? '-' : '';
+  const size = Math.abs(seconds);
+  if (size === 0) return '0 s';
+  if (size < 0.9995e-3) return `${sign}${digits(size * 1e6)} µs`;
+  if (size < 0.9995) return `${sign}${digits(size * 1e3)} ms`;
+  if (size < 59.95) return `${sign}${digits(size)} s`;
+  const whole = Math.round(size);
+  const parts = [[86400, 'd'], [3600, 'h'], [60, 'min'], [1, 's']];
+  const first = parts.findIndex(([length]) => whole >= Number(length));
+  const [length, unit] = parts[first];
+  const [next, nextUnit] = parts[first + 1] ?? [1, ''];
+  const rest = Math.floor((whole % Number(length)) / Number(next));
+  const tail = rest > 0 ? ` ${rest} ${nextUnit}` : '';
+  return `${sign}${Math.floor(whole / Number(length))} ${unit}${tail}`;
+}
+
+/**
+ * A part of one as a percentage. A loss above zero never prints as zero.
+ * @param {number|null|undefined} part
+ */
+export function percent(part) {
+  if (part == null || !Number.isFinite(part)) return NOTHING;
+  if (part === 0) return '0 %';
+  if (part > 0 && part < 0.0001) return '<0.01 %';
+  if (part < 1 && part > 0.9999) return '>99.99 %';
+  const hundred = part * 100;
+  return `${hundred >= 10 ? hundred.toFixed(1) : hundred.toFixed(2)} %`;
+}
+
+/**
+ * The time of day of a Unix time, in the browser's zone.
+ * @param {number|null|undefined} seconds
+ */
+export function clock(seconds) {
+  if (seconds == null || !Number.isFinite(seconds)) return NOTHING;
+  const time = new Date(seconds * 1000);
+  const two = (/** @type {number} */ value) => String(value).padStart(2, '0');
+  return `${two(time.getHours())}:${two(time.getMinutes())}:${two(time.getSeconds())}`;
+}
+
+/**
+ * Date and time of day of a Unix time, in the browser's zone.
+ * @param {number|null|undefined} seconds
+ */
+export function date(seconds) {
+  if (seconds == null || !Number.isFinite(seconds)) return NOTHING;
+  const time = new Date(seconds * 1000);
+  const two = (/** @type {number} */ value) => String(value).padStart(2, '0');
+  const day = `${time.getFullYear()}-${two(time.getMonth() + 1)}-${two(time.getDate())}`;
+  return `${day} ${clock(seconds)}`;
+}
+
+/**
+ * "1 topic", "3 topics".
+ * @param {number} number
+ * @param {string} noun
+ * @param {string} [plural]
+ */
+export function several(number, noun, plural = `${noun}s`) {
+  return `${count(number)} ${number === 1 ? noun : plural}`;
+}
+
+// Control, format (bidi, zero width), surrogate, private and unassigned characters, separators,
+// spaces other than U+0020, fillers that print nothing, variation selectors. The backslash is
+// escaped too, so that an escape in the text cannot be mistaken for one of ours.
+const UNSEEN = new RegExp(
+  '[\\p{Cc}\\p{Cf}\\p{Cs}\\p{Co}\\p{Cn}\\p{Zl}\\p{Zp}\\\\' +
+    '\\u034f\\u115f\\u1160\\u17b4\\u17b5\\u180b-\\u180f\\u2800\\u3164\\uffa0\\ufe00-\\ufe0f' +
+    '\\u{e0100}-\\u{e01ef}]|(?! )\\p{Zs}',
+  'gu',
+);
+
+/**
+ * A name or any other text from the network, with each character that prints nothing or reorders
+ * its neighbours shown as `\u{202e}`.
+ * @param {unknown} text
+ * @returns {string}
+ */
+export function visible(text) {
+  return String(text ?? '').replace(UNSEEN, (found) => {
+    if (found === '\\') return '\\\\';
+    if (found === '\n') return '\\n';
+    if (found === '\t') return '\\t';
+    return `\\u{${/** @type {number} */ (found.codePointAt(0)).toString(16)}}`;
+  });
+}
+
+/**
+ * At most `most` characters of a visible text: beginning and end, which distinguish names best.
+ * @param {unknown} text
+ * @param {number} most
+ */
+export function shortened(text, most) {
+  const characters = Array.from(visible(text));
+  if (characters.length <= most) return characters.join('');
+  const head = Math.ceil((most - 1) / 2);
+  const tail = most - 1 - head;
+  const end = tail > 0 ? characters.slice(-tail) : [];
+  return `${characters.slice(0, head).join('')}…${end.join('')}`;
+}
