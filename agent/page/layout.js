@@ -22,8 +22,12 @@
 
 const SWEEPS = 24;
 const SETTLES = 24;
+// Vertices and dummies from which a graph gets half the work.
+const LARGE = 4000;
+// How strongly an edge pulls, by how many of its ends are dummies: long edges are straight first.
+const FORCE = [1, 2, 8];
 // A new order must save this part of the crossings to replace the previous one.
-const GAIN = 0.85;
+const GAIN = 0.75;
 
 /**
  * Places vertices, boxes and edges.
@@ -277,6 +281,7 @@ function layered(items, links, previous, gapX, gapY, sweeps) {
     const key = a < b ? a * items.length + b : b * items.length + a;
     if (!routes.has(key)) routes.set(key, columns.join(a, b));
   }
+  columns.seal();
   const crossings = order(columns, items, previous, sweeps);
   settle(columns, gapY);
 
@@ -436,6 +441,17 @@ function ranks(size, directed) {
   return rank;
 }
 
+/** Lists of neighbours one behind the other: those of `v` are from `begin[v]` to `begin[v + 1]`. */
+class Neighbours {
+  /** @param {number[][]} lists */
+  constructor(lists) {
+    this.begin = new Int32Array(lists.length + 1);
+    lists.forEach((list, at) => { this.begin[at + 1] = this.begin[at] + list.length; });
+    this.list = new Int32Array(this.begin[lists.length]);
+    lists.forEach((list, at) => { this.list.set(list, this.begin[at]); });
+  }
+}
+
 /** Vertices and dummies by rank, with their neighbours left and right. */
 class Columns {
   /** @param {Item[]} items @param {Int32Array} rank */
@@ -449,10 +465,19 @@ class Columns {
     /** @type {number[][]} */ this.list = [];
     for (let vertex = 0; vertex < items.length; vertex += 1) this.enter(vertex);
     /** @type {Float64Array} */ this.y = new Float64Array(0);
+    this.toLeft = new Neighbours([]);
+    this.toRight = new Neighbours([]);
   }
 
   get size() {
     return this.rank.length;
+  }
+
+  /** Packs the neighbours for the passes that follow, which add none. */
+  seal() {
+    this.toLeft = new Neighbours(this.left);
+    this.toRight = new Neighbours(this.right);
+    this.y = new Float64Array(this.size);
   }
 
   /** @param {number} vertex */
@@ -496,46 +521,70 @@ class Columns {
  * @param {number} sweeps
  */
 function order(columns, items, previous, sweeps) {
-  const place = new Float64Array(columns.size);
-  const number = () => {
-    for (const column of columns.list) column.forEach((vertex, at) => { place[vertex] = at; });
-  };
-  const start = startOrder(columns, items, previous);
-  number();
+  const place = new Int32Array(columns.size);
+  const mostly = startOrder(columns, items, previous);
+  for (const column of columns.list) column.forEach((vertex, at) => { place[vertex] = at; });
+  const kept = items.map((item) => previous[item.id]?.y);
+  // First only what is new moves, then everything, and then the gain has to be worth it.
+  const gentle = mostly ? swept(columns, place, sweeps / 2, kept) : Infinity;
+  const initial = columns.list.map((column) => column.slice());
+  const free = swept(columns, place, sweeps, null);
+  if (free < gentle * GAIN || !mostly) return free;
+  columns.list = initial;
+  return gentle;
+}
+
+/**
+ * Sweeps over the columns, leaves them in the best order found, and returns its crossings.
+ * @param {Columns} columns
+ * @param {Int32Array} place
+ * @param {number} sweeps
+ * @param {(number|undefined)[]|null} kept the y of vertices that keep their order
+ */
+function swept(columns, place, sweeps, kept) {
   const tree = new Int32Array(Math.max(...columns.list.map((column) => column.length)) + 2);
   let best = crossed(columns, place, tree);
-  const began = best;
   let chosen = columns.list.map((column) => column.slice());
-  const initial = chosen;
   const key = new Float64Array(columns.size);
   let idle = 0;
   for (let sweep = 0; sweep < sweeps && best > 0 && idle < 6; sweep += 1) {
     const rightwards = sweep % 2 === 0;
+    const near = rightwards ? columns.toLeft : columns.toRight;
     const last = columns.list.length - 1;
-    for (let step = 1; step <= last; step += 1) {
+    for (let step = kept ? 0 : 1; step <= last; step += 1) {
       const column = columns.list[rightwards ? step : last - step];
       for (const vertex of column) {
-        const near = rightwards ? columns.left[vertex] : columns.right[vertex];
         let sum = 0;
-        for (const other of near) sum += place[other];
-        key[vertex] = near.length ? sum / near.length : place[vertex];
+        for (let at = near.begin[vertex]; at < near.begin[vertex + 1]; at += 1) {
+          sum += place[near.list[at]];
+        }
+        const count = near.begin[vertex + 1] - near.begin[vertex];
+        key[vertex] = count ? sum / count : place[vertex];
       }
       column.sort((a, b) => key[a] - key[b] || place[a] - place[b]);
+      if (kept) {
+        const isKept = (/** @type {number} */ vertex) => kept[vertex] !== undefined;
+        const own = column.filter(isKept);
+        own.sort((a, b) => Number(kept[a]) - Number(kept[b]));
+        let next = 0;
+        column.forEach((vertex, at) => {
+          if (isKept(vertex)) column[at] = own[next++];
+        });
+      }
       column.forEach((vertex, at) => { place[vertex] = at; });
     }
+    // Counting costs more than sweeping: a large graph is counted every other time.
+    if (columns.size > LARGE && rightwards) continue;
     const found = crossed(columns, place, tree);
-    idle += 1;
+    idle += columns.size > LARGE ? 2 : 1;
     if (found < best) {
       best = found;
       chosen = columns.list.map((column) => column.slice());
       idle = 0;
     }
   }
-  if (start && best > began * GAIN) {
-    columns.list = initial;
-    return began;
-  }
   columns.list = chosen;
+  for (const column of chosen) column.forEach((vertex, at) => { place[vertex] = at; });
   return best;
 }
 
@@ -586,10 +635,11 @@ function startOrder(columns, items, previous) {
 /**
  * Crossings between neighbouring columns, by a Fenwick tree.
  * @param {Columns} columns
- * @param {Float64Array} place
+ * @param {Int32Array} place
  * @param {Int32Array} tree
  */
 function crossed(columns, place, tree) {
+  const { begin, list } = columns.toRight;
   let crossings = 0;
   for (let rank = 0; rank + 1 < columns.list.length; rank += 1) {
     const length = columns.list[rank + 1].length;
@@ -597,13 +647,13 @@ function crossed(columns, place, tree) {
     let entered = 0;
     for (const vertex of columns.list[rank]) {
       // Edges of one vertex do not cross each other: count all of them before entering any.
-      for (const other of columns.right[vertex]) {
+      for (let edge = begin[vertex]; edge < begin[vertex + 1]; edge += 1) {
         let below = 0;
-        for (let at = place[other] + 1; at > 0; at -= at & -at) below += tree[at];
+        for (let at = place[list[edge]] + 1; at > 0; at -= at & -at) below += tree[at];
         crossings += entered - below;
       }
-      for (const other of columns.right[vertex]) {
-        for (let at = place[other] + 1; at <= length; at += at & -at) tree[at] += 1;
+      for (let edge = begin[vertex]; edge < begin[vertex + 1]; edge += 1) {
+        for (let at = place[list[edge]] + 1; at <= length; at += at & -at) tree[at] += 1;
         entered += 1;
       }
     }
@@ -617,9 +667,7 @@ function crossed(columns, place, tree) {
  * @param {number} gapY
  */
 function settle(columns, gapY) {
-  const { height, left, right } = columns;
-  const y = new Float64Array(columns.size);
-  columns.y = y;
+  const { height, y } = columns;
   for (const column of columns.list) {
     let top = 0;
     for (const vertex of column) {
@@ -627,21 +675,21 @@ function settle(columns, gapY) {
       top += height[vertex] + gapY;
     }
   }
-  const isDummy = (/** @type {number} */ vertex) => vertex >= columns.real;
+  const sides = [columns.toLeft, columns.toRight];
   const wanted = new Float64Array(columns.size);
   const weight = new Float64Array(columns.size);
-  for (let round = 0; round < SETTLES; round += 1) {
+  const rounds = columns.size > LARGE ? SETTLES / 2 : SETTLES;
+  for (let round = 0; round < rounds; round += 1) {
     for (let step = 0; step < columns.list.length; step += 1) {
       const column = columns.list[round % 2 === 0 ? step : columns.list.length - 1 - step];
       for (const vertex of column) {
-        // Long edges are straight before short ones are.
         let sum = 0;
         let total = 0;
-        for (const side of [left[vertex], right[vertex]]) {
-          for (const other of side) {
-            const force = isDummy(vertex) && isDummy(other) ? 8
-              : isDummy(vertex) || isDummy(other) ? 2 : 1;
-            sum += force * y[other];
+        const own = vertex >= columns.real ? 1 : 0;
+        for (const { begin, list } of sides) {
+          for (let at = begin[vertex]; at < begin[vertex + 1]; at += 1) {
+            const force = FORCE[own + (list[at] >= columns.real ? 1 : 0)];
+            sum += force * y[list[at]];
             total += force;
           }
         }
