@@ -1,0 +1,68 @@
+// Addresses of views: `#/topics/%2Fpoints?domain=0`. The fragment never reaches the agent.
+
+/**
+ * @typedef {{view: string, name: string|null, query: Record<string, string>}} Route
+ *   `name` is that of a topic or node where the view shows one.
+ */
+
+const VIEWS = ['', 'topics', 'graph', 'nodes', 'events', 'recordings', 'agent', 'token'];
+
+/**
+ * @param {string} fragment with or without its `#`
+ * @returns {Route|null} null where no view has that address
+ */
+export function parse(fragment) {
+  const text = fragment.replace(/^#/, '').replace(/^\/?/, '');
+  const [path, query = ''] = split(text, '?');
+  const [view, name] = split(path, '/');
+  if (!VIEWS.includes(view)) return null;
+  try {
+    return {
+      view,
+      name: name ? decodeURIComponent(name) : null,
+      query: Object.fromEntries(new URLSearchParams(query)),
+    };
+  } catch {
+    // A fragment typed by hand may hold a broken escape.
+    return null;
+  }
+}
+
+/**
+ * @param {string} view
+ * @param {string|null} [name]
+ * @param {Record<string, string|number|boolean|null|undefined>} [query] empty values are left out
+ */
+export function address(view, name = null, query = {}) {
+  const given = Object.entries(query)
+    .filter(([, value]) => value != null && value !== '' && value !== false)
+    .map(([key, value]) => [key, value === true ? '1' : String(value)]);
+  const rest = new URLSearchParams(given).toString();
+  const path = name == null ? view : `${view}/${encodeURIComponent(name)}`;
+  return `#/${path}${rest ? `?${rest}` : ''}`;
+}
+
+/** @param {{name: string, domain: number}} topic */
+export function topicAddress(topic) {
+  return address('topics', topic.name, { domain: topic.domain });
+}
+
+/** @param {{name: string, domain: number}} node */
+export function nodeAddress(node) {
+  return address('nodes', node.name, { domain: node.domain });
+}
+
+/**
+ * The token that `rp page` puts into the fragment, or null.
+ * @param {string} fragment
+ */
+export function tokenOf(fragment) {
+  const found = /^#?token=([0-9A-Za-z._~+/-]+=*)$/.exec(fragment);
+  return found ? found[1] : null;
+}
+
+/** @param {string} text @param {string} by @returns {[string, string|undefined]} */
+function split(text, by) {
+  const at = text.indexOf(by);
+  return at < 0 ? [text, undefined] : [text.slice(0, at), text.slice(at + 1)];
+}
