@@ -1,0 +1,494 @@
+// From the state to what the graph view draws: which vertices, which edges, in which boxes.
+// Nothing here depends on figures, so that figures change the look and never the layout.
+
+import { shortened, visible } from './format.js';
+
+/** Nodes above which namespace boxes are closed at first. */
+export const MANY_NODES = 60;
+
+// Topics that join everything with everything, by the last part of their names.
+const HUBS = new Set(['rosout', 'parameter_events', 'tf', 'tf_static', 'clock', 'diagnostics',
+  'diagnostics_agg', 'diagnostics_toplevel_state', 'bond']);
+
+/**
+ * @typedef {{mode: 'both'|'nodes', hubs: boolean, hidden: boolean,
+ *   boxes: 'none'|'namespace'|'process', toggled: Set<string>, focus: string|null,
+ *   hops: number}} Options
+ *   `toggled` holds the boxes that are not as they are at first.
+ * @typedef {{key: string, kind: 'node'|'participant'|'topic'|'service'|'action'|'box',
+ *   name: string, detail: string, parent: string|null, topic: number|null, node: number|null,
+ *   closed: boolean, count: number, members: string[], w: number, h: number}} Vertex
+ *   A closed box is a vertex without content; `members` are the nodes and topics in it.
+ * @typedef {{id: string, from: string, to: string, kind: string, topics: number[],
+ *   guids: string[], passages: number}} Edge
+ * @typedef {{vertices: Vertex[], edges: Edge[], signature: string, folded: number,
+ *   nodes: number}} Graph
+ *   `folded` counts the hubs left out; `nodes` those shown before boxes were closed.
+ */
+
+/** @param {string} name */
+export function isHub(name) {
+  return HUBS.has(name.slice(name.lastIndexOf('/') + 1));
+}
+
+/** @param {{domain: number, name: string}} topic */
+export function topicKey(topic) {
+  return `topic:${topic.domain}:${topic.name}`;
+}
+
+/** @param {{domain: number, name: string}} node */
+export function nodeKey(node) {
+  return `node:${node.domain}:${node.name}`;
+}
+
+/**
+ * @param {import('./state.js').State} state
+ * @param {Options} options
+ * @param {{nodes: any[], edges: any[]}|null} [joints] services and actions, as `GET /graph` has them
+ * @returns {Graph}
+ */
+export function build(state, options, joints = null) {
+  const base = gather(state, options, joints);
+  const near = options.focus ? around(base, options.focus, options.hops) : null;
+  if (near) {
+    for (const key of [...base.vertices.keys()]) if (!near.has(key)) base.vertices.delete(key);
+  }
+  const joined = base.edges.filter((edge) =>
+    base.vertices.has(edge.from) && base.vertices.has(edge.to));
+  let edges = joined;
+  if (options.mode === 'nodes') {
+    edges = [...pairs(base.vertices, joined),
+      ...joined.filter((edge) => edge.kind === 'calls' || edge.kind === 'served_by')];
+    for (const vertex of [...base.vertices.values()]) {
+      if (vertex.kind === 'topic') base.vertices.delete(vertex.key);
+    }
+  }
+  const isNode = (/** @type {Vertex} */ vertex) =>
+    vertex.kind === 'node' || vertex.kind === 'participant';
+  const nodes = [...base.vertices.values()].filter(isNode).length;
+  const boxes = options.boxes === 'namespace' ? namespaces(base.vertices)
+    : options.boxes === 'process' ? processes(state, base.vertices) : new Map();
+  enclose(base.vertices, edges, boxes);
+  const closed = options.boxes === 'namespace'
+    ? closedBoxes(boxes, options.toggled, nodes > MANY_NODES)
+    : new Set([...boxes.keys()].filter((key) => options.toggled.has(key)));
+  const graph = close(base.vertices, boxes, edges, closed);
+  for (const vertex of graph.vertices) measure(vertex);
+  const signature = JSON.stringify([
+    graph.vertices.map((vertex) => [vertex.key, vertex.parent, vertex.closed, vertex.w]),
+    graph.edges.map((edge) => edge.id),
+  ]);
+  return { ...graph, signature, folded: base.folded, nodes };
+}
+
+/**
+ * @param {string} key @param {Vertex['kind']} kind @param {string} name
+ * @param {Partial<Vertex>} more
+ * @returns {Vertex}
+ */
+function vertex(key, kind, name, more = {}) {
+  return {
+    key, kind, name, detail: '', parent: null, topic: null, node: null, closed: false, count: 0,
+    members: [], w: 0, h: 0, ...more,
+  };
+}
+
+/**
+ * Nodes and topics with the edges between them.
+ * @param {import('./state.js').State} state
+ * @param {Options} options
+ * @param {{nodes: any[], edges: any[]}|null} joints
+ */
+function gather(state, options, joints) {
+  /** @type {Map<string, Vertex>} */
+  const vertices = new Map();
+  /** @type {Edge[]} */
+  const edges = [];
+  /** @type {Map<string, Edge>} */
+  const known = new Map();
+  let folded = 0;
+  for (const node of state.nodes.values()) {
+    if (node.hidden && !options.hidden) continue;
+    const key = nodeKey(node);
+    vertices.set(key, vertex(key, 'node', node.name, { node: node.id }));
+  }
+  const join = (/** @type {Omit<Edge, 'id'>} */ edge) => {
+    const id = `${edge.from} ${edge.kind} ${edge.to}`;
+    const before = known.get(id);
+    if (before) {
+      before.guids.push(...edge.guids);
+      before.passages |= edge.passages;
+      return;
+    }
+    const own = { id, ...edge };
+    known.set(id, own);
+    edges.push(own);
+  };
+  const focused = options.focus;
+  for (const topic of state.topics.values()) {
+    if (topic.vanished || (topic.hidden && !options.hidden)) continue;
+    const key = topicKey(topic);
+    if (!options.hubs && isHub(topic.name) && focused !== key) {
+      folded += 1;
+      continue;
+    }
+    vertices.set(key, vertex(key, 'topic', topic.name, { topic: topic.id }));
+    for (const side of /** @type {const} */ (['publishers', 'subscriptions'])) {
+      for (const endpoint of topic[side]) {
+        const owner = state.ownerOf(endpoint);
+        if (owner.node?.hidden && !options.hidden) continue;
+        if (!vertices.has(owner.key)) {
+          vertices.set(owner.key, vertex(owner.key, owner.node ? 'node' : 'participant',
+            owner.name, { node: owner.node?.id ?? null }));
+        }
+        const publishes = side === 'publishers';
+        join({
+          from: publishes ? owner.key : key, to: publishes ? key : owner.key,
+          kind: publishes ? 'publishes' : 'feeds', topics: [topic.id], guids: [endpoint.guid],
+          passages: endpoint.passages,
+        });
+      }
+    }
+  }
+  for (const joint of joints?.nodes ?? []) {
+    if (joint.kind !== 'service' && joint.kind !== 'action') continue;
+    vertices.set(joint.id, vertex(joint.id, joint.kind, joint.name));
+  }
+  for (const edge of joints?.edges ?? []) {
+    if (edge.kind !== 'calls' && edge.kind !== 'served_by') continue;
+    if (!vertices.has(edge.source) || !vertices.has(edge.target)) continue;
+    join({ from: edge.source, to: edge.target, kind: edge.kind, topics: [], guids: [],
+      passages: 0 });
+  }
+  return { vertices, edges, folded };
+}
+
+/**
+ * What lies within some hops of one vertex. A hop leads from node to node, or from a topic to its
+ * nodes. Null where the vertex does not exist.
+ * @param {{vertices: Map<string, Vertex>, edges: Edge[]}} base
+ * @param {string} focus
+ * @param {number} hops
+ */
+function around(base, focus, hops) {
+  const start = base.vertices.get(focus);
+  if (!start) return null;
+  /** @type {Map<string, string[]>} */
+  const near = new Map();
+  const add = (/** @type {string} */ a, /** @type {string} */ b) => {
+    const list = near.get(a);
+    if (list) list.push(b);
+    else near.set(a, [b]);
+  };
+  for (const edge of base.edges) {
+    add(edge.from, edge.to);
+    add(edge.to, edge.from);
+  }
+  const isNode = start.kind === 'node' || start.kind === 'participant';
+  const steps = isNode ? 2 * hops : 2 * hops - 1;
+  const found = new Set([focus]);
+  let edge = [focus];
+  for (let step = 0; step < steps && edge.length; step += 1) {
+    const next = [];
+    for (const key of edge) {
+      for (const other of near.get(key) ?? []) {
+        if (found.has(other)) continue;
+        found.add(other);
+        next.push(other);
+      }
+    }
+    edge = next;
+  }
+  return found;
+}
+
+/**
+ * One edge for each pair of nodes, with all topics that go from the one to the other.
+ * @param {Map<string, Vertex>} vertices
+ * @param {Edge[]} edges
+ */
+function pairs(vertices, edges) {
+  /** @type {Map<string, {from: Edge[], to: Edge[]}>} */
+  const topics = new Map();
+  for (const edge of edges) {
+    const publishes = edge.kind === 'publishes';
+    if (!publishes && edge.kind !== 'feeds') continue;
+    const key = publishes ? edge.to : edge.from;
+    const ends = topics.get(key) ?? { from: [], to: [] };
+    (publishes ? ends.from : ends.to).push(edge);
+    topics.set(key, ends);
+  }
+  /** @type {Map<string, Edge>} */
+  const found = new Map();
+  for (const ends of topics.values()) {
+    for (const one of ends.from) {
+      for (const other of ends.to) {
+        if (one.from === other.to) continue;
+        const id = `${one.from} to ${other.to}`;
+        const guids = [...one.guids, ...other.guids];
+        const before = found.get(id);
+        if (before) {
+          before.topics.push(...one.topics);
+          before.guids.push(...guids);
+          before.passages |= one.passages & other.passages;
+        } else {
+          found.set(id, {
+            id, from: one.from, to: other.to, kind: 'pair', topics: [...one.topics], guids,
+            passages: one.passages & other.passages,
+          });
+        }
+      }
+    }
+  }
+  return [...found.values()];
+}
+
+/**
+ * Boxes of namespaces that hold at least two nodes, the inner ones in the outer ones.
+ * @param {Map<string, Vertex>} vertices
+ * @returns {Map<string, Vertex>}
+ */
+function namespaces(vertices) {
+  /** @type {Map<string, number>} */
+  const sizes = new Map();
+  const spaces = (/** @type {string} */ name) => {
+    const parts = name.split('/').slice(1, -1);
+    return parts.map((_, at) => `/${parts.slice(0, at + 1).join('/')}`);
+  };
+  const nodes = [...vertices.values()].filter((each) => each.kind === 'node');
+  for (const node of nodes) {
+    for (const space of spaces(node.name)) sizes.set(space, (sizes.get(space) ?? 0) + 1);
+  }
+  /** @type {Map<string, Vertex>} */
+  const boxes = new Map();
+  for (const node of nodes) {
+    let parent = null;
+    const own = spaces(node.name);
+    for (const [depth, space] of own.entries()) {
+      const size = sizes.get(space) ?? 0;
+      // A namespace that holds nothing but one inner namespace is drawn as that one.
+      const inner = own[depth + 1];
+      if (size < 2 || (inner && sizes.get(inner) === size)) continue;
+      const key = `box:${space}`;
+      if (!boxes.has(key)) boxes.set(key, vertex(key, 'box', `${space}/`, { parent }));
+      parent = key;
+    }
+    node.parent = parent;
+  }
+  return boxes;
+}
+
+/**
+ * Boxes of hosts, and of processes that hold at least two nodes.
+ * @param {import('./state.js').State} state
+ * @param {Map<string, Vertex>} vertices
+ * @returns {Map<string, Vertex>}
+ */
+function processes(state, vertices) {
+  /** @type {Map<string, Vertex>} */
+  const boxes = new Map();
+  /** @type {Map<string, number>} */
+  const sizes = new Map();
+  const byGuid = new Map([...state.participants.values()].map((each) => [each.guid, each]));
+  const place = (/** @type {Vertex} */ each) => {
+    const node = each.node == null ? null : state.nodes.get(each.node);
+    const participant = node ? state.participants.get(node.participants[0])
+      : byGuid.get(each.key.split(':').slice(2).join(':'));
+    if (!participant) return null;
+    const host = participant.host ?? 'unknown host';
+    const { pid, process } = participant;
+    const inner = pid == null ? null : `box:${host} ${pid}`;
+    const name = [process, pid].filter((part) => part != null).join(' ');
+    return { host, inner, name };
+  };
+  const owners = [...vertices.values()].filter((each) =>
+    each.kind === 'node' || each.kind === 'participant');
+  const places = owners.map((each) => ({ each, at: place(each) }));
+  for (const { at } of places) {
+    if (at?.inner) sizes.set(at.inner, (sizes.get(at.inner) ?? 0) + 1);
+  }
+  for (const { each, at } of places) {
+    if (!at) continue;
+    const host = `box:${at.host}`;
+    if (!boxes.has(host)) boxes.set(host, vertex(host, 'box', at.host));
+    each.parent = host;
+    if (!at.inner) continue;
+    if ((sizes.get(at.inner) ?? 0) < 2) {
+      each.detail = at.name;
+      continue;
+    }
+    if (!boxes.has(at.inner)) {
+      boxes.set(at.inner, vertex(at.inner, 'box', at.name, { parent: host }));
+    }
+    each.parent = at.inner;
+  }
+  return boxes;
+}
+
+/**
+ * Puts topics, services and actions into the innermost box that holds all their nodes.
+ * @param {Map<string, Vertex>} vertices
+ * @param {Edge[]} edges
+ * @param {Map<string, Vertex>} boxes
+ */
+function enclose(vertices, edges, boxes) {
+  if (!boxes.size) return;
+  const chain = (/** @type {string|null} */ key) => {
+    const found = [];
+    for (let at = key; at != null; at = boxes.get(at)?.parent ?? null) found.unshift(at);
+    return found;
+  };
+  /** @type {Map<string, string[]>} */
+  const common = new Map();
+  for (const edge of edges) {
+    for (const [joint, owner] of [[edge.from, edge.to], [edge.to, edge.from]]) {
+      const kind = vertices.get(joint)?.kind;
+      if (kind === 'node' || kind === 'participant' || kind === undefined) continue;
+      const own = chain(vertices.get(owner)?.parent ?? null);
+      const before = common.get(joint);
+      if (!before) {
+        common.set(joint, own);
+      } else {
+        let same = 0;
+        while (same < own.length && own[same] === before[same]) same += 1;
+        common.set(joint, before.slice(0, same));
+      }
+    }
+  }
+  for (const [key, path] of common) {
+    const own = vertices.get(key);
+    if (own) own.parent = path[path.length - 1] ?? null;
+  }
+}
+
+/**
+ * @param {Map<string, Vertex>} boxes
+ * @param {Set<string>} toggled
+ * @param {boolean} many whether boxes are closed at first
+ */
+function closedBoxes(boxes, toggled, many) {
+  const closed = new Set();
+  if (many) {
+    const below = (/** @type {string|null} */ parent) =>
+      [...boxes.values()].filter((box) => box.parent === parent);
+    // A single box around everything would say nothing: its inner ones are closed.
+    let level = below(null);
+    while (level.length === 1 && below(level[0].key).length) level = below(level[0].key);
+    for (const box of level) closed.add(box.key);
+  }
+  for (const key of toggled) {
+    if (closed.has(key)) closed.delete(key);
+    else if (boxes.has(key)) closed.add(key);
+  }
+  return closed;
+}
+
+/**
+ * Replaces what lies in closed boxes by the boxes.
+ * @param {Map<string, Vertex>} vertices
+ * @param {Map<string, Vertex>} boxes
+ * @param {Edge[]} edges
+ * @param {Set<string>} closed
+ */
+function close(vertices, boxes, edges, closed) {
+  const standsFor = (/** @type {string} */ key) => {
+    let found = key;
+    const parent = vertices.get(key)?.parent ?? boxes.get(key)?.parent ?? null;
+    for (let at = parent; at != null; at = boxes.get(at)?.parent ?? null) {
+      if (closed.has(at)) found = at;
+    }
+    return found;
+  };
+  /** @type {Vertex[]} */
+  const shown = [];
+  const inner = new Set();
+  for (const each of vertices.values()) {
+    const own = standsFor(each.key);
+    for (let at = each.parent; at != null; at = boxes.get(at)?.parent ?? null) {
+      const box = /** @type {Vertex} */ (boxes.get(at));
+      box.members.push(each.key);
+      if (each.kind === 'node' || each.kind === 'participant') box.count += 1;
+      inner.add(at);
+    }
+    if (own === each.key) shown.push(each);
+  }
+  for (const box of boxes.values()) {
+    if (!inner.has(box.key) || standsFor(box.key) !== box.key) continue;
+    box.closed = closed.has(box.key);
+    shown.push(box);
+  }
+  /** @type {Map<string, Edge>} */
+  const joined = new Map();
+  for (const edge of edges) {
+    const [from, to] = [standsFor(edge.from), standsFor(edge.to)];
+    if (from === to) continue;
+    const id = `${from} ${edge.kind} ${to}`;
+    const before = joined.get(id);
+    if (before) {
+      before.topics = [...new Set([...before.topics, ...edge.topics])];
+      before.guids = [...before.guids, ...edge.guids];
+      before.passages |= edge.passages;
+    } else {
+      joined.set(id, { ...edge, id, from, to });
+    }
+  }
+  return { vertices: shown, edges: [...joined.values()] };
+}
+
+/** Pixels of a text in the graph's font, which is a monospaced one. @param {string} text */
+function textWidth(text) {
+  let units = 0;
+  // East Asian characters are twice as wide.
+  for (const character of text) units += /[\u1100-\uffdc\u{1f000}-\u{3ffff}]/u.test(character) ? 2 : 1;
+  return units * 6.7;
+}
+
+/** Characters of a name in the graph. */
+export const MOST_LABEL = 32;
+
+/** @param {Vertex} own */
+function measure(own) {
+  const label = shortened(own.name, MOST_LABEL);
+  const detail = shortened(own.detail, MOST_LABEL);
+  own.w = Math.max(96, Math.ceil(Math.max(textWidth(label), textWidth(detail)) + 34));
+  own.h = own.kind === 'topic' || own.detail || own.closed ? 40 : 28;
+  if (own.kind === 'box' && !own.closed) own.h = 0;
+}
+
+/**
+ * The graph in the language of Graphviz.
+ * @param {Graph} graph
+ * @param {(edge: Edge) => string} labelOf
+ */
+export function dot(graph, labelOf) {
+  const quoted = (/** @type {string} */ text) => {
+    const own = visible(text).replaceAll('\\', '\\\\').replaceAll('"', '\\"');
+    return `"${own}"`;
+  };
+  const number = new Map(graph.vertices.map((each, at) => [each.key, `v${at}`]));
+  const lines = ['digraph ros {', '  rankdir=LR;'];
+  const shapes = /** @type {Record<string, string>} */ ({
+    topic: 'box', service: 'hexagon', action: 'octagon', box: 'folder', participant: 'component',
+  });
+  const draw = (/** @type {string|null} */ parent, /** @type {string} */ indent) => {
+    for (const each of graph.vertices) {
+      if (each.parent !== parent) continue;
+      const id = number.get(each.key);
+      if (each.kind === 'box' && !each.closed) {
+        lines.push(`${indent}subgraph cluster_${id} {`, `${indent}  label=${quoted(each.name)};`);
+        draw(each.key, `${indent}  `);
+        lines.push(`${indent}}`);
+      } else {
+        lines.push(`${indent}${id} [label=${quoted(each.name)},`
+          + ` shape=${shapes[each.kind] ?? 'ellipse'}];`);
+      }
+    }
+  };
+  draw(null, '  ');
+  for (const edge of graph.edges) {
+    lines.push(`  ${number.get(edge.from)} -> ${number.get(edge.to)}`
+      + ` [label=${quoted(labelOf(edge))}];`);
+  }
+  lines.push('}', '');
+  return lines.join('\n');
+}

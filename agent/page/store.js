@@ -1,0 +1,129 @@
+// What all views share: the state, its stream, the route, and hooks that follow them.
+
+import { useEffect, useReducer, useRef, useState } from './vendor/hooks.mjs';
+import { json, Refusal } from './api.js';
+import { parse } from './router.js';
+import { State } from './state.js';
+import { Stream } from './stream.js';
+
+/** @type {Set<() => void>} */
+const listeners = new Set();
+let scheduled = false;
+
+function changed() {
+  if (scheduled) return;
+  scheduled = true;
+  queueMicrotask(() => {
+    scheduled = false;
+    for (const listener of listeners) listener();
+  });
+}
+
+export const state = new State();
+export const stream = new Stream(state, changed);
+
+/** Draws the component again with each batch. */
+export function useLive() {
+  const [, draw] = useReducer((count) => count + 1, 0);
+  useEffect(() => {
+    const listener = () => draw(0);
+    listeners.add(listener);
+    return () => { listeners.delete(listener); };
+  }, []);
+  return state;
+}
+
+/** The route of the address; null where no view has it. */
+export function useRoute() {
+  const [route, become] = useState(() => parse(location.hash));
+  useEffect(() => {
+    const follow = () => become(parse(location.hash));
+    window.addEventListener('hashchange', follow);
+    return () => window.removeEventListener('hashchange', follow);
+  }, []);
+  return route;
+}
+
+/** Changes the query of the address without a new entry in the history. @param {string} to */
+export function replaceAddress(to) {
+  history.replaceState(null, '', to);
+  window.dispatchEvent(new HashChangeEvent('hashchange'));
+}
+
+/**
+ * Asks an endpoint again and again while the view is shown and the stream runs.
+ * @param {string|null} path null asks nothing
+ * @param {number} every milliseconds; 0 asks once
+ * @returns {{data: any, problem: Refusal|null, refresh: () => void}}
+ */
+export function usePoll(path, every) {
+  const [answer, take] = useState(
+    /** @type {{path: string|null, data: any, problem: Refusal|null}} */
+    ({ path: null, data: null, problem: null }),
+  );
+  const again = useRef(() => {});
+  useEffect(() => {
+    if (path == null) return undefined;
+    const abort = new AbortController();
+    let timer = 0;
+    const ask = async () => {
+      clearTimeout(timer);
+      if (document.visibilityState !== 'hidden' && stream.status !== 'paused') {
+        try {
+          take({ path, data: await json(path, { signal: abort.signal }), problem: null });
+        } catch (error) {
+          if (abort.signal.aborted) return;
+          const problem = error instanceof Refusal ? error : new Refusal(0, String(error));
+          take((before) => ({ path, data: before.path === path ? before.data : null, problem }));
+        }
+      }
+      if (every > 0 && !abort.signal.aborted) timer = setTimeout(ask, every);
+    };
+    again.current = ask;
+    ask();
+    return () => {
+      clearTimeout(timer);
+      abort.abort();
+    };
+  }, [path, every]);
+  const own = answer.path === path;
+  return {
+    data: own ? answer.data : null,
+    problem: own ? answer.problem : null,
+    refresh: () => again.current(),
+  };
+}
+
+/**
+ * A value kept in this browser under a key.
+ * @template T
+ * @param {string} key
+ * @param {T} initial
+ * @returns {[T, (value: T) => void]}
+ */
+export function useKept(key, initial) {
+  const [value, become] = useState(() => kept(key, initial));
+  return [value, (next) => {
+    keep(key, next);
+    become(() => next);
+  }];
+}
+
+/** @template T @param {string} key @param {T} initial @returns {T} */
+export function kept(key, initial) {
+  try {
+    const text = localStorage.getItem(`ros2probe-${key}`);
+    return text == null ? initial : JSON.parse(text);
+  } catch {
+    return initial;
+  }
+}
+
+/** @param {string} key @param {unknown} value */
+export function keep(key, value) {
+  try {
+    localStorage.setItem(`ros2probe-${key}`, JSON.stringify(value));
+  } catch {
+    // A browser that keeps nothing shows the page all the same.
+  }
+}

@@ -1,0 +1,137 @@
+// The one stream of a tab: `GET /live`, reopened when it breaks, closed while nobody looks.
+
+import { Refusal, request } from './api.js';
+import { Lines } from './state.js';
+
+/** Silence after which the connection counts as dead. */
+const SILENCE_MS = 5000;
+/** A hidden tab closes its stream after this; a quick change of tabs keeps it. */
+const SLEEP_MS = 10000;
+const FIRST_WAIT_MS = 1000;
+const LONGEST_WAIT_MS = 10000;
+
+/** @typedef {'connecting'|'live'|'paused'|'asleep'|'lost'|'refused'} Status */
+
+export class Stream {
+  /**
+   * @param {import('./state.js').State} state
+   * @param {() => void} changed called once a batch, and when the status changes
+   */
+  constructor(state, changed) {
+    this.state = state;
+    this.changed = changed;
+    /** @type {Status} */ this.status = 'connecting';
+    /** @type {Refusal|null} */ this.problem = null;
+    /** @type {AbortController|null} */ this.connection = null;
+    this.wait = FIRST_WAIT_MS;
+    this.retry = 0;
+    this.sleep = 0;
+    document.addEventListener('visibilitychange', () => this.seen());
+    // A page in the back-forward cache must not hold a stream.
+    window.addEventListener('pagehide', () => this.close('asleep'));
+    window.addEventListener('pageshow', (event) => {
+      if (event.persisted) this.seen();
+    });
+  }
+
+  /** Opens the stream unless it is open, paused or refused. */
+  open() {
+    if (this.connection || this.status === 'paused') return;
+    clearTimeout(this.retry);
+    this.become('connecting', this.problem);
+    const connection = new AbortController();
+    this.connection = connection;
+    this.follow(connection).then(() => null, (error) => error).then((error) => {
+      if (this.connection !== connection) return;
+      this.connection = null;
+      this.broken(error);
+    });
+  }
+
+  /** @param {Status} status */
+  close(status) {
+    clearTimeout(this.retry);
+    const connection = this.connection;
+    this.connection = null;
+    connection?.abort();
+    this.become(status, null);
+  }
+
+  pause() {
+    this.close('paused');
+  }
+
+  resume() {
+    this.status = 'connecting';
+    this.open();
+  }
+
+  /** Opens the stream anew, as another token demands. */
+  reopen() {
+    this.close('connecting');
+    this.wait = FIRST_WAIT_MS;
+    this.open();
+  }
+
+  /** The tab was hidden or shown. */
+  seen() {
+    clearTimeout(this.sleep);
+    if (document.visibilityState === 'hidden') {
+      this.sleep = setTimeout(() => {
+        if (this.status !== 'paused' && this.status !== 'refused') this.close('asleep');
+      }, SLEEP_MS);
+    } else if (this.status === 'asleep' || this.status === 'lost') {
+      this.wait = FIRST_WAIT_MS;
+      this.open();
+    }
+  }
+
+  /** @param {AbortController} connection */
+  async follow(connection) {
+    const silence = () => setTimeout(() => connection.abort(), SILENCE_MS);
+    let watchdog = silence();
+    try {
+      const response = await request('live', { signal: connection.signal });
+      const reader = /** @type {ReadableStream<Uint8Array>} */ (response.body).getReader();
+      const decoder = new TextDecoder();
+      const lines = new Lines();
+      for (;;) {
+        const { done, value } = await reader.read();
+        if (done || this.connection !== connection) return;
+        clearTimeout(watchdog);
+        watchdog = silence();
+        let whole = false;
+        for (const line of lines.take(decoder.decode(value, { stream: true }))) {
+          whole = this.state.apply(line) || whole;
+        }
+        if (whole) {
+          this.wait = FIRST_WAIT_MS;
+          this.become('live', null);
+        }
+      }
+    } finally {
+      clearTimeout(watchdog);
+      connection.abort();
+    }
+  }
+
+  /** @param {unknown} error */
+  broken(error) {
+    const refusal = error instanceof Refusal ? error : null;
+    if (refusal?.status === 401) {
+      this.become('refused', refusal);
+      return;
+    }
+    this.become('lost', refusal);
+    if (document.visibilityState === 'hidden') return;
+    this.retry = setTimeout(() => this.open(), this.wait);
+    this.wait = Math.min(LONGEST_WAIT_MS, this.wait * 2);
+  }
+
+  /** @param {Status} status @param {Refusal|null} problem */
+  become(status, problem) {
+    this.status = status;
+    this.problem = problem;
+    this.changed();
+  }
+}

@@ -1,0 +1,166 @@
+import assert from 'node:assert/strict';
+import { test } from 'node:test';
+import { build, dot, isHub } from '../graph-model.js';
+import { layout } from '../layout.js';
+import { State } from '../state.js';
+
+/** @type {import('../graph-model.js').Options} */
+const ALL = {
+  mode: 'both', hubs: false, hidden: false, boxes: 'none', toggled: new Set(), focus: null, hops: 1,
+};
+
+/**
+ * @param {string[]} nodes
+ * @param {[string, string[], string[]][]} topics name, publishers, subscribers
+ */
+function robot(nodes, topics) {
+  const state = new State();
+  const id = new Map(nodes.map((name, at) => [name, at + 1]));
+  state.apply({ open: { run: 'r', flags: [], passages: ['network'], access: 'read' } });
+  const ends = (/** @type {1|2} */ side) => topics.flatMap((topic, at) => topic[side].map(
+    (node, place) => [at + 1, id.get(node) ?? 0, 1 + ((id.get(node) ?? 1) % 3),
+      `${side}.${at}.${place}`, 1, 'RELIABLE', 'VOLATILE']));
+  state.apply({ graph: {
+    participants: [1, 2, 3].map((at) => [at, `guid${at}`, 0, 'v', at === 3 ? 'b' : 'a', at, `p${at}`,
+      null]),
+    nodes: nodes.map((name, at) => [at + 1, 0, name, [1 + ((at + 1) % 3)],
+      name.includes('/_') ? 1 : 0]),
+    topics: topics.map(([name], at) => [at + 1, 0, name, `rt${name}`, 'topic', ['T'],
+      name.includes('/_') ? 1 : 0, 0, 0, 0]),
+    publishers: ends(1),
+    subscriptions: ends(2),
+  } });
+  return state;
+}
+
+const CHAIN = () => robot(['/a', '/b', '/c', '/d'], [
+  ['/ab', ['/a'], ['/b']], ['/bc', ['/b'], ['/c']], ['/cd', ['/c'], ['/d']],
+  ['/rosout', ['/a', '/b', '/c', '/d'], []], ['/ns/tf', ['/a'], ['/d']],
+]);
+
+/** @param {import('../graph-model.js').Graph} graph */
+const names = (graph) => graph.vertices.map((vertex) => vertex.name).sort();
+
+test('hubs are folded until they are asked for', () => {
+  assert.ok(isHub('/robot1/tf') && isHub('/rosout') && !isHub('/tfx') && !isHub('/clock/x'));
+  const graph = build(CHAIN(), ALL);
+  assert.deepEqual(names(graph), ['/a', '/ab', '/b', '/bc', '/c', '/cd', '/d']);
+  assert.equal(graph.folded, 2);
+  assert.ok(names(build(CHAIN(), { ...ALL, hubs: true })).includes('/rosout'));
+});
+
+test('a hub that is the focus is shown', () => {
+  const graph = build(CHAIN(), { ...ALL, focus: 'topic:0:/rosout' });
+  assert.deepEqual(names(graph), ['/a', '/b', '/c', '/d', '/rosout']);
+});
+
+test('a hop leads from node to node, and from a topic to its nodes', () => {
+  const one = build(CHAIN(), { ...ALL, focus: 'node:0:/b' });
+  assert.deepEqual(names(one), ['/a', '/ab', '/b', '/bc', '/c']);
+  const topic = build(CHAIN(), { ...ALL, focus: 'topic:0:/bc' });
+  assert.deepEqual(names(topic), ['/b', '/bc', '/c']);
+  const two = build(CHAIN(), { ...ALL, focus: 'topic:0:/bc', hops: 2 });
+  assert.deepEqual(names(two), ['/a', '/ab', '/b', '/bc', '/c', '/cd', '/d']);
+  assert.equal(names(build(CHAIN(), { ...ALL, focus: 'node:0:/gone' })).length, 7);
+});
+
+test('nodes alone have one edge a pair, with all its topics', () => {
+  const state = robot(['/a', '/b'], [
+    ['/x', ['/a'], ['/b']], ['/y', ['/a'], ['/b', '/a']], ['/z', ['/b'], []],
+  ]);
+  const graph = build(state, { ...ALL, mode: 'nodes' });
+  assert.deepEqual(names(graph), ['/a', '/b']);
+  assert.equal(graph.edges.length, 1);
+  assert.deepEqual(graph.edges[0].topics, [1, 2]);
+});
+
+test('hidden nodes and topics are shown on request', () => {
+  const state = robot(['/a', '/_cli'], [['/x', ['/a'], ['/_cli']], ['/_y', ['/a'], []]]);
+  assert.deepEqual(names(build(state, ALL)), ['/a', '/x']);
+  assert.equal(build(state, ALL).edges.length, 1);
+  assert.deepEqual(names(build(state, { ...ALL, hidden: true })), ['/_cli', '/_y', '/a', '/x']);
+});
+
+test('an endpoint without a node belongs to its participant', () => {
+  const state = robot(['/a'], [['/x', ['/a'], ['nobody']]]);
+  const graph = build(state, ALL);
+  assert.ok(graph.vertices.some((vertex) => vertex.kind === 'participant'));
+  assert.equal(graph.edges.length, 2);
+});
+
+test('namespaces are boxes, and topics between their own nodes lie in them', () => {
+  const state = robot(['/r/a', '/r/b', '/s/c', '/s/d', '/lone'], [
+    ['/r/x', ['/r/a'], ['/r/b']], ['/y', ['/r/a'], ['/s/c']],
+  ]);
+  const graph = build(state, { ...ALL, boxes: 'namespace' });
+  const parent = Object.fromEntries(graph.vertices.map((vertex) => [vertex.name, vertex.parent]));
+  assert.equal(parent['/r/x'], 'box:/r');
+  assert.equal(parent['/y'], null);
+  assert.equal(parent['/lone'], null);
+  const closed = build(state, { ...ALL, boxes: 'namespace', toggled: new Set(['box:/r']) });
+  assert.deepEqual(names(closed), ['/lone', '/r/', '/s/', '/s/c', '/s/d', '/y']);
+  assert.deepEqual(closed.edges.map((edge) => [edge.from, edge.to]),
+    [['box:/r', 'topic:0:/y'], ['topic:0:/y', 'node:0:/s/c']]);
+  const box = /** @type {any} */ (closed.vertices.find((vertex) => vertex.key === 'box:/r'));
+  assert.equal(box.count, 2);
+});
+
+test('above 60 nodes boxes are closed, below the one that holds everything', () => {
+  const nodes = Array.from({ length: 70 }, (_, at) => `/robot/${'abcde'[at % 5]}/n${at}`);
+  const graph = build(robot(nodes, []), { ...ALL, boxes: 'namespace' });
+  assert.deepEqual(names(graph),
+    ['/robot/', '/robot/a/', '/robot/b/', '/robot/c/', '/robot/d/', '/robot/e/']);
+  const opened = build(robot(nodes, []),
+    { ...ALL, boxes: 'namespace', toggled: new Set(['box:/robot/a']) });
+  assert.equal(opened.vertices.length, 6 + 14);
+});
+
+test('hosts are boxes, and processes of several nodes', () => {
+  const state = robot(['/a', '/b', '/c', '/d'], [['/x', ['/a'], ['/d']]]);
+  const graph = build(state, { ...ALL, boxes: 'process' });
+  const by = Object.fromEntries(graph.vertices.map((vertex) => [vertex.name, vertex]));
+  // Nodes 1 and 4 share the participant of process 2 on host a; the others are alone in theirs.
+  assert.equal(by['/a'].parent, 'box:a 2');
+  assert.equal(by['/d'].parent, 'box:a 2');
+  assert.equal(by['/x'].parent, 'box:a 2');
+  assert.equal(by['/b'].parent, 'box:b');
+  assert.equal(by['/b'].detail, 'p3 3');
+  assert.equal(by['p2 2'].parent, 'box:a');
+});
+
+test('services join nodes that are shown', () => {
+  const joints = {
+    nodes: [{ id: 'service:0:/s', kind: 'service', name: '/s' }, { id: 'topic:0:/x', kind: 'topic' }],
+    edges: [{ source: 'node:0:/a', target: 'service:0:/s', kind: 'calls' },
+      { source: 'service:0:/s', target: 'node:0:/gone', kind: 'served_by' }],
+  };
+  const graph = build(robot(['/a'], []), ALL, joints);
+  assert.deepEqual(names(graph), ['/a', '/s']);
+  assert.equal(graph.edges.length, 1);
+});
+
+test('figures leave the signature alone, another endpoint changes it', () => {
+  const state = CHAIN();
+  const before = build(state, ALL).signature;
+  state.apply({ values: { t: 1, topics: [[1, 5, 5, 5, 0, 0, null, null, 1, 1]],
+    totals: [1, 1, 0, 1] } });
+  assert.equal(build(state, ALL).signature, before);
+  assert.notEqual(build(CHAIN(), { ...ALL, hubs: true }).signature, before);
+});
+
+test('all of it can be laid out', () => {
+  for (const boxes of /** @type {const} */ (['none', 'namespace', 'process'])) {
+    const graph = build(CHAIN(), { ...ALL, boxes, hubs: true });
+    const placed = layout(graph.vertices.map((each) => ({ ...each, id: each.key })), graph.edges);
+    assert.equal(placed.vertices.length, graph.vertices.length);
+    assert.equal(placed.edges.length, graph.edges.length);
+  }
+});
+
+test('Graphviz gets quoted text only', () => {
+  const state = robot(['/a"];x', '/b\\\u202e'], [['/t', ['/a"];x'], ['/b\\\u202e']]]);
+  const text = dot(build(state, ALL), () => 'l"');
+  assert.ok(text.includes('label="/a\\"];x"'));
+  assert.ok(text.includes('label="/b\\\\\\\\\\\\u{202e}"'), text);
+  assert.ok(text.includes('label="l\\""'));
+});

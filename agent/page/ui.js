@@ -1,0 +1,200 @@
+// Small parts that several views are made of.
+
+import { h } from './vendor/preact.mjs';
+import { useEffect, useRef, useState } from './vendor/hooks.mjs';
+import htm from './vendor/htm.mjs';
+import { Refusal } from './api.js';
+import { several, shortened, visible } from './format.js';
+import { nodeAddress, topicAddress } from './router.js';
+
+export const html = htm.bind(h);
+
+/**
+ * A name from the network: isolated from the text around it, with nothing unseen in it.
+ * @param {{text: string, most?: number}} props
+ */
+export function Name({ text, most = 0 }) {
+  const whole = visible(text);
+  const shown = most ? shortened(text, most) : whole;
+  return html`<bdi class="name" dir="ltr" title=${shown === whole ? undefined : whole}
+    >${shown}</bdi>`;
+}
+
+/** @param {{topic: import('./state.js').Topic, most?: number}} props */
+export function TopicLink({ topic, most }) {
+  return html`<a href=${topicAddress(topic)}><${Name} text=${topic.name} most=${most} /></a>`;
+}
+
+/** @param {{node: import('./state.js').Node, most?: number}} props */
+export function NodeLink({ node, most }) {
+  return html`<a href=${nodeAddress(node)}><${Name} text=${node.name} most=${most} /></a>`;
+}
+
+/** How bad something is: a mark, a word and a colour. */
+const MARKS = /** @type {Record<string, [string, string]>} */ ({
+  error: ['✖', 'error'],
+  warning: ['▲', 'warning'],
+  note: ['●', 'note'],
+  good: ['✔', 'good'],
+});
+
+/** @param {{severity: string}} props */
+export function Mark({ severity }) {
+  const [sign, word] = MARKS[severity] ?? MARKS.note;
+  return html`<span class="mark ${severity}"><span aria-hidden="true">${sign}</span
+    ><span class="unseen">${word}</span></span>`;
+}
+
+/** Each flag of a topic: severity, word, and what it means. */
+export const FLAGS = /** @type {Record<string, [string, string, string]>} */ ({
+  qos: ['error', 'QoS', 'A publisher and a subscription have incompatible QoS.'],
+  type: ['error', 'type', 'Publishers and subscriptions have different types.'],
+  definition: ['error', 'definition', 'Endpoints have different definitions of the type.'],
+  violated: ['error', 'violated', 'An expectation of a watch is violated.'],
+  loss: ['warning', 'loss', 'Messages were lost in the last minute.'],
+  silent: ['warning', 'silent', 'No message in the last 10 s.'],
+  rejected: ['warning', 'rejected', 'limits.topics is reached: the topic is not measured.'],
+  unheard: ['note', 'unheard', 'A publisher has no matching subscription.'],
+  unfed: ['note', 'unfed', 'A subscription has no matching publisher.'],
+  unseen: ['note', 'unseen', 'Messages of a pair pass where the agent cannot look.'],
+  sampled: ['note', 'sampled', 'Counts come from samples of shared memory.'],
+  encrypted: ['note', 'encrypted', 'A participant announces DDS security.'],
+});
+
+/** Words for the ways of messages. */
+export const PASSAGES = /** @type {Record<string, string>} */ ({
+  network: 'network',
+  shared_memory: 'shared memory',
+  data_sharing: 'data sharing (unseen)',
+  same_process: 'same process (unseen)',
+  iceoryx: 'iceoryx (unseen)',
+});
+
+/** @param {{flags: string[]}} props */
+export function Badges({ flags }) {
+  return flags.map((flag) => {
+    const [severity, word, meaning] = FLAGS[flag] ?? ['note', flag, flag];
+    return html`<span class="badge ${severity}" title=${meaning}
+      ><${Mark} severity=${severity} /> ${word}</span> `;
+  });
+}
+
+/** The worst of a topic's flags: `error`, `warning`, `note` or `good`. @param {string[]} flags */
+export function worst(flags) {
+  const order = ['error', 'warning', 'note'];
+  const found = flags.map((flag) => FLAGS[flag]?.[0] ?? 'note');
+  return order.find((severity) => found.includes(severity)) ?? 'good';
+}
+
+/**
+ * The course of the last ten minutes. The number beside it says the same to a screen reader.
+ * @param {{points: (number|null)[], steps?: number}} props
+ */
+export function Spark({ points, steps = 60 }) {
+  const [width, height] = [120, 24];
+  let most = 0;
+  for (const point of points) if (point != null) most = Math.max(most, point);
+  let path = '';
+  let drawing = false;
+  points.forEach((point, at) => {
+    if (point == null) {
+      drawing = false;
+      return;
+    }
+    const x = ((at + steps - points.length) / (steps - 1)) * width;
+    const y = height - 2 - (most > 0 ? point / most : 0) * (height - 4);
+    path += `${drawing ? 'L' : 'M'}${x.toFixed(1)} ${y.toFixed(1)}`;
+    drawing = true;
+  });
+  return html`<svg class="spark" viewBox="0 0 ${width} ${height}" aria-hidden="true"
+    preserveAspectRatio="none"><path d=${path || 'M0 0'} /></svg>`;
+}
+
+/** @param {{problem: Refusal|null, what: string}} props */
+export function Failed({ problem, what }) {
+  if (!problem) return null;
+  return html`<p class="problem"><${Mark} severity="warning" /> ${what}: ${problem.message}.
+    ${problem.needsToken && html` <${AskButton} />`}</p>`;
+}
+
+/** Opens the dialog that takes a token. */
+export function AskButton() {
+  return html`<button type="button" onClick=${() => askToken()}>Enter a token</button>`;
+}
+
+export function askToken() {
+  window.dispatchEvent(new CustomEvent('ask-token'));
+}
+
+/**
+ * A button that does one thing at a time and shows its refusal.
+ * @param {{action: () => Promise<unknown>, children: any, label?: string, disabled?: boolean,
+ *   pressed?: boolean, kind?: string}} props
+ */
+export function Act({ action, children, label, disabled, pressed, kind = '' }) {
+  const [busy, work] = useState(false);
+  const [problem, refuse] = useState(/** @type {Refusal|null} */ (null));
+  const alive = useRef(true);
+  useEffect(() => () => { alive.current = false; }, []);
+  const press = async () => {
+    work(true);
+    refuse(null);
+    try {
+      await action();
+    } catch (error) {
+      const refusal = error instanceof Refusal ? error : new Refusal(0, String(error));
+      if (alive.current) refuse(refusal);
+      if (refusal.needsToken) askToken();
+    }
+    if (alive.current) work(false);
+  };
+  return html`<button type="button" class=${kind} aria-label=${label} aria-pressed=${pressed}
+    disabled=${disabled || busy} onClick=${press}>${children}</button>
+    ${problem && html` <span class="problem" role="alert">${problem.message}</span>`}`;
+}
+
+/**
+ * A number with its name.
+ * @param {{label: string, value: string, points?: (number|null)[], href?: string}} props
+ */
+export function Figure({ label, value, points, href }) {
+  const text = html`<span class="label">${label}</span><span class="value">${value}</span>
+    ${points && html`<${Spark} points=${points} />`}`;
+  return html`<div class="figure">${href ? html`<a href=${href}>${text}</a>` : text}</div>`;
+}
+
+/** @param {{count: number, noun: string, children?: any}} props */
+export function Empty({ children }) {
+  return html`<p class="empty">${children}</p>`;
+}
+
+/**
+ * Whether all words of a filter are in a text.
+ * @param {string} filter
+ * @param {string} text
+ */
+export function matches(filter, text) {
+  const own = text.toLowerCase();
+  return filter.toLowerCase().split(/\s+/).every((word) => own.includes(word));
+}
+
+/**
+ * A field that filters a list.
+ * @param {{value: string, change: (value: string) => void, label: string, found: number,
+ *   noun: string}} props
+ */
+export function Filter({ value, change, label, found, noun }) {
+  return html`<label class="filter">${label}
+    <input type="search" value=${value} spellcheck=${false} autocomplete="off"
+      onInput=${(/** @type {any} */ event) => change(event.target.value)} />
+    <span class="dim">${several(found, noun)}</span></label>`;
+}
+
+/** Hands text or bytes to the browser as a file. @param {string} file @param {Blob} blob */
+export function download(file, blob) {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(blob);
+  link.download = file;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
