@@ -285,6 +285,7 @@ function layered(items, links, previous, gapX, gapY, sweeps) {
   const crossings = order(columns, items, previous, sweeps);
   settle(columns, gapY);
 
+  /** @type {{left: number, middle: number, right: number}[]} */
   const x = [];
   let width = 0;
   for (const column of columns.list) {

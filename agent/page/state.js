@@ -59,33 +59,32 @@ export class Series {
 }
 
 export class State {
-  constructor() {
-    this.clear();
-  }
+  /** @type {any} */ open = null;
+  /** @type {Map<number, Participant>} */ participants = new Map();
+  /** @type {Map<number, Node>} */ nodes = new Map();
+  /** @type {Map<number, Topic>} */ topics = new Map();
+  /** Changes with the structure of the graph, not with its figures. */
+  structure = 0;
+  /** @type {Map<number, Figures>} */ figures = new Map();
+  /** @type {Map<number, Series>} */ series = new Map();
+  /** @type {{rate: number, bandwidth: number, lost: number, measured: number}} */
+  totals = { rate: 0, bandwidth: 0, lost: 0, measured: 0 };
+  totalSeries = [new Series(), new Series(), new Series()];
+  /** @type {Finding[]} */ findings = [];
+  /** @type {any} */ agent = null;
+  /** @type {Event[]} */ events = [];
+  missedEvents = 0;
+  /** Time of the source's clock. */
+  time = 0;
+  stepBegan = 0;
+  /** @type {{part: number|null, finished: boolean}|null} */ replay = null;
+  /** @type {string|null} */ ended = null;
+  /** Whole batches taken since the state is of this run. */
+  batches = 0;
 
   /** Forgets everything, as another run of the agent demands. */
   clear() {
-    /** @type {any} */ this.open = null;
-    /** @type {Map<number, Participant>} */ this.participants = new Map();
-    /** @type {Map<number, Node>} */ this.nodes = new Map();
-    /** @type {Map<number, Topic>} */ this.topics = new Map();
-    /** Changes with the structure of the graph, not with its figures. */
-    this.structure = (this.structure ?? 0) + 1;
-    /** @type {Map<number, Figures>} */ this.figures = new Map();
-    /** @type {Map<number, Series>} */ this.series = new Map();
-    this.totals = { rate: 0, bandwidth: 0, lost: 0, measured: 0 };
-    this.totalSeries = [new Series(), new Series(), new Series()];
-    /** @type {Finding[]} */ this.findings = [];
-    /** @type {any} */ this.agent = null;
-    /** @type {Event[]} */ this.events = [];
-    this.missedEvents = 0;
-    /** Time of the source's clock. */
-    this.time = 0;
-    this.stepBegan = 0;
-    /** @type {{part: number|null, finished: boolean}|null} */ this.replay = null;
-    /** @type {string|null} */ this.ended = null;
-    /** Whole batches taken since the state is of this run. */
-    this.batches = 0;
+    Object.assign(this, new State(), { structure: this.structure + 1 });
   }
 
   /**

@@ -24,7 +24,7 @@ export const stream = new Stream(state, changed);
 
 /** Draws the component again with each batch. */
 export function useLive() {
-  const [, draw] = useReducer((count) => count + 1, 0);
+  const [, draw] = useReducer((/** @type {number} */ count) => count + 1, 0);
   useEffect(() => {
     const listener = () => draw(0);
     listeners.add(listener);
@@ -74,7 +74,7 @@ export function usePoll(path, every) {
         } catch (error) {
           if (abort.signal.aborted) return;
           const problem = error instanceof Refusal ? error : new Refusal(0, String(error));
-          take((before) => ({ path, data: before.path === path ? before.data : null, problem }));
+          take((/** @type {any} */ before) => ({ path, data: before.path === path ? before.data : null, problem }));
         }
       }
       if (every > 0 && !abort.signal.aborted) timer = setTimeout(ask, every);

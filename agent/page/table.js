@@ -56,7 +56,7 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
     const top = body.current.getBoundingClientRect().top;
     const first = Math.max(0, Math.floor(-top / height) - SPARE);
     const last = Math.ceil((window.innerHeight - top) / height) + SPARE;
-    setRange((before) => (before.first === first && before.last === last
+    setRange((/** @type {any} */ before) => (before.first === first && before.last === last
       ? before : { first, last: Math.max(first, last) }));
   };
   useLayoutEffect(measure);

@@ -1,0 +1,242 @@
+// The page: navigation, status, dialogs, and the view of the address.
+
+import { render } from './vendor/preact.mjs';
+import { useEffect, useRef, useState } from './vendor/hooks.mjs';
+import { keepToken } from './api.js';
+import { count, visible } from './format.js';
+import { address, parse, tokenOf } from './router.js';
+import { Keys, Search, Token } from './dialogs.js';
+import { kept, keep, state, stream, useLive, useRoute } from './store.js';
+import { html, Mark } from './ui.js';
+import { TimeBar } from './timebar.js';
+import { Agent } from './views/agent.js';
+import { Events } from './views/events.js';
+import { Graph } from './views/graph.js';
+import { NodeView, Nodes } from './views/nodes.js';
+import { Overview } from './views/overview.js';
+import { Recordings } from './views/recordings.js';
+import { Topic } from './views/topic.js';
+import { Topics } from './views/topics.js';
+
+// Before anything else: the token leaves the address and the history.
+takeToken();
+const theme = kept('theme', 'auto');
+applyTheme(theme);
+
+/** @type {[string, string, string][]} view, title, second key of its shortcut */
+const VIEWS = [
+  ['', 'Overview', 'o'], ['topics', 'Topics', 't'], ['graph', 'Graph', 'g'],
+  ['nodes', 'Nodes', 'n'], ['events', 'Events', 'e'], ['recordings', 'Recordings', 'r'],
+  ['agent', 'Agent', 'a'],
+];
+
+function takeToken() {
+  const token = tokenOf(location.hash);
+  if (!token) return;
+  keepToken(token);
+  history.replaceState(null, '', address(''));
+}
+
+/** @param {string} name `auto`, `light` or `dark` */
+function applyTheme(name) {
+  document.documentElement.dataset.theme = name;
+  window.dispatchEvent(new Event('theme'));
+}
+
+function App() {
+  useLive();
+  const route = useRoute();
+  const [dialog, show] = useState(/** @type {string|null} */ (null));
+  const main = useRef(/** @type {HTMLElement|null} */ (null));
+  useEffect(() => keyboard(show), []);
+  useEffect(() => {
+    const ask = () => show('token');
+    const token = () => {
+      if (!tokenOf(location.hash)) return;
+      takeToken();
+      stream.reopen();
+    };
+    window.addEventListener('ask-token', ask);
+    window.addEventListener('hashchange', token);
+    return () => {
+      window.removeEventListener('ask-token', ask);
+      window.removeEventListener('hashchange', token);
+    };
+  }, []);
+  const refused = stream.status === 'refused';
+  useEffect(() => { if (refused) show('token'); }, [refused]);
+  const place = `${route?.view}/${route?.name}`;
+  const first = useRef(true);
+  useEffect(() => {
+    const [, title] = VIEWS.find(([view]) => view === route?.view) ?? ['', 'Not found'];
+    const host = state.open?.host;
+    document.title = `${route?.name ? `${visible(route.name)} · ` : ''}${title}`
+      + ` · ${host ? visible(host) : 'ros2probe'}`;
+  }, [place, state.open]);
+  useEffect(() => {
+    // Another view begins at its top, and a screen reader with its heading.
+    if (!first.current) {
+      window.scrollTo(0, 0);
+      main.current?.querySelector('h1')?.focus({ preventScroll: true });
+    }
+    first.current = false;
+  }, [place]);
+  return html`
+    <a class="skip" href="#main" onClick=${(/** @type {Event} */ event) => {
+      event.preventDefault();
+      main.current?.focus();
+    }}>Skip to the content</a>
+    <${Header} route=${route} show=${show} />
+    <${TimeBar} />
+    <${Notice} />
+    <main id="main" tabindex="-1" ref=${main}>
+      ${state.batches > 0 || route?.view === 'token'
+        ? html`<${View} key=${place} route=${route} />`
+        : html`<h1 tabindex="-1">${refused ? 'The agent asks for a token' : 'Connecting …'}</h1>`}
+    </main>
+    <${News} />
+    ${dialog === 'search' && html`<${Search} close=${() => show(null)} />`}
+    ${dialog === 'keys' && html`<${Keys} views=${VIEWS} close=${() => show(null)} />`}
+    ${dialog === 'token' && html`<${Token} close=${() => show(null)} />`}`;
+}
+
+/** @param {{route: import('./router.js').Route|null}} props */
+function View({ route }) {
+  const query = route?.query ?? {};
+  switch (route?.view) {
+    case '': return html`<${Overview} />`;
+    case 'topics': return route.name == null
+      ? html`<${Topics} query=${query} />`
+      : html`<${Topic} name=${route.name} query=${query} />`;
+    case 'graph': return html`<${Graph} query=${query} />`;
+    case 'nodes': return route.name == null
+      ? html`<${Nodes} query=${query} />`
+      : html`<${NodeView} name=${route.name} query=${query} />`;
+    case 'events': return html`<${Events} query=${query} />`;
+    case 'recordings': return html`<${Recordings} />`;
+    case 'agent': return html`<${Agent} />`;
+    default: return html`<h1 tabindex="-1">No such view</h1>
+      <p><a href=${address('')}>Overview</a></p>`;
+  }
+}
+
+const SIGNS = /** @type {Record<string, string>} */ ({ auto: '◐', light: '☀', dark: '☾' });
+
+/** @param {{route: import('./router.js').Route|null, show: (name: string) => void}} props */
+function Header({ route, show }) {
+  const errors = state.findings.filter((finding) => finding.severity === 'error').length;
+  const [own, become] = useState(theme);
+  const next = /** @type {Record<string, string>} */ ({ auto: 'light', light: 'dark', dark: 'auto' });
+  const turn = () => {
+    keep('theme', next[own]);
+    become(next[own]);
+    applyTheme(next[own]);
+  };
+  return html`<header>
+    <div class="bar">
+      <span class="host"><strong>${visible(state.open?.host ?? 'ros2probe')}</strong> <${Status} /></span>
+      <span class="tools">
+        <button type="button" onClick=${() => show('search')}>Search <kbd>/</kbd></button>
+        <${PauseButton} />
+        <button type="button" onClick=${turn} aria-label="Theme: ${own}. Change to ${next[own]}."
+          >${SIGNS[own]}</button>
+        <button type="button" onClick=${() => show('keys')} aria-label="Keys and help">?</button>
+      </span>
+    </div>
+    <nav aria-label="Views"><ul>
+      ${VIEWS.map(([view, title]) => html`<li key=${view}><a href=${address(view)}
+        aria-current=${route?.view === view ? 'page' : undefined}>${title}${
+        view === '' && errors > 0
+          ? html` <span class="badge error"><${Mark} severity="error" /> ${errors}</span>` : ''}</a></li>`)}
+    </ul></nav>
+  </header>`;
+}
+
+function PauseButton() {
+  const paused = stream.status === 'paused';
+  return html`<button type="button" aria-pressed=${paused}
+    onClick=${() => (paused ? stream.resume() : stream.pause())}>${paused ? 'Paused' : 'Pause'}</button>`;
+}
+
+function Status() {
+  const words = {
+    connecting: ['note', 'connecting'], live: ['good', 'live'], paused: ['note', 'paused'],
+    asleep: ['note', 'asleep'], lost: ['warning', 'no connection'], refused: ['warning', 'refused'],
+  };
+  const [severity, word] = words[stream.status];
+  return html`<span class="status"><${Mark} severity=${severity} /> ${word}</span>`;
+}
+
+/** What stands between the page and live figures. */
+function Notice() {
+  if (stream.status === 'lost') {
+    const why = stream.problem?.message ?? 'the connection broke';
+    return html`<p class="notice" role="status"><${Mark} severity="warning" /> No connection: ${why}.
+      ${state.batches > 0 ? ' The figures below are the last ones.' : ''} Trying again.</p>`;
+  }
+  if (stream.status === 'paused') {
+    return html`<p class="notice" role="status">Paused: the figures below stand still.
+      <button type="button" onClick=${() => stream.resume()}>Continue</button></p>`;
+  }
+  return null;
+}
+
+/** The one polite region: findings that appear while the page is open. */
+function News() {
+  const known = useRef(/** @type {Set<string>|null} */ (null));
+  const [text, say] = useState('');
+  const ids = state.findings.map((finding) => finding.id).join('\n');
+  useEffect(() => {
+    if (!state.batches) return;
+    const before = known.current;
+    known.current = new Set(state.findings.map((finding) => finding.id));
+    if (!before) return;
+    const fresh = state.findings.filter((finding) =>
+      !before.has(finding.id) && finding.severity !== 'note');
+    if (!fresh.length) return;
+    const more = fresh.length > 1 ? ` And ${count(fresh.length - 1)} more.` : '';
+    say(`New finding: ${visible(fresh[0].text)}.${more}`);
+  }, [ids, state.batches > 0]);
+  return html`<div class="unseen" role="status" aria-live="polite">${text}</div>`;
+}
+
+/**
+ * Single keys: `/`, `?`, `p`, and `g` with a second one. They can be switched off.
+ * @param {(dialog: string) => void} show
+ */
+function keyboard(show) {
+  let first = '';
+  let timer = 0;
+  const press = (/** @type {KeyboardEvent} */ event) => {
+    const target = /** @type {HTMLElement} */ (event.target);
+    if (event.ctrlKey || event.metaKey || event.altKey || !kept('keys', true)) return;
+    if (target.closest('input, textarea, select, dialog')) return;
+    const before = first;
+    first = '';
+    clearTimeout(timer);
+    if (before === 'g') {
+      const found = VIEWS.find(([, , key]) => key === event.key);
+      if (found) location.hash = address(found[0]);
+    } else if (event.key === '/') {
+      event.preventDefault();
+      show('search');
+    } else if (event.key === '?') {
+      show('keys');
+    } else if (event.key === 'p') {
+      if (stream.status === 'paused') stream.resume();
+      else stream.pause();
+    } else if (event.key === 'g') {
+      first = 'g';
+      timer = setTimeout(() => { first = ''; }, 1500);
+    }
+  };
+  document.addEventListener('keydown', press);
+  return () => document.removeEventListener('keydown', press);
+}
+
+// A fragment that no view has and that is no token is left to the view `No such view`.
+if (!location.hash && parse('')) history.replaceState(null, '', address(''));
+const place = /** @type {HTMLElement} */ (document.getElementById('app'));
+place.textContent = '';
+render(html`<${App} />`, place);
+stream.open();

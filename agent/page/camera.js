@@ -1,0 +1,142 @@
+// Pan and zoom of a drawing: wheel, drag, two fingers, keys. Nothing is drawn again for it.
+
+const LEAST = 0.05;
+const MOST = 4;
+
+export class Camera {
+  /** @param {SVGSVGElement} svg @param {SVGGElement} stage */
+  constructor(svg, stage) {
+    this.svg = svg;
+    this.stage = stage;
+    this.x = 0;
+    this.y = 0;
+    this.scale = 1;
+    this.size = { width: 1, height: 1 };
+    this.fitted = true;
+    /** Whether the last press moved the drawing, and is no click. */
+    this.moved = false;
+    /** @type {Map<number, {x: number, y: number}>} */ this.pointers = new Map();
+    const on = (/** @type {string} */ name, /** @type {(event: any) => void} */ listener) =>
+      svg.addEventListener(name, listener, { passive: false });
+    on('wheel', (event) => this.wheel(event));
+    on('pointerdown', (event) => this.down(event));
+    on('pointermove', (event) => this.move(event));
+    on('pointerup', (event) => this.up(event));
+    on('pointercancel', (event) => this.up(event));
+    this.watch = new ResizeObserver(() => { if (this.fitted) this.fit(); });
+    this.watch.observe(svg);
+  }
+
+  end() {
+    this.watch.disconnect();
+  }
+
+  /** The drawing has this size now; a fitted view stays fitted. @param {number} width @param {number} height */
+  frame(width, height) {
+    this.size = { width: Math.max(1, width), height: Math.max(1, height) };
+    if (this.fitted) this.fit();
+  }
+
+  fit() {
+    const { width, height } = this.view();
+    const margin = 16;
+    const scale = Math.min((width - 2 * margin) / this.size.width,
+      (height - 2 * margin) / this.size.height, 1.2);
+    this.scale = Math.max(LEAST, scale);
+    this.x = (width - this.size.width * this.scale) / 2;
+    this.y = (height - this.size.height * this.scale) / 2;
+    this.fitted = true;
+    this.apply();
+  }
+
+  view() {
+    const { width, height } = this.svg.getBoundingClientRect();
+    return { width: width || 600, height: height || 400 };
+  }
+
+  apply() {
+    this.stage.setAttribute('transform',
+      `translate(${this.x.toFixed(1)} ${this.y.toFixed(1)}) scale(${this.scale.toFixed(4)})`);
+  }
+
+  /** Zooms about a point of the view. @param {number} by @param {number} x @param {number} y */
+  zoom(by, x, y) {
+    const scale = Math.max(LEAST, Math.min(MOST, this.scale * by));
+    this.x = x - ((x - this.x) * scale) / this.scale;
+    this.y = y - ((y - this.y) * scale) / this.scale;
+    this.scale = scale;
+    this.fitted = false;
+    this.apply();
+  }
+
+  /** Moves the view, if need be, so that a vertex is in it. @param {{x: number, y: number}} at */
+  show(at) {
+    const { width, height } = this.view();
+    const [x, y] = [this.x + at.x * this.scale, this.y + at.y * this.scale];
+    const margin = 60;
+    if (x > margin && x < width - margin && y > margin && y < height - margin) return;
+    this.x += width / 2 - x;
+    this.y += height / 2 - y;
+    this.fitted = false;
+    this.apply();
+  }
+
+  /** Takes a key; whether it means something here. @param {string} key */
+  key(key) {
+    const { width, height } = this.view();
+    if (key === '+' || key === '=') this.zoom(1.3, width / 2, height / 2);
+    else if (key === '-' || key === '−') this.zoom(1 / 1.3, width / 2, height / 2);
+    else if (key === '0') this.fit();
+    else return false;
+    return true;
+  }
+
+  /** @param {WheelEvent} event */
+  wheel(event) {
+    // Without Ctrl the page scrolls, unless the drawing has the focus.
+    if (!event.ctrlKey && !this.svg.contains(document.activeElement)) return;
+    event.preventDefault();
+    const { left, top } = this.svg.getBoundingClientRect();
+    this.zoom(Math.exp(-event.deltaY * 0.0015), event.clientX - left, event.clientY - top);
+  }
+
+  /** @param {PointerEvent} event */
+  down(event) {
+    if (event.button !== 0) return;
+    this.moved = false;
+    this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+  }
+
+  /** @param {PointerEvent} event */
+  move(event) {
+    const before = this.pointers.get(event.pointerId);
+    if (!before) return;
+    const now = { x: event.clientX, y: event.clientY };
+    const distance = Math.hypot(now.x - before.x, now.y - before.y);
+    if (!this.moved && distance < 4) return;
+    if (!this.moved) {
+      this.moved = true;
+      this.svg.setPointerCapture(event.pointerId);
+    }
+    const others = [...this.pointers].filter(([id]) => id !== event.pointerId);
+    if (others.length === 1) {
+      const [, other] = others[0];
+      const [was, is] = [before, now].map((each) => Math.hypot(each.x - other.x, each.y - other.y));
+      const { left, top } = this.svg.getBoundingClientRect();
+      if (was > 0) this.zoom(is / was, (now.x + other.x) / 2 - left, (now.y + other.y) / 2 - top);
+    } else {
+      this.x += now.x - before.x;
+      this.y += now.y - before.y;
+      this.fitted = false;
+      this.apply();
+    }
+    this.pointers.set(event.pointerId, now);
+  }
+
+  /** @param {PointerEvent} event */
+  up(event) {
+    this.pointers.delete(event.pointerId);
+    // The click that follows still sees that it was a drag.
+    setTimeout(() => { if (!this.pointers.size) this.moved = false; }, 0);
+  }
+}

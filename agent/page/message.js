@@ -1,0 +1,231 @@
+// The message of a topic as it comes: a tree of its fields, and charts of the numbers chosen in it.
+// The agent sends at most five a second, and only while this is open.
+
+import { useEffect, useRef, useState } from './vendor/hooks.mjs';
+import { named, Refusal, request } from './api.js';
+import { Chart } from './chart.js';
+import { bytes, clock, count, visible } from './format.js';
+import { Lines } from './state.js';
+import { state, stream, useKept } from './store.js';
+import { AskButton, Failed, html, Mark, Name } from './ui.js';
+
+const HERTZ = 5;
+/** Points of a field's chart: two minutes at five a second. */
+const MOST_POINTS = 600;
+/** Lines of a tree: a message of thousands of fields stays a page. */
+const MOST_LINES = 400;
+
+/**
+ * @typedef {{path: string, depth: number, key: string, value: unknown, count: number|null}} Leaf
+ *   `count` is the number of members of an object or array, null for a value.
+ */
+
+/**
+ * A message as lines; arrays and texts that the agent cut show their whole length.
+ * @param {unknown} value
+ * @param {Set<string>} closed paths of objects that are not unfolded
+ * @param {number} [most]
+ * @returns {Leaf[]}
+ */
+export function flatten(value, closed, most = MOST_LINES) {
+  /** @type {Leaf[]} */
+  const lines = [];
+  const walk = (/** @type {unknown} */ each, /** @type {string} */ key, /** @type {string} */ path,
+    /** @type {number} */ depth) => {
+    if (lines.length >= most) return;
+    const [members, length, cut] = inside(each);
+    if (!members) {
+      lines.push({ path, depth, key, value: cut ?? each, count: null });
+      return;
+    }
+    if (depth >= 0) lines.push({ path, depth, key, value: null, count: length });
+    if (closed.has(path)) return;
+    for (const [name, member] of members) {
+      const isPlace = typeof name === 'number';
+      walk(member, isPlace ? `[${name}]` : name,
+        isPlace ? `${path}[${name}]` : path ? `${path}.${name}` : name, depth + 1);
+    }
+  };
+  walk(value, '', '', -1);
+  return lines;
+}
+
+/**
+ * Members of an object or array with their number; for a text that was cut, the text.
+ * @param {unknown} value
+ * @returns {[[string|number, unknown][]|null, number, string|null]}
+ */
+function inside(value) {
+  if (value === null || typeof value !== 'object') return [null, 0, null];
+  if (Array.isArray(value)) return [value.map((each, at) => [at, each]), value.length, null];
+  const own = /** @type {Record<string, any>} */ (value);
+  if (typeof own.$text === 'string') return [null, 0, `${own.$text}… (${own.$length} characters)`];
+  if (Array.isArray(own.$items)) {
+    return [own.$items.map((/** @type {unknown} */ each, /** @type {number} */ at) => [at, each]),
+      own.$length, null];
+  }
+  const members = Object.entries(own);
+  return [members, members.length, null];
+}
+
+/**
+ * The number at a path such as `pose.position.x` or `ranges[3]`; null where it is no number.
+ * @param {unknown} value
+ * @param {string} path
+ * @returns {number|null}
+ */
+export function numberAt(value, path) {
+  let at = value;
+  for (const part of path.match(/[^.[\]]+/g) ?? []) {
+    if (at === null || typeof at !== 'object') return null;
+    const own = /** @type {any} */ (at);
+    at = Array.isArray(own.$items) ? own.$items[Number(part)] : own[part];
+  }
+  if (typeof at === 'boolean') return Number(at);
+  const number = typeof at === 'string' && at.trim() !== '' ? Number(at) : at;
+  return typeof number === 'number' && Number.isFinite(number) ? number : null;
+}
+
+/** @param {{topic: import('./state.js').Topic, scope: string, name: string}} props */
+export function LiveMessage({ topic, scope, name }) {
+  const [open, turn] = useState(false);
+  const may = state.may('all');
+  return html`<section aria-labelledby="live"><h2 id="live">Live message</h2>
+    ${!may && html`<p>Messages may hold anything the robot sees. Showing them needs a token with the
+      right <strong>all</strong>: run <code>rp page</code> on the robot. <${AskButton} /></p>`}
+    ${may && html`<p><button type="button" aria-expanded=${open} onClick=${() => turn(!open)}>${open
+      ? 'Close' : 'Show messages'}</button> <span class="dim">at most ${HERTZ} a second; the topic is
+      measured meanwhile</span></p>`}
+    ${may && open && html`<${Follow} scope=${scope} name=${name} topic=${topic} />`}</section>`;
+}
+
+/** @param {{scope: string, name: string, topic: import('./state.js').Topic}} props */
+function Follow({ scope, name, topic }) {
+  const [type, setType] = useState(/** @type {any} */ (null));
+  const [message, setMessage] = useState(/** @type {any} */ (null));
+  const [problem, refuse] = useState(/** @type {Refusal|null} */ (null));
+  const [end, setEnd] = useState('');
+  const [closed, close] = useState(/** @type {Set<string>} */ (new Set()));
+  const [plotted, plot] = useKept(`plot ${topic.types[0]}`, /** @type {string[]} */ ([]));
+  const [run, again] = useState(0);
+  const points = useRef({ times: /** @type {number[]} */ ([]),
+    values: /** @type {Map<string, (number|null)[]>} */ (new Map()) });
+  const wanted = useRef(plotted);
+  wanted.current = plotted;
+  useEffect(() => {
+    const abort = new AbortController();
+    const take = (/** @type {any} */ line) => {
+      if (line.type) setType(line.type);
+      if (line.end) setEnd(line.end.reason);
+      if (!line.message || stream.status === 'paused') return;
+      setMessage(line.message);
+      const { times, values } = points.current;
+      times.push(line.message.time);
+      for (const path of wanted.current) {
+        const own = values.get(path) ?? times.slice(1).map(() => null);
+        own.push(numberAt(line.message.value, path));
+        values.set(path, own);
+      }
+      for (const path of [...values.keys()]) {
+        if (!wanted.current.includes(path)) values.delete(path);
+      }
+      while (times.length > MOST_POINTS) {
+        times.shift();
+        for (const own of values.values()) own.shift();
+      }
+    };
+    const follow = async () => {
+      const rest = `/messages${scope}${scope ? '&' : '?'}max_hertz=${HERTZ}`;
+      const response = await request(named('topics', name, rest), { signal: abort.signal });
+      const reader = /** @type {ReadableStream<Uint8Array>} */ (response.body).getReader();
+      const [decoder, lines] = [new TextDecoder(), new Lines()];
+      for (;;) {
+        const { done, value } = await reader.read();
+        if (done) return;
+        for (const line of lines.take(decoder.decode(value, { stream: true }))) take(line);
+      }
+    };
+    refuse(null);
+    setEnd('');
+    follow().then(() => setEnd((/** @type {string} */ reason) => reason || 'the connection broke'), (error) => {
+      if (abort.signal.aborted) return;
+      refuse(error instanceof Refusal ? error : new Refusal(0, 'the connection broke'));
+    });
+    // A hidden tab asks for nothing.
+    const hidden = () => {
+      if (document.visibilityState === 'hidden') abort.abort();
+      else if (abort.signal.aborted) again((/** @type {number} */ value) => value + 1);
+    };
+    document.addEventListener('visibilitychange', hidden);
+    return () => {
+      document.removeEventListener('visibilitychange', hidden);
+      abort.abort();
+    };
+  }, [name, scope, run]);
+  const toggle = (/** @type {string} */ path) => {
+    const next = new Set(closed);
+    if (!next.delete(path)) next.add(path);
+    close(next);
+  };
+  const choose = (/** @type {string} */ path) => plot(plotted.includes(path)
+    ? plotted.filter((each) => each !== path) : [...plotted, path].slice(-6));
+  const lines = message?.value != null ? flatten(message.value, closed) : [];
+  const { times, values } = points.current;
+  const colours = ['--line-1', '--line-2', '--line-3', '--line-4', '--line-1', '--line-2'];
+  return html`
+    <${Failed} problem=${problem} what="No messages" />
+    ${end && html`<p class="problem"><${Mark} severity="warning" /> The messages end: ${end}.
+      <button type="button" onClick=${() => again(run + 1)}>Again</button></p>`}
+    ${type && !type.known && html`<p><${Mark} severity="note" /> The definition of <${Name}
+      text=${type.name} /> is not known: ${type.reason ?? 'no file has it'}. Sizes are shown, fields
+      are not.</p>`}
+    ${!message && !problem && !end && html`<p class="dim">Waiting for a message …</p>`}
+    ${plotted.map((path, at) => values.has(path) && html`<${Chart} key=${path} title=${path}
+      times=${times} print=${printNumber} lines=${[{ label: path, colour: colours[at],
+        values: values.get(path) ?? [] }]} />`)}
+    ${message && html`<p class="dim">${clock(message.time)}, ${bytes(message.bytes)}${
+      message.sequence_number != null ? `, number ${count(message.sequence_number)}` : ''}${
+      message.node ? html` by <${Name} text=${message.node} />` : ''}${message.skipped
+      ? `, ${count(message.skipped)} not shown before it` : ''}</p>`}
+    ${message?.error && html`<p><${Mark} severity="warning" /> <${Name} text=${message.error} /></p>`}
+    ${lines.length > 0 && html`<div class="scroll tree" tabindex="0" role="region"
+      aria-label="Fields of the message"><table><thead><tr><th scope="col">Field</th>
+      <th scope="col">Value</th><th scope="col"><span class="unseen">Plot</span></th></tr></thead>
+      <tbody>${lines.map((line) => html`<${FieldRow} key=${line.path} line=${line}
+        closed=${closed.has(line.path)} toggle=${toggle} choose=${choose}
+        plotted=${plotted.includes(line.path)} />`)}</tbody></table></div>`}
+    ${lines.length >= MOST_LINES && html`<p class="dim">The first ${count(MOST_LINES)} fields.</p>`}
+    ${type?.definition && html`<details><summary>Definition of <${Name} text=${type.name} /></summary>
+      <pre tabindex="0">${String(type.definition).split(/\r?\n/).map(visible).join('\n')}</pre>
+      ${type.source && html`<p class="dim">From <${Name} text=${type.source} /></p>`}</details>`}`;
+}
+
+/**
+ * @param {{line: Leaf, closed: boolean, toggle: (path: string) => void,
+ *   choose: (path: string) => void, plotted: boolean}} props
+ */
+function FieldRow({ line, closed, toggle, choose, plotted }) {
+  const own = typeof line.value === 'number' || typeof line.value === 'boolean';
+  const name = html`<${Name} text=${line.key} />`;
+  return html`<tr><th scope="row" class="depth-${Math.min(8, line.depth)}">${line.count == null ? name
+    : html`<button type="button" class="plain" aria-expanded=${!closed}
+      onClick=${() => toggle(line.path)}><span aria-hidden="true">${closed ? '▸' : '▾'}</span> ${name}
+      <span class="dim">(${count(line.count)})</span></button>`}</th>
+    <td class="value">${line.count == null ? printValue(line.value) : ''}</td>
+    <td>${own && html`<button type="button" class="small" aria-pressed=${plotted}
+      aria-label="Plot ${line.path}" onClick=${() => choose(line.path)}>plot</button>`}</td></tr>`;
+}
+
+/** @param {unknown} value */
+function printValue(value) {
+  if (typeof value === 'number') return printNumber(value);
+  if (typeof value === 'string') return html`<${Name} text=${value} />`;
+  return visible(String(value));
+}
+
+/** @param {number|null} value */
+function printNumber(value) {
+  if (value == null) return '–';
+  if (Number.isInteger(value)) return String(value);
+  return String(Number(value.toPrecision(9)));
+}

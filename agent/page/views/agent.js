@@ -1,0 +1,88 @@
+// The agent itself: its source, what it is able to see, limits in use, and what it dropped.
+
+import { bytes, count, duration, percent } from '../format.js';
+import { address } from '../router.js';
+import { state, stream, useLive, usePoll } from '../store.js';
+import { AskButton, Failed, html, Mark, Name } from '../ui.js';
+
+const SOURCES = /** @type {Record<string, string>} */ ({
+  host: 'the sockets of this host', wire: 'network interfaces', replay: 'a capture file',
+});
+
+/** @param {{title: string, rows: [any, any][]}} props */
+function Facts({ title, rows }) {
+  return html`<section aria-label=${title}><h2>${title}</h2><table aria-label=${title}><tbody>
+    ${rows.map(([name, value]) => html`<tr key=${name}><th scope="row">${name}</th>
+      <td>${value}</td></tr>`)}</tbody></table></section>`;
+}
+
+export function Agent() {
+  useLive();
+  const { data, problem } = usePoll('health', 2000);
+  const open = state.open ?? {};
+  const drops = data ? /** @type {[string, number|null][]} */ ([
+    ['Packets the kernel dropped before the agent', data.dropped_packets],
+    ['Records that found no room', data.dropped_records],
+    ['Datagrams that found no room', data.dropped_datagrams],
+    ['Datagrams given up because several ran at once', data.contended_datagrams],
+    ['Topics not measured because limits.topics is reached', data.topics_rejected],
+    ['Writers that send without an announcement seen', data.unknown_writers],
+  ]) : [];
+  return html`<h1 tabindex="-1">Agent</h1>
+    <${Failed} problem=${problem} what="No facts about the agent" />
+    ${state.agent && html`<p>${state.agent.ready
+      ? html`<${Mark} severity="good" /> The agent sees the robot.`
+      : html`<${Mark} severity="error" /> The agent is not ready: <${Name}
+        text=${state.agent.reason ?? ''} />`}</p>`}
+    ${state.ended && html`<p><${Mark} severity="warning" /> <${Name} text=${state.ended} /></p>`}
+    <${Facts} title="This agent" rows=${[
+      ['Host', html`<${Name} text=${open.host ?? data?.host ?? 'unknown'} />`],
+      ['Version', open.version ?? '–'],
+      ['Looks at', html`${SOURCES[open.source] ?? open.source ?? '–'} ${data?.source_reason
+        ? html`<span class="dim"><${Name} text=${data.source_reason} /></span>` : ''}`],
+      ['Rights at this address', html`${open.access ?? '–'} ${open.access !== 'all'
+        && html`<${AskButton} />`}`],
+      ['Running for', duration(data?.uptime_seconds)],
+      ['Process', count(data?.process_id)],
+      ['Capabilities', html`<${Name} text=${data?.capabilities.join(', ') || 'none'} />`],
+      ['Watches', html`${count(data?.watches)} <a href=${address('topics', null,
+        { only: 'measured' })}>measured topics</a>`],
+      ['Stream', stream.status],
+    ]} />
+    ${data && html`
+    <section aria-labelledby="abilities"><h2 id="abilities">Abilities</h2><table
+      aria-labelledby="abilities"><tbody>${data.abilities.map((/** @type {any} */ each) => html`
+      <tr key=${each.ability}><th scope="row"><${Mark} severity=${each.able ? 'good' : 'note'} /> ${
+        each.ability.replaceAll('_', ' ')}</th><td>${each.able ? 'yes' : html`no: <${Name}
+        text=${each.reason ?? ''} />`}</td></tr>`)}</tbody></table></section>
+    <${Facts} title="Not counted or dropped" rows=${drops.map(([name, value]) => [name,
+      html`${value ? html`<${Mark} severity="warning" /> ` : ''}${count(value)}`])} />
+    <section aria-labelledby="limits"><h2 id="limits">Limits in use</h2><div class="scroll"
+      tabindex="0" role="region" aria-labelledby="limits"><table><thead><tr><th scope="col">Limit</th>
+      <th scope="col" class="number">Used</th><th scope="col" class="number">Of</th>
+      <th scope="col" class="number">Part</th><th scope="col" class="number">Times reached</th></tr></thead>
+      <tbody>${[...data.limits].sort((one, other) => part(other) - part(one)).map(
+        (/** @type {any} */ each) => html`<tr key=${each.limit}><th scope="row">${each.limit}</th>
+        <td class="number">${amount(each, each.used)}</td>
+        <td class="number">${amount(each, each.cap)}</td>
+        <td class="number">${percent(part(each))}</td>
+        <td class="number">${each.reached > 0 ? html`<${Mark} severity="warning" /> ` : ''}${count(
+          each.reached)}</td></tr>`)}</tbody></table></div></section>
+    ${data.interfaces.length > 0 && html`<section aria-labelledby="interfaces">
+      <h2 id="interfaces">Interfaces</h2><table aria-labelledby="interfaces"><thead><tr>
+      <th scope="col">Interface</th><th scope="col" class="number">Packets</th>
+      <th scope="col" class="number">Dropped</th></tr></thead><tbody>${data.interfaces.map(
+      (/** @type {any} */ each) => html`<tr key=${each.interface}><th scope="row"><${Name}
+        text=${each.interface} /></th><td class="number">${count(each.packets)}</td>
+        <td class="number">${count(each.dropped_packets)}</td></tr>`)}</tbody></table></section>`}`}`;
+}
+
+/** @param {{used: number, cap: number}} limit */
+function part(limit) {
+  return limit.cap > 0 ? limit.used / limit.cap : 0;
+}
+
+/** @param {{limit: string}} limit @param {number} value */
+function amount(limit, value) {
+  return limit.limit.includes('bytes') ? bytes(value) : count(value);
+}

@@ -1,0 +1,555 @@
+// The graph: nodes and topics from left to right, with what flows and where it fails.
+
+import { useEffect, useMemo, useRef, useState } from '../vendor/hooks.mjs';
+import { bandwidth, count, rate, several, shortened, visible } from '../format.js';
+import { build, dot, MANY_NODES, MOST_LABEL } from '../graph-model.js';
+import { address, nodeAddress, topicAddress } from '../router.js';
+import { replaceAddress, state, useLive, usePoll } from '../store.js';
+import { Badges, download, Failed, html, Mark, Name, PASSAGES, worst } from '../ui.js';
+import { Camera } from '../camera.js';
+
+/** The layout follows a change of the structure after this. */
+const SETTLE_MS = 500;
+
+/** The look of an edge by the way its messages go. @param {number} mask @param {string} kind */
+function way(mask, kind) {
+  if (kind === 'calls' || kind === 'served_by') return 'service';
+  const names = state.passagesOf(mask);
+  if (!names.length) return 'unmatched';
+  return ['network', 'shared_memory'].find((name) => names.includes(name)) ?? 'unseen';
+}
+
+/** Pixels of an edge by its bytes a second. @param {number} bytes */
+export function thickness(bytes) {
+  return bytes > 0 ? Math.max(1.2, Math.min(9, 1.2 + Math.log10(1 + bytes / 100) * 1.3)) : 1;
+}
+
+/** @param {import('../graph-model.js').Edge} edge */
+function load(edge) {
+  let [bytes, hertz] = [0, 0];
+  let measured = false;
+  let severity = 'good';
+  for (const id of edge.topics) {
+    const figures = state.figuresOf(id);
+    if (figures.bandwidth != null) {
+      bytes += figures.bandwidth;
+      hertz += figures.rate ?? 0;
+      measured = true;
+    }
+    const own = worst(state.flagsOf(id).filter((flag) => flag !== 'qos'));
+    severity = worse(severity, own);
+  }
+  return { bytes, hertz, measured, severity };
+}
+
+const ORDER = ['error', 'warning', 'note', 'good'];
+
+/** @param {string} one @param {string} other */
+function worse(one, other) {
+  return ORDER[Math.min(ORDER.indexOf(one), ORDER.indexOf(other))];
+}
+
+/** Endpoints of incompatible pairs. */
+function brokenEnds() {
+  const guids = new Set();
+  for (const finding of state.findings) {
+    if (finding.kind !== 'qos_incompatible') continue;
+    guids.add(finding.writer);
+    guids.add(finding.reader);
+  }
+  return guids;
+}
+
+/** How a vertex fares, by key of what it stands for. */
+function healths() {
+  /** @type {Map<number, string>} */
+  const nodes = new Map();
+  for (const finding of state.findings) {
+    if (finding.node == null) continue;
+    nodes.set(finding.node, worse(nodes.get(finding.node) ?? 'good', finding.severity));
+  }
+  return nodes;
+}
+
+/** @param {{query: Record<string, string>}} props */
+export function Graph({ query }) {
+  useLive();
+  const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
+    address('graph', null, { ...query, ...more }));
+  const focus = query.focus ?? null;
+  const hops = Math.max(1, Math.min(9, Number(query.hops) || 1));
+  const wantsJoints = Boolean(query.services || query.actions);
+  const asked = usePoll(wantsJoints ? `graph${query.hidden ? '?hidden=true' : ''}` : null, 5000);
+  const joints = wantsJoints && asked.data ? {
+    nodes: asked.data.nodes.filter((/** @type {any} */ each) =>
+      (query.services && each.kind === 'service') || (query.actions && each.kind === 'action')),
+    edges: asked.data.edges,
+  } : null;
+  const toggled = (query.boxed ?? '').split(' ').filter(Boolean).map(decodeURIComponent);
+  const options = /** @type {import('../graph-model.js').Options} */ ({
+    mode: query.mode === 'nodes' ? 'nodes' : 'both',
+    hubs: Boolean(query.hubs),
+    hidden: Boolean(query.hidden),
+    boxes: ['none', 'process'].includes(query.boxes) ? query.boxes : 'namespace',
+    toggled: new Set(toggled),
+    focus,
+    hops,
+  });
+  const graph = useMemo(() => build(state, options, joints), [
+    state.structure, JSON.stringify(query), asked.data]);
+  const { picture, milliseconds, failed } = useLayout(graph);
+  const [chosen, choose] = useState(/** @type {string|null} */ (focus));
+  const toggle = (/** @type {string} */ box) => {
+    const next = new Set(toggled);
+    if (!next.delete(box)) next.add(box);
+    change({ boxed: [...next].map(encodeURIComponent).join(' ') });
+  };
+  const drawing = useRef(/** @type {SVGSVGElement|null} */ (null));
+  const host = state.open?.host ?? 'robot';
+  const vertexNames = new Map(graph.vertices.map(
+    (/** @type {any} */ each) => [each.key, each.name]));
+  return html`<h1 tabindex="-1">Graph</h1>
+    <div class="controls">
+      <label>Show <select value=${options.mode}
+        onChange=${(/** @type {any} */ event) => change({ mode: event.target.value })}>
+        <option value="both">nodes and topics</option><option value="nodes">nodes only</option>
+      </select></label>
+      <label>Boxes <select value=${options.boxes}
+        onChange=${(/** @type {any} */ event) => change({ boxes: event.target.value, boxed: '' })}>
+        <option value="namespace">namespaces</option>
+        <option value="process">hosts and processes</option><option value="none">none</option>
+      </select></label>
+      ${[['hubs', `hubs${graph.folded ? ` (${graph.folded} folded)` : ''}`], ['hidden', 'hidden'],
+        ['services', 'services'], ['actions', 'actions']].map(([key, title]) => html`
+        <label key=${key}><input type="checkbox" checked=${Boolean(query[key])}
+          onChange=${(/** @type {any} */ event) => change({ [key]: event.target.checked })} />
+          ${title}</label>`)}
+      <${FocusField} focus=${focus} hops=${hops} change=${change} />
+    </div>
+    <div class="controls">
+      <button type="button" onClick=${() => download(`${host}.svg`, new Blob(
+        [standalone(drawing.current)], { type: 'image/svg+xml' }))}>SVG</button>
+      <button type="button" onClick=${() => download(`${host}.dot`, new Blob(
+        [dot(graph, label)], { type: 'text/vnd.graphviz' }))}>DOT</button>
+      <a href=${address(options.mode === 'nodes' ? 'nodes' : 'topics')}>Show as a list</a>
+      <span class="dim">${several(graph.nodes, 'node')}, ${several(graph.edges.length, 'edge')}${
+        milliseconds != null ? `; laid out in ${milliseconds.toFixed(0)} ms` : ''}${
+        graph.nodes > MANY_NODES && options.boxes === 'namespace'
+          ? '; namespaces are closed at first' : ''}</span>
+    </div>
+    <${Failed} problem=${asked.problem} what="No services and actions" />
+    ${failed && html`<p class="problem">${failed}</p>`}
+    ${!graph.vertices.length && html`<p class="empty">${focus
+      ? 'What the graph should focus on does not exist now.' : 'No node has been announced yet.'}</p>`}
+    ${picture && graph.vertices.length > 0 && html`<div class="graph">
+      <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
+        toggle=${toggle} own=${drawing} />
+      <${Panel} graph=${graph} chosen=${chosen} change=${change} toggle=${toggle}
+        choose=${choose} names=${vertexNames} /></div>`}
+    <${Legend} />`;
+}
+
+/** @param {{focus: string|null, hops: number, change: (more: any) => void}} props */
+function FocusField({ focus, hops, change }) {
+  if (!focus) return null;
+  return html`<span class="focus">Focus <${Name} text=${focus.split(':').slice(2).join(':')}
+      most=${40} />
+    <label>hops <input type="number" min="1" max="9" value=${hops}
+      onInput=${(/** @type {any} */ event) => change({ hops: event.target.value })} /></label>
+    <button type="button" onClick=${() => change({ focus: '', hops: '' })}>Show all</button></span>`;
+}
+
+/**
+ * The picture of a graph, made in a worker when the structure has changed and rested.
+ * @param {import('../graph-model.js').Graph} graph
+ */
+function useLayout(graph) {
+  const worker = useRef(/** @type {Worker|null} */ (null));
+  const number = useRef(0);
+  const [answer, take] = useState(/** @type {any} */ ({
+    picture: null, signature: '', milliseconds: null, failed: '',
+  }));
+  const latest = useRef(answer);
+  latest.current = answer;
+  useEffect(() => {
+    const own = new Worker(new URL('../layout-worker.js', import.meta.url), { type: 'module' });
+    worker.current = own;
+    own.onerror = () => take({ ...latest.current, failed: 'The layout failed.' });
+    return () => own.terminate();
+  }, []);
+  useEffect(() => {
+    const ask = () => {
+      const mine = number.current + 1;
+      number.current = mine;
+      const own = worker.current;
+      if (!own) return;
+      own.onmessage = (/** @type {MessageEvent} */ { data }) => {
+        if (data.number !== number.current) return;
+        take({
+          picture: index(data.result), signature: graph.signature,
+          milliseconds: data.milliseconds, failed: '',
+        });
+      };
+      /** @type {Record<string, {x: number, y: number}>} */
+      const previous = {};
+      for (const [key, { x, y }] of latest.current.picture?.at ?? []) previous[key] = { x, y };
+      own.postMessage({
+        number: mine,
+        vertices: graph.vertices.map(({ key, w, h, parent }) => ({ id: key, w, h, parent, title: 20 })),
+        edges: graph.edges.map(({ id, from, to }) => ({ id, from, to })),
+        options: { previous },
+      });
+    };
+    const timer = setTimeout(ask, latest.current.picture ? SETTLE_MS : 0);
+    return () => clearTimeout(timer);
+  }, [graph.signature]);
+  return answer;
+}
+
+/**
+ * @typedef {{width: number, height: number, at: Map<string, import('../layout.js').Placed>,
+ *   routes: Map<string, import('../layout.js').Point[]>}} Picture
+ * @param {import('../layout.js').Layout} result
+ * @returns {Picture}
+ */
+function index(result) {
+  return {
+    width: result.width,
+    height: result.height,
+    at: new Map(result.vertices.map((each) => [each.id, each])),
+    routes: new Map(result.edges.map((each) => [each.id, each.points])),
+  };
+}
+
+/** A smooth path through the points of an edge. @param {import('../layout.js').Point[]} points */
+export function curve(points) {
+  let path = `M${points[0].x.toFixed(1)} ${points[0].y.toFixed(1)}`;
+  for (let at = 1; at < points.length; at += 1) {
+    const [a, b] = [points[at - 1], points[at]];
+    const bend = b.x > a.x ? (b.x - a.x) / 2 : 40;
+    path += `C${(a.x + bend).toFixed(1)} ${a.y.toFixed(1)} ${(b.x - bend).toFixed(1)} `
+      + `${b.y.toFixed(1)} ${b.x.toFixed(1)} ${b.y.toFixed(1)}`;
+  }
+  return path;
+}
+
+/** @param {import('../graph-model.js').Edge} edge */
+function label(edge) {
+  const { bytes, hertz, measured } = load(edge);
+  const figures = measured ? `${rate(hertz)}, ${bandwidth(bytes)}` : '';
+  if (edge.kind !== 'pair') return figures;
+  const names = edge.topics.map((id) => state.topics.get(id)?.name ?? '').join(', ');
+  return figures ? `${names} (${figures})` : names;
+}
+
+/**
+ * @param {{graph: import('../graph-model.js').Graph, picture: Picture, chosen: string|null,
+ *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any}} props
+ */
+function Drawing({ graph, picture, chosen, choose, toggle, own }) {
+  const stage = useRef(/** @type {SVGGElement|null} */ (null));
+  const camera = useRef(/** @type {Camera|null} */ (null));
+  useEffect(() => {
+    const made = new Camera(own.current, /** @type {SVGGElement} */ (stage.current));
+    camera.current = made;
+    return () => made.end();
+  }, []);
+  useEffect(() => camera.current?.frame(picture.width, picture.height),
+    [picture.width, picture.height]);
+  const ends = brokenEnds();
+  const nodes = healths();
+  const near = useMemo(() => neighbours(graph), [graph]);
+  const shown = graph.vertices.filter((each) => picture.at.has(each.key));
+  const roving = shown.some((each) => each.key === chosen) ? chosen : shown[0]?.key;
+  const keys = (/** @type {KeyboardEvent} */ event) => {
+    if (camera.current?.key(event.key)) {
+      event.preventDefault();
+      return;
+    }
+    const key = /** @type {HTMLElement} */ (event.target).closest('[data-key]')
+      ?.getAttribute('data-key');
+    const next = key && step(picture, near, key, event.key);
+    if (!next) return;
+    event.preventDefault();
+    choose(next);
+    for (const element of own.current.querySelectorAll('[data-key]')) {
+      if (element.getAttribute('data-key') === next) {
+        element.focus();
+        camera.current?.show(/** @type {any} */ (picture.at.get(next)));
+      }
+    }
+  };
+  const labels = graph.edges.length <= 60;
+  const few = graph.edges.length <= 400;
+  return html`<div class="canvas"><svg ref=${own} role="group" onKeyDown=${keys}
+    aria-label="Graph of ${several(graph.nodes, 'node')}. Arrow keys walk along the edges. The list
+      of topics shows the same."
+    onClick=${(/** @type {MouseEvent} */ event) => {
+      if (event.target === own.current && !camera.current?.moved) choose(null);
+    }}>
+    <defs>${ORDER.map((severity) => html`<marker id="arrow-${severity}" viewBox="0 0 8 8" refX="7"
+      refY="4" markerWidth="8" markerHeight="8" markerUnits="userSpaceOnUse" orient="auto">
+      <path d="M0 0.5L8 4L0 7.5Z" class="arrow ${severity}" /></marker>`)}</defs>
+    <g ref=${stage}>
+      ${shown.filter((each) => each.kind === 'box' && !each.closed).map((each) => html`<${Box}
+        key=${each.key} vertex=${each} at=${picture.at.get(each.key)} toggle=${toggle}
+        roving=${roving === each.key} choose=${choose} />`)}
+      ${graph.edges.map((edge) => {
+        const points = picture.routes.get(edge.id);
+        if (!points) return null;
+        const { bytes, severity, measured } = load(edge);
+        const broken = edge.guids.some((guid) => ends.has(guid))
+          && edge.topics.some((id) => state.flagsOf(id).includes('qos'));
+        const health = broken ? 'error' : severity;
+        const active = chosen != null && (edge.from === chosen || edge.to === chosen
+          || edge.id === chosen);
+        const middle = points[Math.floor((points.length - 1) / 2)];
+        const after = points[Math.floor((points.length - 1) / 2) + 1];
+        const [x, y] = [(middle.x + after.x) / 2, (middle.y + after.y) / 2];
+        return html`<g key=${edge.id} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
+          ? 'active' : ''} ${measured ? '' : 'unmeasured'}" onClick=${() => choose(edge.id)}>
+          ${few && html`<path class="touch" d=${curve(points)} />`}
+          <path class="line" d=${curve(points)} stroke-width=${thickness(bytes).toFixed(1)}
+            marker-end="url(#arrow-${health})" />
+          ${(health === 'error' || health === 'warning') && edge.kind !== 'feeds' && html`<text
+            class="sign ${health}" x=${x} y=${y + 4}>${health === 'error' ? '✖' : '▲'}</text>`}
+          ${edge.kind === 'pair' && (labels || active) && html`<text class="edge-label" x=${x}
+            y=${y - 5}>${edge.topics.length === 1
+              ? shortened(state.topics.get(edge.topics[0])?.name, 24)
+              : several(edge.topics.length, 'topic')}${measured
+              ? ` ${rate(load(edge).hertz)}` : ''}</text>`}
+          <title>${label(edge)}</title></g>`;
+      })}
+      ${shown.filter((each) => each.kind !== 'box' || each.closed).map((each) => html`<${Shape}
+        key=${each.key} vertex=${each} at=${picture.at.get(each.key)} nodes=${nodes}
+        chosen=${chosen === each.key} roving=${roving === each.key} choose=${choose}
+        toggle=${toggle} camera=${camera} />`)}
+    </g></svg>
+    <div class="zoom"><button type="button" aria-label="Zoom in"
+        onClick=${() => camera.current?.key('+')}>+</button>
+      <button type="button" aria-label="Zoom out"
+        onClick=${() => camera.current?.key('-')}>−</button>
+      <button type="button" onClick=${() => camera.current?.key('0')}>Fit</button></div></div>`;
+}
+
+/** @param {import('../graph-model.js').Graph} graph */
+function neighbours(graph) {
+  /** @type {Map<string, {out: string[], into: string[]}>} */
+  const found = new Map(graph.vertices.map((each) => [each.key, { out: [], into: [] }]));
+  for (const edge of graph.edges) {
+    found.get(edge.from)?.out.push(edge.to);
+    found.get(edge.to)?.into.push(edge.from);
+  }
+  return found;
+}
+
+/**
+ * Where an arrow key leads: along an edge, or to the next vertex of the column.
+ * @param {Picture} picture
+ * @param {Map<string, {out: string[], into: string[]}>} near
+ * @param {string} from
+ * @param {string} key
+ * @returns {string|null}
+ */
+function step(picture, near, from, key) {
+  const own = picture.at.get(from);
+  if (!own) return null;
+  const distance = (/** @type {string} */ to) => {
+    const at = picture.at.get(to);
+    return at ? Math.abs(at.y - own.y) + Math.abs(at.x - own.x) / 10 : Infinity;
+  };
+  const nearest = (/** @type {string[]} */ list) => {
+    const reached = list.filter((to) => picture.at.has(to));
+    return reached.sort((one, other) => distance(one) - distance(other))[0] ?? null;
+  };
+  const column = (/** @type {number} */ by) => nearest([...picture.at].filter(([to, at]) =>
+    to !== from && Math.abs(at.x - own.x) < Math.max(60, (at.w + own.w) / 2)
+    && Math.sign(at.y - own.y) === by && near.has(to)).map(([to]) => to));
+  switch (key) {
+    case 'ArrowRight': return nearest(near.get(from)?.out ?? []);
+    case 'ArrowLeft': return nearest(near.get(from)?.into ?? []);
+    case 'ArrowDown': return column(1);
+    case 'ArrowUp': return column(-1);
+    default: return null;
+  }
+}
+
+/** Whether a key presses a button. @param {KeyboardEvent} event */
+const pressed = (event) => event.key === 'Enter' || event.key === ' ';
+
+/** @param {any} props */
+function Box({ vertex, at, toggle, roving, choose }) {
+  const [left, top] = [at.x - at.w / 2, at.y - at.h / 2];
+  const name = visible(vertex.name);
+  return html`<g class="box"><rect x=${left} y=${top} width=${at.w} height=${at.h} rx="8" />
+    <g role="button" aria-expanded="true" tabindex=${roving ? 0 : -1} data-key=${vertex.key}
+      aria-label="${name}: close the box" onFocus=${() => choose(vertex.key)}
+      onClick=${() => toggle(vertex.key)} onKeyDown=${(/** @type {KeyboardEvent} */ event) => {
+        if (!pressed(event)) return;
+        event.preventDefault();
+        toggle(vertex.key);
+      }}>
+      <rect class="grip" x=${left} y=${top} width=${at.w} height="22" rx="8" />
+      <text x=${left + 10} y=${top + 16}>▾ ${shortened(vertex.name, Math.max(8,
+        Math.floor((at.w - 34) / 7)))}</text></g></g>`;
+}
+
+const SIGNS = /** @type {Record<string, string>} */ ({ error: '✖', warning: '▲' });
+
+/** @param {any} props */
+function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera }) {
+  const figures = vertex.topic == null ? null : state.figuresOf(vertex.topic);
+  const flags = vertex.topic == null ? [] : state.flagsOf(vertex.topic);
+  let severity = vertex.topic != null ? worst(flags) : nodes.get(vertex.node) ?? 'good';
+  if (vertex.closed) {
+    for (const key of vertex.members) severity = worse(severity, healthOf(key, nodes));
+  }
+  const detail = vertex.closed ? several(vertex.count, 'node')
+    : figures ? (figures.rate == null ? 'not measured'
+      : `${rate(figures.rate)} · ${bandwidth(figures.bandwidth)}`)
+      : shortened(vertex.detail, MOST_LABEL);
+  const [left, top] = [at.x - at.w / 2, at.y - at.h / 2];
+  const sign = SIGNS[severity];
+  const press = () => {
+    if (camera.current?.moved) return;
+    if (vertex.closed) toggle(vertex.key);
+    else choose(vertex.key);
+  };
+  const words = sign ? `, with ${severity === 'error' ? 'an error' : 'a warning'}` : '';
+  return html`<g class="vertex ${vertex.kind} ${severity} ${chosen ? 'chosen' : ''}" role="button"
+    tabindex=${roving ? 0 : -1} data-key=${vertex.key} onClick=${press}
+    aria-expanded=${vertex.closed ? 'false' : undefined}
+    aria-pressed=${vertex.closed ? undefined : chosen}
+    onFocus=${() => choose(vertex.key)}
+    aria-label="${vertex.closed ? 'closed box' : vertex.kind} ${visible(vertex.name)}${detail
+      ? `, ${detail}` : ''}${words}"
+    onKeyDown=${(/** @type {KeyboardEvent} */ event) => {
+      if (!pressed(event)) return;
+      event.preventDefault();
+      if (vertex.closed) toggle(vertex.key);
+      else document.getElementById('graph-panel')?.focus();
+    }}>
+    <rect x=${left} y=${top} width=${at.w} height=${at.h}
+      rx=${vertex.kind === 'topic' ? 3 : vertex.kind === 'service' || vertex.kind === 'action'
+        ? 0 : 14} />
+    <text x=${left + 12} y=${top + (detail ? 17 : at.h / 2 + 4)}>${vertex.closed ? '▸ ' : ''}${shortened(
+      vertex.name, MOST_LABEL)}</text>
+    ${detail && html`<text class="detail" x=${left + 12} y=${top + 32}>${detail}</text>`}
+    ${sign && html`<text class="sign ${severity}" x=${left + at.w - 9} y=${top + 14}>${sign}</text>`}
+    <title>${visible(vertex.name)}</title></g>`;
+}
+
+/** @param {string} key @param {Map<number, string>} nodes */
+function healthOf(key, nodes) {
+  const parts = key.split(':');
+  const [kind, domain] = parts;
+  const name = parts.slice(2).join(':');
+  if (kind === 'topic') {
+    const topic = state.topicNamed(name, Number(domain));
+    return topic ? worst(state.flagsOf(topic.id)) : 'good';
+  }
+  const node = kind === 'node' ? state.nodeNamed(name, Number(domain)) : null;
+  return node ? nodes.get(node.id) ?? 'good' : 'good';
+}
+
+/** What is chosen, in words and with links. @param {any} props */
+function Panel({ graph, chosen, change, toggle, choose, names }) {
+  const vertex = graph.vertices.find((/** @type {any} */ each) => each.key === chosen);
+  const edge = vertex ? null : graph.edges.find((/** @type {any} */ each) => each.id === chosen);
+  const title = vertex ? html`<${Name} text=${vertex.name} />`
+    : edge ? html`<${Name} text=${names.get(edge.from) ?? ''} /> → <${Name}
+      text=${names.get(edge.to) ?? ''} />` : 'Details';
+  const link = (/** @type {string} */ key) => html`<button type="button" class="plain"
+    onClick=${() => choose(key)}><${Name} text=${names.get(key) ?? key} /></button>`;
+  const ends = (/** @type {string} */ name, /** @type {any[]} */ edges,
+    /** @type {'from'|'to'} */ side) => edges.length > 0 && html`<h3>${name} (${count(edges.length)})</h3>
+    <ul>${edges.slice(0, 40).map((each) => html`<li key=${each.id}>${link(each[side])}
+      <span class="dim">${wayWords(each)}${each.topics.length > 1
+        ? `, ${several(each.topics.length, 'topic')}` : ''}</span></li>`)}</ul>`;
+  const topic = vertex?.topic != null ? state.topics.get(vertex.topic) : null;
+  const node = vertex?.node != null ? state.nodes.get(vertex.node) : null;
+  const figures = topic && state.figuresOf(topic.id);
+  return html`<aside class="panel" id="graph-panel" tabindex="-1" aria-label="Details">
+    <h2>${title}</h2>
+    ${!vertex && !edge && html`<p class="dim">Choose a node, a topic or an edge.</p>`}
+    ${vertex && html`<p>${topic && html`<a href=${topicAddress(topic)}>Open the topic</a> `}
+      ${node && html`<a href=${nodeAddress(node)}>Open the node</a> `}
+      ${vertex.kind !== 'box' && html`<button type="button"
+        onClick=${() => change({ focus: vertex.key, hops: 1 })}>Focus</button> `}
+      ${vertex.kind === 'box' && html`<button type="button" onClick=${() => toggle(vertex.key)}>${
+        vertex.closed ? 'Open the box' : 'Close the box'}</button>`}</p>
+      ${topic && html`<p><${Name} text=${topic.types.join(', ')} /><br />${figures?.rate == null
+        ? 'not measured' : `${rate(figures.rate)}, ${bandwidth(figures.bandwidth)}, ${count(
+          figures.lost)} lost`}</p><p><${Badges} flags=${state.flagsOf(topic.id)} /></p>`}
+      ${state.findings.filter((finding) => (topic && finding.topic === topic.id)
+        || (node && finding.node === node.id)).slice(0, 8).map((finding) => html`<p
+        key=${finding.id}><${Mark} severity=${finding.severity} /> <${Name}
+        text=${finding.text} /></p>`)}
+      ${ends('From', graph.edges.filter((/** @type {any} */ each) => each.to === chosen), 'from')}
+      ${ends('To', graph.edges.filter((/** @type {any} */ each) => each.from === chosen), 'to')}`}
+    ${edge && html`<p>${wayWords(edge)}</p><ul>${edge.topics.map((/** @type {number} */ id) => {
+      const each = state.topics.get(id);
+      const own = state.figuresOf(id);
+      return each && html`<li key=${id}><a href=${topicAddress(each)}><${Name}
+        text=${each.name} /></a> ${rate(own.rate)}, ${bandwidth(own.bandwidth)} <${Badges}
+        flags=${state.flagsOf(id)} /></li>`;
+    })}</ul>`}</aside>`;
+}
+
+/** @param {import('../graph-model.js').Edge} edge */
+function wayWords(edge) {
+  if (edge.kind === 'calls' || edge.kind === 'served_by') return edge.kind.replace('_', ' ');
+  const names = state.passagesOf(edge.passages);
+  return names.length ? names.map((name) => PASSAGES[name] ?? name).join(', ') : 'no counterpart';
+}
+
+function Legend() {
+  const rows = [['network', 'network'], ['shared_memory', 'shared memory'],
+    ['unseen', 'same process, data sharing or iceoryx: unseen'], ['unmatched', 'no counterpart'],
+    ['service', 'service or action']];
+  return html`<details class="legend"><summary>Legend</summary><ul>
+    ${rows.map(([kind, words]) => html`<li key=${kind}><svg viewBox="0 0 48 12" aria-hidden="true"
+      class="edge ${kind}"><path class="line" d="M2 6L46 6" stroke-width="2.5" /></svg> ${words}</li>`)}
+    <li>Width: bytes a second of the edge’s topics.</li>
+    <li><${Mark} severity="error" /> incompatible QoS, types or a violated expectation;
+      <${Mark} severity="warning" /> loss or silence.</li>
+    <li>Round: node. Square: topic. Boxes: namespaces, or hosts and processes.</li></ul></details>`;
+}
+
+// Colours of a picture that leaves the page, by the names of the page's variables.
+const VARIABLES = ['--paper', '--ink', '--dim', '--grid', '--panel', '--node', '--error',
+  '--warning', '--note', '--accent', '--edge'];
+
+/** The drawing as a file of its own. @param {SVGSVGElement|null} svg */
+export function standalone(svg) {
+  if (!svg) return '';
+  const copy = /** @type {SVGSVGElement} */ (svg.cloneNode(true));
+  const stage = /** @type {SVGGElement} */ (copy.querySelector('g'));
+  stage.removeAttribute('transform');
+  const size = /** @type {any} */ (svg.querySelector('g')).getBBox();
+  copy.setAttribute('xmlns', 'http://www.w3.org/2000/svg');
+  copy.setAttribute('viewBox', [size.x - 10, size.y - 10, size.width + 20, size.height + 20].join(' '));
+  copy.setAttribute('width', String(Math.ceil(size.width + 20)));
+  copy.setAttribute('height', String(Math.ceil(size.height + 20)));
+  for (const element of [copy, ...copy.querySelectorAll('*')]) {
+    for (const name of ['tabindex', 'role', 'data-key', 'aria-pressed', 'aria-expanded']) {
+      element.removeAttribute(name);
+    }
+  }
+  for (const touch of copy.querySelectorAll('.touch')) touch.remove();
+  const style = getComputedStyle(document.documentElement);
+  const variables = VARIABLES.map((name) => `${name}:${style.getPropertyValue(name).trim()}`);
+  const rules = [];
+  for (const sheet of document.styleSheets) {
+    if (!sheet.href?.endsWith('/app.css')) continue;
+    for (const rule of sheet.cssRules) {
+      if (/\.(edge|vertex|box|sign|arrow)/.test(rule.cssText)) {
+        rules.push(rule.cssText.replaceAll('.graph ', ''));
+      }
+    }
+  }
+  const css = `svg{${variables.join(';')};background:var(--paper)}${rules.join('')}`;
+  const text = new XMLSerializer().serializeToString(copy);
+  const escaped = css.replaceAll('&', '&amp;').replaceAll('<', '&lt;');
+  return text.replace(/^(<svg[^>]*>)/, `$1<style>${escaped}</style>`);
+}

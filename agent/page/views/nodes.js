@@ -1,0 +1,190 @@
+// ROS nodes: where they live, what their processes cost, and what they are joined to.
+
+import { useRef } from '../vendor/hooks.mjs';
+import { named } from '../api.js';
+import { bytes, count, date, percent, several } from '../format.js';
+import { nodeKey } from '../graph-model.js';
+import { address } from '../router.js';
+import { replaceAddress, state, useLive, usePoll } from '../store.js';
+import { sorted, Table } from '../table.js';
+import { Failed, Filter, html, Mark, matches, Name, NodeLink } from '../ui.js';
+import { Findings } from './overview.js';
+
+const EVERY_MS = 2000;
+
+/** Services by which a node with parameters is known. */
+const PARAMETER_SERVICES = ['list_parameters', 'get_parameters'];
+
+/**
+ * Processes by id, each with the part of a core it uses between the last two answers.
+ * @returns {{byId: Map<number, any>, answer: {data: any, problem: any}}}
+ */
+function useProcesses() {
+  const answer = usePoll('processes', EVERY_MS);
+  const before = useRef({ time: 0, seconds: /** @type {Map<number, number>} */ (new Map()),
+    part: /** @type {Map<number, number>} */ (new Map()) });
+  const byId = new Map();
+  const { data } = answer;
+  if (data) {
+    const { time, seconds, part } = before.current;
+    const elapsed = data.timestamp_seconds - time;
+    if (elapsed > 0.2) {
+      const fresh = new Map();
+      for (const each of data.processes) {
+        const was = seconds.get(each.process_id);
+        if (was != null) fresh.set(each.process_id, (each.cpu_seconds - was) / elapsed);
+      }
+      before.current = {
+        time: data.timestamp_seconds,
+        seconds: new Map(data.processes.map((/** @type {any} */ each) =>
+          [each.process_id, each.cpu_seconds])),
+        part: time ? fresh : part,
+      };
+    }
+    for (const each of data.processes) {
+      byId.set(each.process_id, { ...each, part: before.current.part.get(each.process_id) ?? null });
+    }
+  }
+  return { byId, answer };
+}
+
+/** Topics a node publishes and subscribes to. */
+function ends() {
+  /** @type {Map<number, {publishers: Set<number>, subscriptions: Set<number>}>} */
+  const found = new Map();
+  for (const topic of state.topics.values()) {
+    for (const side of /** @type {const} */ (['publishers', 'subscriptions'])) {
+      for (const endpoint of topic[side]) {
+        const own = found.get(endpoint.node) ?? { publishers: new Set(), subscriptions: new Set() };
+        own[side].add(topic.id);
+        found.set(endpoint.node, own);
+      }
+    }
+  }
+  return found;
+}
+
+/** @param {{query: Record<string, string>}} props */
+export function Nodes({ query }) {
+  useLive();
+  const { filter = '', sort = 'name', hidden = '' } = query;
+  const { byId, answer } = useProcesses();
+  const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
+    address('nodes', null, { ...query, ...more }));
+  const joined = ends();
+  const participant = (/** @type {any} */ node) => state.participants.get(node.participants[0]);
+  const process = (/** @type {any} */ node) => byId.get(participant(node)?.pid ?? -1);
+  const where = (/** @type {any} */ node) => {
+    const own = participant(node);
+    return [own?.process, own?.pid].filter((part) => part != null).join(' ');
+  };
+  const number = (/** @type {any} */ node, /** @type {'publishers'|'subscriptions'} */ side) =>
+    joined.get(node.id)?.[side].size ?? 0;
+  const worstOf = (/** @type {any} */ node) => {
+    const own = state.findings.filter((finding) => finding.node === node.id);
+    return own[0]?.severity ?? null;
+  };
+  const rows = [...state.nodes.values()].filter((node) => (hidden || !node.hidden)
+    && matches(filter, `${node.name} ${where(node)} ${participant(node)?.host ?? ''}`));
+  const columns = [
+    { key: 'name', title: 'Node', header: true, by: (/** @type {any} */ node) => node.name,
+      cell: (/** @type {any} */ node) => html`<${NodeLink} node=${node} />${
+        node.participants.length > 1 ? html` <span class="badge error"><${Mark} severity="error" />
+          ${node.participants.length} of this name</span>` : ''}${worstOf(node) === 'error'
+        && node.participants.length < 2 ? html` <${Mark} severity="error" />` : ''}` },
+    ...(state.hasDomains() ? [{ key: 'domain', title: 'Domain', kind: 'number wide',
+      by: (/** @type {any} */ node) => node.domain,
+      cell: (/** @type {any} */ node) => node.domain }] : []),
+    { key: 'host', title: 'Host', kind: 'wide',
+      by: (/** @type {any} */ node) => participant(node)?.host,
+      cell: (/** @type {any} */ node) => html`<${Name} text=${participant(node)?.host ?? 'unknown'} />` },
+    { key: 'process', title: 'Process', by: where,
+      cell: (/** @type {any} */ node) => html`<${Name} text=${where(node) || 'unknown'} />` },
+    { key: 'cpu', title: 'CPU', kind: 'number', by: (/** @type {any} */ node) => process(node)?.part,
+      cell: (/** @type {any} */ node) => percent(process(node)?.part) },
+    { key: 'memory', title: 'Memory', kind: 'number',
+      by: (/** @type {any} */ node) => process(node)?.memory_bytes,
+      cell: (/** @type {any} */ node) => bytes(process(node)?.memory_bytes) },
+    { key: 'publishers', title: 'Publishes', kind: 'number wide',
+      by: (/** @type {any} */ node) => number(node, 'publishers'),
+      cell: (/** @type {any} */ node) => count(number(node, 'publishers')) },
+    { key: 'subscriptions', title: 'Subscribes', kind: 'number wide',
+      by: (/** @type {any} */ node) => number(node, 'subscriptions'),
+      cell: (/** @type {any} */ node) => count(number(node, 'subscriptions')) },
+  ];
+  return html`<h1 tabindex="-1">Nodes</h1>
+    <div class="controls">
+      <${Filter} label="Filter" value=${filter} found=${rows.length} noun="node"
+        change=${(/** @type {string} */ text) => change({ filter: text })} />
+      <label><input type="checkbox" checked=${Boolean(hidden)}
+        onChange=${(/** @type {any} */ event) => change({ hidden: event.target.checked })} />
+        hidden nodes</label>
+      <a href=${address('graph', null, { mode: 'nodes' })}>Show as a graph</a></div>
+    <${Failed} problem=${answer.problem} what="No CPU and memory" />
+    ${answer.data?.unreadable > 0 && html`<p class="dim">${several(answer.data.unreadable,
+      'process', 'processes')} of this host cannot be read by the agent.</p>`}
+    <${Table} label="Nodes" columns=${columns} rows=${sorted(rows, columns, sort)} sort=${sort}
+      keyOf=${(/** @type {any} */ node) => node.id}
+      onSort=${(/** @type {string} */ next) => change({ sort: next })} />
+    ${!rows.length && html`<p class="empty">${state.nodes.size ? 'No node matches.'
+      : 'No node has been announced yet.'}</p>`}`;
+}
+
+/** @param {{name: string, query: Record<string, string>}} props */
+export function NodeView({ name, query }) {
+  useLive();
+  const domain = query.domain ? Number(query.domain) : null;
+  const node = state.nodeNamed(name, domain);
+  const scope = node ? `?domain_id=${node.domain}` : '';
+  const details = usePoll(node ? named('nodes', name.replace(/^\//, ''), scope) : null, 5000);
+  const services = usePoll(node ? `services${scope}${scope ? '&' : '?'}hidden=true` : null, 0);
+  const { byId } = useProcesses();
+  if (!node) {
+    return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
+      <p>No such node now. <a href=${address('nodes')}>All nodes</a></p>`;
+  }
+  const { data } = details;
+  const findings = state.findings.filter((finding) => finding.node === node.id);
+  const instances = node.participants.map((id) => state.participants.get(id)).filter(Boolean);
+  const names = new Set((services.data?.services ?? []).map((/** @type {any} */ each) => each.name));
+  const known = PARAMETER_SERVICES.filter((each) => names.has(`${name}/${each}`));
+  const list = (/** @type {string} */ title, /** @type {any[]|undefined} */ rows,
+    /** @type {string|null} */ view) => rows && rows.length > 0 && html`<section
+    aria-label=${title}><h2>${title} (${count(rows.length)})</h2><ul class="plain">${rows.map((row) => html`
+    <li key=${row.name}>${view ? html`<a href=${address(view, row.name, { domain: node.domain })}><${Name}
+      text=${row.name} /></a>` : html`<${Name} text=${row.name} />`} <span class="dim"><${Name}
+      text=${row.types.join(', ')} /></span></li>`)}</ul></section>`;
+  return html`<h1 tabindex="-1"><${Name} text=${node.name} /></h1>
+    <p class="facts">${state.hasDomains() && html`<span class="dim">Domain</span> ${node.domain} `}
+      <a href=${address('graph', null, { focus: nodeKey(node), hops: 1 })}>In the graph</a></p>
+    ${findings.length > 0 && html`<section aria-label="Findings"><${Findings} list=${findings} />
+      </section>`}
+    <section aria-labelledby="where"><h2 id="where">${instances.length > 1
+      ? 'Processes of this name' : 'Process'}</h2>
+    <div class="scroll" tabindex="0" role="region" aria-labelledby="where"><table><thead><tr>
+      <th scope="col">Process</th><th scope="col">Host</th><th scope="col" class="number">CPU</th>
+      <th scope="col" class="number">Memory</th><th scope="col" class="number">Threads</th>
+      <th scope="col">Started</th><th scope="col">Control group</th><th scope="col">DDS</th></tr></thead>
+    <tbody>${instances.map((own) => {
+      const process = own && byId.get(own.pid ?? -1);
+      return own && html`<tr key=${own.guid}><th scope="row"><${Name} text=${[own.process, own.pid]
+        .filter((part) => part != null).join(' ') || 'unknown'} /></th>
+        <td><${Name} text=${own.host ?? 'unknown'} /></td>
+        <td class="number">${percent(process?.part)}</td>
+        <td class="number">${bytes(process?.memory_bytes)}</td>
+        <td class="number">${count(process?.threads)}</td>
+        <td>${date(process?.started_timestamp_seconds)}</td>
+        <td><${Name} text=${own.cgroup ?? ''} /></td>
+        <td>${own.vendor ?? ''} <${Name} text=${own.guid} /></td></tr>`;
+    })}</tbody></table></div></section>
+    <${Failed} problem=${details.problem} what="No details" />
+    <p>Parameters: ${services.data
+      ? known.length ? 'the node has parameter services.' : 'the node has no parameter services.'
+      : '–'}</p>
+    ${list('Publishers', data?.publishers, 'topics')}
+    ${list('Subscriptions', data?.subscriptions, 'topics')}
+    ${list('Services', data?.services, null)}
+    ${list('Clients of services', data?.clients, null)}
+    ${list('Action servers', data?.action_servers, null)}
+    ${list('Action clients', data?.action_clients, null)}`;
+}

@@ -1,0 +1,99 @@
+// What is wrong, since when, and what to do; then totals; then what the agent cannot see.
+
+import { bandwidth, clock, count, duration, percent, rate, several } from '../format.js';
+import { address, nodeAddress, topicAddress } from '../router.js';
+import { state, useLive } from '../store.js';
+import { Figure, html, Mark, Name, TopicLink, worst, Badges } from '../ui.js';
+
+const MOST_SHOWN = 50;
+
+export function Overview() {
+  useLive();
+  const unseen = state.findings.filter((finding) => finding.kind === 'ability');
+  const findings = state.findings.filter((finding) => finding.kind !== 'ability');
+  const serious = findings.filter((finding) => finding.severity !== 'note');
+  const notes = findings.filter((finding) => finding.severity === 'note');
+  return html`<h1 tabindex="-1">Overview</h1>
+    <section aria-labelledby="wrong"><h2 id="wrong">Findings</h2>
+      ${serious.length
+        ? html`<${Findings} list=${serious} />`
+        : html`<p class="fine"><${Mark} severity="good" /> ${notes.length
+          ? 'Nothing is broken. The notes below may explain what you see.'
+          : 'Nothing is broken.'}</p>`}
+      ${notes.length > 0 && html`<details open=${!serious.length}>
+        <summary>${several(notes.length, 'note')}</summary><${Findings} list=${notes} /></details>`}
+    </section>
+    <${Totals} />
+    <${Busiest} />
+    <section aria-labelledby="blind"><h2 id="blind">What the agent cannot see</h2>
+      ${unseen.length
+        ? html`<ul class="findings">${unseen.map((finding) => html`<li key=${finding.id}>
+          <${Mark} severity="note" /> <span><${Name} text=${finding.text} />
+          ${finding.remedy && html`<br /><span class="dim">Remedy: <${Name} text=${finding.remedy}
+            /></span>`}</span></li>`)}</ul>`
+        : html`<p>Everything the agent can look at is open to it.
+          <a href=${address('agent')}>Abilities and limits</a></p>`}
+    </section>`;
+}
+
+/** @param {{list: import('../state.js').Finding[]}} props */
+export function Findings({ list }) {
+  return html`<ul class="findings">${list.slice(0, MOST_SHOWN).map((finding) => html`
+    <li key=${finding.id} class=${finding.severity}><${Mark} severity=${finding.severity} />
+      <span><${Place} finding=${finding} /> <${Name} text=${finding.text} />
+      ${finding.since != null && html` <span class="dim">since ${clock(finding.since)}
+        (${duration(Math.max(0, state.time - finding.since))})</span>`}
+      ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Name} text=${finding.remedy}
+        /></span>`}</span></li>`)}</ul>
+    ${list.length > MOST_SHOWN && html`<p class="dim">${count(list.length - MOST_SHOWN)} more.
+      The <a href=${address('topics', null, { sort: 'state' })}>table of topics</a> has them
+      all.</p>`}`;
+}
+
+/** The link to what a finding is about. @param {{finding: import('../state.js').Finding}} props */
+function Place({ finding }) {
+  const topic = finding.topic == null ? null : state.topics.get(finding.topic);
+  if (topic) return html`<a href=${topicAddress(topic)}><${Name} text=${topic.name} /></a>:`;
+  const node = finding.node == null ? null : state.nodes.get(finding.node);
+  if (node) return html`<a href=${nodeAddress(node)}><${Name} text=${node.name} /></a>:`;
+  return html`<a href=${address('agent')}>Agent</a>:`;
+}
+
+function Totals() {
+  const { rate: messages, bandwidth: bytes, lost, measured } = state.totals;
+  const [rates, sizes, losses] = state.totalSeries.map((series) => series.points);
+  const shown = [...state.topics.values()].filter((topic) => !topic.hidden && !topic.vanished);
+  const nodes = [...state.nodes.values()].filter((node) => !node.hidden);
+  return html`<section aria-labelledby="totals"><h2 id="totals">Now</h2><div class="figures">
+    <${Figure} label="messages a second" value=${rate(messages).replace('Hz', '/s')} points=${rates} />
+    <${Figure} label="bytes a second" value=${bandwidth(bytes)} points=${sizes} />
+    <${Figure} label="lost in the last second" value=${count(lost)} points=${losses} />
+    <${Figure} label="nodes" value=${count(nodes.length)} href=${address('nodes')} />
+    <${Figure} label="topics" value=${count(shown.length)} href=${address('topics')} />
+    <${Figure} label="topics measured" value=${count(measured)}
+      href=${address('topics', null, { only: 'measured' })} />
+  </div></section>`;
+}
+
+function Busiest() {
+  const rows = [...state.topics.values()]
+    .map((topic) => ({ topic, figures: state.figuresOf(topic.id) }))
+    .filter(({ figures }) => figures.bandwidth != null && figures.bandwidth > 0)
+    .sort((one, other) => Number(other.figures.bandwidth) - Number(one.figures.bandwidth))
+    .slice(0, 8);
+  if (!rows.length) return null;
+  const total = state.totals.bandwidth || 1;
+  return html`<section aria-labelledby="busiest"><h2 id="busiest">Busiest topics</h2>
+    <div class="scroll" tabindex="0" role="region" aria-labelledby="busiest"><table>
+    <thead><tr><th scope="col">Topic</th><th scope="col" class="number">Bandwidth</th>
+      <th scope="col" class="number">Share</th><th scope="col" class="number">Rate</th>
+      <th scope="col">State</th></tr></thead>
+    <tbody>${rows.map(({ topic, figures }) => {
+      const flags = state.flagsOf(topic.id);
+      return html`<tr key=${topic.id}><th scope="row"><${TopicLink} topic=${topic} /></th>
+        <td class="number">${bandwidth(figures.bandwidth)}</td>
+        <td class="number">${percent(Number(figures.bandwidth) / total)}</td>
+        <td class="number">${rate(figures.rate)}</td>
+        <td>${worst(flags) === 'good' ? 'ok' : html`<${Badges} flags=${flags} />`}</td></tr>`;
+    })}</tbody></table></div></section>`;
+}

@@ -1,0 +1,222 @@
+// One topic: its course, its endpoints and their QoS, where its messages die, and what they hold.
+
+import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
+import { json, named } from '../api.js';
+import { Chart } from '../chart.js';
+import { bandwidth, clock, count, duration, percent, rate } from '../format.js';
+import { address } from '../router.js';
+import { topicKey } from '../graph-model.js';
+import { LiveMessage } from '../message.js';
+import { Endpoints, Offered } from '../qos.js';
+import { state, stream, useLive, usePoll } from '../store.js';
+import { Badges, Failed, Figure, html, Mark, Name, PASSAGES } from '../ui.js';
+import { Findings } from './overview.js';
+import { Measure } from './topics.js';
+
+const COLUMNS = ['times', 'rate_hertz', 'bandwidth_bytes_per_second', 'lost_messages',
+  'latency_p50_seconds', 'latency_p99_seconds', 'interarrival_p50_seconds',
+  'interarrival_p99_seconds'];
+const HISTORY_AGAIN_MS = 10000;
+
+/** @param {{name: string, query: Record<string, string>}} props */
+export function Topic({ name, query }) {
+  useLive();
+  const domain = query.domain ? Number(query.domain) : null;
+  const topic = state.topicNamed(name, domain);
+  const scope = topic ? `?domain_id=${topic.domain}` : domain == null ? '' : `?domain_id=${domain}`;
+  const details = usePoll(topic ? named('topics', apiName(topic), scope) : null, 2000);
+  if (!topic) {
+    return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
+      <p>No such topic now. It may have had no endpoint since the agent started.
+      <a href=${address('topics')}>All topics</a></p>`;
+  }
+  const figures = state.figuresOf(topic.id);
+  const findings = state.findings.filter((finding) => finding.topic === topic.id);
+  const reasons = details.data?.reasons ?? [];
+  return html`<h1 tabindex="-1"><${Name} text=${topic.name} /></h1>
+    <p class="facts"><span class="dim">Type</span> ${topic.types.map((type) => html`<${Name}
+        text=${type} /> `)}
+      ${state.hasDomains() && html`<span class="dim">Domain</span> ${topic.domain} `}
+      <span class="dim">Measure</span> <${Measure} topic=${topic} />
+      <a href=${address('graph', null, { focus: topicKey(topic), hops: 1 })}>In the graph</a>
+      <a href=${address('events', null, { filter: topic.name })}>Events</a></p>
+    <p><${Badges} flags=${state.flagsOf(topic.id)} /></p>
+    ${findings.length > 0 && html`<section aria-label="Findings"><${Findings} list=${findings} />
+      </section>`}
+    ${reasons.length > 0 && html`<ul class="findings">${reasons.map((/** @type {any} */ reason) =>
+      html`<li key=${reason.code}><${Mark} severity="note" /> <${Name} text=${reason.detail} /></li>`)}
+      </ul>`}
+    <div class="figures">
+      <${Figure} label="rate" value=${rate(figures.rate)} />
+      <${Figure} label="bandwidth" value=${bandwidth(figures.bandwidth)} />
+      <${Figure} label="messages" value=${count(figures.messages)} />
+      <${Figure} label="lost" value=${count(figures.lost)} />
+      <${Figure} label="latency p50" value=${duration(figures.p50)} />
+      <${Figure} label="latency p99" value=${duration(figures.p99)} />
+      <${Figure} label="last message" value=${clock(figures.last)} />
+    </div>
+    <${Charts} key=${topic.id} topic=${topic} scope=${scope} />
+    <${Failed} problem=${details.problem} what="No details" />
+    ${details.data && html`
+      <${Endpoints} details=${details.data} topic=${topic} />
+      <${Offered} details=${details.data} />
+      <${Waterfall} details=${details.data} />
+      <${Passages} details=${details.data} />`}
+    <${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope} name=${apiName(topic)} />`;
+}
+
+/** Topics without a ROS name have the DDS name in addresses. @param {any} topic */
+function apiName(topic) {
+  return topic.kind === 'dds' ? topic.ddsName : topic.name;
+}
+
+/** @param {{topic: import('../state.js').Topic, scope: string}} props */
+function Charts({ topic, scope }) {
+  const columns = useRef(/** @type {(number|null)[][]} */ (COLUMNS.map(() => [])));
+  const [, draw] = useState(0);
+  const path = named('topics', apiName(topic), `/history${scope}`);
+  useEffect(() => {
+    const abort = new AbortController();
+    let timer = 0;
+    const ask = async () => {
+      if (stream.status === 'live' && document.visibilityState !== 'hidden') {
+        try {
+          const history = await json(path, { signal: abort.signal });
+          columns.current = COLUMNS.map((column) => history[column] ?? []);
+          draw((/** @type {number} */ value) => value + 1);
+        } catch {
+          // The stream's figures go on; the next request may succeed.
+        }
+      }
+      if (!abort.signal.aborted) timer = setTimeout(ask, HISTORY_AGAIN_MS);
+    };
+    ask();
+    return () => {
+      clearTimeout(timer);
+      abort.abort();
+    };
+  }, [path]);
+  const [times] = columns.current;
+  // Between two requests the stream gives the latest second.
+  const { rate: hertz, bandwidth: size, lostNow, p50, p99 } = state.figuresOf(topic.id);
+  const last = times[times.length - 1] ?? 0;
+  if (hertz != null && state.time >= Number(last) + 0.9) {
+    [state.time, hertz, size, lostNow, p50, p99, null, null].forEach((value, at) => {
+      const own = columns.current[at];
+      own.push(value);
+      if (own.length > (state.open?.history_seconds ?? 600)) own.shift();
+    });
+  }
+  const [, rates, sizes, lost, half, most, gapHalf, gapMost] = columns.current;
+  if (!times.length) {
+    return html`<p class="dim">${topic.measured ? 'No second has been measured yet.'
+      : 'The topic is not measured: no charts.'}</p>`;
+  }
+  const own = /** @type {number[]} */ (times);
+  return html`<section aria-labelledby="course"><h2 id="course">The last ten minutes</h2>
+    <div class="charts">
+    <${Chart} title="Rate" times=${own} print=${rate}
+      lines=${[{ label: 'rate', colour: '--line-1', values: rates, fill: true }]} />
+    <${Chart} title="Bandwidth" times=${own} print=${bandwidth}
+      lines=${[{ label: 'bandwidth', colour: '--line-2', values: sizes, fill: true }]} />
+    <${Chart} title="Time between messages" times=${own} print=${duration} lines=${[
+      { label: 'p50', colour: '--line-1', values: gapHalf },
+      { label: 'p99', colour: '--line-3', values: gapMost }]} />
+    <${Chart} title="Latency" times=${own} print=${duration} lines=${[
+      { label: 'p50', colour: '--line-1', values: half },
+      { label: 'p99', colour: '--line-3', values: most }]}
+      note="From the writer’s timestamp to the capture; between hosts it needs equal clocks" />
+    <${Chart} title="Lost messages" times=${own} print=${count}
+      lines=${[{ label: 'lost', colour: '--line-4', values: lost, fill: true }]} />
+    </div></section>`;
+}
+
+/** The stations at which a message can die, in their order. */
+const STATIONS = /** @type {[string, string][]} */ ([
+  ['lost_before_host_messages', 'before this host'],
+  ['lost_in_reassembly_messages', 'in IP reassembly'],
+  ['lost_in_socket_buffer_messages', 'in the socket buffer'],
+  ['pending_messages', 'place not known yet'],
+]);
+
+/** Sent, what died at each station, delivered: for each subscriber. @param {{details: any}} props */
+function Waterfall({ details }) {
+  const received = details.deliveries.filter((/** @type {any} */ each) =>
+    each.direction === 'received');
+  const sent = details.deliveries.filter((/** @type {any} */ each) => each.direction === 'sent');
+  const owners = new Map([...details.publishers, ...details.subscriptions].map(
+    (/** @type {any} */ each) => [each.guid, each.node]));
+  const title = html`<h2 id="waterfall">Where messages die</h2>`;
+  if (!received.length) {
+    const out = sent.reduce((/** @type {number} */ sum, /** @type {any} */ each) =>
+      sum + each.delivered.messages, 0);
+    return html`<section aria-labelledby="waterfall">${title}
+      <p class="dim">${sent.length
+        ? `${count(out)} messages left this host; what arrives elsewhere is seen there.`
+        : 'No delivery to a subscriber has been seen by its socket yet.'}</p></section>`;
+  }
+  return html`<section aria-labelledby="waterfall">${title}
+    <div class="scroll" tabindex="0" role="region" aria-labelledby="waterfall"><table>
+    <thead><tr><th scope="col">Publisher → subscriber</th><th scope="col" class="number">Sent</th>
+      ${STATIONS.map(([, name]) => html`<th scope="col" class="number">Lost ${name}</th>`)}
+      <th scope="col" class="number">Delivered</th><th scope="col">Share</th></tr></thead>
+    <tbody>${received.map((/** @type {any} */ each) => {
+      const { delivered } = each;
+      const total = delivered.messages + delivered.lost_messages;
+      const who = each.nodes.length ? each.nodes.join(', ')
+        : each.process ? `${each.process} ${each.process_id}` : each.subscriber || each.destination;
+      return html`<tr key=${`${each.writer} ${each.destination} ${each.subscriber}`}>
+        <th scope="row"><${Name} text=${owners.get(each.writer) ?? each.writer} /> → <${Name}
+          text=${who} /></th>
+        <td class="number">${count(total)}</td>
+        ${STATIONS.map(([key]) => html`<td class="number ${delivered[key] > 0 ? 'bad' : ''}">${
+          delivered[key] > 0 ? html`<${Mark} severity="warning" /> ` : ''}${count(delivered[key])}</td>`)}
+        <td class="number">${count(delivered.messages)}</td>
+        <td><${Bar} delivered=${delivered} total=${total} /></td></tr>`;
+    })}</tbody></table></div></section>`;
+}
+
+/** @param {{delivered: any, total: number}} props */
+function Bar({ delivered, total }) {
+  if (!total) return null;
+  let x = 0;
+  const part = (/** @type {number} */ number, /** @type {string} */ kind) => {
+    const width = (number / total) * 160;
+    const own = width > 0 && html`<rect x=${x} y="0" width=${Math.max(1.5, width)} height="12"
+      class=${kind} />`;
+    x += width;
+    return own;
+  };
+  return html`<svg class="bar" viewBox="0 0 160 12" aria-hidden="true">
+    ${part(delivered.messages, 'delivered')}
+    ${STATIONS.map(([key], at) => part(delivered[key], `lost-${at}`))}</svg>
+    ${' '}${percent(delivered.messages / total)}`;
+}
+
+/** How messages go from publishers to subscribers. @param {{details: any}} props */
+function Passages({ details }) {
+  const { passages, acknowledgements, breakdown } = details;
+  const late = acknowledgements.filter((/** @type {any} */ each) => each.lag_messages > 0);
+  const stages = /** @type {[string, string][]} */ ([
+    ['send_delay', 'from the timestamp to leaving'], ['transit', 'from leaving to arriving'],
+    ['transfer', 'first to last datagram'], ['retransmission', 'until a lost one came again']]);
+  const spent = stages.filter(([key]) => breakdown?.[key]);
+  if (!passages.length && !late.length && !spent.length) return null;
+  return html`<section aria-labelledby="ways"><h2 id="ways">How messages go</h2>
+    ${passages.length > 0 && html`<p>${passages.map((/** @type {any} */ each) =>
+      `${PASSAGES[each.passage] ?? each.passage}: ${count(each.pairs)} ${each.pairs === 1
+        ? 'pair' : 'pairs'}${each.view ? ` (view: ${each.view})` : ''}`).join('; ')}</p>`}
+    ${spent.length > 0 && html`<table><caption>Where time goes on this host</caption><thead><tr>
+      <th scope="col">Part</th><th scope="col" class="number">p50</th>
+      <th scope="col" class="number">p99</th></tr></thead><tbody>${spent.map(([key, name]) => html`
+      <tr key=${key}><th scope="row">${name}</th><td class="number">${duration(
+        breakdown[key].p50_seconds)}</td><td class="number">${duration(
+        breakdown[key].p99_seconds)}</td></tr>`)}</tbody></table>`}
+    ${late.length > 0 && html`<table><caption>Readers that lag behind</caption><thead><tr>
+      <th scope="col">Reader</th><th scope="col" class="number">Messages</th>
+      <th scope="col" class="number">Time</th></tr></thead><tbody>${late.map(
+      (/** @type {any} */ each) => html`<tr key=${each.writer + each.reader}><th scope="row">
+        <${Name} text=${each.node ?? each.reader} /></th><td class="number">${count(
+        each.lag_messages)}</td><td class="number">${duration(each.lag_seconds)}</td></tr>`)}
+      </tbody></table>`}</section>`;
+}

@@ -1,0 +1,118 @@
+// All topics in one table: filtered, sorted, measured on request.
+
+import { named, post, remove } from '../api.js';
+import { bandwidth, count, duration, percent, rate } from '../format.js';
+import { address } from '../router.js';
+import { replaceAddress, state, useLive } from '../store.js';
+import { sorted, Table } from '../table.js';
+import { Act, Badges, FLAGS, Filter, html, matches, Name, Spark, TopicLink, worst } from '../ui.js';
+
+const SEVERITY = /** @type {Record<string, number>} */ ({ error: 0, warning: 1, note: 2, good: 3 });
+
+/** How lists of topics are narrowed. */
+const ONLY = /** @type {Record<string, [string, (topic: any) => boolean]>} */ ({
+  all: ['all', () => true],
+  wrong: ['with problems', (topic) => ['error', 'warning'].includes(worst(state.flagsOf(topic.id)))],
+  measured: ['measured', (topic) => topic.measured],
+  unmeasured: ['not measured', (topic) => !topic.measured],
+});
+
+/** Switches measuring on or off. @param {import('../state.js').Topic} topic */
+export function watch(topic) {
+  const path = `${named('watch', watchName(topic))}?domain_id=${topic.domain}`;
+  return topic.measured ? remove(path) : post(path);
+}
+
+// Topics without a ROS name are watched by their DDS name.
+function watchName(/** @type {import('../state.js').Topic} */ topic) {
+  return topic.kind === 'dds' ? topic.ddsName : topic.name;
+}
+
+/** Why a topic cannot be switched off here; null where it can. @param {any} topic */
+function fixed(topic) {
+  if (!topic.measured || topic.watched === 0) return null;
+  if (topic.watched & 4) return 'A watch with a pattern measures it.';
+  if ((topic.watched & 3) === 1) return 'The configuration measures it.';
+  if ((topic.watched & 3) === 2) return 'The command line of the agent measures it.';
+  return null;
+}
+
+/** @param {{topic: import('../state.js').Topic}} props */
+export function Measure({ topic }) {
+  const why = fixed(topic);
+  const on = topic.measured;
+  if (why) return html`<span title=${why} class="dim">on (${topic.watched & 4 ? 'pattern'
+    : (topic.watched & 3) === 1 ? 'configuration' : 'command line'})</span>`;
+  return html`<${Act} action=${() => watch(topic)} pressed=${on} kind="switch"
+    disabled=${!state.may('watch')} label="Measure ${topic.name}">${on ? 'on' : 'off'}</${Act}>`;
+}
+
+/** @param {{query: Record<string, string>}} props */
+export function Topics({ query }) {
+  useLive();
+  const { filter = '', sort = 'name', only = 'all', hidden = '' } = query;
+  const change = (/** @type {Record<string, any>} */ more) => replaceAddress(
+    address('topics', null, { ...query, ...more }));
+  const domains = state.hasDomains();
+  const accepts = (ONLY[only] ?? ONLY.all)[1];
+  const rows = [...state.topics.values()].filter((topic) =>
+    (hidden || !topic.hidden) && !topic.vanished && accepts(topic)
+    && matches(filter, `${topic.name} ${topic.types.join(' ')} ${state.flagsOf(topic.id)
+      .map((flag) => FLAGS[flag]?.[1] ?? flag).join(' ')}`));
+  const figures = (/** @type {any} */ topic) => state.figuresOf(topic.id);
+  const loss = (/** @type {any} */ topic) => {
+    const { lost, messages } = figures(topic);
+    return lost == null || messages == null || lost + messages === 0 ? null
+      : lost / (lost + messages);
+  };
+  const columns = [
+    { key: 'name', title: 'Topic', header: true, by: (/** @type {any} */ topic) => topic.name,
+      cell: (/** @type {any} */ topic) => html`<${TopicLink} topic=${topic} />` },
+    ...(domains ? [{ key: 'domain', title: 'Domain', kind: 'number wide',
+      by: (/** @type {any} */ topic) => topic.domain,
+      cell: (/** @type {any} */ topic) => topic.domain }] : []),
+    { key: 'type', title: 'Type', kind: 'wide type',
+      by: (/** @type {any} */ topic) => topic.types.join(),
+      cell: (/** @type {any} */ topic) => html`<${Name} text=${topic.types.join(', ')} />` },
+    { key: 'state', title: 'State',
+      by: (/** @type {any} */ topic) => SEVERITY[worst(state.flagsOf(topic.id))],
+      cell: (/** @type {any} */ topic) => html`<${Badges} flags=${state.flagsOf(topic.id)} />` },
+    { key: 'rate', title: 'Rate', kind: 'number', by: (/** @type {any} */ topic) =>
+      figures(topic).rate, cell: (/** @type {any} */ topic) => rate(figures(topic).rate) },
+    { key: 'course', title: '10 min', kind: 'wide',
+      cell: (/** @type {any} */ topic) => topic.measured
+        && html`<${Spark} points=${state.pointsOf(topic.id)} />` },
+    { key: 'bandwidth', title: 'Bandwidth', kind: 'number wide',
+      by: (/** @type {any} */ topic) => figures(topic).bandwidth,
+      cell: (/** @type {any} */ topic) => bandwidth(figures(topic).bandwidth) },
+    { key: 'loss', title: 'Loss', kind: 'number wide', by: loss,
+      cell: (/** @type {any} */ topic) => percent(loss(topic)) },
+    { key: 'latency', title: 'p99 latency', kind: 'number wide',
+      by: (/** @type {any} */ topic) => figures(topic).p99,
+      cell: (/** @type {any} */ topic) => duration(figures(topic).p99) },
+    { key: 'ends', title: 'Pub/Sub', kind: 'number wide',
+      by: (/** @type {any} */ topic) => topic.publishers.length + topic.subscriptions.length,
+      cell: (/** @type {any} */ topic) =>
+        `${count(topic.publishers.length)}/${count(topic.subscriptions.length)}` },
+    { key: 'measured', title: 'Measure', by: (/** @type {any} */ topic) => (topic.measured ? 0 : 1),
+      cell: (/** @type {any} */ topic) => html`<${Measure} topic=${topic} />` },
+  ];
+  return html`<h1 tabindex="-1">Topics</h1>
+    <div class="controls">
+      <${Filter} label="Filter" value=${filter} found=${rows.length} noun="topic"
+        change=${(/** @type {string} */ text) => change({ filter: text })} />
+      <label>Show <select value=${only}
+        onChange=${(/** @type {any} */ event) => change({ only: event.target.value })}>
+        ${Object.entries(ONLY).map(([key, [title]]) => html`<option value=${key}>${title}</option>`)}
+      </select></label>
+      <label><input type="checkbox" checked=${Boolean(hidden)}
+        onChange=${(/** @type {any} */ event) => change({ hidden: event.target.checked })} />
+        hidden topics</label>
+      <a href=${address('graph')}>Show as a graph</a>
+    </div>
+    <${Table} label="Topics" columns=${columns} rows=${sorted(rows, columns, sort)} sort=${sort}
+      keyOf=${(/** @type {any} */ topic) => topic.id}
+      onSort=${(/** @type {string} */ next) => change({ sort: next })} />
+    ${!rows.length && html`<p class="empty">${state.topics.size
+      ? 'No topic matches.' : 'No topic has been announced yet.'}</p>`}`;
+}
