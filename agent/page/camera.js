@@ -2,6 +2,8 @@
 
 const LEAST = 0.05;
 const MOST = 4;
+/** Names can be read from this scale on. */
+const LEGIBLE = 0.7;
 
 export class Camera {
   /** @param {SVGSVGElement} svg @param {SVGGElement} stage */
@@ -11,7 +13,7 @@ export class Camera {
     this.x = 0;
     this.y = 0;
     this.scale = 1;
-    this.size = { width: 1, height: 1 };
+    this.size = { width: 0, height: 0 };
     this.fitted = true;
     /** Whether the last press moved the drawing, and is no click. */
     this.moved = false;
@@ -23,7 +25,7 @@ export class Camera {
     on('pointermove', (event) => this.move(event));
     on('pointerup', (event) => this.up(event));
     on('pointercancel', (event) => this.up(event));
-    this.watch = new ResizeObserver(() => { if (this.fitted) this.fit(); });
+    this.watch = new ResizeObserver(() => { if (this.fitted && this.size.width) this.fit(); });
     this.watch.observe(svg);
   }
 
@@ -31,10 +33,26 @@ export class Camera {
     this.watch.disconnect();
   }
 
-  /** The drawing has this size now; a fitted view stays fitted. @param {number} width @param {number} height */
+  /**
+   * The drawing has this size now; a fitted view stays fitted.
+   * @param {number} width
+   * @param {number} height
+   */
   frame(width, height) {
+    const first = this.size.width === 0;
     this.size = { width: Math.max(1, width), height: Math.max(1, height) };
     if (this.fitted) this.fit();
+    if (first && this.scale < LEGIBLE) this.begin();
+  }
+
+  /** Shows the left of a drawing that would be too small to read as a whole. */
+  begin() {
+    const { height } = this.view();
+    this.scale = LEGIBLE;
+    this.x = 12;
+    this.y = Math.max(12, (height - this.size.height * LEGIBLE) / 2);
+    this.fitted = false;
+    this.apply();
   }
 
   fit() {

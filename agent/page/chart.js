@@ -102,7 +102,11 @@ export function Chart({ title, times, lines, print, note }) {
     };
   }, [asTable, names]);
   useEffect(() => {
-    plot.current?.setData(data);
+    const own = plot.current;
+    if (!own) return;
+    own.setData(data);
+    // Without a cursor the legend shows the latest values.
+    if (own.cursor.idx == null) own.setLegend({ idx: times.length - 1 });
   });
   const move = (/** @type {KeyboardEvent} */ event) => {
     const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -60, PageDown: 60 }[event.key];
@@ -133,7 +137,7 @@ export function Chart({ title, times, lines, print, note }) {
 function ValueTable({ title, times, lines, print }) {
   const places = [];
   for (let at = times.length - 1; at >= 0; at -= 10) places.push(at);
-  return html`<div class="scroll" tabindex="0" role="region" aria-label="${title}, as a table">
+  return html`<div class="scroll" tabindex="0" role="group" aria-label="${title}, as a table">
     <table><thead><tr><th scope="col">time</th>
     ${lines.map((line) => html`<th scope="col" class="number">${line.label}</th>`)}</tr></thead>
     <tbody>${places.map((at) => html`<tr key=${times[at]}><th scope="row">${clock(times[at])}</th>

@@ -7,7 +7,7 @@ import { Chart } from './chart.js';
 import { bytes, clock, count, visible } from './format.js';
 import { Lines } from './state.js';
 import { state, stream, useKept } from './store.js';
-import { AskButton, Failed, html, Mark, Name } from './ui.js';
+import { AskButton, Failed, html, Mark, Name, Text } from './ui.js';
 
 const HERTZ = 5;
 /** Points of a field's chart: two minutes at five a second. */
@@ -188,7 +188,7 @@ function Follow({ scope, name, topic }) {
       message.node ? html` by <${Name} text=${message.node} />` : ''}${message.skipped
       ? `, ${count(message.skipped)} not shown before it` : ''}</p>`}
     ${message?.error && html`<p><${Mark} severity="warning" /> <${Name} text=${message.error} /></p>`}
-    ${lines.length > 0 && html`<div class="scroll tree" tabindex="0" role="region"
+    ${lines.length > 0 && html`<div class="scroll tree" tabindex="0" role="group"
       aria-label="Fields of the message"><table><thead><tr><th scope="col">Field</th>
       <th scope="col">Value</th><th scope="col"><span class="unseen">Plot</span></th></tr></thead>
       <tbody>${lines.map((line) => html`<${FieldRow} key=${line.path} line=${line}
@@ -196,7 +196,7 @@ function Follow({ scope, name, topic }) {
         plotted=${plotted.includes(line.path)} />`)}</tbody></table></div>`}
     ${lines.length >= MOST_LINES && html`<p class="dim">The first ${count(MOST_LINES)} fields.</p>`}
     ${type?.definition && html`<details><summary>Definition of <${Name} text=${type.name} /></summary>
-      <pre tabindex="0">${String(type.definition).split(/\r?\n/).map(visible).join('\n')}</pre>
+      <${Text} text=${type.definition} />
       ${type.source && html`<p class="dim">From <${Name} text=${type.source} /></p>`}</details>`}`;
 }
 

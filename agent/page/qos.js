@@ -41,16 +41,16 @@ export function Endpoints({ details, topic }) {
       <td><${Name} text=${[participant?.host, place].filter(Boolean).join(', ') || 'unknown'} /></td>
       <td>${endpoint.vendor ?? ''}</td>
       <td><${Name} text=${endpoint.message_type} /></td>
-      <td class="number">${publishes ? rate(endpoint.measurement?.rate_hertz) : ''}</td>
+      ${publishes && html`<td class="number">${rate(endpoint.measurement?.rate_hertz)}</td>`}
       <td><${Name} text=${endpoint.guid} /></td></tr>`;
   };
   const table = (/** @type {any[]} */ list, /** @type {boolean} */ publishes) => html`
-    <div class="scroll" tabindex="0" role="region"
+    <div class="scroll" tabindex="0" role="group"
       aria-label=${publishes ? 'Publishers' : 'Subscriptions'}><table>
     <caption>${publishes ? 'Publishers' : 'Subscriptions'} (${count(list.length)})</caption>
     <thead><tr><th scope="col">Node</th><th scope="col">Where</th>
       <th scope="col">Implementation</th><th scope="col">Type</th>
-      <th scope="col" class="number">${publishes ? 'Rate' : ''}</th>
+      ${publishes && html`<th scope="col" class="number">Rate</th>`}
       <th scope="col">GUID</th></tr></thead>
     <tbody>${list.map((endpoint) => row(endpoint, publishes))}</tbody></table></div>`;
   return html`<section aria-labelledby="endpoints"><h2 id="endpoints">Publishers and
@@ -96,7 +96,7 @@ export function Offered({ details }) {
       <${Mark} severity="error" /> <${Name} text=${nameOf(each.writer)} /> offers less than <${Name}
       text=${nameOf(each.reader)} /> requests: ${each.policies.join(', ').replaceAll('_', ' ')}.
       No message passes between them.</p>`)}
-    <div class="scroll" tabindex="0" role="region" aria-labelledby="qos"><table class="side">
+    <div class="scroll" tabindex="0" role="group" aria-labelledby="qos"><table class="side">
     <thead><tr><td></td>
       ${publishers.length > 0 && html`<th scope="colgroup" colspan=${publishers.length}>offered by</th>`}
       ${subscriptions.length > 0 && html`<th scope="colgroup"

@@ -47,17 +47,24 @@ function compare(a, b, down) {
  */
 export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
   const body = useRef(/** @type {HTMLElement|null} */ (null));
+  const measured = useRef(0);
   const [height, setHeight] = useState(37);
   const [range, setRange] = useState({ first: 0, last: 40 });
   const measure = () => {
     if (!body.current) return;
-    const own = body.current.querySelector('tr[data-row]')?.getBoundingClientRect().height;
-    if (own && Math.abs(own - height) > 0.5) setHeight(own);
+    // Rows differ where names wrap: their mean is taken once for each width of the window.
+    const drawn = body.current.querySelectorAll('tr[data-row]');
+    if (drawn.length && measured.current !== window.innerWidth) {
+      measured.current = window.innerWidth;
+      let total = 0;
+      for (const row of drawn) total += row.getBoundingClientRect().height;
+      setHeight(Math.max(20, total / drawn.length));
+    }
     const top = body.current.getBoundingClientRect().top;
-    const first = Math.max(0, Math.floor(-top / height) - SPARE);
-    const last = Math.ceil((window.innerHeight - top) / height) + SPARE;
+    const first = Math.max(0, Math.min(rows.length, Math.floor(-top / height) - SPARE));
+    const last = Math.max(first, Math.ceil((window.innerHeight - top) / height) + SPARE);
     setRange((/** @type {any} */ before) => (before.first === first && before.last === last
-      ? before : { first, last: Math.max(first, last) }));
+      ? before : { first, last }));
   };
   useLayoutEffect(measure);
   useEffect(() => {

@@ -198,3 +198,8 @@ export function download(file, blob) {
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
+
+/** Lines of text from the network, each as visible as a name. @param {{text: string}} props */
+export function Text({ text }) {
+  return html`<pre tabindex="0">${String(text).split(/\r?\n/).map(visible).join('\n')}</pre>`;
+}

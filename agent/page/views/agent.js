@@ -11,7 +11,7 @@ const SOURCES = /** @type {Record<string, string>} */ ({
 
 /** @param {{title: string, rows: [any, any][]}} props */
 function Facts({ title, rows }) {
-  return html`<section aria-label=${title}><h2>${title}</h2><table aria-label=${title}><tbody>
+  return html`<section aria-label=${title}><h2>${title}</h2><table class="short" aria-label=${title}><tbody>
     ${rows.map(([name, value]) => html`<tr key=${name}><th scope="row">${name}</th>
       <td>${value}</td></tr>`)}</tbody></table></section>`;
 }
@@ -50,7 +50,7 @@ export function Agent() {
       ['Stream', stream.status],
     ]} />
     ${data && html`
-    <section aria-labelledby="abilities"><h2 id="abilities">Abilities</h2><table
+    <section aria-labelledby="abilities"><h2 id="abilities">Abilities</h2><table class="short"
       aria-labelledby="abilities"><tbody>${data.abilities.map((/** @type {any} */ each) => html`
       <tr key=${each.ability}><th scope="row"><${Mark} severity=${each.able ? 'good' : 'note'} /> ${
         each.ability.replaceAll('_', ' ')}</th><td>${each.able ? 'yes' : html`no: <${Name}
@@ -58,7 +58,7 @@ export function Agent() {
     <${Facts} title="Not counted or dropped" rows=${drops.map(([name, value]) => [name,
       html`${value ? html`<${Mark} severity="warning" /> ` : ''}${count(value)}`])} />
     <section aria-labelledby="limits"><h2 id="limits">Limits in use</h2><div class="scroll"
-      tabindex="0" role="region" aria-labelledby="limits"><table><thead><tr><th scope="col">Limit</th>
+      tabindex="0" role="group" aria-labelledby="limits"><table><thead><tr><th scope="col">Limit</th>
       <th scope="col" class="number">Used</th><th scope="col" class="number">Of</th>
       <th scope="col" class="number">Part</th><th scope="col" class="number">Times reached</th></tr></thead>
       <tbody>${[...data.limits].sort((one, other) => part(other) - part(one)).map(

@@ -76,7 +76,7 @@ export function Events({ query }) {
     ${failed && html`<p class="problem"><${Mark} severity="warning" /> No earlier events: ${failed}</p>`}
     ${state.missedEvents > 0 && html`<p class="dim">${count(state.missedEvents)} events were
       overwritten before this page could read them.</p>`}
-    ${rows.length ? html`<div class="scroll tall" tabindex="0" role="region" aria-label="Events"><table>
+    ${rows.length ? html`<div class="scroll tall" tabindex="0" role="group" aria-label="Events"><table>
       <thead><tr><th scope="col">Time</th><th scope="col">Event</th><th scope="col">What</th></tr></thead>
       <tbody>${rows.slice(0, MOST_SHOWN).map((/** @type {any} */ event) => html`<tr key=${event.id}>
         <td class="number"><time datetime=${event.time} title=${event.time}>${clock(

@@ -21,7 +21,7 @@ function way(mask, kind) {
 
 /** Pixels of an edge by its bytes a second. @param {number} bytes */
 export function thickness(bytes) {
-  return bytes > 0 ? Math.max(1.2, Math.min(9, 1.2 + Math.log10(1 + bytes / 100) * 1.3)) : 1;
+  return bytes > 0 ? Math.min(7, 1 + Math.log10(1 + bytes / 1000) * 1.2) : 1;
 }
 
 /** @param {import('../graph-model.js').Edge} edge */
@@ -383,7 +383,7 @@ function Box({ vertex, at, toggle, roving, choose }) {
   const name = visible(vertex.name);
   return html`<g class="box"><rect x=${left} y=${top} width=${at.w} height=${at.h} rx="8" />
     <g role="button" aria-expanded="true" tabindex=${roving ? 0 : -1} data-key=${vertex.key}
-      aria-label="${name}: close the box" onFocus=${() => choose(vertex.key)}
+      aria-label="▾ ${name}: close the box" onFocus=${() => choose(vertex.key)}
       onClick=${() => toggle(vertex.key)} onKeyDown=${(/** @type {KeyboardEvent} */ event) => {
         if (!pressed(event)) return;
         event.preventDefault();
@@ -408,6 +408,8 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera }) {
     : figures ? (figures.rate == null ? 'not measured'
       : `${rate(figures.rate)} · ${bandwidth(figures.bandwidth)}`)
       : shortened(vertex.detail, MOST_LABEL);
+  const label = shortened(vertex.name, MOST_LABEL);
+  const closing = vertex.closed ? '▸ ' : '';
   const [left, top] = [at.x - at.w / 2, at.y - at.h / 2];
   const sign = SIGNS[severity];
   const press = () => {
@@ -421,8 +423,8 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera }) {
     aria-expanded=${vertex.closed ? 'false' : undefined}
     aria-pressed=${vertex.closed ? undefined : chosen}
     onFocus=${() => choose(vertex.key)}
-    aria-label="${vertex.closed ? 'closed box' : vertex.kind} ${visible(vertex.name)}${detail
-      ? `, ${detail}` : ''}${words}"
+    aria-label="${closing}${label} ${detail} (${vertex.closed ? 'closed box' : vertex.kind}${words}${
+      label === visible(vertex.name) ? '' : `, ${visible(vertex.name)}`})"
     onKeyDown=${(/** @type {KeyboardEvent} */ event) => {
       if (!pressed(event)) return;
       event.preventDefault();
@@ -432,11 +434,10 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera }) {
     <rect x=${left} y=${top} width=${at.w} height=${at.h}
       rx=${vertex.kind === 'topic' ? 3 : vertex.kind === 'service' || vertex.kind === 'action'
         ? 0 : 14} />
-    <text x=${left + 12} y=${top + (detail ? 17 : at.h / 2 + 4)}>${vertex.closed ? '▸ ' : ''}${shortened(
-      vertex.name, MOST_LABEL)}</text>
-    ${detail && html`<text class="detail" x=${left + 12} y=${top + 32}>${detail}</text>`}
-    ${sign && html`<text class="sign ${severity}" x=${left + at.w - 9} y=${top + 14}>${sign}</text>`}
-    <title>${visible(vertex.name)}</title></g>`;
+    <text x=${left + 12} y=${top + (detail ? 17 : at.h / 2 + 4)}><tspan>${closing}${label}</tspan>${' '}${detail
+      && html`<tspan class="detail" x=${left + 12} y=${top + 32}>${detail}</tspan>`}</text>
+    ${sign && html`<text class="sign ${severity}" aria-hidden="true" x=${left + at.w - 9} y=${top + 14}>${sign}</text>`}
+    ${label !== visible(vertex.name) && html`<title>${visible(vertex.name)}</title>`}</g>`;
 }
 
 /** @param {string} key @param {Map<number, string>} nodes */

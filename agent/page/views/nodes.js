@@ -161,7 +161,7 @@ export function NodeView({ name, query }) {
       </section>`}
     <section aria-labelledby="where"><h2 id="where">${instances.length > 1
       ? 'Processes of this name' : 'Process'}</h2>
-    <div class="scroll" tabindex="0" role="region" aria-labelledby="where"><table><thead><tr>
+    <div class="scroll" tabindex="0" role="group" aria-labelledby="where"><table><thead><tr>
       <th scope="col">Process</th><th scope="col">Host</th><th scope="col" class="number">CPU</th>
       <th scope="col" class="number">Memory</th><th scope="col" class="number">Threads</th>
       <th scope="col">Started</th><th scope="col">Control group</th><th scope="col">DDS</th></tr></thead>

@@ -41,8 +41,7 @@ export function Findings({ list }) {
   return html`<ul class="findings">${list.slice(0, MOST_SHOWN).map((finding) => html`
     <li key=${finding.id} class=${finding.severity}><${Mark} severity=${finding.severity} />
       <span><${Place} finding=${finding} /> <${Name} text=${finding.text} />
-      ${finding.since != null && html` <span class="dim">since ${clock(finding.since)}
-        (${duration(Math.max(0, state.time - finding.since))})</span>`}
+      ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${duration(Math.max(0, state.time - finding.since))})</span>`}
       ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Name} text=${finding.remedy}
         /></span>`}</span></li>`)}</ul>
     ${list.length > MOST_SHOWN && html`<p class="dim">${count(list.length - MOST_SHOWN)} more.
@@ -84,7 +83,7 @@ function Busiest() {
   if (!rows.length) return null;
   const total = state.totals.bandwidth || 1;
   return html`<section aria-labelledby="busiest"><h2 id="busiest">Busiest topics</h2>
-    <div class="scroll" tabindex="0" role="region" aria-labelledby="busiest"><table>
+    <div class="scroll" tabindex="0" role="group" aria-labelledby="busiest"><table>
     <thead><tr><th scope="col">Topic</th><th scope="col" class="number">Bandwidth</th>
       <th scope="col" class="number">Share</th><th scope="col" class="number">Rate</th>
       <th scope="col">State</th></tr></thead>

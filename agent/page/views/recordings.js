@@ -34,7 +34,7 @@ export function Recordings() {
       bag on request, or when an expectation is violated.</p>
     <${Failed} problem=${snapshots.problem} what="No snapshots" />
     ${snapshots.data && (snapshots.data.snapshots.length
-      ? html`<div class="scroll" tabindex="0" role="region" aria-labelledby="snapshots"><table>
+      ? html`<div class="scroll" tabindex="0" role="group" aria-labelledby="snapshots"><table>
         <thead><tr><th scope="col">Snapshot</th><th scope="col">Topics</th>
         <th scope="col" class="number">Seconds</th><th scope="col" class="number">In memory</th>
         <th scope="col" class="number">Written</th><th scope="col">Write</th></tr></thead>
@@ -55,7 +55,7 @@ export function Recordings() {
 /** @param {{name: string, again: () => void}} props */
 function Write({ name, again }) {
   const [written, setWritten] = useState('');
-  return html`<${Act} label="Write snapshot ${name} now" action=${async () => {
+  return html`<${Act} label="Write now: snapshot ${name}" action=${async () => {
     const answer = await post(`snapshots/${encodeURIComponent(name)}`);
     setWritten(`${count(answer.messages)} messages in ${answer.directory}`);
     again();
@@ -114,7 +114,7 @@ function Recording({ recording, again }) {
       ${recording.state === 'paused'
         ? html`<${Act} action=${act('resume')} label="Continue ${name}">Continue</${Act}> `
         : html`<${Act} action=${act('pause')} label="Pause ${name}">Pause</${Act}> `}
-      <${Act} action=${act('split')} label="Begin the next file of ${name}">Split</${Act}> 
+      <${Act} action=${act('split')} label="Split: begin the next file of ${name}">Split</${Act}>${' '}
       <${Act} label="Stop ${name}" action=${async () => {
         await remove(path);
         again();

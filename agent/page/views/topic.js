@@ -9,7 +9,7 @@ import { topicKey } from '../graph-model.js';
 import { LiveMessage } from '../message.js';
 import { Endpoints, Offered } from '../qos.js';
 import { state, stream, useLive, usePoll } from '../store.js';
-import { Badges, Failed, Figure, html, Mark, Name, PASSAGES } from '../ui.js';
+import { Badges, Failed, Figure, html, Mark, Name, PASSAGES, Text } from '../ui.js';
 import { Findings } from './overview.js';
 import { Measure } from './topics.js';
 
@@ -62,6 +62,8 @@ export function Topic({ name, query }) {
       <${Offered} details=${details.data} />
       <${Waterfall} details=${details.data} />
       <${Passages} details=${details.data} />`}
+    <${Definition} key=${`definition ${topic.id}`} path=${named('topics', apiName(topic),
+      `/definition${scope}`)} />
     <${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope} name=${apiName(topic)} />`;
 }
 
@@ -131,6 +133,20 @@ function Charts({ topic, scope }) {
     </div></section>`;
 }
 
+/** The definition of the topic's type, asked for when it is opened. @param {{path: string}} props */
+function Definition({ path }) {
+  const [open, turn] = useState(false);
+  const { data, problem } = usePoll(open ? path : null, 0);
+  return html`<section aria-labelledby="definition"><h2 id="definition">Type definition</h2>
+    <p><button type="button" aria-expanded=${open} onClick=${() => turn(!open)}>${open
+      ? 'Close' : 'Show'}</button></p>
+    ${open && html`<${Failed} problem=${problem} what="No definition" />`}
+    ${open && data && (data.known
+      ? html`<${Text} text=${data.definition} />`
+      : html`<p><${Mark} severity="note" /> The definition of <${Name} text=${data.name} /> is not
+        known: <${Name} text=${data.reason ?? 'no file has it'} /></p>`)}</section>`;
+}
+
 /** The stations at which a message can die, in their order. */
 const STATIONS = /** @type {[string, string][]} */ ([
   ['lost_before_host_messages', 'before this host'],
@@ -156,7 +172,7 @@ function Waterfall({ details }) {
         : 'No delivery to a subscriber has been seen by its socket yet.'}</p></section>`;
   }
   return html`<section aria-labelledby="waterfall">${title}
-    <div class="scroll" tabindex="0" role="region" aria-labelledby="waterfall"><table>
+    <div class="scroll" tabindex="0" role="group" aria-labelledby="waterfall"><table>
     <thead><tr><th scope="col">Publisher → subscriber</th><th scope="col" class="number">Sent</th>
       ${STATIONS.map(([, name]) => html`<th scope="col" class="number">Lost ${name}</th>`)}
       <th scope="col" class="number">Delivered</th><th scope="col">Share</th></tr></thead>

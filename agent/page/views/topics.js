@@ -1,7 +1,7 @@
 // All topics in one table: filtered, sorted, measured on request.
 
 import { named, post, remove } from '../api.js';
-import { bandwidth, count, duration, percent, rate } from '../format.js';
+import { bandwidth, count, duration, percent, rate, visible } from '../format.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
 import { sorted, Table } from '../table.js';
@@ -44,7 +44,7 @@ export function Measure({ topic }) {
   if (why) return html`<span title=${why} class="dim">on (${topic.watched & 4 ? 'pattern'
     : (topic.watched & 3) === 1 ? 'configuration' : 'command line'})</span>`;
   return html`<${Act} action=${() => watch(topic)} pressed=${on} kind="switch"
-    disabled=${!state.may('watch')} label="Measure ${topic.name}">${on ? 'on' : 'off'}</${Act}>`;
+    disabled=${!state.may('watch')} label="${on ? 'on' : 'off'}: measure ${visible(topic.name)}">${on ? 'on' : 'off'}</${Act}>`;
 }
 
 /** @param {{query: Record<string, string>}} props */
