@@ -47,6 +47,11 @@ impl Calendar {
             return;
         }
         self.show(&mut snapshot.at);
+        let diagnosed = snapshot.diagnosed.iter();
+        snapshot.diagnosed = diagnosed
+            .map(|since| self.shown(*since))
+            .collect::<Vec<_>>()
+            .into();
         for participant in &mut snapshot.participants {
             self.show(&mut participant.first_seen);
             self.show(&mut participant.last_seen);

@@ -35,6 +35,7 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
         sockets: deliveries::sockets(observer),
         watches: watches(observer),
         diagnoses: Arc::clone(observer.examiner.current()),
+        diagnosed: Arc::clone(observer.examiner.since()),
         churn: observer.discovery.churn.facts(),
         decode_errors: decode_errors(observer),
         tables: tables(observer),
@@ -128,14 +129,15 @@ fn topic(
             measurement,
         ))
     };
-    let publishers = fitting(
+    let mut publishers = fitting(
         topic.writers.len(),
         topic.writers.iter().filter_map(endpoint),
     );
-    let subscriptions = fitting(
+    let mut subscriptions = fitting(
         topic.readers.len(),
         topic.readers.iter().filter_map(endpoint),
     );
+    let passages = passages(&observer.discovery, &mut publishers, &mut subscriptions);
     let all = || publishers.iter().chain(&subscriptions);
     let mut message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
     if topic.is_vanished() {
@@ -172,11 +174,7 @@ fn topic(
         deliveries: deliveries::deliveries(observer, topic, nodes),
         acknowledgements: deliveries::acknowledgements(observer, topic, nodes, now),
         vanished: topic.is_vanished(),
-        passages: passages(
-            &observer.discovery,
-            topic.writers.iter(),
-            &topic.readers.iter(),
-        ),
+        passages,
         is_read: topic.wished.is_some(),
     }
 }
@@ -212,6 +210,7 @@ fn endpoint_facts(
         type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
         first_seen: endpoint.first_seen,
         measurement,
+        passages: 0,
     }
 }
 

@@ -36,6 +36,8 @@ pub struct Snapshot {
     pub watches: Vec<WatchFacts>,
     /// What is wrong with the graph; the same value as long as nothing changes.
     pub diagnoses: Arc<Diagnoses>,
+    /// When each of them was found, in their order.
+    pub diagnosed: Arc<Vec<Timestamp>>,
     /// Discovery churn since the start.
     pub churn: Vec<ChurnCount>,
     /// Parse failures since the start.
@@ -188,6 +190,12 @@ impl Passage {
         Self::Iceoryx,
     ];
 
+    /// Its place in a set of ways.
+    #[must_use]
+    pub const fn bit(self) -> u8 {
+        1 << self as u8
+    }
+
     /// Label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
@@ -234,6 +242,8 @@ pub struct EndpointFacts {
     pub first_seen: Timestamp,
     /// What was measured of this writer while its topic was watched.
     pub measurement: Option<Box<Measurement>>,
+    /// How messages pass between it and its counterparts: [`Passage::bit`] of each way.
+    pub passages: u8,
 }
 
 /// What was counted while the topic was watched. Counters never go down while the topic lives.

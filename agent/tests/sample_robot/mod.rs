@@ -73,6 +73,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             first_seen: Timestamp(3),
             measurement: measurement(),
         }],
+        diagnosed: Arc::new(vec![Timestamp(5); diagnoses().list.len()]),
         diagnoses: Arc::new(diagnoses()),
         churn: vec![ChurnCount {
             domain_id: 0,
@@ -216,6 +217,7 @@ pub fn topic(name: &str) -> TopicFacts {
         type_hash: None,
         first_seen: Timestamp(4),
         measurement: Some(Box::new(measurement())),
+        passages: 1,
     };
     TopicFacts {
         domain_id: 0,

@@ -1,5 +1,6 @@
 //! When to look, and what is kept of it.
 
+use std::cmp::Ordering;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
@@ -32,6 +33,8 @@ pub struct Examiner {
     /// Since when who is alone.
     alone: HashMap<Guid, Timestamp>,
     current: Arc<Diagnoses>,
+    /// When each of them was found.
+    since: Arc<Vec<Timestamp>>,
     left_out: u64,
 }
 
@@ -55,6 +58,12 @@ impl Examiner {
         &self.current
     }
 
+    /// When each of them was found, in their order.
+    #[must_use]
+    pub const fn since(&self) -> &Arc<Vec<Timestamp>> {
+        &self.since
+    }
+
     /// How many findings there are, the cap, and how many had no room so far.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
@@ -71,6 +80,7 @@ impl Examiner {
             due: _,
             alone,
             current: _,
+            since: _,
             left_out: _,
         } = self;
         let (list, cap, _) = self.size();
@@ -115,9 +125,30 @@ impl Examiner {
         let more = found.left_out.saturating_sub(self.current.left_out);
         self.left_out += more;
         if *self.current != found {
+            self.since = Arc::new(since(&self.current.list, &self.since, &found.list, now));
             self.current = Arc::new(found);
         }
     }
+}
+
+/// When each of `after` was found: what was there before keeps its time.
+fn since(
+    before: &[Diagnosis],
+    times: &[Timestamp],
+    after: &[Diagnosis],
+    now: Timestamp,
+) -> Vec<Timestamp> {
+    let mut before = before.iter().zip(times).peekable();
+    let mut found = Vec::with_capacity(after.len());
+    for finding in after {
+        while before
+            .next_if(|(old, _)| old.cmp_identity(finding) == Ordering::Less)
+            .is_some()
+        {}
+        let same = before.next_if(|(old, _)| old.cmp_identity(finding) == Ordering::Equal);
+        found.push(same.map_or(now, |(_, time)| *time));
+    }
+    found
 }
 
 impl Findings {
@@ -188,4 +219,34 @@ pub(super) fn half_known(discovery: &Discovery) -> BTreeSet<u32> {
         participant.portrait.enclave.is_some() && participant.endpoints.is_empty()
     });
     silent.map(|participant| participant.domain_id).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_finding_keeps_the_time_when_it_was_found_also_when_it_says_something_else() {
+        let duplicate = |node: &str, participants: Vec<Guid>| Diagnosis::DuplicateNode {
+            domain_id: 0,
+            node: node.into(),
+            participants,
+        };
+        let [a, b, c] = ["/a", "/b", "/c"].map(|node| duplicate(node, Vec::new()));
+        let (one, two) = (Timestamp(1), Timestamp(2));
+        let first = since(&[], &[], std::slice::from_ref(&b), one);
+        assert_eq!(first, [one]);
+        let changed = duplicate("/b", vec![Guid::default()]);
+        let second = since(
+            std::slice::from_ref(&b),
+            &first,
+            &[a, changed, c.clone()],
+            two,
+        );
+        assert_eq!(second, [two, one, two]);
+        assert_eq!(
+            since(&[b, c.clone()], &[one, two], &[c], Timestamp(3)),
+            [two]
+        );
+    }
 }
