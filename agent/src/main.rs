@@ -19,6 +19,7 @@ use ros2probe::capture::pcap::Speed;
 use ros2probe::capture::system::give_back_memory;
 use ros2probe::config::{Config, ConfigError};
 use ros2probe::message::{Library, Sources as Places};
+use ros2probe::model::history::History;
 use ros2probe::model::observer::{self, Observer};
 use ros2probe::model::reassembly::Limits;
 use ros2probe::privilege::{
@@ -204,7 +205,11 @@ fn run(options: cli::Run) -> Result<()> {
         Arc::clone(&subscriptions),
         stop.clone(),
     );
-    let run = run.keeping(keeper);
+    let history = usize::try_from(config.history.as_secs()).unwrap_or(usize::MAX);
+    // Without the API nobody can ask for it.
+    let history =
+        (history > 0 && !control.is_empty()).then(|| History::new(history, config.limits.topics));
+    let run = run.keeping(keeper).remembering(history);
     if options.report && server.is_none() && control.is_empty() {
         let ended = worker.finish(run);
         print!("{}", Exposition::new(board).render(Format::Classic)?);

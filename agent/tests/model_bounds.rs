@@ -20,7 +20,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use forge::{Message, SEDP_READERS, SEDP_WRITERS, SPDP};
-use ros2probe::config::{Watch, Watchlist};
+use ros2probe::config::{Limits, Watch, Watchlist};
+use ros2probe::model::history::History;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::selection::{Depth, Selection, Wish};
 use ros2probe::model::size::Size;
@@ -31,6 +32,8 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
 const START: u64 = 1_700_000_000_000_000_000;
 const MESSAGES: u64 = 60_000;
+/// Of the history.
+const SECONDS: usize = 20;
 const DISCOVERY_INFO: EntityId = EntityId([0, 0, 2, 3]);
 const ALICE: GuidPrefix = GuidPrefix([1; 12]);
 const SAMPLES: EntityId = EntityId([0, 0, 3, 3]);
@@ -240,6 +243,7 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
     let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
     let before = ALLOCATED.load(Ordering::Relaxed);
     let mut observer = observer();
+    let mut history = History::new(SECONDS, Limits::default().topics);
     let mut largest = Largest::new();
     let (mut half, mut now) = (0, START);
     for turn in 0..messages {
@@ -248,6 +252,8 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
         if turn % 2_000 == 0 {
             observer.advance(Timestamp(now));
             look(&observer.sizes(), &mut largest);
+            history.take(Timestamp(now), observer.measured(Timestamp(now)));
+            look(&history.sizes(), &mut largest);
             observer.take_given();
             observer.take_events();
             observer.take_spans();

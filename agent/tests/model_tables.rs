@@ -33,7 +33,7 @@ const ANSWERS: [&str; 7] = [
     "selection.rs",
 ];
 /// Likewise single structs: what is handed out, what lasts for one look, lengths.
-const ANSWER: [&str; 4] = ["Taken", "Findings", "Strangers", "Stage"];
+const ANSWER: [&str; 5] = ["Taken", "Findings", "Strangers", "Stage", "Past"];
 /// What others hold and the model only shares.
 const SHARED: [&str; 2] = ["Arc<", "&'"];
 

@@ -15,6 +15,8 @@ mod pace;
 use std::fs::File;
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use flate2::read::MultiGzDecoder;
 use ros2probe_wire::frame::Link;
@@ -34,7 +36,23 @@ pub struct PcapReader {
     /// The packet or block being read; its capacity is reused.
     buffer: Vec<u8>,
     packets: u64,
+    /// Bytes of the file that were read, and how many it has.
+    progress: Option<(Arc<AtomicU64>, u64)>,
     ended: bool,
+}
+
+/// A file of which is counted how much was read.
+struct Counted {
+    file: File,
+    read: Arc<AtomicU64>,
+}
+
+impl Read for Counted {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let read = self.file.read(buffer)?;
+        self.read.fetch_add(read as u64, Ordering::Relaxed);
+        Ok(read)
+    }
 }
 
 /// One packet of a capture.
@@ -146,7 +164,25 @@ impl PcapReader {
             path: path.to_path_buf(),
             source,
         })?;
-        Self::new(file)
+        let length = file.metadata().ok().map(|metadata| metadata.len());
+        let read = Arc::default();
+        let counted = Counted {
+            file,
+            read: Arc::clone(&read),
+        };
+        let length = length.filter(|length| *length > 0);
+        Ok(Self {
+            progress: length.map(|length| (read, length)),
+            ..Self::new(counted)?
+        })
+    }
+
+    /// Which part of the file was read, 0 to 1; `None` where its length is not known.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "a part for people")]
+    pub fn part_read(&self) -> Option<f64> {
+        let (read, length) = self.progress.as_ref()?;
+        Some((read.load(Ordering::Relaxed) as f64 / *length as f64).min(1.0))
     }
 
     /// Reads from any stream of bytes.
@@ -171,6 +207,7 @@ impl PcapReader {
             format,
             buffer: Vec::new(),
             packets: 0,
+            progress: None,
             ended: false,
         })
     }

@@ -306,8 +306,8 @@ impl Limits {
     }
 
     /// What the agent takes beside them: idle, with its rings and the kernel's maps (14 MiB), what is
-    /// kept of events, and two views of all there is under way.
-    pub const BESIDE: usize = 22 << 20;
+    /// kept of events, two views of all there is under way, and the history of measured topics.
+    pub const BESIDE: usize = 29 << 20;
 
     /// Bytes that all of them take when they are reached together.
     #[must_use]

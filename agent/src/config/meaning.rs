@@ -132,6 +132,7 @@ impl Reader {
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(shape.metrics.unwrap_or_default()),
             api: self.api(shape.api.unwrap_or_default()),
+            history: Duration::from_secs(shape.page.unwrap_or_default().history_s.into()),
             otlp: otlp(shape.otlp.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),

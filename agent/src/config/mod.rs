@@ -41,6 +41,8 @@ pub struct Config {
     pub metrics: MetricsSettings,
     /// The control API.
     pub api: ApiSettings,
+    /// How long figures of measured topics are kept for charts; zero = not at all.
+    pub history: Duration,
     /// What is pushed to an OpenTelemetry receiver.
     pub otlp: OtlpSettings,
     /// What the agent records.
@@ -406,6 +408,7 @@ impl Config {
                 self.metrics.web_config != new.metrics.web_config,
             ),
             ("api", self.api != new.api),
+            ("page", self.history != new.history),
             ("otlp", self.otlp != new.otlp),
             ("recordings", self.recordings != new.recordings),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
@@ -460,6 +463,7 @@ impl Default for Config {
                 loopback: Access::default(),
                 token_file: None,
             },
+            history: Duration::from_secs(defaults::HISTORY_S.into()),
             otlp: OtlpSettings::default(),
             recordings: RecordingSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
@@ -503,6 +507,7 @@ mod defaults {
     pub(super) const SHM_READING_CPU_PERCENT: f64 = 25.0;
     pub(super) const LISTEN: &str = "127.0.0.1:17400";
     pub(super) const API: &str = "127.0.0.1:17401";
+    pub(super) const HISTORY_S: u32 = 600;
 
     pub(super) const fn topic_grace_s() -> u64 {
         600

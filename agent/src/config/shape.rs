@@ -31,6 +31,8 @@ pub(super) struct ConfigShape {
     pub(super) metrics: Option<MetricsShape>,
     /// The control API: watches that are added and removed while the agent runs.
     pub(super) api: Option<ApiShape>,
+    /// What the page in the browser shows.
+    pub(super) page: Option<PageShape>,
     /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. What is not
     /// written here the standard `OTEL_*` variables decide.
     pub(super) otlp: Option<OtlpShape>,
@@ -197,6 +199,25 @@ pub(super) struct ApiShape {
     /// File with the bearer token that clients of `listen` must send, as the service manager's
     /// LoadCredential= provides it.
     pub(super) token_file: Option<String>,
+}
+
+/// The page in the browser.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct PageShape {
+    /// How many seconds of figures are kept of each measured topic, for charts; 0 = none. They
+    /// take at most 6 MiB: more than 436 topics have fewer seconds.
+    #[schemars(range(min = 0, max = 3_600))]
+    pub(super) history_s: u32,
+}
+
+impl Default for PageShape {
+    fn default() -> Self {
+        Self {
+            history_s: defaults::HISTORY_S,
+        }
+    }
 }
 
 impl Default for ApiShape {

@@ -64,6 +64,42 @@ impl Histogram {
         self.maximum = self.maximum.max(other.maximum);
     }
 
+    /// What was observed after `earlier`, which is this one as it was before. Its range is not
+    /// known.
+    #[must_use]
+    pub fn since(&self, earlier: &Self) -> Self {
+        let mut news = *self;
+        // Begun anew meanwhile: all of it is new.
+        if self.count() < earlier.count() {
+            return news;
+        }
+        for (count, before) in news.counts.iter_mut().zip(earlier.counts) {
+            *count = count.saturating_sub(before);
+        }
+        news.sum -= earlier.sum;
+        news
+    }
+
+    /// The value below which this part of the values lies, as Prometheus estimates it: evenly
+    /// spread within the bucket. `f64::MAX` where it lies above all bounds.
+    #[must_use]
+    #[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
+    pub fn quantile(&self, part: f64) -> f64 {
+        let wanted = self.count() as f64 * part;
+        let (mut lower, mut below) = (0.0, 0.0);
+        for (upper, count) in self.buckets() {
+            let count = count as f64;
+            if count > 0.0 && below + count >= wanted {
+                if upper.is_infinite() {
+                    return f64::MAX;
+                }
+                return lower + (upper - lower) * (wanted - below) / count;
+            }
+            (lower, below) = (upper, below + count);
+        }
+        lower
+    }
+
     /// How many values.
     #[must_use]
     pub fn count(&self) -> u64 {
@@ -125,6 +161,20 @@ mod tests {
             .collect();
         assert_eq!(filled, [(0.000_02, 1), (0.000_05, 1)]);
         assert!(FINE_BOUNDS.is_sorted() && BOUNDS.is_sorted());
+    }
+
+    #[test]
+    fn what_came_after_is_the_difference() {
+        let mut histogram = Histogram::default();
+        histogram.observe(0.0015);
+        let earlier = histogram;
+        for _ in 0..3 {
+            histogram.observe(0.15);
+        }
+        let news = histogram.since(&earlier);
+        assert_eq!(news.count(), 3);
+        assert!((0.1..=0.2).contains(&news.quantile(0.5)), "{news:?}");
+        assert_eq!(earlier.since(&histogram), earlier, "it began anew");
     }
 
     #[test]

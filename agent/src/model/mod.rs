@@ -17,6 +17,7 @@ pub mod expectation;
 pub mod glob;
 pub mod header;
 pub mod histogram;
+pub mod history;
 pub mod identity;
 pub mod in_order;
 pub mod interest;

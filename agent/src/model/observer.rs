@@ -34,7 +34,7 @@ use super::rate::Slot;
 use super::receivers::{Around, Receivers};
 use super::selection::Wish;
 use super::size::Size;
-use super::snapshot::{Snapshot, SocketFacts, WatchState};
+use super::snapshot::{Measurement, Snapshot, SocketFacts, WatchState};
 use super::topic::{Naming, Topic, TopicId, Topics, Watched};
 use super::trace::{Spans, Subject, Tracer};
 use super::way::Place;
@@ -488,6 +488,11 @@ impl Observer {
         let mut snapshot = super::report::snapshot(self, self.calendar.even(now));
         self.calendar.show_snapshot(&mut snapshot);
         snapshot
+    }
+
+    /// All that was counted by `now` of each topic that is measured: domain, DDS name and counts.
+    pub fn measured(&self, now: Timestamp) -> impl Iterator<Item = (u32, &Arc<str>, Measurement)> {
+        super::report::measured(self, self.calendar.even(now))
     }
 
     /// Counts a parse failure, also of those outside who parse for the core.

@@ -144,13 +144,8 @@ fn topic(
         message_types.extend(topic.last_type.as_deref().map(ToOwned::to_owned));
     }
     let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash.clone()).collect();
-    let mut measurement = topic.retired.clone();
+    let mut measurement = apart(observer, topic, now);
     if let Some(sum) = &mut measurement {
-        let beside = topic
-            .beside
-            .iter()
-            .filter_map(|guid| Some(observer.profiler.get(*guid)?.writer.measurement(now)));
-        beside.for_each(|beside| sum.add(&beside));
         let own = publishers
             .iter()
             .filter_map(|each| each.measurement.as_ref());
@@ -177,6 +172,37 @@ fn topic(
         passages,
         is_read: topic.wished.is_some(),
     }
+}
+
+/// All that was counted of each measured topic.
+pub(super) fn measured(
+    observer: &Observer,
+    now: Timestamp,
+) -> impl Iterator<Item = (u32, &Arc<str>, Measurement)> {
+    let topics = observer.topics.iter().map(|(_, topic)| topic);
+    let topics = topics.filter(|topic| topic.watched == Watched::Yes);
+    topics.filter_map(move |topic| {
+        let mut sum = *apart(observer, topic, now)?;
+        for guid in &topic.writers {
+            let measured = observer.profiler.get(*guid);
+            if let Some(own) = measured.filter(|measured| measured.topic.is_some()) {
+                sum.add(&own.writer.measurement(now));
+            }
+        }
+        Some((topic.domain_id, &topic.naming.dds_name, sum))
+    })
+}
+
+/// What was counted of writers that have gone and of those beside a topic; `None` while it is not
+/// measured.
+fn apart(observer: &Observer, topic: &Topic, now: Timestamp) -> Option<Box<Measurement>> {
+    let mut sum = topic.retired.clone()?;
+    for guid in &topic.beside {
+        if let Some(beside) = observer.profiler.get(*guid) {
+            sum.add(&beside.writer.measurement(now));
+        }
+    }
+    Some(sum)
 }
 
 /// Most topics have one endpoint; collecting would make room for four.

@@ -445,7 +445,8 @@ pub struct DecodeErrorCount {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
-    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `payloads`.
+    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `payloads`,
+    /// `history`.
     pub table: &'static str,
     /// Entries (bytes for `reassembly` and `payloads`).
     pub size: u64,

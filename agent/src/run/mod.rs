@@ -15,6 +15,7 @@ use tokio_util::sync::CancellationToken;
 use crate::capture::live::{CaptureError, LiveSource};
 use crate::capture::pcap::PcapError;
 use crate::capture::system::give_back_memory;
+use crate::model::history::History;
 use crate::model::observer::Observer;
 use crate::model::selection::Wish;
 use crate::model::snapshot::Snapshot;
@@ -65,6 +66,7 @@ pub struct Run {
     told: Timestamp,
     stop: CancellationToken,
     keeper: Option<Keeper>,
+    history: Option<History>,
 }
 
 impl Run {
@@ -90,6 +92,7 @@ impl Run {
             told: Timestamp::default(),
             stop,
             keeper: None,
+            history: None,
         }
     }
 
@@ -97,6 +100,12 @@ impl Run {
     #[must_use]
     pub fn keeping(self, keeper: Option<Keeper>) -> Self {
         Self { keeper, ..self }
+    }
+
+    /// Remembers what was measured in the last seconds.
+    #[must_use]
+    pub fn remembering(self, history: Option<History>) -> Self {
+        Self { history, ..self }
     }
 
     /// Works until told to stop or until the capture ends; the last state stays on the board.
@@ -131,7 +140,7 @@ impl Run {
             } else {
                 SLICE
             };
-            let step = subscribed.then(|| Timestamp(self.told.0.saturating_add(CLOCK_NANOSECONDS)));
+            let step = self.step(subscribed);
             let bell = self.board.bell();
             let polled = self.source.poll(slice, step, bell, &mut self.observer);
             self.board.hear();
@@ -145,6 +154,7 @@ impl Run {
             } else {
                 self.observer.advance(self.source.clock());
             }
+            self.remember();
             self.tell_interest();
             self.hand_over();
             let age = published.elapsed();
@@ -171,6 +181,29 @@ impl Run {
         self.hand_over();
         self.publish();
         Ok(())
+    }
+
+    /// Where a replay has to stop for a moment: where subscribers are told the time, or where a
+    /// second ends.
+    fn step(&self, subscribed: bool) -> Option<Timestamp> {
+        let told = subscribed.then(|| Timestamp(self.told.0.saturating_add(CLOCK_NANOSECONDS)));
+        let second = self.history.as_ref().map(History::due);
+        // Before the first packet nothing is known of the capture's time.
+        let second = second.filter(|second| second.0 > 0);
+        match (told, second) {
+            (Some(told), Some(second)) => Some(told.min(second)),
+            (told, second) => told.or(second),
+        }
+    }
+
+    /// Takes the second that has just ended.
+    fn remember(&mut self) {
+        let now = self.source.clock();
+        let Some(history) = self.history.as_mut().filter(|history| history.is_due(now)) else {
+            return;
+        };
+        history.take(now, self.observer.measured(now));
+        self.board.remember(history.past());
     }
 
     /// Gives away what happened since the last time; nobody makes this wait.
@@ -233,7 +266,10 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             self.observer.participants_alive(live.last_seen());
         }
-        let snapshot = self.observer.snapshot(self.source.clock());
+        let mut snapshot = self.observer.snapshot(self.source.clock());
+        if let Some(history) = &self.history {
+            snapshot.tables.push(history.table());
+        }
         if let Source::Live(live) = &mut self.source {
             follow(live, &mut self.followed, &snapshot);
         }

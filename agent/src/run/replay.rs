@@ -339,6 +339,21 @@ impl Replay {
         self.finished
     }
 
+    /// When the capture begins; `None` until its first packet is read.
+    #[must_use]
+    pub const fn began(&self) -> Option<Timestamp> {
+        self.began
+    }
+
+    /// Which part of the file was read, 0 to 1; `None` where that cannot be told.
+    #[must_use]
+    pub fn part_read(&self) -> Option<f64> {
+        if self.finished {
+            return Some(1.0);
+        }
+        self.reader.part_read()
+    }
+
     /// Packets and their bytes so far.
     #[must_use]
     pub const fn progress(&self) -> (u64, u64) {

@@ -143,6 +143,8 @@ impl Source {
                 let counters = reassembly.counters();
                 AgentFacts {
                     finished: replay.is_finished(),
+                    capture_begin: replay.began(),
+                    replayed: replay.part_read(),
                     unsupported_packets: replay
                         .unsupported()
                         .iter()

@@ -3,6 +3,8 @@
 
 use std::time::Instant;
 
+use ros2probe_wire::Timestamp;
+
 use crate::privilege::{self, Sandbox};
 use crate::state::StateFacts;
 use crate::subscriptions;
@@ -28,6 +30,10 @@ pub struct AgentFacts {
     pub capture_progress: Instant,
     /// A replay has reached its end.
     pub finished: bool,
+    /// When the capture that is replayed begins, in its own time.
+    pub capture_begin: Option<Timestamp>,
+    /// Which part of the capture's file was read, 0 to 1; `None` where that cannot be told.
+    pub replayed: Option<f64>,
     /// Packets of a capture whose link layer cannot be read, by the layer's number.
     pub unsupported_packets: Vec<(u16, u64)>,
     /// Per interface, or per network namespace where the kernel counts no finer.
@@ -147,6 +153,8 @@ impl AgentFacts {
             at,
             capture_progress: at,
             finished: false,
+            capture_begin: None,
+            replayed: None,
             unsupported_packets: Vec::new(),
             interfaces: Vec::new(),
             filter_events: Vec::new(),

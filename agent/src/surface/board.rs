@@ -18,6 +18,7 @@ use super::otlp::{Exports, Reason, Signal, SpanQueue};
 use super::recording_facts::RecordingFigures;
 use crate::bell::Bell;
 use crate::config::{Config, Limits, Watch};
+use crate::model::history::Past;
 use crate::model::snapshot::Snapshot;
 use crate::model::trace::Spans;
 
@@ -28,6 +29,7 @@ const FRESH: Duration = Duration::from_secs(5);
 #[derive(Debug)]
 pub struct Board {
     state: ArcSwap<State>,
+    past: ArcSwap<Past>,
     settings: ArcSwap<Settings>,
     reload: ArcSwap<Reload>,
     events: Arc<EventLog>,
@@ -104,6 +106,7 @@ impl Board {
                 snapshot: None,
                 agent,
             }),
+            past: ArcSwap::default(),
             settings: ArcSwap::from_pointee(settings),
             reload: ArcSwap::from_pointee(reload),
             events: Arc::new(events),
@@ -143,6 +146,17 @@ impl Board {
         self.news.notify_waiters();
     }
 
+    /// Pins what was measured in the last seconds.
+    pub fn remember(&self, past: Past) {
+        self.past.store(Arc::new(past));
+    }
+
+    /// What was measured in the last seconds.
+    #[must_use]
+    pub fn past(&self) -> Arc<Past> {
+        self.past.load_full()
+    }
+
     /// Whether somebody waits for a newer state.
     #[must_use]
     pub fn is_asked(&self) -> bool {
@@ -180,6 +194,11 @@ impl Board {
         self.ring();
         // Late or not: what is on the board is shown, with its age.
         let _ = tokio::time::timeout(patience, news).await;
+    }
+
+    /// Returns when a newer state is pinned, without asking for one.
+    pub async fn published(&self) {
+        self.news.notified().await;
     }
 
     /// Other watches are in force from now on.

@@ -429,6 +429,18 @@ pub const FIXED: &[[&str; 4]] = &[
         "listings_that_are_always_wanted_cost_no_more_than_their_share",
     ],
     [
+        "ROWS",
+        "agent/src/model/history.rs",
+        "agent/src/model/history.rs",
+        "old_seconds_go_and_many_rows_reach_back_less_far",
+    ],
+    [
+        "NAMES",
+        "agent/src/model/history.rs",
+        "agent/src/model/history.rs",
+        "names_of_topics_that_went_make_room_for_those_that_come",
+    ],
+    [
         "SOCKET_CAPACITY",
         "wire/src/host.rs",
         "agent/tests/live_host_hook.rs",

@@ -218,7 +218,7 @@ impl Distribution {
     fn of(values: &Histogram) -> Option<Self> {
         let (minimum, maximum) = values.range()?;
         let count = values.count();
-        let part = |part: f64| percentile(values, part).clamp(minimum, maximum);
+        let part = |part: f64| values.quantile(part).clamp(minimum, maximum);
         Some(Self {
             count,
             mean_seconds: values.sum() / count as f64,
@@ -229,24 +229,6 @@ impl Distribution {
             maximum_seconds: maximum,
         })
     }
-}
-
-/// As Prometheus estimates it: evenly spread within the bucket.
-#[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
-fn percentile(values: &Histogram, part: f64) -> f64 {
-    let wanted = values.count() as f64 * part;
-    let (mut lower, mut below) = (0.0, 0.0);
-    for (upper, count) in values.buckets() {
-        let count = count as f64;
-        if count > 0.0 && below + count >= wanted {
-            if upper.is_infinite() {
-                return f64::MAX;
-            }
-            return lower + (upper - lower) * (wanted - below) / count;
-        }
-        (lower, below) = (upper, below + count);
-    }
-    lower
 }
 
 #[cfg(test)]

@@ -1,0 +1,581 @@
+//! What was measured in each of the last seconds, so that charts that are opened after an incident
+//! show the incident.
+//!
+//! A second is immutable once it is taken: readers share it with the ring and never hold the
+//! capture up. Rows are bounded in number; seconds of many topics reach back less far.
+
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::sync::Arc;
+
+use ros2probe_wire::Timestamp;
+
+use super::histogram::Histogram;
+use super::rate::SECONDS as WINDOW;
+use super::size::Size;
+use super::snapshot::{Measurement, TableFacts};
+
+/// Rows of all seconds together, 24 bytes each: 10 minutes of 436 topics.
+const ROWS: usize = 262_144;
+/// Names that are known, for each topic that may be measured: one that is measured no more is kept
+/// until there are twice as many.
+const NAMES: usize = 2;
+const SECOND: u64 = 1_000_000_000;
+
+/// The ring.
+#[derive(Debug)]
+pub struct History {
+    /// How many seconds are kept.
+    span: usize,
+    /// Topics that can be named.
+    most: usize,
+    seconds: VecDeque<Arc<Second>>,
+    rows: usize,
+    names: Arc<Names>,
+    before: HashMap<u32, Before>,
+    /// The last id that was given away.
+    last: u32,
+    /// Topics whose past was given up for want of room.
+    evictions: u64,
+}
+
+/// The ring as it is at one moment, for readers.
+#[derive(Clone, Debug, Default)]
+pub struct Past {
+    names: Arc<Names>,
+    seconds: Vec<Arc<Second>>,
+}
+
+/// What was measured in one second.
+#[derive(Debug, Default)]
+pub struct Second {
+    /// Its end, in the source's clock.
+    pub at: Timestamp,
+    /// By topic.
+    rows: Box<[Row]>,
+}
+
+/// One topic in one second.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row {
+    topic: u32,
+    /// Messages received whole.
+    pub messages: u32,
+    /// Messages settled as lost.
+    pub lost: u32,
+    /// Payload bytes.
+    pub bytes: f32,
+    latency: [Short; 2],
+    interarrival: [Short; 2],
+}
+
+/// A row with what it takes to read it among its neighbours.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Reading {
+    /// The row.
+    pub row: Row,
+    /// Messages a second over the last 10 s; `None` in the first second of measuring.
+    pub rate_hz: Option<f64>,
+    /// Payload bytes a second over the same time.
+    pub bandwidth: Option<f64>,
+}
+
+/// The upper half of an `f32`: 8 bits of precision, more than a percentile of a histogram has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Short(u16);
+
+/// Ids of topics by domain and DDS name.
+#[derive(Clone, Debug, Default)]
+struct Names {
+    by_domain: BTreeMap<u32, BTreeMap<Arc<str>, u32>>,
+}
+
+/// What had been counted of a topic by the end of the second before.
+#[derive(Debug)]
+struct Before {
+    messages: u64,
+    bytes: u64,
+    lost: u64,
+    latency: Histogram,
+    interarrival: Histogram,
+}
+
+impl History {
+    /// Of so many seconds, for at most `topics` measured topics at once.
+    #[must_use]
+    pub fn new(span: usize, topics: usize) -> Self {
+        Self {
+            span,
+            most: topics.saturating_mul(NAMES),
+            seconds: VecDeque::new(),
+            rows: 0,
+            names: Arc::default(),
+            before: HashMap::new(),
+            last: 0,
+            evictions: 0,
+        }
+    }
+
+    /// When the next second ends.
+    #[must_use]
+    pub fn due(&self) -> Timestamp {
+        let last = self.seconds.back();
+        last.map_or(Timestamp(0), |last| {
+            Timestamp((last.at.0 / SECOND + 1).saturating_mul(SECOND))
+        })
+    }
+
+    /// Whether a second has ended by `now`, or the clock was set back.
+    #[must_use]
+    pub fn is_due(&self, now: Timestamp) -> bool {
+        let is_back = self.seconds.back().is_some_and(|last| now < last.at);
+        now.0 > 0 && (now >= self.due() || is_back)
+    }
+
+    /// Takes a second that ends at `now`: domain, DDS name and all that was counted of each topic.
+    pub fn take<'a>(
+        &mut self,
+        now: Timestamp,
+        topics: impl Iterator<Item = (u32, &'a Arc<str>, Measurement)>,
+    ) {
+        if self.seconds.back().is_some_and(|last| now < last.at) {
+            // Times would run backwards within a chart.
+            self.seconds.clear();
+            self.rows = 0;
+        }
+        let mut rows: Vec<Row> = Vec::new();
+        let mut is_forgetful = true;
+        for (domain_id, dds_name, counted) in topics {
+            let is_full = self.names.len() >= self.most;
+            let known = self.names.find(domain_id, dds_name);
+            if known.is_none() && is_full && std::mem::take(&mut is_forgetful) {
+                self.forget(&rows);
+            }
+            if let Some(topic) = known.or_else(|| self.name(domain_id, dds_name)) {
+                rows.push(self.row(topic, &counted));
+            }
+        }
+        rows.sort_unstable_by_key(|row| row.topic);
+        self.rows += rows.len();
+        let rows = rows.into();
+        self.seconds.push_back(Arc::new(Second { at: now, rows }));
+        while self.seconds.len() > self.span || self.rows > ROWS {
+            let Some(oldest) = self.seconds.pop_front() else {
+                break;
+            };
+            self.rows -= oldest.rows.len();
+        }
+    }
+
+    /// For readers.
+    #[must_use]
+    pub fn past(&self) -> Past {
+        Past {
+            names: Arc::clone(&self.names),
+            seconds: self.seconds.iter().cloned().collect(),
+        }
+    }
+
+    /// Topics whose past is kept, and their cap.
+    #[must_use]
+    pub fn table(&self) -> TableFacts {
+        TableFacts {
+            table: "history",
+            size: self.names.len() as u64,
+            limit: self.most as u64,
+            evictions: self.evictions,
+        }
+    }
+
+    /// The size of each of its tables.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // A new table does not compile before it has a place here.
+        let Self {
+            span,
+            most,
+            seconds,
+            rows,
+            names,
+            before,
+            last: _,
+            evictions: _,
+        } = self;
+        vec![
+            Size::new("history.seconds", seconds.len(), *span),
+            Size::new("history.rows", *rows, ROWS),
+            Size::new("history.names", names.len(), *most),
+            Size::new("history.before", before.len(), *most),
+        ]
+    }
+
+    /// An id for a topic that has none; `None` where as many are named as may be.
+    fn name(&mut self, domain_id: u32, dds_name: &Arc<str>) -> Option<u32> {
+        if self.names.len() >= self.most {
+            self.evictions += 1;
+            return None;
+        }
+        self.last = self.last.checked_add(1)?;
+        let names = &mut Arc::make_mut(&mut self.names).by_domain;
+        let names = names.entry(domain_id).or_default();
+        names.insert(Arc::clone(dds_name), self.last);
+        Some(self.last)
+    }
+
+    /// Gives up the past of topics that were measured neither in the last second nor in this one.
+    fn forget(&mut self, rows: &[Row]) {
+        let last = self.seconds.back().cloned().unwrap_or_default();
+        let now: HashSet<_> = rows.iter().map(|row| row.topic).collect();
+        let stays = |id: u32| now.contains(&id) || last.row(id).is_some();
+        let before = self.names.len();
+        let names = &mut Arc::make_mut(&mut self.names).by_domain;
+        for names in names.values_mut() {
+            names.retain(|_, id| stays(*id));
+        }
+        names.retain(|_, names| !names.is_empty());
+        self.evictions += (before - self.names.len()) as u64;
+        self.before.retain(|id, _| stays(*id));
+    }
+
+    fn row(&mut self, topic: u32, counted: &Measurement) -> Row {
+        let after = Before {
+            messages: counted.messages,
+            bytes: counted.bytes,
+            lost: counted.lost,
+            latency: counted.source_latency,
+            interarrival: counted.interarrival,
+        };
+        let nothing = || Before {
+            messages: 0,
+            bytes: 0,
+            lost: 0,
+            latency: Histogram::default(),
+            interarrival: Histogram::default(),
+        };
+        let before = self.before.get(&topic);
+        let row = after.since(topic, before.unwrap_or(&nothing()));
+        self.before.insert(topic, after);
+        row
+    }
+}
+
+impl Past {
+    /// Every second of one topic, the oldest first; `None` while it was not measured.
+    pub fn topic(
+        &self,
+        domain_id: u32,
+        dds_name: &str,
+    ) -> Option<impl Iterator<Item = (Timestamp, Option<Reading>)> + '_> {
+        let id = self.names.find(domain_id, dds_name)?;
+        let readings = (0..self.seconds.len()).filter_map(move |place| {
+            let second = self.seconds.get(place)?;
+            Some((second.at, self.reading(place, id)))
+        });
+        Some(readings)
+    }
+
+    /// The id by which [`Second::row`] knows a topic.
+    #[must_use]
+    pub fn id(&self, domain_id: u32, dds_name: &str) -> Option<u32> {
+        self.names.find(domain_id, dds_name)
+    }
+
+    /// The seconds, the oldest first.
+    #[must_use]
+    pub fn seconds(&self) -> &[Arc<Second>] {
+        &self.seconds
+    }
+
+    /// One second of a topic, with its rate over the window that ends there.
+    fn reading(&self, place: usize, id: u32) -> Option<Reading> {
+        let row = self.seconds.get(place)?.row(id)?;
+        let window = usize::try_from(WINDOW).unwrap_or(usize::MAX);
+        let first = place.saturating_sub(window);
+        let (mut messages, mut bytes) = (0.0, 0.0);
+        let mut began = None;
+        for second in self.seconds.get(first..=place).unwrap_or_default() {
+            let Some(row) = second.row(id) else {
+                // Counting began anew behind this.
+                (messages, bytes, began) = (0.0, 0.0, Some(second.at));
+                continue;
+            };
+            // The first second only tells when the next one began.
+            if began.is_some() {
+                messages += f64::from(row.messages);
+                bytes += f64::from(row.bytes);
+            } else {
+                began = Some(second.at);
+            }
+        }
+        let at = self.seconds.get(place)?.at;
+        let seconds = at.seconds() - began.unwrap_or(at).seconds();
+        let per_second = |sum: f64| (seconds > 0.0).then(|| sum / seconds);
+        Some(Reading {
+            row,
+            rate_hz: per_second(messages),
+            bandwidth: per_second(bytes),
+        })
+    }
+}
+
+impl Second {
+    /// What was measured of a topic.
+    #[must_use]
+    pub fn row(&self, topic: u32) -> Option<Row> {
+        let place = self.rows.binary_search_by_key(&topic, |row| row.topic);
+        self.rows.get(place.ok()?).copied()
+    }
+
+    /// All topics.
+    #[must_use]
+    pub fn rows(&self) -> &[Row] {
+        &self.rows
+    }
+}
+
+impl Row {
+    /// The id of its topic.
+    #[must_use]
+    pub const fn topic(&self) -> u32 {
+        self.topic
+    }
+
+    /// Median and 99th percentile of the time from the writer's timestamp to the capture, in
+    /// seconds.
+    #[must_use]
+    pub fn latency(&self) -> Option<[f32; 2]> {
+        pair(self.latency)
+    }
+
+    /// Median and 99th percentile of the times between messages of one writer, in seconds.
+    #[must_use]
+    pub fn interarrival(&self) -> Option<[f32; 2]> {
+        pair(self.interarrival)
+    }
+}
+
+fn pair([median, high]: [Short; 2]) -> Option<[f32; 2]> {
+    Some([median.value()?, high.value()?])
+}
+
+impl Short {
+    const NONE: Self = Self(0xffff);
+
+    fn new(value: f64) -> Self {
+        #[expect(clippy::cast_possible_truncation, reason = "rounding is the purpose")]
+        let bits = (value as f32).to_bits();
+        // Half of what is cut off is added; a finite number stays below the bits of NaN.
+        Self(u16::try_from(bits.saturating_add(0x8000) >> 16).unwrap_or(0xffff))
+    }
+
+    fn value(self) -> Option<f32> {
+        (self != Self::NONE).then(|| f32::from_bits(u32::from(self.0) << 16))
+    }
+}
+
+impl Names {
+    fn find(&self, domain_id: u32, dds_name: &str) -> Option<u32> {
+        self.by_domain.get(&domain_id)?.get(dds_name).copied()
+    }
+
+    fn len(&self) -> usize {
+        let Self { by_domain } = self;
+        by_domain.values().map(BTreeMap::len).sum()
+    }
+}
+
+impl Before {
+    /// What was counted between `before` and this. A count that fell belongs to a topic that was
+    /// forgotten meanwhile: all of it is new.
+    fn since(&self, topic: u32, before: &Self) -> Row {
+        let more = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now);
+        let count = |now, before| u32::try_from(more(now, before)).unwrap_or(u32::MAX);
+        let percentiles = |now: &Histogram, before: &Histogram| {
+            let news = now.since(before);
+            let Some((minimum, maximum)) = now.range().filter(|_| news.count() > 0) else {
+                return [Short::NONE; 2];
+            };
+            [0.5, 0.99].map(|part| Short::new(news.quantile(part).clamp(minimum, maximum)))
+        };
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "bytes of one second, for a chart"
+        )]
+        let bytes = more(self.bytes, before.bytes) as f32;
+        Row {
+            topic,
+            messages: count(self.messages, before.messages),
+            lost: count(self.lost, before.lost),
+            bytes,
+            latency: percentiles(&self.latency, &before.latency),
+            interarrival: percentiles(&self.interarrival, &before.interarrival),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn counted(messages: u64, lost: u64, latencies: &[f64]) -> Measurement {
+        let mut counted = Measurement {
+            messages,
+            lost,
+            bytes: messages * 100,
+            ..Measurement::default()
+        };
+        for latency in latencies {
+            counted.source_latency.observe(*latency);
+        }
+        counted
+    }
+
+    fn name(text: &str) -> Arc<str> {
+        text.into()
+    }
+
+    fn take(history: &mut History, second: u64, topics: &[(&Arc<str>, Measurement)]) {
+        let topics = topics
+            .iter()
+            .map(|(name, counted)| (0, *name, counted.clone()));
+        history.take(Timestamp(second * SECOND), topics);
+        for size in history.sizes() {
+            assert!(size.entries <= size.cap, "{size:?}");
+        }
+    }
+
+    #[test]
+    fn a_row_is_24_bytes() {
+        assert_eq!(size_of::<Row>(), 24);
+    }
+
+    #[test]
+    fn a_second_has_what_was_counted_in_it() {
+        let (mut history, points) = (History::new(600, 10), name("rt/points"));
+        take(&mut history, 100, &[(&points, counted(10, 0, &[0.001]))]);
+        take(
+            &mut history,
+            101,
+            &[(&points, counted(20, 3, &[0.001, 0.04]))],
+        );
+        take(
+            &mut history,
+            102,
+            &[(&points, counted(20, 3, &[0.001, 0.04]))],
+        );
+        let past = history.past();
+        let seen: Vec<_> = past.topic(0, "rt/points").unwrap().collect();
+        let rows: Vec<_> = seen
+            .iter()
+            .map(|(_, reading)| reading.unwrap().row)
+            .collect();
+        let counts: Vec<_> = rows.iter().map(|row| (row.messages, row.lost)).collect();
+        assert_eq!(counts, [(10, 0), (10, 3), (0, 0)]);
+        // Of the second alone: the millisecond before is not in it.
+        let [median, high] = rows[1].latency().unwrap();
+        assert!(median > 0.02 && high < 0.0402, "{median} {high}");
+        assert_eq!((rows[2].latency(), rows[1].interarrival()), (None, None));
+        assert_eq!(seen[1].1.unwrap().rate_hz, Some(10.0));
+        assert_eq!(seen[2].1.unwrap().rate_hz, Some(5.0));
+        assert_eq!(seen[2].1.unwrap().bandwidth, Some(500.0));
+        assert!(past.topic(1, "rt/points").is_none());
+    }
+
+    #[test]
+    fn a_topic_that_was_not_measured_for_a_while_has_a_gap() {
+        let mut history = History::new(600, 10);
+        let (one, other) = (name("rt/a"), name("rt/b"));
+        take(
+            &mut history,
+            1,
+            &[(&one, counted(5, 0, &[])), (&other, counted(1, 0, &[]))],
+        );
+        take(&mut history, 2, &[(&other, counted(2, 0, &[]))]);
+        take(
+            &mut history,
+            3,
+            &[(&one, counted(7, 0, &[])), (&other, counted(3, 0, &[]))],
+        );
+        let past = history.past();
+        let seen: Vec<_> = past.topic(0, "rt/a").unwrap().collect();
+        let messages: Vec<_> = seen
+            .iter()
+            .map(|(_, reading)| reading.map(|reading| reading.row.messages))
+            .collect();
+        assert_eq!(messages, [Some(5), None, Some(2)]);
+        assert_eq!(seen[2].1.unwrap().rate_hz, Some(2.0));
+    }
+
+    #[test]
+    fn old_seconds_go_and_many_rows_reach_back_less_far() {
+        let (mut history, points) = (History::new(3, 10), name("rt/points"));
+        for second in 1..=5 {
+            take(&mut history, second, &[(&points, counted(second, 0, &[]))]);
+        }
+        let past = history.past();
+        let times: Vec<_> = past
+            .seconds()
+            .iter()
+            .map(|second| second.at.0 / SECOND)
+            .collect();
+        assert_eq!(times, [3, 4, 5]);
+
+        let mut history = History::new(600, 20_000);
+        let names: Vec<_> = (0..20_000)
+            .map(|number| name(&number.to_string()))
+            .collect();
+        for second in 1..=20 {
+            let topics = names.iter().map(|name| (0, name, Measurement::default()));
+            history.take(Timestamp(second * SECOND), topics);
+        }
+        assert_eq!(history.past().seconds().len(), 13);
+        let sizes = history.sizes();
+        let rows = sizes.iter().find(|size| size.table == "history.rows");
+        let rows = rows.unwrap();
+        assert_eq!((rows.entries, rows.cap), (13 * 20_000, ROWS));
+    }
+
+    #[test]
+    fn names_of_topics_that_went_make_room_for_those_that_come() {
+        let mut history = History::new(600, 2);
+        let names: Vec<_> = (0..9).map(|number| name(&number.to_string())).collect();
+        for (second, name) in (1..).zip(&names) {
+            take(&mut history, second, &[(name, counted(1, 0, &[]))]);
+        }
+        let past = history.past();
+        let table = history.table();
+        assert!(table.size <= 4 && table.limit == 4, "{table:?}");
+        assert_eq!(table.size + table.evictions, 9);
+        assert!(past.topic(0, "8").is_some() && past.topic(0, "0").is_none());
+        assert!(history.before.len() <= 4);
+        // More at once than can be named.
+        let all: Vec<_> = names
+            .iter()
+            .map(|name| (name, counted(1, 0, &[])))
+            .collect();
+        take(&mut history, 20, &all);
+        assert_eq!(history.table().size, 4);
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_begins_anew() {
+        let (mut history, points) = (History::new(600, 2), name("rt/points"));
+        take(&mut history, 100, &[(&points, counted(1, 0, &[]))]);
+        assert!(!history.is_due(Timestamp(100 * SECOND + 5)));
+        assert!(history.is_due(Timestamp(101 * SECOND)));
+        assert!(history.is_due(Timestamp(50 * SECOND)));
+        take(&mut history, 50, &[(&points, counted(2, 0, &[]))]);
+        assert_eq!(history.past().seconds().len(), 1);
+        assert_eq!(history.due(), Timestamp(51 * SECOND));
+        assert!(!History::new(1, 1).is_due(Timestamp(0)));
+    }
+
+    #[test]
+    fn short_numbers_keep_two_digits() {
+        for value in [1e-6, 0.00123, 0.5, 9.99, 86_400.0] {
+            let short = f64::from(Short::new(value).value().unwrap());
+            assert!((short / value - 1.0).abs() < 0.004, "{value} {short}");
+        }
+        assert_eq!(Short::NONE.value(), None);
+        assert!(Short::new(f64::MAX).value().is_some());
+    }
+}
