@@ -175,18 +175,18 @@ fn run(options: cli::Run) -> Result<()> {
     };
     let keeper = state.map_or(Ok(None), keep);
     let keeper = keeper.context("cannot start the threads that keep state")?;
-    let library = Library::new(Places::new(
+    let library = Arc::new(Library::new(Places::new(
         Vec::new(),
         std::env::var_os("AMENT_PREFIX_PATH").as_deref(),
         Dialect::default(),
-    ));
+    )));
     let recordings = Arc::new(Recordings::new(
         recordings_directory,
         config.recordings.limits,
         caps.bytes / 2,
         Arc::clone(&board),
         Arc::clone(&subscriptions),
-        Arc::new(library),
+        Arc::clone(&library),
     ));
     let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings, &board) {
         // The disk is not there today: no reason to see nothing.
@@ -226,6 +226,7 @@ fn run(options: cli::Run) -> Result<()> {
         subscriptions,
         recordings: Arc::clone(&recordings),
         snapshots: Arc::clone(&snapshots),
+        library,
         reloader,
         stop: stop.clone(),
     };

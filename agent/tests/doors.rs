@@ -263,7 +263,7 @@ fn refusal(answer: &Answer) -> Option<(String, String)> {
 }
 
 /// Requests and the level that they need.
-const REQUESTS: [(&str, &str, &str); 18] = [
+const REQUESTS: [(&str, &str, &str); 24] = [
     ("GET", "/health", "read"),
     ("GET", "/topics", "read"),
     ("GET", "/graph", "read"),
@@ -286,6 +286,12 @@ const REQUESTS: [(&str, &str, &str); 18] = [
     ("POST", "/snapshots/none", "all"),
     ("POST", "/-/reload", "all"),
     ("POST", "/%2D/reload", "all"),
+    ("GET", "/processes", "read"),
+    ("GET", "/topics/nowhere/history", "read"),
+    ("GET", "/topics/nowhere/definition", "read"),
+    ("GET", "/topics/nowhere/messages", "all"),
+    ("GET", "/recordings/none/files", "all"),
+    ("GET", "/recordings/none/files/metadata.yaml", "all"),
 ];
 
 #[test]

@@ -156,13 +156,14 @@ impl Replayed {
         let thread = thread.spawn(work);
         thread.map_err(|source| ClientError::Runtime { source })?;
         // A capture is recorded by `rp bag record`, not by the agent that replays it.
+        let library = Arc::new(Library::new(Sources::default()));
         let recordings = Arc::new(Recordings::new(
             None,
             crate::config::RecordingLimits::default(),
             caps.bytes,
             Arc::clone(&board),
             Arc::clone(&subscriptions),
-            Arc::new(Library::new(Sources::default())),
+            Arc::clone(&library),
         ));
         let (pipes, opened) = mpsc::unbounded_channel();
         let (reloader, _) = reload::channel();
@@ -172,6 +173,7 @@ impl Replayed {
             subscriptions,
             recordings,
             snapshots: Arc::default(),
+            library,
             reloader,
             stop: token.clone(),
         };

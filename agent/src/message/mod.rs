@@ -31,4 +31,4 @@ pub use definition::{
 pub use library::{Library, NotFound, Sources};
 pub use parse::{ParseError, Problem};
 pub use shown::Shown;
-pub use value::Value;
+pub use value::{Array, Items, Message, Scalar, Value};

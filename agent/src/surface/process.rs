@@ -1,4 +1,4 @@
-//! What the kernel says about this process, from `/proc`. A value that cannot be read is absent:
+//! What the kernel says about this process and others, from `/proc`. A value that cannot be read is absent:
 //! hardened services may not see all of it.
 
 use std::fs;
@@ -15,16 +15,71 @@ pub(super) struct Process {
     pub(super) start_time: Option<f64>,
 }
 
+/// What another process has used.
+#[derive(Clone, Debug)]
+pub(super) struct Usage {
+    pub(super) name: String,
+    pub(super) cpu_seconds: f64,
+    pub(super) resident_bytes: u64,
+    pub(super) threads: u32,
+    /// Unix time.
+    pub(super) started: Option<f64>,
+}
+
+impl Usage {
+    /// `None` where the process has gone, or the kernel does not show it.
+    pub(super) fn read(id: u32) -> Option<Self> {
+        let stat = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
+        let fields = Fields::of(&stat);
+        let (before, _) = stat.rsplit_once(") ")?;
+        let (_, name) = before.split_once('(')?;
+        let ticks = ticks_per_second();
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "a whole number of bytes far below 2^53"
+        )]
+        let resident_bytes = (fields.number(24)? * page_bytes()).max(0.0) as u64;
+        Some(Self {
+            name: name.to_owned(),
+            cpu_seconds: (fields.number(14)? + fields.number(15)?) / ticks,
+            resident_bytes,
+            threads: fields.text(20)?.parse().ok()?,
+            started: fields
+                .number(22)
+                .zip(boot_time())
+                .map(|(start, boot)| boot + start / ticks),
+        })
+    }
+}
+
+/// The fields of `/proc/PID/stat`, by their numbers in proc(5).
+struct Fields<'a>(Vec<&'a str>);
+
+impl<'a> Fields<'a> {
+    fn of(stat: &'a str) -> Self {
+        // The command name may hold spaces and brackets; fields count from behind its last one.
+        Self(match stat.rsplit_once(") ") {
+            Some((_, rest)) => rest.split(' ').collect(),
+            None => Vec::new(),
+        })
+    }
+
+    /// proc(5) counts fields from 1 and the state is the third.
+    fn text(&self, number: usize) -> Option<&'a str> {
+        Some(self.0.get(number.checked_sub(3)?)?.trim())
+    }
+
+    fn number(&self, number: usize) -> Option<f64> {
+        self.text(number)?.parse().ok()
+    }
+}
+
 impl Process {
     pub(super) fn read() -> Self {
         let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
-        // The command name may hold spaces and brackets; fields count from behind its last one.
-        let fields: Vec<&str> = match stat.rsplit_once(") ") {
-            Some((_, rest)) => rest.split(' ').collect(),
-            None => Vec::new(),
-        };
-        // proc(5) counts fields from 1 and the state is the third.
-        let field = |number: usize| fields.get(number - 3)?.trim().parse::<f64>().ok();
+        let fields = Fields::of(&stat);
+        let field = |number: usize| fields.number(number);
         let ticks = ticks_per_second();
         Self {
             cpu_seconds: field(14)

@@ -441,6 +441,30 @@ pub const FIXED: &[[&str; 4]] = &[
         "names_of_topics_that_went_make_room_for_those_that_come",
     ],
     [
+        "QUEUE_BYTES",
+        "agent/src/surface/api/messages/mod.rs",
+        "agent/src/surface/api/messages/mod.rs",
+        "messages_that_wait_beyond_the_bytes_go_and_are_counted",
+    ],
+    [
+        "VALUES",
+        "agent/src/surface/api/messages/tree.rs",
+        "agent/src/surface/api/messages/tree.rs",
+        "arrays_of_arrays_have_one_room_together",
+    ],
+    [
+        "MAX_PROCESSES",
+        "agent/src/surface/api/processes.rs",
+        "agent/src/surface/api/processes.rs",
+        "so_many_processes_are_read_for_one_answer",
+    ],
+    [
+        "MAX_FILES",
+        "agent/src/surface/api/downloads.rs",
+        "agent/src/surface/api/downloads.rs",
+        "so_many_files_are_listed",
+    ],
+    [
         "SOCKET_CAPACITY",
         "wire/src/host.rs",
         "agent/tests/live_host_hook.rs",

@@ -5,13 +5,16 @@
 
 mod actions;
 mod body;
+mod downloads;
 mod endpoint;
 mod events;
 mod finding;
 mod graph;
 mod health;
+mod history;
 mod index;
 mod measured;
+mod messages;
 mod names;
 mod nearest;
 mod nodes;
@@ -21,6 +24,7 @@ mod participants;
 mod party;
 mod pipe;
 pub mod problem;
+mod processes;
 mod recordings;
 pub mod reload;
 mod samples;
@@ -49,6 +53,7 @@ use utoipa_axum::router::OpenApiRouter;
 use super::board::{Board, State};
 use super::large::Answers;
 use crate::config::{Access, Limit};
+use crate::message::Library;
 use crate::recording::{Recordings, Snapshots};
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
@@ -75,6 +80,8 @@ pub struct Context {
     pub recordings: Arc<Recordings>,
     /// The last seconds of some topics.
     pub snapshots: Arc<Snapshots>,
+    /// Definitions of messages.
+    pub library: Arc<Library>,
     /// Has the configuration read again.
     pub reloader: Reloader,
     /// Ends streams when the agent ends.
@@ -104,8 +111,10 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(events::routes())
         .merge(needs(Access::Watch, Access::Watch, samples::routes()))
         .merge(needs(Access::All, Access::All, recordings::routes()))
+        .merge(needs(Access::All, Access::All, downloads::routes()))
         .merge(needs(Access::All, Access::All, snapshots::routes()))
         .merge(turns(views()))
+        .merge(processes::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
         .merge(openapi::routes())
@@ -126,6 +135,10 @@ fn views() -> OpenApiRouter<Context> {
 /// Views that are being made and read.
 static VIEWS: Answers = Answers::new();
 
+/// Marks a response that is a stream: it is passed on as it comes, and takes no turn of a view.
+#[derive(Clone, Copy, Debug)]
+struct Streamed;
+
 /// Few views at a time: see [`super::large`].
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
     let Some(turn) = VIEWS.turn().await else {
@@ -133,7 +146,11 @@ async fn take_turns(Extract(context): Extract<Context>, request: Request, next: 
         let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();
     };
-    let (mut head, body) = next.run(request).await.into_parts();
+    let response = next.run(request).await;
+    if response.extensions().get::<Streamed>().is_some() {
+        return response;
+    }
+    let (mut head, body) = response.into_parts();
     match to_bytes(body, usize::MAX).await {
         Ok(bytes) => {
             head.headers.insert(CONTENT_LENGTH, bytes.len().into());

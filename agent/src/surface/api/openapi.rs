@@ -37,6 +37,12 @@ const COMMON: [(&str, &str); 6] = [
         description = "Control API of the ros2probe agent on one robot: what is watched, and what is known.",
         license(name = "Apache-2.0 OR MIT", identifier = "Apache-2.0 OR MIT")
     ),
+    // Answered by the route of topics, whose names may have any number of slashes.
+    paths(
+        super::history::show,
+        super::messages::definition,
+        super::messages::follow
+    ),
     components(schemas(ProblemBody)),
     tags(
         (name = "watch", description = "Watches, changed while the agent runs."),

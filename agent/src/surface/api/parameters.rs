@@ -3,6 +3,7 @@
 
 use axum::extract::rejection::{PathRejection, QueryRejection};
 use axum::extract::{FromRequestParts, Path, Query};
+use axum::http::Uri;
 use axum::http::request::Parts;
 use serde::de::DeserializeOwned;
 
@@ -38,9 +39,27 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequestParts<S> for Parameters<T> 
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, Problem> {
         let query = Query::<T>::from_request_parts(parts, state).await;
-        let Query(parameters) = query.map_err(|error: QueryRejection| {
-            Problem::new(Code::MalformedRequest, error.body_text())
-        })?;
-        Ok(Self(parameters))
+        query.map(Self::from).map_err(|error| problem(&error))
     }
+}
+
+impl<T> From<Query<T>> for Parameters<T> {
+    fn from(Query(parameters): Query<T>) -> Self {
+        Self(parameters)
+    }
+}
+
+impl<T: DeserializeOwned> Parameters<T> {
+    /// Those of an address, where a route reads its query in more than one way.
+    ///
+    /// # Errors
+    /// A parameter is unknown, or its value is none.
+    pub(super) fn of(uri: &Uri) -> Result<Self, Problem> {
+        let query = Query::<T>::try_from_uri(uri);
+        query.map(Self::from).map_err(|error| problem(&error))
+    }
+}
+
+fn problem(error: &QueryRejection) -> Problem {
+    Problem::new(Code::MalformedRequest, error.body_text())
 }

@@ -293,7 +293,7 @@ fn order(context: &Context, name: &str, order: Order) -> Result<Response, Proble
     Ok((StatusCode::ACCEPTED, Json(view(&recording))).into_response())
 }
 
-fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Problem> {
+pub(super) fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Problem> {
     let found = context.recordings.find(name);
     found.ok_or_else(|| {
         let name: String = name.chars().take(128).collect();

@@ -49,6 +49,11 @@ impl Scope {
 }
 
 impl Domain {
+    /// This one, or any.
+    pub(super) const fn of(domain_id: Option<u32>) -> Self {
+        Self { domain_id }
+    }
+
     /// # Errors
     /// There is no such domain.
     pub(super) fn checked(self) -> Result<Self, Problem> {

@@ -3,7 +3,8 @@
 use std::time::Instant;
 
 use axum::Json;
-use axum::extract::State;
+use axum::extract::{Extension, State};
+use axum::http::Uri;
 use axum::response::{IntoResponse, Response};
 use ros2probe_wire::Guid;
 use serde::Serialize;
@@ -14,12 +15,15 @@ use utoipa_axum::routes;
 use super::Context;
 use super::endpoint::{EndpointView, text, texts};
 use super::finding::FindingView;
+use super::history;
 use super::index::{Index, Watching};
 use super::measured::{BreakdownView, BucketView, DeliveredView, MeasurementView, buckets};
+use super::messages;
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Domain, Scope, only};
+use super::security::Granted;
 use super::silence::{Circumstances, ReasonView};
 use super::watch::ExpectationsView;
 use crate::model::snapshot::{AcknowledgementFacts, DeliveryFacts, Passage, Snapshot, TopicFacts};
@@ -243,32 +247,100 @@ async fn list(
 )]
 async fn show(
     State(context): State<Context>,
+    Extension(granted): Extension<Granted>,
+    uri: Uri,
     Name(name): Name,
-    Parameters(domain): Parameters<Domain>,
 ) -> Result<Response, Problem> {
+    match aspect(&context, &uri, &name) {
+        Some((topic, Aspect::History)) => {
+            let Parameters(domain) = Parameters::of(&uri)?;
+            return history::show(&context, topic, domain).await;
+        }
+        Some((topic, Aspect::Definition)) => {
+            let Parameters(domain) = Parameters::of(&uri)?;
+            return messages::definition(&context, topic, domain).await;
+        }
+        Some((topic, Aspect::Messages)) => {
+            let Parameters(wanted) = Parameters::of(&uri)?;
+            return messages::follow(context.clone(), &granted, topic, wanted).await;
+        }
+        None => {}
+    }
+    let Parameters(domain) = Parameters::<Domain>::of(&uri)?;
     let domain = domain.checked()?;
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let desk = Desk::new(&state, &in_force);
+    let topic = find(desk.snapshot, &name, domain)?;
+    Ok(Json(desk.details(topic)).into_response())
+}
+
+/// The one topic of this name.
+///
+/// # Errors
+/// There is none, or there are several.
+pub(super) fn find<'a>(
+    snapshot: &'a Snapshot,
+    name: &str,
+    domain: Domain,
+) -> Result<&'a TopicFacts, Problem> {
     let admitted = || {
-        let topics = desk.snapshot.topics.iter();
+        let topics = snapshot.topics.iter();
         topics.filter(|topic| domain.admits(topic.domain_id))
     };
-    let found = admitted().filter(|topic| is_called(topic, &name));
+    let found = admitted().filter(|topic| is_called(topic, name));
     let found = found.map(|topic| (topic.domain_id, topic)).collect();
     let missing = || {
         let names = admitted().map(|topic| topic.name.as_str());
-        let hint = hint(&name, names);
+        let hint = hint(name, names);
         Problem::new(Code::NoSuchTopic, format!("no endpoint on {name}{hint}"))
     };
-    let topic: &TopicFacts = only(found, &name, missing)?;
-    Ok(Json(desk.details(topic)).into_response())
+    only(found, name, missing)
+}
+
+/// What is asked for of a topic, besides the topic itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Aspect {
+    /// Its last minutes.
+    History,
+    /// What its type consists of.
+    Definition,
+    /// What its messages say.
+    Messages,
+}
+
+impl Aspect {
+    const ALL: [(&'static str, Self); 3] = [
+        ("/history", Self::History),
+        ("/definition", Self::Definition),
+        ("/messages", Self::Messages),
+    ];
+}
+
+/// The topic and what is asked for of it. Names may end so, too: a topic of the whole name goes
+/// first, unless slashes of the name are encoded.
+fn aspect<'a>(context: &Context, uri: &Uri, name: &'a str) -> Option<(&'a str, Aspect)> {
+    let (topic, aspect) = Aspect::ALL
+        .into_iter()
+        .find_map(|(end, aspect)| Some((name.strip_suffix(end)?, aspect)))?;
+    let path = uri.path().strip_prefix("/topics/").unwrap_or_default();
+    let is_sure = path.rsplit_once('/').is_some_and(|(topic, _)| {
+        let has_encoded = topic.contains("%2F") || topic.contains("%2f");
+        has_encoded && !topic.contains('/')
+    });
+    let is_another = || {
+        let state = context.board.state();
+        let mut topics = state.known().topics.iter();
+        // With its last slash encoded it is the name of a topic.
+        !path.contains('/') || topics.any(|topic| is_called(topic, name))
+    };
+    (is_sure || !is_another()).then_some((topic, aspect))
 }
 
 /// The topic in a path, for the document.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read by the document's generator alone")]
-struct TopicParameter {
+pub(super) struct TopicParameter {
     /// ROS name without its leading slash; slashes within need not be encoded.
     #[param(min_length = 1, example = "camera/front/image_raw")]
     topic: String,

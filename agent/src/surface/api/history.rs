@@ -1,0 +1,141 @@
+//! `/topics/{topic}/history`: what was measured of a topic in each of the last seconds, as columns.
+
+use axum::Json;
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::Context;
+use super::problem::ProblemBody;
+use super::scope::Domain;
+use super::topics::{TopicParameter, find};
+use crate::surface::api::problem::Problem;
+
+/// The last seconds of a topic. Columns have one length; null = not measured then, or no such value
+/// in that second.
+#[derive(Debug, Default, Serialize, ToSchema)]
+#[schema(as = History)]
+pub(super) struct HistoryView {
+    /// ROS name.
+    #[schema(example = "/points")]
+    topic: String,
+    /// Domain.
+    domain_id: u32,
+    /// Time between two rows.
+    interval_seconds: u32,
+    /// Unix time of the facts.
+    timestamp_seconds: f64,
+    /// Unix time at which each second ended, in the source's clock.
+    times: Vec<f64>,
+    /// Messages received whole in each.
+    messages: Vec<Option<u32>>,
+    /// Messages settled as lost in each.
+    lost_messages: Vec<Option<u32>>,
+    /// Messages a second over the 10 s before.
+    rate_hertz: Vec<Option<f64>>,
+    /// Payload bytes a second over the 10 s before.
+    bandwidth_bytes_per_second: Vec<Option<f64>>,
+    /// Median time from the writer's timestamp to the capture.
+    latency_p50_seconds: Vec<Option<f64>>,
+    /// Its 99th percentile.
+    latency_p99_seconds: Vec<Option<f64>>,
+    /// Median time between messages of one writer.
+    interarrival_p50_seconds: Vec<Option<f64>>,
+    /// Its 99th percentile.
+    interarrival_p99_seconds: Vec<Option<f64>>,
+}
+
+/// The last minutes of a topic
+///
+/// As many seconds as `page.history_s` says, the oldest first. A topic has a history while it is
+/// measured. A name with encoded slashes (`/topics/%2Fcamera%2Fimage/history`) is the topic's for
+/// certain; `/topics/camera/history` is the topic `/camera/history` where there is one.
+#[utoipa::path(
+    get,
+    path = "/topics/{topic}/history",
+    tag = "graph",
+    params(TopicParameter, Domain),
+    responses(
+        (status = 200, description = "Its last minutes.", body = HistoryView),
+        (status = 404, description = "No such topic.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 409, description = "It is in several domains.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn show(
+    context: &Context,
+    name: &str,
+    domain: Domain,
+) -> Result<Response, Problem> {
+    let state = context.board.state();
+    let topic = find(state.known(), name, domain.checked()?)?;
+    let past = context.board.past();
+    let mut view = HistoryView {
+        topic: topic.name.clone(),
+        domain_id: topic.domain_id,
+        interval_seconds: 1,
+        timestamp_seconds: state.known().at.seconds(),
+        ..HistoryView::default()
+    };
+    let seconds = past.topic(topic.domain_id, &topic.dds_name);
+    for (at, reading) in seconds.into_iter().flatten() {
+        let row = reading.as_ref().map(|reading| &reading.row);
+        // What came before its first row says nothing.
+        if row.is_none() && view.times.is_empty() {
+            continue;
+        }
+        let part = |pair: Option<[f32; 2]>, place: usize| {
+            pair.and_then(|pair| pair.get(place).copied()).map(short)
+        };
+        let latency = row.and_then(|row| row.latency());
+        let interarrival = row.and_then(|row| row.interarrival());
+        view.times.push(at.seconds());
+        view.messages.push(row.map(|row| row.messages));
+        view.lost_messages.push(row.map(|row| row.lost));
+        let rate = reading.as_ref().and_then(|reading| reading.rate_hz);
+        view.rate_hertz.push(rate.map(thousandths));
+        let bandwidth = reading.as_ref().and_then(|reading| reading.bandwidth);
+        view.bandwidth_bytes_per_second
+            .push(bandwidth.map(f64::round));
+        view.latency_p50_seconds.push(part(latency, 0));
+        view.latency_p99_seconds.push(part(latency, 1));
+        view.interarrival_p50_seconds.push(part(interarrival, 0));
+        view.interarrival_p99_seconds.push(part(interarrival, 1));
+    }
+    Ok(Json(view).into_response())
+}
+
+/// The digits that a percentile has.
+pub(super) fn short(value: f32) -> f64 {
+    let value = f64::from(value);
+    if value <= 0.0 || !value.is_finite() {
+        return 0.0;
+    }
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "an exponent of a finite number"
+    )]
+    let digits = 2 - value.log10().floor() as i32;
+    let scale = 10_f64.powi(digits.clamp(0, 12));
+    (value * scale).round() / scale
+}
+
+/// Three digits behind the point.
+pub(super) fn thousandths(value: f64) -> f64 {
+    (value * 1e3).round() / 1e3
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_have_as_many_digits_as_they_are_worth() {
+        assert_eq!(short(0.001_234_567), 0.001_23);
+        assert_eq!(short(12.345_678), 12.3);
+        assert_eq!(short(1234.5), 1235.0);
+        assert_eq!((short(0.0), short(-1.0), short(f32::NAN)), (0.0, 0.0, 0.0));
+        assert_eq!(thousandths(9.987_654), 9.988);
+    }
+}
