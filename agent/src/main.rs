@@ -226,6 +226,7 @@ fn run(options: cli::Run) -> Result<()> {
         subscriptions,
         recordings: Arc::clone(&recordings),
         snapshots: Arc::clone(&snapshots),
+        live: Arc::new(api::Live::new(config.history)),
         library,
         reloader,
         stop: stop.clone(),

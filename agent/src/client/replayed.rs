@@ -173,6 +173,7 @@ impl Replayed {
             subscriptions,
             recordings,
             snapshots: Arc::default(),
+            live: Arc::new(api::Live::new(Duration::ZERO)),
             library,
             reloader,
             stop: token.clone(),

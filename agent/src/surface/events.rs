@@ -207,6 +207,12 @@ impl EventLog {
         format!("{}-{number}", self.run)
     }
 
+    /// What tells this run of the agent from others.
+    #[must_use]
+    pub fn run(&self) -> String {
+        self.run.to_string()
+    }
+
     /// What an id means to this run; `None` = it is no id.
     #[must_use]
     pub fn place(&self, id: &str) -> Option<Place> {

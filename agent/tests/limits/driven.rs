@@ -441,6 +441,12 @@ pub const FIXED: &[[&str; 4]] = &[
         "names_of_topics_that_went_make_room_for_those_that_come",
     ],
     [
+        "MOST",
+        "agent/src/surface/api/live/findings.rs",
+        "agent/src/surface/api/live/findings.rs",
+        "of_more_findings_than_are_sent_the_worst_are",
+    ],
+    [
         "QUEUE_BYTES",
         "agent/src/surface/api/messages/mod.rs",
         "agent/src/surface/api/messages/mod.rs",

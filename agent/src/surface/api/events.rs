@@ -69,7 +69,7 @@ struct Selection {
 /// One event: the `data` of a message, whose `event` is its name and whose `id` is its id.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = Event)]
-struct EventView<'a> {
+pub(super) struct EventView<'a> {
     /// Where to go on after a break. Belongs to one run of the agent.
     #[schema(example = "641a2b3c4d5e6-17")]
     id: String,
@@ -262,15 +262,21 @@ impl Stream {
     }
 
     fn text(&self, record: &Record) -> String {
-        let view = EventView {
-            id: self.log.id(record.number),
+        let view = EventView::new(&self.log, record);
+        // Written to memory, which does not fail.
+        serde_json::to_string(&view).unwrap_or_default()
+    }
+}
+
+impl<'a> EventView<'a> {
+    pub(super) fn new(log: &EventLog, record: &'a Record) -> Self {
+        Self {
+            id: log.id(record.number),
             time: record.time(),
             name: record.definition.name,
             severity: record.severity.text(),
             attributes: Attributes(&record.attributes),
-        };
-        // Written to memory, which does not fail.
-        serde_json::to_string(&view).unwrap_or_default()
+        }
     }
 }
 

@@ -18,7 +18,7 @@ use crate::surface::otlp::Host;
 use crate::surface::process::Process;
 
 /// Read once: a robot is not renamed while its agent runs.
-static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
+pub(super) static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
 
 /// How the agent is.
 #[derive(Debug, Serialize, ToSchema)]

@@ -13,6 +13,7 @@ mod graph;
 mod health;
 mod history;
 mod index;
+pub mod live;
 mod measured;
 mod messages;
 mod names;
@@ -57,6 +58,7 @@ use crate::message::Library;
 use crate::recording::{Recordings, Snapshots};
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
+pub use live::Live;
 pub use openapi::document;
 pub use pipe::serve as serve_in_process;
 use problem::{Code, Problem};
@@ -80,6 +82,8 @@ pub struct Context {
     pub recordings: Arc<Recordings>,
     /// The last seconds of some topics.
     pub snapshots: Arc<Snapshots>,
+    /// What streams of the page have in common.
+    pub live: Arc<Live>,
     /// Definitions of messages.
     pub library: Arc<Library>,
     /// Has the configuration read again.
@@ -109,6 +113,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
     OpenApiRouter::with_openapi(openapi::head())
         .merge(needs(Access::Read, Access::Watch, watch::routes()))
         .merge(events::routes())
+        .merge(live::routes())
         .merge(needs(Access::Watch, Access::Watch, samples::routes()))
         .merge(needs(Access::All, Access::All, recordings::routes()))
         .merge(needs(Access::All, Access::All, downloads::routes()))

@@ -198,6 +198,10 @@ impl Granted {
         Self { access, socket }
     }
 
+    pub(super) const fn access(&self) -> Access {
+        self.access
+    }
+
     /// Returns a problem that names the way to `needed` where the listener does not grant it.
     pub(super) fn require(&self, needed: Access) -> Result<(), Problem> {
         if needed <= self.access {
