@@ -17,7 +17,7 @@ use clap::Parser as _;
 use ros2probe::capture::live::LiveSource;
 use ros2probe::capture::pcap::Speed;
 use ros2probe::capture::system::give_back_memory;
-use ros2probe::config::{Config, ConfigError};
+use ros2probe::config::{Config, ConfigError, PageChoice};
 use ros2probe::message::{Library, Sources as Places};
 use ros2probe::model::history::History;
 use ros2probe::model::observer::{self, Observer};
@@ -228,6 +228,10 @@ fn run(options: cli::Run) -> Result<()> {
         snapshots: Arc::clone(&snapshots),
         live: Arc::new(api::Live::new(config.history)),
         library,
+        page: Arc::new(api::Page::new(match config.api.page {
+            PageChoice::On => control.addresses().collect(),
+            PageChoice::Off => Vec::new(),
+        })),
         reloader,
         stop: stop.clone(),
     };

@@ -263,7 +263,7 @@ fn refusal(answer: &Answer) -> Option<(String, String)> {
 }
 
 /// Requests and the level that they need.
-const REQUESTS: [(&str, &str, &str); 24] = [
+const REQUESTS: [(&str, &str, &str); 25] = [
     ("GET", "/health", "read"),
     ("GET", "/topics", "read"),
     ("GET", "/graph", "read"),
@@ -292,6 +292,7 @@ const REQUESTS: [(&str, &str, &str); 24] = [
     ("GET", "/topics/nowhere/messages", "all"),
     ("GET", "/recordings/none/files", "all"),
     ("GET", "/recordings/none/files/metadata.yaml", "all"),
+    ("POST", "/page/token", "all"),
 ];
 
 #[test]

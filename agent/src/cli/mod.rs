@@ -13,6 +13,7 @@ mod interrupt;
 mod node;
 mod notes;
 mod output;
+mod page;
 mod rates;
 mod record;
 mod reference;
@@ -83,6 +84,8 @@ pub(crate) enum Question {
     Doctor(doctor::Doctor),
     /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
     Top(top::Top),
+    /// Print the address of the page that shows the robot in a browser
+    Page(page::Page),
 }
 
 impl Question {
@@ -99,6 +102,7 @@ impl Question {
             Self::Action(action) => action.ask(),
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
+            Self::Page(page) => page.ask(),
         }
     }
 
@@ -107,9 +111,11 @@ impl Question {
         match self {
             Self::Bag(bag) => bag.interrupted(),
             Self::Topic(topic) => Some(topic.interrupted()),
-            Self::Node(_) | Self::Service(_) | Self::Action(_) | Self::Doctor(_) => {
-                Some(interrupt::INTERRUPTED)
-            }
+            Self::Node(_)
+            | Self::Service(_)
+            | Self::Action(_)
+            | Self::Doctor(_)
+            | Self::Page(_) => Some(interrupt::INTERRUPTED),
             // Gives the terminal back first.
             Self::Top(_) => None,
         }

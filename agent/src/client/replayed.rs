@@ -175,6 +175,7 @@ impl Replayed {
             snapshots: Arc::default(),
             live: Arc::new(api::Live::new(Duration::ZERO)),
             library,
+            page: Arc::default(),
             reloader,
             stop: token.clone(),
         };

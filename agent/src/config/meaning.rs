@@ -263,6 +263,7 @@ impl Reader {
             },
             loopback: shape.loopback,
             token_file: shape.token_file.map(PathBuf::from),
+            page: shape.page,
         }
     }
 

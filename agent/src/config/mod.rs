@@ -137,6 +137,17 @@ impl std::fmt::Display for Access {
     }
 }
 
+/// Whether the page is served.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum PageChoice {
+    /// To browsers, beside the API.
+    #[default]
+    On,
+    /// Not at all.
+    Off,
+}
+
 /// How every message into shared memory is seen, if at all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
@@ -201,6 +212,8 @@ pub struct ApiSettings {
     pub loopback: Access,
     /// Holds the bearer token that clients on the network address must send.
     pub token_file: Option<PathBuf>,
+    /// Whether the page is served at `listen`.
+    pub page: PageChoice,
 }
 
 /// Which unix socket.
@@ -462,6 +475,7 @@ impl Default for Config {
                 socket: SocketChoice::default(),
                 loopback: Access::default(),
                 token_file: None,
+                page: PageChoice::default(),
             },
             history: Duration::from_secs(defaults::HISTORY_S.into()),
             otlp: OtlpSettings::default(),

@@ -10,7 +10,7 @@ use serde::Deserialize;
 
 use super::limits::LimitsShape;
 use super::watch::Retain;
-use super::{Access, Compression, ExactChoice, Level, ShmMode, SourceChoice, defaults};
+use super::{Access, Compression, ExactChoice, Level, PageChoice, ShmMode, SourceChoice, defaults};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
@@ -199,9 +199,11 @@ pub(super) struct ApiShape {
     /// File with the bearer token that clients of `listen` must send, as the service manager's
     /// LoadCredential= provides it.
     pub(super) token_file: Option<String>,
+    /// Whether `listen` also serves the page for browsers, at `/`.
+    pub(super) page: PageChoice,
 }
 
-/// The page in the browser.
+/// The page in the browser; `api.page` switches it off.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
@@ -227,6 +229,7 @@ impl Default for ApiShape {
             socket: "auto".to_owned(),
             loopback: Access::default(),
             token_file: None,
+            page: PageChoice::default(),
         }
     }
 }

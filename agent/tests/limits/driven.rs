@@ -441,10 +441,22 @@ pub const FIXED: &[[&str; 4]] = &[
         "names_of_topics_that_went_make_room_for_those_that_come",
     ],
     [
+        "MAX_TABS",
+        "agent/src/surface/api/live/mod.rs",
+        "agent/tests/page.rs",
+        "streams_are_limited_and_a_closed_one_is_noticed",
+    ],
+    [
         "MOST",
         "agent/src/surface/api/live/findings.rs",
         "agent/src/surface/api/live/findings.rs",
         "of_more_findings_than_are_sent_the_worst_are",
+    ],
+    [
+        "MAX_READERS",
+        "agent/src/surface/api/messages/mod.rs",
+        "agent/tests/page.rs",
+        "topics_whose_messages_are_decoded_are_limited",
     ],
     [
         "QUEUE_BYTES",
@@ -457,6 +469,12 @@ pub const FIXED: &[[&str; 4]] = &[
         "agent/src/surface/api/messages/tree.rs",
         "agent/src/surface/api/messages/tree.rs",
         "arrays_of_arrays_have_one_room_together",
+    ],
+    [
+        "MAX_TOKENS",
+        "agent/src/surface/api/page/tokens.rs",
+        "agent/src/surface/api/page/tokens.rs",
+        "the_latest_tokens_are_valid_and_no_two_are_alike",
     ],
     [
         "MAX_PROCESSES",

@@ -20,6 +20,7 @@ mod names;
 mod nearest;
 mod nodes;
 mod openapi;
+pub mod page;
 mod parameters;
 mod participants;
 mod party;
@@ -60,6 +61,7 @@ use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
 pub use live::Live;
 pub use openapi::document;
+pub use page::Page;
 pub use pipe::serve as serve_in_process;
 use problem::{Code, Problem};
 use reload::Reloader;
@@ -86,6 +88,8 @@ pub struct Context {
     pub live: Arc<Live>,
     /// Definitions of messages.
     pub library: Arc<Library>,
+    /// The page for browsers.
+    pub page: Arc<Page>,
     /// Has the configuration read again.
     pub reloader: Reloader,
     /// Ends streams when the agent ends.
@@ -122,6 +126,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(processes::routes())
         .merge(health::routes())
         .merge(needs(Access::All, Access::All, reload::routes()))
+        .merge(needs(Access::All, Access::All, page::routes()))
         .merge(openapi::routes())
 }
 
@@ -168,7 +173,11 @@ async fn take_turns(Extract(context): Extract<Context>, request: Request, next: 
 /// What answers behind `door`.
 fn router(context: &Context, door: Arc<Door>) -> Router {
     let (router, _) = nouns(Some(context)).split_for_parts();
-    router
+    let files = (door.is_for_browsers() && context.page.is_served()).then(|| {
+        let guard = middleware::from_fn_with_state(Arc::clone(&door), security::guard_files);
+        page::files().layer(guard)
+    });
+    let router = router
         .fallback(async || Problem::new(Code::NotFound, "the paths are listed in /openapi.json"))
         .method_not_allowed_fallback(async |method: Method| {
             Problem::new(
@@ -176,6 +185,10 @@ fn router(context: &Context, door: Arc<Door>) -> Router {
                 format!("{method} is not possible here"),
             )
         })
-        .layer(middleware::from_fn_with_state(door, security::guard))
-        .with_state(context.clone())
+        .layer(middleware::from_fn_with_state(door, security::guard));
+    let router = match files {
+        Some(files) => router.merge(files),
+        None => router,
+    };
+    router.with_state(context.clone())
 }

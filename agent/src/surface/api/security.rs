@@ -17,6 +17,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use subtle::ConstantTimeEq as _;
 
+use super::page;
 use super::problem::{Code, Problem};
 use crate::config::Access;
 use crate::surface::authority;
@@ -31,6 +32,7 @@ const BURST: f64 = 1_000.0;
 const TOKEN_BYTES: std::ops::RangeInclusive<usize> = 16..=4096;
 
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
+const SEC_FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
 /// What clients have to know.
 #[derive(Clone)]
@@ -63,6 +65,7 @@ pub enum TokenError {
 pub(super) struct Door {
     kind: Kind,
     granted: Granted,
+    page: page::Shared,
     clients: Mutex<Bucket>,
     outsiders: Mutex<Bucket>,
 }
@@ -142,17 +145,52 @@ impl Door {
         Self {
             kind,
             granted,
+            page: page::Shared::default(),
             clients: bucket(),
             outsiders: bucket(),
         }
     }
 
+    /// The same, which knows the tokens of pages.
+    pub(super) fn with(self, page: page::Shared) -> Self {
+        Self { page, ..self }
+    }
+
+    /// Browsers can come here.
+    pub(super) const fn is_for_browsers(&self) -> bool {
+        matches!(self.kind, Kind::Loopback(_) | Kind::Network(_))
+    }
+
+    /// How far the request may go.
+    fn let_in(&self, headers: &HeaderMap, now: Instant) -> Result<Granted, Problem> {
+        let granted = self.pass(self.admit(headers), now)?;
+        small(headers)?;
+        Ok(granted)
+    }
+
+    /// Whether a file of the page is sent, which needs no token: a browser asks for it before
+    /// anybody can have one.
+    fn let_in_for_files(&self, headers: &HeaderMap, now: Instant) -> Result<(), Problem> {
+        let host = match self.kind {
+            Kind::Loopback(_) => own_host(headers),
+            Kind::Socket | Kind::Network(_) => Ok(()),
+        };
+        // A link may lead here from anywhere.
+        let is_link = headers
+            .get(SEC_FETCH_MODE)
+            .is_some_and(|mode| mode.as_bytes() == b"navigate");
+        let admitted = host.and_then(|()| match is_link {
+            true => Ok(()),
+            false => own_pages(headers),
+        });
+        self.pass(admitted, now)
+    }
+
     /// Each class of clients has its own rate: requests without the token take nothing from those
     /// with it.
-    fn let_in(&self, headers: &HeaderMap, now: Instant) -> Result<(), Problem> {
-        let admitted = self.admit(headers);
+    fn pass<T>(&self, admitted: Result<T, Problem>, now: Instant) -> Result<T, Problem> {
         let bucket = match &admitted {
-            Ok(()) => &self.clients,
+            Ok(_) => &self.clients,
             Err(_) => &self.outsiders,
         };
         let mut bucket = bucket.lock().unwrap_or_else(PoisonError::into_inner);
@@ -161,25 +199,26 @@ impl Door {
             return Err(Problem::new(Code::TooManyRequests, detail));
         }
         drop(bucket);
-        admitted?;
-        small(headers)
+        admitted
     }
 
-    fn admit(&self, headers: &HeaderMap) -> Result<(), Problem> {
-        match &self.kind {
-            Kind::Socket => Ok(()),
+    fn admit(&self, headers: &HeaderMap) -> Result<Granted, Problem> {
+        let token = match &self.kind {
+            Kind::Socket => return Ok(self.granted.clone()),
             Kind::Loopback(token) => {
                 own_host(headers)?;
-                own_pages(headers)?;
-                token
-                    .as_ref()
-                    .map_or(Ok(()), |token| authorized(headers, token))
+                token.as_ref()
             }
-            Kind::Network(token) => {
-                own_pages(headers)?;
-                authorized(headers, token)
-            }
+            Kind::Network(token) => Some(token),
+        };
+        own_pages(headers)?;
+        if bearer(headers).is_some_and(|offered| self.page.tokens.know(offered)) {
+            return Ok(self.granted.everything());
         }
+        if let Some(token) = token {
+            authorized(headers, token)?;
+        }
+        Ok(self.granted.clone())
     }
 }
 
@@ -202,6 +241,14 @@ impl Granted {
         self.access
     }
 
+    /// As far as there is.
+    fn everything(&self) -> Self {
+        Self {
+            access: Access::All,
+            ..self.clone()
+        }
+    }
+
     /// Returns a problem that names the way to `needed` where the listener does not grant it.
     pub(super) fn require(&self, needed: Access) -> Result<(), Problem> {
         if needed <= self.access {
@@ -214,7 +261,7 @@ impl Granted {
         let way = match &self.socket {
             Some(path) => format!(
                 "use the unix socket {}, open to root and its group (`sudo usermod -aG ros2probe \
-                 $USER`, then log in again)",
+                 $USER`, then log in again), or a token that `rp page` prints",
                 path.display()
             ),
             None => "configure `api.socket` or `api.token_file`".to_owned(),
@@ -246,15 +293,29 @@ pub(super) async fn guard(
     next: Next,
 ) -> Response {
     match door.let_in(request.headers(), Instant::now()) {
-        Ok(()) => {
-            request.extensions_mut().insert(door.granted.clone());
+        Ok(granted) => {
+            request.extensions_mut().insert(granted);
             next.run(request).await
         }
-        Err(problem) => {
-            let close = [(CONNECTION, HeaderValue::from_static("close"))];
-            (close, problem).into_response()
-        }
+        Err(problem) => turned_away(problem),
     }
+}
+
+/// The same for files of the page.
+pub(super) async fn guard_files(
+    State(door): State<Arc<Door>>,
+    request: Request,
+    next: Next,
+) -> Response {
+    match door.let_in_for_files(request.headers(), Instant::now()) {
+        Ok(()) => next.run(request).await,
+        Err(problem) => turned_away(problem),
+    }
+}
+
+fn turned_away(problem: Problem) -> Response {
+    let close = [(CONNECTION, HeaderValue::from_static("close"))];
+    (close, problem).into_response()
 }
 
 /// Answers what the listener does not grant.
@@ -308,15 +369,23 @@ fn own_pages(headers: &HeaderMap) -> Result<(), Problem> {
 }
 
 fn authorized(headers: &HeaderMap, token: &Token) -> Result<(), Problem> {
-    let Some(credentials) = headers.get(AUTHORIZATION).map(HeaderValue::as_bytes) else {
+    if !headers.contains_key(AUTHORIZATION) {
         let detail = "send the header `Authorization: Bearer TOKEN`";
         return Err(Problem::new(Code::Unauthorized, detail));
-    };
-    let (scheme, offered) = credentials.split_at_checked(7).unwrap_or_default();
-    if scheme.eq_ignore_ascii_case(b"bearer ") && token.is(offered.trim_ascii()) {
+    }
+    if bearer(headers).is_some_and(|offered| token.is(offered)) {
         return Ok(());
     }
     Err(Problem::new(Code::Unauthorized, "the token is wrong"))
+}
+
+/// The token that a request has.
+fn bearer(headers: &HeaderMap) -> Option<&[u8]> {
+    let credentials = headers.get(AUTHORIZATION)?.as_bytes();
+    let (scheme, offered) = credentials.split_at_checked(7)?;
+    scheme
+        .eq_ignore_ascii_case(b"bearer ")
+        .then(|| offered.trim_ascii())
 }
 
 /// A body without a length is bounded while it is read.

@@ -174,6 +174,12 @@ impl Server {
         addresses.chain(sockets)
     }
 
+    /// The addresses among them.
+    pub fn addresses(&self) -> impl Iterator<Item = SocketAddr> {
+        let addresses = self.addresses.iter().map(TcpListener::local_addr);
+        addresses.filter_map(Result::ok)
+    }
+
     /// Answers on all of them until `context` says stop, then finishes the answers that have begun.
     ///
     /// # Errors
@@ -183,7 +189,7 @@ impl Server {
         let socket = socket.map(|socket| Arc::from(socket.file.path.as_path()));
         let door = |kind: Kind| {
             let granted = Granted::new(kind.access(self.loopback), socket.clone());
-            Arc::new(Door::new(kind, granted))
+            Arc::new(Door::new(kind, granted).with(Arc::clone(&context.page)))
         };
         for listener in self.addresses {
             let is_local = listener.local_addr()?.ip().is_loopback();

@@ -1,0 +1,146 @@
+//! `rp page`: the address of the page, with a token that grants all rights.
+
+use std::net::IpAddr;
+use std::process::{Command, ExitCode, Stdio};
+
+use anyhow::Result;
+use clap::Args;
+use ros2probe::client::{Agent, Target};
+use serde::Deserialize;
+use serde_json::json;
+
+use super::{Output, Said};
+
+/// The built-in port of the API.
+const PORT: &str = "17401";
+/// Opens addresses on a desktop.
+const OPENER: &str = "xdg-open";
+
+/// `rp page`.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+The agent serves the page beside its API. The address that is printed holds a token behind the `#`,
+which browsers send to nobody; the page keeps it for its tab. Without the token the page shows what
+`api.loopback` grants. The agent gives tokens over its unix socket, or for its token file.
+
+With --host of another robot it prints the command that brings its page to this computer.
+
+Examples:
+  rp page --open
+  rp page --host robot1")]
+pub(crate) struct Page {
+    /// Open it in the browser of this desktop; its users may see the token in the list of processes
+    #[arg(long)]
+    open: bool,
+    #[command(flatten)]
+    target: Target,
+}
+
+#[derive(Deserialize)]
+struct Token {
+    token: String,
+    address: Option<String>,
+}
+
+impl Page {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let mut output = Output::new();
+        let near = match self.target.host.as_deref().map(parts) {
+            Some((name, port)) if !is_near(name) => {
+                output.write(&tunnel(name, port))?;
+                return Ok(ExitCode::SUCCESS);
+            }
+            Some((name, port)) => Some(format!("http://{name}:{port}/")),
+            None => None,
+        };
+        if self.target.replay.is_some() {
+            let way = "rp run --replay FILE serves the page of a capture".to_owned();
+            return Err(Said(way).into());
+        }
+        let agent = Agent::reach(&self.target)?;
+        let Token { token, address } = agent.post("/page/token", &json!({}))?;
+        let Some(address) = address else {
+            let reason = "the agent serves no page: api.listen or api.page is off".to_owned();
+            return Err(Said(reason).into());
+        };
+        // Where this program has just reached it, if that was by an address.
+        let address = near.unwrap_or(address);
+        let address = format!("{address}#token={token}");
+        output.write(&format!("{address}\n"))?;
+        if self.open {
+            open(&address)?;
+        }
+        Ok(ExitCode::SUCCESS)
+    }
+}
+
+/// Name and port of a host.
+fn parts(host: &str) -> (&str, &str) {
+    match host.rsplit_once(':') {
+        Some((name, port)) if !name.ends_with(':') && port.parse::<u16>().is_ok() => (name, port),
+        _ => (host, PORT),
+    }
+}
+
+/// Whether this is the host of this program.
+fn is_near(name: &str) -> bool {
+    let address = name.trim_matches(['[', ']']).parse::<IpAddr>();
+    name == "localhost" || address.is_ok_and(|address| address.is_loopback())
+}
+
+/// How the page of another host comes to this one.
+fn tunnel(name: &str, port: &str) -> String {
+    format!(
+        "ssh -L {port}:127.0.0.1:{port} {name}\n\
+         # then http://localhost:{port}/ here; `rp page` on {name} prints it with a token\n"
+    )
+}
+
+fn open(address: &str) -> Result<()> {
+    let opened = Command::new(OPENER)
+        .arg(address)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .status();
+    match opened {
+        Ok(status) if status.success() => Ok(()),
+        _ => {
+            let reason = format!("{OPENER} does not open it: copy the address into a browser");
+            Err(Said(reason).into())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tunnel_has_the_port_of_the_agent() {
+        let of = |host: &str| {
+            let (name, port) = parts(host);
+            tunnel(name, port)
+        };
+        assert!(of("robot1").starts_with("ssh -L 17401:127.0.0.1:17401 robot1\n"));
+        let other = of("pi@robot1:9000");
+        assert!(
+            other.starts_with("ssh -L 9000:127.0.0.1:9000 pi@robot1\n"),
+            "{other}"
+        );
+        assert!(other.contains("http://localhost:9000/"));
+    }
+
+    #[test]
+    fn addresses_of_this_host_need_no_tunnel() {
+        for (host, expected) in [
+            ("localhost", true),
+            ("127.0.0.1:9000", true),
+            ("[::1]:9000", true),
+            ("robot1", false),
+            ("10.0.0.1:9000", false),
+        ] {
+            assert_eq!(is_near(parts(host).0), expected, "{host}");
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! Tokens that were given to pages. They live in memory and end with the agent.
+
+use std::collections::VecDeque;
+use std::fmt::Write as _;
+use std::io;
+use std::sync::{Mutex, PoisonError};
+
+use subtle::ConstantTimeEq as _;
+
+/// Tokens that are valid at once; the oldest goes.
+const MAX_TOKENS: usize = 16;
+/// Random bytes of a token, which is written in hexadecimal digits.
+const BYTES: usize = 32;
+
+/// The valid ones, the oldest first.
+#[derive(Default)]
+pub(in super::super) struct Tokens(Mutex<VecDeque<Box<[u8]>>>);
+
+impl Tokens {
+    /// A new one.
+    ///
+    /// # Errors
+    /// The kernel gives no random bytes.
+    pub(super) fn mint(&self) -> io::Result<String> {
+        let mut bytes = [0; BYTES];
+        let flags = rustix::rand::GetRandomFlags::empty();
+        // Up to 256 bytes come whole (getrandom(2)).
+        let given = rustix::rand::getrandom(&mut bytes, flags)?;
+        if given != BYTES {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        let mut token = String::with_capacity(2 * BYTES);
+        for byte in bytes {
+            // Writing to a string cannot fail.
+            let _ = write!(token, "{byte:02x}");
+        }
+        let mut tokens = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if tokens.len() >= MAX_TOKENS {
+            tokens.pop_front();
+        }
+        tokens.push_back(token.as_bytes().into());
+        Ok(token)
+    }
+
+    /// Whether it is one of them; takes the same time for every wrong one of the right length.
+    pub(in super::super) fn know(&self, offered: &[u8]) -> bool {
+        let tokens = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        tokens.iter().fold(false, |known, token| {
+            known | bool::from(token.ct_eq(offered))
+        })
+    }
+}
+
+impl std::fmt::Debug for Tokens {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Tokens")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_latest_tokens_are_valid_and_no_two_are_alike() {
+        let tokens = Tokens::default();
+        assert!(!tokens.know(b""));
+        let given: Vec<_> = (0..=MAX_TOKENS).map(|_| tokens.mint().unwrap()).collect();
+        assert!(given.iter().all(|token| token.len() == 64));
+        assert!(!tokens.know(given[0].as_bytes()), "the oldest has gone");
+        assert!(given[1..].iter().all(|token| tokens.know(token.as_bytes())));
+        assert!(!tokens.know(&given[1].as_bytes()[1..]));
+        assert!(!tokens.know(b""));
+    }
+}
