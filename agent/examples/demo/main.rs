@@ -1,6 +1,7 @@
 //! `make demo`: a robot and an operator's host in network namespaces of their own, the agent beside
 //! the robot, and a live summary of what it exports. Nothing of it touches the machine's network;
-//! the metrics are relayed to a port of this machine so that `curl` and a browser reach them.
+//! the metrics, the control API and the page are relayed to ports of this machine, so that `rp`,
+//! `curl` and a browser reach them as they would reach an agent of this host.
 //!
 //! It only reads what anybody can read from `/metrics`.
 
@@ -16,7 +17,7 @@ use crate::harness::agent::Agent;
 use crate::harness::network::{Link, Namespace};
 use crate::harness::peer;
 use crate::harness::process::Process;
-use crate::relay::Relay;
+use crate::relay::{Relay, Relays};
 use crate::summary::Summary;
 
 #[path = "../../tests/harness/mod.rs"]
@@ -25,8 +26,9 @@ mod relay;
 mod summary;
 
 const REFRESH: Duration = Duration::from_secs(2);
-/// The agent's own metrics port, used here too when it is free.
-const PORT: u16 = 17400;
+/// The agent's own ports, used here too when they are free.
+const METRICS: u16 = 17400;
+const API: u16 = 17401;
 
 #[derive(Parser)]
 #[command(about = "Shows the agent watching a small robot; needs root for network namespaces")]
@@ -41,6 +43,8 @@ struct Options {
     seconds: Option<f64>,
     #[arg(long, hide = true)]
     relay: Option<PathBuf>,
+    #[arg(long, hide = true, default_value_t = METRICS)]
+    port: u16,
 }
 
 fn main() -> ExitCode {
@@ -57,7 +61,7 @@ fn main() -> ExitCode {
 #[tokio::main(flavor = "current_thread")]
 async fn demo(options: &Options) -> Result<()> {
     if let Some(socket) = &options.relay {
-        return relay::serve(socket, PORT);
+        return relay::serve(socket, options.port);
     }
     let agent = options.agent.clone().map_or_else(beside_this_program, Ok)?;
     for needed in [&agent, &options.config] {
@@ -83,7 +87,10 @@ async fn demo(options: &Options) -> Result<()> {
         .context("cannot write a configuration")?;
     let agent = Agent::start_logging(&link.robot, agent, &config, &log)
         .with_context(|| format!("the agent said: {}", read_lossy(&log).trim()))?;
-    let relay = Relay::start(&link.robot, directory.path(), PORT)?;
+    let relays = Relays {
+        metrics: Relay::start(&link.robot, directory.path(), METRICS)?,
+        api: Relay::start(&link.robot, directory.path(), API)?,
+    };
     let robots = [
         robot(&link.robot, "lidar")?,
         robot(&link.robot, "base")?,
@@ -101,7 +108,7 @@ async fn demo(options: &Options) -> Result<()> {
             () = tokio::time::sleep(REFRESH) => {}
         }
         match agent.scrape() {
-            Ok(scrape) => summary.show(&scrape, &relay, &link),
+            Ok(scrape) => summary.show(&scrape, &relays, &link),
             Err(error) => {
                 failure =
                     Some(error.context(format!("the agent said: {}", read_lossy(&log).trim())));
@@ -110,7 +117,7 @@ async fn demo(options: &Options) -> Result<()> {
         }
     }
     println!("\nstopping the robot and the agent");
-    drop(relay);
+    drop(relays);
     for mut robot in robots {
         robot.terminate()?;
     }
@@ -123,13 +130,20 @@ async fn demo(options: &Options) -> Result<()> {
     }
 }
 
-/// The configuration, with the sockets of one of the two hosts only: both are this machine.
+/// The configuration, with the sockets of one of the two hosts only: both are this machine. An agent
+/// of this machine keeps its unix socket. Loopback has all rights (`Agent::start`).
 fn for_one_host(config: &Path, cgroup: &Path) -> Result<String> {
-    let text = std::fs::read_to_string(config)
+    let mut text = std::fs::read_to_string(config)
         .with_context(|| format!("cannot read {}", config.display()))?;
-    let key = format!("  cgroup: {}\n", cgroup.display());
-    let (before, after) = text.split_once("\ncapture:\n").unwrap_or((&text, ""));
-    Ok(format!("{before}\ncapture:\n{key}{after}"))
+    for (section, key) in [
+        ("capture", format!("cgroup: {}", cgroup.display())),
+        ("api", "socket: off".to_owned()),
+    ] {
+        let head = format!("\n{section}:\n");
+        let (before, after) = text.split_once(&head).unwrap_or((&text, ""));
+        text = format!("{before}{head}  {key}\n{after}");
+    }
+    Ok(text)
 }
 
 fn beside_this_program() -> Result<PathBuf> {

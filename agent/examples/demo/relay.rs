@@ -18,12 +18,36 @@ pub(crate) struct Relay {
     _remote: Process,
 }
 
+/// What of the agent is reached from this machine.
+pub(crate) struct Relays {
+    pub(crate) metrics: Relay,
+    /// The control API, and the page.
+    pub(crate) api: Relay,
+}
+
+impl Relays {
+    /// What commands have to be given so that they find the agent: nothing where it listens as one
+    /// of this host would.
+    pub(crate) fn options(&self, port: u16) -> String {
+        match self.api.address() {
+            address if address.port() == port => String::new(),
+            address => format!(" --host {address}"),
+        }
+    }
+}
+
 impl Relay {
     /// Listens on `port` of this machine, or on any free one when it is taken.
     pub(crate) fn start(host: &Namespace, directory: &Path, port: u16) -> Result<Relay> {
-        let socket = directory.join("relay");
+        let socket = directory.join(format!("relay-{port}"));
         let program = std::env::current_exe().context("cannot tell where this program is")?;
-        let words = ["--relay".as_ref(), socket.as_os_str()];
+        let number = port.to_string();
+        let words = [
+            "--relay".as_ref(),
+            socket.as_os_str(),
+            "--port".as_ref(),
+            number.as_ref(),
+        ];
         let mut remote = Process::start(&host.on_network(), program, words)?;
         remote.wait_for("ready", Duration::from_secs(5))?;
         let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, port))

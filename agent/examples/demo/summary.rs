@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use crate::API;
 use crate::harness::agent::Scrape;
 use crate::harness::network::Link;
-use crate::relay::Relay;
+use crate::relay::Relays;
 
 pub(crate) struct Summary {
     /// Whether the table may replace the one before.
@@ -21,7 +22,7 @@ impl Summary {
         }
     }
 
-    pub(crate) fn show(&mut self, scrape: &Scrape, relay: &Relay, link: &Link) {
+    pub(crate) fn show(&mut self, scrape: &Scrape, relays: &Relays, link: &Link) {
         if self.redraws {
             print!("\x1b[H\x1b[J");
         }
@@ -50,11 +51,15 @@ impl Summary {
                 self.latency(scrape, &topic),
             );
         }
-        println!("\ncurl http://{}/metrics", relay.address());
+        let (api, options) = (relays.api.address(), relays.options(API));
+        println!("\nrp topic list{options}    rp top{options}");
+        println!("curl http://{}/metrics", relays.metrics.address());
+        println!("curl -X POST http://{api}/watch/points");
         println!(
             "ip netns exec {} tcpdump -ni eth0   (Ctrl-C ends the demo)",
             link.robot.name()
         );
+        println!("the page: http://localhost:{}/", api.port());
     }
 
     /// Mean time from the writer's timestamp to the wire since the scrape before.
