@@ -24,7 +24,7 @@ use crate::report::Miss;
 
 /// The configuration as it is shipped.
 const CONFIGURATION: &str = include_str!("../../../config/ros2probe.yaml");
-const TOPICS: usize = 200;
+pub(crate) const TOPICS: usize = 200;
 /// Of each topic.
 const RATE: &str = "5";
 const SCRAPES: Duration = Duration::from_secs(5);
@@ -116,15 +116,7 @@ impl OfSource {
         std::thread::sleep(SETTLED);
         let idle = most_during(length, &agent, false)?;
         let _crowd = crowd(&link)?;
-        let counted = |agent: &Agent<'_>| -> Result<usize> {
-            let page = agent.scrape()?;
-            let messages = page.samples("ros2_topic_messages_total", &[]);
-            Ok(messages.filter(|messages| *messages > 0.0).count())
-        };
-        let deadline = Instant::now() + PATIENCE;
-        while counted(&agent)? < TOPICS && Instant::now() < deadline {
-            std::thread::sleep(Duration::from_secs(1));
-        }
+        wait_for_topics(&agent)?;
         let busy = most_during(length, &agent, true)?;
         Ok(OfSource {
             name,
@@ -277,7 +269,7 @@ impl Drop for Killed {
 
 /// The shipped configuration with one source; at the sockets of these hosts only, because others on
 /// this machine may have something to see.
-fn configured(source: &str, link: &Link) -> Result<String> {
+pub(crate) fn configured(source: &str, link: &Link) -> Result<String> {
     let mut text = CONFIGURATION.to_owned();
     let cgroup = link.cgroup().display().to_string();
     let mut settings = vec![("source", source), ("log", "warn")];
@@ -296,7 +288,7 @@ fn configured(source: &str, link: &Link) -> Result<String> {
 }
 
 /// Processes that talk on [`TOPICS`] topics from one host to the other.
-fn crowd(link: &Link) -> Result<[Process; 2]> {
+pub(crate) fn crowd(link: &Link) -> Result<[Process; 2]> {
     let topics = TOPICS.to_string();
     let start = |host: &Namespace, role: &str| -> Result<Process> {
         let words = ["--role", role, "--topics", &topics, "--rate", RATE];
@@ -308,6 +300,24 @@ fn crowd(link: &Link) -> Result<[Process; 2]> {
         start(&link.monitor, "listeners")?,
         start(&link.robot, "talkers")?,
     ])
+}
+
+/// Topics with messages, once there are all of them or it took too long.
+pub(crate) fn wait_for_topics(agent: &Agent<'_>) -> Result<usize> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let topics = counted(agent)?;
+        if topics >= TOPICS || Instant::now() > deadline {
+            return Ok(topics);
+        }
+        std::thread::sleep(Duration::from_secs(1));
+    }
+}
+
+fn counted(agent: &Agent<'_>) -> Result<usize> {
+    let page = agent.scrape()?;
+    let messages = page.samples("ros2_topic_messages_total", &[]);
+    Ok(messages.filter(|messages| *messages > 0.0).count())
 }
 
 /// Whether the agent of the calling thread's namespace answers with its metrics.

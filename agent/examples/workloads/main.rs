@@ -2,7 +2,7 @@
 //! with the agent (host hook, then packet sockets), and with one more Cyclone DDS subscriber in C++
 //! instead, in turns; the table shows the observer's CPU time and memory, and what all of it spent.
 //!
-//! Before that, how small the agent is (`footprint`).
+//! Before that, how small the agent is (`footprint`) and what open pages cost (`tabs`).
 //!
 //! What holds on a busy machine too (memory, bytes copied, messages counted) is checked, and ends
 //! this with a failure; CPU time is compared with its targets, and only told.
@@ -10,6 +10,7 @@
 mod caps;
 mod footprint;
 mod report;
+mod tabs;
 mod window;
 
 use std::path::{Path, PathBuf};
@@ -47,7 +48,7 @@ struct Options {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     rounds: u16,
     /// Only workloads whose name contains this; `footprint` for sizes, start and memory,
-    /// `caps` for the memory of full tables
+    /// `caps` for the memory of full tables, `tabs` for open pages
     #[arg(long, default_value = "")]
     only: String,
     /// Only publishers and subscribers of this DDS
@@ -114,6 +115,10 @@ fn main() -> Result<ExitCode> {
     }
     if "caps".contains(&options.only) {
         caps::measure(&program).context("caps")?;
+    }
+    if "tabs".contains(&options.only) {
+        let length = Duration::from_secs(options.seconds);
+        missed.extend(tabs::measure(&program, length).context("tabs")?);
     }
     println!(
         "{} windows of {} s each; CPU seconds are per 20 s; workload = publisher, subscriber, observer and ksoftirqd\n",
