@@ -694,7 +694,7 @@ fn an_agent_of_this_host_is_reached_by_its_address() {
 #[test]
 fn messages_are_decoded_five_a_second_at_most() {
     let capture = data("cyclonedds/lifecycle-2ns");
-    let mut agent = LocalAgent::start_on(&capture, &["--watch", "/**", "--speed", "1"]);
+    let mut agent = LocalAgent::start_on(&capture, &["--watch", "/**", "--speed", "0.5"]);
     agent.wait_for_log("ready");
     // The robot of the capture publishes it from some moment on.
     let deadline = Instant::now() + PATIENCE;
@@ -715,6 +715,7 @@ fn messages_are_decoded_five_a_second_at_most() {
         std::thread::sleep(Duration::from_millis(100));
     };
     let path = format!("/topics/{}/messages", topic.replace('/', "%2F"));
+    let opened = Instant::now();
     let mut lines = Lines::open(agent.api, &path, "").unwrap_or_else(|_| panic!("{path}"));
     let (mut told, mut known) = (Vec::new(), Value::Null);
     while told.len() < 3 {
@@ -746,10 +747,12 @@ fn messages_are_decoded_five_a_second_at_most() {
         assert!(message["error"].is_null() && message["bytes"].as_u64().unwrap() > 4);
         assert!(message["time"].as_f64().unwrap() > 1e9);
     }
-    // At the pace of the capture, whenever this program comes to read them.
+    // However late this program reads them.
+    let most = 1.0 + 5.0 * opened.elapsed().as_secs_f64();
+    assert!(told.len() as f64 <= most, "{told:?}");
     for pair in told.windows(2) {
         let [time, next] = [&pair[0], &pair[1]].map(|message| message["time"].as_f64().unwrap());
-        assert!(next - time > 0.1, "{told:?}");
+        assert!(next > time, "{told:?}");
         let number = |message: &Value| message["sequence_number"].as_u64().unwrap();
         let skipped = pair[1]["skipped"].as_u64().unwrap();
         assert_eq!(number(&pair[1]) - number(&pair[0]), skipped + 1, "{told:?}");
