@@ -3,6 +3,7 @@
 #
 #   prerequisites.sh demo|test|dist|ebpf|fuzz|miri|deny...   install what those targets need
 #   prerequisites.sh types                    install what the dashboards are type-checked with
+#   prerequisites.sh page                     install the browser that the page is tested in
 #   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
 #   prerequisites.sh --left-out               print which tests `make test` leaves out
@@ -78,6 +79,60 @@ types() {
     cp agent/tests/dashboard/types/package.json "$lock" "$directory"
     (cd "$directory" && npm ci --ignore-scripts --no-audit --no-fund --silent) ||
         { rm -f "$directory/package-lock.json"; say "npm failed: the dashboards cannot be type-checked"; }
+}
+
+# Node runs the page's tests, drives the browser and needs to be 20 or newer; Debian 12 has 18 and
+# Ubuntu 22.04 has 12. Node's own builds come from npm then, in a place of their own.
+nodejs() {
+    local place=$tools/node version=20.20.2 architecture found
+    [ -x "$place/bin/node" ] && return
+    found=$(node_version || true)
+    [ "${found:-0}" -ge 20 ] && return
+    case $(uname -m) in
+    x86_64) architecture=x64 ;;
+    aarch64) architecture=arm64 ;;
+    *) die "node 20 or newer is needed: install it, then run this again" ;;
+    esac
+    command -v npm >/dev/null || packages npm
+    say "installing node $version from npm into target/tools/node (here is ${found:-none})"
+    mkdir -p "$place"
+    (cd "$place" && npm pack --silent "node-linux-$architecture@$version" >/dev/null &&
+        tar -xzf node-linux-*.tgz --strip-components 1 && rm node-linux-*.tgz) ||
+        die "npm has no node: install node 20 or newer, then run this again"
+}
+
+node_version() { command node --version 2>/dev/null | sed -E 's/v([0-9]+).*/\1/'; }
+
+# A real browser, what drives it, and the rules of accessibility. Debian has Chromium's headless
+# shell as a package. Ubuntu has none: playwright fetches its own build there, into target/tools.
+page() {
+    local place=$tools/page tests=agent/tests/page
+    nodejs
+    [ -x "$tools/node/bin/node" ] && export PATH=$tools/node/bin:$PATH
+    if ! cmp -s "$tests/package-lock.json" "$place/package-lock.json" ||
+        [ ! -d "$place/node_modules/playwright-core" ]; then
+        command -v npm >/dev/null || packages npm
+        say "installing $(sed -nE 's/^ *"([a-z-]+)": "([0-9.]+)",?$/\1 \2/p' $tests/package.json |
+            paste -sd ' ') from npm into target/tools/page"
+        mkdir -p "$place"
+        cp "$tests/package.json" "$tests/package-lock.json" "$place"
+        (cd "$place" && npm ci --ignore-scripts --no-audit --no-fund --silent) || {
+            rm -f "$place/package-lock.json"
+            die "npm failed: the page's tests need what $tests/package-lock.json names"
+        }
+    fi
+    [ -x /usr/bin/chromium-headless-shell ] && return
+    refresh
+    if available chromium-headless-shell; then
+        packages chromium-headless-shell
+        return
+    fi
+    compgen -G "$place/browsers/chromium_headless_shell-*/INSTALLATION_COMPLETE" >/dev/null && return
+    say "installing Chromium's headless shell with playwright-core into target/tools/page/browsers," \
+        "and the libraries it needs (this system has no package chromium-headless-shell)"
+    as_root env PATH="$PATH" PLAYWRIGHT_BROWSERS_PATH="$place/browsers" \
+        node "$place/node_modules/playwright-core/cli.js" install --with-deps chromium-headless-shell ||
+        die "no browser: put a chromium-headless-shell at /usr/bin/chromium-headless-shell"
 }
 
 # The OpenTelemetry receiver that the tests send to; it is linked against this very libpython.
@@ -274,6 +329,7 @@ for need; do
         rotel
         bags
         types
+        page
         rust
         nextest
         musl aarch64
@@ -292,6 +348,7 @@ for need; do
         cargo_deb
         ;;
     types) types ;;
+    page) page ;;
     ebpf)
         rust
         ebpf
@@ -321,6 +378,6 @@ for need; do
             cargo install cargo-deny --version 0.20.2 --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, dist, types, ebpf, fuzz, miri, deny" ;;
+    *) die "prerequisites.sh: $need is none of demo, test, dist, types, page, ebpf, fuzz, miri, deny" ;;
     esac
 done
