@@ -175,7 +175,7 @@ function Notice() {
       ${state.batches > 0 ? ' The figures below are the last ones.' : ''} Trying again.</p>`;
   }
   if (stream.status === 'paused') {
-    return html`<p class="notice" role="status">Paused: the figures below stand still.
+    return html`<p class="notice" role="status">Paused: the figures below stand still.${' '}
       <button type="button" onClick=${() => stream.resume()}>Continue</button></p>`;
   }
   return null;

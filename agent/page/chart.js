@@ -7,6 +7,9 @@ import { html } from './ui.js';
 
 const uPlot = /** @type {any} */ (globalThis).uPlot;
 const HEIGHT = 150;
+/** Steps of an axis that counts: half a message does not exist. */
+const WHOLE = [1, 2, 5].flatMap((step) => [0, 1, 2, 3, 4, 5, 6, 7, 8].map((power) => step * 10 ** power))
+  .sort((one, other) => one - other);
 
 /**
  * @typedef {{label: string, colour: string, values: (number|null)[], fill?: boolean}} Line
@@ -44,9 +47,9 @@ function faint(variable, alpha) {
 
 /**
  * @param {{title: string, times: number[], lines: Line[], print: (value: number|null) => string,
- *   note?: string}} props
+ *   note?: string, whole?: boolean}} props `whole`: values are counts
  */
-export function Chart({ title, times, lines, print, note }) {
+export function Chart({ title, times, lines, print, note, whole }) {
   const place = useRef(/** @type {HTMLElement|null} */ (null));
   const plot = useRef(/** @type {any} */ (null));
   const [asTable, showTable] = useState(false);
@@ -72,7 +75,7 @@ export function Chart({ title, times, lines, print, note }) {
         { ...axis, values: (/** @type {any} */ _, /** @type {number[]} */ ticks) =>
           ticks.map(clock), space: 80 },
         { ...axis, values: (/** @type {any} */ _, /** @type {number[]} */ ticks) =>
-          ticks.map(print), size: 78 },
+          ticks.map(print), size: 78, ...(whole ? { incrs: WHOLE } : {}) },
       ],
       series: [
         { label: 'time', value: (/** @type {any} */ _, /** @type {number} */ time) => clock(time) },
@@ -115,7 +118,8 @@ export function Chart({ title, times, lines, print, note }) {
     event.preventDefault();
     const at = own.cursor.idx ?? times.length - 1;
     const next = Math.max(0, Math.min(times.length - 1, at + by));
-    own.setCursor({ left: own.valToPos(times[next], 'x'), top: HEIGHT / 3 });
+    // The second `true` moves the cursors of the other charts.
+    own.setCursor({ left: own.valToPos(times[next], 'x'), top: HEIGHT / 3 }, true, true);
   };
   const words = lines.map((line) => summary(line, print)).join('; ');
   return html`<figure class="chart">

@@ -57,7 +57,7 @@ export function Search({ close }) {
       ? several(found.length, 'result') + (found.length === MOST_FOUND ? ' shown; more exist' : '')
       : 'Topics, nodes, services and findings.'}</p>
     <ul class="results">${found.map((each) => html`<li key=${each.kind + each.href + each.name}>
-      <a href=${each.href} onClick=${close}><span class="kind">${each.kind}</span>
+      <a href=${each.href} onClick=${close}><span class="kind">${each.kind}</span>${' '}
       <${Name} text=${each.name} /> <span class="dim"><${Name} text=${each.more} /></span></a>
       </li>`)}</ul></div></${Dialog}>`;
 }

@@ -174,7 +174,7 @@ function Follow({ scope, name, topic }) {
   const colours = ['--line-1', '--line-2', '--line-3', '--line-4', '--line-1', '--line-2'];
   return html`
     <${Failed} problem=${problem} what="No messages" />
-    ${end && html`<p class="problem"><${Mark} severity="warning" /> The messages end: ${end}.
+    ${end && html`<p class="problem"><${Mark} severity="warning" /> The messages end: ${end}.${' '}
       <button type="button" onClick=${() => again(run + 1)}>Again</button></p>`}
     ${type && !type.known && html`<p><${Mark} severity="note" /> The definition of <${Name}
       text=${type.name} /> is not known: ${type.reason ?? 'no file has it'}. Sizes are shown, fields
@@ -209,7 +209,7 @@ function FieldRow({ line, closed, toggle, choose, plotted }) {
   const name = html`<${Name} text=${line.key} />`;
   return html`<tr><th scope="row" class="depth-${Math.min(8, line.depth)}">${line.count == null ? name
     : html`<button type="button" class="plain" aria-expanded=${!closed}
-      onClick=${() => toggle(line.path)}><span aria-hidden="true">${closed ? '▸' : '▾'}</span> ${name}
+      onClick=${() => toggle(line.path)}><span aria-hidden="true">${closed ? '▸' : '▾'}</span> ${name}${' '}
       <span class="dim">(${count(line.count)})</span></button>`}</th>
     <td class="value">${line.count == null ? printValue(line.value) : ''}</td>
     <td>${own && html`<button type="button" class="small" aria-pressed=${plotted}

@@ -223,9 +223,10 @@ export class State {
     this.events = all.slice(-MOST_EVENTS);
   }
 
-  /** @param {number} id */
+  /** Figures of now: a topic that is no longer measured has flags alone. @param {number} id */
   figuresOf(id) {
-    return this.figures.get(id) ?? NO_FIGURES;
+    const own = this.figures.get(id) ?? NO_FIGURES;
+    return this.topics.get(id)?.measured === false ? { ...NO_FIGURES, flags: own.flags } : own;
   }
 
   /** The rates of a topic over the last ten minutes. @param {number} id */

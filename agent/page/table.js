@@ -47,28 +47,53 @@ function compare(a, b, down) {
  */
 export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
   const body = useRef(/** @type {HTMLElement|null} */ (null));
-  const measured = useRef(0);
-  const [height, setHeight] = useState(37);
+  /** Pixels of the rows that have been drawn, by key: names wrap, so rows differ. */
+  const heights = useRef(/** @type {Map<string, number>} */ (new Map()));
+  const known = useRef({ width: 0, mean: 37 });
   const [range, setRange] = useState({ first: 0, last: 40 });
+  const first = Math.min(range.first, Math.max(0, rows.length - 1));
+  const last = Math.min(rows.length, range.last);
+  const high = (/** @type {any} */ row) => heights.current.get(keyOf(row)) ?? known.current.mean;
+  const total = (/** @type {any[]} */ some) => some.reduce((sum, row) => sum + high(row), 0);
   const measure = () => {
     if (!body.current) return;
-    // Rows differ where names wrap: their mean is taken once for each width of the window.
-    const drawn = body.current.querySelectorAll('tr[data-row]');
-    if (drawn.length && measured.current !== window.innerWidth) {
-      measured.current = window.innerWidth;
-      let total = 0;
-      for (const row of drawn) total += row.getBoundingClientRect().height;
-      setHeight(Math.max(20, total / drawn.length));
+    if (known.current.width !== window.innerWidth || heights.current.size > 4 * rows.length + 400) {
+      known.current.width = window.innerWidth;
+      heights.current.clear();
     }
-    const top = body.current.getBoundingClientRect().top;
-    const first = Math.max(0, Math.min(rows.length, Math.floor(-top / height) - SPARE));
-    const last = Math.max(first, Math.ceil((window.innerHeight - top) / height) + SPARE);
-    setRange((/** @type {any} */ before) => (before.first === first && before.last === last
-      ? before : { first, last }));
+    const drawn = [...body.current.querySelectorAll('tr[data-row]')];
+    let sum = 0;
+    drawn.forEach((row, at) => {
+      const { height } = row.getBoundingClientRect();
+      sum += height;
+      if (rows[first + at]) heights.current.set(keyOf(rows[first + at]), height);
+    });
+    if (sum > 0) known.current.mean = Math.max(20, sum / drawn.length);
+    // Rows that cover the window stay, whatever was estimated: drawing others would change the
+    // widths of columns, these the heights of rows, and these again which rows are in sight.
+    const top = drawn[0]?.getBoundingClientRect().top ?? 0;
+    const covers = drawn.length > 0 && (first === 0 || top <= 0)
+      && (last === rows.length || top + sum >= window.innerHeight);
+    if (covers) return;
+    let y = body.current.getBoundingClientRect().top;
+    let from = 0;
+    while (from < rows.length && y + high(rows[from]) <= 0) {
+      y += high(rows[from]);
+      from += 1;
+    }
+    let to = from;
+    while (to < rows.length && y < window.innerHeight) {
+      y += high(rows[to]);
+      to += 1;
+    }
+    const next = { first: Math.max(0, from - SPARE), last: to + SPARE };
+    setRange((/** @type {any} */ before) => (before.first === next.first && before.last === next.last
+      ? before : next));
   };
-  useLayoutEffect(measure);
+  useLayoutEffect(measure, [rows.length]);
   useEffect(() => {
-    let asked = 0;
+    // Never twice in a frame: a table that cannot settle must not hold the page.
+    let asked = requestAnimationFrame(measure);
     const soon = () => {
       cancelAnimationFrame(asked);
       asked = requestAnimationFrame(measure);
@@ -81,8 +106,6 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
       window.removeEventListener('resize', soon);
     };
   });
-  const first = Math.min(range.first, Math.max(0, rows.length - 1));
-  const last = Math.min(rows.length, range.last);
   const walk = (/** @type {KeyboardEvent} */ event) => {
     const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
     const row = /** @type {HTMLElement} */ (event.target).closest('tr');
@@ -104,19 +127,19 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
           aria-hidden="true">${own ? (down ? ' ▼' : ' ▲') : ''}</span></button>`
         : column.title}</th>`;
   });
-  const space = (/** @type {number} */ count) => count > 0
+  const space = (/** @type {any[]} */ left) => left.length > 0
     && html`<tr aria-hidden="true" class="space"><td colspan=${columns.length}
-      style=${{ height: `${count * height}px` }}></td></tr>`;
+      style=${{ height: `${total(left)}px` }}></td></tr>`;
   return html`<div class="table" onKeyDown=${walk}>
     <table aria-label=${label} aria-rowcount=${rows.length + 1}>
     <thead><tr aria-rowindex="1">${head}</tr></thead>
     <tbody ref=${body}>
-      ${space(first)}
+      ${space(rows.slice(0, first))}
       ${rows.slice(first, last).map((row, at) => html`<tr key=${keyOf(row)} data-row
         aria-rowindex=${first + at + 2} class=${rowClass?.(row) ?? ''}>
         ${columns.map((column) => (column.header
           ? html`<th scope="row" class=${column.kind ?? ''}>${column.cell(row)}</th>`
           : html`<td class=${column.kind ?? ''}>${column.cell(row)}</td>`))}</tr>`)}
-      ${space(rows.length - last)}
+      ${space(rows.slice(last))}
     </tbody></table></div>`;
 }

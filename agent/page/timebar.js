@@ -11,9 +11,9 @@ export function TimeBar() {
   const { part, finished } = state.replay;
   const elapsed = Math.max(0, state.time - begin);
   const done = finished ? 1 : part;
-  return html`<div class="timebar">
+  return html`<section class="timebar" aria-label="Time of the replay">
     <label>Replay
       <progress max="1" value=${done ?? undefined}></progress></label>
     <span>${date(state.time)}, ${duration(elapsed)} after the begin${
-      finished ? ', finished' : done == null ? '' : `, ${percent(done)} read`}</span></div>`;
+      finished ? ', finished' : done == null ? '' : `, ${percent(done)} read`}</span></section>`;
 }

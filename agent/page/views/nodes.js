@@ -88,8 +88,8 @@ export function Nodes({ query }) {
     && matches(filter, `${node.name} ${where(node)} ${participant(node)?.host ?? ''}`));
   const columns = [
     { key: 'name', title: 'Node', header: true, by: (/** @type {any} */ node) => node.name,
-      cell: (/** @type {any} */ node) => html`<${NodeLink} node=${node} />${
-        node.participants.length > 1 ? html` <span class="badge error"><${Mark} severity="error" />
+      cell: (/** @type {any} */ node) => html`<${NodeLink} node=${node} most=${100} />${
+        node.participants.length > 1 ? html` <span class="badge error"><${Mark} severity="error" />${' '}
           ${node.participants.length} of this name</span>` : ''}${worstOf(node) === 'error'
         && node.participants.length < 2 ? html` <${Mark} severity="error" />` : ''}` },
     ...(state.hasDomains() ? [{ key: 'domain', title: 'Domain', kind: 'number wide',

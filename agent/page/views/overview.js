@@ -31,7 +31,9 @@ export function Overview() {
           <${Mark} severity="note" /> <span><${Name} text=${finding.text} />
           ${finding.remedy && html`<br /><span class="dim">Remedy: <${Name} text=${finding.remedy}
             /></span>`}</span></li>`)}</ul>`
-        : html`<p>Everything the agent can look at is open to it.
+        : html`<p>${state.open?.source === 'replay'
+          ? 'This is a capture. It holds what passed the interface it was taken on: nothing of sockets, processes and shared memory.'
+          : 'Everything the agent can look at is open to it.'}${' '}
           <a href=${address('agent')}>Abilities and limits</a></p>`}
     </section>`;
 }
@@ -66,7 +68,7 @@ function Totals() {
   return html`<section aria-labelledby="totals"><h2 id="totals">Now</h2><div class="figures">
     <${Figure} label="messages a second" value=${rate(messages).replace('Hz', '/s')} points=${rates} />
     <${Figure} label="bytes a second" value=${bandwidth(bytes)} points=${sizes} />
-    <${Figure} label="lost in the last second" value=${count(lost)} points=${losses} />
+    <${Figure} label="lost a second" value=${count(lost)} points=${losses} />
     <${Figure} label="nodes" value=${count(nodes.length)} href=${address('nodes')} />
     <${Figure} label="topics" value=${count(shown.length)} href=${address('topics')} />
     <${Figure} label="topics measured" value=${count(measured)}

@@ -22,7 +22,7 @@ export function Recordings() {
   const again = () => recordings.refresh();
   return html`<h1 tabindex="-1">Recordings</h1>
     <${Failed} problem=${recordings.problem} what="No recordings" />
-    ${data && !data.directory && html`<p><${Mark} severity="note" /> The agent records nothing:
+    ${data && !data.directory && html`<p><${Mark} severity="note" /> The agent records nothing:${' '}
       <code>recordings.directory</code> is not set in its configuration.</p>`}
     ${data?.directory && html`<${Start} again=${again} />`}
     ${data && (data.recordings.length

@@ -27,7 +27,7 @@ export function Topic({ name, query }) {
   const details = usePoll(topic ? named('topics', apiName(topic), scope) : null, 2000);
   if (!topic) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
-      <p>No such topic now. It may have had no endpoint since the agent started.
+      <p>No such topic now. It may have had no endpoint since the agent started.${' '}
       <a href=${address('topics')}>All topics</a></p>`;
   }
   const figures = state.figuresOf(topic.id);
@@ -128,7 +128,7 @@ function Charts({ topic, scope }) {
       { label: 'p50', colour: '--line-1', values: half },
       { label: 'p99', colour: '--line-3', values: most }]}
       note="From the writer’s timestamp to the capture; between hosts it needs equal clocks" />
-    <${Chart} title="Lost messages" times=${own} print=${count}
+    <${Chart} title="Lost messages" times=${own} print=${count} whole
       lines=${[{ label: 'lost', colour: '--line-4', values: lost, fill: true }]} />
     </div></section>`;
 }
@@ -152,7 +152,7 @@ const STATIONS = /** @type {[string, string][]} */ ([
   ['lost_before_host_messages', 'before this host'],
   ['lost_in_reassembly_messages', 'in IP reassembly'],
   ['lost_in_socket_buffer_messages', 'in the socket buffer'],
-  ['pending_messages', 'place not known yet'],
+  ['pending_messages', 'at a place not known yet'],
 ]);
 
 /** Sent, what died at each station, delivered: for each subscriber. @param {{details: any}} props */

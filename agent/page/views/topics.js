@@ -67,13 +67,13 @@ export function Topics({ query }) {
   };
   const columns = [
     { key: 'name', title: 'Topic', header: true, by: (/** @type {any} */ topic) => topic.name,
-      cell: (/** @type {any} */ topic) => html`<${TopicLink} topic=${topic} />` },
+      cell: (/** @type {any} */ topic) => html`<${TopicLink} topic=${topic} most=${100} />` },
     ...(domains ? [{ key: 'domain', title: 'Domain', kind: 'number wide',
       by: (/** @type {any} */ topic) => topic.domain,
       cell: (/** @type {any} */ topic) => topic.domain }] : []),
     { key: 'type', title: 'Type', kind: 'wide type',
       by: (/** @type {any} */ topic) => topic.types.join(),
-      cell: (/** @type {any} */ topic) => html`<${Name} text=${topic.types.join(', ')} />` },
+      cell: (/** @type {any} */ topic) => html`<${Name} text=${topic.types.join(', ')} most=${80} />` },
     { key: 'state', title: 'State',
       by: (/** @type {any} */ topic) => SEVERITY[worst(state.flagsOf(topic.id))],
       cell: (/** @type {any} */ topic) => html`<${Badges} flags=${state.flagsOf(topic.id)} />` },
