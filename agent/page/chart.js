@@ -109,7 +109,10 @@ export function Chart({ title, times, lines, print, note, whole }) {
     if (!own) return;
     own.setData(data);
     // Without a cursor the legend shows the latest values.
-    if (own.cursor.idx == null) own.setLegend({ idx: times.length - 1 });
+    if (own.cursor.idx != null) return;
+    let latest = times.length - 1;
+    while (latest > 0 && lines.every((line) => line.values[latest] == null)) latest -= 1;
+    own.setLegend({ idx: latest });
   });
   const move = (/** @type {KeyboardEvent} */ event) => {
     const by = { ArrowLeft: -1, ArrowRight: 1, PageUp: -60, PageDown: 60 }[event.key];

@@ -18,7 +18,14 @@ function Dialog({ title, close, children }) {
   const outside = (/** @type {MouseEvent} */ event) => {
     if (event.target === own.current) close();
   };
-  return html`<dialog ref=${own} onClose=${close} onClick=${outside} aria-label=${title}>
+  // A field for a search takes the first Escape for itself otherwise.
+  const leave = (/** @type {KeyboardEvent} */ event) => {
+    if (event.key !== 'Escape') return;
+    event.preventDefault();
+    close();
+  };
+  return html`<dialog ref=${own} onClose=${close} onClick=${outside}
+    onKeyDown=${leave} aria-label=${title}>
     <div class="dialog"><div class="title"><h2>${title}</h2>
       <button type="button" onClick=${close} aria-label="Close">✕</button></div>
       ${children}</div></dialog>`;

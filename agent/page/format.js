@@ -84,6 +84,16 @@ export function duration(seconds) {
 }
 
 /**
+ * How long something has lasted, in whole seconds: "3 s", "2 min 5 s".
+ * @param {number|null|undefined} seconds
+ */
+export function age(seconds) {
+  if (seconds == null || !Number.isFinite(seconds)) return NOTHING;
+  const whole = Math.max(0, Math.round(seconds));
+  return whole < 60 ? `${whole} s` : duration(whole);
+}
+
+/**
  * A part of one as a percentage. A loss above zero never prints as zero.
  * @param {number|null|undefined} part
  */

@@ -26,6 +26,10 @@ const HUBS = new Set(['rosout', 'parameter_events', 'tf', 'tf_static', 'clock', 
  *   `folded` counts the hubs left out; `nodes` those shown before boxes were closed.
  */
 
+// Every node serves these.
+const PARAMETERS = new Set(['describe_parameters', 'get_parameter_types', 'get_parameters',
+  'list_parameters', 'set_parameters', 'set_parameters_atomically', 'get_type_description']);
+
 /** @param {string} name */
 export function isHub(name) {
   return HUBS.has(name.slice(name.lastIndexOf('/') + 1));
@@ -152,6 +156,10 @@ function gather(state, options, joints) {
   }
   for (const joint of joints?.nodes ?? []) {
     if (joint.kind !== 'service' && joint.kind !== 'action') continue;
+    if (!options.hubs && PARAMETERS.has(joint.name.slice(joint.name.lastIndexOf('/') + 1))) {
+      folded += 1;
+      continue;
+    }
     vertices.set(joint.id, vertex(joint.id, joint.kind, joint.name));
   }
   for (const edge of joints?.edges ?? []) {
@@ -443,13 +451,17 @@ function textWidth(text) {
   return units * 6.7;
 }
 
+/** The longest figures of a topic. */
+const FIGURES = '99.9 kHz · 99.9 MB/s';
+
 /** Characters of a name in the graph. */
 export const MOST_LABEL = 32;
 
 /** @param {Vertex} own */
 function measure(own) {
   const label = shortened(own.name, MOST_LABEL);
-  const detail = shortened(own.detail, MOST_LABEL);
+  // Figures come and go without another layout: there is room for them from the start.
+  const detail = own.kind === 'topic' ? FIGURES : shortened(own.detail, MOST_LABEL);
   own.w = Math.max(96, Math.ceil(Math.max(textWidth(label), textWidth(detail)) + 34));
   own.h = own.kind === 'topic' || own.detail || own.closed ? 40 : 28;
   if (own.kind === 'box' && !own.closed) own.h = 0;

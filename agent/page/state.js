@@ -116,7 +116,9 @@ export class State {
   takeGraph(graph) {
     this.structure += 1;
     this.participants = new Map(graph.participants.map((/** @type {any[]} */ row) => {
-      const [id, guid, domain, vendor, host, pid, process, cgroup] = row;
+      const [id, guid, domain, vendor, announced, pid, process, cgroup] = row;
+      // Control groups are known of this host's processes only.
+      const host = announced ?? (cgroup == null ? null : this.open?.host ?? null);
       return [id, { id, guid, domain, vendor, host, pid, process, cgroup }];
     }));
     this.nodes = new Map(graph.nodes.map((/** @type {any[]} */ row) => {

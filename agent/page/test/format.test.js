@@ -71,3 +71,10 @@ test('long names keep both ends and never split a character', () => {
   assert.equal(format.shortened('/short', 21), '/short');
   assert.equal(format.shortened('/short', 1), '…');
 });
+
+test('an age is in whole seconds', () => {
+  for (const [seconds, text] of [[0.2, '0 s'], [3.16, '3 s'], [-1, '0 s'], [59.6, '1 min'],
+    [125, '2 min 5 s'], [null, '–']]) {
+    assert.equal(format.age(seconds), text);
+  }
+});

@@ -139,6 +139,17 @@ test('services join nodes that are shown', () => {
   assert.equal(graph.edges.length, 1);
 });
 
+test('the parameter services of every node are folded like hubs', () => {
+  const joints = {
+    nodes: [{ id: 'service:0:/a/get_parameters', kind: 'service', name: '/a/get_parameters' }],
+    edges: [],
+  };
+  const folded = build(robot(['/a'], []), ALL, joints);
+  assert.deepEqual([names(folded), folded.folded], [['/a'], 1]);
+  const shown = build(robot(['/a'], []), { ...ALL, hubs: true }, joints);
+  assert.deepEqual(names(shown), ['/a', '/a/get_parameters']);
+});
+
 test('figures leave the signature alone, another endpoint changes it', () => {
   const state = CHAIN();
   const before = build(state, ALL).signature;

@@ -1,6 +1,6 @@
 // What is wrong, since when, and what to do; then totals; then what the agent cannot see.
 
-import { bandwidth, clock, count, duration, percent, rate, several } from '../format.js';
+import { age, bandwidth, clock, count, percent, rate, several } from '../format.js';
 import { address, nodeAddress, topicAddress } from '../router.js';
 import { state, useLive } from '../store.js';
 import { Figure, html, Mark, Name, TopicLink, worst, Badges } from '../ui.js';
@@ -40,15 +40,39 @@ export function Overview() {
 
 /** @param {{list: import('../state.js').Finding[]}} props */
 export function Findings({ list }) {
-  return html`<ul class="findings">${list.slice(0, MOST_SHOWN).map((finding) => html`
+  const [firsts, more] = grouped(list);
+  return html`<ul class="findings">${firsts.slice(0, MOST_SHOWN).map((finding) => html`
     <li key=${finding.id} class=${finding.severity}><${Mark} severity=${finding.severity} />
       <span><${Place} finding=${finding} /> <${Name} text=${finding.text} />
-      ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${duration(Math.max(0, state.time - finding.since))})</span>`}
+      ${more.has(finding) && html` <span class="dim">and ${several(more.get(finding) ?? 0, 'other')}
+        of this topic</span>`}
+      ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${age(state.time - finding.since)})</span>`}
       ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Name} text=${finding.remedy}
         /></span>`}</span></li>`)}</ul>
-    ${list.length > MOST_SHOWN && html`<p class="dim">${count(list.length - MOST_SHOWN)} more.
+    ${firsts.length > MOST_SHOWN && html`<p class="dim">${count(firsts.length - MOST_SHOWN)} more.
       The <a href=${address('topics', null, { sort: 'state' })}>table of topics</a> has them
       all.</p>`}`;
+}
+
+/**
+ * Endpoints of a topic that have no counterpart as one finding: all nodes may listen to `/clock`.
+ * @param {import('../state.js').Finding[]} list
+ * @returns {[import('../state.js').Finding[], Map<import('../state.js').Finding, number>]} the first
+ *   of each topic, and how many follow it
+ */
+export function grouped(list) {
+  /** @type {Map<string, import('../state.js').Finding>} */
+  const seen = new Map();
+  const more = new Map();
+  const firsts = list.filter((finding) => {
+    if (finding.topic == null || !/^un(fed|heard)_/.test(finding.kind)) return true;
+    const key = `${finding.kind} ${finding.topic}`;
+    const first = seen.get(key);
+    if (first) more.set(first, (more.get(first) ?? 0) + 1);
+    else seen.set(key, finding);
+    return !first;
+  });
+  return [firsts, more];
 }
 
 /** The link to what a finding is about. @param {{finding: import('../state.js').Finding}} props */
@@ -83,7 +107,8 @@ function Busiest() {
     .sort((one, other) => Number(other.figures.bandwidth) - Number(one.figures.bandwidth))
     .slice(0, 8);
   if (!rows.length) return null;
-  const total = state.totals.bandwidth || 1;
+  const all = [...state.figures.keys()].map((id) => state.figuresOf(id).bandwidth ?? 0);
+  const total = all.reduce((sum, each) => sum + each, 0) || 1;
   return html`<section aria-labelledby="busiest"><h2 id="busiest">Busiest topics</h2>
     <div class="scroll" tabindex="0" role="group" aria-labelledby="busiest"><table>
     <thead><tr><th scope="col">Topic</th><th scope="col" class="number">Bandwidth</th>
