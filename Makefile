@@ -18,7 +18,8 @@ MIRI_AGENT := capture::ring::block capture::ring::turns capture::shm::cell captu
     capture::shm::segment capture::shm::inbox
 MIRI_THREADS := capture::ring::turns
 
-export PATH := $(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
+# Node of target/tools is there only where the system's is too old for the page's tests.
+export PATH := $(TARGET)/tools/node/bin:$(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
 # Comes with Rust and links for both architectures: no cross toolchain.
 export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_MUSL_LINKER := rust-lld
 # The tests make network namespaces: build as the user, run the tests as root.
@@ -39,6 +40,7 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	cargo fmt --all --check
 	cargo clippy --workspace --all-targets -- -D warnings
 	NIGHTLY=$$(.ci/prerequisites.sh --nightly) agent-ebpf/build.sh --check
+	@$(MAKE) --no-print-directory page
 	@$(MAKE) --no-print-directory peers
 	@$(MAKE) --no-print-directory arm
 	cargo build --workspace --bins --examples
@@ -58,6 +60,23 @@ ebpf: ## rebuild the kernel filter's committed object
 run: ## run the agent on this machine with the default configuration (needs root)
 	cargo build --release --package ros2probe --bin rp
 	$(SUDO) $(TARGET)/release/rp run --config config/ros2probe.yaml
+
+page: ## unit tests of the page, its types, and its libraries compared with what npm publishes
+	@.ci/prerequisites.sh types page
+	node --test --test-reporter dot agent/page/test/
+	agent/page/test/types
+	agent/page/vendor/check
+
+page-bench: ## first paint, layout, memory and cost of the page; MEASURE_MINUTES=N (10)
+	@.ci/prerequisites.sh page
+	cargo build --release --package ros2probe --bin rp
+	MEASURE_MINUTES=$(or $(MEASURE_MINUTES),10) cargo test --release --package ros2probe \
+	    --test browser -- --ignored --exact measurements --nocapture
+
+screenshots: ## the pictures of README and docs, from the demo, in target/screenshots (needs root)
+	@.ci/prerequisites.sh demo page
+	cargo build --package ros2probe --bin rp --example robot --example demo
+	$(SUDO) env PATH=$(PATH) node agent/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
 
 peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
 	@$(MAKE) --no-print-directory -C agent/tests/peers OUT=$(TARGET)/peers
@@ -113,4 +132,4 @@ deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-ros2 ebpf run peers arm dist distcheck bench soak fuzz miri deny prerequisites
+.PHONY: help demo test test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri deny prerequisites

@@ -1,0 +1,126 @@
+// Every view for everybody: axe finds nothing in either theme, nothing scrolls sideways at 360 px
+// and at 400 % zoom, and everything is reached by keys.
+
+import assert from 'node:assert/strict';
+import { scenario, until } from './tab.mjs';
+
+/** Address, and what is there once the view is drawn. */
+const VIEWS = [
+  ['', '.figures'],
+  ['#/topics', 'main tbody tr[data-row]'],
+  ['#/topics/%2Fpoints?domain=0', '.plot canvas'],
+  ['#/graph', '.vertex'],
+  ['#/graph?services=1&actions=1&boxes=process', '.vertex.service'],
+  ['#/graph?mode=nodes&hubs=1', '.vertex'],
+  ['#/nodes', 'main tbody tr[data-row]'],
+  ['#/nodes/%2Flidar?domain=0', 'main ul.plain'],
+  ['#/events', 'main tbody tr'],
+  ['#/recordings', 'form'],
+  ['#/agent', 'section[aria-labelledby="limits"] tbody tr'],
+  ['#/nowhere', 'main p'],
+];
+
+/** Opens what a view unfolds on request, so that it is looked at as well. */
+async function unfold(tab) {
+  for (const summary of await tab.page.locator('details:not([open]) > summary').all()) {
+    await summary.click();
+  }
+  const definition = tab.page.locator('section[aria-labelledby="definition"] button');
+  if (await definition.count()) {
+    await definition.click();
+    await tab.page.locator('section[aria-labelledby="definition"] pre').waitFor();
+    await tab.page.getByRole('button', { name: 'Show messages' }).click();
+    await tab.page.locator('.tree').waitFor();
+    await tab.page.locator('.chart').first().getByRole('button', { name: 'Table' }).click();
+  }
+  const vertex = tab.page.locator('.vertex.topic').first();
+  if (await vertex.count()) await vertex.focus();
+}
+
+async function dialogs(tab, what) {
+  await tab.go('');
+  await tab.page.keyboard.press('/');
+  await tab.page.keyboard.type('i');
+  await until('results', async () => (await tab.page.locator('.results li').count()) > 0);
+  await tab.accessible(`${what}: search`);
+  await tab.narrow(`${what}: search`);
+  await tab.page.keyboard.press('Escape');
+  await tab.page.keyboard.press('?');
+  await tab.page.getByRole('dialog', { name: 'Keys' }).waitFor();
+  await tab.accessible(`${what}: keys`);
+  await tab.page.keyboard.press('Escape');
+  await tab.page.evaluate(() => window.dispatchEvent(new CustomEvent('ask-token')));
+  await tab.page.getByRole('dialog', { name: 'Token' }).waitFor();
+  await tab.accessible(`${what}: token`);
+  await tab.narrow(`${what}: token`);
+  await tab.page.keyboard.press('Escape');
+}
+
+/** From the begin of the page by the Tab key alone, to the first row of the table of topics. */
+async function byKeyboard(tab) {
+  await tab.go('#/topics');
+  await tab.page.locator('main tbody tr[data-row]').first().waitFor();
+  await tab.page.keyboard.press('Tab');
+  assert.equal(await tab.page.evaluate(() => document.activeElement.textContent), 'Skip to the content');
+  await tab.page.keyboard.press('Enter');
+  const seen = [];
+  for (let step = 0; step < 40; step += 1) {
+    await tab.page.keyboard.press('Tab');
+    const [tag, inRow, outline] = await tab.page.evaluate(() => [document.activeElement.tagName,
+      Boolean(document.activeElement.closest('tr[data-row]')),
+      getComputedStyle(document.activeElement).outlineStyle]);
+    seen.push(tag);
+    assert.notEqual(outline, 'none', `the focus is visible at step ${step}: ${tag}`);
+    if (inRow) break;
+  }
+  const first = await tab.page.evaluate(() => document.activeElement.textContent);
+  await tab.page.keyboard.press('ArrowDown');
+  const second = await tab.page.evaluate(() => document.activeElement.textContent);
+  assert.ok(first.startsWith('/') && second.startsWith('/') && first !== second,
+    `${seen}: ${first}, ${second}`);
+  await tab.page.keyboard.press('Enter');
+  await tab.heading(second.trim());
+}
+
+await scenario(async (open) => {
+  for (const theme of ['light', 'dark']) {
+    const tab = await open({ theme });
+    await tab.live();
+    const paper = await tab.page.evaluate(() => getComputedStyle(document.body.parentElement)
+      .backgroundColor);
+    const light = paper.match(/\d+/g).every((part) => Number(part) > 128);
+    assert.equal(light, theme === 'light', `${theme}: ${paper}`);
+    for (const [fragment, ready] of VIEWS) {
+      await tab.go(fragment);
+      await tab.page.locator(ready).first().waitFor();
+      await unfold(tab);
+      await tab.accessible(`${theme} ${fragment}`);
+    }
+    await dialogs(tab, theme);
+    await tab.page.close();
+  }
+  // 360 px wide; then 1280 px at 400 %, which is 320 px of CSS.
+  for (const [width, height, scale] of [[360, 740, 3], [320, 256, 4]]) {
+    const tab = await open({ width, height, scale });
+    await tab.live();
+    for (const [fragment, ready] of VIEWS) {
+      await tab.go(fragment);
+      await tab.page.locator(ready).first().waitFor({ state: 'attached' });
+      await unfold(tab);
+      await tab.narrow(`${width} px ${fragment}`);
+      await tab.accessible(`${width} px ${fragment}`);
+    }
+    await dialogs(tab, `${width} px`);
+    await tab.page.close();
+  }
+  await byKeyboard(await open());
+  // The choice of a theme stays, whatever the system prefers.
+  const tab = await open({ theme: 'light' });
+  await tab.live();
+  await tab.page.getByRole('button', { name: /^Theme: auto/ }).click();
+  await tab.page.getByRole('button', { name: /^Theme: light/ }).click();
+  await tab.page.reload();
+  await tab.live();
+  assert.equal(await tab.page.evaluate(() => document.documentElement.dataset.theme), 'dark');
+  await tab.accessible('dark by choice');
+});

@@ -1,0 +1,62 @@
+// A tab nobody looks at: frozen for a minute by the browser, and hidden. It costs the agent nothing
+// while hidden, and shows the state of now when it is looked at again.
+
+import assert from 'node:assert/strict';
+import { ask, scenario, until } from './tab.mjs';
+
+const MINUTE_MS = 60_000;
+
+/** Lets the test hide the tab: the browser without a window has no tabs to change between. */
+function hideable() {
+  let state = 'visible';
+  Object.defineProperty(Document.prototype, 'visibilityState', { get: () => state });
+  Object.defineProperty(Document.prototype, 'hidden', { get: () => state === 'hidden' });
+  globalThis.becomeVisible = (visible) => {
+    state = visible ? 'visible' : 'hidden';
+    document.dispatchEvent(new Event('visibilitychange'));
+  };
+}
+
+await scenario(async (open) => {
+  const tab = await open({ fragment: '#/topics', init: hideable });
+  await tab.live();
+  const row = (name) => tab.page.locator('main tbody tr[data-row]', { hasText: name });
+  await until('figures', async () => /Hz/.test(await row('/imu').innerText()));
+
+  const session = await tab.page.context().newCDPSession(tab.page);
+  await session.send('Page.setWebLifecycleState', { state: 'frozen' });
+  await new Promise((wake) => setTimeout(wake, MINUTE_MS / 2));
+  await ask('another topic');
+  await new Promise((wake) => setTimeout(wake, MINUTE_MS / 2));
+  await session.send('Page.setWebLifecycleState', { state: 'active' });
+  await row('/while_asleep').waitFor();
+  await tab.live();
+  // The figures are of now: the time of the last message moves on with the clock.
+  await tab.page.getByRole('link', { name: '/imu', exact: true }).click();
+  await until('a message of now', async () => {
+    const text = await tab.page.locator('.figure', { hasText: 'last message' })
+      .locator('.value').innerText();
+    const now = await tab.page.evaluate(() => {
+      const date = new Date();
+      return date.getHours() * 3600 + date.getMinutes() * 60 + date.getSeconds();
+    });
+    const [hours, minutes, seconds] = text.split(':').map(Number);
+    return Math.abs(now - (hours * 3600 + minutes * 60 + seconds)) <= 3;
+  });
+
+  // Hidden: after ten seconds the agent has one stream less to compute.
+  assert.equal((await ask('streams')).live, 1);
+  await tab.page.evaluate(() => globalThis.becomeVisible(false));
+  await until('the stream is closed', async () => (await ask('streams')).live === 0);
+  await tab.page.evaluate(() => globalThis.becomeVisible(true));
+  await tab.live();
+  assert.equal((await ask('streams')).live, 1);
+  // A short look elsewhere keeps it.
+  const opened = () => tab.requests.filter((request) => request.url().endsWith('/live')).length;
+  const before = opened();
+  await tab.page.evaluate(() => globalThis.becomeVisible(false));
+  await new Promise((wake) => setTimeout(wake, 2000));
+  await tab.page.evaluate(() => globalThis.becomeVisible(true));
+  await tab.live();
+  assert.equal(opened(), before);
+});

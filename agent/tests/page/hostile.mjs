@@ -1,0 +1,130 @@
+// 500 topics with names that mean harm: markup, quotes, marks that turn text around, 256 bytes of
+// junk. They stay text, every one is listed and found by its own address, and the page stays usable.
+// Arguments: address, number of topics.
+
+import assert from 'node:assert/strict';
+import { scenario, until } from './tab.mjs';
+
+const TOPICS = Number(process.argv[3]);
+/** Nothing that prints nothing or turns its neighbours around is in the document. */
+const UNSEEN = /[\u0000-\u0008\u000b-\u001f\u007f-\u009f\u00ad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffc]/;
+
+/** What in the document is not as it must be. */
+function looked(pattern) {
+  const unseen = new RegExp(pattern);
+  const wrong = [];
+  for (const each of document.querySelectorAll('body *')) {
+    if (/^(script|iframe|img|object|embed|style|base|meta|link|form.+)$/i.test(each.tagName)) {
+      wrong.push(`element ${each.outerHTML.slice(0, 200)}`);
+    }
+    for (const { name, value } of each.attributes) {
+      if (/^on/i.test(name)) wrong.push(`attribute ${name} of ${each.tagName}`);
+      if (/^(href|src|action|xlink:href)$/i.test(name) && !value.startsWith('#')
+        && !value.startsWith('blob:')) wrong.push(`${name}=${value.slice(0, 100)}`);
+      // A key of the page's own is on no screen and read by no one.
+      if (name !== 'data-key' && unseen.test(value)) wrong.push(`unseen in ${name} of ${each.tagName}: ${
+        encodeURIComponent(value.slice(0, 60))}`);
+    }
+  }
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (walk.nextNode()) {
+    const text = walk.currentNode.textContent;
+    if (unseen.test(text)) wrong.push(`unseen text ${encodeURIComponent(text.slice(0, 80))}`);
+  }
+  if (globalThis.harmed) wrong.push('code of a name ran');
+  if (Object.prototype.polluted !== undefined) wrong.push('a prototype was changed');
+  return wrong.slice(0, 10);
+}
+
+await scenario(async (open) => {
+  // Names that begin with an underscore are hidden at first.
+  const tab = await open({ fragment: '#/topics?hidden=1' });
+  await tab.live();
+  const harmless = async (what) => assert.deepEqual(
+    await tab.page.evaluate(looked, UNSEEN.source), [], what);
+  await tab.page.locator('main tbody tr[data-row]').first().waitFor();
+  await harmless('topics');
+
+  // All of them, row by row as one scrolls, though few are in the document at a time.
+  const links = new Map();
+  let most = 0;
+  await until('every topic', async () => {
+    const rows = await tab.page.locator('main tbody tr[data-row]').evaluateAll((all) => all.map(
+      (row) => [row.querySelector('a')?.getAttribute('href'), row.querySelector('a')?.textContent]));
+    most = Math.max(most, rows.length);
+    for (const [href, text] of rows) links.set(href, text);
+    await tab.page.mouse.wheel(0, 700);
+    return links.size >= TOPICS;
+  }, 60_000);
+  assert.equal(links.size, TOPICS);
+  assert.ok(most < 120, `${most} rows in the document`);
+  await harmless('topics at the end');
+  const texts = [...links.values()];
+  assert.equal(new Set(texts).size, TOPICS, 'no two names look alike');
+  for (const part of ['<img src=x onerror=', '><script>', '\\u{200f}', '__proto__', 'javascript:',
+    '\\u{200b}', '&quot; onmouseover=', '&lt;b&gt;', '\\u{61c}']) {
+    assert.ok(texts.some((text) => text.includes(part)), `a name with ${part}`);
+  }
+  assert.ok(!texts.some((text) => text.includes('refused')), 'the agent takes no quotes and controls');
+  await tab.page.evaluate(() => scrollTo(0, 0));
+  await tab.narrow('topics');
+
+  // One of each kind, opened by its own link: the address leads to that very topic.
+  const kinds = [...links].slice(0, 40);
+  for (const [href, text] of kinds) {
+    await tab.page.goto(`${tab.address}${href}`);
+    await tab.live();
+    // A long name is cut in the middle of the table's cell and whole in the heading.
+    const [begin, end] = text.split('…');
+    await until(`the view of ${text}`, async () => {
+      const heading = await tab.page.locator('main h1').textContent();
+      return end == null ? heading === text : heading.startsWith(begin) && heading.endsWith(end);
+    });
+    await until('details', async () => (await tab.page.locator('section[aria-labelledby="qos"]').count()) > 0);
+    await harmless(text);
+  }
+  await tab.accessible('a topic of a hostile name');
+
+  await tab.go('#/');
+  await harmless('overview');
+  await tab.go('#/nodes?hidden=1');
+  await tab.page.locator('main tbody tr[data-row]').first().waitFor();
+  await harmless('nodes');
+  await tab.accessible('nodes of hostile names');
+  const node = tab.page.locator('main tbody tr[data-row] a').first();
+  const nodeName = await node.textContent();
+  await node.click();
+  await until('the view of the node', async () =>
+    (await tab.page.locator('main h1').textContent()) === nodeName);
+  await tab.shows('Publishers (');
+  await harmless('a node');
+  await tab.go('#/events');
+  await tab.page.locator('main tbody tr').first().waitFor();
+  await harmless('events');
+
+  // The graph of them all: laid out in the worker while the page answers.
+  await tab.go('#/graph?boxes=none&hidden=1');
+  await until('the layout', async () => /laid out in \d+ ms/.test(await tab.text()), 60_000);
+  await harmless('graph');
+  const shown = await tab.page.locator('.vertex').count();
+  assert.ok(shown >= TOPICS, `${shown} vertices`);
+  const words = /laid out in (\d+) ms/.exec(await tab.text());
+  console.log(`${shown} vertices: ${words[0]}`);
+  await tab.page.keyboard.press('/');
+  await tab.page.getByRole('dialog', { name: 'Search' }).waitFor();
+  await tab.page.keyboard.type('<img');
+  await until('results', async () => (await tab.page.locator('.results li').count()) > 1);
+  await harmless('search');
+  await tab.page.keyboard.press('Escape');
+
+  const phone = await open({ fragment: '#/topics', width: 360, height: 740 });
+  await phone.live();
+  await phone.page.locator('main tbody tr[data-row]').first().waitFor();
+  await phone.narrow('topics of hostile names on a phone');
+  for (const [href] of kinds.slice(0, 12)) {
+    await phone.page.goto(`${phone.address}${href}`);
+    await phone.live();
+    await phone.page.locator('section[aria-labelledby="qos"]').waitFor();
+    await phone.narrow(href);
+  }
+});

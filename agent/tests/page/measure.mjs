@@ -1,0 +1,141 @@
+// Measures the page: first useful paint with 500 topics, layout of large graphs in the worker, memory
+// of a tab over minutes of stream, and what tabs cost the agent. Prints the figures; fails where one
+// is over its budget. Arguments: address, address of the agent's metrics.
+// MEASURE_MINUTES is how long the memory is watched (2).
+
+import assert from 'node:assert/strict';
+import { robot } from '../../page/test/robot.js';
+import { ADDRESS, scenario, until } from './tab.mjs';
+
+const METRICS = process.argv[3];
+const MINUTES = Number(process.env.MEASURE_MINUTES ?? 2);
+const PAINT_MS = 1000;
+/** Budgets of layouts: nodes, topics, milliseconds. */
+const LAYOUTS = [[100, 300, 1000], [200, 600, 3000]];
+/** A tab whose memory grows by less than this over the second half of its time is level. */
+const GROWTH_BYTES = 3_000_000;
+
+const sleep = (ms) => new Promise((wake) => setTimeout(wake, ms));
+const median = (all) => all.toSorted((one, other) => one - other)[Math.floor(all.length / 2)];
+
+/** Notes when the first row of a table, or the first finding or figure, is in the document. */
+function mark() {
+  const seen = () => {
+    if (globalThis.usefulAt || !document.querySelector('main tbody tr[data-row], main .figures')) return;
+    // Painted with the next frame.
+    requestAnimationFrame(() => setTimeout(() => { globalThis.usefulAt ??= performance.now(); }));
+  };
+  new MutationObserver(seen).observe(document, { childList: true, subtree: true });
+}
+
+async function paint(browser) {
+  for (const [view, fragment] of [['overview', ''], ['topics', '#/topics']]) {
+    const times = [];
+    for (let run = 0; run < 5; run += 1) {
+      const context = await browser.newContext({ viewport: { width: 1280, height: 800 } });
+      const page = await context.newPage();
+      await page.addInitScript(mark);
+      await page.goto(`${ADDRESS}${fragment}`);
+      times.push(await until('a useful page', () => page.evaluate(() => globalThis.usefulAt)));
+      await context.close();
+    }
+    console.log(`first useful paint, ${view} with 500 topics: ${median(times).toFixed(0)} ms (${times
+      .map((time) => time.toFixed(0)).join(', ')})`);
+    assert.ok(median(times) < PAINT_MS, `${view}: ${times}`);
+  }
+}
+
+async function layouts(open) {
+  const tab = await open();
+  await tab.live();
+  for (const [nodes, topics, budget] of LAYOUTS) {
+    const { vertices, edges } = robot(nodes, topics);
+    const times = [];
+    for (let run = 0; run < 3; run += 1) {
+      times.push(await tab.page.evaluate(([own, joined]) => new Promise((take, fail) => {
+        const worker = new Worker(new URL('page/layout-worker.js', document.baseURI), { type: 'module' });
+        worker.onerror = () => fail(new Error('the worker failed'));
+        worker.onmessage = ({ data }) => {
+          worker.terminate();
+          take(data.milliseconds);
+        };
+        worker.postMessage({ number: 1, vertices: own, edges: joined, options: {} });
+      }), [vertices, edges]));
+    }
+    console.log(`layout of ${nodes} nodes and ${topics} topics in the worker: ${
+      median(times).toFixed(0)} ms (${times.map((time) => time.toFixed(0)).join(', ')})`);
+    assert.ok(median(times) < budget, `${nodes}/${topics}: ${times}`);
+  }
+  await tab.page.close();
+}
+
+async function memory(open) {
+  const tab = await open({ fragment: '#/topics' });
+  await tab.live();
+  const session = await tab.page.context().newCDPSession(tab.page);
+  await session.send('Performance.enable');
+  const heap = async () => {
+    await session.send('HeapProfiler.collectGarbage');
+    const { metrics } = await session.send('Performance.getMetrics');
+    return metrics.find(({ name }) => name === 'JSHeapUsedSize').value;
+  };
+  const samples = [];
+  const steps = 12;
+  // Ten minutes of the page's own history fill within the first of them at most.
+  for (let step = 0; step <= steps; step += 1) {
+    samples.push(await heap());
+    // One looks around as well: every view is opened and left.
+    for (const view of ['#/', '#/graph', '#/nodes', '#/events', '#/topics']) {
+      await tab.page.evaluate((to) => { location.hash = to; }, view);
+      await sleep(300);
+    }
+    await sleep(Math.max(0, (MINUTES * 60_000) / steps - 1500));
+  }
+  const megabytes = samples.map((each) => (each / 1e6).toFixed(1));
+  console.log(`heap of a tab over ${MINUTES} min with 500 topics: ${megabytes.join(', ')} MB`);
+  const half = samples.slice(samples.length / 2);
+  const grown = median(half.slice(-3)) - median(half.slice(0, 3));
+  console.log(`grown in the second half: ${(grown / 1e6).toFixed(2)} MB`);
+  assert.ok(grown < GROWTH_BYTES, `${megabytes}`);
+  await tab.page.close();
+}
+
+/** CPU seconds and memory of the agent. */
+async function agent() {
+  const text = await (await fetch(METRICS)).text();
+  const value = (name) => Number(new RegExp(`^${name} (.+)$`, 'm').exec(text)?.[1]);
+  return { cpu: value('process_cpu_seconds_total'), bytes: value('process_unreclaimable_memory_bytes') };
+}
+
+/** What so many open streams cost the agent, without a browser that takes the same cores. */
+async function tabs() {
+  for (const number of [0, 1, 10]) {
+    const aborts = Array.from({ length: number }, () => new AbortController());
+    let bytes = 0;
+    const readers = aborts.map(async ({ signal }) => {
+      try {
+        const { body } = await fetch(`${ADDRESS}live`, { signal });
+        for await (const chunk of body) bytes += chunk.length;
+      } catch {
+        // Ended below.
+      }
+    });
+    await sleep(3000);
+    const [before, sent, began] = [await agent(), bytes, performance.now()];
+    await sleep(20_000);
+    const [after, seconds] = [await agent(), (performance.now() - began) / 1000];
+    console.log(`${number} tabs: the agent takes ${(((after.cpu - before.cpu) / seconds) * 100)
+      .toFixed(2)} % of a core, ${(after.bytes / 1e6).toFixed(1)} MB, and sends ${
+      ((bytes - sent) / seconds / 1000).toFixed(1)} kB/s`);
+    for (const abort of aborts) abort.abort();
+    await Promise.all(readers);
+    await sleep(2000);
+  }
+}
+
+await scenario(async (open, browser) => {
+  await paint(browser);
+  await layouts(open);
+  await tabs();
+  await memory(open);
+});

@@ -1,0 +1,49 @@
+// The message of a topic as it comes: a tree that is folded and unfolded, and a chart of a number
+// in it. The agent decodes only while the tree is open.
+
+import assert from 'node:assert/strict';
+import { ask, scenario, until } from './tab.mjs';
+
+await scenario(async (open) => {
+  const tab = await open({ fragment: '#/topics/%2Fimu?domain=0' });
+  await tab.live();
+  const section = tab.page.locator('section[aria-labelledby="live"]');
+  const followed = () => tab.requests.filter((request) => request.url().includes('/messages?')).length;
+  assert.equal(followed(), 0, 'nothing is decoded before it is wanted');
+  await section.getByRole('button', { name: 'Show messages' }).click();
+  const tree = section.getByRole('group', { name: 'Fields of the message' });
+  await tree.waitFor();
+  const field = (name) => tree.locator('tr', { has: tab.page.getByRole('rowheader', { name, exact: true }) });
+  assert.match(await tree.innerText(), /header \(2\)/);
+  assert.match(await field('sec').innerText(), /sec\s+1\d{9}/);
+  const before = await field('nanosec').innerText();
+  await until('the next message', async () => (await field('nanosec').innerText()) !== before);
+  assert.match(await section.innerText(), /by \/imu_driver/);
+
+  // Folded away, and back.
+  await tree.getByRole('button', { name: /^header/ }).click();
+  assert.equal(await field('nanosec').count(), 0);
+  await tree.getByRole('button', { name: /^header/ }).click();
+  await field('nanosec').waitFor();
+  // A covariance is an array of nine.
+  assert.match(await tree.innerText(), /orientation_covariance \(9\)/);
+
+  await tree.getByRole('button', { name: 'Plot linear_acceleration.z' }).click();
+  const chart = section.getByRole('img', { name: /^linear_acceleration.z/ });
+  await until('a chart of it', async () => /last -?[\d.]+, minimum/.test(
+    await chart.getAttribute('aria-label')));
+  await until('points', async () => (await chart.locator('canvas').count()) === 1);
+  const values = section.locator('figure', { hasText: 'linear_acceleration.z' });
+  await values.getByRole('button', { name: 'Table' }).click();
+  await until('its values', async () => (await values.locator('tbody tr').count()) >= 1);
+  await tab.accessible('a message with a chart');
+
+  // At most five a second, whatever the topic's rate; how many were left out is shown.
+  await until('what was not shown', async () => /\d+ not shown before it/
+    .test(await section.innerText()));
+  // Closed means that the agent decodes nothing any more.
+  assert.equal((await ask('streams')).messages, 1);
+  await section.getByRole('button', { name: 'Close' }).click();
+  await until('the agent is left alone', async () => (await ask('streams')).messages === 0);
+  assert.equal(followed(), 1);
+});

@@ -1,0 +1,40 @@
+// A best-effort publisher and a reliable subscriber: the finding comes first, and leads to the two
+// endpoints side by side with the policy that does not fit.
+
+import assert from 'node:assert/strict';
+import { scenario, until } from './tab.mjs';
+
+await scenario(async (open) => {
+  const tab = await open();
+  await tab.live();
+  const first = tab.page.locator('.findings li').first();
+  await first.waitFor();
+  assert.equal(await first.getAttribute('class'), 'error');
+  assert.match(await first.innerText(), /reliab/i);
+  assert.match(await first.innerText(), /Remedy: /);
+  assert.match(await tab.text('nav'), /Overview\s+✖\s*error\s*1/);
+  await first.getByRole('link').click();
+  const qos = tab.page.locator('section[aria-labelledby="qos"]');
+  await qos.waitFor();
+  assert.match(await qos.innerText(), /offers less than .* requests: reliability/);
+  const row = qos.locator('tr', { hasText: 'Reliability' });
+  const cells = await row.locator('td').evaluateAll((all) => all.map((cell) =>
+    [cell.className, cell.textContent.replace(/^✖error/, '').trim()]));
+  const bad = cells.filter(([kind]) => kind === 'bad').map(([, text]) => text);
+  assert.ok(bad.some((text) => /BEST_EFFORT/.test(text)) && bad.some((text) => /✖?.*RELIABLE/.test(text)),
+    JSON.stringify(cells));
+  const durability = await qos.locator('tr', { hasText: 'Durability' }).locator('td.bad').count();
+  assert.equal(durability, 0, 'only the policy that does not fit');
+  await tab.accessible('a mismatch');
+
+  // The topic carries the badge, the graph the mark, the node the finding.
+  await tab.go('#/topics?sort=state');
+  assert.match(await tab.page.locator('main tbody tr[data-row]').first().innerText(), /QoS/);
+  await tab.go('#/graph');
+  await tab.page.locator('.edge.error').first().waitFor();
+  assert.ok((await tab.page.locator('.edge .sign.error').count()) > 0);
+  await tab.page.getByRole('combobox', { name: 'Show' }).selectOption('nodes');
+  await until('the pair', async () => (await tab.page.locator('.edge.pair, .edge').count()) > 0);
+  // A screen reader hears of new findings only: none came since the page was opened.
+  assert.equal(await tab.page.locator('[aria-live="polite"]').innerText(), '');
+});

@@ -1,0 +1,64 @@
+// A recording from its start to the file on the disk of the one who looks; and a snapshot.
+
+import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
+import { ask, scenario, until } from './tab.mjs';
+
+await scenario(async (open) => {
+  const tab = await open({ fragment: '#/recordings' });
+  await tab.live();
+  // A refusal is a line of the browser's own on the console.
+  tab.expect(/the server responded with a status of 422/);
+  await tab.shows('No recording yet.');
+  await tab.page.getByRole('combobox', { name: 'Topics' }).fill('/imu /scan');
+  await tab.page.getByLabel('Name').fill('lap one');
+  await tab.page.getByRole('button', { name: 'Start', exact: true }).click();
+  // A name that no file can have is refused in words, and the form stays as it was.
+  await tab.page.locator('main [role="alert"]').waitFor();
+  assert.equal(await tab.page.getByLabel('Name').inputValue(), 'lap one');
+  await tab.page.getByLabel('Name').fill('lap-one');
+  await tab.page.getByRole('button', { name: 'Start', exact: true }).click();
+  const card = tab.page.getByRole('region', { name: 'Recording lap-one' });
+  await card.waitFor();
+  await until('messages', async () => /[1-9][\d,]* messages/.test(await card.innerText()));
+  assert.deepEqual((await ask('recordings')).names, ['lap-one']);
+
+  await card.getByRole('button', { name: 'Pause lap-one' }).click();
+  await until('paused', async () => (await card.innerText()).includes('paused'));
+  await card.getByRole('button', { name: 'Continue lap-one' }).click();
+  await until('recording', async () => (await card.innerText()).includes('recording'));
+  await card.getByRole('button', { name: /^Split/ }).click();
+  await until('two files', async () => (await card.innerText()).includes('in 2 files'));
+  await tab.accessible('a recording');
+  await card.getByRole('button', { name: 'Stop lap-one' }).click();
+  await until('ended', async () => (await card.innerText()).includes('ended'));
+  assert.equal(await card.getByRole('button', { name: /^Pause/ }).count(), 0);
+
+  await card.getByRole('button', { name: 'Files of lap-one' }).click();
+  await card.getByText('metadata.yaml').waitFor();
+  const fetched = async (name) => {
+    const waiting = tab.page.waitForEvent('download');
+    await card.getByRole('button', { name: `Download ${name}`, exact: true }).click();
+    const download = await waiting;
+    assert.equal(download.suggestedFilename(), name);
+    return readFileSync(await download.path());
+  };
+  const metadata = (await fetched('metadata.yaml')).toString();
+  assert.match(metadata, /rosbag2_bagfile_information/);
+  assert.ok(metadata.includes('/imu') && metadata.includes('/scan'), metadata);
+  const names = (await card.locator('li').allInnerTexts()).map((text) => /\S+\.mcap/.exec(text)?.[0])
+    .filter(Boolean);
+  assert.equal(names.length, 2, await card.innerText());
+  for (const name of names) {
+    const bytes = await fetched(name);
+    assert.equal(bytes.subarray(1, 5).toString(), 'MCAP', name);
+    assert.equal(bytes.subarray(-7, -3).toString(), 'MCAP', `${name} is whole`);
+    const { size } = await ask(`size ${name}`);
+    assert.equal(bytes.length, size, `${name} is the agent's file`);
+  }
+
+  const row = tab.page.locator('tr', { hasText: 'incident' });
+  await until('messages in memory', async () => /[1-9][\d,]* messages?,/.test(await row.innerText()));
+  await row.getByRole('button', { name: 'Write now: snapshot incident' }).click();
+  await until('a bag of it', async () => /[1-9][\d,]* messages in /.test(await row.innerText()));
+});

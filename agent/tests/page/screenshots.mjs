@@ -1,0 +1,70 @@
+// Takes the pictures of the documentation from the demo: `make screenshots`.
+// Arguments: the demo's program, the directory of the pictures.
+
+import { spawn } from 'node:child_process';
+import { mkdirSync, statSync } from 'node:fs';
+import { createInterface } from 'node:readline';
+import { launch, Tab, until } from './tab.mjs';
+
+const [, , PROGRAM, DIRECTORY] = process.argv;
+/** Seconds of figures before the pictures are taken, so that charts have a course. */
+const WAIT_S = Number(process.env.SCREENSHOT_WAIT_S ?? 75);
+
+/** Name, fragment, theme, width, height, what is done before, wait for. */
+const PICTURES = [
+  ['overview', '#/', 'light', 1280, 860, '.figures'],
+  ['overview-dark', '#/', 'dark', 1280, 860, '.figures'],
+  ['overview-phone', '#/', 'light', 390, 844, '.figures'],
+  ['topics', '#/topics', 'light', 1280, 700, 'main tbody tr[data-row]'],
+  ['topics-phone', '#/topics', 'dark', 390, 844, 'main tbody tr[data-row]'],
+  ['topic', '#/topics/%2Fpoints?domain=0', 'light', 1280, 1250, '.plot canvas'],
+  ['topic-dark', '#/topics/%2Fpoints?domain=0', 'dark', 1280, 1250, '.plot canvas'],
+  ['topic-phone', '#/topics/%2Fpoints?domain=0', 'light', 390, 844, '.plot canvas'],
+  ['graph', '#/graph', 'light', 1280, 760, '.vertex'],
+  ['graph-dark', '#/graph', 'dark', 1280, 760, '.vertex'],
+  ['graph-phone', '#/graph', 'light', 390, 844, '.vertex'],
+  ['graph-processes', '#/graph?boxes=process&services=1', 'light', 1280, 760, '.vertex.service'],
+  ['nodes', '#/nodes', 'light', 1280, 500, 'main tbody tr[data-row]'],
+  ['node', '#/nodes/%2Flidar', 'light', 1280, 800, 'main ul.plain'],
+  ['events', '#/events', 'light', 1280, 700, 'main tbody tr'],
+  ['recordings', '#/recordings', 'light', 1280, 600, 'main form, main p'],
+  ['agent', '#/agent', 'light', 1280, 900, 'section[aria-labelledby="limits"]'],
+];
+
+const demo = spawn(PROGRAM, [], { stdio: ['ignore', 'pipe', 'inherit'] });
+const lines = createInterface({ input: demo.stdout });
+const address = await new Promise((take, fail) => {
+  lines.on('line', (line) => {
+    const found = /(http:\/\/[^\s]+\/)\s*$/.exec(line);
+    if (/page/.test(line) && found) take(found[1]);
+  });
+  demo.on('exit', (code) => fail(new Error(`the demo ended with ${code}`)));
+});
+console.log(`the demo's page: ${address}`);
+const browser = await launch();
+try {
+  mkdirSync(DIRECTORY, { recursive: true });
+  await new Promise((wake) => setTimeout(wake, WAIT_S * 1000));
+  for (const [name, fragment, theme, width, height, ready] of PICTURES) {
+    const context = await browser.newContext({
+      colorScheme: theme, viewport: { width, height }, deviceScaleFactor: 1, reducedMotion: 'reduce',
+    });
+    const page = await context.newPage();
+    const tab = new Tab(page, address);
+    await page.goto(`${address}${fragment}`);
+    await tab.live();
+    await until(`${name}: ${ready}`, async () => (await page.locator(ready).count()) > 0);
+    await new Promise((wake) => setTimeout(wake, 2500));
+    const file = `${DIRECTORY}/${name}.png`;
+    await page.screenshot({ path: file });
+    console.log(`${file}: ${Math.ceil(statSync(file).size / 1000)} kB`);
+    tab.verify();
+    await context.close();
+  }
+} finally {
+  await browser.close();
+  demo.removeAllListeners('exit');
+  const ended = new Promise((take) => { demo.on('exit', take); });
+  demo.kill('SIGTERM');
+  await ended;
+}

@@ -1,0 +1,38 @@
+// A topic is measured and no longer measured at a press: the agent's list of watches and the
+// kernel's map of writers follow, and so do the figures.
+
+import assert from 'node:assert/strict';
+import { ask, scenario, until } from './tab.mjs';
+
+await scenario(async (open) => {
+  const tab = await open({ fragment: '#/topics' });
+  await tab.live();
+  const row = tab.page.locator('main tbody tr[data-row]', { hasText: '/scan' });
+  await row.waitFor();
+  const before = await ask('watches');
+  assert.deepEqual(before.topics, [], 'nothing is measured at first');
+  assert.match(await row.innerText(), /–/, 'no rate');
+
+  await row.getByRole('button', { name: 'off: measure /scan' }).click();
+  await row.getByRole('button', { name: 'on: measure /scan' }).waitFor();
+  const measured = await until('the kernel knows the writer', async () => {
+    const now = await ask('watches');
+    return now.interest > before.interest && now;
+  });
+  assert.deepEqual(measured.topics, ['/scan']);
+  await until('its rate', async () => /\b(9|10|11)(\.\d+)? Hz/.test(await row.innerText()));
+  // The other topics stay as they were.
+  const other = tab.page.locator('main tbody tr[data-row]', { hasText: '/points' });
+  assert.ok(await other.getByRole('button', { name: 'off: measure /points' }).isVisible());
+
+  // In the view of the topic the same button, with the same effect.
+  await tab.page.getByRole('link', { name: '/scan', exact: true }).click();
+  await tab.page.locator('.plot canvas').first().waitFor();
+  await tab.page.getByRole('button', { name: 'on: measure /scan' }).click();
+  await tab.page.getByRole('button', { name: 'off: measure /scan' }).waitFor();
+  await until('the kernel forgets the writer', async () => {
+    const now = await ask('watches');
+    return now.topics.length === 0 && now.interest === before.interest;
+  });
+  await tab.shows(/rate\s+–/);
+});
