@@ -43,7 +43,7 @@ export function Agent() {
       ['Rights at this address', html`${open.access ?? '–'} ${open.access !== 'all'
         && html`<${AskButton} />`}`],
       ['Running for', duration(data?.uptime_seconds)],
-      ['Process', count(data?.process_id)],
+      ['Process', data?.process_id ?? '–'],
       ['Capabilities', html`<${Name} text=${data?.capabilities.join(', ') || 'none'} />`],
       ['Watches', html`${count(data?.watches)} <a href=${address('topics', null,
         { only: 'measured' })}>measured topics</a>`],
@@ -53,8 +53,8 @@ export function Agent() {
     <section aria-labelledby="abilities"><h2 id="abilities">Abilities</h2><table class="short"
       aria-labelledby="abilities"><tbody>${data.abilities.map((/** @type {any} */ each) => html`
       <tr key=${each.ability}><th scope="row"><${Mark} severity=${each.able ? 'good' : 'note'} /> ${
-        each.ability.replaceAll('_', ' ')}</th><td>${each.able ? 'yes' : html`no: <${Name}
-        text=${each.reason ?? ''} />`}</td></tr>`)}</tbody></table></section>
+        each.ability.replaceAll('_', ' ')}</th><td>${each.able ? 'yes' : each.reason
+        ? html`no: <${Name} text=${each.reason} />` : 'no'}</td></tr>`)}</tbody></table></section>
     <${Facts} title="Not counted or dropped" rows=${drops.map(([name, value]) => [name,
       html`${value ? html`<${Mark} severity="warning" /> ` : ''}${count(value)}`])} />
     <section aria-labelledby="limits"><h2 id="limits">Limits in use</h2><div class="scroll"

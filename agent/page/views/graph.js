@@ -221,13 +221,19 @@ function index(result) {
   };
 }
 
+/** Pixels within which an edge that leads back turns. */
+const TURN = 40;
+
 /** A smooth path through the points of an edge. @param {import('../layout.js').Point[]} points */
 export function curve(points) {
   let path = `M${points[0].x.toFixed(1)} ${points[0].y.toFixed(1)}`;
   for (let at = 1; at < points.length; at += 1) {
     const [a, b] = [points[at - 1], points[at]];
-    const bend = b.x > a.x ? (b.x - a.x) / 2 : 40;
-    path += `C${(a.x + bend).toFixed(1)} ${a.y.toFixed(1)} ${(b.x - bend).toFixed(1)} `
+    // An edge that leads back leaves to the right, turns, and turns again before its end.
+    const half = (b.x - a.x) / 2;
+    const out = half < 0 && at === 1 ? TURN : half;
+    const into = half < 0 && at === points.length - 1 ? TURN : half;
+    path += `C${(a.x + out).toFixed(1)} ${a.y.toFixed(1)} ${(b.x - into).toFixed(1)} `
       + `${b.y.toFixed(1)} ${b.x.toFixed(1)} ${b.y.toFixed(1)}`;
   }
   return path;

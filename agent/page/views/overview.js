@@ -43,7 +43,7 @@ export function Findings({ list }) {
   const [firsts, more] = grouped(list);
   return html`<ul class="findings">${firsts.slice(0, MOST_SHOWN).map((finding) => html`
     <li key=${finding.id} class=${finding.severity}><${Mark} severity=${finding.severity} />
-      <span><${Place} finding=${finding} /> <${Name} text=${finding.text} />
+      <span><${Place} finding=${finding} /> <${Name} text=${rest(finding)} />
       ${more.has(finding) && html` <span class="dim">and ${several(more.get(finding) ?? 0, 'other')}
         of this topic</span>`}
       ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${age(state.time - finding.since)})</span>`}
@@ -73,6 +73,13 @@ export function grouped(list) {
     return !first;
   });
   return [firsts, more];
+}
+
+/** A finding's text without the name of its topic before it. @param {any} finding */
+function rest(finding) {
+  const name = state.topics.get(finding.topic)?.name;
+  return name && finding.text.startsWith(`${name} `) ? finding.text.slice(name.length + 1)
+    : finding.text;
 }
 
 /** The link to what a finding is about. @param {{finding: import('../state.js').Finding}} props */
