@@ -10,17 +10,17 @@ const [, , PROGRAM, DIRECTORY] = process.argv;
 /** Seconds of figures before the pictures are taken, so that charts have a course. */
 const WAIT_S = Number(process.env.SCREENSHOT_WAIT_S ?? 75);
 
-/** Name, fragment, theme, width, height, what is done before, wait for. */
+/** Name, fragment, theme, width, height, and what is there once the view is drawn. */
 const PICTURES = [
   ['overview', '#/', 'light', 1280, 860, '.figures'],
   ['overview-dark', '#/', 'dark', 1280, 860, '.figures'],
   ['overview-phone', '#/', 'light', 390, 844, '.figures'],
   ['topics', '#/topics', 'light', 1280, 700, 'main tbody tr[data-row]'],
   ['topics-phone', '#/topics', 'dark', 390, 844, 'main tbody tr[data-row]'],
-  ['topic', '#/topics/%2Fpoints?domain=0', 'light', 1280, 1250, '.plot canvas'],
-  ['topic-dark', '#/topics/%2Fpoints?domain=0', 'dark', 1280, 1250, '.plot canvas'],
+  ['topic', '#/topics/%2Fpoints?domain=0', 'light', 1200, 960, '.plot canvas'],
+  ['topic-dark', '#/topics/%2Fpoints?domain=0', 'dark', 1200, 960, '.plot canvas'],
   ['topic-phone', '#/topics/%2Fpoints?domain=0', 'light', 390, 844, '.plot canvas'],
-  ['graph', '#/graph', 'light', 1280, 760, '.vertex'],
+  ['graph', '#/graph', 'light', 1280, 640, '.vertex'],
   ['graph-dark', '#/graph', 'dark', 1280, 760, '.vertex'],
   ['graph-phone', '#/graph', 'light', 390, 844, '.vertex'],
   ['graph-processes', '#/graph?boxes=process&services=1', 'light', 1280, 760, '.vertex.service'],
