@@ -38,7 +38,6 @@ export function Search({ close }) {
   const [words, look] = useState('');
   const field = useRef(/** @type {HTMLInputElement|null} */ (null));
   const services = usePoll('services', 0);
-  useEffect(() => field.current?.focus(), []);
   const found = words.trim() ? search(words.trim(), services.data?.services ?? []) : [];
   const walk = (/** @type {KeyboardEvent} */ event) => {
     const by = { ArrowDown: 1, ArrowUp: -1 }[event.key];
@@ -58,7 +57,7 @@ export function Search({ close }) {
   };
   return html`<${Dialog} title="Search" close=${close}><div onKeyDown=${walk}>
     <form onSubmit=${enter}><label class="filter">Words of a name or type
-      <input type="search" ref=${field} value=${words} autocomplete="off" spellcheck=${false}
+      <input type="search" ref=${field} autofocus=${true} value=${words} autocomplete="off" spellcheck=${false}
         onInput=${(/** @type {any} */ event) => look(event.target.value)} /></label></form>
     <p class="dim" role="status">${words.trim()
       ? several(found.length, 'result') + (found.length === MOST_FOUND ? ' shown; more exist' : '')
@@ -152,7 +151,7 @@ export function Token({ close }) {
       It stays in this tab and is sent in a header only.</p>
     ${stream.problem && html`<p><${Mark} severity="warning" /> ${stream.problem.message}</p>`}
     <form onSubmit=${submit}>
-      <label class="filter">Token <input type="password" ref=${field} autocomplete="off"
+      <label class="filter">Token <input type="password" ref=${field} autofocus=${true} autocomplete="off"
         spellcheck=${false} required /></label>
       <button type="submit">Use this token</button>
       ${token() && html` <button type="button" onClick=${forget}>Forget the token</button>`}
