@@ -1,13 +1,12 @@
-// Measures the page: first useful paint with 500 topics, layout of large graphs in the worker, memory
-// of a tab over minutes of stream, and what tabs cost the agent. Prints the figures; fails where one
-// is over its budget. Arguments: address, address of the agent's metrics.
+// Measures the page: first useful paint with 500 topics, layout of large graphs in the worker, and
+// memory of a tab over minutes of stream. Prints the figures; fails where one is over its budget.
+// What tabs cost the agent: make bench BENCH_OPTIONS="--only tabs".
 // MEASURE_MINUTES is how long the memory is watched (2).
 
 import assert from 'node:assert/strict';
 import { robot } from '../../page/test/robot.js';
 import { ADDRESS, scenario, until } from './tab.mjs';
 
-const METRICS = process.argv[3];
 const MINUTES = Number(process.env.MEASURE_MINUTES ?? 2);
 const PAINT_MS = 1000;
 /** Budgets of layouts: nodes, topics, milliseconds. */
@@ -100,42 +99,8 @@ async function memory(open) {
   await tab.page.close();
 }
 
-/** CPU seconds and memory of the agent. */
-async function agent() {
-  const text = await (await fetch(METRICS)).text();
-  const value = (name) => Number(new RegExp(`^${name} (.+)$`, 'm').exec(text)?.[1]);
-  return { cpu: value('process_cpu_seconds_total'), bytes: value('process_unreclaimable_memory_bytes') };
-}
-
-/** What so many open streams cost the agent, without a browser that takes the same cores. */
-async function tabs() {
-  for (const number of [0, 1, 10]) {
-    const aborts = Array.from({ length: number }, () => new AbortController());
-    let bytes = 0;
-    const readers = aborts.map(async ({ signal }) => {
-      try {
-        const { body } = await fetch(`${ADDRESS}live`, { signal });
-        for await (const chunk of body) bytes += chunk.length;
-      } catch {
-        // Ended below.
-      }
-    });
-    await sleep(3000);
-    const [before, sent, began] = [await agent(), bytes, performance.now()];
-    await sleep(20_000);
-    const [after, seconds] = [await agent(), (performance.now() - began) / 1000];
-    console.log(`${number} tabs: the agent takes ${(((after.cpu - before.cpu) / seconds) * 100)
-      .toFixed(2)} % of a core, ${(after.bytes / 1e6).toFixed(1)} MB, and sends ${
-      ((bytes - sent) / seconds / 1000).toFixed(1)} kB/s`);
-    for (const abort of aborts) abort.abort();
-    await Promise.all(readers);
-    await sleep(2000);
-  }
-}
-
 await scenario(async (open, browser) => {
   await paint(browser);
   await layouts(open);
-  await tabs();
   await memory(open);
 });

@@ -1,12 +1,12 @@
 // Takes the pictures of the documentation from the demo: `make screenshots`.
-// Arguments: the demo's program, the directory of the pictures.
+// Arguments: the demo's program, the directory of the pictures, names of pictures (all of them).
 
 import { spawn } from 'node:child_process';
 import { mkdirSync, statSync } from 'node:fs';
 import { createInterface } from 'node:readline';
 import { launch, Tab, until } from './tab.mjs';
 
-const [, , PROGRAM, DIRECTORY] = process.argv;
+const [, , PROGRAM, DIRECTORY, ...WANTED] = process.argv;
 /** Seconds of figures before the pictures are taken, so that charts have a course. */
 const WAIT_S = Number(process.env.SCREENSHOT_WAIT_S ?? 75);
 
@@ -46,6 +46,7 @@ try {
   mkdirSync(DIRECTORY, { recursive: true });
   await new Promise((wake) => setTimeout(wake, WAIT_S * 1000));
   for (const [name, fragment, theme, width, height, ready] of PICTURES) {
+    if (WANTED.length && !WANTED.includes(name)) continue;
     const context = await browser.newContext({
       colorScheme: theme, viewport: { width, height }, deviceScaleFactor: 1, reducedMotion: 'reduce',
     });
