@@ -1,6 +1,6 @@
 // Dialogs over every view: search, keys, token. The browser keeps the focus inside them.
 
-import { useEffect, useRef, useState } from './vendor/hooks.mjs';
+import { useLayoutEffect, useRef, useState } from './vendor/hooks.mjs';
 import { keepToken, token } from './api.js';
 import { several } from './format.js';
 import { address, nodeAddress, topicAddress } from './router.js';
@@ -10,7 +10,8 @@ import { html, Mark, matches, Name } from './ui.js';
 /** @param {{title: string, close: () => void, children: any}} props */
 function Dialog({ title, close, children }) {
   const own = useRef(/** @type {HTMLDialogElement|null} */ (null));
-  useEffect(() => {
+  // Before the next key: who types `/imu` at once loses no letter.
+  useLayoutEffect(() => {
     const before = /** @type {HTMLElement|null} */ (document.activeElement);
     own.current?.showModal();
     return () => before?.focus?.();

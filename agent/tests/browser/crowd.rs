@@ -140,7 +140,9 @@ fn is_shown(unit: char) -> bool {
 
 fn type_name(topic: usize, hostile: bool) -> String {
     match hostile {
-        true if topic % 3 == 0 => format!("<b>{}</b>::msg::dds_::T_", HARM[topic % HARM.len()]),
+        true if topic.is_multiple_of(3) => {
+            format!("<b>{}</b>::msg::dds_::T_", HARM[topic % HARM.len()])
+        }
         _ => "sensor_msgs::msg::dds_::PointCloud2_".to_owned(),
     }
 }
