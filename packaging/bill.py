@@ -3,8 +3,8 @@
 
     bill.py ARCHITECTURE BINARY
 
-It lists the crates along normal edges with the features of this very build, the standard library
-and the kernel object; no build tool, no test. The same sources give the same bytes: no serial
+It lists the crates along normal edges with the features of this very build, the standard library,
+the kernel object and the page's JavaScript libraries; no build tool, no test. The same sources give the same bytes: no serial
 number, the time is SOURCE_DATE_EPOCH. Python 3.8 or newer, nothing else.
 
 cargo-cyclonedx 0.5.9 was tried: it adds 58 crates that are not in the binary (macros, and features
@@ -16,6 +16,7 @@ import os
 import re
 import subprocess
 import sys
+from base64 import b64decode
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -59,6 +60,26 @@ def purl(crate):
     return "pkg:cargo/%s@%s" % crate
 
 
+def vendored():
+    """The libraries of the page, with the sums of npm's archives and of the files taken from them."""
+    found = {}
+    for line in (ROOT / "agent/page/vendor/VERSIONS").read_text().splitlines():
+        if line.startswith("#"):
+            continue
+        file, name, version, licence, _, _, integrity = line.split("\t")
+        if file.endswith(".LICENSE"):
+            continue
+        reference = "pkg:npm/%s@%s" % (name, version)
+        path = "agent/page/vendor/" + file
+        component = found.setdefault(reference, {
+            "type": "library", "bom-ref": reference, "name": name, "version": version,
+            "hashes": [{"alg": "SHA-512", "content": b64decode(integrity[len("sha512-"):]).hex()}],
+            "licenses": [{"expression": licence}], "purl": reference, "components": []})
+        component["components"].append(
+            {"type": "file", "bom-ref": path, "name": path, "hashes": sha256(ROOT / path)})
+    return [found[reference] for reference in sorted(found)]
+
+
 def main(architecture, binary):
     target = architecture + "-unknown-linux-musl"
     licences, edges = crates(target)
@@ -82,10 +103,13 @@ def main(architecture, binary):
         {"type": "file", "bom-ref": kernel, "name": kernel, "hashes": sha256(ROOT / kernel),
          "description": "the kernel programs, committed as built"},
     ]
+    page = vendored()
+    components += page
     dependencies = [{"ref": purl(crate), "dependsOn": sorted(map(purl, edges[crate]))} for crate in sorted(edges)]
     for dependency in dependencies:
         if dependency["ref"] == purl(program):
-            dependency["dependsOn"] = sorted(dependency["dependsOn"] + [standard, kernel])
+            dependency["dependsOn"] = sorted(
+                dependency["dependsOn"] + [standard, kernel] + [library["bom-ref"] for library in page])
     time = datetime.fromtimestamp(int(os.environ["SOURCE_DATE_EPOCH"]), timezone.utc)
     bill = {
         "bomFormat": "CycloneDX",
