@@ -44,8 +44,8 @@ export function Findings({ list }) {
   return html`<ul class="findings">${firsts.slice(0, MOST_SHOWN).map((finding) => html`
     <li key=${finding.id} class=${finding.severity}><${Mark} severity=${finding.severity} />
       <span><${Place} finding=${finding} /> <${Name} text=${rest(finding)} />
-      ${more.has(finding) && html` <span class="dim">and ${several(more.get(finding) ?? 0, 'other')}
-        of this topic</span>`}
+      ${more.has(finding) && html`
+        <span class="dim"> and ${several(more.get(finding) ?? 0, 'other')} of this topic</span>`}
       ${finding.since != null && html` <span class="dim">since ${clock(finding.since)} (${age(state.time - finding.since)})</span>`}
       ${finding.remedy && html`<br /><span class="remedy">Remedy: <${Name} text=${finding.remedy}
         /></span>`}</span></li>`)}</ul>
