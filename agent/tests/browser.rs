@@ -14,8 +14,6 @@ mod crowd;
 #[allow(dead_code, reason = "shared with other tests")]
 mod forge;
 mod harness;
-#[path = "browser/kernel.rs"]
-mod kernel;
 mod local_agent;
 #[path = "browser/player.rs"]
 mod player;
@@ -28,6 +26,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
 use flate2::read::MultiGzDecoder;
+use harness::bpf::interest_of;
 use local_agent::{LocalAgent, rp};
 use player::{play, watch};
 use robot::{Place, Robot};
@@ -78,7 +77,8 @@ fn a_press_measures_a_topic_down_to_the_kernel() -> Result<()> {
             .iter()
             .map(|each| each["topic"].clone())
             .collect();
-        Ok(json!({"topics": topics, "interest": kernel::interest(agent.process.pid())?}))
+        let interest = interest_of(agent.process.pid())?.len();
+        Ok(json!({"topics": topics, "interest": interest}))
     };
     play(&place.inside(), "watch", &[PAGE], &mut answers)
 }

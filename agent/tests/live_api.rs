@@ -3,15 +3,15 @@
 
 mod harness;
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io::{Read as _, Write as _};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
-use aya::maps::{HashMap, Map, MapData, MapInfo};
 use harness::agent::{Agent, Scrape, at_the_sockets_of, get};
+use harness::bpf::interest_of;
 use harness::network::Namespace;
 use harness::peer::{Peer, Role, Stack, Stream};
 use serde_json::Value;
@@ -122,7 +122,7 @@ fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
         };
         wait_for(agent, watched)?;
     }
-    let before = (series(&agent.scrape()?), interest(agent.process.pid())?);
+    let before = (series(&agent.scrape()?), interest_of(agent.process.pid())?);
     ensure!(!before.1.is_empty(), "the kernel's map is empty");
 
     let begun = Instant::now();
@@ -153,7 +153,7 @@ fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
         begun.elapsed()
     );
 
-    let mut after = (series(&agent.scrape()?), interest(agent.process.pid())?);
+    let mut after = (series(&agent.scrape()?), interest_of(agent.process.pid())?);
     let deadline = Instant::now() + PATIENCE;
     while after != before {
         let more: Vec<_> = after.0.symmetric_difference(&before.0).take(5).collect();
@@ -164,7 +164,7 @@ fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
             after.1
         );
         std::thread::sleep(Duration::from_millis(100));
-        after = (series(&agent.scrape()?), interest(agent.process.pid())?);
+        after = (series(&agent.scrape()?), interest_of(agent.process.pid())?);
     }
     Ok(())
 }
@@ -280,21 +280,4 @@ fn series(scrape: &Scrape) -> BTreeSet<String> {
     let tables = tables.map(|table| format!("ros2probe_table_entries{{table=\"{table}\"}}"));
     let tables = lines.filter(|line| tables.iter().any(|table| line.starts_with(table)));
     named.chain(tables).map(str::to_owned).collect()
-}
-
-/// What the kernel programs of a process are told about writers and readers.
-fn interest(process: u32) -> Result<BTreeMap<[u32; 4], u32>> {
-    for entry in std::fs::read_dir(format!("/proc/{process}/fdinfo"))? {
-        let text = std::fs::read_to_string(entry?.path()).unwrap_or_default();
-        let id = text.lines().find_map(|line| line.strip_prefix("map_id:"));
-        let Some(id) = id.and_then(|id| id.trim().parse().ok()) else {
-            continue;
-        };
-        if MapInfo::from_id(id)?.name_as_str() == Some("INTEREST") {
-            let map = Map::HashMap(MapData::from_id(id)?);
-            let map: HashMap<_, [u32; 4], u32> = HashMap::try_from(map)?;
-            return map.iter().map(|entry| Ok(entry?)).collect();
-        }
-    }
-    anyhow::bail!("the process {process} has no such map")
 }

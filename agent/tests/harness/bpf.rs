@@ -1,13 +1,14 @@
 //! The kernel's BPF programs as anybody may ask for them: which are attached to a control group,
 //! which a process holds, which still exist. And one of somebody else's.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io;
 use std::os::fd::{AsRawFd as _, FromRawFd as _, OwnedFd};
 use std::path::Path;
 
-use anyhow::{Context as _, Result};
+use anyhow::{Context as _, Result, bail};
+use aya::maps::{HashMap, Map, MapData, MapInfo};
 
 const PROG_LOAD: libc::c_int = 5;
 const PROG_ATTACH: libc::c_int = 8;
@@ -116,6 +117,19 @@ pub(crate) fn objects_of(process: u32) -> Result<BTreeSet<Object>> {
         }));
     }
     Ok(objects)
+}
+
+/// The writers and readers that a process named to its kernel programs, with their verdicts.
+pub(crate) fn interest_of(process: u32) -> Result<BTreeMap<[u32; 4], u32>> {
+    for object in objects_of(process)? {
+        let Object::Map(id) = object else { continue };
+        if MapInfo::from_id(id)?.name_as_str() == Some("INTEREST") {
+            let map = Map::HashMap(MapData::from_id(id)?);
+            let map: HashMap<_, [u32; 4], u32> = HashMap::try_from(map)?;
+            return map.iter().map(|entry| Ok(entry?)).collect();
+        }
+    }
+    bail!("the process {process} has no such map")
 }
 
 /// How often the kernel left out running one of this process's programs because it was running on
