@@ -5,7 +5,6 @@
 //! are limited in number and end when the agent ends.
 
 use std::collections::VecDeque;
-use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,7 +13,6 @@ use axum::http::HeaderMap;
 use axum::http::header::CACHE_CONTROL;
 use axum::response::sse::{Event, Sse};
 use axum::response::{IntoResponse, Response};
-use futures_util::stream;
 use serde::ser::SerializeMap as _;
 use serde::{Deserialize, Serialize, Serializer};
 use tokio::sync::{Semaphore, SemaphorePermit};
@@ -25,6 +23,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use super::body_stream::{Pieces, stream_of};
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use crate::config::{Watch, Watchlist};
@@ -181,11 +180,7 @@ async fn events(
         _permit: permit,
     };
     stream.begin(restarted);
-    let stream = stream::unfold(stream, |mut stream| async {
-        let message = stream.next().await?;
-        Some((Ok::<_, Infallible>(message), stream))
-    });
-    Ok(([(CACHE_CONTROL, "no-store")], Sse::new(stream)).into_response())
+    Ok(([(CACHE_CONTROL, "no-store")], Sse::new(stream_of(stream))).into_response())
 }
 
 fn no_id(text: &str) -> Problem {
@@ -196,16 +191,8 @@ fn no_id(text: &str) -> Problem {
     )
 }
 
-impl Stream {
-    /// The first message tells the place, so that a client that is cut off before the first event
-    /// comes back to it.
-    fn begin(&mut self, restarted: bool) {
-        let greeting = Event::default().comment("ros2probe").retry(RETRY);
-        self.waiting.push_back(greeting.id(self.log.id(self.place)));
-        if restarted {
-            self.lag(None, "restarted");
-        }
-    }
+impl Pieces for Stream {
+    type Piece = Event;
 
     async fn next(&mut self) -> Option<Event> {
         loop {
@@ -230,7 +217,18 @@ impl Stream {
             }
         }
     }
+}
 
+impl Stream {
+    /// The first message tells the place, so that a client that is cut off before the first event
+    /// comes back to it.
+    fn begin(&mut self, restarted: bool) {
+        let greeting = Event::default().comment("ros2probe").retry(RETRY);
+        self.waiting.push_back(greeting.id(self.log.id(self.place)));
+        if restarted {
+            self.lag(None, "restarted");
+        }
+    }
     /// Takes the next events into `waiting`; whether there were any.
     fn read(&mut self) -> bool {
         let batch = self.log.read(self.place, BATCH);

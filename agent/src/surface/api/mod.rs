@@ -5,6 +5,7 @@
 
 mod actions;
 mod body;
+mod body_stream;
 mod downloads;
 mod endpoint;
 mod events;

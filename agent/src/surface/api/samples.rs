@@ -5,7 +5,6 @@
 //! and is told, on a replay it is waited for. It holds nobody else up.
 
 use std::collections::HashSet;
-use std::convert::Infallible;
 use std::time::Duration;
 
 use axum::body::Body;
@@ -13,7 +12,6 @@ use axum::extract::{Extension, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use futures_util::stream;
 use ros2probe_wire::Guid;
 use serde::Deserialize;
 use tokio_util::sync::CancellationToken;
@@ -22,6 +20,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use super::body_stream::{Pieces, stream_of};
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
@@ -174,15 +173,13 @@ async fn samples(
         introduced: HashSet::new(),
         ended: false,
     };
-    let stream = stream::unfold(stream, |mut stream| async {
-        let piece = stream.next().await?;
-        Some((Ok::<_, Infallible>(piece), stream))
-    });
     let headers = [(CACHE_CONTROL, "no-store"), (CONTENT_TYPE, media_type)];
-    Ok((headers, Body::from_stream(stream)).into_response())
+    Ok((headers, Body::from_stream(stream_of(stream))).into_response())
 }
 
-impl Stream {
+impl Pieces for Stream {
+    type Piece = Bytes;
+
     /// The next piece of the answer: some lines, or the payload behind the last one.
     async fn next(&mut self) -> Option<Bytes> {
         if let Some(payload) = self.payload.take() {
@@ -207,7 +204,9 @@ impl Stream {
         }
         (!lines.is_empty()).then(|| lines.into())
     }
+}
 
+impl Stream {
     /// The line for it; with what the writer announced where it is the writer's first.
     fn told(&mut self, item: &Item) -> Line {
         let mut line = Line::from(item);

@@ -11,7 +11,6 @@ mod scene;
 mod structure;
 mod values;
 
-use std::convert::Infallible;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -20,13 +19,13 @@ use axum::extract::{Extension, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use futures_util::stream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, sleep_until};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use super::body_stream::{Pieces, stream_of};
 use super::events::EventView;
 use super::health::HOST;
 use super::problem::{Code, Problem, ProblemBody};
@@ -123,18 +122,16 @@ async fn live(
         permit: Some(permit),
         context,
     };
-    let stream = stream::unfold(stream, |mut stream| async {
-        let piece = stream.next().await?;
-        Some((Ok::<_, Infallible>(piece), stream))
-    });
     let headers = [
         (CACHE_CONTROL, "no-store"),
         (CONTENT_TYPE, "application/x-ndjson"),
     ];
-    Ok((headers, Body::from_stream(stream)).into_response())
+    Ok((headers, Body::from_stream(stream_of(stream))).into_response())
 }
 
-impl Stream {
+impl Pieces for Stream {
+    type Piece = Bytes;
+
     /// The next batch.
     async fn next(&mut self) -> Option<Bytes> {
         if self.ended {
@@ -153,7 +150,9 @@ impl Stream {
         self.batch(&mut lines);
         Some(lines.into())
     }
+}
 
+impl Stream {
     /// Waits for the next moment that is shown; whether there is one.
     async fn moment(&self) -> bool {
         let board = &self.context.board;

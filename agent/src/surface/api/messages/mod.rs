@@ -6,7 +6,6 @@
 
 mod tree;
 
-use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -15,7 +14,6 @@ use axum::body::Body;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use futures_util::stream;
 use ros2probe_wire::Guid;
 use serde::{Deserialize, Serialize};
 use tokio::sync::{Semaphore, SemaphorePermit};
@@ -23,6 +21,7 @@ use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until};
 use utoipa::{IntoParams, ToSchema};
 
+use super::body_stream::{Pieces, stream_of};
 use super::endpoint::text;
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::Domain;
@@ -267,15 +266,11 @@ pub(super) async fn follow(
         _permit: permit,
         context,
     };
-    let stream = stream::unfold(stream, |mut stream| async {
-        let piece = stream.next().await?;
-        Some((Ok::<_, Infallible>(piece), stream))
-    });
     let headers = [
         (CACHE_CONTROL, "no-store"),
         (CONTENT_TYPE, "application/x-ndjson"),
     ];
-    let mut response = (headers, Body::from_stream(stream)).into_response();
+    let mut response = (headers, Body::from_stream(stream_of(stream))).into_response();
     response.extensions_mut().insert(Streamed);
     Ok(response)
 }
@@ -297,7 +292,9 @@ fn request(topic: Choice, domain_id: u32) -> Request {
     }
 }
 
-impl Stream {
+impl Pieces for Stream {
+    type Piece = Bytes;
+
     /// The next lines.
     async fn next(&mut self) -> Option<Bytes> {
         if self.ended {
@@ -325,7 +322,9 @@ impl Stream {
         self.said = Instant::now();
         Some(lines.into())
     }
+}
 
+impl Stream {
     fn take(&mut self, item: Item) {
         match item {
             Item::Sample(sample) => {

@@ -1,0 +1,24 @@
+//! Response bodies that are produced piece by piece while the client reads.
+
+use std::convert::Infallible;
+
+use futures_util::stream::{self, Stream};
+
+/// Produces the pieces of one client's response.
+pub(super) trait Pieces: Send + 'static {
+    /// Bytes, or a server-sent event.
+    type Piece: Send;
+
+    /// Returns the next piece, or `None` at the end of the response.
+    fn next(&mut self) -> impl Future<Output = Option<Self::Piece>> + Send;
+}
+
+/// Turns `source` into the stream that a response body takes. It is dropped with the connection.
+pub(super) fn stream_of<S: Pieces>(
+    source: S,
+) -> impl Stream<Item = Result<S::Piece, Infallible>> + Send {
+    stream::unfold(source, |mut source| async {
+        let piece = source.next().await?;
+        Some((Ok(piece), source))
+    })
+}
