@@ -13,7 +13,7 @@ pub mod discover;
 pub mod doctor;
 pub mod file;
 pub mod message;
-pub mod model;
+pub use ros2probe_model as model;
 pub mod privilege;
 pub mod recording;
 pub mod ros2;

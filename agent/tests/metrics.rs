@@ -101,7 +101,7 @@ fn the_readme_s_tables_are_those_of_the_sources() {
             events::markdown(),
         ),
         (
-            "config/limits.rs -->\n",
+            "model/src/limits.rs -->\n",
             "<!-- limits: end",
             limits_markdown(),
         ),

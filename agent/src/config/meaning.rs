@@ -238,7 +238,7 @@ impl Reader {
             },
             per_subscriber: entry.per_subscriber,
             trace: entry.trace.unwrap_or_default(),
-            retain: entry.retain,
+            retain: entry.retain.into(),
         }
     }
 

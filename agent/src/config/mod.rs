@@ -8,7 +8,6 @@ mod limits;
 mod meaning;
 mod mistake;
 mod shape;
-pub mod watch;
 
 use std::collections::BTreeMap;
 use std::io;
@@ -19,10 +18,12 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-pub use limits::{Limit, Limits, Row as LimitRow, markdown as limits_markdown};
+pub use limits::markdown as limits_markdown;
 pub use mistake::{Mistake, Mistakes, Position};
-pub use watch::{
-    Expectations, ManyGlobs, PatternError, Retain, Watch, Watchlist, check_globs, check_pattern,
+pub use ros2probe_model::limits::{Limit, Limits, Row as LimitRow};
+pub use ros2probe_model::watch::{
+    self, Expectations, ManyGlobs, PatternError, Retain, Watch, Watchlist, check_globs,
+    check_pattern,
 };
 
 /// A larger file is no configuration.

@@ -6,11 +6,12 @@
 use std::collections::BTreeMap;
 
 use schemars::JsonSchema;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use super::limits::LimitsShape;
-use super::watch::Retain;
-use super::{Access, Compression, ExactChoice, Level, PageChoice, ShmMode, SourceChoice, defaults};
+use super::{
+    Access, Compression, ExactChoice, Level, PageChoice, Retain, ShmMode, SourceChoice, defaults,
+};
 
 /// Configuration of the ros2probe agent. Every key may be left out.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
@@ -84,7 +85,7 @@ pub(super) struct WatchEntryShape {
     /// `last`: the last message of each covered transient-local writer is kept in memory, so that
     /// a recording that begins later has it (`/tf_static`). Captures the covered topics.
     #[serde(default)]
-    pub(super) retain: Retain,
+    pub(super) retain: RetainShape,
     /// At least this many messages a second.
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) min_rate_hz: Option<f64>,
@@ -100,6 +101,18 @@ pub(super) struct WatchEntryShape {
     /// Longest time without a message, in seconds.
     #[schemars(range(min = 0.001, max = 604_800.0))]
     pub(super) max_silence_s: Option<f64>,
+}
+
+/// What is kept of a topic's messages for recordings that begin later.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize, JsonSchema)]
+#[schemars(rename = "Retain")]
+#[serde(rename_all = "lowercase")]
+pub(super) enum RetainShape {
+    /// Nothing.
+    #[default]
+    None,
+    /// The last one of each writer that keeps its own for late joiners (transient local).
+    Last,
 }
 
 /// Where packets are taken from.
@@ -212,6 +225,15 @@ pub(super) struct PageShape {
     /// take at most 6 MiB: more than 436 topics have fewer seconds.
     #[schemars(range(min = 0, max = 3_600))]
     pub(super) history_s: u32,
+}
+
+impl From<RetainShape> for Retain {
+    fn from(shape: RetainShape) -> Self {
+        match shape {
+            RetainShape::None => Self::None,
+            RetainShape::Last => Self::Last,
+        }
+    }
 }
 
 impl Default for PageShape {

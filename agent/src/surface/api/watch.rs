@@ -51,11 +51,41 @@ struct WatchView {
     #[schema(minimum = 0, maximum = 1)]
     trace: f64,
     /// `last`: the last message of each transient-local writer is kept for recordings that begin later.
-    retain: Retain,
+    retain: RetainView,
     #[serde(flatten)]
     expectations: ExpectationsView,
     /// The topics it covers now, and a name that does not exist yet.
     topics: Vec<TopicView>,
+}
+
+/// What is kept of a topic's messages for recordings that begin later.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize, ToSchema)]
+#[schema(as = Retain)]
+#[serde(rename_all = "lowercase")]
+enum RetainView {
+    /// Nothing.
+    #[default]
+    None,
+    /// The last one of each writer that keeps its own for late joiners (transient local).
+    Last,
+}
+
+impl From<Retain> for RetainView {
+    fn from(retain: Retain) -> Self {
+        match retain {
+            Retain::None => Self::None,
+            Retain::Last => Self::Last,
+        }
+    }
+}
+
+impl From<RetainView> for Retain {
+    fn from(view: RetainView) -> Self {
+        match view {
+            RetainView::None => Self::None,
+            RetainView::Last => Self::Last,
+        }
+    }
 }
 
 /// What should hold for each topic; what is left out is not expected.
@@ -157,7 +187,7 @@ struct WatchRequest {
     #[schema(minimum = 0, maximum = 1)]
     trace: f64,
     /// `last`: keep the last message of each transient-local writer for recordings that begin later.
-    retain: Retain,
+    retain: RetainView,
     /// At least this many messages a second.
     #[schema(minimum = 0, maximum = 1_000_000)]
     min_rate_hz: Option<f64>,
@@ -383,7 +413,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
             expectations,
             per_subscriber: settings.per_subscriber,
             trace,
-            retain: settings.retain,
+            retain: settings.retain.into(),
         }),
         Err(mistake) => invalid(mistake),
     }
@@ -477,7 +507,7 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
         state: stage,
         per_subscriber: watch.per_subscriber,
         trace: watch.trace,
-        retain: watch.retain,
+        retain: watch.retain.into(),
         expectations: (&watch.expectations).into(),
         topics,
     }

@@ -3,12 +3,12 @@
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::Receiver;
-use crate::model::cause::LossCause;
-use crate::model::deaths::Deaths;
-use crate::model::journal::{DeliveryLoss, Journal};
-use crate::model::reception::Decision;
-use crate::model::snapshot::{Breakdown, Delivered, Direction};
-use crate::model::way::Way;
+use crate::cause::LossCause;
+use crate::deaths::Deaths;
+use crate::journal::{DeliveryLoss, Journal};
+use crate::reception::Decision;
+use crate::snapshot::{Breakdown, Delivered, Direction};
+use crate::way::Way;
 
 /// What is counted of all deliveries of a writer.
 #[derive(Clone, Debug, Default)]

@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 
 use ros2probe_wire::{Guid, Timestamp};
 
-use crate::model::cause::LossCause;
-use crate::model::histogram::Histogram;
+use crate::cause::LossCause;
+use crate::histogram::Histogram;
 
 /// Samples of one delivery, or of several. All but `pending` never go down.
 ///

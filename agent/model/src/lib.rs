@@ -1,5 +1,7 @@
 //! The core: a plain state machine. Time and bytes in, facts out; no I/O, no clock, no thread.
 
+#![forbid(unsafe_code)]
+
 pub mod acknowledgement;
 pub mod ahead;
 pub mod assembly;
@@ -22,6 +24,7 @@ pub mod identity;
 pub mod in_order;
 pub mod interest;
 pub mod journal;
+pub mod limits;
 pub mod observer;
 mod passage;
 pub mod payloads;
@@ -42,6 +45,7 @@ pub mod sockets;
 pub mod subscribers;
 pub mod topic;
 pub mod trace;
+pub mod watch;
 pub mod way;
 pub mod ways;
 pub mod writer;

@@ -9,7 +9,7 @@ use regex::bytes::{Regex, RegexBuilder};
 
 use super::glob;
 use super::topic::Naming;
-use crate::config::{PatternError, check_pattern};
+use crate::watch::{PatternError, check_pattern};
 
 /// Largest compiled form of one regular expression, in bytes, and as much again while it is matched.
 const REGEX_BYTES: usize = 256 << 10;

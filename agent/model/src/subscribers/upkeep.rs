@@ -4,9 +4,9 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Reliability;
 
 use super::{Stage, Subscribers, is_reader, scene};
-use crate::model::delivery::{Delivery, Receiver, Totals};
-use crate::model::receivers::{Matched, readers};
-use crate::model::way::Way;
+use crate::delivery::{Delivery, Receiver, Totals};
+use crate::receivers::{Matched, readers};
+use crate::way::Way;
 
 const SECOND: u64 = 1_000_000_000;
 /// A way by which nothing came for so long is forgotten, unless a reader is known at its end.

@@ -15,7 +15,7 @@ use ros2probe_wire::{EntityId, Guid, Timestamp};
 use super::facts::{Participant, named};
 use super::worth::Worth;
 use super::{Discovery, SECOND};
-use crate::model::journal::Journal;
+use crate::journal::Journal;
 
 /// A participant that was seen over this span is no forgery of the moment.
 const ESTABLISHED: u64 = 2 * SECOND;

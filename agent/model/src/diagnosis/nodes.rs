@@ -8,7 +8,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use super::Diagnosis;
 use super::examiner::Findings;
-use crate::model::discovery::{Discovery, Node, Participant};
+use crate::discovery::{Discovery, Node, Participant};
 
 /// One node with whom it belongs to.
 #[derive(Clone, Copy, Debug)]

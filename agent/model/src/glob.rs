@@ -8,7 +8,7 @@
 const ANY_TOKENS: &str = "/**";
 
 /// Returns whether `pattern` covers `name`: both are absolute, or begin alike before the first
-/// slash, as DDS names do (`rq/**`). What a pattern covers that [`crate::config::check_pattern`]
+/// slash, as DDS names do (`rq/**`). What a pattern covers that [`crate::watch::check_pattern`]
 /// refuses is not specified.
 ///
 /// `**` at the end covers at least one token, elsewhere also none: `/a/**` does not cover `/a`,
@@ -115,7 +115,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::config::check_pattern;
+    use crate::watch::check_pattern;
 
     /// What another implementation says, which builds an automaton.
     fn reference(pattern: &str, name: &str) -> bool {

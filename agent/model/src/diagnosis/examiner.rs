@@ -8,9 +8,9 @@ use ros2probe_wire::{Guid, Timestamp};
 
 use super::endpoints::{Lonely, Lookout};
 use super::{Diagnoses, Diagnosis, QosPairs, nodes};
-use crate::model::discovery::Discovery;
-use crate::model::size::Size;
-use crate::model::topic::Topics;
+use crate::discovery::Discovery;
+use crate::size::Size;
+use crate::topic::Topics;
 
 const SECOND: u64 = 1_000_000_000;
 /// How long an endpoint is alone before that is a finding: nodes start one after another.

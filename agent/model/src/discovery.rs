@@ -37,7 +37,7 @@ use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
 use super::size::Size;
 use super::topic::Naming;
-use crate::config::Watchlist;
+use crate::watch::Watchlist;
 
 const SECOND: u64 = 1_000_000_000;
 /// Endpoints and nodes whose participant is not known yet: how many and how long.

@@ -6,8 +6,8 @@ use ros2probe_wire::Guid;
 use ros2probe_wire::discovery::Role;
 
 use super::facts::{Endpoint, Portrait};
-use crate::model::churn::{Entity, Event};
-use crate::model::event::{EventKind, bounded, bounded_shared};
+use crate::churn::{Entity, Event};
+use crate::event::{EventKind, bounded, bounded_shared};
 
 /// One participant, endpoint or node.
 pub(super) struct Subject<'a> {

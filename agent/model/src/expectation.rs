@@ -9,7 +9,7 @@ use ros2probe_wire::Timestamp;
 
 use super::rate::{SECONDS, Slot};
 use super::snapshot::WatchState;
-use crate::config::Expectations;
+use crate::watch::Expectations;
 
 /// Consecutive bad judgements until a topic is violated.
 const BAD: u8 = 2;

@@ -16,7 +16,7 @@ use super::expectation::Judgement;
 use super::selection::{Depth, Wish};
 use super::size::Size;
 use super::snapshot::Measurement;
-use crate::config::Watchlist;
+use crate::watch::Watchlist;
 
 /// Handle of a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -570,7 +570,7 @@ mod tests {
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;
-    use crate::config::Watch;
+    use crate::watch::Watch;
 
     fn naming(name: &str) -> Naming {
         Naming::of(&DdsTopic::parse(name).unwrap())

@@ -39,7 +39,8 @@ use super::topic::{Naming, Topic, TopicId, Topics, Watched};
 use super::trace::{Spans, Subject, Tracer};
 use super::way::Place;
 use super::writer::{Counted, Traits};
-use crate::config::{Limits, Watch, Watchlist};
+use crate::limits::Limits;
+use crate::watch::{Watch, Watchlist};
 
 const SECOND: u64 = 1_000_000_000;
 /// How often leases, windows and gaps are looked at.
@@ -1249,7 +1250,7 @@ const DATA_FLAG: u8 = 0x04;
 const KEY_FLAG: u8 = 0x08;
 
 /// What a DATA submessage carries.
-pub(crate) fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
+pub fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
     match found.record.submessage_flags & (DATA_FLAG | KEY_FLAG) {
         0 => Payload::None,
         KEY_FLAG => Payload::Key(found.payload),
@@ -1258,7 +1259,7 @@ pub(crate) fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
 }
 
 /// Inline QoS of a DATA submessage: behind `octetsToInlineQos`, which counts from its own end.
-pub(crate) fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireError> {
+pub fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireError> {
     let flags = found.record.submessage_flags;
     if flags & INLINE_QOS_FLAG == 0 {
         return Ok(InlineQos::default());

@@ -4,11 +4,9 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 
-use crate::model::glob;
+use crate::glob;
 
 /// One watchlist entry.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,9 +26,7 @@ pub struct Watch {
 }
 
 /// What is kept of a topic's messages for recordings that begin later.
-#[derive(
-    Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema, ToSchema,
-)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Retain {
     /// Nothing.

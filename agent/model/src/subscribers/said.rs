@@ -4,10 +4,10 @@ use ros2probe_wire::record::kind;
 use ros2probe_wire::{GuidPrefix, Record};
 
 use super::{Stage, Subscribers, is_open, scene};
-use crate::model::delivery::Receiver;
-use crate::model::receivers::Matched;
-use crate::model::way::Place;
-use crate::model::ways::Known;
+use crate::delivery::Receiver;
+use crate::receivers::Matched;
+use crate::way::Place;
+use crate::ways::Known;
 
 impl Subscribers {
     /// A HEARTBEAT or GAP came this way.

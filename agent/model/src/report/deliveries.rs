@@ -4,12 +4,12 @@ use std::collections::{BTreeSet, HashMap};
 
 use ros2probe_wire::{EntityId, Guid, Timestamp};
 
-use crate::model::delivery::{Delivery, Receiver, Totals};
-use crate::model::observer::Observer;
-use crate::model::receivers::readers;
-use crate::model::snapshot::{AcknowledgementFacts, DeliveryFacts, Direction, SocketFacts};
-use crate::model::topic::Topic;
-use crate::model::ways::Known;
+use crate::delivery::{Delivery, Receiver, Totals};
+use crate::observer::Observer;
+use crate::receivers::readers;
+use crate::snapshot::{AcknowledgementFacts, DeliveryFacts, Direction, SocketFacts};
+use crate::topic::Topic;
+use crate::ways::Known;
 
 /// Nodes by their endpoints.
 type Nodes<'a> = HashMap<Guid, &'a str>;

@@ -11,8 +11,8 @@ use ros2probe_wire::rtps::VendorId;
 use super::examiner::{Findings, half_known};
 use super::matching::{self, Offer, Policies, Policy, Verdict};
 use super::{Diagnosis, QosPairs, TopicKey, Unmatched};
-use crate::model::discovery::{Discovery, Endpoint};
-use crate::model::topic::Topic;
+use crate::discovery::{Discovery, Endpoint};
+use crate::topic::Topic;
 
 /// Incompatible pairs listed of one topic.
 const PAIRS_PER_TOPIC: usize = 32;

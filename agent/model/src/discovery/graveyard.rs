@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::facts::Origin;
-use crate::model::size::Size;
+use crate::size::Size;
 
 /// Announcements older than a disposal are stale, for this long after it.
 const BURIED: u64 = 500_000_000;

@@ -7,8 +7,8 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use ros2probe_wire::GuidPrefix;
 
-use crate::model::size::Size;
-use crate::model::way::Place;
+use crate::size::Size;
+use crate::way::Place;
 
 /// All addresses.
 #[derive(Debug)]

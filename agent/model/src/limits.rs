@@ -1,0 +1,331 @@
+//! The caps that an operator may set (`limits:`), once: key, default, range, what one entry costs,
+//! what happens when it is reached. The configuration's keys, its schema, the table of the documents
+//! and the metrics `ros2probe_limit*` come from here; caps that protect a parser or the kernel's memory are
+//! constants where they apply, and are listed in the README beside these.
+//!
+//! The defaults fit a Raspberry Pi 4 and `MemoryMax=` of the unit: all of them reached at once, a
+//! test adds up what their entries take.
+
+/// One cap of the configuration.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Limit {
+    /// DDS participants.
+    Participants,
+    /// Writers and readers.
+    Endpoints,
+    /// Topics that are measured.
+    Topics,
+    /// Watches of every origin.
+    Watches,
+    /// Writers that send without a known announcement.
+    UnknownWriters,
+    /// What one writer sends to one receiver or destination.
+    Flows,
+    /// Bytes held while datagrams are reassembled.
+    ReassemblyBytes,
+    /// Streams of messages and recordings.
+    Subscriptions,
+    /// Bytes of messages put together for those and waiting for them.
+    PayloadBytes,
+    /// Bags that the agent writes on request.
+    Recordings,
+    /// Connections to each listener of the API.
+    ApiClients,
+    /// Connections to the metrics listener.
+    MetricsClients,
+}
+
+/// All there is to say of a cap.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Row {
+    /// Its key below `limits`, and the label `limit`.
+    pub key: &'static str,
+    /// When nobody says otherwise.
+    pub default: usize,
+    /// Smallest and largest value that is accepted.
+    pub range: (usize, usize),
+    /// What is counted.
+    pub what: &'static str,
+    /// What becomes of the next one.
+    pub reached: &'static str,
+    /// Which metrics tell more than `ros2probe_limit_reached_total` does.
+    pub told_by: &'static str,
+    /// Bytes that one takes at most on a robot with names of usual length, with two snapshots and two
+    /// pages of metrics that tell of it; 1 where bytes are counted.
+    pub bytes: usize,
+}
+
+/// The caps in force.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// DDS participants.
+    pub participants: usize,
+    /// Writers and readers.
+    pub endpoints: usize,
+    /// Topics that are measured.
+    pub topics: usize,
+    /// Watches of every origin.
+    pub watches: usize,
+    /// Writers that send without a known announcement.
+    pub unknown_writers: usize,
+    /// What one writer sends to one receiver or destination.
+    pub flows: usize,
+    /// Bytes held while datagrams are reassembled.
+    pub reassembly_bytes: usize,
+    /// Streams of messages and recordings.
+    pub subscriptions: usize,
+    /// Bytes of messages put together for those and waiting for them.
+    pub payload_bytes: usize,
+    /// Bags that the agent writes on request.
+    pub recordings: usize,
+    /// Connections to each listener of the API.
+    pub api_clients: usize,
+    /// Connections to the metrics listener.
+    pub metrics_clients: usize,
+}
+
+impl Limit {
+    /// All of them, in the order in which they are documented.
+    pub const ALL: [Self; 12] = [
+        Self::Participants,
+        Self::Endpoints,
+        Self::Topics,
+        Self::Watches,
+        Self::UnknownWriters,
+        Self::Flows,
+        Self::ReassemblyBytes,
+        Self::Subscriptions,
+        Self::PayloadBytes,
+        Self::Recordings,
+        Self::ApiClients,
+        Self::MetricsClients,
+    ];
+
+    /// The table.
+    #[must_use]
+    pub const fn row(self) -> Row {
+        match self {
+            Self::Participants => Row {
+                key: "participants",
+                default: 1_000,
+                range: (1, 100_000),
+                what: "DDS participants",
+                reached: "one that is no longer heard makes room (for 5 s, if it was there for \
+                    less than 2 s, else for 90 s), or the least worthy one for a newcomer that is \
+                    worth more; otherwise the newcomer is left out",
+                told_by: "ros2probe_table_evictions_total",
+                bytes: 2 << 10,
+            },
+            Self::Endpoints => Row {
+                key: "endpoints",
+                default: 8_192,
+                range: (1, 1_000_000),
+                what: "Writers and readers",
+                reached: "a participant that is no longer heard makes room with all its entries, \
+                    or the least worthy entry for a newcomer that is worth more; otherwise the \
+                    newcomer waits until there is room",
+                told_by: "ros2probe_table_evictions_total",
+                bytes: 5_632,
+            },
+            Self::Topics => Row {
+                key: "topics",
+                default: 1_000,
+                range: (1, 100_000),
+                what: "Measured topics with series of their own",
+                reached: "one that has vanished makes room, or the latest one that is not watched \
+                    by its exact name for one that is; otherwise the newcomer is listed but not \
+                    measured until an entry is free",
+                told_by: "ros2probe_topics_rejected_total",
+                bytes: 15 << 10,
+            },
+            Self::Watches => Row {
+                key: "watches",
+                default: 1_000,
+                range: (1, 10_000),
+                what: "Watches of the configuration, the command line and clients together",
+                reached: "a client's is refused (409), and so is a configuration that lists more",
+                told_by: "",
+                bytes: 1 << 10,
+            },
+            Self::UnknownWriters => Row {
+                key: "unknown_writers",
+                default: 256,
+                range: (1, 100_000),
+                what: "Writers whose announcement was missed",
+                reached: "one that sent less than 10 messages and nothing for 3 s makes room; \
+                          otherwise the newcomer is not followed",
+                told_by: "ros2probe_table_evictions_total",
+                bytes: 4 << 10,
+            },
+            Self::Flows => Row {
+                key: "flows",
+                default: 4_096,
+                range: (1, 1_000_000),
+                what: "Pairs of a measured writer and one receiver, or one destination, of its \
+                       messages",
+                reached: "those that were silent for 10 s make room; until then the newcomer is not \
+                          followed, and its topic's own counts stay right",
+                told_by: "ros2probe_table_evictions_total",
+                bytes: 2 << 10,
+            },
+            Self::ReassemblyBytes => Row {
+                key: "reassembly_bytes",
+                default: 4 << 20,
+                range: (65_536, 1 << 30),
+                what: "Bytes of captured datagrams of which fragments are missing",
+                reached: "the oldest datagram is dropped",
+                told_by: "ros2probe_incomplete_datagrams_total",
+                bytes: 1,
+            },
+            Self::Subscriptions => Row {
+                key: "subscriptions",
+                default: 32,
+                range: (1, 1_000),
+                what: "Clients that get messages one by one, recordings and snapshots",
+                reached: "the next one is refused (503)",
+                told_by: "ros2probe_subscriptions_refused_total",
+                bytes: 8 << 10,
+            },
+            Self::PayloadBytes => Row {
+                key: "payload_bytes",
+                default: 40 << 20,
+                range: (1 << 20, 16 << 30),
+                what: "Bytes of messages that are put together for them (one half), or wait to be \
+                       read (the other)",
+                reached: "the oldest message of the longest queue is dropped, or the least \
+                    complete one, and reported to its readers",
+                told_by: "ros2probe_missed_messages_total",
+                bytes: 1,
+            },
+            Self::Recordings => Row {
+                key: "recordings",
+                default: 4,
+                range: (1, 100),
+                what: "Bags that the agent writes at once on request",
+                reached: "the next one is refused (409)",
+                told_by: "",
+                bytes: 6 << 20,
+            },
+            Self::ApiClients => Row {
+                key: "api_clients",
+                default: 64,
+                range: (1, 10_000),
+                what: "Connections to each listener of the control API",
+                reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed",
+                told_by: "",
+                bytes: 32 << 10,
+            },
+            Self::MetricsClients => Row {
+                key: "metrics_clients",
+                default: 32,
+                range: (1, 10_000),
+                what: "Connections to the metrics listener",
+                reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed; with TLS it is closed",
+                told_by: "",
+                bytes: 32 << 10,
+            },
+        }
+    }
+
+    /// Its key, which is also its label.
+    #[must_use]
+    pub const fn key(self) -> &'static str {
+        self.row().key
+    }
+
+    /// Whether part of the robot is not seen while it is reached.
+    #[must_use]
+    pub const fn blinds(self) -> bool {
+        matches!(
+            self,
+            Self::Participants
+                | Self::Endpoints
+                | Self::Topics
+                | Self::UnknownWriters
+                | Self::Flows
+                | Self::ReassemblyBytes
+        )
+    }
+
+    /// The one with this key.
+    #[must_use]
+    pub fn find(key: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|limit| limit.key() == key)
+    }
+}
+
+impl Limits {
+    /// The caps that `value` gives for each limit.
+    pub fn of(value: impl Fn(Limit) -> usize) -> Self {
+        Self {
+            participants: value(Limit::Participants),
+            endpoints: value(Limit::Endpoints),
+            topics: value(Limit::Topics),
+            watches: value(Limit::Watches),
+            unknown_writers: value(Limit::UnknownWriters),
+            flows: value(Limit::Flows),
+            reassembly_bytes: value(Limit::ReassemblyBytes),
+            subscriptions: value(Limit::Subscriptions),
+            payload_bytes: value(Limit::PayloadBytes),
+            recordings: value(Limit::Recordings),
+            api_clients: value(Limit::ApiClients),
+            metrics_clients: value(Limit::MetricsClients),
+        }
+    }
+
+    /// One of them.
+    #[must_use]
+    pub const fn get(&self, limit: Limit) -> usize {
+        match limit {
+            Limit::Participants => self.participants,
+            Limit::Endpoints => self.endpoints,
+            Limit::Topics => self.topics,
+            Limit::Watches => self.watches,
+            Limit::UnknownWriters => self.unknown_writers,
+            Limit::Flows => self.flows,
+            Limit::ReassemblyBytes => self.reassembly_bytes,
+            Limit::Subscriptions => self.subscriptions,
+            Limit::PayloadBytes => self.payload_bytes,
+            Limit::Recordings => self.recordings,
+            Limit::ApiClients => self.api_clients,
+            Limit::MetricsClients => self.metrics_clients,
+        }
+    }
+
+    /// What the agent takes beside them: idle, with its rings and the kernel's maps (14 MiB), what is
+    /// kept of events, two views of all there is under way, and the history of measured topics.
+    pub const BESIDE: usize = 29 << 20;
+
+    /// Bytes that all of them take when they are reached together.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        let each = |limit: Limit| self.get(limit).saturating_mul(limit.row().bytes);
+        Limit::ALL
+            .into_iter()
+            .map(each)
+            .fold(0, usize::saturating_add)
+    }
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self::of(|limit| limit.row().default)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_limit_is_what_its_key_says() {
+        let numbers = Limits::of(|limit| limit as usize);
+        for (place, limit) in Limit::ALL.into_iter().enumerate() {
+            assert_eq!((limit as usize, numbers.get(limit)), (place, place));
+            assert_eq!(Limit::find(limit.key()), Some(limit));
+            let Row { default, range, .. } = limit.row();
+            assert!((range.0..=range.1).contains(&default), "{limit:?}");
+        }
+        assert_eq!(Limit::find("clouds"), None);
+    }
+}
