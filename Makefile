@@ -14,9 +14,8 @@ MIRI := MIRIFLAGS="-Zmiri-strict-provenance -Zmiri-disable-isolation $$MIRI_MORE
 # Floods and what is tried with every change of a byte would take hours there, and queues wake their
 # readers through sockets that it does not have.
 MIRI_WIRE := cursor:: walk:: record:: rtps:: --skip never
-MIRI_AGENT := capture::ring::block capture::ring::turns capture::shm::cell capture::shm::port \
-    capture::shm::segment capture::shm::inbox
-MIRI_THREADS := capture::ring::turns
+MIRI_CAPTURE := ring::block ring::turns shm::cell shm::port shm::segment shm::inbox
+MIRI_THREADS := ring::turns
 
 # Node of target/tools is there only where the system's is too old for the page's tests.
 export PATH := $(TARGET)/tools/node/bin:$(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
@@ -122,8 +121,8 @@ fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 miri: ## rings and the walk under Miri, which finds what the compiler may not assume
 	@.ci/prerequisites.sh miri
 	@$(MIRI) --package ros2probe-wire --lib -- $(MIRI_WIRE)
-	@$(MIRI) --package ros2probe --lib -- $(MIRI_AGENT)
-	@MIRI_MORE=-Zmiri-many-seeds=0..16 $(MIRI) --package ros2probe --lib -- $(MIRI_THREADS)
+	@$(MIRI) --package ros2probe-capture --lib -- $(MIRI_CAPTURE)
+	@MIRI_MORE=-Zmiri-many-seeds=0..16 $(MIRI) --package ros2probe-capture --lib -- $(MIRI_THREADS)
 
 deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses sources: without network
 	@.ci/prerequisites.sh deny

@@ -5,8 +5,7 @@
 //! `ros2` is the text that people know.
 
 pub mod bag;
-pub mod bell;
-pub mod capture;
+pub use ros2probe_capture as capture;
 pub mod client;
 pub mod config;
 pub mod discover;

@@ -124,7 +124,7 @@ fn run(options: cli::Run) -> Result<()> {
         .is_some_and(|state| memory::restore_watches(state, &watches));
     let role = match &mut source {
         Source::Live(live) => {
-            live.start();
+            live.start(privilege::spawn_source);
             Role::capture()
         }
         Source::Replay(_) => Role::Service,

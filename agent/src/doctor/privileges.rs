@@ -110,7 +110,7 @@ fn probes(host: &Host, settings: &CaptureSettings) -> Option<Finding> {
     if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
         return None;
     }
-    let missing = privilege::lacking_for_probes(&host.capabilities);
+    let missing = crate::capture::exact::lacking(&host.capabilities);
     if missing.is_empty() {
         return None;
     }

@@ -22,13 +22,6 @@ const WIRE: [Capability; 3] = [
     Capability::CAP_PERFMON,
 ];
 
-/// Breakpoints in other processes: `CAP_PERFMON` was enough from Linux 5.8 on and is not any more.
-/// Which files they map: of those of other users with both.
-const PROBES: [(Capability, &str); 2] = [
-    (Capability::CAP_SYS_ADMIN, "CAP_SYS_ADMIN"),
-    (Capability::CAP_SYS_PTRACE, "CAP_SYS_PTRACE"),
-];
-
 /// Live capture is not possible for lack of these.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Missing {
@@ -120,26 +113,6 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)
         }
         SourceChoice::Auto | SourceChoice::Wire => vec![(SourceChoice::Wire, wire())],
     }
-}
-
-/// What [`crate::capture::exact`] lacks.
-#[must_use]
-pub fn missing_for_probes() -> Vec<&'static str> {
-    let Ok(effective) = caps::read(None, CapSet::Effective) else {
-        return Vec::new();
-    };
-    lacking_for_probes(&effective)
-}
-
-/// Likewise, of a process with these effective capabilities.
-pub(crate) fn lacking_for_probes(effective: &CapsHashSet) -> Vec<&'static str> {
-    let needed = PROBES.iter().filter(|(one, _)| !effective.contains(one));
-    needed.map(|(_, name)| *name).collect()
-}
-
-/// Whether this is one of what attaching to libraries needs.
-pub(super) fn is_for_probes(capability: Capability) -> bool {
-    PROBES.iter().any(|(one, _)| *one == capability)
 }
 
 /// Gives up what the calling thread does not keep, from every set; from the bounding set where it

@@ -10,7 +10,9 @@ use caps::Capability;
 use super::calls::{self, FilterError};
 use super::capabilities::{self, DropError};
 use super::probe::map_updates_need_bpf;
+use crate::capture::exact;
 use crate::capture::system::allow_running_first;
+use crate::capture::threads::Task;
 
 /// Whether filters are in force, as the kernel answered when the first thread was confined: its answer
 /// is the same for all.
@@ -145,7 +147,7 @@ impl Role {
                 Capability::CAP_SYS_NICE => needs_nice,
                 _ => false,
             },
-            Self::Exact => capabilities::is_for_probes(capability),
+            Self::Exact => exact::requires(capability),
         }
     }
 }
@@ -205,4 +207,24 @@ pub fn spawn(
     })?;
     told.recv().map_err(|_| SpawnError::Died)??;
     Ok(thread)
+}
+
+/// Starts a thread of a source, confined to its task.
+///
+/// # Errors
+/// As [`spawn`].
+pub fn spawn_source(
+    task: Task,
+    thread: Builder,
+    work: Box<dyn FnOnce() + Send>,
+) -> io::Result<JoinHandle<()>> {
+    let role = match task {
+        Task::SharedMemory => Role::shared_memory(),
+        Task::Reattach => Role::reattach(),
+        Task::Probes => Role::Exact,
+    };
+    spawn(role, thread, work).map_err(|error| match error {
+        SpawnError::Thread(error) => error,
+        error => io::Error::other(error),
+    })
 }

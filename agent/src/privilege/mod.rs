@@ -13,8 +13,10 @@ mod probe;
 mod threads;
 mod user;
 
-pub use capabilities::{DropError, Missing, Powerless, StillPowerful, check, missing_for_probes};
-pub(crate) use capabilities::{lacking_for_probes, missing};
-pub use confinement::{ConfineError, Role, Sandbox, SpawnError, confine, give_up, sandbox, spawn};
+pub(crate) use capabilities::missing;
+pub use capabilities::{DropError, Missing, Powerless, StillPowerful, check};
+pub use confinement::{
+    ConfineError, Role, Sandbox, SpawnError, confine, give_up, sandbox, spawn, spawn_source,
+};
 pub use threads::{ThreadPowers, threads};
 pub use user::{Identity, become_own_user};

@@ -16,7 +16,7 @@ use super::events::{AgentEvent, EventLog};
 use super::limit_facts::LimitFigures;
 use super::otlp::{Exports, Reason, Signal, SpanQueue};
 use super::recording_facts::RecordingFigures;
-use crate::bell::Bell;
+use crate::capture::bell::Bell;
 use crate::config::{Config, Limits, Watch};
 use crate::model::history::Past;
 use crate::model::snapshot::Snapshot;

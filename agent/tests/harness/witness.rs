@@ -149,7 +149,7 @@ fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Tes
         Some(network) => netns::within(network, open)??,
         None => open()?,
     };
-    source.start();
+    source.start(ros2probe::privilege::spawn_source);
     let mut observer = Observer::new(observer::Settings::default());
     observer.set_watchlist(Watchlist::new(config.watches.clone())?);
     let publish = |snapshot: Snapshot| {

@@ -28,7 +28,7 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "UNKNOWN_BYTES_PER_SECOND",
-        "agent/src/capture/live.rs",
+        "agent/capture/src/live.rs",
         "agent/tests/kernel_filter.rs",
         "an_unknown_writer_is_captured_until_its_budget_ends_then_metered_then_only_counted",
     ],
@@ -52,14 +52,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_WALKED",
-        "agent/src/capture/order.rs",
-        "agent/src/capture/order.rs",
+        "agent/capture/src/order.rs",
+        "agent/capture/src/order.rs",
         "no_more_wait_than_there_is_room_for",
     ],
     [
         "MAX_OPEN",
-        "agent/src/capture/whole.rs",
-        "agent/src/capture/whole.rs",
+        "agent/capture/src/whole.rs",
+        "agent/capture/src/whole.rs",
         "more_than_there_is_room_for_push_out_the_oldest",
     ],
     [
@@ -70,8 +70,8 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_BYTES",
-        "agent/src/capture/shm/inbox.rs",
-        "agent/src/capture/shm/inbox.rs",
+        "agent/capture/src/shm/inbox.rs",
+        "agent/capture/src/shm/inbox.rs",
         "messages_beyond_the_bytes_that_may_wait_are_refused_and_counted",
     ],
     [
@@ -376,14 +376,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_PORTS",
-        "agent/src/capture/shm/tap.rs",
-        "agent/src/capture/shm/tap/tests.rs",
+        "agent/capture/src/shm/tap.rs",
+        "agent/capture/src/shm/tap/tests.rs",
         "ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_other_s",
     ],
     [
         "MAX_SEGMENTS",
-        "agent/src/capture/shm/tap.rs",
-        "agent/src/capture/shm/tap/tests.rs",
+        "agent/capture/src/shm/tap.rs",
+        "agent/capture/src/shm/tap/tests.rs",
         "ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_other_s",
     ],
     [
@@ -418,14 +418,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_FILES",
-        "agent/src/capture/shm/scan.rs",
-        "agent/src/capture/shm/scan.rs",
+        "agent/capture/src/shm/scan.rs",
+        "agent/capture/src/shm/scan.rs",
         "files_of_living_processes_are_found_among_more_forged_ones_than_are_kept",
     ],
     [
         "SHARE",
-        "agent/src/capture/shm/listing.rs",
-        "agent/src/capture/shm/listing.rs",
+        "agent/capture/src/shm/listing.rs",
+        "agent/capture/src/shm/listing.rs",
         "listings_that_are_always_wanted_cost_no_more_than_their_share",
     ],
     [
@@ -496,20 +496,20 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_WAITING",
-        "agent/src/capture/intake.rs",
+        "agent/capture/src/intake.rs",
         "agent/tests/kernel_caps.rs",
         "records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted",
     ],
     [
         "MAX_LIBRARIES",
-        "agent/src/capture/exact/search.rs",
-        "agent/src/capture/exact/search.rs",
+        "agent/capture/src/exact/search.rs",
+        "agent/capture/src/exact/search.rs",
         "a_library_beyond_the_cap_is_said_to_be_uncovered_until_another_is_no_longer_used",
     ],
     [
         "MAX_LISTED",
-        "agent/src/capture/shm/scan.rs",
-        "agent/src/capture/shm/scan.rs",
+        "agent/capture/src/shm/scan.rs",
+        "agent/capture/src/shm/scan.rs",
         "of_more_entries_than_are_looked_through_those_of_files_that_were_known_stay",
     ],
 ];

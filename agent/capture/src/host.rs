@@ -14,8 +14,8 @@ use super::intake::Intake;
 use super::reattach::{self, Reattach};
 use super::sockets::Sockets;
 use super::system::Clocks;
-use crate::model::observer::Observer;
-use crate::privilege::SpawnError;
+use crate::threads::Spawn;
+use ros2probe_model::observer::Observer;
 
 /// Why the host hook is not in place.
 #[derive(Debug, thiserror::Error)]
@@ -35,8 +35,8 @@ pub enum FollowError {
     #[error(transparent)]
     Filter(#[from] FilterError),
     /// The thread.
-    #[error(transparent)]
-    Spawn(#[from] SpawnError),
+    #[error("failed to spawn a thread")]
+    Thread(#[from] std::io::Error),
 }
 
 /// Which sockets are looked at, and with how much memory.
@@ -96,13 +96,13 @@ impl HostTap {
     ///
     /// # Errors
     /// There can be no thread for it.
-    pub fn start(&mut self) -> Result<(), FollowError> {
+    pub fn start(&mut self, spawn: Spawn) -> Result<(), FollowError> {
         let Some(attached) = reattach::of(self.cgroup.directory()) else {
             return Ok(());
         };
         if !self.is_whole_host() {
             let links = self.filter().links()?;
-            self.reattach = Some(Reattach::start(self.cgroup.path(), attached, links)?);
+            self.reattach = Some(Reattach::start(self.cgroup.path(), attached, links, spawn)?);
         }
         Ok(())
     }

@@ -10,7 +10,7 @@ use std::os::unix::fs::FileExt as _;
 
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
-use crate::capture::filter::Form;
+use crate::filter::Form;
 
 /// `SharedMemTransport::copy_to_shared_buffer`, called once for each message that goes into shared
 /// memory; `send` above it is called for all others, too. What follows tells the parameters.

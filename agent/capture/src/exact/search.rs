@@ -16,11 +16,11 @@ use std::time::{Duration, Instant};
 
 use super::library::{self, LibraryError};
 use super::processes::{LibraryId, Mapped, Processes, is_library};
-use crate::capture::filter::{FilterError, Probe, Probes};
-use crate::capture::live::in_words;
-use crate::capture::shm::scan::{Name, Places, Scope};
-use crate::capture::system::DirectoryWatch;
-use crate::privilege::{self, Role, SpawnError};
+use crate::filter::{FilterError, Probe, Probes};
+use crate::live::in_words;
+use crate::shm::scan::{Name, Places, Scope};
+use crate::system::DirectoryWatch;
+use crate::threads::{Spawn, Task};
 
 /// How often processes are gone through when nothing happens.
 const EVERY: Duration = Duration::from_secs(1);
@@ -176,14 +176,14 @@ impl Search {
     ///
     /// # Errors
     /// There can be no more threads.
-    pub fn start(&mut self) -> Result<(), SpawnError> {
+    pub fn start(&mut self, spawn: Spawn) -> io::Result<()> {
         let Some((attachments, scope)) = self.waiting.take() else {
             return Ok(());
         };
         let thread = std::thread::Builder::new().name("exact".to_owned());
         let shared = Arc::clone(&self.shared);
-        let work = move || follow(&shared, attachments, scope);
-        self.thread = Some(privilege::spawn(Role::Exact, thread, work)?);
+        let work = Box::new(move || follow(&shared, attachments, scope));
+        self.thread = Some(spawn(Task::Probes, thread, work)?);
         Ok(())
     }
 
@@ -459,7 +459,7 @@ mod tests {
 
     use super::super::processes::Use;
     use super::*;
-    use crate::capture::filter::{Filter, FilterSettings};
+    use crate::filter::{Filter, FilterSettings};
 
     /// Maps a file into this process, for good.
     fn map(file: &fs::File) {

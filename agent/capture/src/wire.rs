@@ -20,9 +20,9 @@ use super::order::{Next, Order};
 use super::reattach::{Identity, identity};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::Clocks;
-use crate::model::ahead::{Ahead, Ready};
-use crate::model::observer::Observer;
-use crate::model::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
+use ros2probe_model::ahead::{Ahead, Ready};
+use ros2probe_model::observer::Observer;
+use ros2probe_model::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 
 /// Records younger than this wait, so that frames captured before them are taken in first: a frame
 /// waits up to 100 ms for its block to fill.
@@ -496,7 +496,7 @@ fn take_in_rest(rest: &Reassembled, observer: &mut Observer) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::netns::tests::{in_new_namespace, ip};
+    use crate::netns::tests::{in_new_namespace, ip};
 
     #[test]
     fn an_interface_that_the_configuration_names_is_missed_until_it_is_there_again() {

@@ -26,10 +26,11 @@ use super::shm::pace::Budget as Shares;
 use super::shm::scan::{Places, Scope};
 use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
+use super::threads::Spawn;
 use super::wire::{self, TapError, WireSettings, WireTap};
-use crate::config::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
-use crate::model::observer::{Observer, Wanted};
-use crate::model::reassembly::Limits;
+use crate::settings::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
+use ros2probe_model::observer::{Observer, Wanted};
+use ros2probe_model::reassembly::Limits;
 
 /// What unclassified writers may cost each second, all together: a dozen nodes that start at once
 /// stay far below, a storm of forged ones stays bounded.
@@ -171,21 +172,22 @@ impl LiveSource {
         Ok(source)
     }
 
-    /// Starts the threads that need privileges of their own, before the caller gives up its own.
-    pub fn start(&mut self) {
+    /// Starts the threads that need privileges of their own with `spawn`, before the caller gives up
+    /// its own.
+    pub fn start(&mut self, spawn: Spawn) {
         if let Some(exact) = &mut self.exact
-            && let Err(error) = exact.start()
+            && let Err(error) = exact.start(spawn)
         {
             let reason = in_words(&error);
             tracing::warn!(reason, "uprobes are not attached to libraries loaded later");
         }
         if let Some(host) = &mut self.host
-            && let Err(error) = host.start()
+            && let Err(error) = host.start(spawn)
         {
             let reason = in_words(&error);
             tracing::warn!(reason, "a cgroup that is made anew is not seen");
         }
-        self.start_shared_memory();
+        self.start_shared_memory(spawn);
     }
 
     /// The tap at the host's sockets, if that is where this looks.
@@ -490,11 +492,11 @@ impl LiveSource {
         host.chain(self.exact.iter().map(Exact::intake))
     }
 
-    fn start_shared_memory(&mut self) {
+    fn start_shared_memory(&mut self, spawn: Spawn) {
         let Shm::Later(scope, budget) = &self.shared_memory else {
             return;
         };
-        let started = SharedMemory::start(Places::new(scope.clone()), *budget);
+        let started = SharedMemory::start(Places::new(scope.clone()), *budget, spawn);
         self.shared_memory = match started {
             Ok(running) => Shm::Running(running),
             Err(error) => {
@@ -623,7 +625,8 @@ fn open_wires(
 }
 
 /// An error and its causes in one line; of a verifier's log, the first line.
-pub(crate) fn in_words(error: &dyn Error) -> String {
+#[must_use]
+pub fn in_words(error: &dyn Error) -> String {
     let mut words = String::new();
     let mut cause = Some(error);
     while let Some(error) = cause {

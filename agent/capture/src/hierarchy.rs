@@ -109,7 +109,8 @@ pub fn mount_point() -> Result<PathBuf, HierarchyError> {
 }
 
 /// Of several mounts one that shows all, that is `/` of the hierarchy.
-pub(crate) fn topmost(mounts: &[u8]) -> Option<PathBuf> {
+#[must_use]
+pub fn topmost(mounts: &[u8]) -> Option<PathBuf> {
     let found = mounts
         .split(|byte| *byte == b'\n')
         .filter_map(mount)

@@ -8,7 +8,7 @@ use std::fs::{self, File};
 use std::io::{self, Read as _};
 use std::path::PathBuf;
 
-use crate::capture::shm::scan::Scope;
+use crate::shm::scan::Scope;
 
 /// Names of the library: Fast DDS 2.x, 3.x. A version may follow.
 const LIBRARIES: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];

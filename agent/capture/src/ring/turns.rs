@@ -119,7 +119,7 @@ mod tests {
     use std::thread;
 
     use super::*;
-    use crate::capture::ring::block::tests::block_of;
+    use crate::ring::block::tests::block_of;
 
     const BLOCK: usize = 512;
     const BLOCKS: usize = 3;

@@ -173,7 +173,7 @@ pub(super) mod tests {
     }
 
     /// Frames as the kernel lays them out; the last one with a VLAN tag.
-    pub(in crate::capture::ring) fn block_of(frames: &[&[u8]]) -> Vec<u8> {
+    pub(in crate::ring) fn block_of(frames: &[&[u8]]) -> Vec<u8> {
         let mut block = vec![0; 48];
         put(&mut block, STATUS, libc::TP_STATUS_USER);
         put(&mut block, COUNT, u32::try_from(frames.len()).unwrap());

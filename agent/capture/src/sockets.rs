@@ -13,8 +13,8 @@ use super::control_groups::ControlGroups;
 use super::filter::Filter;
 use super::inside::Inside;
 use super::owners::Owner;
-use crate::model::observer::Observer;
-use crate::model::snapshot::SocketFacts;
+use ros2probe_model::observer::Observer;
+use ros2probe_model::snapshot::SocketFacts;
 
 const SECOND: u64 = 1_000_000_000;
 /// How often new sockets are looked for.
@@ -185,7 +185,7 @@ impl Known {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::model::observer::Settings;
+    use ros2probe_model::observer::Settings;
 
     fn owner(drops: u32) -> Owner {
         Owner {

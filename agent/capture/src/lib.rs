@@ -1,5 +1,6 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
+pub mod bell;
 pub mod control_groups;
 pub mod exact;
 pub mod feed;
@@ -18,8 +19,10 @@ pub mod pcap;
 pub mod reattach;
 pub mod ring;
 pub mod set_clock;
+pub mod settings;
 pub mod shm;
 pub mod sockets;
 pub mod system;
+pub mod threads;
 pub mod whole;
 pub mod wire;

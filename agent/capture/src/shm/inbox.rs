@@ -136,7 +136,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::capture::system::wait;
+    use crate::system::wait;
 
     fn fragment(start: u32) -> Item {
         Item::Record(Record {

@@ -395,7 +395,7 @@ fn listen() -> Result<OwnedFd, InterfacesError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::capture::netns::tests::{in_new_namespace, ip};
+    use crate::netns::tests::{in_new_namespace, ip};
 
     fn globs(list: &[&str]) -> Vec<String> {
         list.iter().map(|glob| (*glob).to_owned()).collect()

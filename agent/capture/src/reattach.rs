@@ -18,7 +18,7 @@ use super::filter::{FilterError, Links};
 use super::hierarchy::{Cgroup, HierarchyError};
 use super::live::in_words;
 use super::system::{DirectoryWatch, wait};
-use crate::privilege::{self, Role, SpawnError};
+use crate::threads::{Spawn, Task};
 
 /// How often the path is looked at. A group that appears in an existing directory is noticed at once.
 const EVERY: Duration = Duration::from_secs(1);
@@ -67,7 +67,7 @@ impl Reattach {
     ///
     /// # Errors
     /// There can be no more threads.
-    pub fn start(path: &Path, attached: Identity, links: Links) -> Result<Self, SpawnError> {
+    pub fn start(path: &Path, attached: Identity, links: Links, spawn: Spawn) -> io::Result<Self> {
         let (ended, end) = io::pipe()?;
         let shared = Arc::new(Shared::default());
         let mut follow = Follow {
@@ -80,7 +80,7 @@ impl Reattach {
         let thread = Builder::new()
             .name("cgroup".to_owned())
             .stack_size(256 << 10);
-        let thread = privilege::spawn(Role::reattach(), thread, move || follow.run(&ended))?;
+        let thread = spawn(Task::Reattach, thread, Box::new(move || follow.run(&ended)))?;
         Ok(Self {
             shared,
             end: Some(end),

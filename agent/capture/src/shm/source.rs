@@ -10,7 +10,7 @@
 
 use std::fs::File;
 use std::io;
-use std::os::unix::fs::{FileExt as _, MetadataExt as _};
+use std::os::unix::fs::{FileExt as _, MetadataExt as _, OpenOptionsExt as _};
 use std::path::Path;
 
 /// Bytes at offsets.
@@ -60,8 +60,14 @@ impl SharedFile {
     /// # Errors
     /// It is not there, is no regular file, or is not for us to read.
     pub fn open(path: &Path) -> io::Result<Self> {
-        let file = crate::file::open_no_link(path)?;
+        let file = File::options()
+            .read(true)
+            .custom_flags(libc::O_NOFOLLOW | libc::O_NONBLOCK | libc::O_NOCTTY)
+            .open(path)?;
         let metadata = file.metadata()?;
+        if !metadata.is_file() {
+            return Err(io::Error::from(io::ErrorKind::InvalidInput));
+        }
         Ok(Self {
             file,
             inode: metadata.ino(),

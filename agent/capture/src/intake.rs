@@ -15,7 +15,7 @@ use super::filter::Filter;
 use super::order::{Next, Order};
 use super::system::Clocks;
 use super::whole::Wholes;
-use crate::model::observer::Observer;
+use ros2probe_model::observer::Observer;
 
 /// Records younger than this wait for those that a run of fragments keeps back.
 pub const SETTLE_NANOSECONDS: u64 = 50_000_000;

@@ -18,7 +18,7 @@ use super::scan::{Generation, Name, PlaceId, Places};
 use super::segment::{Buffer, Message, Refusal};
 use super::source::SharedFile;
 use super::verdict::{Judge, Judgement};
-use crate::capture::system::thread_cpu;
+use crate::system::thread_cpu;
 
 /// Ports and segments that are open at once.
 const MAX_PORTS: usize = 512;

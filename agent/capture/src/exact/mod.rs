@@ -20,8 +20,9 @@ use super::filter::{Filter, FilterError, FilterSettings};
 use super::intake::Intake;
 use super::shm::scan::Scope;
 use super::system::Clocks;
-use crate::model::observer::Observer;
-use crate::privilege::{self, SpawnError};
+use crate::threads::Spawn;
+use caps::{CapSet, Capability, CapsHashSet};
+use ros2probe_model::observer::Observer;
 
 /// A process hands over a hundred thousand messages a second if it can, ten times what a socket
 /// takes: its ring is larger by this.
@@ -50,6 +51,32 @@ pub enum ExactError {
     Filter(#[from] FilterError),
 }
 
+/// Capabilities that attaching uprobes in other processes needs: `CAP_PERFMON` was enough from Linux
+/// 5.8 on and is not any more. Which files the processes of other users map needs both.
+const REQUIRED: [(Capability, &str); 2] = [
+    (Capability::CAP_SYS_ADMIN, "CAP_SYS_ADMIN"),
+    (Capability::CAP_SYS_PTRACE, "CAP_SYS_PTRACE"),
+];
+
+/// Whether attaching uprobes needs this capability.
+#[must_use]
+pub fn requires(capability: Capability) -> bool {
+    REQUIRED.iter().any(|(one, _)| *one == capability)
+}
+
+/// Names of the capabilities that attaching uprobes needs and `effective` lacks.
+#[must_use]
+pub fn lacking(effective: &CapsHashSet) -> Vec<&'static str> {
+    let lacking = REQUIRED.iter().filter(|(one, _)| !effective.contains(one));
+    lacking.map(|(_, name)| *name).collect()
+}
+
+/// What the calling thread lacks; nothing when its capabilities cannot be read.
+fn missing() -> Vec<&'static str> {
+    let effective = caps::read(None, CapSet::Effective);
+    effective.map_or_else(|_| Vec::new(), |effective| lacking(&effective))
+}
+
 /// The kernel programs and the thread that attaches them.
 pub struct Exact {
     intake: Intake,
@@ -69,7 +96,7 @@ impl Exact {
         record_ring_bytes: usize,
         on_demand: bool,
     ) -> Result<Self, ExactError> {
-        let missing = privilege::missing_for_probes();
+        let missing = missing();
         if !missing.is_empty() {
             return Err(ExactError::Missing(missing.join(" and ")));
         }
@@ -98,8 +125,8 @@ impl Exact {
     ///
     /// # Errors
     /// There can be no more threads.
-    pub fn start(&mut self) -> Result<(), SpawnError> {
-        self.search.start()
+    pub fn start(&mut self, spawn: Spawn) -> io::Result<()> {
+        self.search.start(spawn)
     }
 
     /// Readable when a ring is half full.

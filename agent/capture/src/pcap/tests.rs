@@ -5,7 +5,7 @@ use flate2::write::GzEncoder;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use super::*;
-use crate::model::reassembly::{self, FlowKey, Limits, Reassembly};
+use ros2probe_model::reassembly::{self, FlowKey, Limits, Reassembly};
 
 const PACKETS: [(u32, u32, &[u8]); 3] = [
     (1_700_000_000, 123_456, b"first"),
@@ -15,7 +15,7 @@ const PACKETS: [(u32, u32, &[u8]); 3] = [
 
 fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("../wire/tests/data")
+        .join("../../wire/tests/data")
         .join(name)
 }
 

@@ -21,6 +21,7 @@ pub mod verdict;
 mod image;
 
 use std::collections::BTreeSet;
+use std::io;
 use std::os::fd::BorrowedFd;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
@@ -37,8 +38,8 @@ use self::pace::{Budget, Need, Pace};
 use self::scan::{Name, Places};
 use self::tap::{Counters, Tap};
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu};
-use crate::model::observer::{Observer, Wanted};
-use crate::privilege::{self, Role, SpawnError};
+use crate::threads::{Spawn, Task};
+use ros2probe_model::observer::{Observer, Wanted};
 
 /// How often the counters are put where others can read them.
 const REPORT: u64 = 200_000_000;
@@ -87,17 +88,17 @@ impl SharedMemory {
     ///
     /// # Errors
     /// There can be no more threads.
-    pub fn start(places: Places, budget: Budget) -> Result<Self, SpawnError> {
+    pub fn start(places: Places, budget: Budget, spawn: Spawn) -> io::Result<Self> {
         let shared = Arc::new(Shared {
             inbox: Inbox::with_bell(),
             ..Shared::default()
         });
         let thread = std::thread::Builder::new().name("shm".to_owned());
         let looks = Arc::clone(&shared);
-        let thread = privilege::spawn(
-            Role::shared_memory(),
+        let thread = spawn(
+            Task::SharedMemory,
             thread.stack_size(256 << 10),
-            move || look(&looks, places, budget),
+            Box::new(move || look(&looks, places, budget)),
         )?;
         Ok(Self {
             shared,
