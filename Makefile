@@ -44,13 +44,13 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	@$(MAKE) --no-print-directory arm
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
-	cargo test --package ros2probe --features tls --test web_config --test otlp_tls --quiet
+	cargo test --package ros2probe --features tls --test surface --quiet -- web_config:: otlp_tls::
 	@.ci/prerequisites.sh --left-out
 	cargo nextest run --workspace
 
 test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
 	@.ci/prerequisites.sh test ros2
-	cargo nextest run --package ros2probe --run-ignored only --filterset 'binary(/^humble_/)'
+	cargo nextest run --package ros2probe --run-ignored only --filterset 'binary(humble)'
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf
@@ -70,7 +70,7 @@ page-bench: ## first paint with 500 topics, layout and memory of the page; MEASU
 	@.ci/prerequisites.sh page
 	cargo build --release --package ros2probe --bin rp
 	MEASURE_MINUTES=$(or $(MEASURE_MINUTES),10) cargo test --release --package ros2probe \
-	    --test browser -- --ignored --exact measurements --nocapture
+	    --test live -- --ignored --exact browser::measurements --nocapture
 
 screenshots: ## the pictures of README and docs, from the demo, in target/screenshots (needs root)
 	@.ci/prerequisites.sh demo page
@@ -86,7 +86,7 @@ arm: ## build rp for aarch64, static and unoptimized, which the tests run under 
 dist: ## release both binaries, packages, bills of materials and checksums into target/dist, tested
 	@.ci/prerequisites.sh dist
 	packaging/dist.sh
-	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist --test package
+	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist
 
 distcheck: ## build what make dist has built again, elsewhere, and compare every byte
 	packaging/dist.sh --again
@@ -105,7 +105,7 @@ soak: ## an hour of a changing graph, and faults, on what is shipped; SOAK_SECON
 	@mkdir -p $(TARGET)/soak && rm -f $(TARGET)/soak/faults.md
 	ROS2PROBE_SOAK=1 ROS2PROBE_SOAK_SECONDS=$(or $(SOAK_SECONDS),3600) \
 	    ROS2PROBE_SOAK_PROGRAM=$(TARGET)/$(SHIPPED)/release/rp cargo test --release \
-	    --package ros2probe --test live_endurance --test live_faults --no-fail-fast -- \
+	    --package ros2probe --test live --no-fail-fast -- endurance:: faults:: \
 	    --nocapture --test-threads 1
 	@cat $(TARGET)/soak/faults.md
 

@@ -248,7 +248,7 @@ ros2() {
 
 left_out() {
     local tests
-    tests=$(cat agent/tests/humble_*.rs | grep -c '^#\[ignore = "needs ROS 2 Humble')
+    tests=$(cat agent/tests/humble/*.rs | grep -c '^#\[ignore = "needs ROS 2 Humble')
     say "left out here: the $tests tests with real ROS 2 Humble nodes (make test-ros2)"
 }
 

@@ -5,20 +5,16 @@
 
 #![expect(
     clippy::unwrap_used,
-    clippy::expect_used,
     clippy::indexing_slicing,
     reason = "a benchmark may panic on its own input"
 )]
-
-#[path = "../tests/program_run/mod.rs"]
-mod program_run;
 
 use std::collections::BTreeMap;
 use std::hint::black_box;
 use std::time::Duration;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use program_run::{Hook, Kernel};
+use ros2probe_testing::program_run::{self, Hook, Kernel};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};

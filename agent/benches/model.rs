@@ -2,20 +2,16 @@
 //! for a whole capture.
 #![expect(clippy::unwrap_used, reason = "a benchmark may panic on its own input")]
 
-#[path = "../tests/model/forge.rs"]
-#[allow(dead_code, reason = "shared with the tests")]
-mod forge;
-
 use std::hint::black_box;
 use std::path::Path;
 
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
-use forge::{Message, SEDP_WRITERS, SPDP};
 use ros2probe::capture::feed::Feed;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::reassembly::Limits;
+use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 

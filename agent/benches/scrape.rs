@@ -1,12 +1,10 @@
 //! How long a scrape of a large robot takes: the capture thread never waits for it, but a core does.
 
-#[path = "../tests/sample_robot/mod.rs"]
-mod sample_robot;
-
 use std::sync::Arc;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use ros2probe::surface::{Board, Exposition, Format, Settings, SourceKind};
+use ros2probe_testing::sample_robot;
 
 fn scrape(criterion: &mut Criterion) {
     let names: Vec<String> = (0..1_000)

@@ -13,15 +13,13 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, bail};
 use clap::Parser;
 
-use crate::harness::agent::Agent;
-use crate::harness::network::{Link, Namespace};
-use crate::harness::peer;
-use crate::harness::process::Process;
 use crate::relay::{Relay, Relays};
 use crate::summary::Summary;
+use ros2probe_testing::harness::agent::Agent;
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer;
+use ros2probe_testing::harness::process::Process;
 
-#[path = "../../tests/harness/mod.rs"]
-mod harness;
 mod relay;
 mod summary;
 

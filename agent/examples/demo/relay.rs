@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 
-use crate::harness::network::Namespace;
-use crate::harness::process::Process;
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
 
 /// The relay's end on this machine; its other end runs on the host and ends with it.
 pub(crate) struct Relay {

@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 
 use crate::API;
-use crate::harness::agent::Scrape;
-use crate::harness::network::Link;
 use crate::relay::Relays;
+use ros2probe_testing::harness::agent::Scrape;
+use ros2probe_testing::harness::network::Link;
 
 pub(crate) struct Summary {
     /// Whether the table may replace the one before.

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
 
-use crate::forged::{Carrier as _, Sender, Talker};
-use crate::harness::agent::{Agent, METRICS, ON_THE_WIRE, Scrape, get};
-use crate::harness::network::Link;
-use crate::harness::usage::Usage;
+use ros2probe_testing::forged::{Carrier as _, Sender, Talker};
+use ros2probe_testing::harness::agent::{Agent, METRICS, ON_THE_WIRE, Scrape, get};
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::usage::Usage;
 
 /// The built-in caps (`limits` in the configuration).
 const PARTICIPANTS: u32 = 1000;

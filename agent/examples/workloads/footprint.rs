@@ -15,12 +15,12 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe::capture::netns;
 
-use crate::harness::agent::{Agent, METRICS, get};
-use crate::harness::network::{Link, Namespace};
-use crate::harness::peer::robot;
-use crate::harness::process::Process;
-use crate::harness::usage::Memory;
 use crate::report::Miss;
+use ros2probe_testing::harness::agent::{Agent, METRICS, get};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::robot;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::usage::Memory;
 
 /// The configuration as it is shipped.
 const CONFIGURATION: &str = include_str!("../../../config/ros2probe.yaml");

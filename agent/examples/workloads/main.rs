@@ -21,19 +21,9 @@ use anyhow::{Context as _, Result, bail};
 use clap::{Parser, ValueEnum};
 
 use crate::footprint::Footprint;
-use crate::harness::peer::{Stack, Stream};
 use crate::report::{Row, Targets};
 use crate::window::{Observer, Window};
-
-#[path = "../../tests/harness/mod.rs"]
-mod harness;
-
-#[path = "../../tests/forged/mod.rs"]
-#[expect(
-    clippy::indexing_slicing,
-    reason = "code of tests, which say by failing what must hold"
-)]
-mod forged;
+use ros2probe_testing::harness::peer::{Stack, Stream};
 
 #[derive(Parser)]
 #[command(about = "Measures what observing costs; needs root for network namespaces")]

@@ -2,9 +2,9 @@
 
 use std::fmt;
 
-use crate::harness::peer::Stack;
-use crate::harness::usage::Memory;
 use crate::window::{Observer, Told, UNIT_SECONDS, Window};
+use ros2probe_testing::harness::peer::Stack;
+use ros2probe_testing::harness::usage::Memory;
 
 const AGENTS: [(Observer, &str); 2] = [(Observer::Host, "host"), (Observer::Wire, "wire")];
 

@@ -13,10 +13,10 @@ use anyhow::{Context as _, Result, ensure};
 use ros2probe::capture::netns;
 
 use crate::footprint::{TOPICS, configured, crowd, wait_for_topics};
-use crate::harness::agent::Agent;
-use crate::harness::network::{Link, Namespace};
-use crate::harness::usage::Usage;
 use crate::report::Miss;
+use ros2probe_testing::harness::agent::Agent;
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::usage::Usage;
 
 /// Streams that are open together.
 const COUNTS: [usize; 3] = [0, 1, 10];

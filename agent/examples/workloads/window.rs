@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result};
 
-use crate::harness::agent::{Agent, Scrape};
-use crate::harness::network::{INTERFACE, Link, Namespace};
-use crate::harness::peer::{Peer, Role, Stack, Stream};
-use crate::harness::run;
-use crate::harness::usage::{Memory, Usage, machine_idle, softirq_cpu};
+use ros2probe_testing::harness::agent::{Agent, Scrape};
+use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::run;
+use ros2probe_testing::harness::usage::{Memory, Usage, machine_idle, softirq_cpu};
 
 /// Time for discovery to settle and caches to fill before the window opens.
 const WARM_UP: Duration = Duration::from_secs(3);

@@ -151,13 +151,10 @@ pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
 }
 
 #[cfg(test)]
-#[allow(dead_code, reason = "shared with the test of the program")]
-#[path = "../../tests/pseudo_terminal/mod.rs"]
-mod pseudo_terminal;
-
-#[cfg(test)]
 mod tests {
     use std::process::Command;
+
+    use ros2probe_testing::pseudo_terminal;
 
     use super::*;
 

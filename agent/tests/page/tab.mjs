@@ -1,7 +1,7 @@
 // A real browser that shows the agent's page, and what the page must never do: write to the console,
 // ask another origin, open a dialog of the browser, break a rule of accessibility.
 //
-// A scenario runs beside a Rust test (agent/tests/browser.rs), which has started the agent. `ask`
+// A scenario runs beside a Rust test (agent/tests/live/browser.rs), which has started the agent. `ask`
 // puts a question to that test, such as to restart the agent.
 
 import assert from 'node:assert/strict';

@@ -1,0 +1,617 @@
+//! A robot whose graph never stands still, and the truth about it: who is there, who went and how.
+//!
+//! Participants say what DDS implementations say, at a bounded rate. What the sender knows is exact:
+//! a lease that it could not renew in time is one that ran out.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+
+use super::storm::Dice;
+use super::{Carrier, PARTICIPANT, PUBLICATIONS_WRITER, Parameters, SPDP_WRITER};
+use super::{SUBSCRIPTIONS_WRITER, data, text_of};
+
+/// Datagrams a second, at most.
+const PACE: f64 = 2500.0;
+/// Whoever could not speak for this part of its lease is given up: what comes later might be too late.
+const LATE: f64 = 0.8;
+/// An observer tells the end of a lease within this.
+const GREY: Duration = Duration::from_millis(2500);
+/// Participants that stay, each with so many topics that carry messages.
+const STAYING: usize = 20;
+const MEASURED: usize = 10;
+const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];
+const ENTITIES_READER: [u8; 4] = [0, 0, 1, 4];
+const ENTITIES_TOPIC: &str = "ros_discovery_info";
+const ENTITIES_TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
+const TYPE: &str = "sensor_msgs::msg::dds_::PointCloud2_";
+
+/// How much goes on.
+#[derive(Clone, Copy, Debug)]
+pub struct Scale {
+    /// Most participants that an observer may believe in at a time.
+    pub participants: usize,
+    /// How long one lives, on average.
+    pub life: Duration,
+    /// Endpoints that come or go, a second.
+    pub endpoint_changes: f64,
+    /// Messages a second of all measured topics.
+    pub messages: f64,
+    /// Leases in seconds, each with how many of a hundred participants have it.
+    pub leases: &'static [(u64, u64)],
+}
+
+/// Who is there.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub struct Graph {
+    /// GUIDs.
+    pub participants: BTreeSet<String>,
+    /// DDS topic, role and GUID.
+    pub endpoints: BTreeSet<(String, &'static str, String)>,
+    /// Participant and name.
+    pub nodes: BTreeSet<(String, String)>,
+}
+
+/// What happened, by entity and event.
+pub type Tally = BTreeMap<(&'static str, &'static str), u64>;
+
+pub struct Crowd<C> {
+    carrier: C,
+    dice: Dice,
+    scale: Scale,
+    target: usize,
+    members: Vec<Member>,
+    /// Those that went without a word, until their leases end.
+    silent: Vec<Member>,
+    tally: Tally,
+    /// Messages of each measured topic.
+    messages: Vec<u32>,
+    /// What was said last of those that went since [`Crowd::forget`].
+    farewells: Vec<Vec<u8>>,
+    born: u32,
+    due: Instant,
+    ticked: Instant,
+    owed: [f64; 3],
+    next_topic: usize,
+}
+
+struct Member {
+    prefix: [u8; 12],
+    slot: usize,
+    lease: Duration,
+    node: String,
+    endpoints: BTreeMap<[u8; 4], String>,
+    /// Numbers of announcements of writers, readers and nodes.
+    numbers: [u32; 3],
+    entity: u16,
+    seen: Instant,
+}
+
+impl<C: Carrier> Crowd<C> {
+    pub fn new(carrier: C, scale: Scale) -> Crowd<C> {
+        let now = Instant::now();
+        Crowd {
+            carrier,
+            dice: Dice::new(0x2545_f491_4f6c_dd1d),
+            scale,
+            target: scale.participants,
+            members: Vec::new(),
+            silent: Vec::new(),
+            tally: Tally::new(),
+            messages: vec![0; STAYING * MEASURED],
+            farewells: Vec::new(),
+            born: 0,
+            due: now,
+            ticked: now,
+            owed: [0.0; 3],
+            next_topic: 0,
+        }
+    }
+
+    /// How many there should be from now on.
+    pub fn aim(&mut self, participants: usize) {
+        self.target = participants.clamp(STAYING, self.scale.participants);
+    }
+
+    /// Lives for so long.
+    pub fn live(&mut self, span: Duration) -> Result<()> {
+        let end = Instant::now() + span;
+        while Instant::now() < end {
+            self.tick(true)?;
+        }
+        Ok(())
+    }
+
+    /// Nobody comes or goes for so long, and nothing is sent but signs of life.
+    pub fn rest(&mut self, span: Duration) -> Result<()> {
+        let end = Instant::now() + span;
+        while Instant::now() < end {
+            self.tick(false)?;
+        }
+        Ok(())
+    }
+
+    /// Whether an observer may be of two minds about somebody for the moment.
+    pub fn is_grey(&self) -> bool {
+        let now = Instant::now();
+        self.silent.iter().any(|member| member.ends() < now + GREY)
+    }
+
+    /// As it is now.
+    pub fn graph(&self) -> Graph {
+        let mut graph = Graph::default();
+        for member in self.members.iter().chain(&self.silent) {
+            let participant = guid(&member.prefix, PARTICIPANT);
+            for (entity, topic) in &member.endpoints {
+                let role = role(*entity);
+                let guid = guid(&member.prefix, *entity);
+                graph.endpoints.insert((topic.clone(), role, guid));
+            }
+            let name = format!("/{}", member.node);
+            graph.nodes.insert((participant.clone(), name));
+            graph.participants.insert(participant);
+        }
+        graph
+    }
+
+    /// All that happened.
+    pub fn tally(&self) -> &Tally {
+        &self.tally
+    }
+
+    /// How many messages each measured topic has carried.
+    pub fn messages(&self) -> impl Iterator<Item = (String, u32)> {
+        let counts = self.messages.iter().enumerate();
+        counts.map(|(index, count)| (format!("/measured/topic_{index}"), *count))
+    }
+
+    /// How many participants there are, with those that nobody knows to be gone.
+    pub fn size(&self) -> usize {
+        self.members.len() + self.silent.len()
+    }
+
+    /// How many there have been.
+    pub fn born(&self) -> u32 {
+        self.born
+    }
+
+    /// Says again all that still holds, for an observer that could not listen.
+    pub fn repeat(&mut self) -> Result<()> {
+        for farewell in self.farewells.clone() {
+            self.say(&farewell)?;
+        }
+        for index in 0..self.members.len() {
+            for message in self.members[index].introduction() {
+                self.say(&message)?;
+            }
+            self.members[index].seen = Instant::now();
+            self.tick(false)?;
+        }
+        Ok(())
+    }
+
+    /// An observer knows all that was said so far.
+    pub fn forget(&mut self) {
+        self.farewells.clear();
+    }
+
+    fn tick(&mut self, changes: bool) -> Result<()> {
+        let now = Instant::now();
+        let passed = now.duration_since(self.ticked).as_secs_f64().min(0.1);
+        self.ticked = now;
+        self.bury();
+        self.renew()?;
+        if changes {
+            let deaths = self.members.len().saturating_sub(STAYING) as f64;
+            let rates = [
+                deaths / self.scale.life.as_secs_f64(),
+                self.scale.endpoint_changes,
+                self.scale.messages,
+            ];
+            for (owed, rate) in self.owed.iter_mut().zip(rates) {
+                *owed += rate * passed;
+            }
+            for _ in 0..self.owe(0) {
+                self.death()?;
+            }
+            for _ in 0..self.owe(1) {
+                self.endpoint_change()?;
+            }
+            for _ in 0..self.owe(2) {
+                self.message()?;
+            }
+            let surplus = self.members.len().saturating_sub(self.target);
+            for _ in 0..surplus.min(10) {
+                self.dispose()?;
+            }
+            for _ in 0..self.target.saturating_sub(self.size()).min(10) {
+                let node = format!("node_{}", self.dice.pick(1 << 40));
+                self.birth(node)?;
+            }
+        }
+        std::thread::sleep(Duration::from_millis(5));
+        Ok(())
+    }
+
+    fn owe(&mut self, kind: usize) -> u64 {
+        let whole = self.owed[kind].floor();
+        self.owed[kind] -= whole;
+        whole as u64
+    }
+
+    /// Leases that have ended.
+    fn bury(&mut self) {
+        let now = Instant::now();
+        let (silenced, members) = std::mem::take(&mut self.members)
+            .into_iter()
+            .partition(Member::is_late);
+        self.members = members;
+        self.silent.extend(Vec::from_iter(silenced));
+        let (ended, silent): (Vec<_>, _) = std::mem::take(&mut self.silent)
+            .into_iter()
+            .partition(|member| member.ends() <= now);
+        self.silent = silent;
+        for member in ended {
+            self.count_end(&member, "expired");
+        }
+    }
+
+    fn renew(&mut self) -> Result<()> {
+        for index in 0..self.members.len() {
+            let member = &self.members[index];
+            // Held up while it renewed others, this may be too late for some.
+            if member.seen.elapsed() > member.lease / 3 && !member.is_late() {
+                let message = member.announcement();
+                self.say(&message)?;
+                self.members[index].seen = Instant::now();
+            }
+        }
+        Ok(())
+    }
+
+    fn birth(&mut self, node: String) -> Result<()> {
+        let staying = self.born < STAYING as u32;
+        let slot = self.free_slot();
+        let lease = if staying { 100 } else { self.lease() };
+        let mut prefix = *b"\x01\x0fcrowd.....";
+        prefix[8..].copy_from_slice(&self.born.to_be_bytes());
+        self.born += 1;
+        let mut member = Member {
+            prefix,
+            slot,
+            lease: Duration::from_secs(lease),
+            node,
+            endpoints: BTreeMap::new(),
+            numbers: [0; 3],
+            entity: 1,
+            seen: Instant::now(),
+        };
+        member
+            .endpoints
+            .insert(ENTITIES_WRITER, ENTITIES_TOPIC.to_owned());
+        member
+            .endpoints
+            .insert(ENTITIES_READER, ENTITIES_TOPIC.to_owned());
+        if staying {
+            for index in slot * MEASURED..(slot + 1) * MEASURED {
+                member.add(3, format!("rt/measured/topic_{index}"));
+            }
+        } else {
+            member.add(3, format!("rt/robot/part_{slot}/points"));
+            member.add(3, format!("rt/robot/part_{slot}/state"));
+            for _ in 0..2 {
+                let topic = self.topic();
+                member.add(4, topic);
+            }
+        }
+        member.number_endpoints();
+        for message in member.introduction() {
+            self.say(&message)?;
+        }
+        member.seen = Instant::now();
+        self.count("participant", "appeared", 1);
+        self.count("node", "appeared", 1);
+        for entity in member.endpoints.keys() {
+            self.count(role(*entity), "appeared", 1);
+        }
+        self.members.push(member);
+        Ok(())
+    }
+
+    /// One that does not stay ends, in one of many ways.
+    fn death(&mut self) -> Result<()> {
+        match self.dice.pick(10) {
+            0..4 => self.dispose(),
+            4..8 => self.silence().map(drop),
+            // The same node again, in another process, before anybody knows that the first is gone.
+            _ => match self.silence()? {
+                Some(node) if self.size() < self.scale.participants => self.birth(node),
+                _ => Ok(()),
+            },
+        }
+    }
+
+    fn dispose(&mut self) -> Result<()> {
+        if let Some(member) = self.take() {
+            let message = member.disposal(SPDP_WRITER, 2, PARTICIPANT, self.dice.pick(2) == 0);
+            self.say(&message)?;
+            self.farewells.push(message);
+            self.count_end(&member, "disposed");
+        }
+        Ok(())
+    }
+
+    fn silence(&mut self) -> Result<Option<String>> {
+        let member = self.take();
+        let node = member.as_ref().map(|member| member.node.clone());
+        self.silent.extend(member);
+        Ok(node)
+    }
+
+    fn take(&mut self) -> Option<Member> {
+        let staying = self.members.iter().filter(|member| member.stays()).count();
+        let others = self.members.len().checked_sub(staying + 1)?;
+        let lot = self.dice.pick(others as u64 + 1) as usize;
+        let mut mortal = (0..self.members.len()).filter(|index| !self.members[*index].stays());
+        Some(self.members.swap_remove(mortal.nth(lot)?))
+    }
+
+    fn endpoint_change(&mut self) -> Result<()> {
+        let index = self.dice.pick(self.members.len().max(1) as u64) as usize;
+        let topic = self.topic();
+        let (delete, by_key) = (self.dice.pick(2) == 0, self.dice.pick(2) == 0);
+        let kind = if self.dice.pick(2) == 0 { 3 } else { 4 };
+        let Some(member) = self.members.get_mut(index).filter(|member| !member.stays()) else {
+            return Ok(());
+        };
+        let last = member.endpoints.last_key_value().map(|(last, _)| *last);
+        let crowded = member.endpoints.len() > 8;
+        let message = match last.filter(|last| (delete || crowded) && last[1..3] != [0, 1]) {
+            Some(entity) => {
+                member.endpoints.remove(&entity);
+                let number = member.next_number(entity);
+                let message = member.disposal(announcer(entity), number, entity, by_key);
+                self.count(role(entity), "disposed", 1);
+                self.farewells.push(message.clone());
+                message
+            }
+            None => {
+                let entity = member.add(kind, topic);
+                let number = member.next_number(entity);
+                let message = member.endpoint(entity, number);
+                self.count(role(entity), "appeared", 1);
+                message
+            }
+        };
+        self.say(&message)?;
+        // Whoever speaks is alive.
+        self.members[index].seen = Instant::now();
+        Ok(())
+    }
+
+    /// The next message of the next measured topic.
+    fn message(&mut self) -> Result<()> {
+        const SIZES: [usize; 5] = [120, 320, 644, 1300, 6000];
+        let index = self.next_topic;
+        self.next_topic = (index + 1) % self.messages.len();
+        let size = SIZES[self.dice.pick(SIZES.len() as u64) as usize];
+        let Some(position) = self
+            .members
+            .iter()
+            .position(|member| member.stays() && member.slot == index / MEASURED)
+        else {
+            return Ok(());
+        };
+        let mut payload = vec![0, 1, 0, 0];
+        payload.resize(size, 0x33);
+        self.messages[index] += 1;
+        let entity = entity(2 + (index % MEASURED) as u16, 3);
+        let member = &mut self.members[position];
+        member.seen = Instant::now();
+        let message = member.message(entity, self.messages[index], &payload);
+        self.say(&message)
+    }
+
+    fn say(&mut self, message: &[u8]) -> Result<()> {
+        self.due = (self.due + Duration::from_secs_f64(1.0 / PACE)).max(Instant::now());
+        self.carrier.carry(message)?;
+        let ahead = self.due.saturating_duration_since(Instant::now());
+        if ahead > Duration::from_millis(2) {
+            std::thread::sleep(ahead);
+        }
+        Ok(())
+    }
+
+    fn count(&mut self, entity: &'static str, event: &'static str, number: u64) {
+        *self.tally.entry((entity, event)).or_default() += number;
+    }
+
+    fn count_end(&mut self, member: &Member, event: &'static str) {
+        self.count("participant", event, 1);
+        self.count("node", "cascaded", 1);
+        for entity in member.endpoints.keys() {
+            self.count(role(*entity), "cascaded", 1);
+        }
+    }
+
+    fn free_slot(&self) -> usize {
+        let everybody = self.members.iter().chain(&self.silent);
+        let taken: BTreeSet<usize> = everybody.map(|member| member.slot).collect();
+        (0..).find(|slot| !taken.contains(slot)).unwrap_or(0)
+    }
+
+    fn lease(&mut self) -> u64 {
+        let mut lot = self.dice.pick(100);
+        for (lease, share) in self.scale.leases {
+            match lot.checked_sub(*share) {
+                Some(rest) => lot = rest,
+                None => return *lease,
+            }
+        }
+        100
+    }
+
+    /// Somebody's topic; one in twenty is nobody's and new.
+    fn topic(&mut self) -> String {
+        if self.dice.pick(20) == 0 {
+            return format!("rt/once/topic_{}", self.dice.pick(1 << 40));
+        }
+        let slot = self.dice.pick(self.scale.participants as u64);
+        let part = if self.dice.pick(2) == 0 {
+            "points"
+        } else {
+            "state"
+        };
+        format!("rt/robot/part_{slot}/{part}")
+    }
+}
+
+impl Member {
+    fn stays(&self) -> bool {
+        self.slot < STAYING
+    }
+
+    fn is_late(&self) -> bool {
+        self.seen.elapsed() > self.lease.mul_f64(LATE)
+    }
+
+    /// When its lease ends.
+    fn ends(&self) -> Instant {
+        self.seen + self.lease
+    }
+
+    fn add(&mut self, kind: u8, topic: String) -> [u8; 4] {
+        self.entity += 1;
+        let entity = entity(self.entity, kind);
+        self.endpoints.insert(entity, topic);
+        entity
+    }
+
+    fn next_number(&mut self, entity: [u8; 4]) -> u32 {
+        let number = &mut self.numbers[usize::from(entity[3] == 4)];
+        *number += 1;
+        *number
+    }
+
+    fn number_endpoints(&mut self) {
+        for entity in self.endpoints.keys() {
+            self.numbers[usize::from(entity[3] == 4)] += 1;
+        }
+    }
+
+    /// All that it has to say, as to one that has just come.
+    fn introduction(&self) -> Vec<Vec<u8>> {
+        let mut messages = vec![self.announcement()];
+        let mut numbers = self.numbers;
+        for entity in self.endpoints.keys().rev() {
+            let number = &mut numbers[usize::from(entity[3] == 4)];
+            messages.push(self.endpoint(*entity, *number));
+            *number -= 1;
+        }
+        messages.push(self.entities());
+        messages
+    }
+
+    fn announcement(&self) -> Vec<u8> {
+        let lease = u32::try_from(self.lease.as_secs()).unwrap_or(u32::MAX);
+        let mut list = Parameters::new();
+        list.add(0x15, &[2, 3, 0, 0]);
+        list.add(0x16, &[1, 0x0f, 0, 0]);
+        list.add(0x50, &[&self.prefix[..], &PARTICIPANT].concat());
+        list.add(0x02, &[lease.to_le_bytes(), [0; 4]].concat());
+        list.add(0x0f, &[0; 4]);
+        self.message(SPDP_WRITER, 1, &list.finish())
+    }
+
+    fn endpoint(&self, entity: [u8; 4], number: u32) -> Vec<u8> {
+        let topic = self.endpoints.get(&entity).map_or("", String::as_str);
+        let kind = match entity {
+            ENTITIES_WRITER | ENTITIES_READER => ENTITIES_TYPE,
+            _ => TYPE,
+        };
+        let mut list = Parameters::new();
+        list.add(0x5a, &[&self.prefix[..], &entity].concat());
+        list.add_text(0x05, topic);
+        list.add_text(0x07, kind);
+        list.add(0x1a, &[1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+        self.message(announcer(entity), number, &list.finish())
+    }
+
+    /// `ros_discovery_info` with 16-byte gids: one node that has all.
+    fn entities(&self) -> Vec<u8> {
+        let mut bytes = vec![0, 1, 0, 0];
+        bytes.extend_from_slice(&self.prefix);
+        bytes.extend_from_slice(&PARTICIPANT);
+        bytes.extend_from_slice(&1_u32.to_le_bytes());
+        for text in ["/", &self.node] {
+            bytes.extend_from_slice(&text_of(text));
+        }
+        for kind in [4, 3] {
+            let own: Vec<_> = self.endpoints.keys().filter(|it| it[3] == kind).collect();
+            let count = u32::try_from(own.len()).unwrap_or(0);
+            bytes.extend_from_slice(&count.to_le_bytes());
+            for entity in own {
+                bytes.extend_from_slice(&self.prefix);
+                bytes.extend_from_slice(entity);
+            }
+        }
+        self.message(ENTITIES_WRITER, 1, &bytes)
+    }
+
+    /// A farewell, as Cyclone DDS (key) or Fast DDS (key hash) puts it.
+    fn disposal(&self, writer: [u8; 4], number: u32, entity: [u8; 4], by_key: bool) -> Vec<u8> {
+        let guid = [&self.prefix[..], &entity].concat();
+        let mut inline = Vec::new();
+        let mut parameter = |id: u16, value: &[u8]| {
+            inline.extend_from_slice(&id.to_le_bytes());
+            inline.extend_from_slice(&u16::try_from(value.len()).unwrap_or(0).to_le_bytes());
+            inline.extend_from_slice(value);
+        };
+        if !by_key {
+            parameter(0x70, &guid);
+        }
+        parameter(0x71, &[0, 0, 0, 3]);
+        parameter(1, &[]);
+        if by_key {
+            let mut key = Parameters::new();
+            key.add(if entity == PARTICIPANT { 0x50 } else { 0x5a }, &guid);
+            inline.extend_from_slice(&key.finish());
+        }
+        let mut message = self.message(writer, number, &inline);
+        // Inline QoS; and a key in the place of data, or nothing there.
+        message[21] = if by_key { 0x0b } else { 0x03 };
+        message
+    }
+
+    fn message(&self, writer: [u8; 4], number: u32, payload: &[u8]) -> Vec<u8> {
+        let mut bytes = [&b"RTPS\x02\x03\x01\x0f"[..], &self.prefix].concat();
+        data(&mut bytes, writer, number, payload);
+        bytes
+    }
+}
+
+fn entity(number: u16, kind: u8) -> [u8; 4] {
+    let [high, low] = number.to_be_bytes();
+    [0, high, low, kind]
+}
+
+/// Who announces an endpoint.
+fn announcer(entity: [u8; 4]) -> [u8; 4] {
+    if entity[3] == 3 {
+        PUBLICATIONS_WRITER
+    } else {
+        SUBSCRIPTIONS_WRITER
+    }
+}
+
+fn role(entity: [u8; 4]) -> &'static str {
+    if entity[3] == 3 { "writer" } else { "reader" }
+}
+
+/// As the agent writes it.
+fn guid(prefix: &[u8; 12], entity: [u8; 4]) -> String {
+    let hexadecimal =
+        |bytes: &[u8]| -> String { bytes.iter().map(|byte| format!("{byte:02x}")).collect() };
+    format!("{}.{}", hexadecimal(prefix), hexadecimal(&entity))
+}

@@ -1,0 +1,249 @@
+//! The agent under test, and what it exports.
+
+use std::collections::BTreeSet;
+use std::ffi::OsStr;
+use std::fs::File;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail};
+
+use super::network::Namespace;
+use super::process::Process;
+
+/// The metrics listener's built-in address: every host is its own, so the port is free.
+pub const METRICS: &str = "http://127.0.0.1:17400";
+
+/// What a test of packet sockets adds to its configuration.
+pub const ON_THE_WIRE: &str = "capture: {source: wire}\n";
+
+/// How long the page may take to show what has been sent, on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// How long the kernel may take to verify the programs there.
+const START: Duration = Duration::from_secs(60);
+/// A gap of a best-effort stream is settled a second after it opened, and some more.
+const STILL: Duration = Duration::from_millis(1800);
+/// The page of an agent that had its turn on the CPU.
+const FRESH: f64 = 0.4;
+
+/// `rp run` on a host.
+pub struct Agent<'a> {
+    pub process: Process,
+    pub host: &'a Namespace,
+}
+
+/// One answer of `/metrics`.
+pub struct Scrape(pub String);
+
+/// What a test of the host's sockets adds to its configuration.
+pub fn at_the_sockets_of(host: &Namespace) -> String {
+    let cgroup = host.cgroup().display();
+    format!("capture: {{source: host, cgroup: {cgroup}}}\n")
+}
+
+impl<'a> Agent<'a> {
+    /// Starts `rp run` (`env!("CARGO_BIN_EXE_rp")` in a test) and waits until it is ready.
+    pub fn start(
+        host: &'a Namespace,
+        program: impl AsRef<OsStr>,
+        configuration: &Path,
+    ) -> Result<Agent<'a>> {
+        Agent::start_with(host, program, configuration, Stdio::inherit())
+    }
+
+    /// As [`Agent::start`], with what the agent logs in a file.
+    pub fn start_logging(
+        host: &'a Namespace,
+        program: impl AsRef<OsStr>,
+        configuration: &Path,
+        log: &Path,
+    ) -> Result<Agent<'a>> {
+        let file = File::create(log).with_context(|| format!("cannot create {}", log.display()))?;
+        Agent::start_with(host, program, configuration, file.into())
+    }
+
+    fn start_with(
+        host: &'a Namespace,
+        program: impl AsRef<OsStr>,
+        configuration: &Path,
+        errors: Stdio,
+    ) -> Result<Agent<'a>> {
+        let arguments = [
+            OsStr::new("run"),
+            OsStr::new("--config"),
+            configuration.as_os_str(),
+            // A test host has no service manager, and so no unix socket.
+            OsStr::new("--api-loopback"),
+            OsStr::new("all"),
+        ];
+        let process = Process::start_with(&host.on_network(), program, arguments, errors)?;
+        let mut agent = Agent { process, host };
+        agent.wait_ready(START)?;
+        Ok(agent)
+    }
+
+    pub fn wait_ready(&mut self, limit: Duration) -> Result<()> {
+        let deadline = Instant::now() + limit;
+        while let Err(error) = self.request("/readyz") {
+            if let Ok(status) = self.process.wait(Duration::ZERO) {
+                bail!("the agent ended with {status} before it was ready");
+            }
+            if Instant::now() > deadline {
+                return Err(error.context(format!("the agent is not ready after {limit:?}")));
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        Ok(())
+    }
+
+    pub fn scrape(&self) -> Result<Scrape> {
+        Ok(Scrape(self.request("/metrics")?))
+    }
+
+    /// A scrape that shows what was asked for.
+    pub fn scrape_until(&self, what: &str, shows: impl Fn(&Scrape) -> bool) -> Result<Scrape> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let page = self.scrape()?;
+            if shows(&page) {
+                return Ok(page);
+            }
+            if Instant::now() > deadline {
+                bail!("not {what} within {PATIENCE:?}: {}", page.0);
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// A scrape once the agent has counted so many messages of a topic, or had time to, and nothing
+    /// it counts of that topic changes any more.
+    pub fn settled_scrape(&self, topic: &str, messages: u64) -> Result<Scrape> {
+        let label = [("topic", topic)];
+        let deadline = Instant::now() + PATIENCE;
+        let (mut before, mut since) = (Vec::new(), Instant::now());
+        loop {
+            let page = self.scrape()?;
+            let now = page.counters(topic);
+            let is_fresh = page.sum("ros2probe_snapshot_age_seconds", &[]) < FRESH;
+            if now != before || !is_fresh {
+                (before, since) = (now, Instant::now());
+            }
+            let all = page.sum("ros2_topic_messages_total", &label) >= messages as f64;
+            let in_time = Instant::now() < deadline;
+            if since.elapsed() >= STILL && (all || !in_time) {
+                return Ok(page);
+            }
+            if Instant::now() > deadline + STILL {
+                bail!(
+                    "what is counted of {topic} does not stand still: {}",
+                    page.0
+                );
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// GETs a path from inside the host; anything but success is an error.
+    pub fn request(&self, path: &str) -> Result<String> {
+        get(self.host, &format!("{METRICS}{path}"))
+    }
+}
+
+impl Scrape {
+    /// The value of the sample of `name` that has all of these labels.
+    pub fn value(&self, name: &str, labels: &[(&str, &str)]) -> Option<f64> {
+        self.samples(name, labels).next()
+    }
+
+    /// The sum over all samples of `name` that have these labels.
+    pub fn sum(&self, name: &str, labels: &[(&str, &str)]) -> f64 {
+        self.samples(name, labels).sum()
+    }
+
+    /// The values that a label takes over the samples of `name`.
+    pub fn labels_of(&self, name: &str, label: &str) -> BTreeSet<String> {
+        let start = format!("{label}=\"");
+        let values = self.0.lines().filter_map(|line| {
+            let labels = line.strip_prefix(name)?.strip_prefix('{')?;
+            let (_, value) = labels.split_once(&start)?;
+            Some(value.split_once('"')?.0.to_owned())
+        });
+        values.collect()
+    }
+
+    /// Every counter above zero that could explain a difference.
+    pub fn doubts(&self) -> String {
+        let telling = [
+            "lost",
+            "dropped",
+            "incomplete",
+            "evict",
+            "duplicate",
+            "errors",
+            "recovered",
+        ];
+        let lines = self.0.lines().filter(|line| {
+            !line.starts_with('#')
+                && !line.ends_with(" 0")
+                && telling.iter().any(|word| line.contains(word))
+        });
+        lines.collect::<Vec<_>>().join("; ")
+    }
+
+    /// What counts messages of a topic, with the values.
+    fn counters(&self, topic: &str) -> Vec<String> {
+        let topic = format!("topic=\"{topic}\"");
+        let counters = self.0.lines().filter(|line| {
+            let name = line.split_once('{').map_or("", |(name, _)| name);
+            name.ends_with("_messages_total") && line.contains(&topic)
+        });
+        counters.map(str::to_owned).collect()
+    }
+
+    pub fn samples(&self, name: &str, labels: &[(&str, &str)]) -> impl Iterator<Item = f64> {
+        let wanted: Vec<String> = labels
+            .iter()
+            .map(|(label, value)| format!("{label}=\"{value}\""))
+            .collect();
+        self.0.lines().filter_map(move |line| {
+            let (series, rest) = match line.split_once('{') {
+                Some((series, rest)) => (series, rest),
+                None => line.split_once(' ')?,
+            };
+            let (labels, value) = rest.rsplit_once("} ").unwrap_or(("", rest));
+            let named = series == name && wanted.iter().all(|pair| has_label(labels, pair));
+            let value = value.split_whitespace().next().filter(|_| named)?;
+            value.parse().ok()
+        })
+    }
+}
+
+/// Whether `label="value"` stands in a label set at the start or after a comma.
+fn has_label(labels: &str, pair: &str) -> bool {
+    labels
+        .match_indices(pair)
+        .any(|(at, _)| at == 0 || labels.as_bytes().get(at - 1) == Some(&b','))
+}
+
+/// GETs a URL from inside a host.
+pub fn get(host: &Namespace, url: &str) -> Result<String> {
+    let [program, arguments @ ..] = &host.outside();
+    let output = Command::new(program)
+        .args(arguments)
+        .args([
+            "curl",
+            "--silent",
+            "--show-error",
+            "--fail",
+            "--max-time",
+            "20",
+            url,
+        ])
+        .output()
+        .context("cannot run curl")?;
+    if !output.status.success() {
+        bail!("{url}: {}", String::from_utf8_lossy(&output.stderr).trim());
+    }
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}

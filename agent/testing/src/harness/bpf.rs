@@ -1,0 +1,256 @@
+//! The kernel's BPF programs as anybody may ask for them: which are attached to a control group,
+//! which a process holds, which still exist. And one of somebody else's.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, File};
+use std::io;
+use std::os::fd::{AsRawFd as _, FromRawFd as _, OwnedFd};
+use std::path::Path;
+
+use anyhow::{Context as _, Result, bail};
+use aya::maps::{HashMap, Map, MapData, MapInfo};
+
+const PROG_LOAD: libc::c_int = 5;
+const PROG_ATTACH: libc::c_int = 8;
+const PROG_GET_FD_BY_ID: libc::c_int = 13;
+const MAP_GET_FD_BY_ID: libc::c_int = 14;
+const PROG_QUERY: libc::c_int = 16;
+const LINK_GET_FD_BY_ID: libc::c_int = 30;
+const CGROUP_SKB: u32 = 8;
+const ALLOW_MULTI: u32 = 2;
+
+/// `BPF_CGROUP_INET_INGRESS` and `BPF_CGROUP_INET_EGRESS`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Direction {
+    Ingress = 0,
+    Egress = 1,
+}
+
+/// What the kernel holds for a process that asked for it, by its number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Object {
+    Program(u32),
+    Map(u32),
+    Link(u32),
+}
+
+/// How a stranger's program tolerates others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Manners {
+    /// As everybody should.
+    BesideOthers,
+    /// Nobody else may attach.
+    Alone,
+}
+
+/// Somebody else's program on a control group: it lets everything pass. It stays attached until the
+/// group is removed.
+pub fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) -> Result<()> {
+    // r0 = 1; exit
+    let instructions: [u64; 2] = [0x0000_0001_0000_00b7, 0x95];
+    let license = c"GPL";
+    let load = ProgramToLoad {
+        kind: CGROUP_SKB,
+        instruction_count: 2,
+        instructions: instructions.as_ptr() as u64,
+        license: license.as_ptr() as u64,
+        expected_attach_type: direction as u32,
+        ..ProgramToLoad::default()
+    };
+    let program = descriptor(bpf(PROG_LOAD, &load)?);
+    let directory = File::open(cgroup)?;
+    let attach = ProgramToAttach {
+        target: directory.as_raw_fd(),
+        program: program.as_raw_fd(),
+        attach_type: direction as u32,
+        flags: match manners {
+            Manners::BesideOthers => ALLOW_MULTI,
+            Manners::Alone => 0,
+        },
+    };
+    bpf(PROG_ATTACH, &attach)?;
+    Ok(())
+}
+
+/// How many programs are attached to a control group itself.
+pub fn attached(cgroup: &Path, direction: Direction) -> Result<u32> {
+    let directory = File::open(cgroup)?;
+    let mut query = ProgramsToFind {
+        target: directory.as_raw_fd(),
+        attach_type: direction as u32,
+        ..ProgramsToFind::default()
+    };
+    bpf_mut(PROG_QUERY, &mut query)?;
+    Ok(query.program_count)
+}
+
+/// Ids of the programs that a process holds.
+pub fn programs_of(process: u32) -> Result<BTreeSet<u32>> {
+    let mut programs = BTreeSet::new();
+    for entry in fs::read_dir(format!("/proc/{process}/fdinfo"))? {
+        // A descriptor may be closed meanwhile.
+        let text = fs::read_to_string(entry?.path()).unwrap_or_default();
+        let ids = text
+            .lines()
+            .filter_map(|line| line.strip_prefix("prog_id:"));
+        programs.extend(ids.filter_map(|id| id.trim().parse::<u32>().ok()));
+    }
+    Ok(programs)
+}
+
+/// All objects that a process holds.
+pub fn objects_of(process: u32) -> Result<BTreeSet<Object>> {
+    let mut objects = BTreeSet::new();
+    for entry in fs::read_dir(format!("/proc/{process}/fdinfo"))? {
+        // A descriptor may be closed meanwhile.
+        let text = fs::read_to_string(entry?.path()).unwrap_or_default();
+        objects.extend(text.lines().filter_map(|line| {
+            let (name, id) = line.split_once(':')?;
+            let id = id.trim().parse().ok()?;
+            Some(match name {
+                "prog_id" => Object::Program(id),
+                "map_id" => Object::Map(id),
+                "link_id" => Object::Link(id),
+                _ => return None,
+            })
+        }));
+    }
+    Ok(objects)
+}
+
+/// The writers and readers that a process named to its kernel programs, with their verdicts.
+pub fn interest_of(process: u32) -> Result<BTreeMap<[u32; 4], u32>> {
+    for object in objects_of(process)? {
+        let Object::Map(id) = object else { continue };
+        if MapInfo::from_id(id)?.name_as_str() == Some("INTEREST") {
+            let map = Map::HashMap(MapData::from_id(id)?);
+            let map: HashMap<_, [u32; 4], u32> = HashMap::try_from(map)?;
+            return map.iter().map(|entry| Ok(entry?)).collect();
+        }
+    }
+    bail!("the process {process} has no such map")
+}
+
+/// How often the kernel left out running one of this process's programs because it was running on
+/// that CPU already.
+pub fn skipped_runs() -> Result<u64> {
+    let mut skipped = 0;
+    for entry in fs::read_dir("/proc/self/fdinfo")? {
+        let text = fs::read_to_string(entry?.path()).unwrap_or_default();
+        let misses = text
+            .lines()
+            .filter_map(|line| line.strip_prefix("recursion_misses:"));
+        skipped += misses
+            .filter_map(|count| count.trim().parse::<u64>().ok())
+            .sum::<u64>();
+    }
+    Ok(skipped)
+}
+
+/// Whether anything still holds a program.
+pub fn exists(program: u32) -> Result<bool> {
+    is_there(Object::Program(program))
+}
+
+/// Whether anything still holds an object.
+pub fn is_there(object: Object) -> Result<bool> {
+    let (command, id) = match object {
+        Object::Program(id) => (PROG_GET_FD_BY_ID, id),
+        Object::Map(id) => (MAP_GET_FD_BY_ID, id),
+        Object::Link(id) => (LINK_GET_FD_BY_ID, id),
+    };
+    let by_id = ObjectById {
+        id,
+        ..ObjectById::default()
+    };
+    match bpf(command, &by_id) {
+        Ok(number) => {
+            drop(descriptor(number));
+            Ok(true)
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error).with_context(|| format!("cannot ask for {object:?}")),
+    }
+}
+
+/// The beginnings of `union bpf_attr`; the kernel takes what is missing for zero.
+trait Attributes: Copy {}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ProgramToLoad {
+    kind: u32,
+    instruction_count: u32,
+    instructions: u64,
+    license: u64,
+    log_level: u32,
+    log_size: u32,
+    log: u64,
+    kernel_version: u32,
+    flags: u32,
+    name: [u8; 16],
+    interface: u32,
+    expected_attach_type: u32,
+}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ProgramToAttach {
+    target: i32,
+    program: i32,
+    attach_type: u32,
+    flags: u32,
+}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ProgramsToFind {
+    target: i32,
+    attach_type: u32,
+    query_flags: u32,
+    attach_flags: u32,
+    programs: u64,
+    program_count: u32,
+    padding: u32,
+}
+
+#[derive(Clone, Copy, Default)]
+#[repr(C)]
+struct ObjectById {
+    id: u32,
+    next: u32,
+    open_flags: u32,
+}
+
+impl Attributes for ProgramToLoad {}
+impl Attributes for ProgramToAttach {}
+impl Attributes for ProgramsToFind {}
+impl Attributes for ObjectById {}
+
+fn bpf<A: Attributes>(command: libc::c_int, attributes: &A) -> io::Result<i32> {
+    let mut attributes = *attributes;
+    bpf_mut(command, &mut attributes)
+}
+
+fn bpf_mut<A: Attributes>(command: libc::c_int, attributes: &mut A) -> io::Result<i32> {
+    // SAFETY: the attributes are plain words of the size given, laid out as `union bpf_attr` is, and
+    // what they point to outlives the call.
+    let result = unsafe {
+        libc::syscall(
+            libc::SYS_bpf,
+            command,
+            std::ptr::from_mut(attributes),
+            size_of::<A>(),
+        )
+    };
+    match i32::try_from(result) {
+        Ok(number) if number >= 0 => Ok(number),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+fn descriptor(number: i32) -> OwnedFd {
+    // SAFETY: the kernel has just opened it for this process, and nothing else knows it.
+    unsafe { OwnedFd::from_raw_fd(number) }
+}

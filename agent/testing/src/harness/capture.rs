@@ -1,0 +1,69 @@
+//! What crossed a host's cable, as tcpdump saw it: the judge of what the agent says, and of whether
+//! it sent anything itself.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail};
+
+use super::network::{INTERFACE, Namespace};
+use super::process::Process;
+
+/// tcpdump takes frames out of the kernel's buffer this often, and not at its end.
+pub const SETTLE: Duration = Duration::from_millis(1200);
+/// 64 MiB: more than a second of point clouds.
+const BUFFER_KILOBYTES: &str = "65536";
+
+pub struct Capture {
+    process: Process,
+    path: PathBuf,
+    said: PathBuf,
+}
+
+impl Capture {
+    /// Records every frame of the host's interface into a file until [`Capture::finish`].
+    pub fn start(host: &Namespace, path: &Path) -> Result<Capture> {
+        let said = path.with_extension("said");
+        let errors =
+            File::create(&said).with_context(|| format!("cannot create {}", said.display()))?;
+        let words = ["-i", INTERFACE, "-B", BUFFER_KILOBYTES, "-Z", "root", "-w"];
+        let words = words.iter().map(AsRef::as_ref).chain([path.as_os_str()]);
+        let process = Process::start_with(&host.inside(), "tcpdump", words, errors.into())?;
+        let capture = Capture {
+            process,
+            path: path.to_owned(),
+            said,
+        };
+        let deadline = Instant::now() + Duration::from_secs(30);
+        while !capture.said()?.contains("listening on") {
+            if Instant::now() > deadline {
+                bail!("tcpdump does not begin: {}", capture.said()?);
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        Ok(capture)
+    }
+
+    /// Ends the recording. The file has all but what happened in the last [`SETTLE`]; a judge that
+    /// missed frames before is an error.
+    pub fn finish(mut self) -> Result<PathBuf> {
+        self.process.signal("INT")?;
+        let status = self
+            .process
+            .wait(Duration::from_secs(30))
+            .context("tcpdump")?;
+        let said = self.said()?;
+        if !status.success() {
+            bail!("tcpdump ended with {status}: {said}");
+        }
+        if !said.contains("\n0 packets dropped by kernel") {
+            bail!("tcpdump missed frames: {said}");
+        }
+        Ok(self.path)
+    }
+
+    fn said(&self) -> Result<String> {
+        fs::read_to_string(&self.said).context("cannot read what tcpdump says")
+    }
+}

@@ -1,0 +1,301 @@
+//! What tshark reads in a recording: a judge that shares no code with the agent.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::{Context as _, Result, bail, ensure};
+
+const ACKNACK: &str = "0x06";
+const HEARTBEAT: &str = "0x07";
+const GAP: &str = "0x08";
+const NACK_FRAG: &str = "0x12";
+const HEARTBEAT_FRAG: &str = "0x13";
+const DATA: &str = "0x15";
+const DATA_FRAG: &str = "0x16";
+
+/// The columns asked of tshark, in this order.
+const COLUMNS: [&str; 15] = [
+    "frame.time_epoch",
+    "frame.protocols",
+    "eth.src",
+    "ip.src",
+    "udp.srcport",
+    "rtps.guidPrefix.src",
+    "rtps.sm.id",
+    "rtps.sm.wrEntityId",
+    "rtps.sm.rdEntityId",
+    "rtps.sm.seqNumber",
+    "rtps.bitmap.num_bits",
+    "rtps.data_frag.number",
+    "rtps.data_frag.num_fragments",
+    "rtps.data_frag.sample_size",
+    "rtps.data_frag.size",
+];
+
+/// Every frame of a recording.
+pub struct Dissection {
+    pub frames: Vec<Frame>,
+}
+
+/// One frame. A datagram that came in IP fragments is in the frame of its last one.
+pub struct Frame {
+    /// Seconds since the Unix epoch.
+    pub time: f64,
+    /// Such as `eth:ethertype:ip:udp:rtps`.
+    pub protocols: String,
+    pub ethernet_source: String,
+    pub ip_source: String,
+    pub source_port: Option<u16>,
+    /// 24 hexadecimal digits of the sender's GUID prefix.
+    pub prefix: String,
+    pub submessages: Vec<Submessage>,
+}
+
+/// One submessage that names a writer.
+#[derive(Clone, Debug)]
+pub struct Submessage {
+    /// Eight hexadecimal digits.
+    pub writer: String,
+    pub reader: String,
+    pub content: Content,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Content {
+    Data(u64),
+    /// Of a sample that has `of` fragments, those from `first` (counted from 1) on.
+    Fragments {
+        number: u64,
+        first: u32,
+        count: u32,
+        of: u32,
+    },
+    Heartbeat {
+        last: u64,
+    },
+    /// An ACKNACK: a reader asks for some of these again.
+    Request {
+        first: u64,
+        end: u64,
+    },
+    Other,
+}
+
+/// The samples of one writer, as they came.
+#[derive(Debug, Default)]
+pub struct Samples {
+    /// Writer sequence number and time of each sample that came whole, in that order.
+    pub whole: BTreeMap<u64, f64>,
+    /// Lowest and highest number of which anything came.
+    pub span: Option<(u64, u64)>,
+    /// Samples whose first DATA was dropped: a later one had come before, or a HEARTBEAT that told
+    /// of them and then a request. What lies before the first DATA of all does not count.
+    pub retransmitted: u64,
+    /// A HEARTBEAT told of them and nobody asked: RustDDS announces what it is about to send.
+    pub announced_early: u64,
+    /// DATA submessages beyond the first of each sample.
+    pub repeated: u64,
+}
+
+impl Dissection {
+    pub fn read(recording: &Path) -> Result<Dissection> {
+        let mut tshark = Command::new("tshark");
+        tshark.args(["-n", "-T", "fields", "-r"]).arg(recording);
+        for column in COLUMNS {
+            tshark.args(["-e", column]);
+        }
+        let output = tshark
+            .output()
+            .context("cannot run tshark: `apt-get install tshark`")?;
+        if !output.status.success() {
+            bail!("tshark: {}", String::from_utf8_lossy(&output.stderr));
+        }
+        let text = String::from_utf8_lossy(&output.stdout);
+        let frames = text
+            .lines()
+            .map(|line| Frame::parse(line).with_context(|| format!("tshark printed `{line}`")));
+        Ok(Dissection {
+            frames: frames.collect::<Result<_>>()?,
+        })
+    }
+
+    /// The samples of the writer with this GUID (32 hexadecimal digits).
+    pub fn samples_of(&self, writer: &str) -> Samples {
+        let (prefix, entity) = writer.split_at(24);
+        let mut samples = Samples::default();
+        let mut fragments: BTreeMap<u64, BTreeSet<u32>> = BTreeMap::new();
+        let (mut began, mut newest, mut told) = (None, 0, 0);
+        let mut requested = BTreeSet::new();
+        for frame in &self.frames {
+            let own = frame.prefix == prefix;
+            for submessage in &frame.submessages {
+                if submessage.writer != entity {
+                    continue;
+                }
+                match submessage.content {
+                    // There are two participants, so another one's answer is to this writer.
+                    Content::Request { first, end } if !own => requested.extend(first..end),
+                    _ if !own => {}
+                    Content::Data(number) => {
+                        if samples.whole.contains_key(&number) {
+                            samples.repeated += 1;
+                            continue;
+                        }
+                        let counts = number > *began.get_or_insert(number);
+                        let missed = number < newest || requested.contains(&number);
+                        samples.retransmitted += u64::from(counts && missed);
+                        samples.announced_early += u64::from(counts && !missed && number <= told);
+                        samples.whole.insert(number, frame.time);
+                        samples.extend(number);
+                        newest = newest.max(number);
+                    }
+                    Content::Fragments {
+                        number,
+                        first,
+                        count,
+                        of,
+                    } => {
+                        let seen = fragments.entry(number).or_default();
+                        seen.extend(first..first + count);
+                        if seen.len() as u64 >= u64::from(of) {
+                            samples.whole.entry(number).or_insert(frame.time);
+                        }
+                        samples.extend(number);
+                    }
+                    Content::Heartbeat { last } => told = told.max(last),
+                    Content::Request { .. } | Content::Other => {}
+                }
+            }
+        }
+        samples
+    }
+}
+
+impl Samples {
+    /// How many numbers between the first and the last did not come whole.
+    pub fn missing(&self) -> u64 {
+        self.span.map_or(0, |(first, last)| {
+            last - first + 1 - self.whole.range(first..=last).count() as u64
+        })
+    }
+
+    /// The application counts from 0, the writer from 1.
+    pub fn application_numbers(&self) -> BTreeSet<u64> {
+        self.whole.keys().map(|number| number - 1).collect()
+    }
+
+    fn extend(&mut self, number: u64) {
+        let (first, last) = self.span.unwrap_or((number, number));
+        self.span = Some((first.min(number), last.max(number)));
+    }
+}
+
+impl Frame {
+    fn parse(line: &str) -> Result<Frame> {
+        let cells: Vec<&str> = line.split('\t').collect();
+        let Ok(
+            [
+                time,
+                protocols,
+                ethernet_source,
+                ip_source,
+                source_port,
+                prefix,
+                kinds,
+                writers,
+                readers,
+                numbers,
+                bits,
+                starts,
+                counts,
+                sizes,
+                fragment_sizes,
+            ],
+        ) = <[&str; COLUMNS.len()]>::try_from(cells)
+        else {
+            bail!("not {} columns", COLUMNS.len());
+        };
+        let [mut writers, mut readers] = [writers, readers].map(values);
+        let [mut numbers, mut bits] = [numbers, bits].map(values);
+        let [mut starts, mut counts, mut sizes, mut fragment_sizes] =
+            [starts, counts, sizes, fragment_sizes].map(values);
+        let mut submessages = Vec::new();
+        for kind in values(kinds) {
+            let mut number = || next(&mut numbers);
+            let content = match kind {
+                DATA => Content::Data(number()?),
+                DATA_FRAG => {
+                    let size: u32 = next(&mut sizes)?;
+                    let fragment_size: u32 = next(&mut fragment_sizes)?;
+                    Content::Fragments {
+                        number: number()?,
+                        first: next(&mut starts)?,
+                        count: next(&mut counts)?,
+                        of: size.div_ceil(fragment_size),
+                    }
+                }
+                HEARTBEAT => {
+                    number()?;
+                    Content::Heartbeat { last: number()? }
+                }
+                ACKNACK => {
+                    let (first, bits) = (number()?, next::<u64>(&mut bits)?);
+                    Content::Request {
+                        first,
+                        end: first + bits,
+                    }
+                }
+                NACK_FRAG | HEARTBEAT_FRAG => {
+                    number()?;
+                    Content::Other
+                }
+                GAP => {
+                    number()?;
+                    number()?;
+                    next::<u64>(&mut bits)?;
+                    Content::Other
+                }
+                _ => continue,
+            };
+            let entity = |id: Option<&str>| -> Result<String> {
+                let id = id.context("an entity id is missing")?;
+                Ok(id.trim_start_matches("0x").to_owned())
+            };
+            submessages.push(Submessage {
+                writer: entity(writers.next())?,
+                reader: entity(readers.next())?,
+                content,
+            });
+        }
+        // What was not used up was given to the wrong submessage.
+        ensure!(
+            writers.next().is_none()
+                && numbers.next().is_none()
+                && bits.next().is_none()
+                && starts.next().is_none(),
+            "values are left over"
+        );
+        Ok(Frame {
+            time: time.parse().context("frame.time_epoch")?,
+            protocols: protocols.to_owned(),
+            ethernet_source: ethernet_source.to_owned(),
+            ip_source: ip_source.to_owned(),
+            source_port: source_port.parse().ok(),
+            prefix: prefix.to_owned(),
+            submessages,
+        })
+    }
+}
+
+fn values(cell: &str) -> impl Iterator<Item = &str> {
+    cell.split(',').filter(|value| !value.is_empty())
+}
+
+fn next<'a, T: std::str::FromStr>(values: &mut impl Iterator<Item = &'a str>) -> Result<T> {
+    let value = values.next().context("a value is missing")?;
+    value
+        .parse()
+        .ok()
+        .with_context(|| format!("{value} is not a number"))
+}

@@ -1,0 +1,79 @@
+//! What a peer says it really sent or received: one JSON object per line.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
+use serde::Deserialize;
+
+/// One line. Which fields are there depends on `ev`.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Event {
+    /// `start`, `endpoint`, `pub`, `pub_failed`, `sub`, `error`, `stop` or `exit`.
+    pub ev: String,
+    /// Unix time in nanoseconds.
+    pub t: u64,
+    /// The application's sequence number from 0; the DDS writer counts from 1.
+    pub seq: Option<u64>,
+    /// The DDS writer's sequence number, where the stack tells a subscriber.
+    pub sn: Option<u64>,
+    /// Serialized size with the encapsulation header.
+    pub len: Option<u64>,
+    pub stamp_ns: Option<u64>,
+    pub kind: Option<String>,
+    /// Prefix and entity id, 32 hexadecimal digits.
+    pub guid: Option<String>,
+    pub topic: Option<String>,
+    pub node: Option<String>,
+}
+
+pub struct EventLog(pub Vec<Event>);
+
+impl EventLog {
+    pub fn read(path: &Path) -> Result<EventLog> {
+        let text = std::fs::read_to_string(path)
+            .with_context(|| format!("cannot read {}", path.display()))?;
+        let whole_lines = text.rfind('\n').map_or("", |end| &text[..end]);
+        let events = whole_lines.lines().map(|line| {
+            serde_json::from_str(line).with_context(|| format!("not an event: {line}"))
+        });
+        Ok(EventLog(events.collect::<Result<_>>()?))
+    }
+
+    /// The application's sequence numbers of the events of one kind, in the order they happened.
+    pub fn sequences(&self, ev: &str) -> Vec<u64> {
+        self.0
+            .iter()
+            .filter(|event| event.ev == ev)
+            .filter_map(|event| event.seq)
+            .collect()
+    }
+
+    /// The DDS writer's sequence numbers of the events of one kind.
+    pub fn writer_numbers(&self, ev: &str) -> Result<BTreeSet<u64>> {
+        let mut numbers = BTreeSet::new();
+        for event in self.0.iter().filter(|event| event.ev == ev) {
+            let number = event.seq.context("an event without a number")? + 1;
+            ensure!(
+                event.sn.is_none_or(|told| told == number),
+                "the writer did not number its samples one by one: {event:?}"
+            );
+            ensure!(numbers.insert(number), "twice: {event:?}");
+        }
+        Ok(numbers)
+    }
+
+    /// How many samples are missing between the first and the last that this subscriber was given:
+    /// what an observer of the same link can know to be lost.
+    pub fn missing(&self) -> u64 {
+        let received: BTreeSet<u64> = self.sequences("sub").into_iter().collect();
+        match (received.first(), received.last()) {
+            (Some(first), Some(last)) => last - first + 1 - received.len() as u64,
+            _ => 0,
+        }
+    }
+
+    pub fn endpoints(&self) -> impl Iterator<Item = &Event> {
+        self.0.iter().filter(|event| event.ev == "endpoint")
+    }
+}

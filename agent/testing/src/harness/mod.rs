@@ -1,0 +1,108 @@
+//! What the live tests and the demo stand on: hosts made of a network namespace and a cgroup, DDS
+//! peers and the agent started inside them, packet loss, and the logs and metrics they leave behind.
+//!
+//! Everything is named after the process and a counter, so tests run side by side, and everything
+//! goes when its value is dropped, also when a test panics. Where something is missing the harness
+//! fails and says what to install; it never skips.
+
+pub mod agent;
+pub mod bpf;
+pub mod capture;
+pub mod cgroup;
+pub mod code;
+pub mod dissection;
+pub mod event_log;
+pub mod loss;
+pub mod network;
+pub mod peer;
+pub mod process;
+pub mod prometheus;
+pub mod shared_memory;
+pub mod snmp;
+pub mod soak;
+pub mod switch;
+pub mod usage;
+pub mod witness;
+
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail, ensure};
+
+/// Tools the harness runs, with the Debian or Ubuntu package that has each.
+const TOOLS: [(&str, &str); 8] = [
+    ("ip", "iproute2"),
+    ("nft", "nftables"),
+    ("ethtool", "ethtool"),
+    ("nsenter", "util-linux"),
+    ("setpriv", "util-linux"),
+    ("sysctl", "procps"),
+    ("curl", "curl"),
+    ("tcpdump", "tcpdump"),
+];
+
+/// What namespaces and cgroups are named with, before the process that made them.
+pub const PREFIX: &str = "r2p";
+
+/// Fails unless this process is root and every tool is there.
+pub fn require() -> Result<()> {
+    let status = std::fs::read_to_string("/proc/self/status").context("cannot read /proc")?;
+    let effective = status.lines().find_map(|line| line.strip_prefix("Uid:"));
+    if effective.and_then(|ids| ids.split_whitespace().nth(1)) != Some("0") {
+        bail!("network namespaces need root: run `sudo -E make test`");
+    }
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    for (tool, package) in TOOLS {
+        if !std::env::split_paths(&path).any(|directory| directory.join(tool).exists()) {
+            bail!("`{tool}` is missing: run `apt-get install {package}` or `make prerequisites`");
+        }
+    }
+    Ok(())
+}
+
+/// Looks ten times a second whether it holds, for a minute.
+pub fn wait_until(what: &str, mut holds: impl FnMut() -> Result<bool>) -> Result<()> {
+    const PATIENCE: Duration = Duration::from_secs(60);
+    let deadline = Instant::now() + PATIENCE;
+    while !holds()? {
+        ensure!(Instant::now() < deadline, "{what}: not within {PATIENCE:?}");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    Ok(())
+}
+
+/// Runs a command line made of words without spaces, and fails with what it said.
+pub fn run(line: &str) -> Result<String> {
+    let mut words = line.split_whitespace();
+    let program = words.next().context("an empty command")?;
+    let output = Command::new(program)
+        .args(words)
+        .output()
+        .with_context(|| format!("cannot run `{line}`"))?;
+    if !output.status.success() {
+        bail!(
+            "`{line}` failed: {}",
+            String::from_utf8_lossy(&output.stderr).trim()
+        );
+    }
+    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+}
+
+/// Calls `remove` with each name in a directory that a process made which is gone.
+fn remove_leftovers(directory: &Path, remove: impl Fn(&str)) {
+    let Ok(entries) = std::fs::read_dir(directory) else {
+        return;
+    };
+    for entry in entries.flatten() {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        let mut parts = name.split('-');
+        let (prefix, owner) = (parts.next(), parts.next());
+        let Some(owner) = owner.filter(|_| prefix == Some(PREFIX)) else {
+            continue;
+        };
+        if !Path::new("/proc").join(owner).exists() {
+            remove(&name);
+        }
+    }
+}

@@ -1,0 +1,183 @@
+//! Hosts: network namespaces joined by a veth pair of MTU 1500 with real checksums, each with a
+//! cgroup for its processes.
+
+use std::net::Ipv4Addr;
+use std::path::Path;
+use std::sync::Once;
+use std::sync::atomic::{AtomicU16, Ordering};
+
+use anyhow::Result;
+
+use super::cgroup::{self, Cgroup};
+use super::{PREFIX, remove_leftovers, require, run};
+
+/// The interface of every host.
+pub const INTERFACE: &str = "eth0";
+
+static NEXT: AtomicU16 = AtomicU16::new(0);
+
+/// One host.
+pub struct Namespace {
+    name: String,
+    address: Ipv4Addr,
+    cgroup: Cgroup,
+}
+
+/// Two hosts on one cable.
+pub struct Link {
+    pub robot: Namespace,
+    pub monitor: Namespace,
+    /// That of both hosts, as if one machine ran them as containers.
+    cgroup: Cgroup,
+}
+
+impl Link {
+    pub fn new() -> Result<Link> {
+        sweep()?;
+        let subnet = next_subnet();
+        Link::create(subnet, Cgroup::create(&name_of("link", subnet))?)
+    }
+
+    /// As [`Link::new`], below a cgroup that somebody may be looking at already.
+    pub fn below(above: &Cgroup) -> Result<Link> {
+        sweep()?;
+        let subnet = next_subnet();
+        Link::create(subnet, above.create_below(&name_of("link", subnet))?)
+    }
+
+    fn create(subnet: u16, cgroup: Cgroup) -> Result<Link> {
+        let robot = Namespace::create("robot", subnet, 1, Some(&cgroup))?;
+        let monitor = Namespace::create("monitor", subnet, 2, Some(&cgroup))?;
+        run(&format!(
+            "ip link add {INTERFACE} netns {} mtu 1500 type veth peer name {INTERFACE} mtu 1500 netns {}",
+            robot.name, monitor.name
+        ))?;
+        robot.configure(INTERFACE)?;
+        monitor.configure(INTERFACE)?;
+        Ok(Link {
+            robot,
+            monitor,
+            cgroup,
+        })
+    }
+
+    /// The cgroup that holds those of both hosts.
+    pub fn cgroup(&self) -> &Path {
+        self.cgroup.path()
+    }
+}
+
+impl Namespace {
+    /// A host whose cable ends nowhere: its nodes talk over loopback only.
+    pub fn alone() -> Result<Namespace> {
+        sweep()?;
+        let host = Namespace::create("robot", next_subnet(), 1, None)?;
+        run(&format!(
+            "ip -n {0} link add {INTERFACE} type veth peer name unplugged",
+            host.name
+        ))?;
+        run(&format!("ip -n {0} link set unplugged up", host.name))?;
+        host.configure(INTERFACE)?;
+        Ok(host)
+    }
+
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    pub fn address(&self) -> Ipv4Addr {
+        self.address
+    }
+
+    /// The cgroup that its processes are in.
+    pub fn cgroup(&self) -> &Path {
+        self.cgroup.path()
+    }
+
+    /// Runs `make` with this process in the host's cgroup: sockets belong where they were created.
+    pub fn hold<T>(&self, make: impl FnOnce() -> T) -> Result<T> {
+        self.cgroup.hold(make)
+    }
+
+    /// The words that run a command in this host with the host's own `/sys`.
+    pub fn inside(&self) -> Vec<String> {
+        let mut words = self.cgroup.inside();
+        words.extend(["ip", "netns", "exec", &self.name].map(str::to_owned));
+        words
+    }
+
+    /// The words that run a command on this host's network only: `/sys/fs/cgroup` and the rest of
+    /// the file system stay as they are, as for a system service.
+    pub fn on_network(&self) -> Vec<String> {
+        let mut words = self.cgroup.inside();
+        words.extend(self.outside());
+        words
+    }
+
+    /// The words that run a command on this host's network which is none of its processes.
+    pub fn outside(&self) -> [String; 2] {
+        let network = format!("--net=/run/netns/{}", self.name);
+        ["nsenter".to_owned(), network]
+    }
+
+    fn create(role: &str, subnet: u16, host: u8, above: Option<&Cgroup>) -> Result<Namespace> {
+        let name = name_of(role, subnet);
+        let [_, third] = subnet.to_be_bytes();
+        let cgroup = match above {
+            Some(above) => above.create_below(role)?,
+            None => Cgroup::create(&name)?,
+        };
+        run(&format!("ip netns add {name}"))?;
+        Ok(Namespace {
+            name,
+            cgroup,
+            address: Ipv4Addr::new(10, 99, third, host),
+        })
+    }
+
+    pub(super) fn configure(&self, interface: &str) -> Result<()> {
+        let Namespace { name, address, .. } = self;
+        run(&format!("ip -n {name} link set lo multicast on up"))?;
+        run(&format!(
+            "ip -n {name} addr add {address}/24 dev {interface}"
+        ))?;
+        run(&format!("ip -n {name} link set {interface} up"))?;
+        run(&format!(
+            "ip -n {name} route add 239.0.0.0/8 dev {interface}"
+        ))?;
+        // veth carries unfinished checksums otherwise, which no cable does.
+        run(&format!(
+            "ip netns exec {name} ethtool -K {interface} tx off"
+        ))?;
+        Ok(())
+    }
+}
+
+impl Drop for Namespace {
+    fn drop(&mut self) {
+        if let Err(error) = run(&format!("ip netns delete {}", self.name)) {
+            eprintln!("{error:#}");
+        }
+    }
+}
+
+/// Fails where tests cannot run; removes what killed ones left behind.
+fn sweep() -> Result<()> {
+    require()?;
+    static SWEPT: Once = Once::new();
+    SWEPT.call_once(|| {
+        remove_leftovers(Path::new("/run/netns"), |name| {
+            let _ = run(&format!("ip netns delete {name}"));
+        });
+        cgroup::sweep();
+    });
+    Ok(())
+}
+
+fn name_of(role: &str, subnet: u16) -> String {
+    format!("{PREFIX}-{}-{subnet}-{role}", std::process::id())
+}
+
+fn next_subnet() -> u16 {
+    NEXT.fetch_add(1, Ordering::Relaxed)
+}

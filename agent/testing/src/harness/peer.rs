@@ -1,0 +1,267 @@
+//! Real DDS participants: one command line for three stacks (see `agent/tests/peers/peer.hpp`).
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, bail};
+use tempfile::TempDir;
+
+use super::event_log::EventLog;
+use super::network::Namespace;
+use super::process::Process;
+
+/// How long discovery may take on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stack {
+    Fast,
+    Cyclone,
+    Rust,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    Publisher,
+    Subscriber,
+}
+
+/// What the publisher sends or the subscriber expects.
+#[derive(Clone, Debug)]
+pub struct Stream {
+    pub topic: String,
+    pub size: usize,
+    pub rate: f64,
+    pub count: u64,
+    pub reliable: bool,
+    pub transient_local: bool,
+    pub depth: usize,
+    pub domain: u16,
+    /// Whether the peers log every sample.
+    pub logged: bool,
+    /// Seconds for which a publisher stays after its last sample, unless it is terminated.
+    pub linger: f64,
+    /// After so many samples, and so many more, a publisher waits for [`Peer::go`]; 0 = never.
+    pub stretch: u64,
+    /// How many of the other role a peer waits for.
+    pub peers: usize,
+    /// Bytes of each of the peers' receive buffers, as far as net.core.rmem_max goes.
+    pub receive_buffer: u32,
+    /// Fast DDS: the transports that it has by itself, shared memory among them.
+    pub shares_memory: bool,
+    /// Fast DDS: readers read the history of writers of their host.
+    pub shares_history: bool,
+}
+
+pub struct Peer {
+    pub process: Process,
+    directory: TempDir,
+}
+
+impl Stack {
+    pub const ALL: [Stack; 3] = [Stack::Fast, Stack::Cyclone, Stack::Rust];
+
+    fn program(self) -> Result<PathBuf> {
+        match self {
+            Stack::Fast => built("fastdds"),
+            Stack::Cyclone => built("cyclonedds"),
+            Stack::Rust => is_there(robot()?, "cargo build --example robot"),
+        }
+    }
+
+    /// The library of this name that its program loads, as the dynamic linker finds it.
+    pub fn library(self, name: &str) -> Result<PathBuf> {
+        let list = Command::new("ldd").arg(self.program()?).output()?;
+        let list = String::from_utf8_lossy(&list.stdout).into_owned();
+        let line = list.lines().find(|line| line.contains(name));
+        let path = line.and_then(|line| line.split_ascii_whitespace().nth(2));
+        path.map(PathBuf::from)
+            .with_context(|| format!("{name} is not in {list}"))
+    }
+}
+
+impl Stream {
+    /// Small samples as from an IMU: 320 B at 200 Hz, best effort.
+    pub fn small(count: u64) -> Stream {
+        Stream {
+            topic: "/imu".to_owned(),
+            size: 320,
+            rate: 200.0,
+            count,
+            reliable: false,
+            transient_local: false,
+            depth: 100,
+            domain: 0,
+            logged: true,
+            linger: 1.0,
+            stretch: 0,
+            peers: 1,
+            receive_buffer: 4 << 20,
+            shares_memory: false,
+            shares_history: false,
+        }
+    }
+
+    /// A point cloud of `size` bytes at 20 Hz, best effort. The history is a second long: RustDDS
+    /// drops what it overwrites before a busy CPU has sent it.
+    pub fn point_cloud(size: usize, count: u64) -> Stream {
+        Stream {
+            topic: "/points".to_owned(),
+            size,
+            rate: 20.0,
+            depth: 20,
+            ..Stream::small(count)
+        }
+    }
+}
+
+impl Peer {
+    /// Starts a peer and waits until its endpoints exist. A publisher holds its samples until
+    /// [`Peer::go`].
+    pub fn start(
+        host: &Namespace,
+        stack: Stack,
+        role: Role,
+        stream: &Stream,
+        nodes: &[&str],
+    ) -> Result<Peer> {
+        let mut peer = Peer::launch(host, stack, role, stream, nodes)?;
+        peer.wait_ready()
+            .with_context(|| format!("{stack:?} {role:?}"))?;
+        Ok(peer)
+    }
+
+    /// As [`Peer::start`] without waiting, for peers that begin at the same time.
+    pub fn launch(
+        host: &Namespace,
+        stack: Stack,
+        role: Role,
+        stream: &Stream,
+        nodes: &[&str],
+    ) -> Result<Peer> {
+        Peer::launch_behind(&host.inside(), stack, role, stream, nodes)
+    }
+
+    /// As [`Peer::launch`] behind words of the caller's, such as a host's and an environment's.
+    pub fn launch_behind(
+        enter: &[String],
+        stack: Stack,
+        role: Role,
+        stream: &Stream,
+        nodes: &[&str],
+    ) -> Result<Peer> {
+        let directory = tempfile::tempdir().context("cannot create a directory for the log")?;
+        let role_name = match role {
+            Role::Publisher => "pub",
+            Role::Subscriber => "sub",
+        };
+        let mut words: Vec<String> = ["--role", role_name, "--topic", &stream.topic, "--hold"]
+            .into_iter()
+            .filter(|word| *word != "--hold" || role == Role::Publisher)
+            .map(str::to_owned)
+            .collect();
+        let mut option = |name: &str, value: String| words.extend([name.to_owned(), value]);
+        option("--size", stream.size.to_string());
+        option("--rate", stream.rate.to_string());
+        option("--depth", stream.depth.to_string());
+        option("--domain", stream.domain.to_string());
+        option("--peers", stream.peers.to_string());
+        option("--receive-buffer", stream.receive_buffer.to_string());
+        if stream.logged {
+            option("--log", directory.path().join("log").display().to_string());
+        }
+        if role == Role::Publisher {
+            option("--count", stream.count.to_string());
+            option("--stretch", stream.stretch.to_string());
+            option("--linger", stream.linger.to_string());
+        }
+        for node in nodes {
+            option("--node", (*node).to_owned());
+        }
+        words.push(
+            if stream.reliable {
+                "--reliable"
+            } else {
+                "--best-effort"
+            }
+            .to_owned(),
+        );
+        if stream.shares_memory {
+            words.extend(["--transport", "default"].map(str::to_owned));
+        }
+        if stream.shares_history {
+            words.push("--data-sharing".to_owned());
+        }
+        if stream.transient_local {
+            words.push("--transient-local".to_owned());
+        }
+        let process = Process::start(enter, stack.program()?, words)?;
+        Ok(Peer { process, directory })
+    }
+
+    pub fn wait_ready(&mut self) -> Result<()> {
+        self.process.wait_for("ready", PATIENCE)
+    }
+
+    /// Waits until a peer of the other role is known.
+    pub fn wait_matched(&mut self) -> Result<()> {
+        self.process.wait_for("matched", PATIENCE)
+    }
+
+    /// Lets a publisher send.
+    pub fn go(&mut self) -> Result<()> {
+        self.process.say("go")
+    }
+
+    /// Waits until a publisher has sent everything.
+    pub fn wait_sent(&mut self, limit: Duration) -> Result<()> {
+        self.process.wait_for("done", limit)
+    }
+
+    pub fn log_path(&self) -> PathBuf {
+        self.directory.path().join("log")
+    }
+
+    pub fn log(&self) -> Result<EventLog> {
+        EventLog::read(&self.log_path())
+    }
+}
+
+/// The demo robot, built by cargo as an example beside the tests.
+pub fn robot() -> Result<PathBuf> {
+    Ok(profile_directory()?.join("examples/robot"))
+}
+
+/// `target/debug` or the like: tests run from its `deps`, examples from its `examples`.
+fn profile_directory() -> Result<PathBuf> {
+    let program = std::env::current_exe().context("cannot tell where this program is")?;
+    let directory = program
+        .ancestors()
+        .nth(2)
+        .context("this program is not in a target directory")?;
+    Ok(directory.to_owned())
+}
+
+/// A program that `make peers` builds.
+pub fn built(name: &str) -> Result<PathBuf> {
+    is_there(target_directory()?.join("peers").join(name), "make peers")
+}
+
+fn is_there(program: PathBuf, remedy: &str) -> Result<PathBuf> {
+    if !program.exists() {
+        bail!("{} is missing: run `{remedy}`", program.display());
+    }
+    Ok(program)
+}
+
+fn target_directory() -> Result<PathBuf> {
+    let profile = profile_directory()?;
+    let target = profile
+        .ancestors()
+        .find(|directory| directory.join("CACHEDIR.TAG").exists());
+    Ok(target
+        .or_else(|| profile.parent())
+        .unwrap_or(Path::new("target"))
+        .to_owned())
+}

@@ -1,0 +1,156 @@
+//! A real Prometheus on a host, and what it answers.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail};
+use tempfile::TempDir;
+
+use super::agent::get;
+use super::network::Namespace;
+use super::process::Process;
+
+pub const INSTALL: &str = "run `make prerequisites` or `apt-get install prometheus`";
+const SERVER: &str = "127.0.0.1:9090";
+/// How long a query may have no answer.
+const PATIENCE: Duration = Duration::from_secs(40);
+
+pub struct Prometheus<'a> {
+    host: &'a Namespace,
+    _process: Process,
+    _directory: TempDir,
+}
+
+/// What a Prometheus does.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// Keeps, evaluates and answers, and takes what others push.
+    Server,
+    /// Scrapes and pushes, and keeps only what it could not deliver.
+    Agent,
+}
+
+impl<'a> Prometheus<'a> {
+    /// Scrapes these targets (`address:port`) and evaluates these files of rules each second.
+    pub fn start(
+        host: &'a Namespace,
+        targets: &[String],
+        rules: &[PathBuf],
+    ) -> Result<Prometheus<'a>> {
+        let text = format!(
+            "global: {{scrape_interval: 1s, evaluation_interval: 1s}}\n\
+             rule_files: {rules:?}\n\
+             scrape_configs: [{{job_name: ros2probe, static_configs: [{{targets: {targets:?}}}]}}]\n",
+        );
+        Prometheus::run(host, Kind::Server, &text)
+    }
+
+    /// As a configuration says, on port 9090.
+    pub fn run(host: &'a Namespace, kind: Kind, text: &str) -> Result<Prometheus<'a>> {
+        let directory = tempfile::tempdir()?;
+        let configuration = directory.path().join("prometheus.yml");
+        std::fs::write(&configuration, text)?;
+        let data = directory.path().join("data");
+        let data = data.display();
+        let own = match kind {
+            Kind::Server => [
+                format!("--storage.tsdb.path={data}"),
+                "--web.enable-remote-write-receiver".to_owned(),
+            ],
+            Kind::Agent => [
+                format!("--storage.agent.path={data}"),
+                "--enable-feature=agent".to_owned(),
+            ],
+        };
+        let arguments = own.into_iter().chain([
+            format!("--config.file={}", configuration.display()),
+            "--web.listen-address=0.0.0.0:9090".to_owned(),
+            "--log.level=error".to_owned(),
+        ]);
+        let process = Process::start(&host.outside(), "prometheus", arguments).context(INSTALL)?;
+        Ok(Prometheus {
+            host,
+            _process: process,
+            _directory: directory,
+        })
+    }
+
+    /// Asks until there is an answer; the value of its first sample.
+    pub fn query(&self, expression: &str) -> Result<f64> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let answer = self.ask(expression);
+            let value = answer
+                .as_ref()
+                .ok()
+                .and_then(|answer| answer.pointer("/data/result/0/value/1"))
+                .and_then(|value| value.as_str());
+            if let Some(value) = value.and_then(|value| value.parse().ok()) {
+                return Ok(value);
+            }
+            if Instant::now() > deadline {
+                bail!("{expression}: {answer:?}; is `prometheus` there? {INSTALL}");
+            }
+            std::thread::sleep(Duration::from_millis(300));
+        }
+    }
+
+    /// Asks until this is the answer.
+    pub fn wait_for(&self, expression: &str, wanted: f64) -> Result<()> {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let value = self.query(expression)?;
+            if value == wanted {
+                return Ok(());
+            }
+            if Instant::now() > deadline {
+                bail!("{expression} is {value} and not {wanted}");
+            }
+            std::thread::sleep(Duration::from_millis(300));
+        }
+    }
+
+    /// How many series an expression has now.
+    pub fn series(&self, expression: &str) -> Result<usize> {
+        Ok(self.label_sets(expression)?.len())
+    }
+
+    /// The labels of each series that an expression has now.
+    pub fn label_sets(&self, expression: &str) -> Result<Vec<BTreeMap<String, String>>> {
+        let answer = self
+            .ask(expression)
+            .with_context(|| expression.to_owned())?;
+        let result = answer.pointer("/data/result");
+        let series = result.and_then(|result| result.as_array());
+        let labels = series
+            .with_context(|| format!("{expression}: {answer}"))?
+            .iter()
+            .map(|series| Ok(serde_json::from_value(series["metric"].clone())?));
+        labels.collect()
+    }
+
+    /// The times of a series' samples: of its first, for an expression such as `up[30s]`.
+    pub fn times(&self, expression: &str) -> Result<Vec<f64>> {
+        let answer = self.ask(expression)?;
+        let samples = answer.pointer("/data/result/0/values");
+        let samples = samples.and_then(|samples| samples.as_array());
+        let samples = samples.with_context(|| format!("{expression}: {answer}"))?;
+        Ok(samples
+            .iter()
+            .filter_map(|sample| sample.get(0)?.as_f64())
+            .collect())
+    }
+
+    fn ask(&self, expression: &str) -> Result<serde_json::Value> {
+        let encoded: String = expression
+            .bytes()
+            .map(|byte| format!("%{byte:02X}"))
+            .collect();
+        let body = get(
+            self.host,
+            &format!("http://{SERVER}/api/v1/query?query={encoded}"),
+        )?;
+        serde_json::from_str(&body).with_context(|| format!("not JSON: {body}"))
+    }
+}

@@ -1,0 +1,40 @@
+//! A switch between two hosts. What it loses, the sender's packet taps have seen and the receiver's
+//! have not: `Loss::of_samples` on it makes loss between two agents.
+
+use anyhow::Result;
+
+use super::network::{INTERFACE, Link, Namespace};
+use super::run;
+
+/// The switch's port to the robot; the one to the monitor is called [`INTERFACE`].
+const ROBOT_PORT: &str = "robot";
+
+pub struct Switched {
+    pub link: Link,
+    pub switch: Namespace,
+}
+
+impl Switched {
+    /// Plugs the two ends of a new link into a switch.
+    pub fn new() -> Result<Switched> {
+        let link = Link::new()?;
+        let switch = Namespace::alone()?;
+        let name = switch.name();
+        for host in [&link.robot, &switch] {
+            run(&format!("ip -n {} link delete {INTERFACE}", host.name()))?;
+        }
+        run(&format!(
+            "ip -n {name} link add bridge type bridge mcast_snooping 0"
+        ))?;
+        for (host, port) in [(&link.robot, ROBOT_PORT), (&link.monitor, INTERFACE)] {
+            run(&format!(
+                "ip link add {port} netns {name} mtu 1500 type veth peer name {INTERFACE} mtu 1500 netns {}",
+                host.name()
+            ))?;
+            run(&format!("ip -n {name} link set {port} master bridge up"))?;
+            host.configure(INTERFACE)?;
+        }
+        run(&format!("ip -n {name} link set bridge up"))?;
+        Ok(Switched { link, switch })
+    }
+}

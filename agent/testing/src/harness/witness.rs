@@ -1,0 +1,178 @@
+//! The agent's library inside the test: what it knows, sample by sample, where the agent's page has
+//! sums only. It works as the agent does, and looks at sockets of the whole machine: give it a
+//! control group.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, anyhow, bail, ensure};
+use ros2probe::capture::live::LiveSource;
+use ros2probe::capture::netns;
+use ros2probe::config::{Config, Watchlist};
+use ros2probe::model::journal::{DeliveryLoss, Loss};
+use ros2probe::model::observer::{self, Observer};
+use ros2probe::model::reassembly::Limits;
+use ros2probe::model::snapshot::Snapshot;
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::filter::Counter;
+
+use super::bpf;
+use super::network::Namespace;
+
+const SLICE: Duration = Duration::from_millis(100);
+/// How long the kernel may wait for IP fragments, and some more: after that every cause is settled.
+const UNTIL_ALL_IS_SETTLED: u64 = 60_000_000_000;
+
+pub struct Witness {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<Result<Testimony>>>,
+}
+
+/// All it knows at the end.
+pub struct Testimony {
+    /// Once the peers had gone and everything open was settled.
+    pub end: Snapshot,
+    pub losses: Vec<Loss>,
+    pub delivery_losses: Vec<DeliveryLoss>,
+    /// The kernel programs' own counters.
+    pub counters: Vec<(Counter, u64)>,
+    /// Runs of those that the kernel left out.
+    pub skipped_runs: u64,
+}
+
+impl Testimony {
+    /// Fails when the kernel programs had to leave anything out.
+    pub fn ensure_complete(&self) -> Result<()> {
+        for (counter, value) in &self.counters {
+            let blind = ["records_lost", "contended"].contains(&counter.label());
+            ensure!(!blind || *value == 0, "{}: {value}", counter.label());
+        }
+        Ok(())
+    }
+}
+
+#[derive(Default)]
+struct Shared {
+    stop: AtomicBool,
+    latest: Mutex<Option<Arc<Snapshot>>>,
+}
+
+impl Witness {
+    /// Returns once it sees all that happens.
+    pub fn start(configuration: &str) -> Result<Witness> {
+        Witness::start_in(None, configuration)
+    }
+
+    /// As [`Witness::start`], on a host's network.
+    pub fn start_on(host: &Namespace, configuration: &str) -> Result<Witness> {
+        let network = PathBuf::from(format!("/run/netns/{}", host.name()));
+        Witness::start_in(Some(network), configuration)
+    }
+
+    fn start_in(network: Option<PathBuf>, configuration: &str) -> Result<Witness> {
+        let config = Config::parse(configuration.as_bytes())
+            .map_err(|mistakes| anyhow!("{}", mistakes.report("the witness")))?;
+        let shared = Arc::new(Shared::default());
+        let theirs = Arc::clone(&shared);
+        let thread = std::thread::Builder::new()
+            .name("witness".to_owned())
+            .spawn(move || watch(network.as_deref(), &config, &theirs))?;
+        let mut witness = Witness {
+            shared,
+            thread: Some(thread),
+        };
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while witness.latest().is_none() {
+            if witness.thread.as_ref().is_none_or(JoinHandle::is_finished) {
+                witness.finish()?;
+                bail!("the witness ended before it began");
+            }
+            if Instant::now() > deadline {
+                bail!("the witness does not begin");
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        Ok(witness)
+    }
+
+    pub fn latest(&self) -> Option<Arc<Snapshot>> {
+        let latest = self.shared.latest.lock();
+        latest.unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Waits until what it knows answers `question`.
+    pub fn wait_for<T>(
+        &self,
+        what: &str,
+        limit: Duration,
+        mut question: impl FnMut(&Snapshot) -> Option<T>,
+    ) -> Result<T> {
+        let deadline = Instant::now() + limit;
+        loop {
+            let latest = self.latest().context("the witness has not begun")?;
+            if let Some(answer) = question(&latest) {
+                return Ok(answer);
+            }
+            if Instant::now() > deadline {
+                bail!("the witness does not see {what} within {limit:?}");
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Takes in what the kernel still holds and settles everything.
+    pub fn finish(&mut self) -> Result<Testimony> {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        let thread = self.thread.take().context("the witness has ended")?;
+        thread
+            .join()
+            .map_err(|_| anyhow!("the witness panicked"))?
+            .context("the witness")
+    }
+}
+
+impl Drop for Witness {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Testimony> {
+    let open = || LiveSource::open(&config.capture, Limits::default());
+    let mut source = match network {
+        Some(network) => netns::within(network, open)??,
+        None => open()?,
+    };
+    source.start(ros2probe::privilege::spawn_source);
+    let mut observer = Observer::new(observer::Settings::default());
+    observer.set_watchlist(Watchlist::new(config.watches.clone())?);
+    let publish = |snapshot: Snapshot| {
+        let mut latest = shared.latest.lock().unwrap_or_else(PoisonError::into_inner);
+        *latest = Some(Arc::new(snapshot));
+    };
+    while !shared.stop.load(Ordering::Relaxed) {
+        publish(observer.snapshot(source.clock()));
+        source.poll(SLICE, None, &mut observer)?;
+        observer.advance(source.clock());
+        source.apply(&observer.interest_changes());
+    }
+    source.drain(&mut observer);
+    let counters = source.counters()?;
+    let skipped_runs = bpf::skipped_runs()?;
+    let end = Timestamp(source.clock().0.saturating_add(UNTIL_ALL_IS_SETTLED));
+    observer.advance(end);
+    observer.settle();
+    Ok(Testimony {
+        end: observer.snapshot(end),
+        losses: observer.journal().losses().copied().collect(),
+        delivery_losses: observer.journal().delivery_losses().copied().collect(),
+        counters,
+        skipped_runs,
+    })
+}

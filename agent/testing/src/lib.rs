@@ -1,0 +1,35 @@
+//! What the tests, benchmarks and examples of `ros2probe` share. Nothing of it is shipped.
+//!
+//! [`harness`] starts agents and DDS peers in network namespaces, [`local_agent`] starts an agent on
+//! a capture without any privilege, [`forged`] sends RTPS that no real participant would, and
+//! [`model`] writes the same for a model in virtual time. Where something is missing, these fail and
+//! name what to install.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+#![allow(missing_docs, reason = "fields and short methods of test code say it")]
+
+pub mod dashboard;
+pub mod forged;
+pub mod harness;
+pub mod local_agent;
+pub mod model;
+pub mod program_run;
+pub mod pseudo_terminal;
+pub mod rotel;
+pub mod sample_robot;
+pub mod truth;
+
+use std::path::{Path, PathBuf};
+
+/// A file of the repository, named from its top.
+#[must_use]
+pub fn repository(path: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../..")
+        .join(path)
+}

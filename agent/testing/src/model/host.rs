@@ -1,0 +1,321 @@
+//! A host in virtual time: a writer elsewhere or on it, and receivers at its sockets.
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+
+use ros2probe::config::{Watch, Watchlist};
+use ros2probe::model::cause::LossCause;
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe::model::snapshot::{
+    DeliveryFacts, Direction, Measurement, Snapshot, SocketFacts, TopicFacts,
+};
+use ros2probe_wire::record::{flag, guid_words, kind};
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
+
+use super::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+
+pub const MILLISECOND: u64 = 1_000_000;
+pub const START: u64 = 1_795_143_000_000 * MILLISECOND;
+pub const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
+pub const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);
+pub const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
+pub const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
+pub const CAROL: GuidPrefix = GuidPrefix(*b"\x01\x10carol-host");
+/// Where multicast samples go.
+pub const GROUP: &str = "239.255.0.1:7401";
+const STRING: &str = "std_msgs::msg::dds_::String_";
+
+/// Where a record is seen.
+#[derive(Clone, Copy)]
+pub struct Seen {
+    pub socket: u64,
+    pub address: SocketAddrV4,
+    pub directed: Option<GuidPrefix>,
+    pub flags: u16,
+}
+
+impl Seen {
+    /// The same receiver's multicast socket.
+    pub fn multicast(self, socket: u64) -> Self {
+        Self {
+            socket,
+            address: GROUP.parse().unwrap(),
+            directed: None,
+            ..self
+        }
+    }
+
+    /// On its way out to there.
+    pub fn leaving(self) -> Self {
+        Self {
+            socket: 9,
+            flags: flag::HOST | flag::OUTGOING,
+            ..self
+        }
+    }
+
+    /// On a wire.
+    pub fn wire(self) -> Self {
+        Self {
+            socket: 0,
+            flags: 0,
+            ..self
+        }
+    }
+
+    pub fn directed(self, prefix: GuidPrefix) -> Self {
+        Self {
+            directed: Some(prefix),
+            ..self
+        }
+    }
+}
+
+/// The observer of one host.
+pub struct Host {
+    pub observer: Observer,
+    pub now: u64,
+}
+
+impl Default for Host {
+    fn default() -> Self {
+        Self::with(Settings::default())
+    }
+}
+
+impl Host {
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// With a reliable writer of Alice's on `/chatter`.
+    pub fn with(settings: Settings) -> Self {
+        let mut observer = Observer::new(settings);
+        observer.set_watchlist(Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap());
+        observer.advance(Timestamp(START));
+        let mut host = Self {
+            observer,
+            now: START,
+        };
+        host.participant(ALICE, "10.0.0.1:7411".parse().unwrap());
+        host.writer(true);
+        host
+    }
+
+    /// Announces Alice's writer, with this reliability.
+    pub fn writer(&mut self, reliable: bool) {
+        let payload = forge::endpoint(Guid::new(ALICE, WRITER), "rt/chatter", STRING, reliable);
+        self.announce(Message::from(ALICE).data(SEDP_WRITERS, 1, &payload));
+    }
+
+    pub fn participant(&mut self, prefix: GuidPrefix, unicast: SocketAddrV4) {
+        let payload = forge::participant_at(prefix, 1_000_000, Some(0), &[unicast]);
+        self.announce(Message::from(prefix).data(SPDP, 1, &payload));
+    }
+
+    /// A participant with one reader, reached by unicast at this port.
+    pub fn reader(&mut self, prefix: GuidPrefix, port: u16) -> Seen {
+        let address = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 2), port);
+        self.participant(prefix, address);
+        self.subscribe(prefix, 1);
+        Seen {
+            socket: port.into(),
+            address,
+            directed: None,
+            flags: flag::HOST,
+        }
+    }
+
+    /// Announces a reader; `number` is that of the announcement.
+    pub fn subscribe(&mut self, prefix: GuidPrefix, number: u64) {
+        self.subscribe_with(prefix, number, true);
+    }
+
+    /// Likewise, with this reliability.
+    pub fn subscribe_with(&mut self, prefix: GuidPrefix, number: u64, reliable: bool) {
+        let guid = Guid::new(prefix, READER);
+        let payload = forge::endpoint(guid, "rt/chatter", STRING, reliable);
+        self.announce(Message::from(prefix).data(SEDP_READERS, number, &payload));
+    }
+
+    pub fn unsubscribe(&mut self, prefix: GuidPrefix, number: u64) {
+        let guid = Guid::new(prefix, READER);
+        self.announce(Message::from(prefix).dispose_by_hash(SEDP_READERS, number, guid));
+    }
+
+    /// A participant with a reader of another topic only.
+    pub fn bystander(&mut self, prefix: GuidPrefix, port: u16) -> Seen {
+        let address = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 2), port);
+        self.participant(prefix, address);
+        let payload = forge::endpoint(Guid::new(prefix, READER), "rt/other", STRING, true);
+        self.announce(Message::from(prefix).data(SEDP_READERS, 1, &payload));
+        Seen {
+            socket: port.into(),
+            address,
+            directed: None,
+            flags: flag::HOST,
+        }
+    }
+
+    /// The socket is held by the process in which the participant lives, as its own packets tell.
+    pub fn owner(&mut self, seen: Seen, prefix: GuidPrefix) {
+        let process_id = u32::from(prefix.0[2]);
+        let sending = 1000 + u64::from(process_id);
+        for cookie in [sending, seen.socket] {
+            self.observer.socket(SocketFacts {
+                cookie,
+                process_id: Some(process_id),
+                process: Some("listener".to_owned()),
+                ..SocketFacts::default()
+            });
+        }
+        let out = Record {
+            kind: kind::ACKNACK,
+            reader: guid_words(Guid::new(prefix, READER)),
+            writer: guid_words(Guid::new(ALICE, WRITER)),
+            flags: flag::HOST | flag::OUTGOING,
+            socket: sending,
+            sequence_number: 1,
+            time: self.now,
+            ..Record::default()
+        };
+        self.observer.record(&out);
+    }
+
+    pub fn announce(&mut self, message: Message) {
+        let envelope = Envelope {
+            ..forge::multicast(self.now, 0)
+        };
+        self.observer.datagram(&envelope, &message.bytes(), None);
+    }
+
+    pub fn wait(&mut self, milliseconds: u64) {
+        self.now += milliseconds * MILLISECOND;
+        self.observer.advance(Timestamp(self.now));
+    }
+
+    /// A record of Alice's writer.
+    pub fn record(&self, seen: Seen, kind: u8, number: u64) -> Record {
+        let [a, b, c, d] = seen.address.ip().octets();
+        let directed = seen
+            .directed
+            .map_or_else(Guid::default, |prefix| Guid::new(prefix, EntityId::UNKNOWN));
+        let seconds = self.now / 1_000_000_000;
+        let fraction = ((self.now % 1_000_000_000) << 32) / 1_000_000_000;
+        Record {
+            kind,
+            submessage_flags: 5,
+            writer: guid_words(Guid::new(ALICE, WRITER)),
+            reader: guid_words(directed),
+            time: self.now,
+            sequence_number: number,
+            source_timestamp: seconds << 32 | fraction,
+            destination: [
+                0,
+                0,
+                u32::from_ne_bytes([0, 0, 0xff, 0xff]),
+                u32::from_ne_bytes([a, b, c, d]),
+            ],
+            destination_port: seen.address.port(),
+            datagram_len: 200,
+            payload_len: 100,
+            flags: seen.flags,
+            socket: seen.socket,
+            ..Record::default()
+        }
+    }
+
+    pub fn put(&mut self, record: Record) {
+        self.observer.record(&record);
+    }
+
+    pub fn data(&mut self, seen: Seen, number: u64) {
+        self.put(self.record(seen, kind::DATA, number));
+    }
+
+    /// It reached the socket, which had no room.
+    pub fn no_room(&mut self, seen: Seen, number: u64) {
+        let arrival = self.record(seen, kind::DATA, number);
+        self.put(Record {
+            flags: seen.flags | flag::NO_ROOM,
+            ..arrival
+        });
+        self.put(arrival);
+    }
+
+    /// Fragments of a sample of ten, joined over `elapsed` nanoseconds.
+    pub fn fragments(&self, seen: Seen, number: u64, start: u32, count: u32) -> Record {
+        Record {
+            fragment_start: start,
+            fragments: count << 16 | 1000,
+            sample_size: 9500,
+            payload_len: count * 1000,
+            submessage_flags: 1,
+            datagram_len: 1100,
+            ..self.record(seen, kind::DATA_FRAG, number)
+        }
+    }
+
+    pub fn heartbeat(&mut self, seen: Seen, first: u64, last: u64) {
+        self.put(Record {
+            payload_len: u32::try_from(last >> 32).unwrap(),
+            encapsulation: last as u32,
+            ..self.record(seen, kind::HEARTBEAT, first)
+        });
+    }
+
+    /// Bob's reader has all below `base`.
+    pub fn acknack(&mut self, bob: Seen, base: u64) {
+        self.request(bob, base, 0, 0);
+    }
+
+    /// And asks for some of the next `bits`.
+    pub fn request(&mut self, bob: Seen, base: u64, bits: u32, bitmap: u32) {
+        self.put(Record {
+            reader: guid_words(Guid::new(BOB, READER)),
+            stamp_seconds: bits,
+            stamp_nanoseconds: bitmap,
+            ..self.record(bob.leaving(), kind::ACKNACK, base)
+        });
+    }
+
+    /// This one will not come.
+    pub fn gap(&mut self, seen: Seen, number: u64) {
+        self.put(Record {
+            payload_len: 0,
+            encapsulation: u32::try_from(number).unwrap() + 1,
+            ..self.record(seen, kind::GAP, number)
+        });
+    }
+
+    pub fn snapshot(&self) -> Snapshot {
+        self.observer.snapshot(Timestamp(self.now))
+    }
+
+    pub fn topic(&self) -> TopicFacts {
+        let mut topics = self.snapshot().topics.into_iter();
+        topics.find(|topic| topic.name == "/chatter").unwrap()
+    }
+
+    pub fn measurement(&self) -> Measurement {
+        *self.topic().measurement.unwrap()
+    }
+
+    /// At receivers.
+    pub fn deliveries(&self) -> Vec<DeliveryFacts> {
+        let mut deliveries = self.topic().deliveries;
+        deliveries.retain(|each| each.direction == Direction::Received);
+        deliveries
+    }
+
+    /// Numbers lost by this cause, of all receivers.
+    pub fn losses(&self, cause: LossCause) -> Vec<u64> {
+        let losses = self.observer.journal().delivery_losses();
+        let mut lost: Vec<_> = losses
+            .filter(|loss| loss.cause == cause)
+            .flat_map(|loss| loss.first..=loss.last)
+            .collect();
+        lost.sort_unstable();
+        lost
+    }
+}

@@ -1,0 +1,188 @@
+//! A real OpenTelemetry receiver, rotel, and what it printed of all it got.
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::repository;
+
+/// Longest wait for anything.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A running receiver; killed with its value, what it printed stays.
+pub struct Rotel {
+    child: Child,
+    output: PathBuf,
+    pub address: SocketAddr,
+}
+
+/// One data point, span or record as printed: fields and attributes by name.
+#[derive(Clone, Debug, Default)]
+pub struct Item {
+    /// `Name`, `Unit`, `Value`, `Trace ID`, ...
+    pub fields: BTreeMap<String, String>,
+    pub attributes: BTreeMap<String, String>,
+    /// Counts of a histogram's buckets.
+    pub buckets: Vec<u64>,
+}
+
+/// What came in one request.
+#[derive(Clone, Debug, Default)]
+pub struct Export {
+    pub resource: BTreeMap<String, String>,
+    pub items: Vec<Item>,
+}
+
+impl Rotel {
+    /// Starts one on a free port, or on this one again, printing into `directory`.
+    pub fn start(command: &mut Command, directory: &Path, address: Option<SocketAddr>) -> Self {
+        let free = || {
+            let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+            listener.local_addr().unwrap()
+        };
+        let (address, other) = (address.unwrap_or_else(free), free());
+        let output = directory.join(format!("rotel-{}", other.port()));
+        let child = command
+            .arg("start")
+            .args([
+                "--exporter",
+                "blackhole",
+                "--debug-log-verbosity",
+                "detailed",
+            ])
+            .args([
+                "--debug-log",
+                "metrics",
+                "--debug-log",
+                "logs",
+                "--debug-log",
+                "traces",
+            ])
+            .args(["--otlp-grpc-endpoint", &address.to_string()])
+            .args(["--otlp-http-endpoint", &other.to_string()])
+            .stdout(File::create(&output).unwrap())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap_or_else(|error| panic!("rotel: {error}; run `make prerequisites`"));
+        let mut rotel = Self {
+            child,
+            output,
+            address,
+        };
+        rotel.wait_for("it starts", |text| text.contains("Starting Rotel"));
+        rotel
+    }
+
+    /// The binary, as the prerequisites install it.
+    pub fn binary() -> PathBuf {
+        let tools = repository("target/tools/rotel/lib");
+        let directories = fs::read_dir(&tools).into_iter().flatten().flatten();
+        let binary = directories
+            .map(|python| python.path().join("site-packages/rotel/rotel-agent"))
+            .find(|path| path.exists());
+        binary
+            .unwrap_or_else(|| panic!("no rotel in {}: run `make prerequisites`", tools.display()))
+    }
+
+    /// Everything printed so far.
+    pub fn text(&self) -> String {
+        fs::read_to_string(&self.output).unwrap()
+    }
+
+    /// Waits until what it printed is as wanted, and gives it.
+    pub fn wait_for(&mut self, what: &str, wanted: impl Fn(&str) -> bool) -> String {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let text = self.text();
+            if wanted(&text) {
+                return text;
+            }
+            let ended = self.child.try_wait().unwrap();
+            assert!(
+                ended.is_none() && Instant::now() < deadline,
+                "rotel, while waiting until {what} ({ended:?}):\n{}",
+                names(&text)
+            );
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+impl Drop for Rotel {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The names of all that came, and how often.
+fn names(text: &str) -> String {
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    for line in text.lines().map(str::trim_start) {
+        if line.starts_with("Name ")
+            || line.starts_with("-> Name:")
+            || line.starts_with("EventName")
+        {
+            *counts.entry(line).or_default() += 1;
+        }
+    }
+    format!("{counts:#?}")
+}
+
+/// What was printed, by request. The last one may be cut.
+pub fn exports(text: &str) -> Vec<Export> {
+    let mut exports: Vec<Export> = Vec::new();
+    let mut family = BTreeMap::new();
+    let mut resource = false;
+    for line in text.lines() {
+        if line.starts_with("Resource") && line.ends_with(" #0") {
+            exports.push(Export::default());
+            resource = true;
+            continue;
+        }
+        let Some(export) = exports.last_mut() else {
+            continue;
+        };
+        if line.starts_with("Scope") {
+            resource = false;
+        } else if line.starts_with("Metric #") {
+            family = BTreeMap::new();
+        } else if line.contains("DataPoints #")
+            || line.starts_with("Span #")
+            || line.starts_with("LogRecord #")
+        {
+            export.items.push(Item {
+                fields: family.clone(),
+                ..Item::default()
+            });
+        } else if let Some((name, value)) =
+            line.trim_start().trim_start_matches("-> ").split_once(": ")
+        {
+            let (name, value) = (name.trim().to_owned(), value.trim());
+            let attribute = plain(value);
+            match (export.items.last_mut(), attribute) {
+                (_, Some(value)) if resource => drop(export.resource.insert(name, value)),
+                (Some(item), Some(value)) => drop(item.attributes.insert(name, value)),
+                (Some(item), None) if name.starts_with("Buckets #") => {
+                    item.buckets
+                        .push(value.trim_start_matches("Count: ").parse().unwrap_or(0));
+                }
+                (Some(item), None) if !line.starts_with("     ->") => {
+                    item.fields.insert(name, value.to_owned());
+                }
+                _ => drop(family.insert(name, value.to_owned())),
+            }
+        }
+    }
+    exports
+}
+
+/// The value in `Str(value)` or `Int(value)`.
+fn plain(value: &str) -> Option<String> {
+    let inner = ["Str(", "Int(", "Double(", "Bool("]
+        .into_iter()
+        .find_map(|kind| value.strip_prefix(kind))?;
+    inner.strip_suffix(')').map(str::to_owned)
+}

@@ -1,0 +1,13 @@
+//! What is shipped: binaries, packages, the systemd unit and `deploy/`.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+mod binaries;
+mod deploy;
+mod package;
+mod systemd;

@@ -1,0 +1,12 @@
+//! `rp` against an installed ROS 2 Humble (`make test-ros2`).
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+mod echo;
+mod installed;
+mod robot;

@@ -1,0 +1,11 @@
+//! The kernel programs, run by the kernel itself. Needs root.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+mod caps;
+mod filter;

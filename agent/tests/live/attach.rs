@@ -1,0 +1,418 @@
+//! The host hook comes and goes while nodes talk, and they notice nothing: no sample is lost, and
+//! nothing of it stays in the kernel, however its process ends and whoever else is there.
+//!
+//! The judges are the logs of the nodes, the kernel's own counters, and the kernel's answer to who
+//! is attached.
+
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::PREFIX;
+use ros2probe_testing::harness::agent::{Agent, get};
+use ros2probe_testing::harness::bpf::{self, Direction, Manners};
+use ros2probe_testing::harness::cgroup::Cgroup;
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::snmp::Snmp;
+use ros2probe_testing::harness::witness::Witness;
+use tempfile::TempDir;
+
+const DIRECTIONS: [Direction; 2] = [Direction::Ingress, Direction::Egress];
+/// On a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
+const ROUNDS: u64 = 20;
+/// Milliseconds: an agent needs about 200 until it is ready.
+const LIVES: [u64; 10] = [0, 20, 40, 60, 90, 120, 160, 210, 270, 400];
+
+/// Descriptors of this process are counted: one test at a time.
+static TURN: Mutex<()> = Mutex::new(());
+
+#[test]
+fn nodes_lose_nothing_while_agents_come_and_go() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let above = Cgroup::create(&format!("{PREFIX}-{}-attach", std::process::id()))?;
+    let link = Link::below(&above)?;
+    let configuration = Configuration::at(above.path())?;
+    // The same without any agent comes first: what the machine itself cannot do shows there.
+    let mut alone = Talks::start(&link)?;
+    std::thread::sleep(Duration::from_secs(3));
+    alone.ensure_lossless().context("without any agent")?;
+
+    let mut talks = Talks::start(&link)?;
+    // Whatever the library opens once and keeps, it has opened after the first time.
+    Witness::start(&configuration.text)?.finish()?;
+    let descriptors = open_descriptors()?;
+    for _ in 0..ROUNDS {
+        Witness::start(&configuration.text)?.finish()?;
+    }
+    ensure!(
+        open_descriptors()? == descriptors,
+        "descriptors: {descriptors} before {ROUNDS} rounds, {} after",
+        open_descriptors()?
+    );
+    ensure_nothing_attached(above.path(), 0)?;
+
+    for milliseconds in LIVES {
+        let mut agent = configuration.launch(&link.robot)?;
+        std::thread::sleep(Duration::from_millis(milliseconds));
+        kill(&mut agent)?;
+        ensure_nothing_attached(above.path(), 0)?;
+    }
+    let mut agent = configuration.start(&link.robot)?;
+    let programs = kill(&mut agent.process)?;
+    ensure!(programs > 0, "a working agent holds no programs");
+    ensure_nothing_attached(above.path(), 0)?;
+
+    for direction in DIRECTIONS {
+        bpf::attach_stranger(above.path(), direction, Manners::BesideOthers)?;
+    }
+    let one = configuration.start(&link.robot)?;
+    let other = configuration.start(&link.monitor)?;
+    for direction in DIRECTIONS {
+        let attached = bpf::attached(above.path(), direction)?;
+        ensure!(attached == 3, "{attached} programs of three owners");
+    }
+    let later = Link::below(&above)?;
+    let stream = Stream {
+        topic: "/later".to_owned(),
+        ..Stream::small(200)
+    };
+    talk(&later, &stream)?;
+    for agent in [&one, &other] {
+        let scrape = agent.settled_scrape("/later", 200)?;
+        let counted = scrape.sum("ros2_topic_messages_total", &[("topic", "/later")]);
+        ensure!(
+            counted == 200.0,
+            "an agent counted {counted} in a later container"
+        );
+        ensure!(scrape.sum("ros2_topic_lost_messages_total", &[("topic", "/later")]) == 0.0);
+    }
+    drop(one);
+    ensure_nothing_attached(above.path(), 2)?;
+    drop(other);
+    ensure_nothing_attached(above.path(), 1)?;
+    talks
+        .ensure_lossless()
+        .context("while agents came and went")
+}
+
+#[test]
+fn where_a_stranger_wants_to_be_alone_the_agent_looks_at_the_wire_and_says_why() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let above = Cgroup::create(&format!("{PREFIX}-{}-alone", std::process::id()))?;
+    let link = Link::below(&above)?;
+    bpf::attach_stranger(above.path(), Direction::Egress, Manners::Alone)?;
+    let configuration = Configuration::at(above.path())?;
+    let mut refused = configuration.launch(&link.robot)?;
+    ensure!(!refused.wait(PATIENCE)?.success(), "`source: host` came up");
+    let configuration = Configuration::new(&format!(
+        "watch: [/**]\ncapture: {{source: auto, cgroup: {}}}\n",
+        above.path().display()
+    ))?;
+    let agent = configuration.start(&link.robot)?;
+    talk(&link, &Stream::small(200))?;
+    let scrape = agent.settled_scrape("/imu", 200)?;
+    let wire = [("source", "wire")];
+    ensure!(
+        scrape.value("ros2probe_capture_source_info", &wire) == Some(1.0),
+        "{}",
+        scrape.0
+    );
+    let counted = scrape.sum("ros2_topic_messages_total", &[("topic", "/imu")]);
+    ensure!(counted == 200.0, "counted {counted}");
+    drop(agent);
+    ensure!(bpf::attached(above.path(), Direction::Egress)? == 1);
+    ensure_nothing_attached(link.cgroup(), 0)
+}
+
+#[test]
+fn a_cgroup_that_is_made_anew_is_seen_again_and_missed_meanwhile() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let name = format!("{PREFIX}-{}-anew", std::process::id());
+    // The agent is in none of the groups that go.
+    let elsewhere = Namespace::alone()?;
+    let above = Cgroup::create(&name)?;
+    let configuration = Configuration::at(above.path())?;
+    let mut agent = configuration.start(&elsewhere)?;
+    let tells = |what: &str, round: usize| {
+        eventually(|| {
+            let events = get(
+                &elsewhere,
+                "http://127.0.0.1:17401/events?after=0&follow=false",
+            )?;
+            let told = events.matches(what).count();
+            ensure!(told == round, "{told} of {round} {what} in {events}");
+            Ok(())
+        })
+    };
+    for round in 1..=2 {
+        let topic = format!("/round{round}");
+        let link = Link::below(&above)?;
+        let stream = Stream {
+            topic: topic.clone(),
+            ..Stream::small(200)
+        };
+        talk(&link, &stream)?;
+        let scrape = agent.settled_scrape(&topic, 200)?;
+        let counted = scrape.sum("ros2_topic_messages_total", &[("topic", &topic)]);
+        ensure!(counted == 200.0, "counted {counted} in round {round}");
+        drop(link);
+        remove_until(above.path(), || agent.request("/readyz").is_err())?;
+        let scrape = agent.scrape()?;
+        ensure!(scrape.value("ros2probe_ready", &[]) == Some(0.0), "ready");
+        let able = scrape.sum("ros2probe_capture_ability", &[]);
+        ensure!(able == 0.0, "{able} abilities without a cgroup");
+        let health = agent.request("/healthz");
+        ensure!(health.is_ok(), "the agent is gone: {health:?}");
+        tells("\"ros2probe.capture.blind\"", round)?;
+        tells("was removed", round)?;
+        std::fs::create_dir(above.path())?;
+        agent.wait_ready(PATIENCE)?;
+        tells("\"ros2probe.capture.seeing\"", round)?;
+        for direction in DIRECTIONS {
+            let attached = bpf::attached(above.path(), direction)?;
+            ensure!(attached == 1, "{attached} programs are attached");
+        }
+    }
+    agent.process.terminate()?;
+    ensure_nothing_attached(above.path(), 0)
+}
+
+#[test]
+fn a_cgroup_that_is_gone_for_a_moment_is_told_and_seen_again() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let elsewhere = Namespace::alone()?;
+    let above = Cgroup::create(&format!("{PREFIX}-{}-moment", std::process::id()))?;
+    let configuration = Configuration::at(above.path())?;
+    let mut agent = configuration.start(&elsewhere)?;
+    for round in 1..=2 {
+        std::fs::remove_dir(above.path())?;
+        std::fs::create_dir(above.path())?;
+        eventually(|| {
+            let page = agent.scrape()?;
+            for name in ["ros2probe.capture.blind", "ros2probe.capture.seeing"] {
+                let told = page.sum("ros2probe_events_total", &[("name", name)]);
+                ensure!(told == f64::from(round), "{told} of {round} {name}");
+            }
+            Ok(())
+        })?;
+    }
+    for direction in DIRECTIONS {
+        let attached = bpf::attached(above.path(), direction)?;
+        ensure!(attached == 1, "{attached} programs are attached");
+    }
+    let link = Link::below(&above)?;
+    talk(&link, &Stream::small(200))?;
+    let scrape = agent.settled_scrape("/imu", 200)?;
+    let counted = scrape.sum("ros2_topic_messages_total", &[("topic", "/imu")]);
+    ensure!(counted == 200.0, "counted {counted}");
+    drop(link);
+    agent.process.terminate()?;
+    ensure_nothing_attached(above.path(), 0)
+}
+
+/// Removes a cgroup that has no processes any more, and waits.
+fn remove_until(cgroup: &Path, noticed: impl Fn() -> bool) -> Result<()> {
+    eventually(|| Ok(std::fs::remove_dir(cgroup)?))?;
+    eventually(|| {
+        ensure!(noticed(), "nothing is noticed");
+        Ok(())
+    })
+}
+
+/// What the agent is told.
+struct Configuration {
+    text: String,
+    directory: TempDir,
+}
+
+impl Configuration {
+    fn at(cgroup: &Path) -> Result<Configuration> {
+        let path = cgroup.display();
+        Configuration::new(&format!(
+            "watch: [/**]\ncapture: {{source: host, cgroup: {path}}}\n"
+        ))
+    }
+
+    fn new(text: &str) -> Result<Configuration> {
+        let directory = tempfile::tempdir()?;
+        std::fs::write(directory.path().join("ros2probe.yaml"), text)?;
+        Ok(Configuration {
+            text: text.to_owned(),
+            directory,
+        })
+    }
+
+    fn start<'a>(&self, host: &'a Namespace) -> Result<Agent<'a>> {
+        let file = self.directory.path().join("ros2probe.yaml");
+        Agent::start(host, env!("CARGO_BIN_EXE_rp"), &file)
+    }
+
+    /// Without waiting.
+    fn launch(&self, host: &Namespace) -> Result<Process> {
+        let file = self.directory.path().join("ros2probe.yaml");
+        let arguments = ["run".as_ref(), "--config".as_ref(), file.as_os_str()];
+        Process::start(&host.on_network(), env!("CARGO_BIN_EXE_rp"), arguments)
+    }
+}
+
+/// A stream of small samples and one of point clouds.
+struct Talks {
+    publishers: Vec<Peer>,
+    subscribers: Vec<Peer>,
+}
+
+impl Talks {
+    fn start(link: &Link) -> Result<Talks> {
+        let mut talks = Talks {
+            publishers: Vec::new(),
+            subscribers: Vec::new(),
+        };
+        let streams = [
+            (Stack::Cyclone, Stream::small(0)),
+            // A receive buffer holds a third of a second of it.
+            (
+                Stack::Fast,
+                Stream {
+                    rate: 10.0,
+                    ..Stream::point_cloud(644_000, 0)
+                },
+            ),
+        ];
+        for ((stack, stream), domain) in streams.into_iter().zip(10..) {
+            let stream = Stream {
+                domain,
+                depth: 1000,
+                ..stream
+            };
+            let role = Role::Subscriber;
+            talks.subscribers.push(Peer::start(
+                &link.monitor,
+                stack,
+                role,
+                &stream,
+                &["/listener"],
+            )?);
+            let role = Role::Publisher;
+            talks.publishers.push(Peer::start(
+                &link.robot,
+                stack,
+                role,
+                &stream,
+                &["/talker"],
+            )?);
+        }
+        for peer in talks.publishers.iter_mut().chain(&mut talks.subscribers) {
+            peer.wait_matched()?;
+        }
+        // Fast DDS tells its subscriber first.
+        std::thread::sleep(Duration::from_millis(300));
+        talks.publishers.iter_mut().try_for_each(Peer::go)?;
+        Ok(talks)
+    }
+
+    /// Ends the streams.
+    fn ensure_lossless(&mut self) -> Result<()> {
+        for publisher in &mut self.publishers {
+            publisher.process.terminate()?;
+        }
+        std::thread::sleep(Duration::from_millis(500));
+        let host = self
+            .subscribers
+            .first()
+            .context("no subscriber")?
+            .process
+            .pid();
+        let counted = Snmp::of(host)?;
+        for subscriber in &mut self.subscribers {
+            subscriber.process.terminate()?;
+        }
+        let overflows = counted.receive_buffer_errors()?;
+        for (publisher, subscriber) in self.publishers.iter().zip(&self.subscribers) {
+            let sent = publisher.log()?.writer_numbers("pub")?;
+            let received = subscriber.log()?.writer_numbers("sub")?;
+            let lost: Vec<_> = sent.difference(&received).collect();
+            // What a node kept from the CPU had no room for is nobody's fault.
+            ensure!(
+                lost.len() as u64 <= overflows,
+                "lost {lost:?} of {}, {overflows} overflows",
+                sent.len()
+            );
+            println!("{} samples, {lost:?} lost", sent.len());
+        }
+        // The kernel counts what a program refuses among the other errors.
+        ensure!(
+            counted.receive_errors()? == overflows,
+            "a datagram was refused"
+        );
+        Ok(())
+    }
+}
+
+/// A stream from beginning to end, all of it received.
+fn talk(link: &Link, stream: &Stream) -> Result<()> {
+    let host = &link.monitor;
+    let mut subscriber = Peer::start(
+        host,
+        Stack::Cyclone,
+        Role::Subscriber,
+        stream,
+        &["/listener"],
+    )?;
+    let host = &link.robot;
+    let mut publisher = Peer::start(host, Stack::Cyclone, Role::Publisher, stream, &["/talker"])?;
+    publisher.wait_matched()?;
+    subscriber.wait_matched()?;
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    std::thread::sleep(Duration::from_millis(300));
+    let received = subscriber.log()?.writer_numbers("sub")?.len() as u64;
+    ensure!(received == stream.count, "{received} received");
+    Ok(())
+}
+
+fn open_descriptors() -> Result<usize> {
+    Ok(std::fs::read_dir("/proc/self/fd")?.count())
+}
+
+/// The kernel takes a process apart a moment after it has ended.
+fn eventually(what: impl Fn() -> Result<()>) -> Result<()> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let outcome = what();
+        if outcome.is_ok() || Instant::now() > deadline {
+            return outcome;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// Ends a process at once; tells how many programs it held, which are gone.
+fn kill(agent: &mut Process) -> Result<usize> {
+    let programs = bpf::programs_of(agent.pid())?;
+    agent.signal("KILL")?;
+    agent.wait(PATIENCE)?;
+    eventually(|| {
+        for program in &programs {
+            ensure!(!bpf::exists(*program)?, "program {program} stays behind");
+        }
+        Ok(())
+    })?;
+    Ok(programs.len())
+}
+
+fn ensure_nothing_attached(cgroup: &Path, but: u32) -> Result<()> {
+    eventually(|| {
+        for direction in DIRECTIONS {
+            let attached = bpf::attached(cgroup, direction)?;
+            ensure!(
+                attached == but,
+                "{attached} programs are attached for {direction:?}, not {but}"
+            );
+        }
+        Ok(())
+    })
+}

@@ -1,0 +1,487 @@
+//! The agent on either end of a link counts exactly what passed there: three DDS stacks, small
+//! samples with 0, 10 and 20 % loss, point clouds of 644 KB and 2.72 MB.
+//!
+//! Loss is made before the packet taps of the publisher's host, so the samples that it takes are
+//! seen by no agent. The judges are what the peers log, the count of dropped datagrams, and what
+//! tshark reads in recordings of both ends: at 54 MB/s subscribers lose whole samples in their
+//! socket buffers, and only a recording tells what was on the wire.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::sync::{PoisonError, RwLock};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail, ensure};
+use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape};
+use ros2probe_testing::harness::capture::{self, Capture};
+use ros2probe_testing::harness::dissection::{Dissection, Samples};
+use ros2probe_testing::harness::event_log::EventLog;
+use ros2probe_testing::harness::loss::Loss;
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+
+/// Three seconds each.
+const SMALL_SAMPLES: u64 = 600;
+const POINT_CLOUDS: u64 = 60;
+/// How far the clocks of a frame's two observers, the agent's filter and tcpdump, may be apart on
+/// average.
+const CLOCK_TOLERANCE: f64 = 0.002;
+
+/// Point clouds take the machine for themselves, also where tests are threads of one process.
+static MACHINE: RwLock<()> = RwLock::new(());
+
+#[test]
+fn fast_dds_small_samples_are_all_counted() -> Result<()> {
+    best_effort(Stack::Fast, 0)
+}
+
+#[test]
+fn fast_dds_small_samples_lost_at_10_percent_are_counted_as_lost() -> Result<()> {
+    best_effort(Stack::Fast, 100)
+}
+
+#[test]
+fn fast_dds_small_samples_lost_at_20_percent_are_counted_as_lost() -> Result<()> {
+    best_effort(Stack::Fast, 200)
+}
+
+#[test]
+fn fast_dds_reliable_samples_dropped_at_10_percent_are_counted_as_recovered() -> Result<()> {
+    reliable(Stack::Fast, 100)
+}
+
+#[test]
+fn fast_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() -> Result<()> {
+    reliable(Stack::Fast, 200)
+}
+
+#[test]
+fn fast_dds_point_clouds_of_644_kb_are_counted_as_on_the_wire() -> Result<()> {
+    point_clouds(Stack::Fast, 644_000)
+}
+
+#[test]
+fn fast_dds_point_clouds_of_2_72_mb_are_counted_as_on_the_wire() -> Result<()> {
+    point_clouds(Stack::Fast, 2_720_000)
+}
+
+#[test]
+fn cyclone_dds_small_samples_are_all_counted() -> Result<()> {
+    best_effort(Stack::Cyclone, 0)
+}
+
+#[test]
+fn cyclone_dds_small_samples_lost_at_10_percent_are_counted_as_lost() -> Result<()> {
+    best_effort(Stack::Cyclone, 100)
+}
+
+#[test]
+fn cyclone_dds_small_samples_lost_at_20_percent_are_counted_as_lost() -> Result<()> {
+    best_effort(Stack::Cyclone, 200)
+}
+
+#[test]
+fn cyclone_dds_reliable_samples_dropped_at_10_percent_are_counted_as_recovered() -> Result<()> {
+    reliable(Stack::Cyclone, 100)
+}
+
+#[test]
+fn cyclone_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() -> Result<()> {
+    reliable(Stack::Cyclone, 200)
+}
+
+#[test]
+fn cyclone_dds_point_clouds_of_644_kb_are_counted_as_on_the_wire() -> Result<()> {
+    point_clouds(Stack::Cyclone, 644_000)
+}
+
+#[test]
+fn cyclone_dds_point_clouds_of_2_72_mb_are_counted_as_on_the_wire() -> Result<()> {
+    point_clouds(Stack::Cyclone, 2_720_000)
+}
+
+#[test]
+fn rust_dds_small_samples_are_all_counted() -> Result<()> {
+    best_effort(Stack::Rust, 0)
+}
+
+#[test]
+fn rust_dds_small_samples_lost_at_10_percent_are_counted_as_lost() -> Result<()> {
+    best_effort(Stack::Rust, 100)
+}
+
+#[test]
+fn rust_dds_small_samples_lost_at_20_percent_are_counted_as_lost() -> Result<()> {
+    best_effort(Stack::Rust, 200)
+}
+
+#[test]
+fn rust_dds_reliable_samples_dropped_at_10_percent_are_counted_as_recovered() -> Result<()> {
+    reliable(Stack::Rust, 100)
+}
+
+#[test]
+fn rust_dds_reliable_samples_dropped_at_20_percent_are_counted_as_recovered() -> Result<()> {
+    reliable(Stack::Rust, 200)
+}
+
+#[test]
+fn rust_dds_point_clouds_of_644_kb_are_counted_as_on_the_wire() -> Result<()> {
+    point_clouds(Stack::Rust, 644_000)
+}
+
+#[test]
+fn rust_dds_point_clouds_of_2_72_mb_are_counted_as_on_the_wire() -> Result<()> {
+    point_clouds(Stack::Rust, 2_720_000)
+}
+
+fn best_effort(stack: Stack, per_mille: u16) -> Result<()> {
+    let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
+    let seen = Exchange::of(stack, &Stream::small(SMALL_SAMPLES), per_mille)?;
+    seen.print(stack, per_mille);
+    assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
+    let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
+    assert_eq!(received.len() as u64, SMALL_SAMPLES - seen.dropped);
+    for end in &seen.ends {
+        let counted = end.counted();
+        assert_eq!(end.wire.application_numbers(), received, "{}", end.name);
+        assert_eq!(counted.messages, received.len() as u64, "{}", end.name);
+        assert_eq!(counted.lost, seen.received.missing(), "{}", end.name);
+        assert_eq!(counted.bytes, counted.messages * 320, "{}", end.name);
+        assert_eq!(
+            (counted.recovered, counted.incomplete),
+            (0, 0),
+            "{}",
+            end.name
+        );
+        assert_eq!(counted.duplicates, end.wire.repeated, "{}", end.name);
+        end.assert_delays(&seen.received)?;
+    }
+    Ok(())
+}
+
+fn reliable(stack: Stack, per_mille: u16) -> Result<()> {
+    let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
+    let stream = Stream {
+        reliable: true,
+        depth: 1000,
+        ..Stream::small(SMALL_SAMPLES)
+    };
+    let seen = Exchange::of(stack, &stream, per_mille)?;
+    seen.print(stack, per_mille);
+    assert_eq!(seen.sent.sequences("pub").len() as u64, SMALL_SAMPLES);
+    let received: BTreeSet<u64> = seen.received.sequences("sub").into_iter().collect();
+    assert_eq!(received, (0..SMALL_SAMPLES).collect());
+    assert!(seen.dropped > 0);
+    for end in &seen.ends {
+        let counted = end.counted();
+        assert_eq!(end.wire.application_numbers(), received, "{}", end.name);
+        assert_eq!(counted.messages, SMALL_SAMPLES, "{}", end.name);
+        assert_eq!(counted.bytes, SMALL_SAMPLES * 320, "{}", end.name);
+        assert_eq!((counted.lost, counted.incomplete), (0, 0), "{}", end.name);
+        let recovered = end.wire.retransmitted..=end.wire.retransmitted + end.wire.announced_early;
+        assert!(recovered.contains(&counted.recovered), "{}", end.name);
+        assert!(
+            stack == Stack::Rust || end.wire.announced_early == 0,
+            "{}",
+            end.name
+        );
+        assert_eq!(counted.duplicates, end.wire.repeated, "{}", end.name);
+    }
+    Ok(())
+}
+
+fn point_clouds(stack: Stack, size: usize) -> Result<()> {
+    let _alone = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
+    let seen = Exchange::of(stack, &Stream::point_cloud(size, POINT_CLOUDS), 0)?;
+    seen.print(stack, 0);
+    assert_eq!(seen.sent.sequences("pub").len() as u64, POINT_CLOUDS);
+    for end in &seen.ends {
+        let counted = end.counted();
+        let passed = end.wire.whole.len() as u64;
+        assert_eq!(counted.messages, passed, "{}", end.name);
+        assert_eq!(counted.lost, end.wire.missing(), "{}", end.name);
+        assert_eq!(counted.bytes, passed * size as u64, "{}", end.name);
+        assert_eq!(counted.recovered, 0, "{}", end.name);
+        // Every sample of which the last datagram left the publisher was seen in part at least.
+        assert!(passed + counted.lost >= POINT_CLOUDS - 1, "{}", end.name);
+        // A sample is one record; what else is copied is discovery, and the stream's beginning.
+        let share = if size == 2_720_000 { 0.01 } else { 0.02 };
+        let copied = end.scrape.sum("ros2probe_capture_copied_bytes_total", &[]);
+        let traffic = counted.bytes as f64;
+        assert!(
+            copied < traffic * share,
+            "{}: copied {copied} of {traffic} bytes",
+            end.name
+        );
+        end.assert_delays(&seen.received)?;
+    }
+    Ok(())
+}
+
+/// One stream from one host to the other as its ends, the link and both agents saw it.
+struct Exchange {
+    sent: EventLog,
+    received: EventLog,
+    dropped: u64,
+    ends: [End; 2],
+}
+
+/// One end of the link: what was there, and what the agent there says.
+struct End {
+    name: &'static str,
+    topic: String,
+    wire: Samples,
+    scrape: Scrape,
+}
+
+#[derive(Debug)]
+struct Counted {
+    messages: u64,
+    bytes: u64,
+    lost: u64,
+    recovered: u64,
+    duplicates: u64,
+    incomplete: u64,
+}
+
+impl Exchange {
+    fn of(stack: Stack, stream: &Stream, per_mille: u16) -> Result<Exchange> {
+        let link = Link::new()?;
+        let directory = tempfile::tempdir()?;
+        let configuration = directory.path().join("ros2probe.yaml");
+        std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
+        let robot = Observer::start("robot", &link.robot, &configuration)?;
+        let monitor = Observer::start("monitor", &link.monitor, &configuration)?;
+
+        let stream = Stream {
+            linger: 60.0,
+            ..stream.clone()
+        };
+        let (talker, listener) = (["/talker"], ["/listener"]);
+        let mut subscriber =
+            Peer::start(&link.monitor, stack, Role::Subscriber, &stream, &listener)?;
+        let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, &stream, &talker)?;
+        subscriber.wait_matched()?;
+        publisher.wait_matched()?;
+        let loss = match per_mille {
+            0 => None,
+            _ => Some(Loss::of_samples(
+                &link.robot,
+                &link.monitor,
+                &stream,
+                per_mille,
+            )?),
+        };
+        // Until it has classified both endpoints the agent does not learn who asks for what, and
+        // what is repaired at once passes for reordering.
+        std::thread::sleep(Duration::from_millis(500));
+        publisher.go()?;
+        publisher
+            .wait_sent(Duration::from_secs(60))
+            .context("the publisher sends")?;
+        if stream.reliable {
+            wait_received(&subscriber, stream.count)?;
+        }
+        std::thread::sleep(capture::SETTLE);
+        let counts = loss.as_ref().map(Loss::counts).transpose()?;
+        publisher.process.terminate().context("the publisher")?;
+        // Once the writer has gone everything about it is decided.
+        let sent = publisher.log()?;
+        let writer = writer_of(&sent, &stream.topic)?;
+        let ends = [
+            robot.finish(stack, &stream.topic, &writer)?,
+            monitor.finish(stack, &stream.topic, &writer)?,
+        ];
+        subscriber.process.terminate().context("the subscriber")?;
+        Ok(Exchange {
+            sent,
+            received: subscriber.log()?,
+            dropped: counts.map_or(0, |counts| counts.dropped),
+            ends,
+        })
+    }
+
+    fn print(&self, stack: Stack, per_mille: u16) {
+        for end in &self.ends {
+            println!(
+                "{stack:?} {} at {per_mille}/1000 on {}: sent {}, dropped {}, on the wire {} (retransmitted {}, early {}, \
+                 repeated {}, missing {}), received {}, {:?}",
+                end.topic,
+                end.name,
+                self.sent.sequences("pub").len(),
+                self.dropped,
+                end.wire.whole.len(),
+                end.wire.retransmitted,
+                end.wire.announced_early,
+                end.wire.repeated,
+                end.wire.missing(),
+                self.received.sequences("sub").len(),
+                end.counted(),
+            );
+            println!("{}", end.scrape.doubts());
+        }
+    }
+}
+
+/// An agent and a recording on one host.
+struct Observer<'a> {
+    name: &'static str,
+    agent: Agent<'a>,
+    capture: Capture,
+    _directory: tempfile::TempDir,
+}
+
+impl<'a> Observer<'a> {
+    fn start(name: &'static str, host: &'a Namespace, configuration: &Path) -> Result<Self> {
+        let directory = tempfile::tempdir()?;
+        Ok(Observer {
+            name,
+            agent: Agent::start(host, env!("CARGO_BIN_EXE_rp"), configuration)?,
+            capture: Capture::start(host, &directory.path().join("link.pcap"))?,
+            _directory: directory,
+        })
+    }
+
+    /// Waits until the agent has seen the writer go. RustDDS on a busy machine may go without saying
+    /// so: what it sent is decided all the same.
+    fn finish(self, stack: Stack, topic: &str, writer: &str) -> Result<End> {
+        let gone =
+            |page: &Scrape| page.value("ros2_topic_publishers", &[("topic", topic)]) == Some(0.0);
+        let mut scrape = self.agent.settled_scrape(topic, 0)?;
+        if !gone(&scrape) && stack != Stack::Rust {
+            let what = format!("without a publisher of {topic}");
+            scrape = self.agent.scrape_until(&what, gone)?;
+        }
+        for lossless in [
+            "ros2probe_capture_dropped_packets_total",
+            "ros2probe_records_dropped_total",
+        ] {
+            let dropped = scrape.sum(lossless, &[]);
+            ensure!(dropped == 0.0, "{lossless} is {dropped} on {}", self.name);
+        }
+        let recording = self.capture.finish()?;
+        Ok(End {
+            name: self.name,
+            topic: topic.to_owned(),
+            wire: Dissection::read(&recording)?.samples_of(writer),
+            scrape,
+        })
+    }
+}
+
+impl End {
+    fn counted(&self) -> Counted {
+        Counted {
+            messages: self.count("ros2_topic_messages_total"),
+            bytes: self.count("ros2_topic_bytes_total"),
+            lost: self.count("ros2_topic_lost_messages_total"),
+            recovered: self.count("ros2_topic_recovered_messages_total"),
+            duplicates: self.count("ros2_topic_duplicate_messages_total"),
+            incomplete: self.count("ros2_topic_incomplete_messages_total"),
+        }
+    }
+
+    /// Intervals and latencies fit the messages: one host, one clock.
+    fn assert_delays(&self, received: &EventLog) -> Result<()> {
+        let messages = self.counted().messages;
+        let name = self.name;
+        let intervals = self.count("ros2_topic_interarrival_seconds_count");
+        assert_eq!(intervals, messages - 1, "{name}");
+        assert_eq!(
+            self.count("ros2_topic_negative_latency_messages_total"),
+            0,
+            "{name}"
+        );
+        for latency in [
+            "ros2_topic_latency_seconds",
+            "ros2_topic_header_latency_seconds",
+        ] {
+            assert_eq!(
+                self.count(&format!("{latency}_count")),
+                messages,
+                "{name} {latency}"
+            );
+            // One clock: anything beyond a busy machine's delays is a wrong epoch or unit.
+            let median = self.median(latency)?;
+            assert!(median <= 1.0, "{name}: {latency} {median} s");
+        }
+        let latency = self.sum("ros2_topic_latency_seconds_sum");
+        let header_latency = self.sum("ros2_topic_header_latency_seconds_sum");
+        // The message is stamped before it is given to the writer.
+        assert!(latency > 0.0 && latency <= header_latency, "{name}");
+        self.assert_header_latency(received)
+    }
+
+    /// The mean time from `Header.stamp` to the capture, against the peers' stamps and tcpdump's
+    /// times of the samples that the subscriber was given.
+    fn assert_header_latency(&self, received: &EventLog) -> Result<()> {
+        let stamped = received
+            .0
+            .iter()
+            .filter(|event| event.ev == "sub")
+            .filter_map(|event| {
+                let frame = self.wire.whole.get(&(event.seq? + 1))?;
+                Some(frame - event.stamp_ns? as f64 / 1e9)
+            });
+        let delays: Vec<f64> = stamped.collect();
+        ensure!(!delays.is_empty(), "the subscriber was given nothing");
+        if delays.len() as u64 == self.counted().messages {
+            let messages = delays.len() as f64;
+            let truth = delays.iter().sum::<f64>() / messages;
+            let mean = self.sum("ros2_topic_header_latency_seconds_sum") / messages;
+            let apart = (mean - truth).abs();
+            assert!(
+                apart < CLOCK_TOLERANCE,
+                "{}: mean {mean} s, not {truth} s",
+                self.name
+            );
+        }
+        Ok(())
+    }
+
+    /// The upper bound of the histogram's bucket that holds the median.
+    fn median(&self, histogram: &str) -> Result<f64> {
+        let half = self.sum(&format!("{histogram}_count")) / 2.0;
+        let bucket = format!("{histogram}_bucket");
+        let bounds = self.scrape.labels_of(&bucket, "le");
+        let mut holding = bounds.iter().filter_map(|bound| {
+            let labels = [("topic", self.topic.as_str()), ("le", bound)];
+            let below = self.scrape.value(&bucket, &labels)?;
+            (below >= half).then(|| bound.parse::<f64>().ok())?
+        });
+        let first = holding.next().with_context(|| format!("no {bucket}"))?;
+        Ok(holding.fold(first, f64::min))
+    }
+
+    fn count(&self, name: &str) -> u64 {
+        self.sum(name) as u64
+    }
+
+    fn sum(&self, name: &str) -> f64 {
+        self.scrape.sum(name, &[("topic", &self.topic)])
+    }
+}
+
+fn writer_of(log: &EventLog, topic: &str) -> Result<String> {
+    let mut endpoints = log.endpoints();
+    let endpoint = endpoints.find(|event| event.topic.as_deref() == Some(topic));
+    endpoint
+        .and_then(|event| event.guid.clone())
+        .context("the publisher logged no GUID")
+}
+
+/// A reliable subscriber gets everything, in time.
+fn wait_received(subscriber: &Peer, count: u64) -> Result<()> {
+    let deadline = Instant::now() + Duration::from_secs(60);
+    loop {
+        let received = subscriber.log()?.sequences("sub").len() as u64;
+        if received >= count {
+            return Ok(());
+        }
+        if Instant::now() > deadline {
+            bail!("a reliable subscriber was given {received} of {count} samples");
+        }
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}

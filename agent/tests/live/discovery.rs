@@ -1,0 +1,408 @@
+//! Who is there, live: robots of sixteen nodes that start at once, before or around the agent; those
+//! that leave or die; domains side by side; and what is shown of writers whose announcement was
+//! missed.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::panic::resume_unwind;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use tempfile::TempDir;
+
+const STARTS: usize = 10;
+const NODES: usize = 16;
+/// What a whole robot may take to start on a busy machine.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Less than the shortest lease: nobody is gone because it expired.
+const LEAVE: Duration = Duration::from_secs(8);
+/// Nodes that may leave without a goodbye.
+const SILENT: usize = NODES / 2;
+
+#[test]
+fn sixteen_fast_dds_nodes_are_all_there_ten_times_in_a_row() -> Result<()> {
+    all_nodes_are_there_each_time(Stack::Fast)
+}
+
+#[test]
+fn sixteen_cyclone_dds_nodes_are_all_there_ten_times_in_a_row() -> Result<()> {
+    all_nodes_are_there_each_time(Stack::Cyclone)
+}
+
+#[test]
+fn sixteen_rust_dds_nodes_are_all_there_ten_times_in_a_row() -> Result<()> {
+    all_nodes_are_there_each_time(Stack::Rust)
+}
+
+#[test]
+fn an_agent_that_starts_after_half_of_the_fast_dds_nodes_shows_all() -> Result<()> {
+    late_agent_shows_all_nodes_each_time(Stack::Fast)
+}
+
+#[test]
+fn an_agent_that_starts_after_half_of_the_cyclone_dds_nodes_shows_all() -> Result<()> {
+    late_agent_shows_all_nodes_each_time(Stack::Cyclone)
+}
+
+#[test]
+fn an_agent_that_starts_after_half_of_the_rust_dds_nodes_shows_all() -> Result<()> {
+    late_agent_shows_all_nodes_each_time(Stack::Rust)
+}
+
+#[test]
+fn a_late_agent_shows_writers_it_cannot_name_with_their_rate() -> Result<()> {
+    // Each on a link of its own, so none has to wait for the others.
+    std::thread::scope(|scope| {
+        let stacks = Stack::ALL.map(|stack| scope.spawn(move || late_agent_shows_rate(stack)));
+        stacks
+            .into_iter()
+            .try_for_each(|stack| stack.join().unwrap_or_else(|panic| resume_unwind(panic)))
+    })
+}
+
+fn late_agent_shows_rate(stack: Stack) -> Result<()> {
+    let link = Link::new()?;
+    let stream = Stream {
+        rate: 100.0,
+        ..Stream::small(1500)
+    };
+    let (mut publisher, _subscriber) = talking(&link, stack, &stream)?;
+    std::thread::sleep(Duration::from_secs(1));
+    let watcher = Watcher::start(&link.monitor)?;
+    let unknown = |page: &Scrape| page.sum("ros2_unknown_writers", &[]) == 1.0;
+    watcher.wait(unknown, PATIENCE, "an unknown writer")?;
+
+    let log = publisher.log()?;
+    let guid = log.endpoints().find_map(|endpoint| endpoint.guid.clone());
+    let guid = guid.context("no GUID in the log")?;
+    let writer = format!("{}.{}", &guid[..24], &guid[24..]);
+    let count = || -> Result<f64> {
+        let page = watcher.agent.scrape()?;
+        let writer = [("writer", writer.as_str())];
+        let count = page.value("ros2_unknown_writer_messages_total", &writer);
+        count.with_context(|| format!("no {writer:?} in {}", page.0))
+    };
+    let before = (count()?, Instant::now());
+    std::thread::sleep(Duration::from_secs(5));
+    let rate = (count()? - before.0) / before.1.elapsed().as_secs_f64();
+    // Counts are as old as the snapshot: up to a second of five.
+    assert!((70.0..130.0).contains(&rate), "{stack:?}: {rate} Hz");
+    publisher.process.terminate()?;
+    Ok(())
+}
+
+#[test]
+fn the_same_topic_of_two_domains_is_two_topics() -> Result<()> {
+    let link = Link::new()?;
+    let watcher = Watcher::start(&link.monitor)?;
+    let mut pairs = Vec::new();
+    let counts = [(0, 300), (5, 500)];
+    for (stack, (domain, count)) in [Stack::Fast, Stack::Cyclone].into_iter().zip(counts) {
+        let stream = Stream {
+            domain,
+            ..Stream::small(count)
+        };
+        pairs.push(talking(&link, stack, &stream)?);
+    }
+    let nodes = |page: &Scrape| {
+        let of = |domain| page.sum("ros2_nodes", &[("domain_id", domain)]) == 2.0;
+        of("0") && of("5")
+    };
+    watcher.wait(nodes, PATIENCE, "two nodes in each domain")?;
+    for (publisher, _) in &mut pairs {
+        publisher.wait_sent(PATIENCE)?;
+    }
+    let all = counts.iter().map(|(_, count)| count).sum();
+    let page = watcher.agent.settled_scrape("/imu", all)?;
+    for (domain, count) in counts {
+        let labels = [("domain_id", &*domain.to_string()), ("topic", "/imu")];
+        assert_eq!(
+            page.sum("ros2_topic_messages_total", &labels),
+            count as f64,
+            "{domain}"
+        );
+        assert_eq!(
+            page.sum("ros2_topic_subscriptions", &labels),
+            1.0,
+            "{domain}"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+fn nodes_that_stop_are_gone_at_once_and_killed_ones_when_their_lease_ends() -> Result<()> {
+    let link = Link::new()?;
+    let watcher = Watcher::start(&link.robot)?;
+    // Each in a domain of its own: an assertion of Fast DDS 2.9 ends it when it meets RustDDS.
+    let node = |stack, name| {
+        let stream = Stream {
+            domain: stack as u16,
+            ..Stream::small(1)
+        };
+        Peer::start(&link.robot, stack, Role::Subscriber, &stream, &[name])
+    };
+    let mut stopping = vec![
+        ("/fast_stops", node(Stack::Fast, "/fast_stops")?),
+        ("/cyclone_stops", node(Stack::Cyclone, "/cyclone_stops")?),
+        ("/rust_stops", node(Stack::Rust, "/rust_stops")?),
+    ];
+    // The lease, and how long before the end it may have been renewed for the last time.
+    let dying = BTreeMap::from([
+        ("/fast_dies", (node(Stack::Fast, "/fast_dies")?, 20, 3)),
+        (
+            "/cyclone_dies",
+            (node(Stack::Cyclone, "/cyclone_dies")?, 10, 8),
+        ),
+    ]);
+    watcher.wait(|page| nodes(page).len() == 5, PATIENCE, "five nodes")?;
+
+    for (name, peer) in &mut stopping {
+        let ended = peer.process.terminate()?;
+        assert!(ended.success(), "{name} ended with {ended}");
+        watcher.wait(
+            |page| !nodes(page).contains(*name),
+            LEAVE,
+            "a node that stopped",
+        )?;
+    }
+    let page = watcher.agent.scrape()?;
+    let went = |event| {
+        let labels = [("entity", "participant"), ("event", event)];
+        page.sum("ros2_discovery_events_total", &labels)
+    };
+    assert_eq!((went("disposed"), went("expired")), (3.0, 0.0));
+
+    for (peer, ..) in dying.values() {
+        peer.process.signal("KILL")?;
+    }
+    let killed = Instant::now();
+    let mut gone: BTreeMap<&str, Duration> = BTreeMap::new();
+    while gone.len() < dying.len() {
+        assert!(killed.elapsed() < Duration::from_secs(40), "only {gone:?}");
+        let page = watcher.agent.scrape()?;
+        let there = nodes(&page);
+        for name in dying.keys().filter(|name| !there.contains(**name)) {
+            gone.entry(name).or_insert_with(|| killed.elapsed());
+        }
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    for (name, (_, lease, renewal)) in &dying {
+        let expected = Duration::from_secs(lease - renewal)..Duration::from_secs(lease + 8);
+        assert!(expected.contains(&gone[name]), "{name}: {gone:?}");
+    }
+    let page = watcher.agent.scrape()?;
+    assert_eq!(page.sum("ros2_participants", &[]), 0.0);
+    assert_eq!(
+        page.sum("ros2_topic_subscriptions", &[("topic", "/imu")]),
+        0.0
+    );
+    let labels = [("entity", "participant"), ("event", "expired")];
+    assert_eq!(page.sum("ros2_discovery_events_total", &labels), 2.0);
+    Ok(())
+}
+
+fn all_nodes_are_there_each_time(stack: Stack) -> Result<()> {
+    let link = Link::new()?;
+    let mut watchers = watchers(&link)?;
+    for start in 0..STARTS {
+        let began = Instant::now();
+        let mut robot = Robot::new(&link, stack, start);
+        robot.launch(NODES)?;
+        robot.wait_shown(&watchers)?;
+        eprintln!("{stack:?} {start}: shown after {:?}", began.elapsed());
+        if !robot.stop(&watchers)? {
+            drop(watchers);
+            watchers = self::watchers(&link)?;
+        }
+    }
+    Ok(())
+}
+
+fn late_agent_shows_all_nodes_each_time(stack: Stack) -> Result<()> {
+    let link = Link::new()?;
+    for start in 0..STARTS {
+        let began = Instant::now();
+        let mut robot = Robot::new(&link, stack, start);
+        robot.launch(NODES / 2)?;
+        let watchers = watchers(&link)?;
+        robot.launch(NODES / 2)?;
+        robot.wait_shown(&watchers)?;
+        eprintln!("{stack:?} {start}: shown after {:?}", began.elapsed());
+        robot.stop(&watchers)?;
+    }
+    Ok(())
+}
+
+/// On the wire of one host, and at the sockets of the other.
+fn watchers(link: &Link) -> Result<[Watcher<'_>; 2]> {
+    Ok([
+        Watcher::start(&link.monitor)?,
+        Watcher::start_looking(&link.robot, &at_the_sockets_of(&link.robot))?,
+    ])
+}
+
+/// Sixteen processes of one node each, on both hosts, that all publish or subscribe one topic.
+struct Robot<'a> {
+    link: &'a Link,
+    stack: Stack,
+    start: usize,
+    peers: Vec<Peer>,
+}
+
+impl<'a> Robot<'a> {
+    fn new(link: &'a Link, stack: Stack, start: usize) -> Robot<'a> {
+        Robot {
+            link,
+            stack,
+            start,
+            peers: Vec::new(),
+        }
+    }
+
+    /// Starts so many more nodes at the same time, and waits until they have their endpoints.
+    fn launch(&mut self, count: usize) -> Result<()> {
+        let first = self.peers.len();
+        for number in first..first + count {
+            // Publishers and subscribers on either host.
+            let host = match number / 2 % 2 {
+                0 => &self.link.robot,
+                _ => &self.link.monitor,
+            };
+            let role = match number % 2 {
+                0 => Role::Publisher,
+                _ => Role::Subscriber,
+            };
+            let (stream, name) = (Stream::small(1), self.name(number));
+            let peer = Peer::launch(host, self.stack, role, &stream, &[&name])?;
+            self.peers.push(peer);
+        }
+        self.peers[first..]
+            .iter_mut()
+            .try_for_each(Peer::wait_ready)
+    }
+
+    fn name(&self, number: usize) -> String {
+        format!("/start_{}/node_{number}", self.start)
+    }
+
+    fn wait_shown(&self, watchers: &[Watcher<'_>]) -> Result<()> {
+        let names: BTreeSet<_> = (0..NODES).map(|number| self.name(number)).collect();
+        let shown = |page: &Scrape| {
+            let topic = [("topic", "/imu")];
+            nodes(page) == names
+                && page.sum("ros2_topic_publishers", &topic) == NODES as f64 / 2.0
+                && page.sum("ros2_topic_subscriptions", &topic) == NODES as f64 / 2.0
+                && page.sum("ros2_participants", &[]) == NODES as f64
+        };
+        let what = format!("all of start {}", self.start);
+        watchers
+            .iter()
+            .try_for_each(|watcher| watcher.wait(shown, PATIENCE, &what))
+    }
+
+    /// Ends all nodes in order and sees them go; tells whether all said goodbye.
+    fn stop(mut self, watchers: &[Watcher<'_>]) -> Result<bool> {
+        // The monitor's first: at the robot's sockets nobody hears who goes when all have gone there.
+        for on_monitor in [1, 0] {
+            let peers = self.peers.iter_mut().enumerate();
+            let there = peers.filter(|(number, _)| number / 2 % 2 == on_monitor);
+            let mut ending = Vec::new();
+            for (number, peer) in there {
+                // The Rust peer cannot end while it waits for the start.
+                if number % 2 == 0 {
+                    peer.go()?;
+                }
+                peer.process.signal("TERM")?;
+                ending.push(peer);
+            }
+            for peer in ending {
+                peer.process.wait(PATIENCE)?;
+            }
+        }
+        let nobody = |page: &Scrape| page.sum("ros2_participants", &[]) == 0.0;
+        let left = watchers
+            .iter()
+            .map(|watcher| watcher.wait(nobody, LEAVE, "nobody"));
+        let Err(error) = left.collect::<Result<Vec<()>>>() else {
+            return Ok(true);
+        };
+        // RustDDS tells its sending thread to end right after it has given it the goodbye, and the
+        // thread heeds that first when it is late (dp_event_loop.rs, drain_queues, of 0.15): nothing
+        // is sent, and watchers of different kinds on different hosts miss the same ones.
+        let stay = |watcher: &Watcher<'_>| {
+            let page = watcher.agent.scrape()?;
+            anyhow::Ok(page.labels_of("ros2_participant_info", "participant"))
+        };
+        let stay: Vec<_> = watchers.iter().map(stay).collect::<Result<_>>()?;
+        eprintln!("{:?} {}: {stay:?} stay", self.stack, self.start);
+        let same = stay.windows(2).all(|pair| pair[0] == pair[1]);
+        if self.stack == Stack::Rust && same && stay[0].len() <= SILENT {
+            return Ok(false);
+        }
+        Err(error)
+    }
+}
+
+/// The agent on a host.
+struct Watcher<'a> {
+    agent: Agent<'a>,
+    _directory: TempDir,
+}
+
+impl<'a> Watcher<'a> {
+    fn start(host: &'a Namespace) -> Result<Watcher<'a>> {
+        Self::start_looking(host, ON_THE_WIRE)
+    }
+
+    fn start_looking(host: &'a Namespace, capture: &str) -> Result<Watcher<'a>> {
+        let directory = tempfile::tempdir()?;
+        let file = directory.path().join("ros2probe.yaml");
+        std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{capture}"))?;
+        let agent = Agent::start(host, Path::new(env!("CARGO_BIN_EXE_rp")), &file)?;
+        Ok(Watcher {
+            agent,
+            _directory: directory,
+        })
+    }
+
+    /// Scrapes until the page shows `what`.
+    fn wait(&self, shows: impl Fn(&Scrape) -> bool, limit: Duration, what: &str) -> Result<()> {
+        let deadline = Instant::now() + limit;
+        loop {
+            let page = self.agent.scrape()?;
+            if shows(&page) {
+                return Ok(());
+            }
+            ensure!(
+                Instant::now() < deadline,
+                "not {what} within {limit:?}: {}",
+                page.0
+            );
+            std::thread::sleep(Duration::from_millis(200));
+        }
+    }
+}
+
+/// A publisher on the robot that sends to a subscriber on the monitor.
+fn talking(link: &Link, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
+    let mut subscriber = Peer::start(
+        &link.monitor,
+        stack,
+        Role::Subscriber,
+        stream,
+        &["/listener"],
+    )?;
+    let mut publisher = Peer::start(&link.robot, stack, Role::Publisher, stream, &["/talker"])?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+    publisher.go()?;
+    Ok((publisher, subscriber))
+}
+
+fn nodes(page: &Scrape) -> BTreeSet<String> {
+    page.labels_of("ros2_node_info", "ros_node")
+}

@@ -1,0 +1,123 @@
+//! The demo robot's troubles reach a real OpenTelemetry receiver as events with names and
+//! attributes: who came, what was lost, who fell silent; and the sums agree with the counters.
+
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE};
+use ros2probe_testing::harness::loss::Loss;
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::peer::robot;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::rotel::{Item, Rotel, exports};
+
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// The records of one name that are printed whole.
+fn records(receiver: &Rotel, name: &str) -> Vec<Item> {
+    let text = receiver.text();
+    let end = text.rfind("\nFlags: ").unwrap_or(0);
+    let exports = exports(text.get(..end).unwrap_or_default());
+    let records = exports.into_iter().flat_map(|export| export.items);
+    let named = |record: &Item| record.fields.get("EventName").is_some_and(|it| it == name);
+    records.filter(named).collect()
+}
+
+/// Waits for a record of this name with this attribute.
+fn wait_for(receiver: &Rotel, name: &str, attribute: &str, value: &str) -> Result<Item> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let is = |record: &Item| {
+            record
+                .attributes
+                .get(attribute)
+                .is_some_and(|it| it == value)
+        };
+        if let Some(record) = records(receiver, name).into_iter().find(is) {
+            return Ok(record);
+        }
+        ensure!(
+            Instant::now() < deadline,
+            "no {name} with {attribute} {value} in {}",
+            receiver.text()
+        );
+        std::thread::sleep(Duration::from_millis(200));
+    }
+}
+
+#[test]
+fn a_receiver_is_told_who_came_what_was_lost_and_who_fell_silent() -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let [enter, words @ ..] = &link.monitor.outside();
+    let mut command = Command::new(enter);
+    command.args(words).arg(Rotel::binary());
+    let receiver = Rotel::start(&mut command, directory.path(), None);
+    let configuration = directory.path().join("ros2probe.yaml");
+    let endpoint = receiver.address;
+    std::fs::write(
+        &configuration,
+        format!(
+            "watch: [{{topic: /imu, max_silence_s: 1}}]\n{ON_THE_WIRE}\
+             otlp: {{endpoint: 'http://{endpoint}', metrics: false}}\n"
+        ),
+    )?;
+    let mut agent = Agent::start(&link.monitor, env!("CARGO_BIN_EXE_rp"), &configuration)?;
+    let mut monitor = Process::start(&link.monitor.inside(), robot()?, ["--role", "monitor"])?;
+    let lidar = Process::start(&link.robot.inside(), robot()?, ["--role", "lidar"])?;
+    for node in ["/lidar", "/imu_driver", "/operator/monitor"] {
+        wait_for(&receiver, "ros2.node.discovered", "ros_node", node)?;
+    }
+
+    // Best effort: what is lost is not sent again.
+    let samples = "udp dport != { 7400, 7410, 7412, 7414, 7416 } udp length 200-1000";
+    let loss = Loss::of(&link.robot, samples, 300)?;
+    let lost = wait_for(&receiver, "ros2.message.lost", "topic", "/imu")?;
+    drop(loss);
+    ensure!(
+        lost.fields
+            .get("SeverityText")
+            .is_some_and(|it| it == "WARN")
+    );
+    ensure!(
+        lost.attributes
+            .get("ros_node")
+            .is_some_and(|it| it == "/imu_driver"),
+        "{lost:?}"
+    );
+
+    lidar.signal("KILL")?;
+    let silent = wait_for(&receiver, "ros2.topic.silent", "topic", "/imu")?;
+    ensure!(
+        silent
+            .attributes
+            .get("watch")
+            .is_some_and(|it| it == "/imu")
+    );
+    let changed = wait_for(&receiver, "ros2.topic.expectation_changed", "to", "silent")?;
+    ensure!(
+        changed.attributes.get("from").is_some_and(|it| it == "ok"),
+        "{changed:?}"
+    );
+    let told = || -> f64 {
+        let losses = records(&receiver, "ros2.message.lost").into_iter();
+        let counts = losses.filter_map(|loss| loss.attributes.get("count")?.parse::<f64>().ok());
+        counts.sum()
+    };
+    agent.scrape_until("what was told", |page| {
+        let lost = page.sum("ros2_topic_lost_messages_total", &[("topic", "/imu")]);
+        lost > 0.0 && (lost - told()).abs() < 0.5
+    })?;
+
+    monitor.terminate()?;
+    wait_for(&receiver, "ros2.participant.lost", "cause", "disposed")?;
+    let begun = Instant::now();
+    agent.process.terminate()?;
+    ensure!(
+        begun.elapsed() < Duration::from_secs(10),
+        "{:?}",
+        begun.elapsed()
+    );
+    Ok(())
+}

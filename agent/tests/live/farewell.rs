@@ -1,0 +1,35 @@
+//! A publisher that leaves announces it within milliseconds after its last sample, and what a frame
+//! announces overtakes nothing: the last samples count.
+
+use std::time::Duration;
+
+use anyhow::{Context as _, Result};
+use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE};
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+
+#[test]
+fn the_last_samples_before_a_farewell_are_counted() -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir().context("cannot create a directory")?;
+    let configuration = directory.path().join("ros2probe.yaml");
+    std::fs::write(&configuration, format!("watch: [/**]\n{ON_THE_WIRE}"))
+        .context("cannot write a configuration")?;
+    let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
+    let stream = Stream::small(0);
+    let (host, role) = (&link.monitor, Role::Subscriber);
+    let _subscriber = Peer::start(host, Stack::Cyclone, role, &stream, &["/listener"])?;
+    let (host, role) = (&link.robot, Role::Publisher);
+    let mut publisher = Peer::start(host, Stack::Cyclone, role, &stream, &["/imu_driver"])?;
+    publisher.wait_matched()?;
+    publisher.go()?;
+    std::thread::sleep(Duration::from_secs(1));
+    publisher.process.terminate()?;
+    let sent = publisher.log()?.sequences("pub").len();
+    assert!(sent > 100, "{sent}");
+    let counted = agent
+        .settled_scrape("/imu", sent as u64)?
+        .sum("ros2_topic_messages_total", &[("topic", "/imu")]);
+    assert_eq!(counted as usize, sent);
+    Ok(())
+}

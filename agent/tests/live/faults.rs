@@ -1,0 +1,251 @@
+//! What an operator's month brings besides robots: full disks, receivers that hang, scrapers that do
+//! not read, no descriptors, no memory, `kill -9`. The agent goes on seeing, says what is wrong, takes
+//! everything up again when it can, and leaves nothing behind. Larger numbers in `make soak`.
+//!
+//! What a single part does is tested with that part: a recording on a full disk in `live/record`, a
+//! receiver that comes back in `otlp` and `live/otlp`, forged traffic in `live/hostile`.
+
+mod clients;
+mod descriptors;
+mod disk;
+mod everything;
+mod killed;
+mod log;
+mod memory;
+mod receivers;
+mod unit;
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe::capture::netns;
+use ros2probe_testing::forged::{Carrier as _, Sender, Talker, path, talk};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::{Agent, Scrape};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::process::Process;
+use serde_json::Value;
+use tempfile::TempDir;
+
+const METRICS_PORT: u16 = 17400;
+const API_PORT: u16 = 17401;
+const PATIENCE: Duration = Duration::from_secs(60);
+/// As participants do.
+const REPEAT: Duration = Duration::from_secs(3);
+/// What ending may take: 3 s for answers and the last round, 2 s for the last export, and a busy machine.
+const ENDING: Duration = Duration::from_secs(8);
+
+/// An agent on a host of its own, and a place for its files.
+struct Scene<'a> {
+    agent: Agent<'a>,
+    log: PathBuf,
+}
+
+impl<'a> Scene<'a> {
+    /// Starts it behind further words, its log in a file.
+    fn start(
+        host: &'a Namespace,
+        directory: &TempDir,
+        configuration: &str,
+        words: &[&str],
+    ) -> Result<Scene<'a>> {
+        let log = directory.path().join("log");
+        let errors = std::fs::File::options()
+            .create(true)
+            .append(true)
+            .open(&log)?;
+        Scene::start_saying(host, directory, configuration, words, errors.into())
+    }
+
+    fn start_saying(
+        host: &'a Namespace,
+        directory: &TempDir,
+        configuration: &str,
+        words: &[&str],
+        errors: Stdio,
+    ) -> Result<Scene<'a>> {
+        let file = directory.path().join("ros2probe.yaml");
+        std::fs::write(&file, configuration)?;
+        let mut enter: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
+        enter.extend(host.on_network());
+        let process = launch(&enter, &file, errors)?;
+        let mut agent = Agent { process, host };
+        agent.wait_ready(PATIENCE)?;
+        Ok(Scene {
+            agent,
+            log: directory.path().join("log"),
+        })
+    }
+
+    fn pid(&self) -> u32 {
+        self.agent.process.pid()
+    }
+
+    fn said(&self) -> String {
+        std::fs::read_to_string(&self.log).unwrap_or_default()
+    }
+
+    /// A connection to one of its listeners.
+    fn connect(&self, port: u16) -> Result<TcpStream> {
+        let stream = netns::within(&path(self.agent.host), || {
+            TcpStream::connect(("127.0.0.1", port))
+        })??;
+        stream.set_read_timeout(Some(Duration::from_secs(20)))?;
+        Ok(stream)
+    }
+
+    /// Asks the API on a connection of its own.
+    fn ask(&self, method: &str, path: &str, body: &str) -> Result<(u16, Value)> {
+        ask(&mut self.connect(API_PORT)?, method, path, body)
+    }
+
+    fn node_is_known(&self, node: &str) -> Result<()> {
+        self.agent.scrape_until(&format!("{node} known"), |page| {
+            page.labels_of("ros2_node_info", "ros_node").contains(node)
+        })?;
+        Ok(())
+    }
+
+    /// Ends it as the service manager does.
+    fn end(mut self) -> Result<Duration> {
+        let began = Instant::now();
+        self.agent.process.signal("TERM")?;
+        let status = self.agent.process.wait(ENDING)?;
+        ensure!(status.success(), "it ended with {status}: {}", self.said());
+        Ok(began.elapsed())
+    }
+}
+
+fn launch(enter: &[String], configuration: &Path, errors: Stdio) -> Result<Process> {
+    let program = harness::soak::program(env!("CARGO_BIN_EXE_rp"));
+    let arguments = [
+        Path::new("run"),
+        Path::new("--config"),
+        configuration,
+        // Recordings are asked for over loopback here.
+        Path::new("--api-loopback"),
+        Path::new("all"),
+    ];
+    Process::start_with(enter, program, arguments, errors)
+}
+
+/// A topic of which every message is counted, whatever else happens. Its participant repeats itself
+/// until this is dropped.
+struct Counted {
+    talker: Talker,
+    sender: Sender,
+    topic: String,
+    sent: u64,
+    /// Hangs up when it is dropped.
+    _stop: std::sync::mpsc::Sender<()>,
+}
+
+impl Counted {
+    fn start(link: &Link, number: u32, node: &str) -> Result<Counted> {
+        let topic = format!("/counted_{number}");
+        let talker = Talker::new(number, &topic);
+        let mut sender = Sender::between(&link.monitor, &link.robot)?;
+        for message in talker.introduction(node) {
+            sender.carry(&message)?;
+        }
+        let mut repeater = Sender::between(&link.monitor, &link.robot)?;
+        let announcement = talker.participant();
+        let (stop, stopped) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            while stopped.recv_timeout(REPEAT) == Err(RecvTimeoutError::Timeout) {
+                let _ = repeater.carry(&announcement);
+            }
+        });
+        Ok(Counted {
+            talker,
+            sender,
+            topic,
+            sent: 0,
+            _stop: stop,
+        })
+    }
+
+    fn talk(&mut self, size: usize, count: usize) -> Result<()> {
+        self.sent += count as u64;
+        talk(
+            &mut self.talker,
+            &mut self.sender,
+            std::iter::repeat_n(size, count),
+        )
+    }
+
+    /// Fails unless the agent has counted them all, and none as lost.
+    fn check(&self, agent: &Agent<'_>) -> Result<()> {
+        self.check_page(&agent.settled_scrape(&self.topic, self.sent)?)
+    }
+
+    fn check_page(&self, page: &Scrape) -> Result<()> {
+        let label = [("topic", self.topic.as_str())];
+        let counted = page.sum("ros2_topic_messages_total", &label);
+        let lost = page.sum("ros2_topic_lost_messages_total", &label);
+        ensure!(
+            (counted, lost) == (self.sent as f64, 0.0),
+            "{counted} of {} counted, {lost} lost: {}",
+            self.sent,
+            page.doubts()
+        );
+        Ok(())
+    }
+}
+
+/// One request on a connection that stays open.
+fn ask(
+    stream: &mut (impl Read + Write),
+    method: &str,
+    path: &str,
+    body: &str,
+) -> Result<(u16, Value)> {
+    let (status, body) = request(stream, method, path, body)?;
+    let value = serde_json::from_str(&body).unwrap_or(Value::String(body));
+    Ok((status, value))
+}
+
+fn request(
+    stream: &mut (impl Read + Write),
+    method: &str,
+    path: &str,
+    body: &str,
+) -> Result<(u16, String)> {
+    let length = body.len();
+    write!(
+        stream,
+        "{method} {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n\
+         Content-Length: {length}\r\n\r\n{body}"
+    )?;
+    let mut bytes = Vec::new();
+    let head = loop {
+        let end = bytes.windows(4).position(|it| it == b"\r\n\r\n");
+        if let Some(end) = end {
+            break end + 4;
+        }
+        read_more(stream, &mut bytes)?;
+    };
+    let text = String::from_utf8_lossy(&bytes[..head]).to_ascii_lowercase();
+    let status = text.split(' ').nth(1).context("no status")?.parse()?;
+    let length = text
+        .lines()
+        .find_map(|line| line.strip_prefix("content-length: "));
+    let length: usize = length.map_or(Ok(0), str::parse)?;
+    while bytes.len() < head + length {
+        read_more(stream, &mut bytes)?;
+    }
+    Ok((status, String::from_utf8_lossy(&bytes[head..]).into_owned()))
+}
+
+fn read_more(stream: &mut impl Read, bytes: &mut Vec<u8>) -> Result<()> {
+    let mut piece = [0; 16 << 10];
+    let count = stream.read(&mut piece)?;
+    ensure!(count > 0, "closed: {}", String::from_utf8_lossy(bytes));
+    bytes.extend_from_slice(&piece[..count]);
+    Ok(())
+}

@@ -1,0 +1,370 @@
+//! Everything that is tried apart elsewhere, at once, in what the unit allows of memory and CPU:
+//! forged announcements of every kind, full tables, recordings, and clients that mean harm.
+
+use std::fs;
+use std::io::Write as _;
+use std::net::UdpSocket;
+use std::os::unix::net::UnixStream;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe::capture::netns;
+use serde_json::Value;
+
+use super::clients::{Asker, Clients, Doors, answer};
+use super::memory::{Breathing, NOBODY};
+use super::unit::{Allowance, Confined, mebibytes};
+use super::{Scene, ask};
+use ros2probe_testing::forged::path;
+use ros2probe_testing::forged::storm::{Storm, forgery};
+use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::soak::{dropped, long, outcome};
+use ros2probe_testing::harness::usage::Usage;
+
+const TOKEN: &str = "0123456789abcdef0123456789abcdef";
+/// A scraper waits for 10 s unless configured otherwise; an unoptimized agent takes several times the
+/// CPU of the shipped one.
+const LONGEST: [Duration; 2] = [Duration::from_secs(10), Duration::from_secs(60)];
+const SENT: Duration = Duration::from_secs(60);
+const RECORDINGS: [(&str, &str); 4] = [
+    ("real", r#", "topics": {"topics": ["/real", "/cloud"]}"#),
+    ("all", ""),
+    ("more", ""),
+    ("most", ""),
+];
+
+#[test]
+fn everything_at_once_on_the_wire_stays_within_the_unit() -> Result<()> {
+    everything("on the wire", |_| ON_THE_WIRE.to_owned())
+}
+
+#[test]
+fn everything_at_once_at_the_sockets_stays_within_the_unit() -> Result<()> {
+    everything("at the sockets", |link| at_the_sockets_of(&link.robot))
+}
+
+fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
+    let span = Duration::from_secs(if long().is_some() { 120 } else { 10 });
+    let allowance = Allowance::of_the_unit()?;
+    let group = Confined::to(&allowance)?;
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let home = directory.path().display();
+    let socket = directory.path().join("api.sock");
+    fs::create_dir(directory.path().join("state"))?;
+    fs::write(directory.path().join("token"), TOKEN)?;
+    let configuration = format!(
+        "watch: [/real, /cloud, {{topic: /**, per_subscriber: true}}]\nlog: warn\n\
+         state_directory: {home}/state\n\
+         recordings: {{directory: {home}/bags, reserve_percent: 0, reserve_bytes: 0}}\n\
+         api: {{listen: '0.0.0.0:17401', token_file: {home}/token, socket: {home}/api.sock}}\n{}",
+        capture(&link)
+    );
+    let enter = group.enter();
+    let words = ["sh", "-c", &enter];
+    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let doors = Doors::new(&link.robot, &socket, TOKEN);
+    let idle = group.needed()?;
+    let mut real = Real::start(&link, span)?;
+    scene.node_is_known("/driver")?;
+    scene.node_is_known("/camera")?;
+    for (name, topics) in RECORDINGS {
+        let body = format!(r#"{{"name": "{name}"{topics}}}"#);
+        let (status, begun) = on_the_socket(&doors, "POST", "/recordings", &body)?;
+        ensure!(status == 201, "{status} {begun}");
+    }
+    let mut silent = Vec::new();
+    for _ in 0..12 {
+        let mut stream = doors.api()?;
+        let path = "/samples?all=true&hidden=true&payload=true&queue_bytes=16777216";
+        stream.write_all(doors.request(path).as_bytes())?;
+        silent.push(stream);
+    }
+    // What no socket waits for, the hook at the sockets does not see. It is never read.
+    let _sink = link.robot.hold(|| sink(&link.robot))??;
+
+    let (before, throttled) = (Usage::of(scene.pid())?, group.throttled()?);
+    let began = Instant::now();
+    let storms = storms(&link)?;
+    let clients = Clients::start(&doors);
+    let askers = askers(&doors);
+    real.go()?;
+    let mut peak = 0;
+    let (mut participants, mut endpoints) = (0.0_f64, 0.0_f64);
+    let mut is_sent = false;
+    while !is_sent {
+        // Once more when all is sent.
+        is_sent = began.elapsed() >= span;
+        if is_sent {
+            real.wait_sent()?;
+        }
+        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
+        peak = peak.max(group.needed()?);
+        let page = page(&doors)?;
+        participants = participants.max(filled(&page, "participants"));
+        endpoints = endpoints.max(filled(&page, "endpoints"));
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    let took = began.elapsed();
+    let cpu = Usage::of(scene.pid())?.since(&before).cpu;
+    let waited = group.throttled()?.saturating_sub(throttled);
+    let mut answered = Vec::new();
+    for asker in askers {
+        let (what, answers) = asker.end()?;
+        let refused = answers.refused.join("; ");
+        // An unoptimized agent may fall behind, and says so.
+        let may_refuse = long().is_none() && what == "/readyz";
+        ensure!(
+            (refused.is_empty() || may_refuse) && answers.count > 0,
+            "{what}: {refused}"
+        );
+        let longest = answers.longest;
+        ensure!(
+            longest < LONGEST[usize::from(long().is_none())],
+            "{what}: {longest:?}"
+        );
+        answered.push(format!("{} {what} in {longest:.1?} at most", answers.count));
+    }
+    let done = clients.end()?;
+    let mut sent = 0;
+    for storm in storms {
+        sent += storm.end()?;
+    }
+    drop(silent);
+    let page = real.settled(&scene)?;
+    peak = peak.max(group.needed()?);
+    ensure!(group.kills()? == 0, "killed at the end");
+    ensure!(
+        peak < allowance.memory,
+        "{peak} bytes with what sockets take"
+    );
+    ensure!(sent > 5_000, "{sent} datagrams are no storm");
+    // What was refused has names.
+    for limit in [
+        "ros2probe_limit_reached_total",
+        "ros2probe_table_evictions_total",
+    ] {
+        ensure!(page.sum(limit, &[]) > 0.0, "{limit}: nothing was refused");
+    }
+    let counted = real.check(&page)?;
+    let mut recorded = 0;
+    for (name, _) in RECORDINGS {
+        recorded += accounted(&doors, name, &real, dropped(&page) == 0.0)?;
+    }
+    let ended = scene.end()?;
+    outcome(
+        &format!(
+            "everything at once {place}, in {} MiB and {} % of a CPU",
+            mebibytes(allowance.memory),
+            allowance.cpu_percent
+        ),
+        &format!(
+            "{sent} forged datagrams in {took:.0?}, participants {:.0} % and endpoints {:.0} % full; {done}: {:.1} MiB \
+             at most ({:.1} MiB before), not killed; {:.1} s of CPU, {:.1} s waited for more; {}; {counted}; \
+             {recorded} messages of real topics in 4 recordings, all others accounted for; ended in {ended:.1?}",
+            participants * 100.0,
+            endpoints * 100.0,
+            mebibytes(peak),
+            mebibytes(idle),
+            cpu.as_secs_f64(),
+            waited.as_secs_f64(),
+            answered.join(", "),
+        ),
+    )
+}
+
+/// Announcements of every kind with fields that are new each time, and messages with much in them.
+fn storms(link: &Link) -> Result<[Storm; 4]> {
+    // An unoptimized agent in half a CPU takes less.
+    let (pace, rest) = if long().is_some() { (2, 50) } else { (1, 200) };
+    let breathing = |count: u32| Breathing::resting(link, count * pace, Duration::from_millis(4));
+    let slow = Breathing::resting(link, 1, Duration::from_millis(rest))?;
+    Ok([
+        Storm::of_a_crowd(breathing(4)?, 1200, 12),
+        Storm::of_addresses(breathing(1)?),
+        Storm::start(breathing(1)?, forgery),
+        Storm::of_large_samples(slow)?,
+    ])
+}
+
+/// Patient, unlike a scraper.
+fn page(doors: &Doors) -> Result<Scrape> {
+    let head = "GET /metrics HTTP/1.1\r\nHost: localhost:17400";
+    let answer = answer(doors.metrics()?, head)?;
+    ensure!(answer.starts_with("HTTP/1.1 200 "), "{answer:.600}");
+    Ok(Scrape(answer))
+}
+
+/// How much of a table is used, of 1.
+fn filled(page: &Scrape, table: &str) -> f64 {
+    let label = [("table", table)];
+    page.sum("ros2probe_table_entries", &label) / page.sum("ros2probe_table_limit", &label)
+}
+
+/// Ends a recording: the messages of real topics in it. Each other one that was sent is counted with
+/// the reason, but for those that the agent counts as dropped before it could tell whose they are.
+fn accounted(doors: &Doors, name: &str, real: &Real, is_all: bool) -> Result<u64> {
+    let path = format!("/recordings/{name}");
+    let (status, ended) = on_the_socket(doors, "DELETE", &path, "")?;
+    ensure!(status == 200, "{status} {ended}");
+    let mut recorded = 0;
+    for (topic, sent) in real.sent()? {
+        let report = &ended["report"]["topics"][topic];
+        let parts = report.as_object().context("not in the report")?;
+        let messages = report["messages"].as_u64().context("no count")?;
+        let counts = parts.iter().filter(|(key, _)| *key != "bytes");
+        let known: u64 = counts.filter_map(|(_, count)| count.as_u64()).sum();
+        let fits = if is_all { known == sent } else { known <= sent };
+        ensure!(messages <= sent && fits, "{topic}: {sent} sent, {report}");
+        recorded += messages;
+    }
+    Ok(recorded)
+}
+
+/// Two publishers on the robot and their subscribers beyond it.
+struct Real {
+    publishers: Vec<(Peer, &'static str)>,
+    _subscribers: Vec<Peer>,
+}
+
+impl Real {
+    fn start(link: &Link, span: Duration) -> Result<Real> {
+        let seconds = span.as_secs();
+        let small = Stream {
+            topic: "/real".to_owned(),
+            // A topic that vanished makes room for new ones.
+            linger: 600.0,
+            ..Stream::small(200 * seconds)
+        };
+        let cloud = Stream {
+            topic: "/cloud".to_owned(),
+            rate: 10.0,
+            linger: 600.0,
+            ..Stream::point_cloud(64_000, 10 * seconds)
+        };
+        let mut real = Real {
+            publishers: Vec::new(),
+            _subscribers: Vec::new(),
+        };
+        for (stack, stream, topic, nodes) in [
+            (Stack::Cyclone, small, "/real", ["/driver", "/listener"]),
+            (Stack::Fast, cloud, "/cloud", ["/camera", "/viewer"]),
+        ] {
+            let mut subscriber =
+                Peer::start(&link.monitor, stack, Role::Subscriber, &stream, &nodes[1..])?;
+            let mut publisher =
+                Peer::start(&link.robot, stack, Role::Publisher, &stream, &nodes[..1])?;
+            subscriber.wait_matched()?;
+            publisher.wait_matched()?;
+            real.publishers.push((publisher, topic));
+            real._subscribers.push(subscriber);
+        }
+        Ok(real)
+    }
+
+    fn go(&mut self) -> Result<()> {
+        self.publishers
+            .iter_mut()
+            .try_for_each(|(publisher, _)| publisher.go())
+    }
+
+    fn wait_sent(&mut self) -> Result<()> {
+        self.publishers
+            .iter_mut()
+            .try_for_each(|(publisher, _)| publisher.wait_sent(SENT))
+    }
+
+    /// By the publishers' own logs.
+    fn sent(&self) -> Result<Vec<(&'static str, u64)>> {
+        let sent = self.publishers.iter().map(|(publisher, topic)| {
+            let numbers = publisher.log()?.writer_numbers("pub")?;
+            Ok((*topic, numbers.len() as u64))
+        });
+        sent.collect()
+    }
+
+    /// A page with all that is counted of them.
+    fn settled(&self, scene: &Scene<'_>) -> Result<Scrape> {
+        let mut page = None;
+        for (topic, sent) in self.sent()? {
+            page = Some(scene.agent.settled_scrape(topic, sent)?);
+        }
+        page.context("no streams")
+    }
+
+    /// Fails unless each message was counted, or the agent counts what it could not take; no loss is
+    /// one of the robot's.
+    fn check(&self, page: &Scrape) -> Result<String> {
+        let dropped = dropped(page);
+        let mut said = Vec::new();
+        for (topic, sent) in self.sent()? {
+            let label = [("topic", topic)];
+            let counted = page.sum("ros2_topic_messages_total", &label);
+            let lost = page.sum("ros2_topic_lost_messages_total", &label);
+            let missing = sent as f64 - counted;
+            ensure!(
+                (0.0..=dropped).contains(&missing) && (0.0..=missing).contains(&lost),
+                "{topic}: {counted} of {sent}, {lost} lost, {dropped} dropped: {}",
+                page.doubts()
+            );
+            said.push(format!("{counted} of {sent} messages of {topic}"));
+        }
+        let told = page.sum(
+            "ros2probe_events_total",
+            &[("name", "ros2probe.capture.dropped")],
+        );
+        let datagrams = page.sum("ros2probe_dropped_datagrams_total", &[]);
+        ensure!(
+            (told > 0.0) == (dropped + datagrams > 0.0),
+            "{dropped} records or frames and {datagrams} datagrams dropped, {told} events"
+        );
+        Ok(format!(
+            "{} counted, {dropped} records or frames dropped",
+            said.join(" and ")
+        ))
+    }
+}
+
+/// Those who mean no harm: a scraper, a service manager that asks whether it is ready, a client with
+/// the token and one on the socket.
+fn askers(doors: &Doors) -> Vec<Asker> {
+    let period = Duration::from_millis(500);
+    let scrape = |path: &'static str| {
+        let doors = doors.clone();
+        move || {
+            answer(
+                doors.metrics()?,
+                &format!("GET {path} HTTP/1.1\r\nHost: localhost:17400"),
+            )
+        }
+    };
+    let (with_token, local) = (doors.clone(), doors.clone());
+    vec![
+        Asker::start("/metrics", period, scrape("/metrics")),
+        Asker::start("/readyz", period, scrape("/readyz")),
+        Asker::start("token", period, move || {
+            answer(with_token.api()?, &with_token.request("/health"))
+        }),
+        Asker::start("socket", period, move || {
+            answer(
+                UnixStream::connect(&local.socket)?,
+                "GET /health HTTP/1.1\r\nHost: rp",
+            )
+        }),
+    ]
+}
+
+/// Asks on the unix socket.
+fn on_the_socket(doors: &Doors, method: &str, path: &str, body: &str) -> Result<(u16, Value)> {
+    let stream = UnixStream::connect(&doors.socket)?;
+    stream.set_read_timeout(Some(Duration::from_secs(20)))?;
+    ask(&mut { stream }, method, path, body)
+}
+
+/// Where the storm arrives.
+fn sink(host: &Namespace) -> Result<UdpSocket> {
+    let address = (host.address(), NOBODY);
+    Ok(netns::within(&path(host), || UdpSocket::bind(address))??)
+}

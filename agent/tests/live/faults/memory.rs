@@ -1,0 +1,160 @@
+//! Everything at its cap at once, in the memory that the unit allows.
+
+use std::fs;
+use std::io::Write as _;
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, ensure};
+
+use super::unit::{Allowance, Confined, mebibytes};
+use super::{API_PORT, Counted, PATIENCE, Scene};
+use ros2probe_testing::forged::storm::{Storm, forgery};
+use ros2probe_testing::forged::{Carrier, Sender};
+use ros2probe_testing::harness::agent::ON_THE_WIRE;
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::soak::{long, outcome};
+
+/// What nobody on the robot listens to.
+pub(super) const NOBODY: u16 = 7399;
+
+/// Leaves other tests some of the machine.
+pub(super) struct Breathing {
+    sender: Sender,
+    carried: u32,
+    /// How many between two rests.
+    pace: u32,
+    rest: Duration,
+}
+
+impl Breathing {
+    /// So many a millisecond.
+    pub(super) fn start(link: &Link, pace: u32) -> Result<Breathing> {
+        Breathing::resting(link, pace, Duration::from_millis(1))
+    }
+
+    /// So many between two rests.
+    pub(super) fn resting(link: &Link, pace: u32, rest: Duration) -> Result<Breathing> {
+        let source = format!("{}:0", link.monitor.address());
+        let target = format!("{}:{NOBODY}", link.robot.address());
+        Ok(Breathing {
+            sender: Sender::new(&link.monitor, &source, &target)?,
+            carried: 0,
+            pace,
+            rest,
+        })
+    }
+}
+
+impl Carrier for Breathing {
+    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+        self.carried += 1;
+        if self.carried.is_multiple_of(self.pace) {
+            std::thread::sleep(self.rest);
+        }
+        self.sender.carry(payload)
+    }
+}
+
+#[test]
+fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
+    let limit = Allowance::of_the_unit()?.memory;
+    let group = Confined::to_memory(limit)?;
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let place = directory.path().display();
+    fs::create_dir(directory.path().join("state"))?;
+    let configuration = format!(
+        "watch: [{{topic: /**, per_subscriber: true}}]\nlog: warn\nstate_directory: {place}/state\n\
+         recordings: {{directory: {place}/bags, reserve_percent: 0, reserve_bytes: 0}}\n\
+         {ON_THE_WIRE}"
+    );
+    let enter = group.enter();
+    let words = ["sh", "-c", &enter];
+    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let idle = group.needed()?;
+    let mut real = Counted::start(&link, 900_000, "real")?;
+    real.talk(320, 50)?;
+    let span = Duration::from_secs(if long().is_some() { 120 } else { 8 });
+    let (sent, peak) = storm(&scene, &group, &link, span, 0.9)?;
+    ensure!(peak < limit, "{peak} bytes with what sockets take");
+    let took = scene.end()?;
+
+    // What was kept of it kills the next one neither at its start nor later.
+    let state = fs::metadata(directory.path().join("state/discovery.json"))?.len();
+    let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
+    let restarted = group.needed()?;
+    let (more, again) = storm(&scene, &group, &link, span / 2, 0.0)?;
+    ensure!(again < limit, "{again} bytes with what sockets take");
+    scene.end()?;
+    outcome(
+        &format!(
+            "every cap at once in {} MiB (MemoryMax, no swap)",
+            mebibytes(limit)
+        ),
+        &format!(
+            "{} hostile datagrams, 12 readers that do not read, 4 recordings: {:.1} MiB at most ({:.1} MiB \
+             before), not killed; ended in {took:?}; started again with a state of {:.1} MiB: {:.1} MiB, {:.1} MiB \
+             at most",
+            sent + more,
+            mebibytes(peak),
+            mebibytes(idle),
+            mebibytes(state),
+            mebibytes(restarted),
+            mebibytes(again)
+        ),
+    )
+}
+
+/// Everything at once, for so long and until so much of the tables is used: the datagrams sent, and
+/// the most memory needed.
+fn storm(
+    scene: &Scene<'_>,
+    group: &Confined,
+    link: &Link,
+    span: Duration,
+    filled: f64,
+) -> Result<(u64, u64)> {
+    // Whoever wants all messages and does not read them.
+    let mut readers = Vec::new();
+    for _ in 0..12 {
+        let mut stream = scene.connect(API_PORT)?;
+        let path = "/samples?all=true&hidden=true&payload=true&queue_bytes=16777216";
+        let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n");
+        stream.write_all(request.as_bytes())?;
+        readers.push(stream);
+    }
+    for number in 0..4 {
+        let body = format!(r#"{{"name": "all_{number}_{}"}}"#, scene.pid());
+        let (status, begun) = scene.ask("POST", "/recordings", &body)?;
+        ensure!(status == 201, "{status} {begun}");
+    }
+    let storms = [
+        Storm::of_a_crowd(Breathing::start(link, 64)?, 1200, 12),
+        Storm::start(Breathing::start(link, 8)?, forgery),
+        Storm::of_large_samples(Breathing::start(link, 4)?)?,
+    ];
+    let began = Instant::now();
+    let (mut peak, mut is_full) = (0, false);
+    while began.elapsed() < span || !is_full {
+        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
+        peak = peak.max(group.needed()?);
+        // A page of all of it is memory, too.
+        let page = scene.agent.scrape()?;
+        is_full = ["participants", "endpoints"].into_iter().all(|table| {
+            let label = [("table", table)];
+            let entries = page.sum("ros2probe_table_entries", &label);
+            entries >= filled * page.sum("ros2probe_table_limit", &label)
+        });
+        ensure!(
+            is_full || began.elapsed() < span + PATIENCE,
+            "the tables are not full"
+        );
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    let mut sent = 0;
+    for storm in storms {
+        sent += storm.end()?;
+    }
+    ensure!(group.kills()? == 0, "killed at the end");
+    Ok((sent, peak))
+}

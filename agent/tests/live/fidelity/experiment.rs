@@ -1,0 +1,509 @@
+//! A stream under one trouble after the other, observed by its subscribers and by the agent.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, bail, ensure};
+use ros2probe::model::cause::LossCause;
+use ros2probe::model::journal::DeliveryLoss;
+use ros2probe::model::snapshot::{Delivered, Direction, Snapshot};
+use ros2probe_wire::{EntityId, Guid};
+
+use super::cell::Cell;
+use ros2probe_testing::harness::agent::{Agent, Scrape};
+use ros2probe_testing::harness::loss::{Loss, Part};
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::run;
+use ros2probe_testing::harness::snmp::Snmp;
+use ros2probe_testing::harness::witness::Witness;
+
+/// Of the whole stream, with all pauses.
+const PATIENCE: Duration = Duration::from_secs(90);
+/// Ports of the first participants of domain 0 that carry no samples.
+pub(crate) const DISCOVERY: &str = "7400, 7410, 7412, 7414, 7416";
+/// RustDDS sends 2125 datagrams a sample, to its own socket too: on a busy machine none has room.
+const RECORD_RING: u32 = 16 << 20;
+/// Gaps of best-effort streams are settled sooner.
+const SETTLED: Duration = Duration::from_secs(60);
+/// RustDDS sends somewhat later than it says, and announcements never cease.
+const QUIET: Duration = Duration::from_millis(400);
+const PAUSE: Duration = Duration::from_millis(20);
+const ANNOUNCEMENTS: u64 = 10;
+/// How long the kernel of the subscribers' host waits for IP fragments, and somewhat more.
+const REASSEMBLY: Duration = Duration::from_millis(1500);
+
+/// What is wrong during one stretch of a stream.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Trouble {
+    Nothing,
+    /// So many of a hundred samples miss a datagram.
+    Datagrams(u64),
+    /// So many of a hundred samples miss a datagram on their way to the last subscriber only.
+    DatagramsToTheLast(u64),
+    /// So many of a hundred samples miss all IP fragments of a datagram but the first.
+    Fragments(u64),
+    /// The first subscriber is stopped and continued.
+    Stops,
+}
+
+/// Sizes that the paper measures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Size {
+    B320,
+    KB644,
+    MB2_72,
+}
+
+pub(crate) struct Experiment {
+    pub(crate) stack: Stack,
+    pub(crate) size: Size,
+    pub(crate) subscribers: usize,
+    pub(crate) troubles: Vec<Trouble>,
+}
+
+/// What was true while a trouble lasted.
+struct Span {
+    trouble: Trouble,
+    overflown: bool,
+}
+
+impl Size {
+    fn stream(self) -> Stream {
+        let stream = match self {
+            // The buffer holds a third of a second.
+            Size::B320 => Stream {
+                rate: 400.0,
+                receive_buffer: 64 << 10,
+                ..Stream::small(0)
+            },
+            // Two samples.
+            Size::KB644 => Stream {
+                receive_buffer: 1 << 20,
+                ..Stream::point_cloud(644_000, 0)
+            },
+            Size::MB2_72 => Stream {
+                rate: 10.0,
+                ..Stream::point_cloud(2_720_000, 0)
+            },
+        };
+        Stream {
+            depth: 1000,
+            linger: 60.0,
+            ..stream
+        }
+    }
+
+    const fn samples(self) -> u64 {
+        match self {
+            Size::B320 => 800,
+            Size::KB644 | Size::MB2_72 => 30,
+        }
+    }
+
+    /// Datagrams that make a sample.
+    const fn datagrams(self, stack: Stack) -> u64 {
+        match (self, stack) {
+            (Size::B320, _) => 1,
+            (Size::KB644, Stack::Fast) => 10,
+            (Size::KB644, Stack::Cyclone) => 48,
+            (Size::KB644, Stack::Rust) => 504,
+            (Size::MB2_72, Stack::Fast) => 42,
+            (Size::MB2_72, Stack::Cyclone) => 203,
+            (Size::MB2_72, Stack::Rust) => 2125,
+        }
+    }
+
+    /// How long a subscriber stands still, and runs.
+    const fn stop(self) -> (Duration, Duration) {
+        match self {
+            Size::B320 => (Duration::from_millis(800), Duration::from_millis(300)),
+            _ => (Duration::from_millis(400), Duration::from_millis(300)),
+        }
+    }
+}
+
+impl Trouble {
+    /// Whether it is in the way of this one of so many subscribers.
+    fn strikes(self, subscriber: usize, subscribers: usize) -> bool {
+        match self {
+            Trouble::Nothing => false,
+            Trouble::Datagrams(_) | Trouble::Fragments(_) => true,
+            Trouble::DatagramsToTheLast(_) => subscriber + 1 == subscribers,
+            Trouble::Stops => subscriber == 0,
+        }
+    }
+
+    const fn cause(self) -> LossCause {
+        match self {
+            Trouble::Fragments(_) => LossCause::Reassembly,
+            Trouble::Stops => LossCause::SocketBuffer,
+            _ => LossCause::BeforeHost,
+        }
+    }
+}
+
+impl Experiment {
+    /// Cells by subscriber and trouble.
+    pub(crate) fn run(&self) -> Result<Vec<Cell>> {
+        let link = Link::new()?;
+        run(&format!(
+            "ip netns exec {} sysctl -qw net.ipv4.ipfrag_time=1",
+            link.monitor.name()
+        ))?;
+        let mut witness = Witness::start(&format!(
+            "watch: [/**]\n\
+             capture: {{source: host, record_ring_bytes: {RECORD_RING}, cgroup: {}}}\n",
+            link.cgroup().display()
+        ))?;
+        let directory = tempfile::tempdir()?;
+        let agent = self.agent(&link, directory.path())?;
+        let mut peers = self.peers(&link)?;
+        witness.wait_for("the endpoints", PATIENCE, |seen| {
+            let mut topics = seen.topics.iter();
+            let topic = topics.find(|topic| topic.name == self.size.stream().topic)?;
+            let known = (topic.publishers.len(), topic.subscriptions.len());
+            (known == (1, self.subscribers)).then_some(())
+        })?;
+
+        let mut spans = Vec::new();
+        for (trouble, due) in self.troubles.iter().zip(1..) {
+            spans.push(self.span(*trouble, due * self.size.samples(), &link, &mut peers)?);
+        }
+        peers.publisher.wait_sent(PATIENCE)?;
+        std::thread::sleep(REASSEMBLY);
+        let sent = Truth::of(&peers.publisher, "pub")?;
+        let received = peers.subscribers.iter().map(|peer| Truth::of(peer, "sub"));
+        let received: Vec<Truth> = received.collect::<Result<_>>()?;
+        ensure!(
+            sent.numbers.len() as u64 == self.samples(),
+            "not all was sent"
+        );
+        // The sums first, while the peers are there; the lists settle once they have gone.
+        let mut doubts = Vec::new();
+        for truth in &received {
+            let missing = truth.missing(&sent.numbers).len() as u64;
+            let logged = (truth.numbers.len() as u64, missing);
+            let told = |seen: &Snapshot| {
+                let sums = sums(seen, &sent.guid, &truth.guid);
+                (sums.messages, sums.lost())
+            };
+            let agrees = |seen: &Snapshot| (told(seen) == logged).then_some(());
+            let agreed = witness.wait_for("what the log says", SETTLED, agrees);
+            let seen = witness.latest().context("no snapshot")?;
+            if agreed.is_err() {
+                doubts.push(format!(
+                    "received and lost {:?}, not {logged:?}",
+                    told(&seen)
+                ));
+            }
+        }
+        let seen = witness.latest().context("no snapshot")?;
+        let topic = self.size.stream().topic;
+        let page = agent.as_ref().map(|agent| agent.settled_scrape(&topic, 0));
+        let page = page.transpose()?;
+        peers.terminate()?;
+        let testimony = witness.finish()?;
+        testimony.ensure_complete()?;
+        if testimony.skipped_runs > 0 {
+            println!("the kernel left out {} runs", testimony.skipped_runs);
+        }
+
+        let mut cells = Vec::new();
+        for (subscriber, truth) in received.iter().enumerate() {
+            let losses = reported(&testimony.delivery_losses, &seen, &sent.guid, &truth.guid)?;
+            if let Some(page) = &page {
+                truth.ensure_on(page, &losses)?;
+            }
+            let missing = truth.missing(&sent.numbers);
+            for (span, due) in spans.iter().zip(1..) {
+                let numbers = (due - 1) * self.size.samples() + 1..=due * self.size.samples();
+                let trouble = span.trouble;
+                let strikes = trouble.strikes(subscriber, self.subscribers);
+                let mut possible = BTreeSet::new();
+                possible.extend(strikes.then_some(trouble.cause()));
+                possible.extend(span.overflown.then_some(LossCause::SocketBuffer));
+                cells.push(Cell {
+                    name: format!(
+                        "{:?} {:?} {trouble:?} subscriber {subscriber}",
+                        self.stack, self.size
+                    ),
+                    sent: numbers.clone().collect(),
+                    lost: missing.range(numbers.clone()).copied().collect(),
+                    reported: losses
+                        .range(numbers.clone())
+                        .map(|(at, why)| (*at, *why))
+                        .collect(),
+                    possible,
+                    must_lose: strikes,
+                });
+            }
+            let beyond: Vec<_> = losses.range(self.samples() + 1..).collect();
+            ensure!(beyond.is_empty(), "never sent: {beyond:?}");
+        }
+        if !doubts.is_empty() {
+            cells.iter().for_each(|cell| println!("{cell}"));
+            bail!("{}", doubts.join("; "));
+        }
+        Ok(cells)
+    }
+
+    /// The agent itself, whose page is to say the same, beside the witness.
+    fn agent<'a>(&self, link: &'a Link, directory: &Path) -> Result<Option<Agent<'a>>> {
+        if self.subscribers < 2 {
+            return Ok(None);
+        }
+        let file = directory.join("ros2probe.yaml");
+        let configuration = format!(
+            "watch: [{{topic: /**, per_subscriber: true}}]\n\
+             capture: {{source: host, cgroup: {}}}\n",
+            link.cgroup().display()
+        );
+        std::fs::write(&file, configuration)?;
+        Agent::start(&link.monitor, env!("CARGO_BIN_EXE_rp"), &file).map(Some)
+    }
+
+    const fn samples(&self) -> u64 {
+        self.size.samples() * self.troubles.len() as u64
+    }
+
+    fn peers(&self, link: &Link) -> Result<Peers> {
+        let stream = Stream {
+            count: self.samples(),
+            ..self.size.stream()
+        };
+        let names = ["/first", "/second"].into_iter().take(self.subscribers);
+        let subscribers = names.map(|name| {
+            let host = &link.monitor;
+            Peer::start(host, self.stack, Role::Subscriber, &stream, &[name])
+        });
+        let mut subscribers: Vec<Peer> = subscribers.collect::<Result<_>>()?;
+        // Cyclone DDS sends to a multicast address as soon as there are two.
+        let unicast = "CYCLONEDDS_URI=<General><AllowMulticast>spdp</AllowMulticast></General>";
+        let mut enter = link.robot.inside();
+        enter.extend(["env", unicast].map(str::to_owned));
+        let stream = Stream {
+            peers: self.subscribers,
+            stretch: self.size.samples(),
+            ..stream
+        };
+        let role = Role::Publisher;
+        let mut publisher = Peer::launch_behind(&enter, self.stack, role, &stream, &["/talker"])?;
+        publisher.wait_ready()?;
+        publisher.wait_matched()?;
+        subscribers.iter_mut().try_for_each(Peer::wait_matched)?;
+        Ok(Peers {
+            publisher,
+            subscribers,
+        })
+    }
+
+    /// One trouble while the next stretch is sent, until there are so many samples in all.
+    fn span(&self, trouble: Trouble, due: u64, link: &Link, peers: &mut Peers) -> Result<Span> {
+        let subscriber = peers.subscribers.first().context("no subscriber")?;
+        let host = subscriber.process.pid();
+        let overflows = || Snmp::of(host)?.receive_buffer_errors();
+        let before = overflows()?;
+        let _loss = self.loss(trouble, link, peers)?;
+        peers.publisher.go()?;
+        while (peers.publisher.log()?.sequences("pub").len() as u64) < due {
+            match trouble {
+                Trouble::Stops => self.stop(peers)?,
+                _ => std::thread::sleep(PAUSE),
+            }
+        }
+        peers.wait_quiet()?;
+        Ok(Span {
+            trouble,
+            overflown: overflows()? > before,
+        })
+    }
+
+    fn stop(&self, peers: &Peers) -> Result<()> {
+        let (stands, runs) = self.size.stop();
+        let slow = &peers.subscribers.first().context("no subscriber")?.process;
+        slow.signal("STOP")?;
+        std::thread::sleep(stands);
+        slow.signal("CONT")?;
+        std::thread::sleep(runs);
+        Ok(())
+    }
+
+    fn loss<'a>(
+        &self,
+        trouble: Trouble,
+        link: &'a Link,
+        peers: &Peers,
+    ) -> Result<Option<Loss<'a>>> {
+        let (per_cent, part, to) = match trouble {
+            Trouble::Nothing | Trouble::Stops => return Ok(None),
+            Trouble::Datagrams(per_cent) => (per_cent, Part::Whole, None),
+            Trouble::Fragments(per_cent) => (per_cent, Part::Trailing, None),
+            Trouble::DatagramsToTheLast(per_cent) => {
+                (per_cent, Part::Whole, Some(peers.ports_of_the_last()?))
+            }
+        };
+        let length = match self.size {
+            Size::B320 => "380-500",
+            _ => "1000-65535",
+        };
+        let to = to.map_or_else(String::new, |ports| {
+            format!("udp dport {{ {} }}", ports.join(", "))
+        });
+        let datagrams = format!("udp length {length} udp dport != {{ {DISCOVERY} }} {to}");
+        // Each time another datagram of a sample.
+        let nth = match self.size.datagrams(self.stack) {
+            1 => 100 / per_cent,
+            several => 100 * several / per_cent - 1,
+        };
+        Loss::of_datagrams(&link.robot, &datagrams, nth, part).map(Some)
+    }
+}
+
+struct Peers {
+    publisher: Peer,
+    subscribers: Vec<Peer>,
+}
+
+impl Peers {
+    /// Ports that only the last subscriber has.
+    fn ports_of_the_last(&self) -> Result<Vec<String>> {
+        let mut sockets = self
+            .subscribers
+            .iter()
+            .rev()
+            .map(|peer| peer.process.udp_ports());
+        let mut ports = sockets.next().context("no subscriber")??;
+        for others in sockets {
+            let others = others?;
+            ports.retain(|port| !others.contains(port));
+        }
+        Ok(ports.iter().map(u16::to_string).collect())
+    }
+
+    /// Waits until all that was sent is on its way, and received what can be.
+    fn wait_quiet(&self) -> Result<()> {
+        let state = || {
+            let logs = self.subscribers.iter().map(|peer| Ok(peer.log()?.0.len()));
+            let received: Vec<usize> = logs.collect::<Result<_>>()?;
+            let sent = Snmp::of(self.publisher.process.pid())?.sent()?;
+            anyhow::Ok((sent, received))
+        };
+        let mut before = state()?;
+        loop {
+            std::thread::sleep(QUIET);
+            let now = state()?;
+            if now.1 == before.1 && now.0 < before.0 + ANNOUNCEMENTS {
+                return Ok(());
+            }
+            before = now;
+        }
+    }
+
+    fn terminate(&mut self) -> Result<()> {
+        for peer in self.subscribers.iter_mut().chain([&mut self.publisher]) {
+            peer.process.terminate()?;
+        }
+        Ok(())
+    }
+}
+
+/// What a peer logged of its stream.
+pub(crate) struct Truth {
+    pub(crate) guid: String,
+    pub(crate) numbers: BTreeSet<u64>,
+}
+
+impl Truth {
+    pub(crate) fn of(peer: &Peer, kind: &str) -> Result<Truth> {
+        let log = peer.log()?;
+        let endpoint = log
+            .endpoints()
+            .find(|event| event.kind.as_deref() == Some(kind));
+        let guid = endpoint
+            .and_then(|event| event.guid.clone())
+            .context("no endpoint is logged")?;
+        Ok(Truth {
+            guid,
+            numbers: log.writer_numbers(kind)?,
+        })
+    }
+
+    /// The page of an agent says the same of this reader.
+    fn ensure_on(&self, page: &Scrape, losses: &BTreeMap<u64, LossCause>) -> Result<()> {
+        let prefix = self.guid.get(..24).context("a short GUID")?;
+        let subscriber = format!("participant {prefix}.000001c1");
+        let whose = ("subscriber", subscriber.as_str());
+        let received = page.sum("ros2_subscriber_received_messages_total", &[whose]);
+        ensure!(
+            received == self.numbers.len() as f64,
+            "{received} on the page"
+        );
+        for cause in LossCause::ALL {
+            let name = "ros2_subscriber_lost_messages_total";
+            let lost = page.sum(name, &[whose, ("cause", cause.label())]);
+            let reported = losses.values().filter(|each| **each == cause).count();
+            ensure!(
+                lost == reported as f64,
+                "{lost} of {} on the page",
+                cause.label()
+            );
+        }
+        Ok(())
+    }
+
+    /// What was sent after the first that came, and did not come.
+    pub(crate) fn missing(&self, sent: &BTreeSet<u64>) -> BTreeSet<u64> {
+        let first = self.numbers.first().copied().unwrap_or(u64::MAX);
+        sent.range(first..)
+            .filter(|number| !self.numbers.contains(number))
+            .copied()
+            .collect()
+    }
+}
+
+/// Of one reader.
+pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
+    let mut sums = Delivered::default();
+    for delivery in seen.topics.iter().flat_map(|topic| &topic.deliveries) {
+        let of_reader = delivery.readers.iter().any(|guid| is(*guid, reader));
+        if delivery.direction == Direction::Received && of_reader && is(delivery.writer, writer) {
+            sums.add(&delivery.delivered);
+        }
+    }
+    sums
+}
+
+/// Lost numbers of one reader with their cause, each named once. A loss that was settled before it
+/// was known whose socket it was is his whose it turned out to be.
+pub(crate) fn reported(
+    losses: &[DeliveryLoss],
+    seen: &Snapshot,
+    writer: &str,
+    reader: &str,
+) -> Result<BTreeMap<u64, LossCause>> {
+    let deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
+    let of_reader = deliveries.filter(|each| each.readers.iter().any(|guid| is(*guid, reader)));
+    let sockets: BTreeSet<u64> = of_reader.flat_map(|each| each.sockets.clone()).collect();
+    let is_prefix = |prefix| {
+        let participant = Guid::new(prefix, EntityId::PARTICIPANT).to_string();
+        participant.get(..24) == reader.get(..24)
+    };
+    let mut reported = BTreeMap::new();
+    for loss in losses {
+        let socket = sockets.contains(&loss.socket);
+        if loss.participant.map_or(socket, is_prefix) && is(loss.writer, writer) {
+            for number in loss.first..=loss.last {
+                let before = reported.insert(number, loss.cause);
+                ensure!(before.is_none(), "{number} was lost twice: {loss:?}");
+            }
+        }
+    }
+    Ok(reported)
+}
+
+/// A log writes GUIDs without the point.
+pub(crate) fn is(guid: Guid, logged: &str) -> bool {
+    guid.to_string().replace('.', "") == logged
+}

@@ -1,0 +1,185 @@
+//! A reliable stream, seen only where it is received: what is lost on the link comes again, and
+//! what comes no more is known although nothing follows it.
+
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe::model::cause::LossCause;
+use ros2probe::model::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
+
+use super::experiment::{DISCOVERY, Truth, is, reported, sums};
+use ros2probe_testing::harness::loss::{Loss, Part};
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::witness::Witness;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Samples of which some are dropped, of seven seconds of them.
+const WOUNDED: u64 = 100;
+const SAMPLES: u64 = 220;
+/// One in so many datagrams with samples is dropped.
+const NTH: u64 = 5;
+
+/// What the agent on the receiving side knew.
+pub(crate) struct Repair {
+    sent: Truth,
+    received: Truth,
+    /// When everything had been repaired.
+    repaired: Delivered,
+    dropped: u64,
+    /// When the tail was missing.
+    waiting: AcknowledgementFacts,
+    /// Once the writer was gone.
+    lost: Vec<(u64, LossCause)>,
+}
+
+impl Repair {
+    pub(crate) fn of(stack: Stack) -> Result<Repair> {
+        let link = Link::new()?;
+        let mut witness = Witness::start(&format!(
+            "watch: [/**]\ncapture: {{source: host, cgroup: {}}}\n",
+            link.monitor.cgroup().display()
+        ))?;
+        let stream = Stream {
+            reliable: true,
+            depth: 1000,
+            rate: 30.0,
+            linger: 60.0,
+            ..Stream::small(SAMPLES)
+        };
+        let host = &link.monitor;
+        let mut subscriber = Peer::start(host, stack, Role::Subscriber, &stream, &["/listener"])?;
+        let host = &link.robot;
+        let mut publisher = Peer::start(host, stack, Role::Publisher, &stream, &["/talker"])?;
+        publisher.wait_matched()?;
+        subscriber.wait_matched()?;
+        witness.wait_for("the endpoints", PATIENCE, |seen| {
+            let mut topics = seen.topics.iter();
+            let topic = topics.find(|topic| topic.name == stream.topic)?;
+            let known = (topic.publishers.len(), topic.subscriptions.len());
+            (known == (1, 1)).then_some(())
+        })?;
+
+        publisher.go()?;
+        // RustDDS sends to a multicast address: whose socket that comes to is known a while later.
+        witness.wait_for("whom samples come to", PATIENCE, |seen| {
+            let mut deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
+            let known =
+                deliveries.any(|each| !each.readers.is_empty() && each.delivered.messages > 0);
+            known.then_some(())
+        })?;
+        // Also of those that go again, alone or several at once. A HEARTBEAT is shorter.
+        let samples = format!("udp length 380-65535 udp dport != {{ {DISCOVERY} }}");
+        let loss = Loss::of_datagrams(&link.robot, &samples, NTH, Part::Whole)?;
+        wait_until(|| Ok(publisher.log()?.sequences("pub").len() as u64 >= WOUNDED))?;
+        let dropped = loss.counts()?.dropped;
+        drop(loss);
+        // Fast DDS asks again within three seconds. Readers are given samples in order, so this one has
+        // all once it is given the latest.
+        wait_until(|| {
+            let received = subscriber.log()?.sequences("sub").len();
+            Ok(received + 2 > publisher.log()?.sequences("pub").len())
+        })?;
+        let _all = Loss::of_datagrams(&link.robot, &samples, 1, Part::Whole)?;
+        let (sent, reader) = (
+            Truth::of(&publisher, "pub")?,
+            Truth::of(&subscriber, "sub")?.guid,
+        );
+        publisher.wait_sent(PATIENCE)?;
+        let sent = Truth {
+            numbers: publisher.log()?.writer_numbers("pub")?,
+            ..sent
+        };
+        let newest = *sent.numbers.last().context("nothing was sent")?;
+        // The HEARTBEAT that tells of the tail is seen some milliseconds before the ACKNACK it is
+        // answered with. Until that comes the last request stands, though all of that was received.
+        let waiting = witness.wait_for("what is missing", PATIENCE, |seen| {
+            let facts = acknowledgement(seen, &sent.guid, &reader)?;
+            let received = Truth::of(&subscriber, "sub").ok()?;
+            let first = *received.missing(&sent.numbers).first()?;
+            let told = facts.acknowledged == first - 1 && facts.missing > 0;
+            (told && facts.acknowledged + facts.lag_samples == newest).then_some(facts)
+        })?;
+        let seen = witness.latest().context("no snapshot")?;
+        let repaired = sums(&seen, &sent.guid, &reader);
+        let received = Truth::of(&subscriber, "sub")?;
+        publisher.process.signal("KILL")?;
+        publisher.process.wait(PATIENCE)?;
+        // In its time: while the reader is there, what the writer said it has is awaited.
+        let testimony = witness.finish()?;
+        testimony.ensure_complete()?;
+        let lost = reported(
+            &testimony.delivery_losses,
+            &seen,
+            &sent.guid,
+            &received.guid,
+        )?;
+        Ok(Repair {
+            sent,
+            received,
+            repaired,
+            dropped,
+            waiting,
+            lost: lost.into_iter().collect(),
+        })
+    }
+
+    pub(crate) fn ensure_told(&self) -> Result<()> {
+        let Repair {
+            sent,
+            received,
+            repaired,
+            dropped,
+            waiting,
+            lost,
+        } = self;
+        println!(
+            "{} sent, {dropped} datagrams dropped, {} received; {repaired:?}; {waiting:?}; {} lost",
+            sent.numbers.len(),
+            received.numbers.len(),
+            lost.len()
+        );
+        let missing = received.missing(&sent.numbers);
+        ensure!(!missing.is_empty() && *dropped > 0);
+        ensure!(
+            repaired.messages == received.numbers.len() as u64,
+            "{repaired:?}"
+        );
+        ensure!(
+            repaired.recovered > 0 && repaired.lost() == 0,
+            "{repaired:?}"
+        );
+        ensure!(repaired.recovery_seconds > 0.0, "{repaired:?}");
+        // The reader acknowledges all before the first that it misses.
+        let first = *missing.first().context("nothing is missing")?;
+        ensure!(
+            waiting.acknowledged == first - 1,
+            "{waiting:?}, {first} is missing"
+        );
+        let expected: Vec<_> = missing
+            .iter()
+            .map(|each| (*each, LossCause::BeforeHost))
+            .collect();
+        ensure!(*lost == expected, "{lost:?} are lost, not {missing:?}");
+        Ok(())
+    }
+}
+
+fn acknowledgement(seen: &Snapshot, writer: &str, reader: &str) -> Option<AcknowledgementFacts> {
+    let mut facts = seen.topics.iter().flat_map(|topic| &topic.acknowledgements);
+    facts
+        .find(|each| is(each.writer, writer) && is(each.reader, reader))
+        .cloned()
+}
+
+fn wait_until(what: impl Fn() -> Result<bool>) -> Result<()> {
+    let deadline = std::time::Instant::now() + PATIENCE;
+    while !what()? {
+        ensure!(
+            std::time::Instant::now() < deadline,
+            "not within {PATIENCE:?}"
+        );
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    Ok(())
+}

@@ -1,0 +1,317 @@
+//! Somebody on the network who means harm, and an operator who gave too little privilege: the agent
+//! stays small, keeps counting what is real, and says what is wrong.
+
+use std::fs::Permissions;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result};
+use ros2probe_testing::forged::frames::Wire;
+use ros2probe_testing::forged::storm::{Dice, Storm, forgery};
+use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::usage::Usage;
+use ros2probe_testing::local_agent;
+
+/// A port that nothing on the robot listens to: the storm is for the agent alone.
+const NOBODY: u16 = 7399;
+const STORM: Duration = Duration::from_secs(6);
+/// What a storm may add to the agent's memory: with every table full, and several snapshots and
+/// pages of it under way, it stays within the unit's `MemoryMax`.
+const GROWTH: u64 = 72 << 20;
+/// Forgeries give way when they have been silent for 5 s; those that went on for longer do when their
+/// lease ends.
+const SILENCE: Duration = Duration::from_secs(6);
+/// Cyclone DDS repeats itself every 8 s.
+const RECOVERY: Duration = Duration::from_secs(30);
+
+#[test]
+fn a_storm_of_forged_rtps_leaves_memory_bounded_the_page_whole_and_a_real_topic_counted()
+-> Result<()> {
+    let link = Link::new()?;
+    let target = format!("{}:{NOBODY}", link.robot.address());
+    let sender = Sender::new(
+        &link.monitor,
+        &format!("{}:0", link.monitor.address()),
+        &target,
+    )?;
+    weather(&link, SILENCE, || Ok(Storm::start(sender, forgery)))
+}
+
+#[test]
+fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_the_page_whole_and_a_real_topic_counted()
+-> Result<()> {
+    let link = Link::new()?;
+    let mut wire = Wire::new(&link.monitor, &link.robot, "eth0")?;
+    wire.port = NOBODY;
+    wire.shuffle = |packets| {
+        // Never the same ones missing, some twice, some over each other.
+        let lot = packets
+            .iter()
+            .fold(0, |sum, packet| sum ^ packet[5] ^ packet[7]) as usize;
+        let gone = lot % packets.len();
+        packets.remove(gone);
+        if let Some(packet) = packets.first_mut().filter(|_| lot.is_multiple_of(3)) {
+            packet[7] = packet[7].wrapping_add(1);
+        }
+        if lot.is_multiple_of(2) {
+            packets.reverse();
+        }
+    };
+    let large = |dice: &mut Dice| {
+        let mut bytes = forgery(dice);
+        bytes.resize(3000 + dice.pick(50_000) as usize, 0x55);
+        bytes
+    };
+    weather(&link, SILENCE, || Ok(Storm::start(wire, large)))
+}
+
+#[test]
+fn a_flood_of_samples_of_a_watched_topic_takes_nothing_from_the_others() -> Result<()> {
+    let link = Link::new()?;
+    let target = format!("{}:{NOBODY}", link.robot.address());
+    let source = format!("{}:0", link.monitor.address());
+    let sender = Sender::new(&link.monitor, &source, &target)?;
+    weather(&link, SILENCE, || Storm::of_samples(sender, "/flood"))
+}
+
+#[test]
+fn a_crowd_of_forgeries_that_fills_every_table_leaves_memory_bounded_and_goes_with_its_leases()
+-> Result<()> {
+    let link = Link::new()?;
+    let target = format!("{}:{NOBODY}", link.robot.address());
+    let source = format!("{}:0", link.monitor.address());
+    let sender = Sender::new(&link.monitor, &source, &target)?;
+    let lease = Duration::from_secs(forged::FINITE_LEASE_SECONDS.into());
+    weather(&link, lease + SILENCE, || {
+        Ok(Storm::of_a_crowd(sender, 2000, 30))
+    })
+}
+
+#[test]
+fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_on_a_topic_watched_by_name()
+-> Result<()> {
+    behind_a_flood(|_| ON_THE_WIRE.to_owned())
+}
+
+#[test]
+fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_at_the_sockets() -> Result<()>
+{
+    behind_a_flood(|link| at_the_sockets_of(&link.robot))
+}
+
+#[test]
+fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let file = |name: &str| directory.path().join(name);
+    // The build directory need not be open to everybody.
+    std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
+    let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
+    std::fs::write(file("ros2probe.yaml"), configuration)?;
+    let only = "-all,+net_raw,+bpf,+perfmon";
+    let script = format!(
+        "#!/bin/sh\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
+         --ambient-caps {only} --bounding-set {only} {} \"$@\"\n",
+        file("rp").display()
+    );
+    std::fs::write(file("start"), script)?;
+    for open in ["", "start", "rp"] {
+        std::fs::set_permissions(file(open), Permissions::from_mode(0o755))?;
+    }
+    let agent = Agent::start(&link.monitor, file("start"), &file("ros2probe.yaml"))?;
+    let status = std::fs::read_to_string(format!("/proc/{}/status", agent.process.pid()))?;
+    assert!(
+        status.contains("\nUid:\t65534\t65534\t65534\t65534\n"),
+        "{status}"
+    );
+    let mut sender = Sender::between(&link.robot, &link.monitor)?;
+    let mut talker = Talker::new(1, "/unprivileged");
+    introduce(&talker, &mut sender)?;
+    talk(&mut talker, &mut sender, [320; 500])?;
+    let page = agent.settled_scrape("/unprivileged", 500)?;
+    let counted = page.sum("ros2_topic_messages_total", &[("topic", "/unprivileged")]);
+    assert_eq!(counted, 500.0, "{}", page.0);
+    // Once the writer is classified the filter meters it: it was told so without privilege.
+    let metered = page.sum("ros2probe_filter_events_total", &[("event", "metered")]);
+    assert!(metered > 400.0, "{metered} of 500 metered");
+    assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
+    Ok(())
+}
+
+/// More participants than the agent has room for, each of which repeats itself every other second as
+/// a real one would; and a robot that is started meanwhile.
+fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("ros2probe.yaml");
+    let configuration = format!("watch: [/**, /real]\n{}", capture(&link));
+    std::fs::write(&file, configuration)?;
+    let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &file)?;
+    // At the sockets a datagram is seen where one receives it.
+    let to = format!("{}:{NOBODY}", link.robot.address());
+    let _receiver = link.robot.hold(|| Sender::new(&link.robot, &to, &to))?;
+    let from = format!("{}:0", link.monitor.address());
+    let sender = Sender::new(&link.monitor, &from, &to)?;
+    let flood = Storm::of_a_crowd(Paced(sender), 1500, 4);
+    std::thread::sleep(Duration::from_secs(6));
+    let full = [("limit", "participants")];
+    let page = agent.scrape()?;
+    assert_eq!(page.sum("ros2probe_at_limit", &full), 1.0, "{}", page.0);
+
+    let stream = Stream {
+        topic: "/real".to_owned(),
+        ..Stream::small(600)
+    };
+    let start = |host: &Namespace, role| Peer::start(host, Stack::Cyclone, role, &stream, &["/n"]);
+    let came = Instant::now();
+    let mut subscriber = start(&link.monitor, Role::Subscriber)?;
+    let mut publisher = start(&link.robot, Role::Publisher)?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+    let real = [("topic", "/real")];
+    agent.scrape_until("/real is there", |page| {
+        page.sum("ros2_topic_publishers", &real) == 1.0
+    })?;
+    eprintln!("the newcomer is seen after {:?}", came.elapsed());
+    publisher.go()?;
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let page = agent.settled_scrape("/real", stream.count)?;
+    let counted = page.sum("ros2_topic_messages_total", &real);
+    assert_eq!(counted, stream.count as f64, "{}", agent.scrape()?.0);
+    assert_eq!(page.sum("ros2_topic_lost_messages_total", &real), 0.0);
+
+    let readiness = agent.request("/readyz")?;
+    let said = "ready\ndegraded: at a limit: participants (1000 of 1000, ";
+    assert!(readiness.starts_with(said), "{readiness}");
+    let [program, arguments @ ..] = &link.robot.outside();
+    let doctor = Command::new(program)
+        .args(arguments)
+        .arg(env!("CARGO_BIN_EXE_rp"))
+        .args(["doctor", "--json", "--host", "127.0.0.1:17401"])
+        .output()?;
+    let report: serde_json::Value = serde_json::from_slice(&doctor.stdout)?;
+    assert_eq!(report["verdict"], "problem", "{report:#}");
+    let sent = flood.end()?;
+    eprintln!("{sent} datagrams forged");
+    Ok(())
+}
+
+/// Some 2000 datagrams a second.
+struct Paced(Sender);
+
+impl Carrier for Paced {
+    fn carry(&mut self, payload: &[u8]) -> Result<()> {
+        std::thread::sleep(Duration::from_micros(400));
+        self.0.carry(payload)
+    }
+}
+
+/// What must hold of an agent on the robot while a storm comes in, and after so long a silence.
+fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>) -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("ros2probe.yaml");
+    std::fs::write(&file, format!("watch: [/**]\nlog: warn\n{ON_THE_WIRE}"))?;
+    let log = directory.path().join("log");
+    let rp = Path::new(env!("CARGO_BIN_EXE_rp"));
+    let agent = Agent::start_logging(&link.robot, rp, &file, &log)?;
+    let before = Usage::of(agent.process.pid())?;
+    let stream = Stream {
+        topic: "/real".to_owned(),
+        ..Stream::small(STORM.as_secs() * 200)
+    };
+    let start =
+        |host: &Namespace, role, node| Peer::start(host, Stack::Cyclone, role, &stream, &[node]);
+    let mut subscriber = start(&link.monitor, Role::Subscriber, "/listener")?;
+    let mut publisher = start(&link.robot, Role::Publisher, "/driver")?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+
+    publisher.go()?;
+    let storm = storm()?;
+    let began = Instant::now();
+    let (mut largest, mut oldest) = (0, 0_f64);
+    while began.elapsed() < STORM {
+        let page = agent.scrape()?;
+        well_formed(&page);
+        oldest = oldest.max(page.sum("ros2probe_snapshot_age_seconds", &[]));
+        largest = largest.max(Usage::of(agent.process.pid())?.memory.unreclaimable);
+        std::thread::sleep(Duration::from_millis(300));
+    }
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let cpu = Usage::of(agent.process.pid())?.since(&before).cpu;
+    let sent = storm.end()?;
+    let ended = Instant::now();
+    let page = agent.settled_scrape("/real", stream.count)?;
+    largest = largest.max(Usage::of(agent.process.pid())?.memory.unreclaimable);
+    well_formed(&page);
+    let growth = largest.saturating_sub(before.memory.unreclaimable);
+    eprintln!(
+        "{sent} datagrams forged, {cpu:?} of CPU, {} KiB more memory, oldest page {oldest} s, {} frames \
+         and {} records dropped",
+        growth >> 10,
+        page.sum("ros2probe_capture_dropped_packets_total", &[]),
+        page.sum("ros2probe_records_dropped_total", &[]),
+    );
+    assert!(sent > 20_000, "{sent} datagrams are no storm");
+    assert!(growth < GROWTH, "{growth} bytes more");
+    assert!(oldest < 10.0, "a page was {oldest} s old");
+    let real = |name| page.sum(name, &[("topic", "/real")]);
+    // What an agent that was kept from the CPU could not take in, it says.
+    let unseen = page.sum("ros2probe_capture_dropped_packets_total", &[])
+        + page.sum("ros2probe_records_dropped_total", &[]);
+    let missing = stream.count as f64 - real("ros2_topic_messages_total");
+    assert!((0.0..=unseen).contains(&missing), "{missing} of {unseen}");
+    assert!(
+        (0.0..=missing).contains(&real("ros2_topic_lost_messages_total")),
+        "{}",
+        page.0
+    );
+
+    // It is over: who comes now is seen, and what it sends is counted.
+    std::thread::sleep(silence.saturating_sub(ended.elapsed()));
+    let stream = Stream {
+        topic: "/after".to_owned(),
+        count: 200,
+        ..stream
+    };
+    let came = Instant::now();
+    let start =
+        |host: &Namespace, role, node| Peer::start(host, Stack::Cyclone, role, &stream, &[node]);
+    let mut subscriber = start(&link.monitor, Role::Subscriber, "/late_listener")?;
+    let mut publisher = start(&link.robot, Role::Publisher, "/late_driver")?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+    let both = ["/late_listener", "/late_driver"];
+    loop {
+        let page = agent.scrape()?;
+        let nodes = page.labels_of("ros2_node_info", "ros_node");
+        let publishers = page.sum("ros2_topic_publishers", &[("topic", "/after")]);
+        if both.iter().all(|node| nodes.contains(*node)) && publishers == 1.0 {
+            break;
+        }
+        assert!(
+            came.elapsed() < RECOVERY,
+            "newcomers are not seen: {nodes:?}"
+        );
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    eprintln!("newcomers are seen after {:?}", came.elapsed());
+    publisher.go()?;
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let page = agent.settled_scrape("/after", 200)?;
+    let after = page.sum("ros2_topic_messages_total", &[("topic", "/after")]);
+    assert_eq!(after, 200.0, "{}", page.0);
+    let log = std::fs::read_to_string(&log).context("the agent's log")?;
+    assert!(log.lines().count() < 20, "{log}");
+    Ok(())
+}
+
+fn well_formed(page: &Scrape) {
+    let said = local_agent::promtool(&page.0);
+    assert_eq!(said, "", "{}", page.0);
+}

@@ -1,0 +1,451 @@
+//! A robot that was there before the agent: what it said once is remembered through a restart of
+//! the agent, and can be asked for; until then what cannot be named is shown as it is.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::{Agent, Scrape};
+use ros2probe_testing::harness::capture::{Capture, SETTLE};
+use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use tempfile::TempDir;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Names are said once: what the restarted agent does not know by then it never learns.
+const AT_ONCE: Duration = Duration::from_secs(5);
+/// Two announcements of each participant.
+const AFTERWARDS: Duration = Duration::from_secs(7);
+/// Seconds in which each announces itself once at least.
+const LISTEN: &str = "5";
+/// Of Cyclone DDS, which otherwise announces itself every 8 s. Fast DDS does every 3 s.
+const TALKATIVE: &str = "CYCLONEDDS_URI=<Discovery><SPDPInterval>3s</SPDPInterval></Discovery>";
+const NODES: [&str; 3] = ["/camera", "/listener", "/talker"];
+
+#[test]
+fn an_agent_restarted_on_a_running_fast_dds_robot_knows_all_names() -> Result<()> {
+    restarted_on_a_running_robot(Stack::Fast)
+}
+
+#[test]
+fn an_agent_restarted_on_a_running_cyclone_dds_robot_knows_all_names() -> Result<()> {
+    restarted_on_a_running_robot(Stack::Cyclone)
+}
+
+#[test]
+fn a_running_fast_dds_robot_that_is_asked_tells_all_names() -> Result<()> {
+    asked(Stack::Fast)
+}
+
+#[test]
+fn a_running_cyclone_dds_robot_that_is_asked_tells_all_names() -> Result<()> {
+    asked(Stack::Cyclone)
+}
+
+#[test]
+fn a_full_disk_costs_one_line_in_the_log_and_the_state_alone() -> Result<()> {
+    let scene = Scene::new()?;
+    let state = scene.file("state");
+    let _disk = Disk::mount(&state)?;
+    fs::write(state.join("something-else"), [7; 44 << 10])?;
+    let log = scene.file("log");
+    let program = env!("CARGO_BIN_EXE_rp");
+    let agent = Agent::start_logging(&scene.place, program, &scene.configuration()?, &log)?;
+    let _robot = scene.robot(Stack::Cyclone)?;
+    let written = |outcome: &'static str, least: f64| {
+        let labels = [("outcome", outcome)];
+        move |page: &Scrape| {
+            let count = page.value("ros2probe_state_writes_total", &labels);
+            count.is_some_and(|count| count >= least)
+        }
+    };
+    // That of nobody still fits.
+    wait(&agent, written("failed", 1.0), PATIENCE, "a failure")?;
+    let known = |page: &Scrape| nodes(page).len() == NODES.len() && has_names(page);
+    let page = wait(&agent, known, PATIENCE, "all names")?;
+    let before = page.value("ros2probe_state_writes_total", &[("outcome", "written")]);
+    let lines = fs::read_to_string(&log)?;
+    assert_eq!(
+        lines.matches("state cannot be written").count(),
+        1,
+        "{lines}"
+    );
+    fs::remove_file(state.join("something-else"))?;
+    // With the next change.
+    let stream = Stream::small(1);
+    let host = &scene.link.robot;
+    let _more = Peer::start(host, Stack::Cyclone, Role::Subscriber, &stream, &["/more"])?;
+    let again = written("written", before.unwrap_or(0.0) + 1.0);
+    wait(&agent, again, PATIENCE, "a state that is written again")?;
+    let state = fs::read_to_string(state.join("discovery.json"))?;
+    assert!(
+        state.contains("/talker") && state.contains("/more"),
+        "{state}"
+    );
+    Ok(())
+}
+
+/// A very small disk.
+struct Disk(PathBuf);
+
+impl Disk {
+    fn mount(place: &Path) -> Result<Disk> {
+        harness::run(&format!(
+            "mount -t tmpfs -o size=48k tmpfs {}",
+            place.display()
+        ))?;
+        Ok(Disk(place.to_path_buf()))
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let _ = harness::run(&format!("umount -l {}", self.0.display()));
+    }
+}
+
+fn restarted_on_a_running_robot(stack: Stack) -> Result<()> {
+    let scene = Scene::new()?;
+    let agent = scene.agent()?;
+    let robot = scene.robot(stack)?;
+    let known = |page: &Scrape| nodes(page).len() == NODES.len() && has_names(page);
+    let before = wait(&agent, known, PATIENCE, "all names")?;
+    // Written a few seconds after the last change at the latest, and so after a crash too.
+    std::thread::sleep(Duration::from_secs(4));
+    agent.process.signal("KILL")?;
+    drop(agent);
+    let recording = Capture::start(&scene.place, &scene.file("agent.pcap"))?;
+    let started = Instant::now();
+    let mut agent = scene.agent()?;
+    let after = wait(&agent, known, AT_ONCE, "all names after the restart")?;
+    println!(
+        "{stack:?}: all names {:?} after the start",
+        started.elapsed()
+    );
+    for name in ["ros2_node_info", "ros2_topic_info", "ros2_participants"] {
+        assert_eq!(lines(&after, name), lines(&before, name), "{name}");
+    }
+    assert_eq!(after.sum("ros2_discovery_events_total", &[]), 0.0);
+    let confirmed = |page: &Scrape| page.value("ros2probe_restored_participants", &[]) == Some(0.0);
+    let page = wait(&agent, confirmed, PATIENCE, "everybody confirmed")?;
+    assert_eq!(nodes(&page).len(), NODES.len());
+    assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0);
+    assert!(page.sum("ros2_topic_messages_total", &[("topic", "/imu")]) > 0.0);
+    assert!(agent.process.udp_ports()?.is_empty());
+    agent.process.terminate()?;
+    std::thread::sleep(SETTLE);
+    assert_eq!(
+        count(&recording.finish()?, "udp or igmp")?,
+        0,
+        "the agent sent"
+    );
+
+    // Who leaves while nobody looks is gone after one lease.
+    drop(robot);
+    let agent = scene.agent()?;
+    wait(&agent, known, AT_ONCE, "names of the dead")?;
+    let gone = |page: &Scrape| page.sum("ros2_participants", &[]) == 0.0;
+    let page = wait(&agent, gone, PATIENCE, "nobody")?;
+    assert!(nodes(&page).is_empty());
+    assert_eq!(
+        page.value("ros2probe_restored_participants", &[]),
+        Some(0.0)
+    );
+    Ok(())
+}
+
+fn asked(stack: Stack) -> Result<()> {
+    let scene = Scene::new()?;
+    let robot = scene.robot(stack)?;
+    std::thread::sleep(Duration::from_secs(1));
+    let agent = scene.agent()?;
+    let unknown = |page: &Scrape| {
+        let rate = page.value("ros2_unknown_writer_rate_hertz", &[]);
+        let processes = page.labels_of("ros2_unknown_writer_info", "process");
+        let heard = page.sum("ros2_participants", &[]) == 2.0;
+        heard && rate.is_some_and(|rate| (80.0..120.0).contains(&rate)) && processes.len() == 1
+    };
+    let page = wait(&agent, unknown, PATIENCE, "an unknown writer with its rate")?;
+    let told = |label| page.labels_of("ros2_unknown_writer_info", label);
+    let one = |text: &str| BTreeSet::from([text.to_owned()]);
+    assert_eq!(told("pid"), one(&robot.publisher.process.pid().to_string()));
+    assert!(told("process").iter().all(|name| !name.is_empty()));
+    assert!(
+        told("vendor").iter().all(|name| name.contains("DDS")),
+        "{}",
+        page.0
+    );
+    assert!(nodes(&page).is_empty() && !has_names(&page));
+
+    let recording = Capture::start(&scene.link.monitor, &scene.file("dry.pcap"))?;
+    let output = scene.discover(&["--all", "--dry-run", "--interface", INTERFACE])?;
+    let said = String::from_utf8(output.stdout)?;
+    assert!(
+        output.status.success() && said.starts_with("2 participants"),
+        "{said}"
+    );
+    let guids = page.labels_of("ros2_participant_info", "participant");
+    let one = guids.first().context("no participant")?;
+    let output = scene.discover(&["--participant", one, "--dry-run", "--no-nodes"])?;
+    let said = String::from_utf8(output.stdout)?;
+    assert!(
+        output.status.success() && said.starts_with("1 participant "),
+        "{said}"
+    );
+    let plan = ["introduction", "request", "goodbye"];
+    let planned = said.lines().filter(|line| line.contains(", at most "));
+    let planned = planned.map(|line| line.trim().split(',').next().unwrap_or_default());
+    assert_eq!(planned.collect::<Vec<_>>(), plan, "{said}");
+    std::thread::sleep(SETTLE);
+    let monitor = scene.link.monitor.address();
+    let ours = format!("udp and src host {monitor}");
+    assert_eq!(count(&recording.finish()?, &ours)?, 0, "a dry run sent");
+
+    let path = scene.file("asked.pcap");
+    let recording = Capture::start(&scene.link.monitor, &path)?;
+    let log_before = robot.log()?;
+    let output = scene.discover(&["--all"])?;
+    let said = String::from_utf8(output.stdout)?;
+    println!("{said}");
+    assert!(output.status.success(), "{said}");
+    for node in NODES {
+        assert!(said.contains(&format!("node   {node}\n")), "{said}");
+    }
+    assert!(
+        said.contains("writer /imu sensor_msgs/msg/PointCloud2\n"),
+        "{said}"
+    );
+    let known = |page: &Scrape| nodes(page) == NODES.map(str::to_owned).into() && has_names(page);
+    let page = wait(&agent, known, AT_ONCE * 2, "all names after asking")?;
+    assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0);
+    std::thread::sleep(AFTERWARDS);
+    std::thread::sleep(SETTLE);
+
+    // What was sent is what was said, to each its introduction first and its goodbye last.
+    let recording = recording.finish()?;
+    let sent = said
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("sent "));
+    let sent = sent.map(|line| line.split_once(' ').map_or("", |(count, _)| count).parse());
+    let sent: Vec<usize> = sent.collect::<Result<_, _>>()?;
+    assert_eq!(sent.len(), 2, "{said}");
+    assert!(
+        sent.iter().all(|packets| (4..=6).contains(packets)),
+        "{said}"
+    );
+    assert_eq!(count(&recording, &ours)?, sent.iter().sum::<usize>());
+    let to_nobody_else = format!("{ours} and not dst host {}", scene.link.robot.address());
+    assert_eq!(count(&recording, &to_nobody_else)?, 0);
+    let refusals = format!("icmp and host {monitor}");
+    assert_eq!(
+        count(&recording, &refusals)?,
+        0,
+        "a port was closed too early"
+    );
+    let conversations = ports(&recording, &ours)?;
+    assert_eq!(conversations.len(), 2);
+    for port in conversations {
+        let own = format!("{ours} and src port {port}");
+        let packets = payloads(&recording, &own)?;
+        let is = |packet: &str, mark: &str| packet.contains(mark);
+        // PID_BUILTIN_ENDPOINT_SET; PID_STATUS_INFO of a goodbye.
+        assert!(is(&packets[0], "5800040039000000"), "{packets:?}");
+        let last = packets.last().context("no packet")?;
+        assert!(is(last, "7100040000000003"), "{packets:?}");
+        let answers = format!("udp and dst port {port}");
+        let times = times(&recording, &format!("{own} or {answers}"))?;
+        let life = times.last().unwrap_or(&0.0) - times.first().unwrap_or(&0.0);
+        assert!(life < 2.0, "packets to a port that is gone, {life} s later");
+    }
+    // Nobody on the robot has noticed.
+    let log_after = robot.log()?;
+    assert_eq!(endpoints(&log_before), endpoints(&log_after));
+    let received = log_after[1].sequences("sub");
+    assert!(
+        received.windows(2).all(|pair| pair[1] == pair[0] + 1),
+        "{received:?}"
+    );
+    assert!(received.len() > log_before[1].sequences("sub").len() + 1000);
+    let participants = |page: &Scrape| page.sum("ros2_participants", &[]) == 2.0;
+    wait(&agent, participants, AT_ONCE, "the two that were there")?;
+    Ok(())
+}
+
+/// A link with a robot on one end, and a place for the agent that is on neither.
+struct Scene {
+    link: Link,
+    place: Namespace,
+    directory: TempDir,
+}
+
+struct Robot {
+    publisher: Peer,
+    subscriber: Peer,
+}
+
+impl Scene {
+    fn new() -> Result<Scene> {
+        let directory = tempfile::tempdir()?;
+        fs::create_dir(directory.path().join("state"))?;
+        Ok(Scene {
+            link: Link::new()?,
+            place: Namespace::alone()?,
+            directory,
+        })
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    fn configuration(&self) -> Result<PathBuf> {
+        let file = self.file("ros2probe.yaml");
+        let cgroup = self.link.cgroup().display();
+        let state = self.file("state");
+        let text = format!(
+            "watch: [/**]\nlog: warn\nstate_directory: {}\ncapture: {{source: host, cgroup: {cgroup}}}\n",
+            state.display()
+        );
+        fs::write(&file, text)?;
+        Ok(file)
+    }
+
+    fn agent(&self) -> Result<Agent<'_>> {
+        let program = env!("CARGO_BIN_EXE_rp");
+        Agent::start(&self.place, program, &self.configuration()?)
+    }
+
+    /// A publisher with two nodes and its subscriber, on one host.
+    fn robot(&self, stack: Stack) -> Result<Robot> {
+        let stream = Stream {
+            rate: 100.0,
+            reliable: true,
+            // Whatever the domain.
+            domain: if stack == Stack::Fast { 3 } else { 0 },
+            ..Stream::small(100_000)
+        };
+        let mut host = self.link.robot.inside();
+        host.extend(["env", TALKATIVE].map(str::to_owned));
+        let start = |role, nodes: &[&str]| Peer::launch_behind(&host, stack, role, &stream, nodes);
+        let mut subscriber = start(Role::Subscriber, &["/listener"])?;
+        subscriber.wait_ready()?;
+        let mut publisher = start(Role::Publisher, &["/talker", "/camera"])?;
+        publisher.wait_ready()?;
+        subscriber.wait_matched()?;
+        publisher.wait_matched()?;
+        publisher.go()?;
+        Ok(Robot {
+            publisher,
+            subscriber,
+        })
+    }
+
+    /// `rp discover` on the other end of the link.
+    fn discover(&self, arguments: &[&str]) -> Result<Output> {
+        let words = self.link.monitor.on_network();
+        let [enter, words @ ..] = &words[..] else {
+            anyhow::bail!("no host");
+        };
+        let output = Command::new(enter)
+            .args(words)
+            .arg(Path::new(env!("CARGO_BIN_EXE_rp")))
+            .args(["discover", "--listen", LISTEN])
+            .args(arguments)
+            .arg("--config")
+            .arg(self.configuration()?)
+            .output()?;
+        Ok(output)
+    }
+}
+
+impl Robot {
+    fn log(&self) -> Result<[harness::event_log::EventLog; 2]> {
+        Ok([self.publisher.log()?, self.subscriber.log()?])
+    }
+}
+
+fn endpoints(logs: &[harness::event_log::EventLog]) -> Vec<String> {
+    let events = logs.iter().flat_map(|log| &log.0);
+    let other = events.filter(|event| !matches!(event.ev.as_str(), "pub" | "sub"));
+    other.map(|event| format!("{event:?}")).collect()
+}
+
+fn nodes(page: &Scrape) -> BTreeSet<String> {
+    page.labels_of("ros2_node_info", "ros_node")
+}
+
+fn has_names(page: &Scrape) -> bool {
+    let ends = ["ros2_topic_publishers", "ros2_topic_subscriptions"];
+    let one = |name: &&str| page.value(name, &[("topic", "/imu")]) == Some(1.0);
+    let typed = page.labels_of("ros2_topic_info", "message_type");
+    ends.iter().all(one) && typed.contains("sensor_msgs/msg/PointCloud2")
+}
+
+fn lines<'a>(page: &'a Scrape, name: &str) -> BTreeSet<&'a str> {
+    let lines = page.0.lines();
+    lines.filter(|line| line.starts_with(name)).collect()
+}
+
+/// Scrapes until the page shows `what`.
+fn wait(
+    agent: &Agent<'_>,
+    shows: impl Fn(&Scrape) -> bool,
+    limit: Duration,
+    what: &str,
+) -> Result<Scrape> {
+    let deadline = Instant::now() + limit;
+    loop {
+        let page = agent.scrape()?;
+        if shows(&page) {
+            return Ok(page);
+        }
+        let in_time = Instant::now() < deadline;
+        assert!(in_time, "not {what} within {limit:?}: {}", page.0);
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+/// What tcpdump prints of the packets of a recording that this filter lets through.
+fn read(recording: &Path, options: &str, filter: &str) -> Result<String> {
+    let file = recording.display();
+    harness::run(&format!("tcpdump -nn -tt {options} -r {file} {filter}"))
+}
+
+fn count(recording: &Path, filter: &str) -> Result<usize> {
+    Ok(read(recording, "", filter)?.lines().count())
+}
+
+fn times(recording: &Path, filter: &str) -> Result<Vec<f64>> {
+    let text = read(recording, "", filter)?;
+    let times = text.lines().filter_map(|line| line.split(' ').next());
+    times.map(|time| time.parse().context("no time")).collect()
+}
+
+/// Source ports.
+fn ports(recording: &Path, filter: &str) -> Result<BTreeSet<u16>> {
+    let text = read(recording, "", filter)?;
+    // 1795143000.123 IP 10.99.0.2.40123 > 10.99.0.1.7412: UDP, length 208
+    let sources = text.lines().filter_map(|line| line.split(' ').nth(2));
+    let ports = sources.filter_map(|source| source.rsplit('.').next());
+    ports.map(|port| port.parse().context("no port")).collect()
+}
+
+/// Hexadecimal digits of each packet.
+fn payloads(recording: &Path, filter: &str) -> Result<Vec<String>> {
+    let text = read(recording, "-x", filter)?;
+    let mut packets: Vec<String> = Vec::new();
+    for line in text.lines() {
+        match line.trim_start().split_once(":  ") {
+            Some((offset, digits)) if offset.starts_with("0x") => {
+                let packet = packets.last_mut().context("digits of no packet")?;
+                packet.extend(digits.chars().filter(char::is_ascii_hexdigit));
+            }
+            _ => packets.push(String::new()),
+        }
+    }
+    Ok(packets)
+}

@@ -1,0 +1,49 @@
+//! The agent beside real DDS participants and a browser, in network namespaces. Needs root.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+mod api;
+mod attach;
+mod between_robots;
+mod browser;
+mod counts;
+mod dashboards;
+mod deploy;
+mod diagnosis;
+mod discovery;
+mod endurance;
+mod events;
+mod farewell;
+mod faults;
+mod fidelity;
+mod handed;
+mod host;
+mod host_hook;
+mod hostile;
+mod inside;
+mod late_start;
+mod links;
+mod otlp;
+mod page;
+mod peers_talk;
+mod privilege;
+mod prometheus;
+mod rates;
+mod record;
+mod samples;
+mod shm;
+mod shm_exact;
+mod sources;
+mod unnoticed;
+
+use std::process::Command;
+
+/// `rp` of this build, with an environment that does not leak into it.
+fn rp() -> Command {
+    ros2probe_testing::local_agent::rp(env!("CARGO_BIN_EXE_rp"))
+}

@@ -1,0 +1,189 @@
+//! Two hosts of the demo robot, an agent and a real OpenTelemetry receiver on each: both report the
+//! same traces, and a receiver that goes and comes back costs no capture.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe::model::discovery::hexadecimal;
+use ros2probe::model::trace::Message;
+use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::rotel::{Item, Rotel, exports};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+const MESSAGES: u64 = 1_200;
+
+fn on(host: &Namespace) -> Command {
+    let [enter, network] = host.outside();
+    let mut command = Command::new(enter);
+    command.arg(network).arg(Rotel::binary());
+    command
+}
+
+/// Traces every other message and pushes everything to `receiver`.
+fn configuration(directory: &Path, host: &Namespace, receiver: &Rotel) -> Result<PathBuf> {
+    let path = directory.join(format!("{}.yaml", host.name()));
+    let yaml = format!(
+        "watch: [{{topic: /**, trace: 0.5}}]\n\
+         otlp: {{endpoint: 'http://{}', interval_s: 1, robot: {}}}\n{}",
+        receiver.address,
+        host.name(),
+        at_the_sockets_of(host)
+    );
+    std::fs::write(&path, yaml)?;
+    Ok(path)
+}
+
+/// The spans of this name, by sequence number.
+fn spans(text: &str, name: &str) -> BTreeMap<u64, Item> {
+    let items = exports(text).into_iter().flat_map(|export| export.items);
+    let named = items.filter(|item| item.fields.get("Name").is_some_and(|found| found == name));
+    named
+        .filter_map(|item| {
+            let number = item.attributes.get("sequence_number")?.parse().ok()?;
+            Some((number, item))
+        })
+        .collect()
+}
+
+fn field(item: &Item, name: &str) -> Result<String> {
+    let value = item.fields.get(name).or(item.attributes.get(name));
+    value
+        .cloned()
+        .with_context(|| format!("no {name} in {item:?}"))
+}
+
+#[test]
+fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let at_robot = Rotel::start(&mut on(&link.robot), directory.path(), None);
+    let mut at_monitor = Rotel::start(&mut on(&link.monitor), directory.path(), None);
+    let mut agents = Vec::new();
+    for (host, receiver) in [(&link.robot, &at_robot), (&link.monitor, &at_monitor)] {
+        let yaml = configuration(directory.path(), host, receiver)?;
+        agents.push(Agent::start(host, env!("CARGO_BIN_EXE_rp"), &yaml)?);
+    }
+    let [agent, _] = agents.as_slice() else {
+        unreachable!("there are two")
+    };
+    let mut roles = Vec::new();
+    for (host, role) in [
+        (&link.robot, "base"),
+        (&link.robot, "lidar"),
+        (&link.monitor, "monitor"),
+    ] {
+        roles.push(Process::start(&host.inside(), robot()?, ["--role", role])?);
+    }
+    let stream = Stream {
+        topic: "/truth".to_owned(),
+        ..Stream::small(MESSAGES)
+    };
+    let mut subscriber = Peer::start(
+        &link.monitor,
+        Stack::Rust,
+        Role::Subscriber,
+        &stream,
+        &["/listener"],
+    )?;
+    let mut publisher = Peer::start(
+        &link.robot,
+        Stack::Rust,
+        Role::Publisher,
+        &stream,
+        &["/sensor"],
+    )?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+
+    let mut at_robot = at_robot;
+    for (receiver, names) in [
+        (&mut at_robot, &["send /points", "receive /cmd_vel"][..]),
+        (
+            &mut at_monitor,
+            &["receive /points", "send /cmd_vel", "settle /cmd_vel"],
+        ),
+    ] {
+        let told = |text: &str, name: &&str| text.contains(&format!("Name           : {name}\n"));
+        let text = receiver.wait_for("all kinds of spans have come", |text| {
+            names.iter().all(|name| told(text, name))
+                && text.contains("-> Name: ros2.topic.messages\n")
+        });
+        ensure!(text.contains("ros2.participant.discovered"), "events, too");
+    }
+    let clouds = spans(&at_robot.text(), "send /points");
+    let cloud = clouds.values().next().context("a cloud")?;
+    let fragments: u64 = field(cloud, "fragments")?.parse()?;
+    ensure!(fragments > 100, "{fragments} fragments");
+    let time = |name: &str| -> Result<u64> { Ok(field(cloud, name)?.parse()?) };
+    let (begin, end) = (time("Start time")?, time("End time")?);
+    let own = time("source_timestamp_unix_nano")?;
+    ensure!(
+        own <= begin && begin < end && end - own < 5_000_000_000,
+        "{cloud:?}"
+    );
+
+    // The receiver is away while the stream begins.
+    let address = at_robot.address;
+    drop(at_robot);
+    publisher.go()?;
+    let dropped = "ros2probe_otlp_dropped_total";
+    agent.scrape_until("given up metrics", |page| {
+        page.sum(dropped, &[("signal", "metrics")]) > 0.0
+    })?;
+    let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), Some(address));
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let page = agent.settled_scrape("/truth", MESSAGES)?;
+    let truth = [("topic", "/truth")];
+    let counted = page.sum("ros2_topic_messages_total", &truth);
+    ensure!(counted as u64 == MESSAGES, "{counted} counted");
+    ensure!(page.sum("ros2_topic_lost_messages_total", &truth) < 0.5);
+    ensure!(page.sum("ros2probe_records_dropped_total", &[]) < 0.5);
+    let traces = page.sum(dropped, &[("signal", "traces")]);
+    ensure!(traces < 0.5, "{traces} spans dropped");
+
+    let writer = publisher
+        .log()?
+        .0
+        .iter()
+        .find_map(|event| event.guid.clone());
+    let writer = guid(&writer.context("the publisher says its GUID")?)?;
+    let sampled: Vec<u64> = (1..=MESSAGES)
+        .filter(|number| Message::identity(writer, *number) >> 55 & 1 == 1)
+        .collect();
+    ensure!(
+        sampled.len() as u64 > MESSAGES / 3,
+        "{} sampled",
+        sampled.len()
+    );
+    let all = |text: &str, name: &str| {
+        let spans = spans(text, name);
+        sampled.iter().all(|number| spans.contains_key(number))
+    };
+    let text = at_robot.wait_for("all sent are told", |text| all(text, "send /truth"));
+    let sent = spans(&text, "send /truth");
+    let text = at_monitor.wait_for("all received are told", |text| all(text, "receive /truth"));
+    let received = spans(&text, "receive /truth");
+    ensure!(sent.len() == sampled.len() && received.len() == sampled.len());
+    for (number, sent) in &sent {
+        let received = received.get(number).context("not received")?;
+        ensure!(field(sent, "Trace ID")? == field(received, "Trace ID")?);
+        ensure!(field(sent, "ID")? == field(received, "Parent ID")?);
+        let trace = format!("{:032x}", Message::identity(writer, *number));
+        ensure!(field(sent, "Trace ID")? == trace);
+    }
+    Ok(())
+}
+
+fn guid(text: &str) -> Result<Guid> {
+    let (prefix, entity) = text.split_at_checked(24).context("no GUID")?;
+    let prefix = hexadecimal(prefix).map(GuidPrefix);
+    let entity = hexadecimal(entity).map(EntityId);
+    let (prefix, entity) = prefix.zip(entity).context("no GUID")?;
+    Ok(Guid::new(prefix, entity))
+}

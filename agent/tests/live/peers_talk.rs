@@ -1,0 +1,103 @@
+//! The test peers and the harness themselves: before anything is said about the agent, what the
+//! peers log must agree with what crossed the link.
+
+use std::time::Duration;
+
+use anyhow::Result;
+use ros2probe_testing::harness::loss::Loss;
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+
+const SAMPLES: u64 = 600;
+
+#[test]
+fn fast_dds_delivers_every_sample() -> Result<()> {
+    delivers_every_sample(Stack::Fast)
+}
+
+#[test]
+fn cyclone_dds_delivers_every_sample() -> Result<()> {
+    delivers_every_sample(Stack::Cyclone)
+}
+
+#[test]
+fn rust_dds_delivers_every_sample() -> Result<()> {
+    delivers_every_sample(Stack::Rust)
+}
+
+#[test]
+fn fast_dds_loses_what_the_link_drops() -> Result<()> {
+    loses_what_the_link_drops(Stack::Fast)
+}
+
+#[test]
+fn cyclone_dds_loses_what_the_link_drops() -> Result<()> {
+    loses_what_the_link_drops(Stack::Cyclone)
+}
+
+#[test]
+fn rust_dds_loses_what_the_link_drops() -> Result<()> {
+    loses_what_the_link_drops(Stack::Rust)
+}
+
+fn delivers_every_sample(stack: Stack) -> Result<()> {
+    let exchange = Exchange::of_small_samples(stack, 0)?;
+    assert_eq!(exchange.sent, (0..SAMPLES).collect::<Vec<_>>());
+    assert_eq!(exchange.received, exchange.sent);
+    Ok(())
+}
+
+fn loses_what_the_link_drops(stack: Stack) -> Result<()> {
+    let exchange = Exchange::of_small_samples(stack, 100)?;
+    assert_eq!(exchange.sent, (0..SAMPLES).collect::<Vec<_>>());
+    assert!(
+        exchange.dropped > 20,
+        "only {} of {SAMPLES} dropped",
+        exchange.dropped
+    );
+    assert_eq!(exchange.received.len() as u64, SAMPLES - exchange.dropped);
+    Ok(())
+}
+
+/// What a best-effort publisher sent, its subscriber received and the link dropped.
+struct Exchange {
+    sent: Vec<u64>,
+    received: Vec<u64>,
+    dropped: u64,
+}
+
+impl Exchange {
+    fn of_small_samples(stack: Stack, per_mille: u16) -> Result<Exchange> {
+        let link = Link::new()?;
+        let stream = Stream::small(SAMPLES);
+        let listener = ["/listener"];
+        let mut subscriber =
+            Peer::start(&link.monitor, stack, Role::Subscriber, &stream, &listener)?;
+        let mut publisher = Peer::start(
+            &link.robot,
+            stack,
+            Role::Publisher,
+            &stream,
+            &["/imu_driver"],
+        )?;
+        subscriber.wait_matched()?;
+        publisher.wait_matched()?;
+        let loss = Loss::of_samples(&link.robot, &link.monitor, &stream, per_mille)?;
+        publisher.go()?;
+        publisher.wait_sent(Duration::from_secs(60))?;
+        std::thread::sleep(Duration::from_millis(300));
+        let counts = loss.counts()?;
+        // A busy RustDDS writer packs several samples into a datagram; those are never dropped.
+        assert!(
+            counts.matched > SAMPLES / 2,
+            "{counts:?} of {SAMPLES} samples"
+        );
+        assert!(counts.matched <= SAMPLES, "{counts:?} of {SAMPLES} samples");
+        subscriber.process.terminate()?;
+        Ok(Exchange {
+            sent: publisher.log()?.sequences("pub"),
+            received: subscriber.log()?.sequences("sub"),
+            dropped: counts.dropped,
+        })
+    }
+}

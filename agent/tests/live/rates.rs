@@ -1,0 +1,362 @@
+//! `rp topic hz`, `bw`, `delay` and `echo` on a robot whose machine is busy: right where subscribers
+//! are not, and gone without a trace, however they end.
+
+use std::hint::spin_loop;
+use std::io::{BufRead as _, BufReader};
+use std::os::unix::process::ExitStatusExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::Agent;
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::usage::Usage;
+use ros2probe_testing::harness::wait_until;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+const RATE: f64 = 200.0;
+/// Of what is said and of what is true.
+const TOLERANCE: f64 = 0.1;
+
+/// One after the other: both keep the machine busy.
+static TURN: Mutex<()> = Mutex::new(());
+
+#[test]
+fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<()> {
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let (agent, socket) = agent(&host, directory.path())?;
+    let stream = Stream::small(100_000);
+    let subscriber = Peer::start(&host, Stack::Cyclone, Role::Subscriber, &stream, &["/ekf"])?;
+    let mut publisher = Peer::start(&host, Stack::Cyclone, Role::Publisher, &stream, &["/imu"])?;
+    publisher.wait_matched()?;
+    agent.scrape_until("published", |scrape| {
+        scrape.sum("ros2_topic_publishers", &[("topic", "/imu")]) > 0.0
+    })?;
+    let _load = Load::on_every_core();
+
+    // As many as there are kinds of ends, and some that only stay.
+    let start = |arguments: &str| Client::start(&socket, arguments);
+    let hz = start("hz /imu")?;
+    let mut killed = start("hz /imu /nobody")?;
+    let mut ended = [
+        (start("hz /imu --distro kilted")?, 0),
+        (start("hz imu --distro humble")?, 2),
+        (start("bw /imu --distro rolling")?, 0),
+        (start("bw /imu --distro kilted")?, 2),
+        (start("delay /imu --distro rolling")?, 2),
+    ];
+    let all = start("hz --all")?;
+    let bandwidth = start("bw /imu")?;
+    let delay = start("delay /imu")?;
+    open(&agent, 10)?;
+    publisher.go()?;
+
+    killed.prints("=====")?;
+    killed.child.kill()?;
+    killed.child.wait()?;
+    open(&agent, 9)?;
+    for (client, code) in &mut ended {
+        client.reports(3)?;
+        let status = client.interrupt()?;
+        ensure!(status == Some(*code), "{}: {status:?}", client.name);
+    }
+    piped_into_head(&socket)?;
+    open(&agent, 4)?;
+
+    // The busier the machine, the longer until single delays no longer show.
+    wait_until("the rate is said", || {
+        Ok((hz.last("average rate: ") - RATE).abs() <= TOLERANCE)
+    })
+    .with_context(|| hz.printed().join("\n"))?;
+    all.prints("average rate: ")?;
+    let log = publisher.log()?.0;
+    let sent: Vec<u64> = log
+        .iter()
+        .filter(|event| event.ev == "pub")
+        .map(|event| event.t)
+        .collect();
+    let (first, last) = (
+        sent.first().context("nothing sent")?,
+        sent.last().context("nothing")?,
+    );
+    let true_rate = (sent.len() - 1) as f64 / ((last - first) as f64 / 1e9);
+    let said = hz.last("average rate: ");
+    let heard = subscriber.log()?.sequences("sub").len();
+    eprintln!(
+        "said {said}, sent {true_rate:.3} Hz; of {} sent {heard} were received",
+        sent.len()
+    );
+    ensure!(
+        (said - true_rate).abs() <= true_rate / 1000.0,
+        "{said} of {true_rate}"
+    );
+    // 320 bytes in DDS's encoding, 200 times a second, over the span until now.
+    let said = bandwidth.last("");
+    ensure!((60.0..=70.0).contains(&said), "{said} KB/s");
+    let said = delay.last("average delay: ");
+    ensure!((0.0..0.1).contains(&said), "{said} s");
+
+    for client in [hz, all, bandwidth, delay] {
+        drop(client);
+    }
+    let_go(&agent, "/imu", 1000.0)?;
+    ensure!(publisher.log()?.sequences("pub").len() as f64 > sent.len() as f64 + RATE);
+    Ok(())
+}
+
+/// An agent that watches nothing by itself, and its socket.
+fn agent<'a>(host: &'a Namespace, directory: &Path) -> Result<(Agent<'a>, PathBuf)> {
+    let configuration = directory.join("ros2probe.yaml");
+    let socket = directory.join("api.sock");
+    let text = format!(
+        "capture: {{source: host, cgroup: {}, shm: {{mode: off}}}}\nwatch: []\n\
+         state_directory: {}\napi: {{socket: {}}}\n",
+        host.cgroup().display(),
+        directory.display(),
+        socket.display()
+    );
+    std::fs::write(&configuration, text)?;
+    let agent = Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)?;
+    Ok((agent, socket))
+}
+
+/// Point clouds of 2.72 MB, 20 a second: 54 MB a second go from the agent to who echoes them.
+#[test]
+fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()> {
+    const SIZE: usize = 2_720_000;
+    const AGENT: u64 = 160 << 20;
+    const CLIENT: u64 = 64 << 20;
+    let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let (agent, socket) = agent(&host, directory.path())?;
+    let stream = Stream {
+        reliable: true,
+        ..Stream::point_cloud(SIZE, 100_000)
+    };
+    let _subscriber = Peer::start(&host, Stack::Cyclone, Role::Subscriber, &stream, &["/map"])?;
+    let mut publisher = Peer::start(&host, Stack::Cyclone, Role::Publisher, &stream, &["/lidar"])?;
+    publisher.wait_matched()?;
+    agent.scrape_until("published", |scrape| {
+        scrape.sum("ros2_topic_publishers", &[("topic", "/points")]) > 0.0
+    })?;
+    let hz = Client::start(&socket, "hz /points")?;
+    let mut echo = Client::start(&socket, "echo /points")?;
+    publisher.go()?;
+    let shown = || -> usize {
+        let printed = echo.printed();
+        printed
+            .iter()
+            .filter(|line| *line == "row_step: 2719947")
+            .count()
+    };
+    let (mut of_agent, mut of_client) = (0, 0);
+    let mut spent = Usage::of(echo.child.id())?;
+    let before = (shown(), Instant::now(), spent);
+    wait_until("a hundred clouds are shown", || {
+        of_agent = of_agent.max(Usage::of(agent.process.pid())?.memory.unreclaimable);
+        spent = Usage::of(echo.child.id())?;
+        of_client = of_client.max(spent.memory.unreclaimable);
+        Ok(shown() >= 100)
+    })?;
+    eprintln!(
+        "agent {} MB, client {} MB and {:.2} CPU s for {} clouds in {:.1} s",
+        of_agent >> 20,
+        of_client >> 20,
+        spent.since(&before.2).cpu.as_secs_f64(),
+        shown() - before.0,
+        before.1.elapsed().as_secs_f64()
+    );
+    ensure!(of_agent < AGENT, "the agent took {of_agent} bytes");
+    ensure!(of_client < CLIENT, "the client took {of_client} bytes");
+
+    // Whoever is killed closes nothing by itself, and is not waited for.
+    echo.child.kill()?;
+    echo.child.wait()?;
+    let log = publisher.log()?.0;
+    let sent: Vec<u64> = log
+        .iter()
+        .filter(|event| event.ev == "pub")
+        .map(|event| event.t)
+        .collect();
+    hz.reports(4)?;
+    let (first, last) = (sent.first(), sent.last());
+    let (first, last) = (first.context("nothing sent")?, last.context("nothing")?);
+    let true_rate = (sent.len() - 1) as f64 / ((last - first) as f64 / 1e9);
+    let said = hz.last("average rate: ");
+    ensure!(
+        (said - true_rate).abs() <= true_rate / 20.0,
+        "{said} of {true_rate}"
+    );
+    drop(hz);
+    let_go(&agent, "/points", 50.0)
+}
+
+/// Nobody wants the topic any more: it goes on, and nobody counts. Had a client left its interest
+/// behind, somebody would.
+fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
+    wait_until("the topic is let go", || {
+        let counted = || -> Result<f64> {
+            let labels = [("topic", topic)];
+            Ok(agent.scrape()?.sum("ros2_topic_messages_total", &labels))
+        };
+        let before = counted()?;
+        ensure!(before > least, "{before} messages were counted");
+        std::thread::sleep(Duration::from_secs(2));
+        Ok(counted()? <= before)
+    })
+}
+
+/// So many subscriptions are open.
+fn open(agent: &Agent<'_>, wanted: u32) -> Result<()> {
+    let what = format!("{wanted} subscriptions open");
+    let page = agent.scrape_until(&what, |page| {
+        page.value("ros2probe_subscriptions", &[]) == Some(f64::from(wanted))
+    });
+    page.map(drop)
+}
+
+/// Ends when its reader has gone, without a word, as any program does.
+fn piped_into_head(socket: &Path) -> Result<()> {
+    let rp = env!("CARGO_BIN_EXE_rp");
+    let script = format!(
+        "{rp} topic hz /imu --socket {} | head -2; echo ${{PIPESTATUS[0]}}",
+        socket.display()
+    );
+    let output = Command::new("bash").args(["-c", &script]).output()?;
+    let (said, errors) = (
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr),
+    );
+    let lines: Vec<&str> = said.lines().collect();
+    let [rate, spread, code] = lines[..] else {
+        anyhow::bail!("{said}{errors}");
+    };
+    ensure!(
+        rate.starts_with("average rate: ") && spread.starts_with("\tmin: "),
+        "{said}"
+    );
+    ensure!(code == "141" && errors.is_empty(), "{said}{errors}");
+    Ok(())
+}
+
+/// One `rp`, and what it has printed.
+struct Client {
+    name: String,
+    child: Child,
+    printed: Arc<Mutex<Vec<String>>>,
+}
+
+impl Client {
+    fn start(socket: &Path, arguments: &str) -> Result<Client> {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_rp"))
+            .env_remove("ROS_DISTRO")
+            .env_remove("ROS_DOMAIN_ID")
+            .arg("topic")
+            .args(arguments.split(' '))
+            .arg("--socket")
+            .arg(socket)
+            .stdout(Stdio::piped())
+            .spawn()?;
+        let stdout = child.stdout.take().context("no output")?;
+        let printed = Arc::new(Mutex::new(Vec::new()));
+        let lines = Arc::clone(&printed);
+        std::thread::spawn(move || {
+            for line in BufReader::new(stdout).lines().map_while(Result::ok) {
+                lines
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner)
+                    .push(line);
+            }
+        });
+        let name = arguments.to_owned();
+        Ok(Client {
+            name,
+            child,
+            printed,
+        })
+    }
+
+    fn printed(&self) -> MutexGuard<'_, Vec<String>> {
+        self.printed.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn prints(&self, begin: &str) -> Result<()> {
+        let what = format!("{} prints `{begin}`", self.name);
+        wait_until(&what, || {
+            Ok(self.printed().iter().any(|line| line.starts_with(begin)))
+        })
+    }
+
+    /// So many more lines than now.
+    fn reports(&self, more: usize) -> Result<()> {
+        let now = self.printed().len();
+        let what = format!("{} goes on", self.name);
+        wait_until(&what, || Ok(self.printed().len() >= now + more))
+    }
+
+    /// The number behind these words, as printed last; none before the first.
+    fn last(&self, words: &str) -> f64 {
+        let printed = self.printed();
+        let mut numbers = printed.iter().rev().filter_map(|line| {
+            let number = line.strip_prefix(words)?.split(' ').next()?;
+            number.parse().ok()
+        });
+        numbers.next().unwrap_or(f64::NAN)
+    }
+
+    /// Ctrl-C.
+    fn interrupt(&mut self) -> Result<Option<i32>> {
+        harness::run(&format!("kill -INT {}", self.child.id()))?;
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            if let Some(status) = self.child.try_wait()? {
+                ensure!(status.signal().is_none(), "{}: {status}", self.name);
+                return Ok(status.code());
+            }
+            ensure!(Instant::now() < deadline, "{} does not end", self.name);
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+impl Drop for Client {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Keeps every core busy.
+struct Load {
+    on: Arc<AtomicBool>,
+}
+
+impl Load {
+    fn on_every_core() -> Load {
+        let on = Arc::new(AtomicBool::new(true));
+        let cores = std::thread::available_parallelism().map_or(2, usize::from);
+        for _ in 0..cores {
+            let on = Arc::clone(&on);
+            std::thread::spawn(move || {
+                while on.load(Ordering::Relaxed) {
+                    spin_loop();
+                }
+            });
+        }
+        Load { on }
+    }
+}
+
+impl Drop for Load {
+    fn drop(&mut self) {
+        self.on.store(false, Ordering::Relaxed);
+    }
+}

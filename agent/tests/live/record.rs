@@ -1,0 +1,685 @@
+//! Recordings of a robot at work, by the agent and by `rp bag record`: every message that was sent is
+//! in the bag or counted as missing, however the recording, its reader or its storage ends. Needs
+//! root.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitStatus, Stdio};
+use std::sync::{PoisonError, RwLock};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, Scrape};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::usage::Usage;
+use ros2probe_testing::harness::wait_until;
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+const RP: &str = env!("CARGO_BIN_EXE_rp");
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Two lidars of 13 MB/s each, and small topics.
+const CLOUD: usize = 644_000;
+const CLOUDS: u64 = 40;
+/// What fills a small disk.
+const SCAN: usize = 64_000;
+const SMALL: u64 = 600;
+/// Between a message and its way into the file: a second, and what a busy machine needs besides.
+const UNFLUSHED: Duration = Duration::from_secs(5);
+
+/// Point clouds take the machine for themselves.
+static MACHINE: RwLock<()> = RwLock::new(());
+
+#[test]
+fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
+    let _alone = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
+    let host = Namespace::alone()?;
+    let robot = Robot::start(&host, "watch: ['/**']\n", &host.on_network())?;
+    let streams = [
+        (Stack::Cyclone, "/front", CLOUD, CLOUDS),
+        (Stack::Fast, "/rear", CLOUD, CLOUDS),
+        (Stack::Cyclone, "/imu", 320, SMALL),
+        (Stack::Fast, "/odom", 320, SMALL),
+    ];
+    let mut pairs = Vec::new();
+    for (stack, topic, size, count) in streams {
+        let small = Stream::small(2 * count);
+        let stream = Stream {
+            topic: topic.to_owned(),
+            size,
+            rate: if size == CLOUD { 20.0 } else { small.rate },
+            reliable: true,
+            depth: if size == CLOUD { 20 } else { 1000 },
+            stretch: count,
+            linger: 60.0,
+            ..small
+        };
+        let subscriber = Peer::launch(&host, stack, Role::Subscriber, &stream, &["/map"])?;
+        let publisher = Peer::launch(&host, stack, Role::Publisher, &stream, &["/driver"])?;
+        pairs.push((topic, count, publisher, subscriber));
+    }
+    for (_, _, publisher, subscriber) in &mut pairs {
+        subscriber.wait_ready()?;
+        publisher.wait_ready()?;
+        publisher.wait_matched()?;
+    }
+    robot.agent.scrape_until("published", |page| {
+        let is_known = |topic| page.sum("ros2_topic_publishers", &[("topic", topic)]) > 0.0;
+        streams.iter().all(|(_, topic, ..)| is_known(topic))
+    })?;
+
+    // Both at once, and all the watches count besides.
+    let (status, _) = robot.ask("POST", "/recordings", &json!({"name": "all"}))?;
+    ensure!(status == 201, "{status}");
+    let mut client = Recorder::start(&robot, "client", &["-a"])?;
+    for (_, _, publisher, _) in &mut pairs {
+        publisher.go()?;
+    }
+    let page = settled(&robot, &pairs, 1)?;
+    let (status, ended) = robot.ask("DELETE", "/recordings/all", &Value::Null)?;
+    ensure!(
+        (status, &ended["state"]) == (200, &json!("ended")),
+        "{ended}"
+    );
+    ensure!(client.interrupt()?.code() == Some(0), "{}", client.said());
+    let by_client = robot.directory.path().join("client");
+    for (bag, report) in [
+        (robot.bags().join("all"), ended["report"].clone()),
+        (by_client.clone(), report_of(&by_client)?),
+    ] {
+        let numbers = numbers(&bag)?;
+        let mut messages = 0;
+        for (topic, count, publisher, _) in &pairs {
+            let sent = sent(publisher)?;
+            let recorded = numbers.get(*topic).cloned().unwrap_or_default();
+            messages += recorded.len();
+            let missing = missing(&report, topic);
+            eprintln!(
+                "{}: {topic}: {} of {} recorded, {missing} missing",
+                bag.display(),
+                recorded.len(),
+                sent.len()
+            );
+            ensure!(sent.len() as u64 == *count, "{topic}: {} sent", sent.len());
+            ensure!(recorded.is_subset(&sent), "{topic}");
+            if is_exact(&page) {
+                let all = recorded.len() as u64 + missing;
+                ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+            }
+            ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
+        }
+        ensure!(report["messages"] == messages, "{messages} of {report:#}");
+        let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
+        ensure!(
+            code == Some(0) && info.contains(&format!("Messages:          {messages}\n")),
+            "{info}"
+        );
+    }
+    if is_exact(&page) {
+        for (topic, count, ..) in &pairs {
+            let counted = |name| page.sum(name, &[("topic", *topic)]);
+            let (messages, lost) = (
+                counted("ros2_topic_messages_total"),
+                counted("ros2_topic_lost_messages_total"),
+            );
+            ensure!(
+                (messages, lost) == (*count as f64, 0.0),
+                "{topic}: {messages} counted, {lost} lost: {}",
+                page.doubts()
+            );
+        }
+    }
+
+    // A reader that does nothing for a while, with room for four clouds.
+    let arguments = ["/front", "/imu", "--max-cache-size", "3000000"];
+    let mut slow = Recorder::start(&robot, "slow", &arguments)?;
+    slow.process.signal("STOP")?;
+    for (_, _, publisher, _) in &mut pairs {
+        publisher.go()?;
+    }
+    let page = settled(&robot, &pairs, 2)?;
+    let memory = Usage::of(robot.agent.process.pid())?.memory.unreclaimable;
+    let queued = page.sum("ros2probe_queued_bytes", &[]);
+    eprintln!("agent {} MB with {queued} bytes queued", memory >> 20);
+    ensure!(memory < 160 << 20, "{memory} bytes");
+    ensure!(queued <= 3_000_000.0, "{queued} bytes wait");
+    slow.process.signal("CONT")?;
+    robot.agent.scrape_until("read", |page| {
+        page.sum("ros2probe_queued_bytes", &[]) == 0.0
+    })?;
+    ensure!(slow.interrupt()?.code() == Some(0), "{}", slow.said());
+    let bag = robot.directory.path().join("slow");
+    let (numbers, report) = (numbers(&bag)?, report_of(&bag)?);
+    for (topic, count, publisher, _) in &pairs {
+        let Some(recorded) = numbers.get(*topic) else {
+            ensure!(!matches!(*topic, "/front" | "/imu"), "{topic}: {report:#}");
+            continue;
+        };
+        let sent: BTreeSet<u64> = sent(publisher)?.split_off(&(count + 1));
+        let missing = missing(&report, topic);
+        let dropped = report["topics"][*topic]["dropped"].as_u64();
+        let dropped = dropped.context("no count")?;
+        eprintln!(
+            "{topic}: {} recorded, {missing} missing, {dropped} dropped of {}",
+            recorded.len(),
+            sent.len()
+        );
+        ensure!(recorded.is_subset(&sent), "{topic}");
+        if is_exact(&page) {
+            let all = recorded.len() as u64 + missing;
+            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+        }
+        // The largest goes first, so that what is small is whole.
+        let is_large = *topic == "/front";
+        ensure!((dropped > 10) == is_large, "{topic}: {report:#}");
+        ensure!(is_large || dropped == 0, "{topic}: {report:#}");
+    }
+    ensure!(
+        slow.said().contains("/front: ")
+            && slow.said().contains("dropped, the storage was too slow"),
+        "{}",
+        slow.said()
+    );
+    Ok(())
+}
+
+#[test]
+fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<()> {
+    let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
+    let host = Namespace::alone()?;
+    let settings = "watch: [{topic: /imu, max_silence_s: 4}]\n\
+                    recordings: {snapshots: [{name: incident, topics: [/imu], seconds: 10}]}\n";
+    let mut robot = Robot::start(&host, settings, &host.on_network())?;
+    let (mut imu, _subscriber) = robot.pair(&Stream::small(1_000_000))?;
+    imu.go()?;
+
+    let long = "x".repeat(10_000);
+    for name in ["../x", "", ".x", "a/b", "a\nb", &long] {
+        let (status, problem) = robot.ask("POST", "/recordings", &json!({"name": name}))?;
+        ensure!(status == 422, "{name:.40}: {status} {problem}");
+    }
+    let endless = json!({"name": "x".repeat(1 << 20)});
+    let (status, problem) = robot.ask("POST", "/recordings", &endless)?;
+    ensure!(status == 413, "{status} {problem}");
+    ensure!(fs::read_dir(robot.bags())?.count() == 0);
+
+    // Every message of the time is in the bag, was let go by, or is counted as missing.
+    let wanted = json!({"name": "led", "topics": {"topics": ["/imu"]}});
+    let (status, begun) = robot.ask("POST", "/recordings", &wanted)?;
+    ensure!(status == 201 && begun["state"] == "recording", "{begun}");
+    let (status, again) = robot.ask("POST", "/recordings", &wanted)?;
+    ensure!(status == 409, "{status} {again}");
+    let shows = |what: &str, holds: &dyn Fn(&Value) -> bool| {
+        wait_until(what, || {
+            let (_, now) = robot.ask("GET", "/recordings/led", &Value::Null)?;
+            Ok(holds(&now))
+        })
+    };
+    let count = |view: &Value, name: &str| {
+        let count = view["report"]["topics"]["/imu"][name].as_u64();
+        count.unwrap_or_default()
+    };
+    shows("it records", &|now| count(now, "messages") >= 100)?;
+    robot.ask("POST", "/recordings/led/pause", &Value::Null)?;
+    shows("it is paused", &|now| {
+        now["state"] == "paused" && count(now, "paused") >= 50
+    })?;
+    let (_, paused) = robot.ask("GET", "/recordings/led", &Value::Null)?;
+    robot.ask("POST", "/recordings/led/resume", &Value::Null)?;
+    let more = count(&paused, "messages") + 100;
+    shows("it goes on", &|now| count(now, "messages") >= more)?;
+    robot.ask("POST", "/recordings/led/split", &Value::Null)?;
+    shows("it has two files", &|now| now["files"] == 2)?;
+    shows("it goes on", &|now| count(now, "messages") >= more + 100)?;
+    let (status, led) = robot.ask("DELETE", "/recordings/led", &Value::Null)?;
+    ensure!((status, &led["state"]) == (200, &json!("ended")), "{led}");
+    ensure!(led["error"].is_null(), "{led}");
+    let bag = robot.bags().join("led");
+    let numbers_of =
+        |bag: &Path| -> Result<BTreeSet<u64>> { numbers(bag)?.remove("/imu").context("no /imu") };
+    let recorded = numbers_of(&bag)?;
+    ensure!(recorded.len() as u64 == count(&led, "messages"), "{led:#}");
+    let accounted = recorded.len() as u64 + count(&led, "paused") + missing(&led["report"], "/imu");
+    ensure!(span(&recorded)? == accounted, "{recorded:?} {led:#}");
+    let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
+    ensure!(
+        code == Some(0)
+            && info.contains("led_1.mcap")
+            && info.contains(&format!("Messages:          {}\n", recorded.len())),
+        "{info}"
+    );
+    let events = robot.events("ros2probe.recording.*")?;
+    let told: Vec<_> = events.iter().map(|event| &event["name"]).collect();
+    ensure!(
+        told == ["ros2probe.recording.started", "ros2probe.recording.ended"],
+        "{events:?}"
+    );
+
+    // Whoever records is killed.
+    let mut client = Recorder::start(&robot, "killed", &["/imu"])?;
+    let killed = robot.directory.path().join("killed");
+    wait_until("it is in the file", || Ok(bytes(&killed) > 200_000))?;
+    client.process.signal("KILL")?;
+    let end = now();
+    client.process.wait(PATIENCE)?;
+    repaired(&killed, &imu, end)?;
+
+    // What was before the silence is in a bag of its own.
+    imu.process.signal("STOP")?;
+    let written = |page: &Scrape| page.sum("ros2probe_snapshots_written_total", &[]);
+    robot
+        .agent
+        .scrape_until("a snapshot", |page| written(page) == 1.0)?;
+    let events = robot.events("ros2probe.snapshot.taken")?;
+    let [taken] = &events[..] else {
+        anyhow::bail!("{events:?}");
+    };
+    let name = taken["attributes"]["recording"].as_str();
+    let before = numbers_of(&robot.bags().join(name.context("no name")?))?;
+    // It may have been stopped between sending and saying so.
+    let last = sent(&imu)?.last().copied().context("nothing sent")?;
+    let is_last = before.last().is_some_and(|it| it.abs_diff(last) <= 1);
+    ensure!(is_last, "{last} of {before:?}");
+    ensure!((100..=2200).contains(&before.len()), "{before:?}");
+    imu.process.signal("CONT")?;
+    robot.agent.scrape_until("messages", |page| {
+        page.sum("ros2probe_snapshot_messages", &[("snapshot", "incident")]) > 10.0
+    })?;
+    let (status, asked) = robot.ask("POST", "/snapshots/incident", &Value::Null)?;
+    ensure!(
+        status == 201 && asked["messages"].as_u64() > Some(10),
+        "{asked}"
+    );
+    robot.agent.process.signal("USR1")?;
+    robot
+        .agent
+        .scrape_until("three snapshots", |page| written(page) == 3.0)?;
+
+    // The agent is killed.
+    let wanted = json!({"name": "last", "topics": {"topics": ["/imu"]}});
+    robot.ask("POST", "/recordings", &wanted)?;
+    let last = robot.bags().join("last");
+    wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
+    robot.agent.process.signal("KILL")?;
+    let end = now();
+    robot.agent.process.wait(PATIENCE)?;
+    repaired(&last, &imu, end)
+}
+
+#[test]
+fn a_storage_that_takes_no_more_ends_a_recording_in_order() -> Result<()> {
+    let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
+    let host = Namespace::alone()?;
+    // A disk of 4 MB that only the agent has.
+    let mut enter = host.on_network();
+    let script = r#"mount -t tmpfs -o size=4m none "$0" && exec "$@""#;
+    enter.extend(["unshare", "--mount", "sh", "-c", script].map(str::to_owned));
+    let robot = Robot::start_on_disk(&host, "watch: []\n", enter)?;
+    let stream = Stream::point_cloud(SCAN, 1_000_000);
+    let (mut lidar, _subscriber) = robot.pair(&stream)?;
+    lidar.go()?;
+
+    let (status, begun) = robot.ask("POST", "/recordings", &json!({"name": "full"}))?;
+    ensure!(status == 201, "{begun}");
+    wait_until("the disk is full", || {
+        let (_, now) = robot.ask("GET", "/recordings/full", &Value::Null)?;
+        Ok(now["state"] == "ended")
+    })?;
+    let (_, ended) = robot.ask("DELETE", "/recordings/full", &Value::Null)?;
+    let told = ended["error"].as_str().unwrap_or_default();
+    ensure!(told.starts_with("no space left to write "), "{ended:#}");
+    let events = robot.events("ros2probe.recording.ended")?;
+    let reasons: Vec<_> = events
+        .iter()
+        .map(|event| &event["attributes"]["reason"])
+        .collect();
+    ensure!(reasons == [told], "{events:?}");
+    // Files of its disk are reached through the process.
+    let root = format!("/proc/{}/root", robot.agent.process.pid());
+    let bag = robot.bags().join("full");
+    let bag = Path::new(&root).join(bag.strip_prefix("/")?);
+    whole(&bag, &ended["report"])?;
+
+    let small = robot.directory.path().join("small");
+    let kept = robot.directory.path().join("kept");
+    fs::create_dir(&small)?;
+    let record = |options: &str, output: &Path| -> Result<(Option<i32>, String)> {
+        let script = format!(
+            r#"mount -t tmpfs -o {options} none "$1" || exit 99
+timeout 120 "$2" bag record -a --socket "$3" -o "$4" </dev/null; code=$?
+if test -e "$1/bag"; then cp -r "$1/bag" "$5"; fi; exit $code"#
+        );
+        let output = Command::new("unshare")
+            .args(["--mount", "sh", "-c", &script, "sh"])
+            .arg(&small)
+            .arg(RP)
+            .arg(&robot.socket)
+            .arg(output)
+            .arg(&kept)
+            .env_remove("ROS_DISTRO")
+            .env_remove("ROS_DOMAIN_ID")
+            .output()?;
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        Ok((output.status.code(), said))
+    };
+    let (code, said) = record("size=4m", &small.join("bag"))?;
+    let mut errors = said.lines().filter(|line| line.contains("[ERROR]"));
+    let error = errors.next().unwrap_or_default();
+    ensure!(
+        code == Some(1) && error.contains("no space left to write ") && errors.next().is_none(),
+        "{code:?} {said}"
+    );
+    whole(&kept, &report_of(&kept)?)?;
+
+    for (options, output, message) in [
+        ("ro", small.join("bag"), "cannot create "),
+        ("size=4m", kept.clone(), "already exists."),
+    ] {
+        let (code, said) = record(options, &output)?;
+        ensure!(
+            code == Some(1) && said.lines().count() == 1 && said.contains(message),
+            "{code:?} {said}"
+        );
+    }
+    Ok(())
+}
+
+/// An agent with a place for bags.
+struct Robot<'a> {
+    host: &'a Namespace,
+    directory: TempDir,
+    socket: PathBuf,
+    agent: Agent<'a>,
+}
+
+impl<'a> Robot<'a> {
+    fn start(host: &'a Namespace, settings: &str, enter: &[String]) -> Result<Robot<'a>> {
+        Robot::start_in(host, settings, enter, tempfile::tempdir()?)
+    }
+
+    /// `enter` mounts over the place for bags, which it is given as its next word.
+    fn start_on_disk(
+        host: &'a Namespace,
+        settings: &str,
+        mut enter: Vec<String>,
+    ) -> Result<Robot<'a>> {
+        let directory = tempfile::tempdir()?;
+        enter.push(directory.path().join("bags").display().to_string());
+        Robot::start_in(host, settings, &enter, directory)
+    }
+
+    fn start_in(
+        host: &'a Namespace,
+        settings: &str,
+        enter: &[String],
+        directory: TempDir,
+    ) -> Result<Robot<'a>> {
+        let socket = directory.path().join("api.sock");
+        let bags = directory.path().join("bags");
+        fs::create_dir(&bags)?;
+        let mut all: serde_json::Map<String, Value> = serde_yaml::from_str(settings)?;
+        all.insert(
+            "capture".to_owned(),
+            json!({"source": "host", "cgroup": host.cgroup(), "shm": {"mode": "off"}}),
+        );
+        all.insert("api".to_owned(), json!({"socket": &socket}));
+        all.insert("state_directory".to_owned(), json!(directory.path()));
+        let recordings = all.entry("recordings").or_insert(json!({}));
+        recordings["directory"] = json!(&bags);
+        // Disks are filled to the last byte here.
+        recordings["reserve_percent"] = json!(0);
+        recordings["reserve_bytes"] = json!(0);
+        let configuration = directory.path().join("ros2probe.yaml");
+        fs::write(&configuration, serde_json::to_string(&all)?)?;
+        let arguments = [Path::new("run"), Path::new("--config"), &configuration];
+        let process = Process::start(enter, RP, arguments)?;
+        let mut agent = Agent { process, host };
+        agent.wait_ready(PATIENCE)?;
+        Ok(Robot {
+            host,
+            directory,
+            socket,
+            agent,
+        })
+    }
+
+    fn bags(&self) -> PathBuf {
+        self.directory.path().join("bags")
+    }
+
+    /// A publisher that is known to the agent, held, and its subscriber.
+    fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
+        let start = |role, node| Peer::start(self.host, Stack::Cyclone, role, stream, &[node]);
+        let subscriber = start(Role::Subscriber, "/map")?;
+        let mut publisher = start(Role::Publisher, "/driver")?;
+        publisher.wait_matched()?;
+        let topic = [("topic", stream.topic.as_str())];
+        self.agent.scrape_until("published", |page| {
+            page.sum("ros2_topic_publishers", &topic) > 0.0
+        })?;
+        Ok((publisher, subscriber))
+    }
+
+    /// The status of an answer, and what it says.
+    fn ask(&self, method: &str, path: &str, body: &Value) -> Result<(u16, Value)> {
+        let text = self.curl(method, path, body)?;
+        let (body, status) = text.rsplit_once('\n').context("no status")?;
+        let value = serde_json::from_str(body).with_context(|| text.clone())?;
+        Ok((status.parse()?, value))
+    }
+
+    /// All events of these names so far.
+    fn events(&self, names: &str) -> Result<Vec<Value>> {
+        let path = format!("/events?after=0&follow=false&name={names}");
+        let text = self.curl("GET", &path, &Value::Null)?;
+        let data = text.lines().filter_map(|line| line.strip_prefix("data: "));
+        let events = data.map(serde_json::from_str).collect::<Result<_, _>>();
+        events.with_context(|| text.clone())
+    }
+
+    fn curl(&self, method: &str, path: &str, body: &Value) -> Result<String> {
+        let mut curl = Command::new("curl");
+        curl.args(["--silent", "--show-error", "--globoff", "--max-time", "60"])
+            .args(["--write-out", "\n%{http_code}", "--request", method])
+            .arg("--unix-socket")
+            .arg(&self.socket)
+            .arg(format!("http://localhost{path}"));
+        if !body.is_null() {
+            curl.args(["--header", "content-type: application/json"])
+                .args(["--data-binary", "@-"]);
+        }
+        let mut child = curl
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .context("cannot run curl")?;
+        let mut input = child.stdin.take().context("no input")?;
+        if !body.is_null() {
+            // An answer may come before all of it was taken.
+            let _ = input.write_all(body.to_string().as_bytes());
+        }
+        drop(input);
+        let output = child.wait_with_output()?;
+        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    }
+}
+
+/// An `rp bag record` that has begun.
+struct Recorder {
+    process: Process,
+    said: PathBuf,
+}
+
+impl Recorder {
+    fn start(robot: &Robot<'_>, name: &str, arguments: &[&str]) -> Result<Recorder> {
+        let said = robot.directory.path().join(format!("{name}.said"));
+        let output = robot.directory.path().join(name);
+        let mut words = vec!["bag".to_owned(), "record".to_owned()];
+        words.extend(arguments.iter().map(|word| (*word).to_owned()));
+        words.extend(["-o".to_owned(), output.display().to_string()]);
+        words.extend(["--socket".to_owned(), robot.socket.display().to_string()]);
+        let mut enter = robot.host.on_network();
+        enter.extend(["env", "-u", "ROS_DISTRO", "-u", "ROS_DOMAIN_ID"].map(str::to_owned));
+        let errors = File::create(&said)?;
+        let process = Process::start_with(&enter, RP, words, errors.into())?;
+        let recorder = Recorder { process, said };
+        wait_until("it records", || {
+            Ok(recorder.said().contains("Recording..."))
+        })
+        .with_context(|| recorder.said())?;
+        Ok(recorder)
+    }
+
+    fn said(&self) -> String {
+        fs::read_to_string(&self.said).unwrap_or_default()
+    }
+
+    /// Ctrl-C.
+    fn interrupt(&mut self) -> Result<ExitStatus> {
+        self.process.signal("INT")?;
+        self.process.wait(PATIENCE)
+    }
+}
+
+/// Publishers have sent so many stretches, and the agent has counted what it will.
+fn settled(robot: &Robot<'_>, pairs: &[(&str, u64, Peer, Peer)], stretches: u64) -> Result<Scrape> {
+    let mut page = robot.agent.scrape()?;
+    for (topic, count, publisher, _) in pairs {
+        let all = stretches * count;
+        wait_until("all is sent", || Ok(sent(publisher)?.len() as u64 >= all))?;
+        page = robot.agent.settled_scrape(topic, all)?;
+    }
+    Ok(page)
+}
+
+/// Where records of messages were lost, nobody knows of those.
+fn is_exact(page: &Scrape) -> bool {
+    let lost = page.sum("ros2probe_records_dropped_total", &[]);
+    if lost > 0.0 {
+        eprintln!("too busy to be exact: {}", page.doubts());
+    }
+    lost == 0.0
+}
+
+/// Numbers of the messages that a publisher has sent, as its writer counts them.
+fn sent(publisher: &Peer) -> Result<BTreeSet<u64>> {
+    publisher.log()?.writer_numbers("pub")
+}
+
+/// Numbers in a bag by topic, each once, as another reader finds them.
+fn numbers(bag: &Path) -> Result<BTreeMap<String, BTreeSet<u64>>> {
+    let mut numbers: BTreeMap<String, BTreeSet<u64>> = BTreeMap::new();
+    for file in fs::read_dir(bag)? {
+        let path = file?.path();
+        if path.extension().is_none_or(|extension| extension != "mcap") {
+            continue;
+        }
+        let bytes = fs::read(&path)?;
+        for message in mcap::MessageStream::new(&bytes)? {
+            let message = message.with_context(|| path.display().to_string())?;
+            let topic = numbers.entry(message.channel.topic.clone()).or_default();
+            ensure!(
+                topic.insert(message.sequence.into()),
+                "{} twice in {}",
+                message.sequence,
+                path.display()
+            );
+        }
+    }
+    Ok(numbers)
+}
+
+/// From the first to the last.
+fn span(numbers: &BTreeSet<u64>) -> Result<u64> {
+    let (first, last) = (numbers.first(), numbers.last());
+    Ok(last.context("nothing")? - first.context("nothing")? + 1)
+}
+
+/// The report in a bag's metadata.
+fn report_of(bag: &Path) -> Result<Value> {
+    let text = fs::read_to_string(bag.join("metadata.yaml"))?;
+    let metadata = ros2probe::bag::metadata::Metadata::read(&text)?;
+    let report = metadata.custom_data.get("ros2probe");
+    Ok(serde_json::from_str(report.context("no report")?)?)
+}
+
+/// Messages of a topic that are not in the bag although they were sent.
+fn missing(report: &Value, topic: &str) -> u64 {
+    let reasons = ["incomplete", "not_captured", "dropped", "unwritten"];
+    let topic = report.pointer("/topics").and_then(|all| all.get(topic));
+    let counts = reasons.iter().map(|reason| topic?.get(reason)?.as_u64());
+    counts.map(Option::unwrap_or_default).sum()
+}
+
+/// A bag whose disk became full: read by others to its end, and its report is right.
+fn whole(bag: &Path, report: &Value) -> Result<()> {
+    let recorded = numbers(bag)?.remove("/points").context("no /points")?;
+    ensure!(recorded.len() > 10, "{recorded:?}");
+    ensure!(
+        report["messages"] == recorded.len(),
+        "{} in the bag: {report:#}",
+        recorded.len()
+    );
+    ensure!(report["bytes"] == recorded.len() * SCAN, "{report:#}");
+    // Without a gap, but for what is said to be missing.
+    ensure!(
+        span(&recorded)? <= recorded.len() as u64 + missing(report, "/points"),
+        "{recorded:?} {report:#}"
+    );
+    let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
+    ensure!(code == Some(0), "{info}");
+    Ok(())
+}
+
+/// A bag whose recorder was killed has, once it is indexed, all messages until shortly before.
+fn repaired(bag: &Path, publisher: &Peer, killed: Duration) -> Result<()> {
+    let (code, said) = rp(&["bag", "reindex", &bag.display().to_string()])?;
+    ensure!(code == Some(0), "{said}");
+    let recorded = numbers(bag)?.remove("/imu").context("no /imu")?;
+    ensure!(span(&recorded)? == recorded.len() as u64, "{recorded:?}");
+    let last = recorded.last().context("nothing")?;
+    let log = publisher.log()?.0;
+    let last = log.iter().find(|event| event.seq == Some(last - 1));
+    let last = Duration::from_nanos(last.context("never sent")?.t);
+    let unflushed = killed.saturating_sub(last);
+    eprintln!(
+        "{}: {} messages, {unflushed:?} are missing",
+        bag.display(),
+        recorded.len()
+    );
+    ensure!(unflushed <= UNFLUSHED, "{unflushed:?} are missing");
+    let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
+    ensure!(
+        code == Some(0) && info.contains(&format!("Messages:          {}\n", recorded.len())),
+        "{info}"
+    );
+    Ok(())
+}
+
+/// Bytes of a bag's files.
+fn bytes(bag: &Path) -> u64 {
+    let files = fs::read_dir(bag).into_iter().flatten().flatten();
+    let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
+    sizes.sum()
+}
+
+fn rp(arguments: &[&str]) -> Result<(Option<i32>, String)> {
+    let output = Command::new(RP)
+        .args(arguments)
+        .env_remove("ROS_DISTRO")
+        .output()?;
+    let said = [output.stdout, output.stderr].concat();
+    Ok((
+        output.status.code(),
+        String::from_utf8_lossy(&said).into_owned(),
+    ))
+}
+
+fn now() -> Duration {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH);
+    now.unwrap_or_default()
+}

@@ -1,0 +1,603 @@
+//! Samples with their bytes from a running agent: what real participants sent is what a client
+//! gets, whole, from any stack and at any source; and clients that stop, or die, hold nobody up.
+//! Needs root.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::io::Write as _;
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail, ensure};
+use ros2probe::client;
+use ros2probe::client::{Lines, Next};
+use ros2probe::subscriptions::line::{Line, MissedFacts, SampleFacts};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::shared_memory::SharedMemory;
+use ros2probe_testing::harness::usage::Usage;
+use ros2probe_testing::harness::wait_until;
+use tempfile::TempDir;
+
+/// Of point clouds.
+const SIZES: [usize; 2] = [644_000, 2_720_000];
+const PATIENCE: Duration = Duration::from_secs(60);
+/// As the peers announce it, ROS style.
+const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
+/// Where the points begin, behind encapsulation, header, fields and sizes.
+const DATA: usize = 52;
+
+#[test]
+fn payloads_of_fast_dds_are_what_was_sent() -> Result<()> {
+    payloads_are_what_was_sent(Stack::Fast, &SIZES, at_the_sockets_of)
+}
+
+#[test]
+fn payloads_of_cyclone_dds_are_what_was_sent() -> Result<()> {
+    payloads_are_what_was_sent(Stack::Cyclone, &SIZES, at_the_sockets_of)
+}
+
+#[test]
+fn payloads_of_rust_dds_are_what_was_sent() -> Result<()> {
+    payloads_are_what_was_sent(Stack::Rust, &SIZES, at_the_sockets_of)
+}
+
+#[test]
+fn payloads_on_the_wire_are_what_was_sent() -> Result<()> {
+    // In IP fragments, and larger ones in frames of 1.4 KB; more than that a busy machine loses.
+    let on_the_wire = |_: &Namespace| ON_THE_WIRE.to_owned();
+    payloads_are_what_was_sent(Stack::Fast, &[60_000, 644_000], on_the_wire)?;
+    payloads_are_what_was_sent(Stack::Cyclone, &[644_000], on_the_wire)
+}
+
+/// Nobody watches: what one stream of samples wants is enough.
+fn payloads_are_what_was_sent(
+    stack: Stack,
+    sizes: &[usize],
+    source: impl Fn(&Namespace) -> String,
+) -> Result<()> {
+    for size in sizes.iter().copied() {
+        let link = Link::new()?;
+        let source = source(&link.robot);
+        // Frames that find no room in a packet ring are not seen at all.
+        let lossless_metering = source != ON_THE_WIRE;
+        let observed = Observed::start(&link.robot, &source)?;
+        let stream = Stream {
+            reliable: true,
+            ..Stream::point_cloud(size, 40)
+        };
+        let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
+        let client = observed.client()?;
+        let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+        let pattern: Vec<u8> = (8..size).map(pattern).collect();
+        publisher.go()?;
+        let mut received = BTreeMap::new();
+        let mut missed = 0;
+        while received.len() as u64 + missed < stream.count {
+            let next = match next(&mut lines) {
+                // Of the last samples nothing may have been seen, and no HEARTBEAT behind them.
+                Err(_) if !lossless_metering && dropped(&observed.agent.scrape()?) > 0.0 => break,
+                next => next,
+            };
+            let next = next.with_context(|| match observed.agent.scrape() {
+                Ok(page) => format!(
+                    "{stack:?} {size}: after {:?} and {missed} missed: {}",
+                    received.keys(),
+                    page.doubts()
+                ),
+                Err(error) => error.to_string(),
+            });
+            let (sample, payload) = match next?.context("the stream ended")? {
+                News::Sample(sample, payload) => (sample, payload),
+                News::Missed(facts) => {
+                    missed += facts.samples;
+                    continue;
+                }
+            };
+            ensure!(sample.message_type == CLOUD && sample.size as usize == payload.len());
+            ensure!(payload.len() == size, "{} of {size} bytes", payload.len());
+            let number = check(&payload, &pattern)?;
+            ensure!(
+                number + 1 == sample.sequence_number,
+                "{number} in {sample:?}"
+            );
+            ensure!(received.insert(number, sample).is_none(), "{number} twice");
+        }
+        publisher.wait_sent(PATIENCE)?;
+        let sent = publisher.log()?.sequences("pub");
+        ensure!(
+            received.keys().all(|number| sent.contains(number)),
+            "{sent:?}"
+        );
+        // All of it where the machine has time, and what is missing was said.
+        let page = observed.agent.scrape()?;
+        let dropped = dropped(&page);
+        ensure!(
+            missed == 0 || dropped > 0.0,
+            "{missed} missed: {}",
+            page.doubts()
+        );
+        ensure!(
+            received.len() >= 10,
+            "{} of 40: {}",
+            received.len(),
+            page.doubts()
+        );
+        let label = [("topic", "/points")];
+        let counted = page.sum("ros2_topic_messages_total", &label);
+        let lost = page.sum("ros2_topic_lost_messages_total", &label);
+        let records_lost = page.sum("ros2probe_records_dropped_total", &[]);
+        if lossless_metering && records_lost == 0.0 {
+            ensure!(
+                (counted, lost) == (40.0, 0.0),
+                "{counted}, {lost}: {}",
+                page.doubts()
+            );
+        }
+    }
+    Ok(())
+}
+
+const LOSSLESS: [&str; 5] = [
+    "ros2probe_missed_messages_total",
+    "ros2probe_capture_dropped_packets_total",
+    "ros2probe_records_dropped_total",
+    "ros2probe_dropped_datagrams_total",
+    "ros2probe_incomplete_datagrams_total",
+];
+
+/// What the agent says that it left out.
+fn dropped(page: &Scrape) -> f64 {
+    LOSSLESS.iter().map(|name| page.sum(name, &[])).sum()
+}
+
+/// What the peers fill points with.
+fn pattern(place: usize) -> u8 {
+    let [low, ..] = (place * 7 + (place >> 8) * 13 + (place >> 16)).to_le_bytes();
+    low
+}
+
+/// The number in a point cloud, every byte of which is as it was sent.
+fn check(payload: &[u8], pattern: &[u8]) -> Result<u64> {
+    ensure!(payload.starts_with(&[0, 1, 0, 0]), "{:?}", payload.get(..4));
+    let (_, data) = payload.split_at(DATA);
+    let (number, rest) = data.split_first_chunk().context("no data")?;
+    // Behind the data: `is_dense`, and padding.
+    let len = rest.len() - 1 - rest.len() % 4;
+    let is_as_sent = rest.get(..len) == pattern.get(..len);
+    ensure!(is_as_sent, "sample {number:?} has other bytes");
+    Ok(u64::from_le_bytes(*number))
+}
+
+/// Opens a stream, and again until it knows this topic.
+fn open<'a>(client: &'a client::Agent, query: &str, topic: &str) -> Result<Lines<'a>> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let mut lines = client.stream(&format!("/samples?{query}"))?;
+        let first = lines.line()?.context("no line")?;
+        let Line::Open(opened) = serde_json::from_slice(&first)? else {
+            bail!("{first:?}");
+        };
+        if opened.topics.iter().any(|known| known.topic == topic) {
+            return Ok(lines);
+        }
+        ensure!(
+            Instant::now() < deadline,
+            "{topic} does not appear: {opened:?}"
+        );
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// What a stream tells.
+enum News {
+    Sample(SampleFacts, Vec<u8>),
+    Missed(MissedFacts),
+}
+
+/// The next sample with its payload, or that there is none; `None` at the end.
+fn next(lines: &mut Lines<'_>) -> Result<Option<News>> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let line = match lines.line_within(PATIENCE)? {
+            Next::Line(line) => line,
+            Next::End => return Ok(None),
+            Next::Nothing => bail!("not even a clock"),
+        };
+        match serde_json::from_slice(&line)? {
+            Line::Sample(sample) => {
+                let len = sample.payload_bytes.context("no payload")? as usize;
+                return Ok(Some(News::Sample(sample, lines.bytes(len)?.to_vec())));
+            }
+            Line::Missed(missed) => return Ok(Some(News::Missed(missed))),
+            Line::Clock(_) => ensure!(Instant::now() < deadline, "no sample"),
+            other => bail!("{other:?}"),
+        }
+    }
+}
+
+/// The binary under test, or another build of it.
+fn program() -> OsString {
+    std::env::var_os("ROS2PROBE_TESTED").unwrap_or_else(|| env!("CARGO_BIN_EXE_rp").into())
+}
+
+struct Observed<'a> {
+    agent: Agent<'a>,
+    socket: PathBuf,
+    _directory: TempDir,
+}
+
+impl<'a> Observed<'a> {
+    fn start(host: &'a Namespace, source: &str) -> Result<Self> {
+        let directory = tempfile::tempdir()?;
+        let socket = directory.path().join("api.sock");
+        let configuration = directory.path().join("ros2probe.yaml");
+        let text = format!("{source}watch: []\napi: {{socket: {}}}\n", socket.display());
+        std::fs::write(&configuration, text)?;
+        Ok(Self {
+            agent: Agent::start(host, program(), &configuration)?,
+            socket,
+            _directory: directory,
+        })
+    }
+
+    fn topic(&self, name: &str) -> Result<serde_json::Value> {
+        let mut curl = Command::new("curl");
+        curl.args(["--silent", "--unix-socket"]).arg(&self.socket);
+        let answer = curl
+            .arg(format!("http://localhost/topics{name}"))
+            .output()?;
+        Ok(serde_json::from_slice(&answer.stdout)?)
+    }
+
+    /// Waits until shared memory is seen in this way.
+    fn wait_for_view(&self, view: &str) -> Result<()> {
+        wait_until(view, || {
+            let topic = self.topic("/points")?;
+            Ok(topic.pointer("/passages/0/view") == Some(&view.into()))
+        })
+    }
+
+    fn client(&self) -> Result<client::Agent> {
+        let target = client::Target {
+            socket: Some(self.socket.clone()),
+            ..client::Target::default()
+        };
+        Ok(client::Agent::reach_stream(&target)?)
+    }
+}
+
+fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
+    let mut subscriber = Peer::start(to, stack, Role::Subscriber, stream, &["/listener"])?;
+    let mut publisher = Peer::start(from, stack, Role::Publisher, stream, &["/sensor"])?;
+    publisher.wait_matched()?;
+    subscriber.wait_matched()?;
+    Ok((publisher, subscriber))
+}
+
+/// Ten clients at once: one never reads, one is killed. What the others get is all there is, the
+/// interest of those that go is closed, and memory keeps its bounds.
+#[test]
+fn readers_that_stop_or_die_hold_nobody_up() -> Result<()> {
+    let host = Namespace::alone()?;
+    let limits = "limits: {payload_bytes: 2097152, subscriptions: 12}\n";
+    let observed = Observed::start(&host, &format!("{limits}{}", at_the_sockets_of(&host)))?;
+    let stream = Stream {
+        reliable: true,
+        linger: 60.0,
+        ..Stream::point_cloud(60_000, 160)
+    };
+    let (mut publisher, _subscriber) = pair(&host, &host, Stack::Cyclone, &stream)?;
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    let query = "/samples?all=true&payload=true";
+    let mut stalled = UnixStream::connect(&observed.socket)?;
+    stalled.write_all(format!("GET {query} HTTP/1.1\r\nHost: localhost\r\n\r\n").as_bytes())?;
+    let mut readers = Vec::new();
+    for _ in 0..8 {
+        readers.push(Reader::start(&observed.socket, query)?);
+    }
+    let open_are = |count: f64| {
+        let shows = move |page: &Scrape| page.sum("ros2probe_subscriptions", &[]) == count;
+        observed.agent.scrape_until("that many", shows)
+    };
+    open_are(10.0)?;
+    publisher.go()?;
+    let mut readers = readers.into_iter();
+    for number in 1..=160 {
+        if number == 40 {
+            let mut killed = readers.next().context("no reader")?;
+            killed.0.kill()?;
+            open_are(9.0)?;
+        }
+        match next(&mut lines)?.context("the stream ended")? {
+            News::Sample(sample, _) => ensure!(sample.sequence_number == number, "{sample:?}"),
+            News::Missed(missed) => bail!("{number}: {missed:?}"),
+        }
+    }
+    let missed = [("reason", "queue_full")];
+    let told = |page: &Scrape| page.sum("ros2probe_missed_messages_total", &missed) > 20.0;
+    let page = observed.agent.scrape_until("told", told)?;
+    let label = [("topic", "/points")];
+    ensure!(
+        page.sum("ros2_topic_messages_total", &label) == 160.0,
+        "{}",
+        page.doubts()
+    );
+    ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
+    let queued = page.sum("ros2probe_queued_bytes", &[]);
+    ensure!(queued > 0.0 && queued <= 1_048_576.0, "{queued} bytes wait");
+    drop((readers, stalled, lines));
+    drop(client);
+    open_are(0.0)?;
+    let page = observed.agent.scrape()?;
+    ensure!(page.sum("ros2probe_queued_bytes", &[]) == 0.0);
+    ensure!(page.samples("ros2_watch_state", &label).count() == 0);
+    Ok(())
+}
+
+/// A client that reads as fast as it can; killed with its value.
+struct Reader(Child);
+
+impl Reader {
+    fn start(socket: &Path, query: &str) -> Result<Self> {
+        let mut curl = Command::new("curl");
+        curl.args([
+            "--silent",
+            "--no-buffer",
+            "--output",
+            "/dev/null",
+            "--unix-socket",
+        ]);
+        curl.arg(socket).arg(format!("http://localhost{query}"));
+        Ok(Self(curl.spawn().context("cannot run curl")?))
+    }
+}
+
+impl Drop for Reader {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// What passes by shared memory is read in the process that sends it, whole.
+#[test]
+fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
+    let host = Host::new()?;
+    let observed = host.observe("exact: uprobe")?;
+    let stream = in_shared_memory(60_000, 40);
+    let (mut publisher, _subscriber) = host.pair(&stream)?;
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    publisher.go()?;
+    let (whole, missed) = given(&mut lines, &stream)?;
+    ensure!((whole, missed) == (40, 0), "{whole} {missed}");
+    Ok(())
+}
+
+/// Fast DDS sends more than 64 KiB in several messages. Read by looking, a sample is whole when all
+/// of them were seen.
+#[test]
+fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
+    let host = Host::new()?;
+    let observed = host.observe("mode: auto")?;
+    let stream = Stream {
+        rate: 10.0,
+        ..in_shared_memory(150_000, 60)
+    };
+    let (mut publisher, _subscriber) = host.known_pair(&observed, &stream)?;
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    publisher.go()?;
+    let (whole, missed) = given(&mut lines, &stream)?;
+    println!("{whole} of {} whole, {missed} missed", stream.count);
+    // A machine that does other things, too, may look too late.
+    ensure!(whole >= 6, "{whole} whole, {missed} missed");
+    let topic = observed.topic("/points")?;
+    ensure!(topic["passages"][0]["view"] == "close", "{topic}");
+    drop(lines);
+    drop(client);
+    observed.wait_for_view("sampled")
+}
+
+/// With `exact: auto` the breakpoint is there while samples are read, and no longer.
+#[test]
+fn on_demand_every_sample_is_seen_and_the_breakpoint_goes_with_the_last_reader() -> Result<()> {
+    let host = Host::with_its_own_fast_dds()?;
+    let observed = host.observe("exact: auto")?;
+    let stream = in_shared_memory(150_000, 40);
+    let (mut publisher, _subscriber) = host.known_pair(&observed, &stream)?;
+    let maps = std::fs::read_to_string(format!("/proc/{}/maps", publisher.process.pid()))?;
+    let line = maps.lines().find(|line| line.contains("/libfastrtps.so"));
+    let library = line.and_then(|line| line.get(line.find('/')?..));
+    let library = PathBuf::from(library.context("no Fast DDS")?);
+    let is_attached = |peer: &Peer| -> Result<bool> {
+        let code = harness::code::at_function(&peer.process, &library)?;
+        Ok(code.in_memory != code.in_file)
+    };
+    ensure!(!is_attached(&publisher)?, "nobody reads samples yet");
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    observed.wait_for_view("exact")?;
+    ensure!(is_attached(&publisher)?, "a sample is to be read");
+    publisher.go()?;
+    let (whole, missed) = given(&mut lines, &stream)?;
+    ensure!((whole, missed) == (stream.count, 0), "{whole} {missed}");
+    drop(lines);
+    drop(client);
+    wait_until("the breakpoint is taken out", || {
+        Ok(!is_attached(&publisher)?)
+    })?;
+    observed.wait_for_view("sampled")
+}
+
+/// A host with a `/dev/shm` of its own.
+struct Host {
+    network: Namespace,
+    enter: Vec<String>,
+    _shared_memory: SharedMemory,
+    /// With a copy of Fast DDS, if it has one.
+    _libraries: Option<TempDir>,
+}
+
+impl Host {
+    fn new() -> Result<Self> {
+        let network = Namespace::alone()?;
+        let shared_memory = SharedMemory::of(&network, 64)?;
+        Ok(Self {
+            enter: shared_memory.inside(&network),
+            network,
+            _shared_memory: shared_memory,
+            _libraries: None,
+        })
+    }
+
+    /// Breakpoints are in a file's pages, for all who map it: other tests' are not in this copy.
+    fn with_its_own_fast_dds() -> Result<Self> {
+        let mut host = Self::new()?;
+        let library = Stack::Fast.library("libfastrtps.so")?;
+        let libraries = tempfile::tempdir()?;
+        let name = library.file_name().context("a library without a name")?;
+        std::fs::copy(&library, libraries.path().join(name))?;
+        let path = format!("LD_LIBRARY_PATH={}", libraries.path().display());
+        host.enter.extend(["env".to_owned(), path]);
+        host._libraries = Some(libraries);
+        Ok(host)
+    }
+
+    /// An agent at its sockets, with this of `capture.shm`.
+    fn observe(&self, shm: &str) -> Result<Observed<'_>> {
+        let cgroup = self.network.cgroup().display();
+        let capture = format!("capture: {{source: host, cgroup: {cgroup}, shm: {{{shm}}}}}\n");
+        Observed::start(&self.network, &capture)
+    }
+
+    /// As [`Self::pair`], until the agent knows their topic: it is said once in shared memory, and a
+    /// busy machine may look too late.
+    fn known_pair(&self, observed: &Observed<'_>, stream: &Stream) -> Result<(Peer, Peer)> {
+        for _ in 0..12 {
+            let (mut publisher, mut subscriber) = self.pair(stream)?;
+            let deadline = Instant::now() + Duration::from_secs(4);
+            while Instant::now() < deadline {
+                let topic = observed.topic(&stream.topic)?;
+                if topic.pointer("/passages/0/pairs") == Some(&1.into()) {
+                    return Ok((publisher, subscriber));
+                }
+                std::thread::sleep(Duration::from_millis(100));
+            }
+            publisher.process.terminate()?;
+            subscriber.process.terminate()?;
+            std::thread::sleep(Duration::from_secs(1));
+        }
+        bail!("{} never became known", stream.topic)
+    }
+
+    /// A publisher and its subscriber that know each other.
+    fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
+        let launch =
+            |role, node| Peer::launch_behind(&self.enter, Stack::Fast, role, stream, &[node]);
+        let mut subscriber = launch(Role::Subscriber, "/listener")?;
+        subscriber.wait_ready()?;
+        let mut publisher = launch(Role::Publisher, "/sensor")?;
+        publisher.wait_ready()?;
+        publisher.wait_matched()?;
+        subscriber.wait_matched()?;
+        Ok((publisher, subscriber))
+    }
+}
+
+/// Point clouds as `rmw_fastrtps_cpp` publishes them by default.
+fn in_shared_memory(size: usize, count: u64) -> Stream {
+    Stream {
+        reliable: true,
+        shares_memory: true,
+        linger: 60.0,
+        ..Stream::point_cloud(size, count)
+    }
+}
+
+/// How many samples of a stream are given, each as it was sent, and how many are not, up to the last
+/// number or until nothing has come for a while.
+fn given(lines: &mut Lines<'_>, stream: &Stream) -> Result<(u64, u64)> {
+    let pattern: Vec<u8> = (8..stream.size).map(pattern).collect();
+    let (mut whole, mut missed, mut last) = (0, 0, 0);
+    let mut deadline = Instant::now() + PATIENCE;
+    while last < stream.count && Instant::now() < deadline {
+        let line = match lines.line_within(PATIENCE)? {
+            Next::Line(line) => line,
+            Next::End => bail!("the stream ended"),
+            Next::Nothing => bail!("not even a clock"),
+        };
+        let number = match serde_json::from_slice(&line)? {
+            Line::Sample(sample) => {
+                let len = sample.payload_bytes.context("no payload")? as usize;
+                let payload = lines.bytes(len)?;
+                ensure!(check(&payload, &pattern)? + 1 == sample.sequence_number);
+                whole += 1;
+                ensure!(
+                    !sample.sampled || sample.sequence_number > last,
+                    "{last} before {sample:?}"
+                );
+                if sample.sequence_number != last + 1 {
+                    println!("{} after {last}", sample.sequence_number);
+                }
+                sample.sequence_number
+            }
+            Line::Missed(facts) => {
+                missed += facts.samples;
+                facts.last_sequence_number
+            }
+            _ => continue,
+        };
+        last = last.max(number);
+        deadline = Instant::now() + Duration::from_secs(5);
+    }
+    Ok((whole, missed))
+}
+
+/// What `BENCHMARKS.md` says of streams: `cargo test --release --test live samples:: -- --ignored
+/// --nocapture`.
+#[test]
+#[ignore = "takes two minutes and a quiet machine to mean anything"]
+fn what_a_stream_of_point_clouds_costs() -> Result<()> {
+    const WINDOW: Duration = Duration::from_secs(20);
+    for (stack, rate) in [
+        (Stack::Cyclone, 20.0),
+        (Stack::Fast, 20.0),
+        (Stack::Cyclone, 37.0),
+        (Stack::Fast, 37.0),
+    ] {
+        let link = Link::new()?;
+        let observed = Observed::start(&link.robot, &at_the_sockets_of(&link.robot))?;
+        let stream = Stream {
+            rate,
+            ..Stream::point_cloud(2_720_000, (rate * 24.0) as u64)
+        };
+        let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
+        let client = observed.client()?;
+        drop(open(&client, "topic=/points", "/points")?);
+        let _reader = Reader::start(&observed.socket, "/samples?topic=/points&payload=true")?;
+        publisher.go()?;
+        std::thread::sleep(Duration::from_secs(2));
+        let before = Usage::of(observed.agent.process.pid())?;
+        std::thread::sleep(WINDOW);
+        let used = Usage::of(observed.agent.process.pid())?.since(&before);
+        publisher.wait_sent(PATIENCE)?;
+        let label = [("topic", "/points")];
+        let page = observed.agent.settled_scrape("/points", stream.count)?;
+        println!(
+            "{stack:?} 2.72 MB @ {rate} Hz: agent {:.2} s CPU in {WINDOW:?}, {:.1} MB unreclaimable, counted {} of {}, {}",
+            used.cpu.as_secs_f64(),
+            used.memory.unreclaimable as f64 / 1e6,
+            page.sum("ros2_topic_messages_total", &label),
+            stream.count,
+            page.doubts(),
+        );
+    }
+    Ok(())
+}

@@ -1,0 +1,788 @@
+//! Fast DDS with its default transports on one host: user data, endpoints and node names go through
+//! shared memory, and nothing but participants shows on the network. The agent reads it, and nobody
+//! can tell.
+//!
+//! Each host has a `/dev/shm` of its own, in a mount namespace as a container has it, which the agent
+//! reaches through `/proc`. The judges are the peers' logs, and what strace says of the agent.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail, ensure};
+use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::wait_until;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Of the samples that there were, those that were seen: what is asked for on a machine that does
+/// other things, too.
+const COVERAGE: f64 = 0.1;
+/// How often a pair may meet before its names are known.
+const MEETINGS: u32 = 12;
+
+#[test]
+fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
+    let streams = [
+        ("/imu", 320, 200.0, 4800),
+        ("/image", 644_000, 20.0, 400),
+        ("/points", 2_720_000, 20.0, 400),
+        ("/odom", 900, 50.0, 1000),
+    ]
+    .map(|(topic, size, rate, count)| Stream {
+        topic: topic.to_owned(),
+        size,
+        rate,
+        count,
+        stretch: count / 2,
+        linger: 60.0,
+        ..shared()
+    });
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let mut pairs = host.known_pairs(&agent, &streams)?;
+    let cpu = |page: &Scrape| page.sum("ros2probe_shm_cpu_seconds_total", &[]);
+    let (before, began) = (cpu(&agent.scrape()?), Instant::now());
+    for (publisher, _) in &mut pairs {
+        publisher.go()?;
+    }
+    let imu = [("topic", "/imu")];
+    agent.scrape_until("the publisher's rate", |page| {
+        let rate = page.sum("ros2_topic_rate_hertz", &imu);
+        (rate - 200.0).abs() < 4.0
+    })?;
+    let count = |page: &Scrape, stream: &Stream| {
+        page.sum("ros2_topic_messages_total", &[("topic", &stream.topic)])
+    };
+    let half = agent.scrape_until("as many messages as were sent first", |page| {
+        // What was sent before the first one that was seen, nobody can count.
+        streams
+            .iter()
+            .all(|stream| count(page, stream) >= 0.9 * stream.stretch as f64)
+    })?;
+    let share = 100.0 * (cpu(&half) - before) / began.elapsed().as_secs_f64();
+    println!("{share:.2} % of a CPU; {}", telling(&half));
+    // Nothing more comes until it is told to.
+    let half = agent.settled_scrape("/imu", 0)?;
+    let began = Instant::now();
+    for (publisher, _) in &mut pairs {
+        publisher.go()?;
+    }
+    for ((publisher, _), stream) in pairs.iter_mut().zip(&streams) {
+        publisher.wait_sent(PATIENCE)?;
+        let sent = publisher.log()?.sequences("pub").len() as u64;
+        ensure!(sent == stream.count, "{sent} of {stream:?}");
+    }
+    let page = agent.settled_scrape("/imu", 0)?;
+    let share = 100.0 * (cpu(&page) - cpu(&half)) / began.elapsed().as_secs_f64();
+    println!("{share:.2} % of a CPU once nobody is new");
+    for stream in &streams {
+        let topic = [("topic", stream.topic.as_str())];
+        let sum = |name: &str| page.sum(name, &topic);
+        let info = [
+            ("topic", stream.topic.as_str()),
+            ("message_type", "sensor_msgs/msg/PointCloud2"),
+            ("reliability", "RELIABLE"),
+            ("durability", "VOLATILE"),
+        ];
+        assert_eq!(page.sum("ros2_topic_info", &info), 1.0, "{}", page.0);
+        let passage = [topic[0], ("passage", "shared_memory")];
+        assert_eq!(page.sum("ros2_topic_pairs", &passage), 1.0);
+        assert_eq!(sum("ros2_topic_pairs"), 1.0);
+        let second = count(&page, stream) - count(&half, stream);
+        assert_eq!(second, stream.stretch as f64, "{}", telling(&page));
+        // A DATA is padded to four bytes where another submessage follows it.
+        let bytes = count(&page, stream) * stream.size as f64;
+        assert!((sum("ros2_topic_bytes_total") - bytes).abs() <= 4.0 * stream.count as f64);
+        assert_eq!(sum("ros2_topic_lost_messages_total"), 0.0);
+        let coverage = sum("ros2_topic_sampled_coverage_ratio");
+        assert!(coverage > COVERAGE && coverage <= 1.0, "{coverage}");
+        let latencies = sum("ros2_topic_latency_seconds_count");
+        let seen = sum("ros2_topic_sampled_seen_messages_total");
+        assert!(
+            latencies > 0.0 && latencies <= seen,
+            "{latencies} of {seen}"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subscriber()
+-> Result<()> {
+    let link = Link::new()?;
+    let host = Host::new(&link.robot)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&link.robot, directory.path())?;
+    let both = Stream {
+        count: 600,
+        stretch: 200,
+        peers: 2,
+        linger: 60.0,
+        ..shared()
+    };
+    let one = Stream {
+        peers: 1,
+        ..both.clone()
+    };
+    let cyclone = Stream {
+        topic: "/points".to_owned(),
+        shares_memory: false,
+        ..one.clone()
+    };
+    let far = Stream {
+        shares_memory: false,
+        ..one.clone()
+    };
+    let pairs = |page: &Scrape, topic, passage| {
+        page.sum(
+            "ros2_topic_pairs",
+            &[("topic", topic), ("passage", passage)],
+        )
+    };
+    let shows_all = |page: &Scrape| {
+        pairs(page, "/imu", "shared_memory") == 1.0
+            && pairs(page, "/imu", "network") == 1.0
+            && pairs(page, "/points", "network") == 1.0
+    };
+    let meet = || -> Result<Option<[Peer; 5]>> {
+        let mut peers = [
+            host.launch(Role::Publisher, &both)?,
+            host.launch_stack(Stack::Cyclone, Role::Publisher, &cyclone)?,
+            host.launch(Role::Subscriber, &one)?,
+            host.launch_stack(Stack::Cyclone, Role::Subscriber, &cyclone)?,
+            Peer::launch(
+                &link.monitor,
+                Stack::Fast,
+                Role::Subscriber,
+                &far,
+                &["/far"],
+            )?,
+        ];
+        for peer in &mut peers {
+            peer.wait_ready()?;
+        }
+        for peer in &mut peers {
+            peer.wait_matched()?;
+        }
+        let deadline = Instant::now() + Duration::from_secs(4);
+        while Instant::now() < deadline {
+            if shows_all(&agent.scrape()?) {
+                return Ok(Some(peers));
+            }
+            std::thread::sleep(Duration::from_millis(200));
+        }
+        for mut peer in peers {
+            peer.process.terminate()?;
+        }
+        std::thread::sleep(Duration::from_secs(1));
+        Ok(None)
+    };
+    let mut met = None;
+    for _ in 0..MEETINGS {
+        met = meet()?;
+        if met.is_some() {
+            break;
+        }
+    }
+    let [mut publisher, mut talker, ..] = met.context("endpoints were never all heard")?;
+    for _ in 0..2 {
+        publisher.go()?;
+        talker.go()?;
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    // What was sent before the first one that was seen, nobody can count.
+    let before = agent.settled_scrape("/imu", 0)?;
+    publisher.go()?;
+    talker.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    talker.wait_sent(PATIENCE)?;
+    let page = agent.settled_scrape("/points", one.count)?;
+    let more = |topic| {
+        let count = |page: &Scrape| page.sum("ros2_topic_messages_total", &[("topic", topic)]);
+        count(&page) - count(&before)
+    };
+    println!("{}", telling(&page));
+    assert_eq!(more("/imu"), 200.0, "{}", telling(&page));
+    assert_eq!(more("/points"), 200.0);
+    assert!(shows_all(&page), "{}", page.0);
+    for topic in ["/imu", "/points"] {
+        assert_eq!(page.sum("ros2_topic_publishers", &[("topic", topic)]), 1.0);
+    }
+    let sampled = |topic| page.sum("ros2_topic_sampled_messages_total", &[("topic", topic)]);
+    assert!(sampled("/imu") > 0.0);
+    assert_eq!(sampled("/points"), 0.0);
+    let lost = page.sum("ros2_topic_lost_messages_total", &[]);
+    assert_eq!(lost, 0.0);
+    Ok(())
+}
+
+#[test]
+fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let stream = Stream {
+        count: 1_000_000,
+        ..shared()
+    };
+    let (mut publisher, mut subscriber) = host.known_pair(&agent, &stream)?;
+    let memory = host.shared_memory();
+    let (ports, segments) = files_of(&memory)?;
+    let port = fs::read(memory.join(&ports[0]))?;
+    let number: u32 = ports[0].trim_start_matches("fastrtps_port").parse()?;
+    let at = port
+        .windows(4)
+        .position(|word| word == number.to_le_bytes())
+        .context("a port does not say its number")?;
+    for idle in 20_000..20_128_u32 {
+        let mut copy = port.clone();
+        copy[at..at + 4].copy_from_slice(&idle.to_le_bytes());
+        fs::write(memory.join(format!("fastrtps_port{idle}")), copy)?;
+    }
+    let noise: Vec<u8> = (0..70_000_u32)
+        .map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8)
+        .collect();
+    for (name, bytes) in [
+        ("fastrtps_port21000", &noise[..]),
+        ("fastrtps_port21001", &[]),
+        ("fastrtps_port21002", &port[..300]),
+        ("fastrtps_0123456789abcdef", &noise[..]),
+        ("fastdds_port21003", &noise[..1]),
+    ] {
+        fs::write(memory.join(name), bytes)?;
+    }
+    publisher.go()?;
+    let open = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "port")]);
+    let idle = agent.scrape_until("128 more ports", |page| open(page) >= 130.0)?;
+    let topic = [("topic", "/imu")];
+    let messages = |page: &Scrape| page.sum("ros2_topic_messages_total", &topic);
+    let began = messages(&idle);
+    agent.scrape_until("messages beside them", |page| {
+        messages(page) > began + 200.0
+    })?;
+    println!("{}", telling(&agent.scrape()?));
+
+    // A file of that name is somebody else's now, and the one that was open is let go.
+    let copy = memory.join("copy");
+    fs::write(&copy, fs::read(memory.join(&segments[0]))?)?;
+    std::os::unix::fs::chown(&copy, Some(65534), Some(65534))?;
+    fs::rename(&copy, memory.join(&segments[0]))?;
+    for name in files_of(&memory)?
+        .0
+        .iter()
+        .filter(|name| !ports.contains(name))
+    {
+        fs::remove_file(memory.join(name))?;
+    }
+    wait_until("what is gone is let go", || {
+        Ok(host
+            .files_open_in(&agent)?
+            .iter()
+            .all(|name| !name.ends_with(" (deleted)")))
+    })?;
+    // The peers cannot go on without their memory; the agent can.
+    for name in files_of(&memory)?.1 {
+        let file = fs::File::options().write(true).open(memory.join(name))?;
+        file.set_len(100)?;
+    }
+    std::thread::sleep(Duration::from_secs(1));
+    for peer in [&mut publisher, &mut subscriber] {
+        peer.process.signal("KILL")?;
+        peer.process.wait(PATIENCE)?;
+    }
+    host.remove_shared_memory()?;
+    wait_until("everything is let go", || {
+        Ok(host.files_open_in(&agent)?.is_empty())
+    })?;
+    // Those that were killed are there until their leases end.
+    for attempt in 1..=MEETINGS {
+        let (mut publisher, _subscriber) = host.pair(&stream)?;
+        let before = messages(&agent.scrape()?);
+        publisher.go()?;
+        let deadline = Instant::now() + Duration::from_secs(5);
+        while Instant::now() < deadline {
+            if messages(&agent.scrape()?) > before + 200.0 {
+                println!("messages again at attempt {attempt}");
+                return Ok(());
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+    }
+    bail!("no messages of a new pair")
+}
+
+#[test]
+fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_open() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let stream = Stream {
+        count: 1_000_000,
+        ..shared()
+    };
+    let (mut publisher, mut subscriber) = host.known_pair(&agent, &stream)?;
+    publisher.go()?;
+    let flows = || -> Result<bool> {
+        let sum = |page: Scrape| page.sum("ros2_topic_messages_total", &[("topic", "/imu")]);
+        let before = sum(agent.scrape()?);
+        std::thread::sleep(Duration::from_secs(1));
+        Ok(sum(agent.scrape()?) - before > 100.0)
+    };
+    wait_until("messages flow", flows)?;
+    let mut most = 0;
+    for round in 0..2 {
+        let role = match round % 2 {
+            0 => Role::Subscriber,
+            _ => Role::Publisher,
+        };
+        // Endpoints are announced in shared memory, too: a new publisher may go unnoticed.
+        let mut is_right_again = |attempt: u32| -> Result<bool> {
+            println!("{role:?} killed, attempt {attempt}");
+            let peer = match role {
+                Role::Subscriber => &mut subscriber,
+                Role::Publisher => &mut publisher,
+            };
+            peer.process.signal("KILL")?;
+            peer.process.wait(Duration::from_secs(5))?;
+            *peer = host.launch(role, &stream)?;
+            peer.wait_ready()?;
+            if role == Role::Publisher {
+                peer.go()?;
+            }
+            std::thread::sleep(Duration::from_secs(2));
+            most = most.max(host.files_open_in(&agent)?.len());
+            Ok(flows()? || flows()?)
+        };
+        let mut attempts = 1..=MEETINGS;
+        loop {
+            let attempt = attempts
+                .next()
+                .context("a peer that was killed is not found again")?;
+            if is_right_again(attempt)? {
+                break;
+            }
+        }
+    }
+    // A port and a segment of each of two peers, and of some that were killed and are not tidied up.
+    assert!((4..=64).contains(&most), "{most} files");
+    for peer in [&mut publisher, &mut subscriber] {
+        peer.process.terminate()?;
+    }
+    host.remove_shared_memory()?;
+    wait_until("everything is let go", || {
+        Ok(host.files_open_in(&agent)?.is_empty())
+    })?;
+    let page = agent.settled_scrape(&stream.topic, 0)?;
+    assert_eq!(page.sum("ros2_topic_lost_messages_total", &[]), 0.0);
+    assert_eq!(page.sum("ros2probe_shm_open", &[("kind", "port")]), 0.0);
+    Ok(())
+}
+
+/// Of killed processes the files stay, with what they sent last. An agent that starts then believes
+/// none of it.
+#[test]
+fn files_of_killed_processes_make_no_node_and_no_unknown_writer() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let stream = Stream {
+        count: 400,
+        linger: 60.0,
+        ..shared()
+    };
+    let (mut publisher, mut subscriber) = host.pair(&stream)?;
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    for peer in [&mut publisher, &mut subscriber] {
+        peer.process.signal("KILL")?;
+        peer.process.wait(PATIENCE)?;
+    }
+    let (ports, segments) = files_of(&host.shared_memory())?;
+    ensure!(!ports.is_empty() && !segments.is_empty(), "nothing is left");
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let looked = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "directory")]) > 0.0;
+    agent.scrape_until("shared memory is found", looked)?;
+    // Strangers are shown after 3 s.
+    std::thread::sleep(Duration::from_secs(5));
+    let page = agent.scrape()?;
+    assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0, "{}", page.0);
+    assert_eq!(page.samples("ros2_node_info", &[]).count(), 0);
+    assert_eq!(page.sum("ros2_participants", &[]), 0.0);
+    assert_eq!(page.sum("ros2probe_shm_open", &[("kind", "port")]), 0.0);
+    Ok(())
+}
+
+#[test]
+fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let stream = Stream {
+        count: 400,
+        linger: 60.0,
+        ..shared()
+    };
+    let (publisher, _subscriber) = host.known_pair(&agent, &stream)?;
+    let trace = directory.path().join("trace");
+    let pid = agent.process.pid().to_string();
+    let mut strace = Command::new("strace")
+        .args(["-f", "-y", "-qq", "-p", &pid, "-o"])
+        .arg(&trace)
+        .spawn()
+        .context("cannot run strace: apt-get install strace")?;
+    wait_until("strace traces", || {
+        let status = fs::read_to_string(format!("/proc/{pid}/status"))?;
+        Ok(!status.contains("TracerPid:\t0\n"))
+    })?;
+    // Files of newcomers are opened before its eyes; it makes the agent too slow to hear names.
+    let _newcomers = host.pair(&Stream {
+        topic: "/late".to_owned(),
+        ..shared()
+    })?;
+    let page = run(&agent, publisher, &stream)?;
+    let _ = Command::new("kill")
+        .args(["-INT", &strace.id().to_string()])
+        .status();
+    strace.wait()?;
+    assert!(
+        page.sum("ros2_topic_sampled_seen_messages_total", &[]) > 0.0,
+        "{}",
+        telling(&page)
+    );
+
+    let trace = fs::read_to_string(&trace)?;
+    let of_shared_memory: Vec<&str> = trace
+        .lines()
+        .filter(|line| line.contains("dev/shm"))
+        .collect();
+    for call in ["openat(", "pread64("] {
+        assert!(
+            of_shared_memory.iter().any(|line| line.contains(call)),
+            "{call}"
+        );
+    }
+    for line in of_shared_memory {
+        let (_, call) = line.trim().split_once(' ').unwrap_or_default();
+        let name = call.trim().split('(').next().unwrap_or_default();
+        let is_harmless = match name {
+            "openat" => {
+                let writes = ["O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC"];
+                line.contains("O_RDONLY") && !writes.iter().any(|flag| line.contains(flag))
+            }
+            // The standard library's own check of a descriptor that it closes.
+            "fcntl" => line.contains("F_GETFD"),
+            "pread64" | "inotify_add_watch" | "statx" | "fstat" | "newfstatat" | "getdents64"
+            | "close" | "lseek" | "readlink" => true,
+            // What strace cut in two was looked at where it began.
+            _ => call.starts_with("<...") || call.trim().starts_with("<..."),
+        };
+        assert!(is_harmless, "{line}");
+    }
+    // Futexes of its own threads apart, the agent waits on nothing and locks nothing.
+    for call in ["flock(", "F_SETLK", "PROT_WRITE, MAP_SHARED, 3<"] {
+        let wrong = trace
+            .lines()
+            .find(|line| line.contains(call) && line.contains("shm"));
+        assert_eq!(wrong, None);
+    }
+    Ok(())
+}
+
+#[test]
+fn where_histories_are_shared_nothing_is_seen_and_the_agent_says_so() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let stream = Stream {
+        shares_history: true,
+        count: 200,
+        linger: 60.0,
+        ..shared()
+    };
+    let (publisher, _subscriber) = host.known_pair(&agent, &stream)?;
+    let page = run(&agent, publisher, &stream)?;
+    let pairs = [("topic", "/imu"), ("passage", "data_sharing")];
+    assert_eq!(page.sum("ros2_topic_pairs", &pairs), 1.0, "{}", page.0);
+    Ok(())
+}
+
+#[test]
+fn an_agent_with_nothing_to_see_costs_next_to_nothing() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let spent = |what: &str| -> Result<f64> {
+        let cpu =
+            || -> Result<f64> { Ok(agent.scrape()?.sum("ros2probe_shm_cpu_seconds_total", &[])) };
+        let before = cpu()?;
+        std::thread::sleep(Duration::from_secs(8));
+        let share = (cpu()? - before) / 8.0;
+        println!("{what}: {:.2} % of a CPU", 100.0 * share);
+        Ok(share)
+    };
+    assert!(spent("nobody there")? < 0.01);
+    let (_publisher, _subscriber) = host.pair(&shared())?;
+    std::thread::sleep(Duration::from_secs(4));
+    assert!(spent("a pair that is silent")? < 0.04);
+    Ok(())
+}
+
+/// What `BENCHMARKS.md` says of names: `cargo test --test live shm:: -- --ignored --nocapture`.
+#[test]
+#[ignore = "takes two minutes and prints a figure"]
+fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
+    const STARTS: usize = 20;
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&network, directory.path())?;
+    let mut known = 0;
+    for _ in 0..STARTS {
+        let (mut publisher, mut subscriber) = host.pair(&shared())?;
+        std::thread::sleep(Duration::from_millis(1500));
+        known += usize::from(is_known(&agent.scrape()?, &shared()));
+        publisher.process.terminate()?;
+        subscriber.process.terminate()?;
+        std::thread::sleep(Duration::from_secs(1));
+    }
+    let page = agent.scrape()?;
+    let cpu = page.sum("ros2probe_shm_cpu_seconds_total", &[]);
+    println!("all known after {known} of {STARTS} starts, for {cpu:.1} s of CPU time");
+    ensure!(known * 2 > STARTS, "{known} of {STARTS}");
+    Ok(())
+}
+
+/// What `BENCHMARKS.md` says of the peers: `cargo test --test live shm:: -- --ignored --nocapture`.
+#[test]
+#[ignore = "takes two minutes and a quiet machine to mean anything"]
+fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {
+    const PAIRS: usize = 10;
+    let network = Namespace::alone()?;
+    let host = Host::new(&network)?;
+    let directory = tempfile::tempdir()?;
+    let stream = Stream {
+        count: 600,
+        reliable: false,
+        linger: 60.0,
+        ..shared()
+    };
+    let mut runs = [Vec::new(), Vec::new()];
+    for pair in 0..2 * PAIRS {
+        // Without, with, with, without, ...: what drifts touches both.
+        let with = usize::from(matches!(pair % 4, 1 | 2));
+        let agent = match with {
+            1 => Some(start_agent(&network, directory.path())?),
+            _ => None,
+        };
+        let (mut publisher, mut subscriber) = host.pair(&stream)?;
+        publisher.go()?;
+        publisher.wait_sent(PATIENCE)?;
+        subscriber
+            .process
+            .wait_for("done", Duration::from_secs(2))
+            .ok();
+        let log = subscriber.log()?;
+        let received = log.sequences("sub").len() as u64;
+        let mut latencies: Vec<u64> = log
+            .0
+            .iter()
+            .filter_map(|event| Some(event.t.saturating_sub(event.stamp_ns?)))
+            .collect();
+        latencies.sort_unstable();
+        let at = |share: usize| latencies.get(latencies.len() * share / 100).copied();
+        let missing = stream.count.saturating_sub(received);
+        runs[with].push([
+            missing,
+            at(50).unwrap_or(0) / 1000,
+            at(99).unwrap_or(0) / 1000,
+        ]);
+        drop(agent);
+    }
+    for (name, mut runs) in ["without", "with"].iter().zip(runs) {
+        let mut median = |column: usize| {
+            runs.sort_unstable_by_key(|run| run[column]);
+            runs[runs.len() / 2][column]
+        };
+        let [missing, typical, worst] = [0, 1, 2].map(&mut median);
+        println!(
+            "{name} an agent, medians of {PAIRS}: {missing} of {} lost, latency {typical} us, \
+             99th percentile {worst} us",
+            stream.count
+        );
+    }
+    Ok(())
+}
+
+/// A host with a `/dev/shm` of its own.
+struct Host<'n> {
+    network: &'n Namespace,
+    /// Keeps the mount namespace.
+    keeper: Process,
+}
+
+impl<'n> Host<'n> {
+    fn new(network: &'n Namespace) -> Result<Host<'n>> {
+        let script = "mount -t tmpfs -o size=64m,mode=1777 shm /dev/shm && echo ready && exec cat";
+        let arguments = ["--mount", "sh", "-c", script];
+        let mut keeper = Process::start(&network.on_network(), "unshare", arguments)?;
+        keeper.wait_for("ready", Duration::from_secs(10))?;
+        Ok(Host { network, keeper })
+    }
+
+    fn launch(&self, role: Role, stream: &Stream) -> Result<Peer> {
+        self.launch_stack(Stack::Fast, role, stream)
+    }
+
+    fn launch_stack(&self, stack: Stack, role: Role, stream: &Stream) -> Result<Peer> {
+        let mut enter = self.network.on_network();
+        let mounts = format!("--mount=/proc/{}/ns/mnt", self.keeper.pid());
+        enter.extend(["nsenter".to_owned(), mounts]);
+        Peer::launch_behind(&enter, stack, role, stream, &[&node_of(role, stream)])
+    }
+
+    /// A publisher and its subscriber that know each other.
+    fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
+        let mut subscriber = self.launch(Role::Subscriber, stream)?;
+        subscriber.wait_ready()?;
+        let mut publisher = self.launch(Role::Publisher, stream)?;
+        publisher.wait_ready()?;
+        publisher.wait_matched()?;
+        subscriber.wait_matched()?;
+        Ok((publisher, subscriber))
+    }
+
+    /// As [`Self::known_pairs`] of one stream.
+    fn known_pair(&self, agent: &Agent<'_>, stream: &Stream) -> Result<(Peer, Peer)> {
+        let mut pairs = self.known_pairs(agent, std::slice::from_ref(stream))?;
+        pairs.pop().context("no pair")
+    }
+
+    /// As [`Self::pair`] for each stream, until the agent knows all by name. Names are said once,
+    /// and the memory that they are said in is used again within a moment: a tap that finds no CPU
+    /// in that moment misses them.
+    fn known_pairs(&self, agent: &Agent<'_>, streams: &[Stream]) -> Result<Vec<(Peer, Peer)>> {
+        for attempt in 1..=MEETINGS {
+            let pairs: Result<Vec<_>> = streams.iter().map(|stream| self.pair(stream)).collect();
+            let pairs = pairs?;
+            let deadline = Instant::now() + Duration::from_secs(3);
+            while Instant::now() < deadline {
+                let page = agent.scrape()?;
+                if streams.iter().all(|stream| is_known(&page, stream)) {
+                    println!("{} known at attempt {attempt}", streams.len());
+                    return Ok(pairs);
+                }
+                std::thread::sleep(Duration::from_millis(200));
+            }
+            for (mut publisher, mut subscriber) in pairs {
+                publisher.process.terminate()?;
+                subscriber.process.terminate()?;
+            }
+            std::thread::sleep(Duration::from_secs(1));
+        }
+        bail!("their names did not become known in {MEETINGS} attempts")
+    }
+
+    /// Files of this host's shared memory that the agent has open.
+    fn files_open_in(&self, agent: &Agent<'_>) -> Result<Vec<String>> {
+        let open = fs::read_dir(format!("/proc/{}/fd", agent.process.pid()))?;
+        let links = open
+            .flatten()
+            .filter_map(|entry| fs::read_link(entry.path()).ok());
+        let names = links.map(|link| link.to_string_lossy().into_owned());
+        Ok(names.filter(|name| name.contains("fastrtps_")).collect())
+    }
+
+    /// Where it is from outside.
+    fn shared_memory(&self) -> PathBuf {
+        PathBuf::from(format!("/proc/{}/root/dev/shm", self.keeper.pid()))
+    }
+
+    /// As `fastdds shm clean` would.
+    fn remove_shared_memory(&self) -> Result<()> {
+        for entry in fs::read_dir(self.shared_memory())? {
+            fs::remove_file(entry?.path())?;
+        }
+        Ok(())
+    }
+}
+
+/// A reliable stream as `rmw_fastrtps_cpp` publishes it by default.
+fn shared() -> Stream {
+    Stream {
+        reliable: true,
+        shares_memory: true,
+        ..Stream::small(0)
+    }
+}
+
+fn node_of(role: Role, stream: &Stream) -> String {
+    let name = stream.topic.trim_start_matches('/');
+    match role {
+        Role::Publisher => format!("/{name}_talker"),
+        Role::Subscriber => format!("/{name}_listener"),
+    }
+}
+
+/// Whether both nodes and both endpoints of the stream's topic are known.
+fn is_known(page: &Scrape, stream: &Stream) -> bool {
+    let nodes = page.labels_of("ros2_node_info", "ros_node");
+    let roles = [Role::Publisher, Role::Subscriber];
+    let endpoints = ["ros2_topic_publishers", "ros2_topic_subscriptions"];
+    roles
+        .iter()
+        .all(|role| nodes.contains(&node_of(*role, stream)))
+        && endpoints
+            .iter()
+            .all(|name| page.sum(name, &[("topic", &stream.topic)]) == 1.0)
+}
+
+/// Names of ports and of segments.
+fn files_of(memory: &Path) -> Result<(Vec<String>, Vec<String>)> {
+    let mut names: Vec<_> = fs::read_dir(memory)?
+        .map(|entry| Ok(entry?.file_name().to_string_lossy().into_owned()))
+        .collect::<Result<_>>()?;
+    names.retain(|name| name.starts_with("fastrtps_") && !name.ends_with("l"));
+    Ok(names.into_iter().partition(|name| name.contains("_port")))
+}
+
+fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
+    let configuration = directory.join("ros2probe.yaml");
+    let text = format!("watch: [/**]\n{}", at_the_sockets_of(host));
+    fs::write(&configuration, text)?;
+    Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)
+}
+
+/// Lets the publisher send everything, and looks.
+fn run(agent: &Agent<'_>, mut publisher: Peer, stream: &Stream) -> Result<Scrape> {
+    // Names and endpoints have settled.
+    std::thread::sleep(Duration::from_secs(1));
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    let sent = publisher.log()?.sequences("pub").len() as u64;
+    ensure!(
+        sent == stream.count,
+        "{sent} of {} were accepted",
+        stream.count
+    );
+    agent.settled_scrape(&stream.topic, 0)
+}
+
+/// What the agent says of its look at shared memory.
+fn telling(page: &Scrape) -> String {
+    let lines = page.0.lines().filter(|line| {
+        !line.starts_with('#') && (line.contains("_shm_") || line.contains("_sampled_"))
+            || line.starts_with("ros2_topic_messages_total")
+    });
+    lines.collect::<Vec<_>>().join("; ")
+}

@@ -1,0 +1,371 @@
+//! Exact mode: every message that Fast DDS puts into shared memory, seen in the process that sends
+//! it. Needs root and a kernel with uprobes.
+//!
+//! The judges are the peers' logs, and the code in their memory: a breakpoint shows there.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::{Agent, Scrape, get};
+use ros2probe_testing::harness::code::{self, Code};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::wait_until;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+const SAMPLES: u64 = 600;
+/// As fast as it goes, into a ring with room for all of it: the agent may get no CPU meanwhile.
+const RING: u64 = 4 << 20;
+const BURST: u64 = 50_000;
+const FASTER_THAN_IT_GOES: f64 = 1e6;
+
+#[test]
+fn every_message_is_seen_and_none_is_when_the_agent_is_killed() -> Result<()> {
+    let host = Host::new()?;
+    let directory = tempfile::tempdir()?;
+    let agent = start_agent(&host.network, directory.path(), &[])?;
+    let stream = Stream {
+        count: SAMPLES,
+        linger: 60.0,
+        ..shared("/imu")
+    };
+    let (mut publisher, mut subscriber) = host.pair(&stream)?;
+    known(&agent, "/imu")?;
+    let library = library_of(&publisher)?;
+    let code = |peer: &Peer| code::at_function(&peer.process, &library);
+    for peer in [&publisher, &subscriber] {
+        let Code { in_memory, in_file } = code(peer)?;
+        assert_ne!(in_memory, in_file);
+    }
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    let page = counted(&agent, "/imu", SAMPLES)?;
+    assert_eq!(received(&mut subscriber, 0, SAMPLES)?, SAMPLES);
+    let topic = [("topic", "/imu")];
+    assert_eq!(page.sum("ros2_topic_lost_messages_total", &topic), 0.0);
+    let bytes = page.sum("ros2_topic_bytes_total", &topic);
+    assert!((bytes - 320.0 * SAMPLES as f64).abs() <= 4.0 * SAMPLES as f64);
+    let latencies = page.sum("ros2_topic_latency_seconds_count", &topic);
+    assert_eq!(latencies, SAMPLES as f64);
+    publisher.process.terminate()?;
+    subscriber.process.terminate()?;
+
+    let burst = Stream {
+        rate: FASTER_THAN_IT_GOES,
+        count: BURST + SAMPLES,
+        stretch: BURST,
+        depth: 1000,
+        ..shared("/burst")
+    };
+    let burst = Stream {
+        linger: 60.0,
+        ..burst
+    };
+    let (mut publisher, mut subscriber) = host.pair(&burst)?;
+    known(&agent, "/burst")?;
+    publisher.go()?;
+    let page = counted(&agent, "/burst", BURST)?;
+    assert_eq!(page.sum("ros2_topic_lost_messages_total", &[]), 0.0);
+    // Shared memory was not looked at, and nothing was sampled.
+    let read = [("event", "read")];
+    assert_eq!(page.sum("ros2probe_shm_events_total", &read), 0.0);
+    assert_eq!(page.sum("ros2_topic_sampled_messages_total", &[]), 0.0);
+    let ability = [("ability", "shared_memory_exact")];
+    assert_eq!(page.sum("ros2probe_capture_ability", &ability), 1.0);
+
+    agent.process.signal("KILL")?;
+    for peer in [&publisher, &subscriber] {
+        wait_until("the breakpoint is taken out", || {
+            let Code { in_memory, in_file } = code(peer)?;
+            Ok(in_memory == in_file)
+        })?;
+    }
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    // Of the burst itself Fast DDS overwrites what it has not got to its reader, agent or not.
+    assert_eq!(received(&mut subscriber, BURST, SAMPLES)?, SAMPLES);
+    Ok(())
+}
+
+#[test]
+fn without_what_it_takes_shared_memory_is_sampled_and_the_reason_is_told() -> Result<()> {
+    let host = Host::new()?;
+    let directory = tempfile::tempdir()?;
+    let lacking = ["setpriv", "--bounding-set", "-sys_admin"].map(str::to_owned);
+    let agent = start_agent(&host.network, directory.path(), &lacking)?;
+    let page = agent.scrape()?;
+    let reasons = page.labels_of("ros2probe_shm_exact_info", "reason");
+    let [reason] = &reasons.into_iter().collect::<Vec<_>>()[..] else {
+        panic!("{}", page.0);
+    };
+    assert!(reason.contains("CAP_SYS_ADMIN"), "{reason}");
+    let able = |name: &str| page.sum("ros2probe_capture_ability", &[("ability", name)]);
+    assert_eq!(able("shared_memory_exact"), 0.0);
+    assert_eq!(able("shared_memory"), 1.0);
+    drop(agent);
+
+    // A process with a library that has no such function, and a pair that has.
+    let fake = directory.path().join("libfastdds.so.3.9");
+    fs::copy(any_library()?, &fake)?;
+    let agent = start_agent(&host.network, directory.path(), &[])?;
+    let looks = || -> Result<f64> { Ok(agent.scrape()?.sum("ros2probe_shm_looks_total", &[])) };
+    let is_able = || -> Result<bool> {
+        let ability = [("ability", "shared_memory_exact")];
+        Ok(agent.scrape()?.sum("ros2probe_capture_ability", &ability) == 1.0)
+    };
+    wait_until("everything is covered", is_able)?;
+    let preload = format!("LD_PRELOAD={}", fake.display());
+    let mut enter = host.network.on_network();
+    enter.extend(["env".to_owned(), preload]);
+    let mut stranger = Process::start(&enter, "sleep", ["60"])?;
+    wait_until("it is not covered", || Ok(!is_able()?))?;
+    let page = agent.scrape()?;
+    let reasons = page.labels_of("ros2probe_shm_exact_info", "reason");
+    assert!(
+        reasons.iter().all(|reason| reason.contains("no symbol")),
+        "{reasons:?}"
+    );
+    let before = looks()?;
+    wait_until(
+        "shared memory is looked at",
+        || Ok(looks()? > before + 10.0),
+    )?;
+    stranger.signal("KILL")?;
+    stranger.wait(PATIENCE)?;
+    wait_until("everything is covered again", is_able)
+}
+
+#[test]
+fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> {
+    let mut host = Host::new()?;
+    let observed = host.network.cgroup().join("observed");
+    fs::create_dir(&observed)?;
+    host.cgroup.clone_from(&observed);
+    let directory = tempfile::tempdir()?;
+    let mut agent = start_agent_at(&host.network, &observed, directory.path(), &[])?;
+    let able = |agent: &Agent<'_>, name: &str| -> Result<bool> {
+        let ability = [("ability", name)];
+        Ok(agent.scrape()?.sum("ros2probe_capture_ability", &ability) == 1.0)
+    };
+    wait_until("it is exact", || able(&agent, "shared_memory_exact"))?;
+    fs::remove_dir(&observed)?;
+    fs::create_dir(&observed)?;
+    wait_until("it is exact no longer", || {
+        Ok(!able(&agent, "shared_memory_exact")?)
+    })?;
+    agent.wait_ready(PATIENCE)?;
+    assert!(able(&agent, "shared_memory")?);
+    let health = get(&host.network, "http://127.0.0.1:17401/health")?;
+    assert!(health.contains("the cgroup was made anew"), "{health}");
+
+    // Who is in the new one is seen by looking, and nobody is believed to have lost anything.
+    let stream = Stream {
+        count: SAMPLES,
+        linger: 60.0,
+        ..shared("/imu")
+    };
+    let is_there = || -> Result<bool> {
+        let page = agent.scrape()?;
+        Ok(page.sum("ros2_topic_publishers", &[("topic", "/imu")]) == 1.0)
+    };
+    // What is said once can be missed by looking: other nodes of the same names say it again.
+    let (mut publisher, mut subscriber) = host.pair(&stream)?;
+    let began = Instant::now();
+    while !is_there()? {
+        ensure!(began.elapsed() < PATIENCE, "the publisher is not known");
+        std::thread::sleep(Duration::from_secs(3));
+        if !is_there()? {
+            drop((publisher, subscriber));
+            (publisher, subscriber) = host.pair(&stream)?;
+        }
+    }
+    publisher.go()?;
+    publisher.wait_sent(PATIENCE)?;
+    assert_eq!(received(&mut subscriber, 0, SAMPLES)?, SAMPLES);
+    let page = agent.settled_scrape("/imu", SAMPLES)?;
+    let topic = [("topic", "/imu")];
+    let counted = page.sum("ros2_topic_messages_total", &topic);
+    let lost = page.sum("ros2_topic_lost_messages_total", &topic);
+    // The last ones may have been overwritten before a look.
+    ensure!(
+        (0.9..=1.0).contains(&(counted / SAMPLES as f64)) && lost == 0.0,
+        "{counted} of {SAMPLES}, {lost} lost: {}",
+        telling(&page)
+    );
+    drop(publisher);
+    drop(subscriber);
+    agent.process.terminate()?;
+    fs::remove_dir(&observed).context("the observed cgroup")
+}
+
+/// A host with a `/dev/shm` of its own.
+struct Host {
+    network: Namespace,
+    /// That its nodes are in.
+    cgroup: PathBuf,
+    /// Keeps the mount namespace.
+    keeper: Process,
+}
+
+impl Host {
+    fn new() -> Result<Host> {
+        let network = Namespace::alone()?;
+        let script = "mount -t tmpfs -o size=64m,mode=1777 shm /dev/shm && echo ready && exec cat";
+        let arguments = ["--mount", "sh", "-c", script];
+        let mut keeper = Process::start(&network.on_network(), "unshare", arguments)?;
+        keeper.wait_for("ready", Duration::from_secs(10))?;
+        Ok(Host {
+            cgroup: network.cgroup().to_owned(),
+            network,
+            keeper,
+        })
+    }
+
+    /// A publisher and its subscriber that know each other.
+    fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
+        let mut subscriber = self.launch(Role::Subscriber, stream)?;
+        subscriber.wait_ready()?;
+        let mut publisher = self.launch(Role::Publisher, stream)?;
+        publisher.wait_ready()?;
+        publisher.wait_matched()?;
+        subscriber.wait_matched()?;
+        Ok((publisher, subscriber))
+    }
+
+    fn launch(&self, role: Role, stream: &Stream) -> Result<Peer> {
+        let mut enter = self.network.on_network();
+        let mounts = format!("--mount=/proc/{}/ns/mnt", self.keeper.pid());
+        let inside = format!("echo 0 >{}/cgroup.procs", self.cgroup.display());
+        let inside = format!("{inside} && exec \"$0\" \"$@\"");
+        enter.extend(["sh", "-c", &inside, "nsenter", &mounts].map(str::to_owned));
+        let node = match role {
+            Role::Publisher => "/talker",
+            Role::Subscriber => "/listener",
+        };
+        Peer::launch_behind(&enter, Stack::Fast, role, stream, &[node])
+    }
+}
+
+/// A reliable stream as `rmw_fastrtps_cpp` publishes it by default.
+fn shared(topic: &str) -> Stream {
+    Stream {
+        topic: topic.to_owned(),
+        reliable: true,
+        shares_memory: true,
+        ..Stream::small(0)
+    }
+}
+
+/// An agent behind some words of its own.
+fn start_agent<'a>(host: &'a Namespace, directory: &Path, words: &[String]) -> Result<Agent<'a>> {
+    start_agent_at(host, host.cgroup(), directory, words)
+}
+
+/// As [`start_agent`], for what is in a cgroup.
+fn start_agent_at<'a>(
+    host: &'a Namespace,
+    cgroup: &Path,
+    directory: &Path,
+    words: &[String],
+) -> Result<Agent<'a>> {
+    let configuration = directory.join("ros2probe.yaml");
+    let cgroup = cgroup.display();
+    let text = format!(
+        "watch: [/imu, /burst]\n\
+         capture: {{source: host, cgroup: {cgroup}, record_ring_bytes: {RING}, \
+         shm: {{exact: uprobe}}}}\n"
+    );
+    fs::write(&configuration, text)?;
+    let program = env!("CARGO_BIN_EXE_rp");
+    if words.is_empty() {
+        return Agent::start(host, program, &configuration);
+    }
+    let script = directory.join("start");
+    let text = format!("#!/bin/sh\nexec {} {program} \"$@\"\n", words.join(" "));
+    fs::write(&script, text)?;
+    harness::run(&format!("chmod 755 {}", script.display()))?;
+    Agent::start(host, script, &configuration)
+}
+
+/// Whether a topic's writer and reader and both nodes are known: all is said in shared memory.
+fn is_known(agent: &Agent<'_>, topic: &str) -> Result<bool> {
+    let page = agent.scrape()?;
+    let nodes = page.labels_of("ros2_node_info", "ros_node");
+    let endpoints = ["ros2_topic_publishers", "ros2_topic_subscriptions"];
+    Ok(nodes.contains("/talker")
+        && nodes.contains("/listener")
+        && endpoints.map(|name| page.sum(name, &[("topic", topic)])) == [1.0; 2])
+}
+
+/// Waits until it is.
+fn known(agent: &Agent<'_>, topic: &str) -> Result<()> {
+    let result = wait_until(topic, || is_known(agent, topic));
+    result.with_context(|| {
+        agent
+            .scrape()
+            .map(|page| telling(&page))
+            .unwrap_or_default()
+    })
+}
+
+/// The page that counts so many messages of a topic, and later no more.
+fn counted(agent: &Agent<'_>, topic: &str, count: u64) -> Result<Scrape> {
+    let page = agent.settled_scrape(topic, count)?;
+    println!("{}", telling(&page));
+    let seen = page.sum("ros2_topic_messages_total", &[("topic", topic)]);
+    ensure!(seen == count as f64, "{seen} of {count}");
+    Ok(page)
+}
+
+/// How many samples a subscriber received from this one on, once it is so many.
+fn received(subscriber: &mut Peer, first: u64, count: u64) -> Result<u64> {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let mut numbers = subscriber.log()?.sequences("sub");
+        numbers.retain(|number| *number >= first);
+        let received = numbers.len() as u64;
+        if received >= count || Instant::now() > deadline {
+            return Ok(received);
+        }
+        std::thread::sleep(Duration::from_millis(200));
+    }
+}
+
+/// The file of a peer's Fast DDS.
+fn library_of(peer: &Peer) -> Result<PathBuf> {
+    mapped(peer.process.pid(), "/libfastrtps.so")
+}
+
+/// Some library that is not Fast DDS.
+fn any_library() -> Result<PathBuf> {
+    mapped(std::process::id(), "/libgcc_s.so")
+}
+
+fn mapped(process: u32, name: &str) -> Result<PathBuf> {
+    let maps = fs::read_to_string(format!("/proc/{process}/maps"))?;
+    let line = maps.lines().find(|line| line.contains(name));
+    let path = line.and_then(|line| line.find('/').and_then(|at| line.get(at..)));
+    Ok(PathBuf::from(path.with_context(|| format!("no {name}"))?))
+}
+
+/// What the agent says of shared memory.
+fn telling(page: &Scrape) -> String {
+    let lines = page.0.lines().filter(|line| {
+        !line.starts_with('#') && (line.contains("_shm_") || line.contains("_sampled_"))
+            || line.starts_with("ros2_topic_messages_total")
+            || line.starts_with("ros2_node_info")
+            || line.starts_with("ros2_topic_publishers")
+            || line.starts_with("ros2_topic_subscriptions")
+            || line.starts_with("ros2_participants")
+            || line.starts_with("ros2probe_decode")
+            || line.starts_with("ros2probe_datagrams")
+            || line.starts_with("ros2_topic_info")
+            || line.starts_with("ros2_unknown")
+            || line.starts_with("ros2probe_filter_events")
+    });
+    lines.collect::<Vec<_>>().join("; ")
+}

@@ -1,0 +1,113 @@
+//! Participants come and go for as long as a robot runs: what is kept of those that went must not add
+//! up. Counted to the byte by an allocator that counts.
+
+use crate::allocator;
+use ros2probe::config::{Limits, Watch, Watchlist};
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+const SECOND: u64 = 1_000_000_000;
+const START: u64 = 1_795_143_000 * SECOND;
+const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
+const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);
+const NODES: EntityId = EntityId([0, 0, 0x04, 0x03]);
+/// Alive at a time.
+const ALIVE: u32 = 60;
+
+struct Robot {
+    observer: Observer,
+    now: u64,
+    born: u32,
+}
+
+impl Robot {
+    fn put(&mut self, message: Message) {
+        let envelope = forge::multicast(self.now, 3);
+        self.observer.datagram(&envelope, &message.bytes(), None);
+    }
+
+    fn prefix(number: u32) -> GuidPrefix {
+        let [a, b, c, d] = number.to_be_bytes();
+        GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, a, b, c, d])
+    }
+
+    /// One comes, with a name that was never there, and speaks; another goes, every second one by its
+    /// lease.
+    fn step(&mut self) {
+        let number = self.born;
+        let prefix = Self::prefix(number);
+        self.born += 1;
+        let announcement = forge::participant(prefix, 4, None);
+        self.put(Message::from(prefix).data(SPDP, 1, &announcement));
+        let own = format!("rt/robot_{number}/points");
+        let shared = format!("rt/shared_{}", number % 40);
+        let writer = Guid::new(prefix, WRITER);
+        for (sedp, guid, topic, sequence) in [
+            (SEDP_WRITERS, writer, &own, 7),
+            (SEDP_READERS, Guid::new(prefix, READER), &shared, 8),
+        ] {
+            let payload = forge::endpoint(guid, topic, "std_msgs::msg::dds_::String_", true);
+            self.put(Message::from(prefix).data(sedp, sequence, &payload));
+        }
+        let name = format!("node_{number}");
+        let payload = forge::entities(prefix, 24, &[("/", &name, writer)]);
+        self.put(Message::from(prefix).data(NODES, 4, &payload));
+        for sequence in 1..4 {
+            self.now += SECOND / 60;
+            self.put(Message::from(prefix).data(WRITER, sequence, b"\0\x01\0\0\x04\0\0\0abc\0"));
+        }
+        // Those that are to stay say so in time.
+        for other in number.saturating_sub(ALIVE)..number {
+            if other % 8 == number % 8 {
+                let prefix = Self::prefix(other);
+                let payload = forge::participant(prefix, 4, None);
+                self.put(Message::from(prefix).data(SPDP, 2, &payload));
+            }
+        }
+        if let Some(gone) = number.checked_sub(ALIVE)
+            && gone % 2 == 0
+        {
+            let guid = Guid::new(Self::prefix(gone), EntityId([0, 0, 1, 0xc1]));
+            let prefix = Self::prefix(gone);
+            self.put(Message::from(prefix).dispose_by_hash(SPDP, 3, guid));
+        }
+        self.observer.advance(Timestamp(self.now));
+        drop((
+            self.observer.take_events(),
+            self.observer.interest_changes(),
+        ));
+    }
+
+    /// Bytes held after so many more have come.
+    fn held_after(&mut self, more: u32) -> usize {
+        (0..more).for_each(|_| self.step());
+        let snapshot = self.observer.snapshot(Timestamp(self.now));
+        let alive = snapshot.participants.len();
+        assert!((30..400).contains(&alive), "{alive}");
+        drop(snapshot);
+        allocator::held()
+    }
+}
+
+#[test]
+fn thousands_that_came_and_went_leave_nothing_behind() {
+    // So that all tables that keep somebody who went are full soon.
+    let limits = Limits {
+        topics: 200,
+        ..Limits::default()
+    };
+    let mut observer = Observer::new(Settings::default().with_limits(&limits));
+    let watch = Watch::named("/**").unwrap();
+    observer.set_watchlist(Watchlist::new(vec![watch]).unwrap());
+    let mut robot = Robot {
+        observer,
+        now: START,
+        born: 0,
+    };
+    robot.held_after(14_000);
+    let held: Vec<_> = (0..4).map(|_| robot.held_after(1_000)).collect();
+    let (least, most) = (held.iter().min().unwrap(), held.iter().max().unwrap());
+    // Of 3000 that went since, less than 7 bytes each.
+    assert!(most - least < 20_000, "{held:?}");
+}

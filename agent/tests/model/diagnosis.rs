@@ -1,0 +1,417 @@
+//! What discovery tells of a graph that cannot work, from forged announcements in virtual time.
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
+use std::time::Instant;
+
+use ros2probe::model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+const MILLISECOND: u64 = 1_000_000;
+const SECOND: u64 = 1000 * MILLISECOND;
+const START: u64 = 1_795_143_000 * SECOND;
+const STRING: &str = "std_msgs::msg::dds_::String_";
+const IMAGE: &str = "sensor_msgs::msg::dds_::Image_";
+const NODES: EntityId = EntityId([0, 0, 0x04, 0x03]);
+
+/// Parameters beside GUID, topic and type.
+type Qos<'a> = &'a [(u16, &'a [u8])];
+
+const RELIABLE: (u16, &[u8]) = (0x1a, &[2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+const BEST_EFFORT: (u16, &[u8]) = (0x1a, &[1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+const TRANSIENT_LOCAL: (u16, &[u8]) = (0x1d, &[1, 0, 0, 0]);
+const TEN_MILLISECONDS: (u16, &[u8]) = (0x23, &[0, 0, 0, 0, 0x5c, 0x8f, 0xc2, 0x02]);
+const PARTITION_A: (u16, &[u8]) = (0x29, b"\x01\0\0\0\x02\0\0\0a\0\0\0");
+
+/// An observer with virtual time.
+struct World {
+    observer: Observer,
+    now: u64,
+    domain_id: u16,
+    announced: u64,
+}
+
+impl World {
+    fn new() -> Self {
+        let mut observer = Observer::new(Settings::default());
+        observer.advance(Timestamp(START));
+        Self {
+            observer,
+            now: START,
+            domain_id: 0,
+            announced: 0,
+        }
+    }
+
+    /// With participants 1 to `count`, each with an endpoint of its own as ROS's have.
+    fn with(count: u8) -> Self {
+        let mut world = Self::new();
+        for number in 1..=count {
+            world.participant(number, &[]);
+        }
+        world
+    }
+
+    fn put(&mut self, message: Message) {
+        let envelope = forge::multicast(self.now, self.domain_id);
+        self.observer.datagram(&envelope, &message.bytes(), None);
+    }
+
+    fn participant(&mut self, number: u8, addresses: &[SocketAddrV4]) {
+        // Infinite patience: nobody repeats anything here.
+        let payload = forge::participant_at(prefix(number), 1_000_000, None, addresses);
+        self.put(Message::from(prefix(number)).data(SPDP, 1, &payload));
+        let info = Guid::new(prefix(number), NODES);
+        let qos: Qos<'_> = &[RELIABLE, TRANSIENT_LOCAL];
+        let type_name = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
+        self.announce(info, "ros_discovery_info", type_name, qos);
+    }
+
+    fn announce(&mut self, guid: Guid, topic: &str, type_name: &str, qos: Qos<'_>) {
+        self.announced += 1;
+        let sedp = match guid.entity.is_writer() {
+            true => SEDP_WRITERS,
+            false => SEDP_READERS,
+        };
+        let payload = forge::endpoint_with(guid, topic, type_name, qos);
+        self.put(Message::from(guid.prefix).data(sedp, self.announced, &payload));
+    }
+
+    fn dispose(&mut self, guid: Guid) {
+        self.announced += 1;
+        let sedp = match guid.entity.is_writer() {
+            true => SEDP_WRITERS,
+            false => SEDP_READERS,
+        };
+        let message = Message::from(guid.prefix);
+        self.put(message.dispose_by_hash(sedp, self.announced, guid));
+    }
+
+    fn nodes(&mut self, number: u8, sequence_number: u64, nodes: &[(&str, &str, Guid)]) {
+        let payload = forge::entities(prefix(number), 24, nodes);
+        let message = Message::from(prefix(number));
+        self.put(message.data(NODES, sequence_number, &payload));
+    }
+
+    fn wait(&mut self, milliseconds: u64) {
+        self.now += milliseconds * MILLISECOND;
+        self.observer.advance(Timestamp(self.now));
+    }
+
+    fn diagnoses(&self) -> Arc<Diagnoses> {
+        self.observer.snapshot(Timestamp(self.now)).diagnoses
+    }
+
+    /// All findings of a kind, after some seconds.
+    fn found(&mut self, kind: &str) -> Vec<Diagnosis> {
+        self.wait(7000);
+        let found = self.diagnoses();
+        let own = found.list.iter().filter(|each| each.kind() == kind);
+        own.cloned().collect()
+    }
+
+    fn pairs(&self, policy: Policy) -> Option<u64> {
+        let found = self.diagnoses();
+        let own = found.qos_pairs.iter().find(|each| each.policy == policy);
+        own.map(|each| each.pairs)
+    }
+}
+
+fn prefix(number: u8) -> GuidPrefix {
+    GuidPrefix([1, 0x10, number, 0, 0, 0, 0, 0, 0, 0, 0, 0])
+}
+
+fn writer(participant: u8, number: u8) -> Guid {
+    Guid::new(prefix(participant), EntityId([0, 1, number, 3]))
+}
+
+fn reader(participant: u8, number: u8) -> Guid {
+    Guid::new(prefix(participant), EntityId([0, 1, number, 4]))
+}
+
+#[test]
+fn incompatible_pairs_are_named_with_every_policy_and_gone_with_the_cause() {
+    let mut world = World::with(2);
+    world.announce(writer(1, 1), "rt/points", STRING, &[BEST_EFFORT]);
+    let demanding: Qos<'_> = &[RELIABLE, TRANSIENT_LOCAL, TEN_MILLISECONDS];
+    world.announce(reader(2, 1), "rt/points", STRING, demanding);
+    world.announce(reader(2, 2), "rt/points", STRING, &[BEST_EFFORT]);
+    let found = world.found("qos_incompatible");
+    let [
+        Diagnosis::QosIncompatible {
+            topic,
+            writer: offers,
+            reader: requests,
+            policies,
+        },
+    ] = &found[..]
+    else {
+        panic!("{found:?}");
+    };
+    assert_eq!((&*topic.name, topic.domain_id), ("/points", 0));
+    assert_eq!((*offers, *requests), (writer(1, 1), reader(2, 1)));
+    let expected = [Policy::Reliability, Policy::Durability, Policy::Deadline];
+    assert_eq!(policies.iter().collect::<Vec<_>>(), expected);
+    for policy in Policy::ALL {
+        let pairs = expected.contains(&policy).then_some(1);
+        assert_eq!(world.pairs(policy), pairs, "{policy:?}");
+    }
+    let unfed = world.found("unfed_subscriber");
+    assert!(
+        matches!(
+            &unfed[..],
+            [Diagnosis::UnfedSubscriber {
+                reason: Unmatched::Qos,
+                ..
+            }]
+        ),
+        "{unfed:?}"
+    );
+    assert_eq!(world.found("unheard_publisher"), []);
+
+    // The subscriber asks for less.
+    world.announce(reader(2, 1), "rt/points", STRING, &[BEST_EFFORT]);
+    assert_eq!(world.found("qos_incompatible"), []);
+    assert_eq!(world.diagnoses().qos_pairs, []);
+    assert_eq!(world.found("unfed_subscriber"), []);
+}
+
+#[test]
+fn endpoints_of_two_domains_are_no_pair() {
+    let mut world = World::with(1);
+    world.announce(writer(1, 1), "rt/points", STRING, &[BEST_EFFORT]);
+    world.domain_id = 5;
+    world.participant(2, &[]);
+    world.announce(reader(2, 1), "rt/points", STRING, &[RELIABLE]);
+    assert_eq!(world.found("qos_incompatible"), []);
+    let unfed = world.found("unfed_subscriber");
+    assert!(
+        matches!(
+            &unfed[..],
+            [Diagnosis::UnfedSubscriber {
+                topic,
+                reason: Unmatched::Nobody,
+                ..
+            }] if topic.domain_id == 5
+        ),
+        "{unfed:?}"
+    );
+}
+
+#[test]
+fn partitions_keep_apart_on_purpose() {
+    let mut world = World::with(2);
+    world.announce(writer(1, 1), "rt/points", STRING, &[BEST_EFFORT]);
+    world.announce(reader(2, 1), "rt/points", STRING, &[RELIABLE, PARTITION_A]);
+    assert_eq!(world.found("qos_incompatible"), []);
+    let unheard = world.found("unheard_publisher");
+    assert!(
+        matches!(
+            &unheard[..],
+            [Diagnosis::UnheardPublisher {
+                reason: Unmatched::Partition,
+                ..
+            }]
+        ),
+        "{unheard:?}"
+    );
+}
+
+#[test]
+fn two_types_and_two_definitions_of_one_are_found() {
+    let mut world = World::with(3);
+    let hash = |digit: &str| {
+        let text = format!("typehash=RIHS01_{};", digit.repeat(64));
+        let mut value = u32::try_from(text.len()).unwrap().to_le_bytes().to_vec();
+        value.extend_from_slice(text.as_bytes());
+        value
+    };
+    let (one, two) = (hash("1"), hash("2"));
+    world.announce(writer(1, 1), "rt/a", STRING, &[(0x2c, &one)]);
+    world.announce(reader(2, 1), "rt/a", STRING, &[(0x2c, &two)]);
+    world.announce(writer(1, 2), "rt/b", STRING, &[(0x2c, &one)]);
+    world.announce(reader(2, 2), "rt/b", IMAGE, &[(0x2c, &two)]);
+    world.announce(reader(3, 1), "rt/c", IMAGE, &[]);
+    world.announce(writer(1, 3), "rt/c", IMAGE, &[(0x2c, &two)]);
+    let hashes = world.found("type_hash_conflict");
+    let [
+        Diagnosis::TypeHashConflict {
+            topic,
+            message_type,
+            hashes,
+        },
+    ] = &hashes[..]
+    else {
+        panic!("{hashes:?}");
+    };
+    assert_eq!((&*topic.name, hashes.len()), ("/a", 2));
+    assert_eq!(&**message_type, "std_msgs/msg/String");
+    let types = world.found("type_conflict");
+    let [Diagnosis::TypeConflict { topic, types }] = &types[..] else {
+        panic!("{types:?}");
+    };
+    assert_eq!(&*topic.name, "/b");
+    let types: Vec<_> = types.iter().map(|each| &**each).collect();
+    assert_eq!(types, ["sensor_msgs/msg/Image", "std_msgs/msg/String"]);
+    let unheard = world.found("unheard_publisher");
+    assert!(
+        matches!(
+            &unheard[..],
+            [Diagnosis::UnheardPublisher {
+                topic,
+                reason: Unmatched::Type,
+                ..
+            }] if &*topic.name == "/b"
+        ),
+        "{unheard:?}"
+    );
+}
+
+#[test]
+fn who_is_alone_is_found_after_some_patience_and_not_where_that_is_normal() {
+    let mut world = World::with(2);
+    world.announce(writer(1, 1), "rt/points", STRING, &[]);
+    world.announce(reader(2, 1), "rt/cmd_vel", STRING, &[]);
+    for (number, quiet) in [
+        (2, "rt/rosout"),
+        (3, "rt/parameter_events"),
+        (4, "rt/lidar/transition_event"),
+        (5, "rt/fib/_action/status"),
+        (6, "rr/addReply"),
+        (7, "Square"),
+    ] {
+        world.announce(writer(1, number), quiet, STRING, &[]);
+    }
+    world.wait(4000);
+    assert_eq!(world.diagnoses().list, []);
+    world.wait(3000);
+    let names = |found: &Diagnoses| -> Vec<(&'static str, String)> {
+        let named = |each: &Diagnosis| (each.kind(), each.topic().unwrap().name.to_string());
+        found.list.iter().map(named).collect()
+    };
+    let expected = [
+        ("unheard_publisher", "/points".to_owned()),
+        ("unfed_subscriber", "/cmd_vel".to_owned()),
+    ];
+    assert_eq!(names(&world.diagnoses()), expected);
+
+    // Somebody comes, and goes again.
+    world.announce(reader(2, 2), "rt/points", STRING, &[]);
+    world.wait(1000);
+    assert_eq!(names(&world.diagnoses()), expected[1..]);
+    world.dispose(reader(2, 2));
+    world.wait(4000);
+    assert_eq!(names(&world.diagnoses()), expected[1..]);
+    world.wait(2000);
+    assert_eq!(names(&world.diagnoses()), expected);
+}
+
+#[test]
+fn nobody_is_called_alone_while_a_participant_s_endpoints_are_unknown() {
+    let mut world = World::with(2);
+    world.announce(writer(1, 1), "rt/points", STRING, &[]);
+    // Announced itself before the agent began to listen to what it has.
+    let payload = forge::participant(prefix(3), 1_000_000, None);
+    world.put(Message::from(prefix(3)).data(SPDP, 1, &payload));
+    assert_eq!(world.found("unheard_publisher"), []);
+    // Once it is known what it has, that nobody listens is a fact.
+    world.announce(reader(3, 1), "rt/other", STRING, &[]);
+    assert_eq!(world.found("unheard_publisher").len(), 1);
+}
+
+#[test]
+fn two_nodes_of_one_name_are_found_in_one_domain_only() {
+    let mut world = World::with(2);
+    world.nodes(
+        1,
+        1,
+        &[
+            ("/", "lidar", writer(1, 1)),
+            ("/", "_ros2cli", writer(1, 1)),
+        ],
+    );
+    world.nodes(2, 1, &[("/", "_ros2cli", writer(2, 1))]);
+    world.domain_id = 5;
+    world.participant(3, &[]);
+    world.nodes(3, 1, &[("/", "lidar", writer(3, 1))]);
+    assert_eq!(world.found("duplicate_node"), []);
+    world.nodes(
+        2,
+        2,
+        &[("/", "lidar", writer(2, 1)), ("/", "lidar", writer(2, 2))],
+    );
+    let found = world.found("duplicate_node");
+    let participant = |number| Guid::new(prefix(number), EntityId::PARTICIPANT);
+    let expected = Diagnosis::DuplicateNode {
+        domain_id: 0,
+        node: "/lidar".into(),
+        participants: vec![participant(1), participant(2), participant(2)],
+    };
+    assert_eq!(found, [expected]);
+}
+
+#[test]
+fn one_machine_with_a_node_in_two_domains_is_found_and_a_fleet_is_not() {
+    let at = |last: u8| [SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, last), 7411)];
+    let mut world = World::new();
+    world.participant(1, &at(1));
+    world.nodes(1, 1, &[("/", "lidar", writer(1, 1))]);
+    world.domain_id = 5;
+    world.participant(2, &at(2));
+    world.nodes(2, 1, &[("/", "lidar", writer(2, 1))]);
+    assert_eq!(world.found("node_in_several_domains"), []);
+    world.domain_id = 7;
+    world.participant(3, &at(1));
+    world.nodes(3, 1, &[("/", "lidar", writer(3, 1))]);
+    let found = world.found("node_in_several_domains");
+    let expected = Diagnosis::NodeInSeveralDomains {
+        node: "/lidar".into(),
+        participant: Guid::new(prefix(1), EntityId::PARTICIPANT),
+        domains: vec![0, 7],
+    };
+    assert_eq!(found, [expected]);
+}
+
+#[test]
+fn nothing_is_found_anew_while_nothing_changes() {
+    let mut world = World::with(1);
+    world.announce(writer(1, 1), "rt/points", STRING, &[]);
+    world.wait(7000);
+    let before = world.diagnoses();
+    assert_eq!(before.list.len(), 1);
+    world.wait(60_000);
+    assert!(Arc::ptr_eq(&before, &world.diagnoses()));
+}
+
+#[test]
+fn a_flood_is_counted_and_takes_no_time() {
+    let mut world = World::with(200);
+    for participant in 1..=100 {
+        for number in 1..=40 {
+            // Every reader asks for something of its own, and for more than any writer offers.
+            let deadline = [number, participant, 0, 0, 0, 0, 0, 0];
+            let qos: Qos<'_> = &[RELIABLE, (0x23, &deadline)];
+            world.announce(reader(participant, number), "rt/flood", STRING, qos);
+        }
+    }
+    for participant in 101..=200 {
+        for number in 1..=40 {
+            let budget = [number, participant, 0, 0, 0, 0, 0, 0];
+            let qos: Qos<'_> = &[BEST_EFFORT, (0x27, &budget)];
+            world.announce(writer(participant, number), "rt/flood", STRING, qos);
+        }
+    }
+    let began = Instant::now();
+    world.wait(1000);
+    println!("{:?} for 4000 x 4000 kinds", began.elapsed());
+    let found = world.diagnoses();
+    assert_eq!(found.list.len(), 32);
+    let pairs = world.pairs(Policy::Reliability).unwrap();
+    assert_eq!(pairs + found.unexamined, 4000 * 4000);
+    assert_eq!(found.left_out, pairs - 32);
+    let tables = world.observer.snapshot(Timestamp(world.now)).tables;
+    let table = tables.iter().find(|table| table.table == "diagnoses");
+    assert_eq!(table.unwrap().evictions, found.left_out);
+}

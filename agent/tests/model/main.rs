@@ -1,0 +1,22 @@
+//! The model under forged and captured traffic, in virtual time.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+mod allocator;
+mod bounds;
+mod churn;
+mod deliveries;
+mod diagnosis;
+mod fixtures;
+mod forged;
+mod memory;
+mod observer;
+mod order;
+mod restart;
+mod room;
+mod tables;

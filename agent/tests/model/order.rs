@@ -1,0 +1,413 @@
+//! Samples one by one in the order of a reliable subscriber: what waits for a repair, for how long,
+//! and what never waits. Virtual time and forged records.
+
+use std::sync::Arc;
+
+use proptest::prelude::*;
+use ros2probe::model::observer::Settings;
+use ros2probe::model::payloads::{MissedReason, News};
+use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe_testing::model::forge;
+use ros2probe_testing::model::forge::Message;
+use ros2probe_testing::model::host::{ALICE, BOB, Host, MILLISECOND, READER, START, Seen, WRITER};
+use ros2probe_wire::record::kind;
+use ros2probe_wire::{Guid, GuidPrefix, Record};
+
+fn wish(host: &mut Host, depth: Depth) {
+    wishes(host, &[1], depth);
+}
+
+fn wishes(host: &mut Host, ids: &[u64], depth: Depth) {
+    let wishes = ids.iter().map(|id| Wish {
+        id: *id,
+        selection: Arc::new(Selection::all()),
+        domain_id: None,
+        depth,
+    });
+    host.observer.set_wishes(Arc::new(wishes.collect()));
+}
+
+/// A host with a reader of Bob's that acknowledges.
+fn listening() -> (Host, Seen) {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    wish(&mut host, Depth::Arrivals);
+    host.acknack(bob, 1);
+    (host, bob)
+}
+
+/// Numbers and milliseconds since the start of the samples that were given, in their order.
+fn given(host: &mut Host) -> Vec<(u64, u64)> {
+    let given = host.observer.take_given().into_iter();
+    given
+        .filter_map(|given| match given.news {
+            News::Sample(sample) => {
+                let at = (sample.time.0 - START) / MILLISECOND;
+                Some((sample.sequence_number, at))
+            }
+            News::Missed(_) => None,
+        })
+        .collect()
+}
+
+fn numbers(host: &mut Host) -> Vec<u64> {
+    given(host).into_iter().map(|(number, _)| number).collect()
+}
+
+/// Reason, first and last number of what is missed.
+fn missed(host: &mut Host) -> Vec<(MissedReason, u64, u64)> {
+    let given = host.observer.take_given().into_iter();
+    given
+        .filter_map(|given| match given.news {
+            News::Missed(missed) => Some((missed.reason, missed.first, missed.last)),
+            News::Sample(_) => None,
+        })
+        .collect()
+}
+
+#[test]
+fn a_stream_without_holes_never_waits() {
+    let (mut host, bob) = listening();
+    for number in 1..=100 {
+        host.wait(10);
+        host.data(bob, number);
+        assert_eq!(given(&mut host), [(number, number * 10)]);
+    }
+}
+
+#[test]
+fn what_follows_a_hole_is_given_behind_its_repair_and_at_the_time_of_the_repair() {
+    let (mut host, bob) = listening();
+    for number in [1, 2, 4, 5] {
+        host.wait(10);
+        host.data(bob, number);
+    }
+    assert_eq!(given(&mut host), [(1, 10), (2, 20)]);
+    host.request(bob, 3, 1, 1 << 31);
+    host.wait(200);
+    assert!(given(&mut host).is_empty());
+    host.data(bob, 3);
+    assert_eq!(given(&mut host), [(3, 240), (4, 240), (5, 240)]);
+    assert_eq!(host.measurement().recovered, 1);
+}
+
+#[test]
+fn a_hole_ends_when_its_writer_leaves_it_out_or_withdraws_it_and_when_readers_acknowledge_it() {
+    let (mut host, bob) = listening();
+    host.data(bob, 1);
+    host.data(bob, 3);
+    host.wait(10);
+    host.gap(bob, 2);
+    assert_eq!(given(&mut host), [(1, 0), (3, 10)]);
+    host.data(bob, 5);
+    host.wait(10);
+    host.heartbeat(bob.directed(BOB), 5, 5);
+    assert_eq!(given(&mut host), [(5, 20)]);
+    host.acknack(bob, 6);
+    host.data(bob, 7);
+    host.wait(10);
+    host.acknack(bob, 8);
+    assert_eq!(given(&mut host), [(7, 30)]);
+    host.wait(12_000);
+    // 6 came by a way that is not seen; only what was withdrawn is lost.
+    assert_eq!(missed(&mut host), [(MissedReason::Lost, 4, 4)]);
+}
+
+#[test]
+fn a_hole_that_nothing_explains_is_waited_for_a_while_and_its_late_repair_is_given_late() {
+    let (mut host, bob) = listening();
+    for number in [1, 3, 4] {
+        host.data(bob, number);
+    }
+    host.wait(3_900);
+    assert_eq!(numbers(&mut host), [1]);
+    host.wait(200);
+    assert_eq!(numbers(&mut host), [3, 4]);
+    // What follows does not wait for the same hole again.
+    host.data(bob, 5);
+    assert_eq!(numbers(&mut host), [5]);
+    host.data(bob, 7);
+    host.data(bob, 2);
+    assert_eq!(given(&mut host), [(2, 4_100)]);
+    host.data(bob, 6);
+    assert_eq!(numbers(&mut host), [6, 7]);
+}
+
+#[test]
+fn nothing_waits_of_a_best_effort_writer_or_for_best_effort_readers() {
+    for reliable in [false, true] {
+        let mut host = Host::new();
+        host.writer(reliable);
+        let bob = host.reader(BOB, 7411);
+        wish(&mut host, Depth::Arrivals);
+        if reliable {
+            host.subscribe_with(BOB, 2, false);
+        } else {
+            host.acknack(bob, 1);
+        }
+        for number in [1, 3, 2, 6] {
+            host.data(bob, number);
+            assert_eq!(numbers(&mut host), [number], "{reliable}");
+        }
+    }
+}
+
+#[test]
+fn a_reliable_reader_is_waited_for_before_its_first_acknack_and_not_for_ever() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    wish(&mut host, Depth::Arrivals);
+    host.data(bob, 1);
+    host.data(bob, 3);
+    host.data(bob, 2);
+    assert_eq!(numbers(&mut host), [1, 2, 3]);
+    host.data(bob, 5);
+    host.wait(4_100);
+    assert_eq!(numbers(&mut host), [5]);
+    // Its ACKNACKs go where they are not seen.
+    host.data(bob, 7);
+    assert_eq!(numbers(&mut host), [7]);
+    host.acknack(bob, 8);
+    host.data(bob, 9);
+    assert!(numbers(&mut host).is_empty());
+    host.data(bob, 8);
+    assert_eq!(numbers(&mut host), [8, 9]);
+}
+
+#[test]
+fn the_end_gives_what_waits() {
+    let (mut host, bob) = listening();
+    for number in [1, 3, 5] {
+        host.data(bob, number);
+    }
+    assert_eq!(numbers(&mut host), [1]);
+    host.observer.settle();
+    assert_eq!(numbers(&mut host), [3, 5]);
+    let (mut host, bob) = listening();
+    for number in [1, 3, 5] {
+        host.data(bob, number);
+    }
+    host.announce(Message::from(ALICE).dispose_by_hash(
+        forge::SEDP_WRITERS,
+        2,
+        Guid::new(ALICE, WRITER),
+    ));
+    assert_eq!(numbers(&mut host), [1, 3, 5]);
+}
+
+#[test]
+fn what_waits_for_a_writer_is_given_once_it_is_believed_to_begin_anew() {
+    let (mut host, bob) = listening();
+    for number in [1, 2, 4, 5, 6, 7, 8] {
+        host.data(bob, number);
+    }
+    host.wait(1000);
+    for number in 1..=6 {
+        host.data(bob, number);
+        host.wait(1);
+    }
+    // The first four may be forged: they hold nothing up, and end no wait.
+    let expected = [1, 2, 1, 2, 3, 4, 4, 5, 6, 7, 8, 5, 6];
+    assert_eq!(numbers(&mut host), expected);
+}
+
+#[test]
+fn what_waits_is_bounded_in_number() {
+    let (mut host, bob) = listening();
+    host.data(bob, 1);
+    (3..=10_000).for_each(|number| host.data(bob, number));
+    let given = numbers(&mut host);
+    assert!(given.len() >= 5_000, "{}", given.len());
+    assert!(given.is_sorted());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+    #[test]
+    fn whatever_is_lost_and_repaired_within_the_patience_is_given_once_and_in_order(
+        fates in prop::collection::vec((0_u8..6, 1_u64..60), 1..200),
+    ) {
+        let (mut host, bob) = listening();
+        host.data(bob, 1);
+        let mut repairs = Vec::new();
+        let mut expected = vec![1];
+        let mut lost = Vec::new();
+        for (number, (fate, pause)) in (2..).zip(&fates) {
+            host.wait(*pause);
+            match fate {
+                0 => repairs.push(number),
+                1 => host.gap(bob, number),
+                2 => lost.push(number),
+                _ => host.data(bob, number),
+            }
+            if !matches!(fate, 1 | 2) {
+                expected.push(number);
+            }
+            if repairs.len() > 3 {
+                repairs.drain(..).for_each(|number| host.data(bob, number));
+                host.heartbeat(bob.directed(BOB), number + 1, number);
+            }
+        }
+        repairs.into_iter().for_each(|number| host.data(bob, number));
+        let end = 2 + fates.len() as u64;
+        host.data(bob, end);
+        expected.push(end);
+        host.heartbeat(bob.directed(BOB), end, end);
+        host.wait(15_000);
+        let mut times = Vec::new();
+        let mut numbers = Vec::new();
+        let mut told = Vec::new();
+        for given in host.observer.take_given() {
+            match given.news {
+                News::Sample(sample) => {
+                    numbers.push(sample.sequence_number);
+                    times.push(sample.time);
+                }
+                News::Missed(missed) => {
+                    prop_assert_eq!(missed.reason, MissedReason::Lost);
+                    told.extend(missed.first..=missed.last);
+                }
+            }
+        }
+        prop_assert_eq!(numbers, expected);
+        prop_assert!(times.is_sorted());
+        prop_assert_eq!(told.len() as u64, host.measurement().lost);
+        prop_assert_eq!(told, lost);
+        prop_assert_eq!(host.measurement().messages, times.len() as u64);
+    }
+}
+
+const DORA: GuidPrefix = GuidPrefix(*b"\x01\x10dora-sends");
+
+/// A host on which Dora's writer sends before it is announced, and Bob's reader.
+struct Unannounced {
+    host: Host,
+    bob: Seen,
+}
+
+impl Unannounced {
+    fn new(depth: Depth) -> Self {
+        let mut host = Host::with(Settings::default());
+        let bob = host.reader(BOB, 7411);
+        wish(&mut host, depth);
+        host.participant(DORA, "10.0.0.3:7411".parse().unwrap());
+        Self { host, bob }
+    }
+
+    fn data(&mut self, number: u64) {
+        self.host.wait(20);
+        let payload = [&[0, 1, 0, 0][..], format!("hello {number}").as_bytes()].concat();
+        let message = Message::from(DORA).data(WRITER, number, &payload);
+        self.host.announce(message);
+    }
+
+    fn announce(&mut self, reliable: bool) {
+        let guid = Guid::new(DORA, WRITER);
+        let payload = forge::endpoint(guid, "rt/chatter", "std_msgs::msg::dds_::String_", reliable);
+        self.host
+            .announce(Message::from(DORA).data(forge::SEDP_WRITERS, 1, &payload));
+    }
+
+    fn acknack(&mut self, base: u64) {
+        let record = Record {
+            writer: ros2probe_wire::record::guid_words(Guid::new(DORA, WRITER)),
+            reader: ros2probe_wire::record::guid_words(Guid::new(BOB, READER)),
+            ..self.host.record(self.bob.leaving(), kind::ACKNACK, base)
+        };
+        self.host.put(record);
+    }
+
+    /// Numbers of the samples that are given, each with its bytes if those are wanted.
+    fn given(&mut self, depth: Depth) -> Vec<u64> {
+        let mut numbers = Vec::new();
+        for given in self.host.observer.take_given() {
+            let News::Sample(sample) = given.news else {
+                panic!("{given:?}")
+            };
+            let number = sample.sequence_number;
+            if depth == Depth::Payloads {
+                let payload = sample.payload.as_ref().unwrap();
+                let text = format!("hello {number}");
+                assert!(payload[4..].starts_with(text.as_bytes()), "{sample:?}");
+            }
+            numbers.push(number);
+        }
+        numbers
+    }
+}
+
+#[test]
+fn what_came_before_the_announcement_is_given_once_when_it_comes_again() {
+    for depth in [Depth::Arrivals, Depth::Payloads] {
+        let mut dora = Unannounced::new(depth);
+        (1..=4).for_each(|number| dora.data(number));
+        assert!(dora.given(depth).is_empty());
+        dora.announce(true);
+        dora.acknack(1);
+        dora.data(5);
+        // The subscriber gets those first.
+        assert!(dora.given(depth).is_empty());
+        for number in [1, 2, 3, 4, 2, 5] {
+            dora.data(number);
+        }
+        dora.data(6);
+        assert_eq!(dora.given(depth), [1, 2, 3, 4, 5, 6], "{depth:?}");
+        dora.acknack(7);
+        dora.host.wait(15_000);
+        assert!(dora.given(depth).is_empty());
+        let measured = dora.host.measurement();
+        assert_eq!((measured.messages, measured.duplicates), (6, 6));
+    }
+}
+
+#[test]
+fn a_subscription_is_told_of_what_came_before_the_announcement_since_it_began() {
+    let mut dora = Unannounced::new(Depth::Arrivals);
+    (1..=3).for_each(|number| dora.data(number));
+    wishes(&mut dora.host, &[1, 2], Depth::Arrivals);
+    dora.data(4);
+    dora.announce(false);
+    dora.data(5);
+    let given = dora.host.observer.take_given().into_iter();
+    let mut told: Vec<_> = given
+        .filter_map(|given| match given.news {
+            News::Missed(missed) => Some((given.to.to_vec(), missed.first, missed.last)),
+            News::Sample(_) => None,
+        })
+        .collect();
+    told.sort();
+    assert_eq!(told, [(vec![1], 1, 4), (vec![2], 4, 4)]);
+}
+
+#[test]
+fn what_came_before_the_announcement_and_never_again_is_told_as_unannounced() {
+    for (reliable, acknowledged) in [(false, false), (true, false), (true, true)] {
+        let mut dora = Unannounced::new(Depth::Payloads);
+        for number in [1, 2, 4] {
+            dora.data(number);
+        }
+        dora.announce(reliable);
+        dora.data(5);
+        if acknowledged {
+            dora.acknack(6);
+            assert_eq!(
+                missed(&mut dora.host),
+                [
+                    (MissedReason::Unannounced, 1, 2),
+                    (MissedReason::Unannounced, 4, 4)
+                ]
+            );
+        } else {
+            dora.host.wait(4_100);
+            assert!(!numbers(&mut dora.host).is_empty(), "{reliable}");
+            dora.data(6);
+            dora.host.wait(10_000);
+            dora.data(7);
+        }
+        if reliable && !acknowledged {
+            let told: Vec<_> = missed(&mut dora.host);
+            assert_eq!(told.len(), 2, "{told:?}");
+        }
+        assert_eq!(dora.host.measurement().lost, 0);
+    }
+}

@@ -1,0 +1,292 @@
+//! An agent that is started anew on a running robot: what it knew comes along, and stays only if
+//! it is still true.
+
+use std::net::{Ipv4Addr, SocketAddrV4};
+
+use proptest::prelude::*;
+use ros2probe::config::{Watch, Watchlist};
+use ros2probe::model::discovery::Memory;
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe::model::snapshot::Snapshot;
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+const SECOND: u64 = 1_000_000_000;
+const START: u64 = 1_795_143_000 * SECOND;
+const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
+const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);
+const NODES: EntityId = EntityId([0, 0, 0x04, 0x03]);
+const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
+const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
+const LEASE: u32 = 10;
+
+fn agent(settings: Settings) -> Observer {
+    let mut observer = Observer::new(settings);
+    let watch = Watch::named("/**").unwrap();
+    observer.set_watchlist(Watchlist::new(vec![watch]).unwrap());
+    observer
+}
+
+fn put(observer: &mut Observer, at: u64, message: Message) {
+    let envelope = forge::multicast(at, 3);
+    observer.datagram(&envelope, &message.bytes(), None);
+}
+
+fn spdp(prefix: GuidPrefix) -> Message {
+    let address = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 1), 8162);
+    let payload = forge::participant_at(prefix, LEASE, None, &[address]);
+    Message::from(prefix).data(SPDP, 1, &payload)
+}
+
+/// A robot of two participants, told in full to an agent.
+fn robot(observer: &mut Observer) {
+    robot_at(observer, START);
+}
+
+fn robot_at(observer: &mut Observer, start: u64) {
+    for (prefix, node) in [(ALICE, "lidar"), (BOB, "mapper")] {
+        put(observer, start, spdp(prefix));
+        let string = "std_msgs::msg::dds_::String_";
+        let ends = [
+            (WRITER, SEDP_WRITERS, "rt/points"),
+            (READER, SEDP_READERS, "rt/cmd"),
+            (NODES, SEDP_WRITERS, "ros_discovery_info"),
+        ];
+        for (entity, sedp, topic) in ends {
+            let guid = Guid::new(prefix, entity);
+            let payload = forge::endpoint(guid, topic, string, true);
+            put(
+                observer,
+                start,
+                Message::from(prefix).data(sedp, 7, &payload),
+            );
+        }
+        let writer = Guid::new(prefix, WRITER);
+        let payload = forge::entities(prefix, 24, &[("/", node, writer)]);
+        put(
+            observer,
+            start,
+            Message::from(prefix).data(NODES, 4, &payload),
+        );
+    }
+    observer.advance(Timestamp(start + SECOND));
+}
+
+/// What is shown of the robot, without when it was seen and without the mark.
+fn shown(observer: &Observer, at: u64) -> String {
+    let Snapshot {
+        mut participants,
+        nodes,
+        topics,
+        ..
+    } = observer.snapshot(Timestamp(at));
+    for participant in &mut participants {
+        (participant.first_seen, participant.last_seen) = (Timestamp(0), Timestamp(0));
+        participant.restored = false;
+    }
+    let endpoints: Vec<_> = topics
+        .iter()
+        .flat_map(|topic| topic.publishers.iter().chain(&topic.subscriptions))
+        .map(|end| {
+            let mut end = end.clone();
+            (end.first_seen, end.measurement) = (Timestamp(0), None);
+            end
+        })
+        .collect();
+    let topics: Vec<_> = topics
+        .iter()
+        .map(|topic| {
+            (
+                topic.domain_id,
+                &topic.name,
+                &topic.message_types,
+                topic.kind,
+            )
+        })
+        .collect();
+    format!("{participants:#?}{nodes:#?}{topics:#?}{endpoints:#?}")
+}
+
+fn unconfirmed(observer: &Observer) -> usize {
+    let snapshot = observer.snapshot(Timestamp(START));
+    let participants = snapshot.participants.iter();
+    participants
+        .filter(|participant| participant.restored)
+        .count()
+}
+
+fn restarted(memory: &Memory, at: u64) -> Observer {
+    let mut observer = agent(Settings::default());
+    observer.restore(memory, Timestamp(at));
+    observer
+}
+
+#[test]
+fn everything_that_was_shown_is_shown_again_and_the_filter_told() {
+    let mut before = agent(Settings::default());
+    robot(&mut before);
+    let text = serde_json::to_string(&before.memory()).unwrap();
+    let memory: Memory = serde_json::from_str(&text).unwrap();
+    let at = START + 60 * SECOND;
+    let mut after = restarted(&memory, at);
+    assert_eq!(shown(&after, at), shown(&before, at));
+    assert!(shown(&after, at).contains("10.0.0.1:8162"));
+    assert_eq!(after.memory(), memory);
+    assert_eq!(unconfirmed(&after), 2);
+    let wanted = |guid| match guid {
+        Guid { entity: NODES, .. } => Verdict::Capture,
+        _ => Verdict::Meter,
+    };
+    let mut told = after.interest_changes();
+    told.sort_unstable_by_key(|(guid, _)| *guid);
+    let all = [ALICE, BOB].map(|prefix| [NODES, WRITER, READER].map(|it| Guid::new(prefix, it)));
+    let all: Vec<_> = all
+        .as_flattened()
+        .iter()
+        .map(|it| (*it, Some(wanted(*it))))
+        .collect();
+    assert_eq!(told, all);
+    let churn = after.snapshot(Timestamp(at)).churn;
+    assert!(churn.is_empty(), "nothing happened to the robot: {churn:?}");
+}
+
+#[test]
+fn who_is_heard_within_a_lease_stays_and_who_is_not_goes() {
+    let mut before = agent(Settings::default());
+    robot(&mut before);
+    let at = START + 60 * SECOND;
+    let mut after = restarted(&before.memory(), at);
+    after.advance(Timestamp(at + 9 * SECOND));
+    assert_eq!(after.snapshot(Timestamp(at)).participants.len(), 2);
+    put(&mut after, at + 9 * SECOND, spdp(BOB));
+    assert_eq!(unconfirmed(&after), 1);
+    after.advance(Timestamp(at + 11 * SECOND));
+    let snapshot = after.snapshot(Timestamp(at + 11 * SECOND));
+    assert_eq!((snapshot.participants.len(), unconfirmed(&after)), (1, 0));
+    assert_eq!(snapshot.participants[0].guid.prefix, BOB);
+    assert_eq!(snapshot.nodes.len(), 1);
+    assert_eq!(snapshot.nodes[0].name, "/mapper");
+    assert!(snapshot.unknown_writers.is_empty());
+}
+
+#[test]
+fn a_robot_whose_clock_begins_in_1970_is_seen_and_forgotten_like_any_other() {
+    // A Raspberry Pi has none that runs without power, and the agent is there before NTP.
+    for start in [1, SECOND, 30 * SECOND] {
+        let mut observer = agent(Settings::default());
+        robot_at(&mut observer, start);
+        let count = |observer: &Observer, at| {
+            let snapshot = observer.snapshot(Timestamp(at));
+            (snapshot.participants.len(), snapshot.nodes.len())
+        };
+        assert_eq!(count(&observer, start + SECOND), (2, 2), "{start}");
+        let memory = observer.memory();
+        observer.advance(Timestamp(start + 9 * SECOND));
+        assert_eq!(count(&observer, start + 9 * SECOND), (2, 2), "{start}");
+        observer.advance(Timestamp(start + 11 * SECOND));
+        assert_eq!(count(&observer, start + 11 * SECOND), (0, 0), "{start}");
+        // Started again before the clock was set.
+        let mut after = restarted(&memory, start);
+        after.advance(Timestamp(start + 9 * SECOND));
+        assert_eq!(count(&after, start + 9 * SECOND), (2, 2), "{start}");
+        after.advance(Timestamp(start + 11 * SECOND));
+        assert_eq!(count(&after, start + 11 * SECOND), (0, 0), "{start}");
+    }
+}
+
+#[test]
+fn any_message_confirms_but_not_one_from_before_the_start() {
+    let mut before = agent(Settings::default());
+    robot(&mut before);
+    let at = START + 60 * SECOND;
+    let mut after = restarted(&before.memory(), at);
+    after.participants_alive([(ALICE, Timestamp(at - SECOND))]);
+    assert_eq!(unconfirmed(&after), 2);
+    after.participants_alive([(ALICE, Timestamp(at + SECOND))]);
+    assert_eq!(unconfirmed(&after), 1);
+    let sample = Message::from(BOB).data(WRITER, 9, &[0, 1, 0, 0]);
+    put(&mut after, at + SECOND, sample);
+    assert_eq!(unconfirmed(&after), 0);
+}
+
+#[test]
+fn an_older_list_of_nodes_does_not_replace_the_one_that_was_known() {
+    let mut before = agent(Settings::default());
+    robot(&mut before);
+    let at = START + 60 * SECOND;
+    let mut after = restarted(&before.memory(), at);
+    let names = |observer: &Observer| {
+        let nodes = observer.snapshot(Timestamp(at)).nodes;
+        nodes.into_iter().map(|node| node.name).collect::<Vec<_>>()
+    };
+    for (number, known) in [(3, "/lidar"), (5, "/changed")] {
+        let payload = forge::entities(ALICE, 24, &[("/", "changed", Guid::new(ALICE, WRITER))]);
+        put(
+            &mut after,
+            at,
+            Message::from(ALICE).data(NODES, number, &payload),
+        );
+        assert_eq!(names(&after), [known, "/mapper"]);
+    }
+}
+
+#[test]
+fn caps_hold_for_what_comes_from_before_too() {
+    let mut before = agent(Settings::default());
+    robot(&mut before);
+    let mut after = agent(Settings {
+        participants: 1,
+        endpoints: 2,
+        nodes: 0,
+        ..Settings::default()
+    });
+    after.restore(&before.memory(), Timestamp(START));
+    let snapshot = after.snapshot(Timestamp(START));
+    let evictions = |table| {
+        let tables = snapshot.tables.iter();
+        let mut tables = tables.filter(|facts| facts.table == table);
+        tables.next().map(|facts| (facts.size, facts.evictions))
+    };
+    assert_eq!(evictions("participants"), Some((1, 1)));
+    assert_eq!(evictions("endpoints"), Some((2, 1)));
+    assert_eq!(evictions("nodes"), Some((0, 1)));
+}
+
+#[test]
+fn what_is_known_has_another_revision_only_when_something_is_new() {
+    let mut observer = agent(Settings::default());
+    robot(&mut observer);
+    let revision = observer.memory_revision();
+    put(&mut observer, START + 2 * SECOND, spdp(ALICE));
+    assert_eq!(observer.memory_revision(), revision);
+    let gone = Guid::new(ALICE, WRITER);
+    put(
+        &mut observer,
+        START + 2 * SECOND,
+        Message::from(ALICE).dispose_by_hash(SEDP_WRITERS, 99, gone),
+    );
+    assert!(observer.memory_revision() > revision);
+}
+
+proptest! {
+    /// One character of the file is another, and it is still JSON of the right shape.
+    #[test]
+    fn a_memory_with_a_wrong_character_is_taken_over_in_part_or_not(
+        place in any::<prop::sample::Index>(),
+        character in "[0-9a-z/\"\\\\ \u{202e}-]",
+    ) {
+        let mut before = agent(Settings::default());
+        robot(&mut before);
+        let mut text = serde_json::to_string(&before.memory()).unwrap();
+        let place = place.index(text.len());
+        text.replace_range(place..=place, &character);
+        if let Ok(memory) = serde_json::from_str::<Memory>(&text) {
+            let mut after = restarted(&memory, START);
+            let shown = shown(&after, START);
+            let is_hostile = shown.contains('\u{202e}');
+            prop_assert!(!is_hostile);
+            after.advance(Timestamp(START + 200 * SECOND));
+        }
+    }
+}

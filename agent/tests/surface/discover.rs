@@ -1,0 +1,326 @@
+//! The conversation of `rp discover`, without a network: against what real participants answered,
+//! and against answers that are lost, late, doubled, cut or forged.
+
+use std::collections::BTreeSet;
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::path::Path;
+
+use proptest::prelude::*;
+use ros2probe::discover::Refusal;
+use ros2probe::discover::message::{Message, Speaker};
+use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
+use ros2probe::model::discovery::{Addresses, hexadecimal};
+use ros2probe::model::snapshot::{ParticipantFacts, ProcessFacts};
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+const MILLISECOND: u64 = 1_000_000;
+const START: u64 = 5_000 * MILLISECOND;
+/// A conversation takes no longer, and a tick.
+const LIMIT: u64 = 3_100 * MILLISECOND;
+/// Where discovery and the rest of the participant are, in these tests.
+const METATRAFFIC: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 7410);
+const DEFAULT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 7411);
+
+/// A recorded conversation.
+struct Recording {
+    speaker: Speaker,
+    target: Target,
+    /// Nanoseconds since the first packet, and the datagram.
+    sent: Vec<(u64, Vec<u8>)>,
+    received: Vec<(u64, Vec<u8>)>,
+}
+
+impl Recording {
+    fn read(name: &str) -> Self {
+        let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/discover");
+        let text = std::fs::read_to_string(directory.join(name)).unwrap();
+        let (mut sent, mut received) = (Vec::new(), Vec::new());
+        for line in text.lines() {
+            let mut words = line.split(' ');
+            let mut word = || words.next().unwrap();
+            let (time, way, digits) = (word(), word(), word());
+            let pairs = digits.as_bytes().chunks(2);
+            let bytes = pairs.map(|pair| hexadecimal::<1>(str::from_utf8(pair).unwrap()).unwrap());
+            let bytes: Vec<u8> = bytes.flatten().collect();
+            let time = time.parse::<u64>().unwrap() * 1000;
+            match way {
+                ">" => sent.push((time, bytes)),
+                _ => received.push((time, bytes)),
+            }
+        }
+        // Its GUID prefix, and the address in its PID_METATRAFFIC_UNICAST_LOCATOR.
+        let introduction = &sent[0].1;
+        let locator = [0x32, 0, 24, 0, 1, 0, 0, 0];
+        let place = introduction
+            .windows(8)
+            .position(|it| it == locator)
+            .unwrap()
+            + 8;
+        let port = u16::from_le_bytes([introduction[place], introduction[place + 1]]);
+        let address: [u8; 4] = introduction[place + 16..place + 20].try_into().unwrap();
+        let prefix = |at: usize| GuidPrefix(introduction[at..at + 12].try_into().unwrap());
+        Self {
+            speaker: Speaker {
+                prefix: prefix(8),
+                address: SocketAddrV4::new(address.into(), port),
+                domain_id: 0,
+            },
+            target: Target {
+                prefix: prefix(24),
+                metatraffic: METATRAFFIC,
+                default: DEFAULT,
+            },
+            sent,
+            received,
+        }
+    }
+
+    fn both() -> [Self; 2] {
+        ["cyclonedds.txt", "fastdds.txt"].map(Self::read)
+    }
+
+    fn session(&self) -> Session {
+        Session::new(self.speaker, self.target, true)
+    }
+
+    /// Plays these answers to a session, each at its time; what it sent and when.
+    fn play(&self, session: &mut Session, answers: &[(u64, Vec<u8>)]) -> Vec<(u64, Outgoing)> {
+        let mut answers = answers.to_vec();
+        answers.sort_by_key(|(time, _)| *time);
+        let mut answers = answers.into_iter().peekable();
+        let mut outgoing = Vec::new();
+        let mut time = 0;
+        while !session.is_over() {
+            assert!(time < LIMIT, "it goes on and on");
+            let now = Timestamp(START + time);
+            outgoing.extend(session.advance(now).into_iter().map(|sent| (time, sent)));
+            while let Some((_, bytes)) = answers.next_if(|(at, _)| *at <= time) {
+                session.datagram(now, &bytes);
+                outgoing.extend(session.advance(now).into_iter().map(|sent| (time, sent)));
+            }
+            time += MILLISECOND;
+        }
+        outgoing
+    }
+}
+
+/// What holds of every conversation.
+fn assert_is_polite(session: &Session, recording: &Recording, outgoing: &[(u64, Outgoing)]) {
+    let (sent, _) = session.cost();
+    assert!(sent.packets <= MOST_PACKETS, "{} packets", sent.packets);
+    assert_eq!(sent.packets as usize, outgoing.len());
+    let bytes: usize = outgoing.iter().map(|(_, packet)| packet.bytes.len()).sum();
+    assert_eq!(sent.bytes, bytes as u64);
+    let message = || Message::new(recording.speaker, recording.target.prefix);
+    let introduction = message().announce(recording.speaker).bytes();
+    let goodbye = message().goodbye(recording.speaker).bytes();
+    assert_eq!(outgoing[0].1.bytes, introduction);
+    let goodbyes = outgoing.iter().filter(|(_, it)| it.bytes == goodbye);
+    assert_eq!(goodbyes.count(), 1);
+    assert_eq!(outgoing.last().unwrap().1.bytes, goodbye);
+    for (_, packet) in outgoing {
+        let to = if packet.what == "goodbye" || packet.what == "introduction" {
+            vec![METATRAFFIC]
+        } else {
+            vec![METATRAFFIC, DEFAULT]
+        };
+        assert!(to.contains(&packet.to));
+        // INFO_DST: to nobody else, whoever else listens there.
+        assert_eq!(packet.bytes[24..36], recording.target.prefix.0);
+    }
+}
+
+fn names(session: &Session) -> BTreeSet<String> {
+    let nodes = session.nodes().unwrap_or_default().iter();
+    nodes.map(|node| node.fully_qualified_name()).collect()
+}
+
+#[test]
+fn real_participants_are_asked_with_the_packets_that_worked_and_tell_everything() {
+    for recording in Recording::both() {
+        let mut session = recording.session();
+        let outgoing = recording.play(&mut session, &recording.received);
+        let sent: Vec<_> = outgoing.iter().map(|(_, packet)| &packet.bytes).collect();
+        let recorded: Vec<_> = recording.sent.iter().map(|(_, bytes)| bytes).collect();
+        assert_eq!(sent, recorded);
+        assert_is_polite(&session, &recording, &outgoing);
+        let expected = (0..24).map(|n| format!("/robot/sensors/camera_{n}"));
+        assert_eq!(names(&session), expected.collect());
+        let writers = session
+            .endpoints()
+            .values()
+            .filter(|it| it.role == Role::Writer);
+        let topics: BTreeSet<_> = writers.map(|it| it.topic.as_str().to_owned()).collect();
+        let further = (1..24).map(|n| format!("rt/imu_{n}"));
+        let all = further.chain(["ros_discovery_info", "rt/imu"].map(str::to_owned));
+        assert_eq!(topics, all.collect());
+        assert_eq!(session.endpoints().len(), 26);
+        assert_eq!((session.missing(), session.was_answered()), (0, true));
+    }
+}
+
+#[test]
+fn without_nodes_one_packet_less_is_sent_and_no_reader_introduced() {
+    for recording in Recording::both() {
+        let mut session = Session::new(recording.speaker, recording.target, false);
+        let outgoing = recording.play(&mut session, &recording.received);
+        assert_is_polite(&session, &recording, &outgoing);
+        assert_eq!((outgoing.len(), session.endpoints().len()), (3, 26));
+        assert!(session.nodes().is_none() && !session.expects_nodes());
+        let reader = |(_, packet): &(u64, Outgoing)| {
+            packet
+                .bytes
+                .windows(18)
+                .any(|it| it == b"ros_discovery_info")
+        };
+        assert!(!outgoing.iter().any(reader));
+    }
+}
+
+#[test]
+fn silence_is_answered_with_one_more_introduction_and_a_goodbye() {
+    let [recording, _] = Recording::both();
+    let mut session = recording.session();
+    let outgoing = recording.play(&mut session, &[]);
+    assert_is_polite(&session, &recording, &outgoing);
+    let said: Vec<_> = outgoing.iter().map(|(_, packet)| packet.what).collect();
+    assert_eq!(said, ["introduction", "introduction", "goodbye"]);
+    let (last, _) = outgoing.last().unwrap();
+    assert!(*last <= 1_010 * MILLISECOND);
+    assert!(!session.was_answered());
+}
+
+#[test]
+fn a_participant_that_announces_without_end_costs_no_more_packets() {
+    for recording in Recording::both() {
+        // HEARTBEATs of ever more samples, none of which ever comes.
+        let heartbeat = |last: u32| {
+            let mut bytes = [b"RTPS\x02\x03\x01\x10", &recording.target.prefix.0[..]].concat();
+            for writer in [
+                EntityId::SEDP_PUBLICATIONS_WRITER,
+                EntityId::SEDP_SUBSCRIPTIONS_WRITER,
+            ] {
+                bytes.extend([0x07, 0x03, 28, 0, 0, 0, 0, 0]);
+                bytes.extend(writer.0);
+                for word in [0, 1, last >> 16, last, last] {
+                    bytes.extend(word.to_le_bytes());
+                }
+            }
+            bytes
+        };
+        let answers: Vec<_> = (0..300)
+            .map(|n| (u64::from(n) * 10 * MILLISECOND, heartbeat(n << 20)))
+            .collect();
+        let mut session = recording.session();
+        let outgoing = recording.play(&mut session, &answers);
+        assert_is_polite(&session, &recording, &outgoing);
+        assert!(session.missing() > 0 && session.missing() <= 2 * 4096);
+    }
+}
+
+#[test]
+fn what_somebody_else_says_is_not_believed() {
+    for recording in Recording::both() {
+        let mut forged = recording.received.clone();
+        for (_, bytes) in &mut forged {
+            bytes[8..20].copy_from_slice(b"someone-else");
+        }
+        let mut session = recording.session();
+        recording.play(&mut session, &forged);
+        assert!(session.endpoints().is_empty() && !session.was_answered());
+        let mut misdirected = recording.received.clone();
+        for (_, bytes) in &mut misdirected {
+            let own = recording.speaker.prefix.0;
+            while let Some(place) = bytes.windows(12).position(|it| it == own) {
+                bytes[place..place + 12].copy_from_slice(b"another-one!");
+            }
+        }
+        let mut session = recording.session();
+        recording.play(&mut session, &misdirected);
+        assert!(
+            session.endpoints().is_empty(),
+            "meant for another participant"
+        );
+    }
+}
+
+#[test]
+fn hanging_up_says_goodbye_once_and_only_to_whom_we_have_met() {
+    let [recording, _] = Recording::both();
+    let mut session = recording.session();
+    assert!(session.hang_up().is_empty());
+    session.advance(Timestamp(START));
+    assert_eq!(session.hang_up().len(), 1);
+    assert!(session.is_over() && session.hang_up().is_empty());
+    assert!(session.advance(Timestamp(START + LIMIT)).is_empty());
+}
+
+#[test]
+fn who_has_secrets_or_no_address_is_not_asked() {
+    let participant = |secured, metatraffic: &[&str]| ParticipantFacts {
+        guid: Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT),
+        domain_id: 0,
+        vendor: String::new(),
+        enclave: None,
+        process: ProcessFacts::default(),
+        first_seen: Timestamp(1),
+        last_seen: Timestamp(1),
+        lease_nanoseconds: None,
+        secured,
+        restored: false,
+        addresses: Addresses {
+            metatraffic: metatraffic.iter().map(|it| it.parse().unwrap()).collect(),
+            default: ["127.0.0.1:7411".parse().unwrap()].into(),
+        },
+    };
+    let asked = |secured, addresses: &[&str]| {
+        let target = Target::of(&participant(secured, addresses));
+        target.map(|target| (target.metatraffic.to_string(), target.default.to_string()))
+    };
+    let there = "127.0.0.1:7410";
+    assert_eq!(asked(true, &[there]), Err(Refusal::Secured));
+    for nowhere in [
+        &[][..],
+        &["[::1]:7410"],
+        &["239.255.0.1:7400"],
+        &["0.0.0.0:1"],
+    ] {
+        assert_eq!(asked(false, nowhere), Err(Refusal::NoAddress));
+    }
+    let found = asked(false, &["[::1]:9", there]).unwrap();
+    assert_eq!(found, (there.to_owned(), "127.0.0.1:7411".to_owned()));
+    let mut asking = participant(false, &[there]);
+    asking.guid.prefix = GuidPrefix(*b"\x01\x7fabcdefghij");
+    assert_eq!(Target::of(&asking), Err(Refusal::Asking));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// Answers are lost, doubled, late, cut and changed.
+    #[test]
+    fn whatever_is_answered_few_packets_are_sent_and_goodbye_is_said(
+        which in 0usize..2,
+        fates in prop::collection::vec(
+            (0u8..6, 0u64..1_500, any::<prop::sample::Index>(), any::<u8>()), 15),
+    ) {
+        let recording = &Recording::both()[which];
+        let mut answers = Vec::new();
+        for ((time, bytes), (fate, delay, place, byte)) in recording.received.iter().zip(fates) {
+            let mut bytes = bytes.clone();
+            let place = place.index(bytes.len());
+            match fate {
+                0 => continue,
+                1 => answers.push((*time + delay * MILLISECOND, bytes.clone())),
+                2 => bytes.truncate(place),
+                3 => bytes[place] = byte,
+                _ => {}
+            }
+            answers.push((*time, bytes));
+        }
+        let mut session = recording.session();
+        let outgoing = recording.play(&mut session, &answers);
+        assert_is_polite(&session, recording, &outgoing);
+    }
+}

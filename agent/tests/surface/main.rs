@@ -1,0 +1,42 @@
+//! What a user of the agent meets: API, metrics, configuration, command line, recordings and bags.
+//! `rp` replays captures on free ports of this host: no namespaces, no DDS participants.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+mod api;
+mod api_views;
+mod bag;
+mod caps;
+mod cli;
+mod config;
+mod dashboards;
+mod discover;
+mod doctor;
+mod doors;
+mod events;
+mod fuzz_seeds;
+mod http;
+mod limits;
+mod message;
+mod metrics;
+mod otlp;
+mod otlp_tls;
+mod page;
+mod recordings;
+mod ros2;
+mod rules;
+mod samples;
+mod top;
+mod web_config;
+
+use std::process::Command;
+
+/// `rp` of this build, with an environment that does not leak into it.
+fn rp() -> Command {
+    ros2probe_testing::local_agent::rp(env!("CARGO_BIN_EXE_rp"))
+}

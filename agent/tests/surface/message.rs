@@ -1,0 +1,163 @@
+//! What a real `ros2 topic echo` printed of 154 payloads, against what is printed here.
+
+mod forms;
+mod golden;
+
+use golden::{cases, library};
+use ros2probe::message::value::{Items, Scalar};
+use ros2probe::message::yaml::{self, Style};
+use ros2probe::message::{Decoded, Limits, Shown, Value, csv, decode};
+
+/// What `ros2 topic echo` shows of arrays and strings unless told otherwise.
+const ECHO: Shown = Shown {
+    truncate: Some(128),
+    no_arrays: false,
+    no_strings: false,
+};
+
+#[test]
+fn every_golden_payload_prints_as_the_original_prints_it() {
+    let mut count = 0;
+    let library = library();
+    for case in cases() {
+        let message_type = library.find(&case.message_type, None).unwrap();
+        let decoded = decode(&message_type, &case.payload, &Limits::default());
+        let decoded = decoded.unwrap_or_else(|error| panic!("{case}: {error}"));
+        let message = &decoded.message;
+        let shown = Shown::default();
+        assert_eq!(
+            yaml::document(message, &ECHO, Style::Block),
+            case.yaml_echo,
+            "{case}"
+        );
+        assert_eq!(
+            yaml::document(message, &shown, Style::Block),
+            case.yaml_full,
+            "{case}"
+        );
+        assert_eq!(csv::line(message, &ECHO), case.csv, "{case}");
+        assert_eq!(
+            decoded.oddities.texts + decoded.oddities.booleans,
+            0,
+            "{case}"
+        );
+        count += 1;
+    }
+    assert_eq!(count, 154);
+}
+
+/// What Python, PyYAML and numpy print (`data/python/forms.py`).
+#[test]
+fn strings_numbers_and_arrays_print_as_python_prints_them() {
+    let mut wrong = 0;
+    let mut kinds = [0; 3];
+    for form in forms::read() {
+        let (kind, differences) = form.differences();
+        kinds[kind] += 1;
+        for difference in differences {
+            wrong += 1;
+            eprintln!("{difference}");
+        }
+    }
+    assert_eq!(kinds, [1500, 601, 500]);
+    assert_eq!(wrong, 0);
+}
+
+/// Whatever is cut off or changed: an answer, and the same one whether elements are kept or not.
+#[test]
+fn damaged_payloads_are_read_or_refused_and_never_more() {
+    let library = library();
+    let few = Limits {
+        kept: 2,
+        ..Limits::default()
+    };
+    for mut case in cases() {
+        case.payload.truncate(600);
+        let message_type = library.find(&case.message_type, None).unwrap();
+        let read = |payload: &[u8]| {
+            let all = decode(&message_type, payload, &Limits::default());
+            let some = decode(&message_type, payload, &few);
+            if let Ok(decoded) = &all {
+                assert!(
+                    csv::line(&decoded.message, &ECHO).len() <= payload.len() * 40,
+                    "{case}"
+                );
+                let _ = yaml::document(&decoded.message, &ECHO, Style::Flow);
+            }
+            let trailing = |decoded: &Decoded<'_>| decoded.oddities.trailing;
+            assert_eq!(
+                all.as_ref().map(trailing),
+                some.as_ref().map(trailing),
+                "{case}"
+            );
+        };
+        for length in 0..case.payload.len() {
+            read(&case.payload[..length]);
+        }
+        let mut payload = case.payload.clone();
+        for position in 0..payload.len().min(250) {
+            let byte = payload[position];
+            for changed in [0xff, byte ^ 0x01] {
+                payload[position] = changed;
+                read(&payload);
+            }
+            payload[position] = byte;
+        }
+    }
+}
+
+/// The second oracle: PyPI `rosbags`, which has no `wstring`.
+#[test]
+fn rosbags_reads_the_same_values() {
+    let library = library();
+    let mut lines = String::new();
+    let mut expected = Vec::new();
+    for case in cases() {
+        if case.message_type.ends_with("/WStrings") {
+            continue;
+        }
+        let message_type = library.find(&case.message_type, None).unwrap();
+        let decoded = decode(&message_type, &case.payload, &Limits::default()).unwrap();
+        // rosbags refuses what is behind the last field.
+        let length = case.payload.len() - decoded.oddities.trailing;
+        let payload = golden::hex(&case.payload[..length]);
+        lines.push_str(&serde_json::to_string(&(&case.message_type, payload)).unwrap());
+        lines.push('\n');
+        expected.push((case.to_string(), plain(&Value::Message(decoded.message))));
+    }
+    let found = golden::rosbags(&lines);
+    let found: Vec<serde_json::Value> = found
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap())
+        .collect();
+    assert_eq!(found.len(), expected.len());
+    for ((name, expected), found) in expected.into_iter().zip(found) {
+        assert_eq!(expected, found, "{name}");
+    }
+}
+
+/// As `read.py` writes it.
+fn plain(value: &Value<'_>) -> serde_json::Value {
+    let scalar = |scalar: Scalar| match scalar {
+        Scalar::Bool(value) => value.into(),
+        // rosbags takes an octet for a signed number.
+        Scalar::Byte(byte) => byte.cast_signed().into(),
+        Scalar::Int(number) => number.into(),
+        Scalar::UInt(number) => number.into(),
+        Scalar::Float32(number) => format!("f{:016x}", f64::from(number).to_bits()).into(),
+        Scalar::Float64(number) => format!("f{:016x}", number.to_bits()).into(),
+    };
+    match value {
+        Value::Scalar(value) => scalar(*value),
+        Value::Text(text) => text.as_ref().into(),
+        Value::Message(message) => message.values.iter().map(plain).collect(),
+        Value::Array(array) => match &array.items {
+            Items::Scalars(scalars) => scalars.iter().map(scalar).collect(),
+            Items::Texts(texts) => texts.iter().map(|text| text.as_ref()).collect(),
+            Items::Messages(messages) => messages
+                .iter()
+                .map(|message| plain(&Value::Message(message.clone())))
+                .collect(),
+        },
+    }
+}

@@ -1,0 +1,357 @@
+//! A real OpenTelemetry receiver gets what the page shows, and the agent does not mind when it goes.
+
+use std::collections::BTreeMap;
+use std::net::TcpListener;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use crate::rp;
+use ros2probe::surface::catalogue::{CATALOGUE, Kind};
+use ros2probe_testing::local_agent::{self, LocalAgent, metric};
+use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
+
+/// What changes from one look to the next.
+fn changes(name: &str) -> bool {
+    name.starts_with("process_")
+        || name.starts_with("ros2probe_otlp_")
+        || matches!(
+            name,
+            "ros2probe_snapshot_age_seconds"
+                | "ros2probe_scrape_duration_seconds"
+                // A scrape is a client itself.
+                | "ros2probe_limit_used"
+        )
+}
+
+/// The page's series, without histograms' buckets and what changes.
+fn page_series(page: &str) -> BTreeMap<String, f64> {
+    let lines = page.lines().filter(|line| !line.starts_with('#'));
+    let series = lines.filter_map(|line| {
+        let (series, value) = line.rsplit_once(' ')?;
+        Some((series.to_owned(), value.parse().ok()?))
+    });
+    series
+        .filter(|(series, _)| !changes(series.split('{').next().unwrap()))
+        .filter(|(series, _)| !series.contains("_bucket{"))
+        .collect()
+}
+
+/// The same of what was exported.
+fn exported_series(export: &[Export]) -> BTreeMap<String, f64> {
+    let names: BTreeMap<String, _> = CATALOGUE
+        .iter()
+        .map(|metric| (metric.otlp_name(), metric))
+        .collect();
+    let mut series = BTreeMap::new();
+    for item in export.iter().flat_map(|export| &export.items) {
+        let name = &item.fields["Name"];
+        let metric = names
+            .get(name)
+            .unwrap_or_else(|| panic!("{name} is in no catalogue"));
+        assert_eq!(
+            item.fields.get("Unit").map_or("", String::as_str),
+            metric.ucum(),
+            "{name}"
+        );
+        let kind = match metric.kind {
+            Kind::Counter => "Sum",
+            Kind::Gauge | Kind::Info => "Gauge",
+            Kind::Histogram => "Histogram",
+        };
+        assert_eq!(item.fields["DataType"], kind, "{name}");
+        if changes(metric.name) {
+            continue;
+        }
+        let label = |label: &&str| {
+            let value = item.attributes.get(*label).map_or("", String::as_str);
+            format!("{label}=\"{value}\"")
+        };
+        let labels: Vec<String> = metric.labels.iter().map(label).collect();
+        let labels = match labels.as_slice() {
+            [] => String::new(),
+            labels => format!("{{{}}}", labels.join(",")),
+        };
+        let mut add = |suffix: &str, field: &str| {
+            let value = item.fields[field].parse().unwrap();
+            series.insert(format!("{}{suffix}{labels}", metric.name), value);
+        };
+        if metric.kind == Kind::Histogram {
+            add("_count", "Count");
+            add("_sum", "Sum");
+            let count: u64 = item.fields["Count"].parse().unwrap();
+            assert_eq!(item.buckets.iter().sum::<u64>(), count, "{name}");
+        } else {
+            add("", "Value");
+        }
+    }
+    series
+}
+
+#[test]
+fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = format!(
+        "watch: [{{topic: /**, per_subscriber: true}}]\nmetrics: {{per_writer: true}}\n\
+         otlp: {{endpoint: 'http://{}', interval_s: 1, robot: marvin, attributes: {{site: hall 2}}}}\n",
+        receiver.address
+    );
+    std::fs::write(&configuration, yaml).unwrap();
+    let mut agent = LocalAgent::start(
+        &mut rp(),
+        &[
+            "--config",
+            configuration.to_str().unwrap(),
+            "--speed",
+            "max",
+        ],
+    );
+    agent.wait_for_log("the capture has ended");
+    let page = page_series(&agent.get("/metrics").body);
+    assert!(page.len() > 200, "{}", page.len());
+
+    // The requests of one second tell the final state; each begins with the same metric.
+    let complete = |text: &str| text.matches("-> Name: process.start_time").count();
+    let seen = complete(&receiver.text());
+    let text = receiver.wait_for("another export is complete", |text| {
+        complete(text) >= seen + 2
+    });
+    let all = exports(&text);
+    let first = |export: &Export| {
+        let item = export.items.first();
+        item.is_some_and(|item| item.fields["Name"] == "ros2.participants")
+    };
+    let ends: Vec<usize> = (0..all.len()).filter(|index| first(&all[*index])).collect();
+    let [.., begin, end] = ends[..] else {
+        panic!("{} exports", all.len())
+    };
+    let exported = exported_series(&all[begin..end]);
+    let (missing, more): (Vec<_>, Vec<_>) = (
+        page.iter()
+            .filter(|each| exported.get(each.0) != Some(each.1))
+            .collect(),
+        exported
+            .iter()
+            .filter(|each| page.get(each.0) != Some(each.1))
+            .collect(),
+    );
+    assert!(
+        missing.is_empty() && more.is_empty(),
+        "page: {missing:#?}\nexported: {more:#?}"
+    );
+    let resource = &all[begin].resource;
+    for (key, value) in [
+        ("service.name", "ros2probe"),
+        ("service.version", env!("CARGO_PKG_VERSION")),
+        ("robot.name", "marvin"),
+        ("site", "hall 2"),
+    ] {
+        assert_eq!(
+            resource.get(key).map(String::as_str),
+            Some(value),
+            "{resource:?}"
+        );
+    }
+    assert!(resource.contains_key("service.instance.id") && resource.contains_key("host.name"));
+
+    let counter = |name: &str, outcome: &str| {
+        format!("ros2probe_otlp_{name}{{signal=\"metrics\",{outcome}}}")
+    };
+    agent.wait_for_metric(
+        &counter("exports_total", "outcome=\"delivered\""),
+        |count| count > 2.0,
+    );
+    let resident = || metric(&agent.get("/metrics").body, "process_resident_memory_bytes").unwrap();
+    let before = resident();
+    let address = receiver.address;
+    drop(receiver);
+    let dropped = counter("dropped_total", "reason=\"superseded\"");
+    agent.wait_for_metric(&dropped, |points| points > 3.0 * page.len() as f64 / 2.0);
+    let mut receiver = Rotel::start(
+        &mut Command::new(Rotel::binary()),
+        directory.path(),
+        Some(address),
+    );
+    receiver.wait_for("it gets all again", |text| complete(text) >= 1);
+    let grown = resident() - before;
+    assert!(grown < 4e6, "{grown} bytes more");
+    assert_eq!(
+        page_series(&agent.get("/metrics").body),
+        page,
+        "the capture noticed nothing"
+    );
+
+    drop(receiver);
+    agent.signal("-TERM");
+    let begun = Instant::now();
+    assert!(agent.wait().success());
+    assert!(
+        begun.elapsed() < Duration::from_secs(4),
+        "{:?}",
+        begun.elapsed()
+    );
+}
+
+/// An event: its name and what is known of it.
+type Told = (String, BTreeMap<String, String>);
+
+/// What the event log keeps.
+fn told(agent: &LocalAgent) -> Vec<Told> {
+    let kept = "/events?after=0&follow=false";
+    let body = local_agent::request(agent.api, "GET", kept, "").body;
+    let data = body.lines().filter_map(|line| line.strip_prefix("data: "));
+    let told = data.map(|data| {
+        let event: serde_json::Value = serde_json::from_str(data).unwrap();
+        let attributes = event["attributes"].as_object().unwrap().iter();
+        let plain = attributes.filter_map(|(key, value)| match value {
+            serde_json::Value::String(text) => Some((key.clone(), text.clone())),
+            serde_json::Value::Number(number) => Some((key.clone(), number.to_string())),
+            _ => None,
+        });
+        (event["name"].as_str().unwrap().to_owned(), plain.collect())
+    });
+    told.collect()
+}
+
+#[test]
+fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
+    let directory = tempfile::tempdir().unwrap();
+    let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
+    let address = address.unwrap();
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = format!("otlp: {{endpoint: 'http://{address}', metrics: false, robot: marvin}}\n");
+    std::fs::write(&configuration, yaml).unwrap();
+    let configuration = configuration.to_str().unwrap();
+    let mut agent = LocalAgent::start(&mut rp(), &["--config", configuration, "--speed", "max"]);
+    agent.wait_for_log("the capture has ended");
+    let retried = "ros2probe_otlp_exports_total{signal=\"events\",outcome=\"retried\"}";
+    agent.wait_for_metric(retried, |count| count > 0.0);
+
+    let told = told(&agent);
+    assert!(told.len() > 50, "{}", told.len());
+    let mut receiver = Rotel::start(
+        &mut Command::new(Rotel::binary()),
+        directory.path(),
+        Some(address),
+    );
+    let text = receiver.wait_for("it has all events", |text| {
+        text.matches("\nFlags: ").count() >= told.len()
+    });
+    let exports = exports(&text);
+    let received: Vec<Told> = exports
+        .iter()
+        .flat_map(|export| &export.items)
+        .map(|record| {
+            assert_eq!(record.fields["SeverityText"], "INFO");
+            let time = |field: &str| record.fields[field].parse::<u64>().unwrap();
+            assert!(time("ObservedTimestamp") >= time("Timestamp"));
+            (
+                record.fields["EventName"].clone(),
+                record.attributes.clone(),
+            )
+        })
+        .collect();
+    assert_eq!(received, told);
+    assert_eq!(exports[0].resource["robot.name"], "marvin");
+    assert_eq!(exports[0].resource["service.name"], "ros2probe");
+
+    // What happens from now on follows, and what happens last is sent before the end.
+    let added = local_agent::request(agent.api, "POST", "/watch/imu", "");
+    assert_eq!(added.status, 201);
+    receiver.wait_for("it has one more", |text| text.contains("watch: Str(/imu)"));
+    let removed = local_agent::request(agent.api, "DELETE", "/watch/imu", "");
+    assert_eq!(removed.status, 204);
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+    receiver.wait_for("it has the last one", |text| {
+        text.contains("EventName: ros2probe.watch.removed")
+    });
+    assert_eq!(
+        receiver.text().matches("\nEventName: ").count(),
+        told.len() + 2
+    );
+}
+
+/// An agent that traces every message of the capture, and what the receiver prints of it.
+fn traced(directory: &std::path::Path) -> Vec<Item> {
+    let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory, None);
+    let configuration = directory.join("traced.yaml");
+    let yaml = format!(
+        "watch: [{{topic: /chatter, trace: 1}}]\n\
+         otlp: {{endpoint: 'http://{}', metrics: false, events: false}}\n",
+        receiver.address
+    );
+    std::fs::write(&configuration, yaml).unwrap();
+    let mut agent = LocalAgent::start(
+        &mut rp(),
+        &[
+            "--config",
+            configuration.to_str().unwrap(),
+            "--speed",
+            "max",
+        ],
+    );
+    agent.wait_for_log("the capture has ended");
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+    let text = receiver.wait_for("spans have come", |text| text.contains("settle /chatter"));
+    let exports = exports(&text);
+    let services = exports
+        .iter()
+        .map(|export| export.resource["service.name"].as_str());
+    assert!(services.into_iter().all(|name| name == "ros2probe"));
+    exports
+        .into_iter()
+        .flat_map(|export| export.items)
+        .collect()
+}
+
+#[test]
+fn a_replay_gives_the_same_traces_every_time_and_they_say_what_the_capture_says() {
+    let directory = tempfile::tempdir().unwrap();
+    let spans = traced(directory.path());
+    let again = traced(directory.path());
+    let identity = |span: &Item| {
+        let field = |name: &str| span.fields[name].clone();
+        (
+            field("Trace ID"),
+            field("ID"),
+            field("Parent ID"),
+            field("Start time"),
+            field("End time"),
+        )
+    };
+    let identities = |spans: &[Item]| spans.iter().map(identity).collect::<Vec<_>>();
+    assert_eq!(identities(&spans), identities(&again));
+
+    let named = |name: &str| {
+        let named = spans.iter().filter(|span| span.fields["Name"] == name);
+        named.collect::<Vec<_>>()
+    };
+    let (sent, settled) = (named("send /chatter"), named("settle /chatter"));
+    assert_eq!(sent.len(), 30, "the talker's messages");
+    assert!(!settled.is_empty() && sent.len() + settled.len() == spans.len());
+    for child in settled {
+        let parent = sent
+            .iter()
+            .find(|span| span.fields["ID"] == child.fields["Parent ID"]);
+        let parent = parent.unwrap_or_else(|| panic!("{child:#?} has no parent"));
+        assert_eq!(parent.fields["Trace ID"], child.fields["Trace ID"]);
+        assert_eq!(
+            parent.attributes["messaging.message.id"],
+            child.attributes["messaging.message.id"]
+        );
+        assert!(child.attributes.contains_key("reader"));
+    }
+    let attributes = &sent[0].attributes;
+    for (key, value) in [
+        ("messaging.system", "dds"),
+        ("messaging.destination.name", "/chatter"),
+        ("message_type", "std_msgs/msg/String"),
+        ("domain_id", "0"),
+    ] {
+        assert_eq!(attributes[key], value, "{attributes:?}");
+    }
+    assert!(attributes.contains_key("source_timestamp_unix_nano"));
+}

@@ -1,0 +1,805 @@
+//! Bags that the agent writes, asked for over its API: begun, paused, split and ended; and the last
+//! seconds before an expectation was violated.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader};
+use std::net::SocketAddr;
+use std::os::unix::net::UnixListener;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::time::{Duration, Instant};
+
+use crate::rp;
+use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask};
+use ros2probe_testing::model::capture::{Capture, ETHERNET, reader, writer};
+use ros2probe_wire::GuidPrefix;
+use serde_json::Value;
+
+const SECOND: u64 = 1_000_000_000;
+const START: u64 = 1_795_143_000 * SECOND;
+const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
+/// Topics of a robot with navigation and two cameras.
+const MANY: usize = 171;
+
+/// An agent that may write bags, and replays slowly.
+fn agent(directory: &Path, more: &str) -> LocalAgent {
+    agent_on(&local_agent::capture(), directory, "0.5", more)
+}
+
+fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalAgent {
+    let configuration = directory.join("ros2probe.yaml");
+    let bags = directory.join("bags");
+    // How full the disk is matters where a test says so.
+    let reserve = match more.contains("reserve_") {
+        true => "",
+        false => "  reserve_percent: 0\n  reserve_bytes: 0\n",
+    };
+    let text = format!(
+        "recordings:\n  directory: {}\n{reserve}{more}",
+        bags.display()
+    );
+    std::fs::write(&configuration, text).unwrap();
+    let configuration = configuration.to_str().unwrap();
+    LocalAgent::replay(
+        &mut rp(),
+        capture,
+        &["--speed", speed, "--config", configuration],
+    )
+}
+
+/// Asks for the recording until it is as wanted.
+fn wait_for(api: SocketAddr, name: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let (status, recording) = ask(api, "GET", &format!("/recordings/{name}"), "");
+        if status == 200 && wanted(&recording) {
+            return recording;
+        }
+        assert!(Instant::now() < deadline, "{recording}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
+/// Sequence numbers in a bag, by topic.
+fn messages(directory: &Path) -> BTreeMap<String, Vec<u32>> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(directory)
+        .unwrap()
+        .map(|file| file.unwrap().path())
+        .filter(|path| {
+            path.extension()
+                .is_some_and(|extension| extension == "mcap")
+        })
+        .collect();
+    files.sort();
+    let mut found = BTreeMap::<_, Vec<_>>::new();
+    for file in files {
+        let bytes = std::fs::read(file).unwrap();
+        for message in mcap::MessageStream::new(&bytes).unwrap() {
+            let message = message.unwrap();
+            let topic = message.channel.topic.clone();
+            found.entry(topic).or_default().push(message.sequence);
+        }
+    }
+    found
+}
+
+#[test]
+fn a_headless_robot_is_told_to_record_and_tells_what_it_has() {
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(directory.path(), "");
+    let api = agent.api;
+
+    let (status, begun) = ask(api, "POST", "/recordings", r#"{"name": "drive"}"#);
+    assert_eq!(
+        (status, &begun["name"]),
+        (201, &Value::from("drive")),
+        "{begun}"
+    );
+    assert_eq!(begun["topics"]["all_topics"], true);
+    let (status, again) = ask(api, "POST", "/recordings", r#"{"name": "drive"}"#);
+    assert_eq!(status, 409, "{again}");
+    let of = |recording: &Value, key: &str| recording["report"][key].as_u64().unwrap();
+    wait_for(api, "drive", |recording| of(recording, "messages") > 5);
+
+    assert_eq!(ask(api, "POST", "/recordings/drive/split", "").0, 202);
+    assert_eq!(ask(api, "POST", "/recordings/drive/pause", "").0, 202);
+    let paused = wait_for(api, "drive", |recording| recording["state"] == "paused");
+    let held = of(&paused, "messages");
+    let resumed = |recording: &Value| {
+        let topics = recording["report"]["topics"].as_object().unwrap();
+        topics
+            .values()
+            .any(|topic| topic["paused"].as_u64() > Some(2))
+    };
+    let paused = wait_for(api, "drive", resumed);
+    assert_eq!(of(&paused, "messages"), held);
+    assert_eq!(ask(api, "POST", "/recordings/drive/resume", "").0, 202);
+    wait_for(api, "drive", |recording| {
+        of(recording, "messages") > held + 3
+    });
+
+    agent.wait_for_metric("ros2probe_recordings", |count| count == 1.0);
+    let (status, ended) = ask(api, "DELETE", "/recordings/drive", "");
+    assert_eq!(
+        (status, &ended["state"]),
+        (200, &Value::from("ended")),
+        "{ended}"
+    );
+    assert_eq!((of(&ended, "missing"), &ended["error"]), (0, &Value::Null));
+    let messages = messages(&directory.path().join("bags/drive"));
+    let counted = messages.values().map(Vec::len).sum::<usize>() as u64;
+    assert_eq!(
+        (counted, ended["files"].as_u64().unwrap() >= 2),
+        (of(&ended, "messages"), true)
+    );
+    for (topic, numbers) in &messages {
+        let mut sorted = numbers.clone();
+        sorted.sort_unstable();
+        sorted.dedup();
+        // The capture has one publisher for each topic.
+        assert_eq!(&sorted, numbers, "{topic}");
+    }
+    let recorded = |count| count == counted as f64;
+    agent.wait_for_metric("ros2probe_recorded_messages_total", recorded);
+    let events = local_agent::request(api, "GET", "/events?after=0&follow=false", "").body;
+    assert!(events.contains("ros2probe.recording.started") && events.contains(r#""missing":0"#));
+    // Asked again, nothing more happens.
+    assert_eq!(ask(api, "DELETE", "/recordings/drive", "").0, 200);
+}
+
+#[test]
+fn a_recording_that_meets_a_limit_ends_in_order_with_the_reason_and_none_begins_then() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(
+        directory.path(),
+        "  max_total_bytes: 1000000\n  reserve_bytes: 65536\n  reserve_percent: 0\n",
+    );
+    let api = agent.api;
+    let (_, all) = ask(api, "GET", "/recordings", "");
+    assert_eq!(all["limits"]["max_total_bytes"], 1_000_000, "{all}");
+    assert_eq!(ask(api, "POST", "/recordings", r#"{"name": "cut"}"#).0, 201);
+    wait_for(api, "cut", |recording| {
+        recording["report"]["messages"].as_u64() > Some(5)
+    });
+    let bags = directory.path().join("bags");
+    std::fs::create_dir(bags.join("other")).unwrap();
+    std::fs::write(bags.join("other/other_0.mcap"), vec![0; 1_000_000]).unwrap();
+    let ended = wait_for(api, "cut", |recording| recording["state"] == "ended");
+    let reason = ended["error"].as_str().unwrap();
+    assert!(reason.contains("recordings.max_total_bytes"), "{reason}");
+    assert_eq!(ended["report"]["limit_reached"], reason);
+    let counted = messages(&bags.join("cut"))
+        .values()
+        .map(Vec::len)
+        .sum::<usize>();
+    assert_eq!(ended["report"]["messages"], counted, "{ended}");
+    let metadata = std::fs::read_to_string(bags.join("cut/metadata.yaml")).unwrap();
+    assert!(metadata.contains("limit_reached"), "{metadata}");
+    for (path, mode) in [
+        ("cut", 0o750),
+        ("cut/cut_0.mcap", 0o640),
+        ("cut/metadata.yaml", 0o640),
+    ] {
+        let about = std::fs::metadata(bags.join(path)).unwrap();
+        assert_eq!(about.permissions().mode() & 0o777, mode, "{path}");
+    }
+    let events = local_agent::request(api, "GET", "/events?after=0&follow=false", "").body;
+    assert!(events.contains("recordings.max_total_bytes"), "{events}");
+    let (status, refused) = ask(api, "POST", "/recordings", r#"{"name": "next"}"#);
+    assert_eq!(status, 507, "{refused}");
+    assert!(!bags.join("next").exists());
+}
+
+#[test]
+fn what_is_to_stay_free_is_not_recorded_into() {
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(directory.path(), "  reserve_bytes: 1099511627776\n");
+    let (status, refused) = ask(agent.api, "POST", "/recordings", r#"{"name": "none"}"#);
+    assert_eq!(status, 507, "{refused}");
+    let detail = refused["detail"].as_str().unwrap();
+    assert!(detail.contains("recordings.reserve_bytes"), "{detail}");
+    assert!(!directory.path().join("bags/none").exists());
+}
+
+#[test]
+fn a_recording_that_cannot_be_is_refused_and_leaves_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let agent = agent(directory.path(), "");
+    let long = "x".repeat(129);
+    for body in [
+        r#"{"name": "../escape"}"#,
+        r#"{"name": ""}"#,
+        r#"{"name": ".hidden"}"#,
+        r#"{"name": "a/b"}"#,
+        &format!(r#"{{"name": "{long}"}}"#),
+        r#"{"topics": {"topics": ["chatter"]}}"#,
+        r#"{"topics": {"regex": "("}}"#,
+        r#"{"topics": {"exclude_regex": "x"}}"#,
+        r#"{"storage_preset_profile": "fastest"}"#,
+        r#"{"file_compression": "gzip"}"#,
+        r#"{"max_bag_size": 5}"#,
+        r#"{"domain_id": 300}"#,
+        r#"{"no_such_key": 1}"#,
+    ] {
+        let (status, problem) = ask(agent.api, "POST", "/recordings", body);
+        assert_eq!(status, 422, "{body}: {problem}");
+        assert_eq!(
+            problem["type"], "urn:ros2probe:problem:invalid-request",
+            "{body}"
+        );
+    }
+    assert!(!directory.path().join("bags").exists());
+    assert!(!directory.path().join("escape").exists());
+    for path in ["/recordings/none", "/recordings/..%2F", "/snapshots"] {
+        let (status, _) = ask(agent.api, "GET", path, "");
+        assert_eq!(
+            status,
+            if path == "/snapshots" { 200 } else { 404 },
+            "{path}"
+        );
+    }
+    assert_eq!(ask(agent.api, "POST", "/snapshots/none", "").0, 404);
+    drop(agent);
+
+    let nowhere = LocalAgent::start(&mut rp(), &["--speed", "0.5"]);
+    let (status, problem) = ask(nowhere.api, "POST", "/recordings", "{}");
+    assert_eq!(status, 409, "{problem}");
+    assert!(
+        problem["detail"]
+            .as_str()
+            .unwrap()
+            .contains("recordings.directory")
+    );
+}
+
+#[test]
+fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
+    let directory = tempfile::tempdir().unwrap();
+    let more = "  snapshots:\n    - {name: incident, topics: ['/**'], seconds: 5}\n\
+                watch: [{topic: '/**', min_rate_hz: 1000000}]\n";
+    let agent = agent(directory.path(), more);
+    agent.wait_for_metric(
+        r#"ros2probe_snapshots_written_total{snapshot="incident"}"#,
+        |count| count >= 1.0,
+    );
+    let bags = directory.path().join("bags");
+    let bag = std::fs::read_dir(&bags).unwrap().next().unwrap().unwrap();
+    assert!(
+        bag.file_name()
+            .to_str()
+            .unwrap()
+            .starts_with("incident_rosbag2_")
+    );
+    assert!(!messages(&bag.path()).is_empty());
+    let events = local_agent::request(agent.api, "GET", "/events?after=0&follow=false", "").body;
+    assert!(events.contains("ros2probe.snapshot.taken"), "{events}");
+
+    // What came since then, for a client that asks; at the same second names would collide.
+    std::thread::sleep(Duration::from_millis(1100));
+    let (status, written) = ask(agent.api, "POST", "/snapshots/incident", "");
+    assert_eq!(status, 201, "{written}");
+    let path = Path::new(written["directory"].as_str().unwrap());
+    let count: usize = messages(path).values().map(Vec::len).sum();
+    assert_eq!(written["messages"], count as u64);
+    let (_, list) = ask(agent.api, "GET", "/snapshots", "");
+    assert_eq!(list["snapshots"][0]["written"], 2, "{list}");
+    assert_eq!(list["snapshots"][0]["failed"], 0, "{list}");
+}
+
+#[test]
+fn a_late_recording_has_what_was_sent_once_before_it_where_the_watchlist_asks_for_that() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo/capture.pcap.gz");
+    let more = "watch: [{topic: /tf_static, retain: last}]\n";
+    let agent = agent_on(&capture, directory.path(), "10", more);
+    agent.wait_for_metric("ros2probe_retained_bytes", |bytes| bytes > 50.0);
+    // It is sent once in the capture: whoever comes now is too late for it.
+    let body = r#"{"name": "late", "topics": {"topics": ["/tf_static", "/chatter"]}}"#;
+    let (status, begun) = ask(agent.api, "POST", "/recordings", body);
+    assert_eq!(status, 201, "{begun}");
+    wait_for(agent.api, "late", |recording| {
+        recording["report"]["topics"]["/tf_static"]["messages"] == 1
+    });
+    let (status, ended) = ask(agent.api, "DELETE", "/recordings/late", "");
+    assert_eq!(status, 200, "{ended}");
+    assert_eq!(
+        ended["report"]["sent_before"],
+        serde_json::json!([]),
+        "{ended}"
+    );
+    let messages = messages(&directory.path().join("bags/late"));
+    assert_eq!(messages["/tf_static"].len(), 1, "{messages:?}");
+}
+
+#[test]
+fn snapshots_without_a_place_are_a_mistake_only_where_none_was_asked_for() {
+    let directory = tempfile::tempdir().unwrap();
+    let configuration = directory.path().join("ros2probe.yaml");
+    let run = |state: &str| {
+        let snapshots = "recordings: {snapshots: [{name: incident, topics: ['/**']}]}\n";
+        std::fs::write(&configuration, format!("{snapshots}{state}")).unwrap();
+        let output = rp()
+            .args(["run", "--report", "--replay"])
+            .arg(local_agent::capture())
+            .arg("--config")
+            .arg(&configuration)
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        (output.status.code(), output.stdout.len(), said)
+    };
+    // A replay has no state directory, as an agent whose disk is not there.
+    let (code, length, said) = run("");
+    assert_eq!(code, Some(0), "{said}");
+    assert!(length > 1000 && said.contains("no snapshots are kept"));
+    let (code, _, said) = run("state_directory: off\n");
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("the agent has no place for recordings"));
+}
+
+/// What `rp bag convert` says of a capture, its exit code and the report in the bag.
+fn converted(capture: &Path, bag: &Path, options: &[&str]) -> (Option<i32>, String, Value) {
+    let mut command = rp();
+    command
+        .args(["bag", "convert"])
+        .args([capture, bag])
+        .args(options);
+    command.env_remove("ROS_DISTRO").env_remove("ROS_DOMAIN_ID");
+    let output = command.stdin(Stdio::null()).output().unwrap();
+    assert!(output.stdout.is_empty(), "{output:?}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    let metadata = std::fs::read_to_string(bag.join("metadata.yaml")).unwrap_or_default();
+    let metadata = ros2probe::bag::metadata::Metadata::read(&metadata).ok();
+    let report = metadata.and_then(|mut metadata| metadata.custom_data.remove("ros2probe"));
+    let report = report.map(|report| serde_json::from_str(&report).unwrap());
+    (output.status.code(), said, report.unwrap_or_default())
+}
+
+/// A minute of so many topics, one message of each a second.
+fn many_topics(path: &Path) {
+    let mut capture = Capture::new(ETHERNET);
+    capture.participant(START, 0, ALICE);
+    for topic in 0..MANY {
+        let guid = writer(ALICE, topic);
+        capture.writer(
+            START,
+            0,
+            guid,
+            &format!("rt/topic{topic}"),
+            topic as u64 + 1,
+        );
+    }
+    for second in 1..60 {
+        for topic in 0..MANY {
+            let time = START + second * SECOND + topic as u64 * 1_000_000;
+            capture.sample(time, 0, writer(ALICE, topic), second);
+        }
+    }
+    capture.write(path);
+}
+
+/// An `rp bag record` and what it prints on stderr.
+struct Recording {
+    child: Child,
+    lines: Receiver<String>,
+    said: Vec<String>,
+}
+
+impl Recording {
+    fn start(api: SocketAddr, bag: &Path, options: &[&str]) -> Self {
+        let mut command = rp();
+        command.args(["bag", "record", "-a", "--host", &api.to_string(), "-o"]);
+        command.arg(bag).args(options);
+        Self::of(&mut command)
+    }
+
+    fn of(command: &mut Command) -> Self {
+        command.env_remove("ROS_DISTRO").env_remove("ROS_DOMAIN_ID");
+        command.stdin(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let stderr = BufReader::new(child.stderr.take().unwrap());
+        let (give, lines) = channel();
+        std::thread::spawn(move || {
+            let mut lines = stderr.lines().map_while(Result::ok);
+            lines.all(|line| give.send(line).is_ok())
+        });
+        Self {
+            child,
+            lines,
+            said: Vec::new(),
+        }
+    }
+
+    /// Waits for a line that has `text`, and says how long that took.
+    fn wait_for(&mut self, text: &str) -> Duration {
+        let begun = Instant::now();
+        loop {
+            let left = PATIENCE.saturating_sub(begun.elapsed());
+            let Ok(line) = self.lines.recv_timeout(left) else {
+                panic!("no `{text}` in {:#?}", self.said);
+            };
+            self.said.push(line);
+            if self.said.last().unwrap().contains(text) {
+                return begun.elapsed();
+            }
+        }
+    }
+
+    fn signal(&self, name: &str) {
+        let id = self.child.id().to_string();
+        let sent = Command::new("kill").args([name, &id]).status().unwrap();
+        assert!(sent.success());
+    }
+
+    /// How it ended and after how long.
+    fn end(&mut self) -> (ExitStatus, Duration) {
+        let begun = Instant::now();
+        let status = loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status;
+            }
+            assert!(begun.elapsed() < PATIENCE, "{:#?}", self.said);
+            std::thread::sleep(Duration::from_millis(20));
+        };
+        self.said.extend(self.lines.iter());
+        (status, begun.elapsed())
+    }
+}
+
+impl Drop for Recording {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[test]
+fn a_recording_of_many_topics_begins_and_ends_without_a_question_for_each() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("many.pcap");
+    many_topics(&capture);
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
+    agent.wait_for_metric("ros2_topics{domain_id=\"0\",kind=\"topic\"}", |topics| {
+        topics == MANY as f64
+    });
+    let bag = directory.path().join("bag");
+    let mut recording = Recording::start(agent.api, &bag, &[]);
+    let began = recording.wait_for("Recording...");
+    std::thread::sleep(Duration::from_secs(2));
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    eprintln!("{MANY} topics: began after {began:?}, ended after {ended:?}");
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert!(began < Duration::from_secs(3), "began after {began:?}");
+    // It waits up to two seconds for messages on their way: a replay's clock is not that of now.
+    assert!(ended < Duration::from_secs(5), "ended after {ended:?}");
+    assert_eq!(messages(&bag).len(), MANY);
+}
+
+#[test]
+fn a_recording_that_is_interrupted_while_it_begins_leaves_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    // An agent that takes the request and never answers.
+    let socket = directory.path().join("api.sock");
+    let listener = UnixListener::bind(&socket).unwrap();
+    let bag = directory.path().join("bag");
+    let mut command = rp();
+    command
+        .args(["bag", "record", "-a", "--socket"])
+        .arg(&socket);
+    let mut recording = Recording::of(command.arg("-o").arg(&bag));
+    let asked = listener.accept().unwrap();
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    assert_eq!(status.code(), Some(2), "{:#?}", recording.said);
+    assert!(ended < Duration::from_secs(5), "{ended:?}");
+    assert!(
+        recording.said[0].contains("no bag was made"),
+        "{:?}",
+        recording.said
+    );
+    assert!(!bag.exists());
+    drop(asked);
+}
+
+#[test]
+fn a_second_interrupt_ends_a_recording_at_once_with_its_report() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("many.pcap");
+    many_topics(&capture);
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
+    let bag = directory.path().join("bag");
+    let mut recording = Recording::start(agent.api, &bag, &[]);
+    recording.wait_for("Recording...");
+    std::thread::sleep(Duration::from_secs(2));
+    // The first one waits for messages on their way until a time that a replay never reaches.
+    recording.signal("-INT");
+    recording.wait_for("Completing the bag");
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert!(ended < Duration::from_millis(1500), "{ended:?}");
+    let count: usize = messages(&bag).values().map(Vec::len).sum();
+    assert!(count > 0);
+    let report = format!("{count} messages in {}", bag.display());
+    assert!(
+        recording.said.iter().any(|line| line.ends_with(&report)),
+        "{:#?}",
+        recording.said
+    );
+}
+
+const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
+const ONE: GuidPrefix = GuidPrefix(*b"\x01\x10oneproc-ss");
+
+/// One that begins late and holds more than one domain.
+fn with_omissions(path: &Path) {
+    let mut capture = Capture::new(ETHERNET);
+    let at = |milliseconds: u64| START + milliseconds * 1_000_000;
+    let (late, whole, never) = (writer(ALICE, 0), writer(ALICE, 1), writer(ALICE, 2));
+    capture.participant(at(0), 0, ALICE);
+    capture.writer(at(1), 0, whole, "rt/whole", 1);
+    for number in 1..=10 {
+        capture.sample(at(10 * number), 0, whole, number);
+        capture.sample(at(10 * number + 1), 0, late, number);
+        capture.sample(at(10 * number + 2), 0, never, number);
+    }
+    capture.writer(at(500), 0, late, "rt/late", 2);
+    for number in 11..=15 {
+        capture.sample(at(500 + 10 * number), 0, late, number);
+    }
+    // Between these nothing passes the network.
+    capture.participant(at(700), 0, ONE);
+    capture.writer(at(710), 0, writer(ONE, 0), "rt/inside", 1);
+    capture.reader(at(711), 0, reader(ONE, 0), "rt/inside", 1);
+    capture.participant(at(720), 7, BOB);
+    capture.writer(at(721), 7, writer(BOB, 0), "rt/imu", 1);
+    for number in 1..=4 {
+        capture.sample(at(730 + 10 * number), 7, writer(BOB, 0), number);
+    }
+    capture.sample(at(2000), 0, whole, 11);
+    capture.write(path);
+}
+
+#[test]
+fn what_a_late_capture_lacks_is_counted_by_topic_and_reason_and_the_exit_code_tells() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("late.pcap");
+    with_omissions(&capture);
+    let bag = directory.path().join("bag");
+    let (code, said, report) = converted(&capture, &bag, &[]);
+    let topics = &report["topics"];
+    assert_eq!(topics["/whole"]["messages"], 11, "{said}");
+    assert_eq!(topics["/late"]["messages"], 5, "{said}");
+    assert_eq!(topics["/late"]["unannounced"], 10, "{said}");
+    assert_eq!(report["missing"], 10, "{report:#}");
+    let unknown = serde_json::json!({"writers": 1, "messages": 10});
+    assert_eq!(report["unknown_writers"], unknown);
+    let unobserved = serde_json::json!({"/inside": "same_process"});
+    assert_eq!(report["unobserved"], unobserved, "{said}");
+    let others = serde_json::json!([{"domain_id": 7, "topics": 1, "messages": 4}]);
+    assert_eq!(report["other_domains"], others);
+    assert_eq!(code, Some(3), "{said}");
+    let last = said.lines().last().unwrap();
+    assert!(
+        last.contains("not everything that was sent is in the bag"),
+        "{said}"
+    );
+    assert!(!said.contains("stdin"), "{said}");
+    for line in [
+        "/late: 5 of 15 messages recorded; 10 sent before their writer was announced",
+        "/inside: no message recorded; publisher and subscriber share one process",
+        "not recorded: 10 messages of 1 unknown writer whose announcement was missed",
+        "not recorded: 1 topic of domain 7 with 4 messages (`--domain 7`)",
+    ] {
+        assert!(said.contains(line), "`{line}` is not in {said}");
+    }
+
+    let bag = directory.path().join("other");
+    let (code, said, report) = converted(&capture, &bag, &["--domain", "7"]);
+    assert_eq!(report["topics"]["/imu"]["messages"], 4, "{said}");
+    assert_eq!(report["other_domains"][0]["domain_id"], 0);
+    assert_eq!(code, Some(3), "{said}");
+}
+
+#[test]
+fn a_capture_that_is_whole_converts_with_exit_code_0() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("many.pcap");
+    many_topics(&capture);
+    let (code, said, report) = converted(&capture, &directory.path().join("bag"), &[]);
+    assert_eq!(
+        (code, &report["missing"]),
+        (Some(0), &Value::from(0)),
+        "{said}"
+    );
+    assert_eq!(report["messages"], 59 * MANY);
+    assert!(
+        said.lines().last().unwrap().ends_with("Recording stopped"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_cut_capture_becomes_a_bag_up_to_the_cut_and_the_exit_code_tells() {
+    let directory = tempfile::tempdir().unwrap();
+    let (whole, cut) = (
+        directory.path().join("many.pcap"),
+        directory.path().join("cut.pcap"),
+    );
+    many_topics(&whole);
+    let bytes = std::fs::read(&whole).unwrap();
+    std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    let (code, said, report) = converted(&cut, &directory.path().join("bag"), &[]);
+    assert_eq!(code, Some(3), "{said}");
+    assert!(report["messages"].as_u64() > Some(1000), "{said}");
+    assert!(said.contains("cut.pcap is incomplete: "), "{said}");
+}
+
+#[test]
+fn a_link_type_that_cannot_be_read_is_no_empty_robot() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("wifi.pcap");
+    let mut capture = Capture::new(127);
+    capture.frame(START, &[0; 60]);
+    capture.write(&path);
+    let capture = path.to_str().unwrap();
+    let bag = directory.path().join("bag");
+    for arguments in [
+        &["topic", "list", "--replay", capture][..],
+        &["topic", "echo", "/a", "--replay", capture],
+        &["topic", "hz", "/a", "--replay", capture],
+        &["node", "list", "--replay", capture],
+        &["bag", "convert", capture, bag.to_str().unwrap()],
+        &["run", "--report", "--replay", capture],
+    ] {
+        let output = rp().args(arguments).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{arguments:?}: {said}");
+        assert!(
+            said.contains("link type is 127 (802.11 with radiotap header)"),
+            "{said}"
+        );
+        assert!(output.stdout.is_empty(), "{arguments:?}");
+    }
+    assert!(!bag.exists());
+}
+
+/// A topic within one participant, one without a subscriber, and a writer that is never announced.
+fn with_silence(path: &Path) {
+    let mut capture = Capture::new(ETHERNET);
+    let at = |milliseconds: u64| START + milliseconds * 1_000_000;
+    for (prefix, number) in [(ALICE, 0), (ONE, 1)] {
+        capture.participant(at(number), 0, prefix);
+    }
+    capture.writer(at(10), 0, writer(ONE, 0), "rt/inside", 1);
+    capture.reader(at(11), 0, reader(ONE, 0), "rt/inside", 1);
+    capture.writer(at(12), 0, writer(ONE, 1), "rt/alone", 2);
+    for number in 1..=600 {
+        capture.sample(at(100 * number), 0, writer(ALICE, 0), number);
+    }
+    capture.write(path);
+}
+
+#[test]
+fn a_silent_topic_is_explained_once_on_stderr() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("silent.pcap");
+    with_silence(&capture);
+    let inside = "rp: no message on /inside: publisher and subscriber share one process; nothing \
+                  crosses the network";
+    let alone = "rp: no message on /alone: it has no subscriber";
+    let unknown = "rp: no message on /nothing: no endpoint on /nothing";
+    for (verb, topic, why) in [
+        ("echo", "/inside", inside),
+        ("hz", "/inside", inside),
+        ("bw", "/inside", inside),
+        ("delay", "/inside", inside),
+        ("hz", "/alone", alone),
+        ("echo", "/alone", alone),
+        ("hz", "/nothing", unknown),
+    ] {
+        let mut command = rp();
+        command
+            .args(["topic", verb, topic, "--replay"])
+            .arg(&capture);
+        let output = command.env_remove("ROS_DOMAIN_ID").output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(said.matches(why).count(), 1, "{verb} {topic}: {said}");
+    }
+
+    // As long as it runs: after some seconds, once.
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
+    agent.wait_for_metric("ros2_topics{domain_id=\"0\",kind=\"topic\"}", |topics| {
+        topics == 2.0
+    });
+    let api = agent.api.to_string();
+    let mut running: Vec<_> = ["echo", "hz", "bw", "delay"]
+        .into_iter()
+        .map(|verb| {
+            let mut command = rp();
+            command.args(["topic", verb, "/inside", "--host", &api]);
+            Recording::of(command.stdout(Stdio::null()))
+        })
+        .collect();
+    let bag = directory.path().join("bag");
+    let mut recording = Recording::start(agent.api, &bag, &["/missing"]);
+    for verb in &mut running {
+        verb.wait_for(inside);
+    }
+    recording.wait_for("/inside: no message recorded; publisher and subscriber share one process");
+    recording.wait_for("/missing has no known publisher");
+    std::thread::sleep(Duration::from_secs(2));
+    for verb in running {
+        assert!(verb.lines.try_recv().is_err(), "{:?}", verb.said);
+    }
+}
+
+#[test]
+fn a_late_start_is_no_empty_robot() {
+    let directory = tempfile::tempdir().unwrap();
+    let (silent, lonely) = (
+        directory.path().join("a.pcap"),
+        directory.path().join("b.pcap"),
+    );
+    with_silence(&silent);
+    let mut capture = Capture::new(ETHERNET);
+    for number in 0..12 {
+        let prefix = [&[1, 16][..], &[number; 10]].concat();
+        capture.participant(START, 0, GuidPrefix(prefix.try_into().unwrap()));
+    }
+    capture.write(&lonely);
+    for (capture, names, said) in [
+        (
+            &silent,
+            "/alone\n/inside\n",
+            "rp: 1 writer is active whose announcement was missed",
+        ),
+        (
+            &lonely,
+            "",
+            "rp: 12 participants are known, but none of their topics",
+        ),
+    ] {
+        let mut command = rp();
+        command.args(["topic", "list", "--replay"]).arg(capture);
+        let output = command.env_remove("ROS_DOMAIN_ID").output().unwrap();
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(String::from_utf8_lossy(&output.stdout), names);
+        assert_eq!(
+            (stderr.lines().count(), stderr.starts_with(said)),
+            (1, true),
+            "{stderr}"
+        );
+    }
+}
+
+#[test]
+fn a_cut_capture_is_echoed_up_to_the_cut_and_no_agent_has_ended() {
+    let directory = tempfile::tempdir().unwrap();
+    let (whole, cut) = (
+        directory.path().join("a.pcap"),
+        directory.path().join("b.pcap"),
+    );
+    many_topics(&whole);
+    let bytes = std::fs::read(&whole).unwrap();
+    std::fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
+    for verb in ["echo", "hz", "bw"] {
+        let mut command = rp();
+        command
+            .args(["topic", verb, "/topic1", "--replay"])
+            .arg(&cut);
+        let output = command.env_remove("ROS_DOMAIN_ID").output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{verb}: {said}");
+        assert_eq!(
+            said.matches("b.pcap is incomplete: ").count(),
+            1,
+            "{verb}: {said}"
+        );
+        assert!(!said.contains("agent"), "{verb}: {said}");
+        assert!(!output.stdout.is_empty(), "{verb}");
+    }
+}
