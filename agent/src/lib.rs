@@ -12,7 +12,6 @@ pub mod config;
 pub mod discover;
 pub mod doctor;
 pub mod file;
-pub mod message;
 pub mod model;
 pub mod privilege;
 pub mod recording;
@@ -24,3 +23,5 @@ pub mod surface;
 pub mod top;
 pub mod visible;
 pub mod watches;
+
+pub use ros2probe_message as message;

@@ -8,7 +8,7 @@ use clap::error::ErrorKind;
 use clap::{Args, CommandFactory as _, Subcommand, ValueEnum};
 use ros2probe::bag::info::{self, Sort};
 use ros2probe::bag::reindex::{self, Found};
-use ros2probe::ros2::Dialect;
+use ros2probe::ros2::{Dialect, dialect};
 
 use super::convert::Convert;
 use super::interrupt::INTERRUPTED;
@@ -55,7 +55,7 @@ struct Info {
     #[arg(long, value_enum, default_value_t)]
     sort: Sort,
     /// Whose output is printed [default: ROS_DISTRO, else jazzy]
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = dialect::parser())]
     distro: Option<Dialect>,
 }
 

@@ -4,7 +4,7 @@
 //! Pure: facts in, text out. Nothing here asks an agent, reads a clock or prints.
 
 pub mod action;
-mod dialect;
+pub mod dialect;
 pub mod echo;
 mod endpoint;
 pub mod facts;
@@ -15,5 +15,5 @@ mod refusal;
 pub mod service;
 pub mod topic;
 
-pub use dialect::Dialect;
+pub use crate::message::Dialect;
 pub use refusal::Refused;

@@ -364,8 +364,8 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_KEPT",
-        "agent/src/message/library.rs",
-        "agent/src/message/library.rs",
+        "agent/message/src/library.rs",
+        "agent/message/src/library.rs",
         "what_is_kept_is_bounded",
     ],
     [

@@ -13,9 +13,9 @@ mod forms;
 mod golden;
 
 use golden::{cases, library};
-use ros2probe::message::value::{Items, Scalar};
-use ros2probe::message::yaml::{self, Style};
-use ros2probe::message::{Decoded, Limits, Shown, Value, csv, decode};
+use ros2probe_message::value::{Items, Scalar};
+use ros2probe_message::yaml::{self, Style};
+use ros2probe_message::{Decoded, Limits, Shown, Value, csv, decode};
 
 /// What `ros2 topic echo` shows of arrays and strings unless told otherwise.
 const ECHO: Shown = Shown {
