@@ -2,9 +2,8 @@
 //!
 //! Three layers, dependencies pointing inwards: `capture` (I/O) and `surface` (metrics, HTTP)
 //! around `model` (discovery and statistics, deterministic). `client` asks a running agent, and
-//! `ros2` is the text that people know.
+//! `ros2` is the text that people know. `bag` and `message` are crates of their own.
 
-pub mod bag;
 pub mod bell;
 pub mod capture;
 pub mod client;
@@ -24,4 +23,5 @@ pub mod top;
 pub mod visible;
 pub mod watches;
 
+pub use ros2probe_bag as bag;
 pub use ros2probe_message as message;
