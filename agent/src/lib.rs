@@ -1,18 +1,15 @@
 //! ros2probe: watches a ROS 2 robot from copies of its RTPS traffic, without joining the domain.
-//!
-//! Three layers, dependencies pointing inwards: `capture` (I/O) and `surface` (metrics, HTTP)
-//! around `model` (discovery and statistics, deterministic). `client` asks a running agent, and
-//! `ros2` is the text that people know.
 
-pub mod bag;
+pub use ros2probe_bag as bag;
 pub use ros2probe_capture as capture;
+pub use ros2probe_message as message;
+pub use ros2probe_model as model;
+
 pub mod client;
 pub mod config;
 pub mod discover;
 pub mod doctor;
 pub mod file;
-pub mod message;
-pub use ros2probe_model as model;
 pub mod privilege;
 pub mod recording;
 pub mod ros2;

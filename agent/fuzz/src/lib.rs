@@ -9,7 +9,7 @@ use std::io::{Cursor, Write as _};
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
 
-use ros2probe::bag::info::{Bag, Sort};
+use ros2probe::bag::info::Bag;
 use ros2probe::bag::reindex::{Found, reindex};
 use ros2probe::capture::exact::library;
 use ros2probe::capture::pcap::PcapReader;
@@ -25,6 +25,7 @@ use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe::model::selection::{Depth, Selection, Wish};
 use ros2probe::ros2::Dialect;
+use ros2probe::ros2::bag::{self, Sort};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, Packet, Payload};
 use ros2probe_wire::record::Record;
@@ -321,15 +322,17 @@ pub fn bag_file(bytes: &[u8]) {
 
 /// All that is told of a bag or a file.
 fn told(path: &Path) {
-    let Ok(bag) = Bag::open(path) else { return };
-    let details = bag.details().ok();
+    let Ok(opened) = Bag::open(path) else {
+        return;
+    };
+    let details = opened.details().ok();
     for (dialect, sort) in [
         (Dialect::Humble, Sort::Type),
         (Dialect::Jazzy, Sort::Name),
         (Dialect::Kilted, Sort::Count),
     ] {
-        assert!(bag.text(dialect, sort, details.as_ref()).ends_with('\n'));
-        let names = bag.names(dialect, sort);
+        assert!(bag::info(&opened, dialect, sort, details.as_ref()).ends_with('\n'));
+        let names = bag::names(&opened, dialect, sort);
         assert!(names.is_empty() || names.ends_with('\n'));
     }
 }

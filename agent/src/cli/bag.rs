@@ -6,9 +6,11 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::error::ErrorKind;
 use clap::{Args, CommandFactory as _, Subcommand, ValueEnum};
-use ros2probe::bag::info::{self, Sort};
+use ros2probe::bag::info;
 use ros2probe::bag::reindex::{self, Found};
-use ros2probe::ros2::Dialect;
+use ros2probe::ros2::bag::{self, Sort};
+use ros2probe::ros2::{Dialect, dialect};
+use ros2probe::visible::visible;
 
 use super::convert::Convert;
 use super::interrupt::INTERRUPTED;
@@ -55,7 +57,7 @@ struct Info {
     #[arg(long, value_enum, default_value_t)]
     sort: Sort,
     /// Whose output is printed [default: ROS_DISTRO, else jazzy]
-    #[arg(long, value_enum)]
+    #[arg(long, value_parser = dialect::parser())]
     distro: Option<Dialect>,
 }
 
@@ -109,11 +111,11 @@ impl Info {
                 ignored.\n",
             )?;
         }
-        let bag = info::Bag::open(&self.bag_path)?;
-        let details = self.verbose.then(|| bag.details()).transpose()?;
+        let opened = info::Bag::open(&self.bag_path)?;
+        let details = self.verbose.then(|| opened.details()).transpose()?;
         let text = match self.topic_name && !self.verbose {
-            true => bag.names(dialect, self.sort),
-            false => bag.text(dialect, self.sort, details.as_ref()),
+            true => bag::names(&opened, dialect, self.sort),
+            false => bag::info(&opened, dialect, self.sort, details.as_ref()),
         };
         output.write(&text)?;
         Ok(ExitCode::SUCCESS)
@@ -130,7 +132,8 @@ impl Reindex {
         let report = reindex::reindex(&self.bag_path)?;
         let mut output = Output::new();
         for file in &report.files {
-            output.write(&format!("{file}\n"))?;
+            // The name of a file is anything but a slash.
+            output.write(&format!("{}\n", visible(&file.to_string())))?;
         }
         let metadata = &report.metadata;
         output.write(&format!(

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::ClientError;
-use crate::ros2::Dialect;
+use crate::ros2::{Dialect, dialect};
 use crate::run::Moment;
 
 /// Highest domain there is.
@@ -41,7 +41,7 @@ pub struct Target {
         value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN)))]
     pub domain_id: Option<u32>,
     /// Whose output to print [default: $ROS_DISTRO, else jazzy]
-    #[arg(long, value_name = "DISTRO", value_enum, hide_possible_values = true)]
+    #[arg(long, value_name = "DISTRO", value_parser = dialect::parser(), hide_possible_values = true)]
     pub distro: Option<Dialect>,
 }
 

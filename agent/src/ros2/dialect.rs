@@ -1,57 +1,52 @@
-//! Distributions whose command lines differ in what they print.
+//! The distribution whose command line is printed, as an option of ours names it.
 
-use clap::ValueEnum;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
-/// The distribution whose output is printed, oldest first.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-pub enum Dialect {
-    /// Humble, and what is older.
-    Humble,
-    /// Jazzy, and Iron.
-    #[default]
-    Jazzy,
-    /// Kilted.
-    Kilted,
-    /// Lyrical and rolling.
-    #[value(alias = "lyrical")]
-    Rolling,
-}
+use super::Dialect;
 
-impl Dialect {
-    /// As `ROS_DISTRO` spells it.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Humble => "humble",
-            Self::Jazzy => "jazzy",
-            Self::Kilted => "kilted",
-            Self::Rolling => "rolling",
+/// Reads the value of `--distro`.
+#[must_use]
+pub fn parser() -> impl TypedValueParser<Value = Dialect> {
+    let values = [
+        (Dialect::Humble, "Humble, and what is older"),
+        (Dialect::Jazzy, "Jazzy, and Iron"),
+        (Dialect::Kilted, "Kilted"),
+        (Dialect::Rolling, "Lyrical and rolling"),
+    ]
+    .map(|(dialect, help)| {
+        let value = PossibleValue::new(dialect.name()).help(help);
+        match dialect {
+            Dialect::Rolling => value.alias("lyrical"),
+            _ => value,
         }
-    }
-
-    /// Of `ROS_DISTRO`; `None` for one that is not known.
-    #[must_use]
-    pub fn of_distro(name: &str) -> Option<Self> {
-        Some(match name {
-            "dashing" | "eloquent" | "foxy" | "galactic" | "humble" => Self::Humble,
-            "iron" | "jazzy" => Self::Jazzy,
-            "kilted" => Self::Kilted,
-            "lyrical" | "rolling" => Self::Rolling,
-            _ => return None,
-        })
-    }
+    });
+    PossibleValuesParser::new(values)
+        .try_map(|name| Dialect::of_distro(&name).ok_or("no distribution that is known"))
 }
 
 #[cfg(test)]
 mod tests {
+    use clap::{Arg, Command};
+
     use super::*;
 
     #[test]
-    fn every_distribution_has_a_dialect_and_dialects_have_an_order() {
-        assert_eq!(Dialect::of_distro("lyrical"), Some(Dialect::Rolling));
-        assert_eq!(Dialect::of_distro("galactic"), Some(Dialect::Humble));
-        assert_eq!(Dialect::of_distro("noetic"), None);
-        assert!(Dialect::Humble < Dialect::default() && Dialect::Kilted < Dialect::Rolling);
-        assert_eq!(Dialect::from_str("lyrical", false), Ok(Dialect::Rolling));
+    fn every_value_that_is_offered_names_a_dialect() {
+        let parse = |name: &str| {
+            let option = Arg::new("distro").long("distro").value_parser(parser());
+            let command = Command::new("rp").arg(option);
+            let matches = command.try_get_matches_from(["rp", "--distro", name]);
+            matches.map(|matches| matches.get_one::<Dialect>("distro").copied())
+        };
+        let offered: Vec<_> = parser().possible_values().unwrap().collect();
+        let names: Vec<_> = offered.iter().map(PossibleValue::get_name).collect();
+        assert_eq!(names, ["humble", "jazzy", "kilted", "rolling"]);
+        for name in names {
+            assert_eq!(parse(name).unwrap().map(Dialect::name), Some(name));
+        }
+        assert_eq!(parse("lyrical").unwrap(), Some(Dialect::Rolling));
+        for name in ["iron", "Jazzy", "noetic"] {
+            assert!(parse(name).is_err(), "{name}");
+        }
     }
 }

@@ -1,10 +1,11 @@
-//! What `rp topic`, `rp node`, `rp service` and `rp action` say: the text of the `ros2` command
+//! What `rp topic`, `rp node`, `rp service`, `rp action` and `rp bag info` print: the text of the `ros2` command
 //! line in the dialect of a distribution.
 //!
 //! Pure: facts in, text out. Nothing here asks an agent, reads a clock or prints.
 
 pub mod action;
-mod dialect;
+pub mod bag;
+pub mod dialect;
 pub mod echo;
 mod endpoint;
 pub mod facts;
@@ -15,5 +16,5 @@ mod refusal;
 pub mod service;
 pub mod topic;
 
-pub use dialect::Dialect;
+pub use crate::message::Dialect;
 pub use refusal::Refused;

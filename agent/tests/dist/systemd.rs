@@ -62,13 +62,17 @@ fn each_claim_of_the_threat_model_names_tests_that_exist() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let places = ["agent/tests", "agent/src", "wire/src", "wire/tests"];
     let source = |file: &str| {
-        let of_crate = file
-            .split_once('/')
-            .map(|(name, rest)| root.join(format!("agent/{name}/src/{rest}.rs")));
-        let mut paths = places
+        let mut paths: Vec<_> = places
             .iter()
             .map(|place| root.join(place).join(format!("{file}.rs")))
-            .chain(of_crate);
+            .collect();
+        // `message/library` is a file of the crate in `agent/message`.
+        if let Some((krate, file)) = file.split_once('/') {
+            let folders =
+                ["src", "tests"].map(|folder| root.join("agent").join(krate).join(folder));
+            paths.extend(folders.map(|folder| folder.join(format!("{file}.rs"))));
+        }
+        let mut paths = paths.iter();
         paths.find_map(|path| std::fs::read_to_string(path).ok())
     };
     let is_test = |source: &str, function: &str| {

@@ -14,6 +14,7 @@ mod deliveries;
 mod diagnosis;
 mod fixtures;
 mod forged;
+mod header;
 mod memory;
 mod observer;
 mod order;

@@ -22,7 +22,6 @@ mod events;
 mod fuzz_seeds;
 mod http;
 mod limits;
-mod message;
 mod metrics;
 mod otlp;
 mod otlp_tls;

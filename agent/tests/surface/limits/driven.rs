@@ -328,26 +328,26 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "EXPANDED",
-        "agent/src/bag/read.rs",
+        "agent/bag/src/read.rs",
         "agent/tests/surface/bag/cut.rs",
         "a_small_file_that_expands_to_gigabytes_is_refused_before_it_does",
     ],
     [
         "MAX_BYTES",
-        "agent/src/bag/metadata.rs",
+        "agent/bag/src/metadata.rs",
         "agent/tests/surface/caps.rs",
         "files_of_more_bytes_than_are_read_are_refused",
     ],
     [
         "MAX_EVENTS",
-        "agent/src/bag/metadata.rs",
-        "agent/src/bag/metadata.rs",
+        "agent/bag/src/metadata.rs",
+        "agent/bag/src/metadata.rs",
         "a_text_that_is_too_deep_or_too_large_is_refused_before_it_is_read",
     ],
     [
         "MAX_DEPTH",
-        "agent/src/bag/metadata.rs",
-        "agent/src/bag/metadata.rs",
+        "agent/bag/src/metadata.rs",
+        "agent/bag/src/metadata.rs",
         "a_text_that_is_too_deep_or_too_large_is_refused_before_it_is_read",
     ],
     [
@@ -364,8 +364,8 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_KEPT",
-        "agent/src/message/library.rs",
-        "agent/src/message/library.rs",
+        "agent/message/src/library.rs",
+        "agent/message/src/library.rs",
         "what_is_kept_is_bounded",
     ],
     [

@@ -5,8 +5,8 @@ use std::borrow::Cow;
 use std::cmp::Ordering;
 
 use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
-use crate::message::python;
-use crate::message::value::{Array, Items, Message, Scalar, Value};
+use crate::python;
+use crate::value::{Array, Items, Message, Scalar, Value};
 
 /// What `m` is.
 #[derive(Debug, Clone, Copy)]

@@ -1,9 +1,43 @@
 //! Bags: recordings in rosbag2's MCAP form, on disk.
 //!
-//! A directory with metadata.yaml and files that `ros2 bag play`, Foxglove and the PyPI readers
-//! open. Written without thread, clock or signal: whoever records calls from a thread of its own
-//! and passes times in. Nothing here subscribes, decodes or chooses topics, and sqlite3 bags are
-//! neither written nor read.
+//! A bag is a directory with metadata.yaml and files that `ros2 bag play`, Foxglove and the PyPI
+//! readers open.
+//!
+//! - [`Writer`] makes a bag; [`Options`] choose form, compression and the size of files.
+//! - [`info::Bag`] opens a bag and knows what it holds; [`read`] walks over the records of a file.
+//! - [`reindex::reindex`] completes the files of a bag whose writer was killed.
+//!
+//! Nothing here has a thread, reads a clock, subscribes, decodes or chooses topics: callers pass
+//! times, payloads and the text of schemas. sqlite3 bags are neither written nor read.
+//!
+//! ```
+//! use std::collections::BTreeMap;
+//!
+//! use ros2probe_bag::info::Bag;
+//! use ros2probe_bag::{Options, Schema, TopicDescription, Writer};
+//! use ros2probe_wire::Timestamp;
+//!
+//! let directory = tempfile::tempdir()?;
+//! let path = directory.path().join("run");
+//! let mut writer = Writer::create(&path, Options::default())?;
+//! let chatter = writer.topic(TopicDescription {
+//!     name: "/chatter".into(),
+//!     type_name: "std_msgs/msg/String".into(),
+//!     type_hash: None,
+//!     publishers: Vec::new(),
+//!     schema: Some(Schema {
+//!         encoding: "ros2msg".into(),
+//!         text: "string data\n".into(),
+//!     }),
+//! })?;
+//! let (received, sent) = (Timestamp(1_795_142_331_000_000_100), Timestamp(1_795_142_331_000_000_000));
+//! writer.write(chatter, received, sent, 1, b"\0\x01\0\0\x06\0\0\0hello\0")?;
+//! writer.close(BTreeMap::new())?;
+//!
+//! let bag = Bag::open(&path)?;
+//! assert_eq!(bag.metadata.message_count, 1);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 use std::fs::{File, OpenOptions};
 use std::io;
@@ -92,6 +126,21 @@ fn new_file(path: &Path) -> io::Result<File> {
     options.write(true).create_new(true).mode(0o640).open(path)
 }
 
+/// Opens a regular file to read it. Opening never waits, as it would for a pipe without a writer; the
+/// open file is checked, so nothing can take its place in between.
+fn open_file(path: &Path) -> io::Result<File> {
+    let flags = libc::O_NONBLOCK | libc::O_NOCTTY;
+    let mut options = OpenOptions::new();
+    let file = options.read(true).custom_flags(flags).open(path)?;
+    match file.metadata()?.is_file() {
+        true => Ok(file),
+        false => Err(io::Error::new(
+            io::ErrorKind::InvalidInput,
+            "not a regular file",
+        )),
+    }
+}
+
 impl Error {
     fn writing(path: &Path, source: io::Error) -> Self {
         let path = path.to_owned();
@@ -108,6 +157,25 @@ impl Error {
         match Self::writing(path, source) {
             Self::Write { path, source } => Self::Create { path, source },
             other => other,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::Command;
+
+    use super::*;
+
+    #[test]
+    fn what_is_no_regular_file_is_refused_without_waiting() {
+        let directory = tempfile::tempdir().unwrap();
+        let pipe = directory.path().join("pipe");
+        let status = Command::new("mkfifo").arg(&pipe).status();
+        assert!(status.unwrap().success());
+        for path in [pipe.as_path(), directory.path(), Path::new("/dev/zero")] {
+            let refused = open_file(path).unwrap_err();
+            assert_eq!(refused.to_string(), "not a regular file");
         }
     }
 }

@@ -6,7 +6,7 @@ use std::hint::black_box;
 use std::path::Path;
 
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
-use ros2probe::bag::{Compression, Options, Storage, TopicDescription, TopicId, Writer};
+use ros2probe_bag::{Compression, Options, Storage, TopicDescription, TopicId, Writer};
 use ros2probe_wire::Timestamp;
 
 const CLOUDS: usize = 24;

@@ -1,7 +1,7 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::message::{Limits, MessageType, decode};
+use crate::{Limits, MessageType, decode};
 
 const SCHEMA: &str = "std_msgs/Header header\nfloat64 x\nint32 n\nbool ok\nstring name\nbyte level
 float32[] ranges\nstring[] names\nuint8[3] three\n

@@ -9,11 +9,11 @@ use std::fs::File;
 use std::io::{self, BufReader, Read, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
-use super::Compression;
 use super::mcap::{
     self, Channel, Chunk, ChunkIndex, Footer, Message, Metadata, Opcode, RECORD_HEADER, Schema,
     Statistics,
 };
+use super::{Compression, open_file};
 
 /// No record is longer: a length beyond this is damage.
 const MAX_RECORD: u64 = 1 << 30;
@@ -85,7 +85,7 @@ impl Contents {
             path: path.to_owned(),
             source,
         };
-        let mut file = crate::file::open(path).map_err(wrong)?;
+        let mut file = open_file(path).map_err(wrong)?;
         let mut magic = [0; mcap::MAGIC.len()];
         if file.read_exact(&mut magic).is_err() || magic != mcap::MAGIC {
             return Err(ReadError::NotMcap(path.to_owned()));
@@ -206,7 +206,7 @@ pub fn scan(path: &Path, each: &mut Each<'_>) -> Result<Scan, ReadError> {
         path: path.to_owned(),
         source,
     };
-    let file = crate::file::open(path).map_err(wrong)?;
+    let file = open_file(path).map_err(wrong)?;
     let length = file.metadata().map_err(wrong)?.len();
     let expands = EXPANDED.saturating_add(length.saturating_mul(EXPANSION));
     let compression = compression(path);

@@ -512,7 +512,7 @@ fn wide(units: &Scalars<'_>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::message::python;
+    use crate::python;
 
     fn message_type(schema: &str) -> MessageType {
         MessageType::parse(&"a/msg/B".parse().unwrap(), schema).unwrap()

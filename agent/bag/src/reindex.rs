@@ -16,8 +16,7 @@ use super::mcap::{self, Message, Opcode};
 use super::metadata::{self, Metadata, Topic};
 use super::read::{self, Contents, ReadError, Scan};
 use super::writer::{Durability, FileCompression, with_suffix, write_metadata};
-use super::{Compression, Error, info};
-use crate::visible::visible;
+use super::{Compression, Error, info, open_file};
 
 /// What was found and done.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -191,7 +190,7 @@ fn rewrite(path: &Path, scan: &Scan) -> io::Result<Found> {
 }
 
 fn write_part(path: &Path, part: &Path, scan: &Scan) -> io::Result<Found> {
-    let mut source = crate::file::open(path)?;
+    let mut source = open_file(path)?;
     let mut writer = FileWriter::resume(part, &mut source, scan)?;
     let mut salvaged = 0;
     let mut known = scan.contents.clone();
@@ -354,6 +353,7 @@ fn metadata_of(
     }
 }
 
+/// In one line, names as they are: they may hold any character but a slash.
 impl fmt::Display for FileReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {
@@ -361,8 +361,6 @@ impl fmt::Display for FileReport {
             messages,
             found,
         } = self;
-        // The name of a file is anything but a slash.
-        let name = visible(name);
         match found {
             Found::Complete => write!(f, "{name}: complete, {messages} messages"),
             Found::NotMcap => write!(
@@ -383,11 +381,9 @@ impl fmt::Display for FileReport {
                     write!(f, ", {unreadable_chunks} chunks cannot be looked into")?;
                 }
                 match kept {
-                    Some(kept) => write!(
-                        f,
-                        ", {cut} bytes were no whole record: kept in {}",
-                        visible(kept)
-                    ),
+                    Some(kept) => {
+                        write!(f, ", {cut} bytes were no whole record: kept in {kept}")
+                    }
                     None => Ok(()),
                 }
             }

@@ -4,8 +4,8 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use ros2probe::message::yaml::{self, Style};
-use ros2probe::message::{Library, Limits, Shown, Sources, decode};
+use ros2probe_message::yaml::{self, Style};
+use ros2probe_message::{Library, Limits, Shown, Sources, decode};
 
 const IMU: usize = 324;
 const CLOUD: usize = 644_000;

@@ -5,9 +5,9 @@ use std::fs::File;
 use std::io::Read as _;
 
 use flate2::read::GzDecoder;
-use ros2probe::message::value::{Array, Items, Message, Scalar, ScalarKind, Scalars};
-use ros2probe::message::yaml::{self, Style};
-use ros2probe::message::{Element, Field, Shape, Shown, Structure, Value, python};
+use ros2probe_message::value::{Array, Items, Message, Scalar, ScalarKind, Scalars};
+use ros2probe_message::yaml::{self, Style};
+use ros2probe_message::{Element, Field, Shape, Shown, Structure, Value, python};
 use ros2probe_wire::cursor::Endianness::Little;
 use serde::Deserialize;
 

@@ -1,12 +1,21 @@
 //! What a real `ros2 topic echo` printed of 154 payloads, against what is printed here.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a failed expectation may panic"
+)]
+
+#[path = "message/forms.rs"]
 mod forms;
+#[path = "message/golden.rs"]
 mod golden;
 
 use golden::{cases, library};
-use ros2probe::message::value::{Items, Scalar};
-use ros2probe::message::yaml::{self, Style};
-use ros2probe::message::{Decoded, Limits, Shown, Value, csv, decode};
+use ros2probe_message::value::{Items, Scalar};
+use ros2probe_message::yaml::{self, Style};
+use ros2probe_message::{Decoded, Limits, Shown, Value, csv, decode};
 
 /// What `ros2 topic echo` shows of arrays and strings unless told otherwise.
 const ECHO: Shown = Shown {

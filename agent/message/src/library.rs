@@ -11,10 +11,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::definition::{MessageType, NotClosed, TypeName};
+use super::dialect::Dialect;
 use super::parse::ParseError;
 use super::place::Place;
 use super::search::Search;
-use crate::ros2::Dialect;
 
 /// Where ROS is installed, one directory for each distribution.
 const INSTALLED: &str = "/opt/ros";

@@ -4,7 +4,7 @@
 //! licences, and how they are written. Nothing is parsed before it is asked for.
 
 use super::definition::{Kind, TypeName};
-use crate::ros2::Dialect;
+use super::dialect::Dialect;
 
 /// What a definition's heading begins with.
 const HEADING: &str = "== ";
@@ -105,13 +105,8 @@ pub(super) fn find(file: &TypeName, dialect: Dialect) -> Option<&'static str> {
 
 impl Embedded {
     fn is_of(&self, dialect: Dialect) -> bool {
-        let name = match dialect {
-            Dialect::Humble => "humble",
-            Dialect::Jazzy => "jazzy",
-            Dialect::Kilted => "kilted",
-            Dialect::Rolling => "rolling",
-        };
-        self.distributions.is_empty() || self.distributions.split(' ').any(|one| one == name)
+        let mut distributions = self.distributions.split(' ');
+        self.distributions.is_empty() || distributions.any(|one| one == dialect.name())
     }
 }
 
@@ -144,7 +139,7 @@ fn definitions(text: &'static str) -> impl Iterator<Item = Embedded> {
 mod tests {
     use std::collections::{BTreeMap, BTreeSet};
 
-    use super::super::definition::{Definition, Element};
+    use super::super::definition::Definition;
     use super::super::{Library, NotFound, Sources};
     use super::*;
 
@@ -170,20 +165,6 @@ mod tests {
         PACKAGES.iter().flat_map(|(package, text)| {
             definitions(text).map(|one| (TypeName::new(package, one.kind, one.name).unwrap(), one))
         })
-    }
-
-    #[test]
-    fn types_that_begin_with_a_header_are_those_that_latency_is_measured_of() {
-        let header: TypeName = "std_msgs/msg/Header".parse().unwrap();
-        for (name, one) in all().filter(|(_, one)| one.kind == Kind::Message) {
-            let definition = Definition::parse(name.clone(), one.text).unwrap();
-            let structure = definition.structures.first().unwrap();
-            let first = structure.fields.first();
-            let begins =
-                first.is_some_and(|field| field.element == Element::Nested(header.clone()));
-            let listed = crate::model::header::begins_with_header(&name.to_string());
-            assert_eq!(listed, begins, "{name}");
-        }
     }
 
     #[test]

@@ -7,8 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use flate2::read::MultiGzDecoder;
-use ros2probe::message::{Library, Sources};
-use ros2probe::ros2::Dialect;
+use ros2probe_message::{Dialect, Library, Sources};
 use serde::Deserialize;
 
 const FILES: [&str; 2] = [
@@ -44,7 +43,7 @@ struct Line {
 }
 
 pub fn data() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data")
 }
 
 pub fn cases() -> Vec<Case> {
@@ -92,9 +91,9 @@ pub fn hex(bytes: &[u8]) -> String {
 /// What rosbags makes of lines of types and payloads.
 pub fn rosbags(lines: &str) -> String {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let python = here.join("../target/tools/bags/bin/python");
+    let python = here.join("../../target/tools/bags/bin/python");
     let mut child = Command::new(&python)
-        .arg(here.join("tests/surface/message/read.py"))
+        .arg(here.join("tests/message/read.py"))
         .arg(data().join("definitions"))
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())

@@ -1,15 +1,16 @@
 //! A place that may have definitions: a directory, an installed ROS, or the program.
 
-use std::io;
+use std::fs::{File, OpenOptions};
+use std::io::{self, Read as _};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::definition::{Definition, TypeName};
+use super::dialect::Dialect;
 use super::embedded;
 use super::library::NotFound;
 use super::parse::{MAX_TEXT, ParseError, Problem};
-use crate::file;
-use crate::ros2::Dialect;
 
 /// The extension of what defines a type where nothing else does.
 const IDL: &str = "idl";
@@ -95,7 +96,31 @@ fn is_absent(error: &io::Error) -> bool {
     )
 }
 
-/// A file's text, if it is there. Never waits: what is no regular file is refused.
+/// Opens a regular file to read it. Opening never waits, as it would for a pipe without a writer; the
+/// open file is checked, so nothing can take its place in between.
+fn open(path: &Path) -> io::Result<File> {
+    let flags = libc::O_NONBLOCK | libc::O_NOCTTY;
+    let mut options = OpenOptions::new();
+    let file = options.read(true).custom_flags(flags).open(path)?;
+    match file.metadata()?.is_file() {
+        true => Ok(file),
+        false => Err(io::Error::new(
+            io::ErrorKind::InvalidInput,
+            "not a regular file",
+        )),
+    }
+}
+
+/// A file's bytes; of one longer than [`MAX_TEXT`], one byte more than that.
+fn read_bytes(path: &Path) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?
+        .take(MAX_TEXT as u64 + 1)
+        .read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// A file's text, if the file exists. Fails for what is no regular file.
 fn read(path: &Path) -> Result<Option<String>, NotFound> {
     let unreadable = |source: io::Error| NotFound::Unreadable {
         path: path.to_owned(),
@@ -105,7 +130,7 @@ fn read(path: &Path) -> Result<Option<String>, NotFound> {
         path: path.to_owned(),
         mistake: ParseError { line, problem },
     };
-    let bytes = match file::read(path, MAX_TEXT as u64) {
+    let bytes = match read_bytes(path) {
         Ok(bytes) => bytes,
         Err(error) if is_absent(&error) => return Ok(None),
         Err(error) => return Err(unreadable(error)),

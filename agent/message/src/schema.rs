@@ -238,7 +238,7 @@ uint32 nanosec
     /// What a real bag has: its files, one after the other, with their comments.
     fn real() -> Vec<(String, String)> {
         let bag =
-            "../../shared/fixtures/cyclonedds/bag-record-2ns/bag_default/bag_default_0.mcap.gz";
+            "../../../shared/fixtures/cyclonedds/bag-record-2ns/bag_default/bag_default_0.mcap.gz";
         let bag = Path::new(env!("CARGO_MANIFEST_DIR")).join(bag);
         // Not in a clone.
         let Ok(file) = File::open(bag) else {

@@ -646,7 +646,7 @@ impl FileCompression {
         let part = with_suffix(&into, "part");
         let wrong = |error| Error::writing(&part, error);
         let done = || {
-            let source = crate::file::open(&self.path)?;
+            let source = super::open_file(&self.path)?;
             let target = super::new_file(&part)?;
             self.compression.compress_file(&source, &target, progress)?;
             target.sync_data()?;

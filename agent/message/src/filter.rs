@@ -1,8 +1,9 @@
 //! Conditions on messages: a subset of Python's expressions over `m`, for `--filter`.
 //!
 //! Attributes, indices, numbers, strings, comparisons (also chained), `in`, `and`, `or`, `not`,
-//! arithmetic, lists, and the functions of [`Function`]. Nothing can be assigned, defined, imported
-//! or repeated: an expression ends, needs little memory, and changes nothing.
+//! arithmetic, lists, and the functions `abs`, `all`, `any`, `bool`, `float`, `int`, `len`, `max`,
+//! `min`, `str` and `sum`. Nothing can be assigned, defined, imported or repeated: an expression ends,
+//! needs little memory, and changes nothing.
 
 mod evaluate;
 mod parse;

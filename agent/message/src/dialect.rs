@@ -1,0 +1,53 @@
+//! Distributions of ROS 2, whose definitions and command lines differ.
+
+/// A distribution of ROS 2 with those that have the same definitions and print alike, oldest first.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Dialect {
+    /// Humble, and what is older.
+    Humble,
+    /// Jazzy, and Iron.
+    #[default]
+    Jazzy,
+    /// Kilted.
+    Kilted,
+    /// Lyrical and rolling.
+    Rolling,
+}
+
+impl Dialect {
+    /// As `ROS_DISTRO` spells it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Humble => "humble",
+            Self::Jazzy => "jazzy",
+            Self::Kilted => "kilted",
+            Self::Rolling => "rolling",
+        }
+    }
+
+    /// Of `ROS_DISTRO`; `None` for one that is not known.
+    #[must_use]
+    pub fn of_distro(name: &str) -> Option<Self> {
+        Some(match name {
+            "dashing" | "eloquent" | "foxy" | "galactic" | "humble" => Self::Humble,
+            "iron" | "jazzy" => Self::Jazzy,
+            "kilted" => Self::Kilted,
+            "lyrical" | "rolling" => Self::Rolling,
+            _ => return None,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_distribution_has_a_dialect_and_dialects_have_an_order() {
+        assert_eq!(Dialect::of_distro("lyrical"), Some(Dialect::Rolling));
+        assert_eq!(Dialect::of_distro("galactic"), Some(Dialect::Humble));
+        assert_eq!(Dialect::of_distro("noetic"), None);
+        assert!(Dialect::Humble < Dialect::default() && Dialect::Kilted < Dialect::Rolling);
+    }
+}

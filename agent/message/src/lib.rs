@@ -1,0 +1,56 @@
+//! ROS messages without ROS: what a type consists of, where its definition comes from, its hash, and
+//! the text of a payload.
+//!
+//! - [`Library`] finds the definition of a type in directories, in an installed ROS or among those
+//!   embedded here, by name and announced hash, and returns a [`MessageType`].
+//! - [`decode()`] reads a CDR payload of that type into a [`Value`] tree that borrows from it.
+//! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them, [`Shown`] says
+//!   how much of them. [`filter`] evaluates an expression over a message.
+//!
+//! Definitions are read from files as rosidl reads them; nothing is generated, loaded or executed.
+//! Files, names and payloads are untrusted: every size, number and depth is bounded.
+//!
+//! ```
+//! use ros2probe_message::yaml::{self, Style};
+//! use ros2probe_message::{Library, Limits, Shown, Sources, decode};
+//!
+//! let library = Library::new(Sources::default());
+//! let message_type = library.find("std_msgs/msg/String", None)?;
+//! let payload = b"\0\x01\0\0\x06\0\0\0hello\0";
+//! let decoded = decode(&message_type, payload, &Limits::default())?;
+//! let text = yaml::document(&decoded.message, &Shown::default(), Style::Block);
+//! assert_eq!(text, "data: hello\n");
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+pub mod csv;
+pub mod decode;
+pub mod definition;
+mod dialect;
+mod digits;
+mod embedded;
+pub mod filter;
+mod hash;
+mod idl;
+mod implied;
+pub mod library;
+mod name;
+mod numpy;
+mod parse;
+mod place;
+pub mod python;
+mod schema;
+mod search;
+pub mod shown;
+pub mod value;
+pub mod yaml;
+
+pub use decode::{DecodeError, Decoded, Limits, decode};
+pub use definition::{
+    Definition, Element, Field, Kind, MessageType, NotClosed, Shape, Structure, TypeName,
+};
+pub use dialect::Dialect;
+pub use library::{Library, NotFound, Sources};
+pub use parse::{ParseError, Problem};
+pub use shown::Shown;
+pub use value::{Array, Items, Message, Scalar, Value};
