@@ -75,10 +75,10 @@ page-bench: ## first paint with 500 topics, layout and memory of the page; MEASU
 screenshots: ## the pictures of README and docs, from the demo, in target/screenshots (needs root)
 	@.ci/prerequisites.sh demo page
 	cargo build --package ros2probe --bin rp --example robot --example demo
-	$(SUDO) env PATH=$(PATH) node agent/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
+	$(SUDO) env PATH=$(PATH) node agent/cli/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
 
 peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
-	@$(MAKE) --no-print-directory -C agent/tests/peers OUT=$(TARGET)/peers
+	@$(MAKE) --no-print-directory -C agent/cli/tests/peers OUT=$(TARGET)/peers
 
 arm: ## build rp for aarch64, static and unoptimized, which the tests run under qemu
 	CARGO_PROFILE_DEV_DEBUG=0 cargo build --package ros2probe --bin rp --target aarch64-unknown-linux-musl

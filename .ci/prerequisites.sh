@@ -71,12 +71,12 @@ prometheus() {
 
 # What the dashboards are type-checked with. Without it one test fails and says so.
 types() {
-    local directory=$tools/grafana lock=agent/tests/dashboard/types/package-lock.json
+    local directory=$tools/grafana lock=agent/cli/tests/dashboard/types/package-lock.json
     cmp -s "$lock" "$directory/package-lock.json" && [ -d "$directory/node_modules/typescript" ] && return
     command -v npm >/dev/null || packages npm
     say "installing @grafana/schema and typescript into target/tools/grafana"
     mkdir -p "$directory"
-    cp agent/tests/dashboard/types/package.json "$lock" "$directory"
+    cp agent/cli/tests/dashboard/types/package.json "$lock" "$directory"
     (cd "$directory" && npm ci --ignore-scripts --no-audit --no-fund --silent) ||
         { rm -f "$directory/package-lock.json"; say "npm failed: the dashboards cannot be type-checked"; }
 }
@@ -106,7 +106,7 @@ node_version() { command node --version 2>/dev/null | sed -E 's/v([0-9]+).*/\1/'
 # A real browser, what drives it, and the rules of accessibility. Debian has Chromium's headless
 # shell as a package. Ubuntu has none: playwright fetches its own build there, into target/tools.
 page() {
-    local place=$tools/page tests=agent/tests/page
+    local place=$tools/page tests=agent/cli/tests/page
     nodejs
     [ -x "$tools/node/bin/node" ] && export PATH=$tools/node/bin:$PATH
     if ! cmp -s "$tests/package-lock.json" "$place/package-lock.json" ||
@@ -248,7 +248,7 @@ ros2() {
 
 left_out() {
     local tests
-    tests=$(cat agent/tests/humble/*.rs | grep -c '^#\[ignore = "needs ROS 2 Humble')
+    tests=$(cat agent/cli/tests/humble/*.rs | grep -c '^#\[ignore = "needs ROS 2 Humble')
     say "left out here: the $tests tests with real ROS 2 Humble nodes (make test-ros2)"
 }
 

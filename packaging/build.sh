@@ -5,7 +5,7 @@
 #
 # writes DIRECTORY/ros2probe_VERSION_ARCHITECTURE.deb. Manual pages and completions are what the
 # binary says of itself; where it cannot run here, RP names one of the same sources that can.
-# What is in the package is listed in agent/Cargo.toml, [package.metadata.deb].
+# What is in the package is listed in agent/cli/Cargo.toml, [package.metadata.deb].
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 
