@@ -49,6 +49,10 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	@.ci/prerequisites.sh --left-out
 	cargo nextest run --workspace
 
+test-fast: ## unit tests, model and surface, without root and namespaces: under 90 s after a build
+	@.ci/prerequisites.sh fast
+	@env -u CARGO_TARGET_$(HOST)_RUNNER cargo nextest run --workspace --profile fast
+
 test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
 	@.ci/prerequisites.sh test ros2
 	cargo nextest run --package ros2probe --run-ignored only --filterset 'binary(humble)'
@@ -132,4 +136,4 @@ deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri deny prerequisites
+.PHONY: help demo test test-fast test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri deny prerequisites

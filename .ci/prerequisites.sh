@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
 #
-#   prerequisites.sh demo|test|dist|ebpf|fuzz|miri|deny...   install what those targets need
+#   prerequisites.sh demo|test|fast|dist|ebpf|fuzz|miri|deny...   install what those targets need
 #   prerequisites.sh types                    install what the dashboards are type-checked with
 #   prerequisites.sh page                     install the browser that the page is tested in
 #   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
@@ -338,6 +338,14 @@ for need; do
         cargo_deb
         ebpf
         ;;
+    fast)
+        packages curl ca-certificates gcc libc6-dev systemd
+        prometheus
+        rotel
+        bags
+        rust
+        nextest
+        ;;
     dist)
         packages gcc libc6-dev python3
         rust
@@ -378,6 +386,6 @@ for need; do
             cargo install cargo-deny --version 0.20.2 --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, dist, types, page, ebpf, fuzz, miri, deny" ;;
+    *) die "prerequisites.sh: $need is none of demo, test, fast, dist, types, page, ebpf, fuzz, miri, deny" ;;
     esac
 done
