@@ -36,9 +36,6 @@ fn the_package_holds_what_an_operator_looks_for() -> Result<()> {
 
 #[test]
 fn the_same_binary_makes_the_same_package() -> Result<()> {
-    if !given()?.is_empty() {
-        return Ok(());
-    }
     let directory = tempfile::tempdir()?;
     let mut made = Vec::new();
     for place in ["once", "again/elsewhere"] {

@@ -364,13 +364,13 @@ fn a_network_namespace_that_goes_is_told_and_takes_nothing_along() -> Result<()>
 }
 
 #[test]
+#[ignore = "sets the clock of this machine: make soak ROS2PROBE_SOAK_CLOCK=30"]
 fn the_clock_of_this_machine_is_set_an_hour_forth_and_back() -> Result<()> {
     // Everything on the machine notices: only on request, by so many seconds or an hour.
-    let asked = std::env::var("ROS2PROBE_SOAK_CLOCK").unwrap_or_default();
-    let step = match asked.parse() {
-        Ok(1) => 3600,
-        Ok(seconds) => seconds,
-        Err(_) => return Ok(()),
+    let asked = std::env::var("ROS2PROBE_SOAK_CLOCK").context("ROS2PROBE_SOAK_CLOCK")?;
+    let step = match asked.parse().context("ROS2PROBE_SOAK_CLOCK")? {
+        1 => 3600,
+        seconds => seconds,
     };
     let link = Link::new()?;
     let robot = Robot::start(&link, &format!("watch: [/**]\n{ON_THE_WIRE}"))?;

@@ -9,7 +9,7 @@
 mod replayed;
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use replayed::Replayed;
 use ros2probe::model::snapshot::Measurement;
@@ -28,12 +28,11 @@ fn the_captures_in_the_repository_reproduce_their_ground_truth() {
 }
 
 #[test]
-fn the_whole_corpus_reproduces_its_ground_truth_if_it_is_there() {
-    let corpus: PathBuf = match std::env::var_os("ROS2PROBE_FIXTURES") {
-        Some(corpus) => corpus.into(),
-        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/fixtures"),
-    };
-    truth::scenarios(&corpus).iter().for_each(check);
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn the_whole_corpus_reproduces_its_ground_truth() {
+    let scenarios = truth::scenarios(&ros2probe_testing::corpus());
+    assert!(!scenarios.is_empty());
+    scenarios.iter().for_each(check);
 }
 
 #[test]

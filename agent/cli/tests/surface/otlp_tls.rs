@@ -3,7 +3,6 @@
 use std::path::Path;
 
 use crate::rp;
-use ros2probe_testing::local_agent;
 
 fn configuration(directory: &Path, port: u16) -> String {
     let path = directory.join("ros2probe.yaml");
@@ -29,7 +28,7 @@ fn encryption_that_is_not_built_in_is_an_error_that_says_what_to_do() {
     ]);
     let output = command
         .arg("--replay")
-        .arg(local_agent::capture())
+        .arg(ros2probe_testing::local_agent::capture())
         .output()
         .unwrap();
     let said = String::from_utf8_lossy(&output.stderr);

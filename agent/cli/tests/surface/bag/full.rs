@@ -31,7 +31,7 @@ fn a_full_disk_leaves_a_complete_bag() {
 }
 
 #[test]
-#[ignore = "run by a_full_disk_leaves_a_complete_bag, on a small disk"]
+#[ignore = "started by another test, on a small disk"]
 fn small_disk() {
     let path = PathBuf::from(std::env::var_os(PLACE).unwrap()).join("bag");
     let mut writer = Writer::create(&path, Options::default()).unwrap();

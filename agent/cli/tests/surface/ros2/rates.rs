@@ -35,14 +35,9 @@ fn own() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/rates")
 }
 
-/// Recordings that lie beside the repository, if they do.
-fn corpus() -> Option<PathBuf> {
-    let corpus = match std::env::var_os("ROS2PROBE_FIXTURES") {
-        Some(corpus) => corpus.into(),
-        None => Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/fixtures"),
-    };
-    let directory = corpus.join("cyclonedds/cli-observed-2ns");
-    directory.exists().then_some(directory)
+/// Recordings of the corpus.
+fn corpus() -> PathBuf {
+    ros2probe_testing::corpus().join("cyclonedds/cli-observed-2ns")
 }
 
 #[test]
@@ -54,7 +49,13 @@ fn what_the_original_said_is_said() {
         compared += 1;
     }
     assert_eq!(compared, 6);
-    let Some(corpus) = corpus() else { return };
+}
+
+#[test]
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn what_the_original_said_in_the_corpus_is_said() {
+    let (list, corpus) = (tolerances(), corpus());
+    let mut compared = 0;
     for recorded in recorded(&corpus.join("cli")) {
         if let Some(tolerance) = list.get(&recorded.name) {
             recorded.compare(&corpus.join("capture-with-observers.pcap.gz"), tolerance);
@@ -63,7 +64,7 @@ fn what_the_original_said_is_said() {
             assert!(recorded.name.ends_with("_points"), "{}", recorded.name);
         }
     }
-    assert_eq!(compared, 6 + list.len());
+    assert_eq!(compared, list.len());
 }
 
 #[test]
@@ -155,9 +156,9 @@ fn what_cannot_be_measured_is_refused() {
 /// What the nodes themselves noted: rates are theirs to a thousandth, where the original is off by
 /// thirty.
 #[test]
-fn rates_are_those_that_were_sent_if_the_corpus_is_there() {
-    let Some(corpus) = corpus() else { return };
-    let list = tolerances();
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn rates_of_the_corpus_are_those_that_were_sent() {
+    let (list, corpus) = (tolerances(), corpus());
     let sent = sent(&corpus.join("sensor.jsonl.gz"));
     for recorded in recorded(&corpus.join("cli")) {
         let is_whole = ["hz_chatter", "hz_imu"].contains(&recorded.name.as_str());
