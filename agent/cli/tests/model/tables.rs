@@ -17,8 +17,9 @@ const COLLECTIONS: [&str; 9] = [
     "String",
 ];
 
-/// Files whose structs are made for one answer and not kept by the model.
-const ANSWERS: [&str; 7] = [
+/// Files whose structs are made for one answer and not kept by the model, and the watchlist, which the
+/// model is given and `limits.watches` bounds.
+const ANSWERS: [&str; 8] = [
     "snapshot.rs",
     "snapshot/delivery.rs",
     "discovery/memory.rs",
@@ -26,6 +27,7 @@ const ANSWERS: [&str; 7] = [
     "diagnosis/endpoints.rs",
     "report/deliveries.rs",
     "selection.rs",
+    "watch.rs",
 ];
 /// Likewise single structs: what is handed out, what lasts for one look, lengths.
 const ANSWER: [&str; 5] = ["Taken", "Findings", "Strangers", "Stage", "Past"];

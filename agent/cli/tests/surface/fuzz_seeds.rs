@@ -17,7 +17,7 @@ fn run(directory: &str, entry: fn(&[u8])) {
 }
 
 fn run_up_to(length: usize, directory: &str, entry: fn(&[u8])) {
-    let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join(directory);
+    let directory = ros2probe_testing::repository("agent").join(directory);
     let mut count = 0;
     for seed in fs::read_dir(directory).unwrap() {
         let seed = seed.unwrap();

@@ -107,7 +107,7 @@ fn every_alert_is_tested_to_fire_and_not_to_fire() -> Result<()> {
 
 #[test]
 fn the_readme_names_every_rule() -> Result<()> {
-    let readme = std::fs::read_to_string(rules().join("../../README.md"))?;
+    let readme = std::fs::read_to_string(rules().join("../README.md"))?;
     for alert in alerts()? {
         let name = alert["alert"].as_str().context("no name")?;
         ensure!(
