@@ -119,9 +119,9 @@ soak: ## an hour of a changing graph, and faults, on what is shipped; SOAK_SECON
 
 fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	@.ci/prerequisites.sh fuzz
-	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list); do \
+	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list --fuzz-dir fuzz); do \
 	    mkdir -p "fuzz/corpus/$$target"; \
-	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run "$$target" "fuzz/corpus/$$target" \
+	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run --fuzz-dir fuzz "$$target" "fuzz/corpus/$$target" \
 	        $$(ls -d "fuzz/seeds/$$target" "tests/data/$${target}s" 2>/dev/null) -- \
 	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
 	done) || exit 1; done
