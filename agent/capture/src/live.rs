@@ -28,9 +28,9 @@ use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
 use super::threads::Spawn;
 use super::wire::{self, TapError, WireSettings, WireTap};
+use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
 use ros2probe_model::observer::{Observer, Wanted};
-use ros2probe_model::reassembly::Limits;
 
 /// What unclassified writers may cost each second, all together: a dozen nodes that start at once
 /// stay far below, a storm of forged ones stays bounded.

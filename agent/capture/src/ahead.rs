@@ -10,7 +10,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::{Record, flag, kind};
 
 use super::reassembly::Reassembled;
-use super::size::Size;
+use ros2probe_model::size::Size;
 
 /// Datagrams waited for; more push out the oldest.
 const DATAGRAMS: usize = 1024;
