@@ -11,16 +11,18 @@ use crate::time::RtpsTime;
 
 /// Submessage kinds (RTPS 2.5, 9.4.5.1.1) and the two that only this ABI knows.
 pub mod kind {
+    use crate::rtps::SubmessageId;
+
     /// ACKNACK: reader acknowledges and asks again.
-    pub const ACKNACK: u8 = 0x06;
+    pub const ACKNACK: u8 = SubmessageId::ACKNACK.0;
     /// HEARTBEAT: writer says what it has.
-    pub const HEARTBEAT: u8 = 0x07;
+    pub const HEARTBEAT: u8 = SubmessageId::HEARTBEAT.0;
     /// GAP: writer says what will never come.
-    pub const GAP: u8 = 0x08;
+    pub const GAP: u8 = SubmessageId::GAP.0;
     /// DATA: one sample.
-    pub const DATA: u8 = 0x15;
+    pub const DATA: u8 = SubmessageId::DATA.0;
     /// DATA_FRAG: some fragments of one sample.
-    pub const DATA_FRAG: u8 = 0x16;
+    pub const DATA_FRAG: u8 = SubmessageId::DATA_FRAG.0;
     /// Not a submessage: the fragmented datagram [`super::Record::datagram`] is complete, all
     /// records that were sent ahead for it now count.
     pub const COMPLETE: u8 = 0xf0;

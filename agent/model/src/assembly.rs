@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use bytes::Bytes;
 use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::rtps::SubmessageFlags;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::reception::is_message;
@@ -22,7 +23,6 @@ const SAMPLES: usize = 16_384;
 const FORGET: u64 = 30_000_000_000;
 /// Least memory that is asked for at once.
 const LEAST: usize = 4096;
-const FRAGMENT_KEY_FLAG: u8 = 0x04;
 
 /// The samples under way.
 #[derive(Debug)]
@@ -269,7 +269,8 @@ fn sizes(record: &Record, payload: &[u8]) -> Option<(usize, usize)> {
             Some((payload.len(), payload.len()))
         }
         kind::DATA_FRAG => {
-            let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
+            let flags = SubmessageFlags(record.submessage_flags);
+            let is_key = flags.contains(SubmessageFlags::FRAGMENT_KEY);
             let size = usize::try_from(record.sample_size).ok()?;
             let fragment_size = usize::try_from(record.fragment_size()).ok()?;
             let is_possible = size > 0 && fragment_size > 0 && record.fragment_start > 0;
@@ -381,7 +382,7 @@ mod tests {
                 ..whole
             },
             Record {
-                submessage_flags: FRAGMENT_KEY_FLAG,
+                submessage_flags: SubmessageFlags::FRAGMENT_KEY.0,
                 ..whole
             },
             Record {

@@ -9,14 +9,11 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::{self, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::parameters::ParameterList;
 use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::record::{Handover, Verdict, flag, kind};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{
-    Cursor, Endianness, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError,
-};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 
 use super::calendar::Calendar;
 use super::diagnosis::{self, Examiner};
@@ -755,7 +752,7 @@ impl Observer {
                 }),
             )
         } else {
-            (data_payload(found), inline_qos(found, vendor))
+            (found.payload(), found.inline_qos(vendor))
         };
         let told = inline_qos.and_then(|inline_qos| match stage {
             "spdp" => self.participant(vendor, payload, &inline_qos, origin),
@@ -1242,36 +1239,4 @@ fn traits(endpoint: &Endpoint) -> Traits {
         keeps_history: endpoint.qos.durability != Durability::VOLATILE,
         has_header: begins_with_header(&endpoint.message_type),
     }
-}
-
-/// Flags of DATA besides E (RTPS 2.5, 9.4.5.4).
-const INLINE_QOS_FLAG: u8 = 0x02;
-const DATA_FLAG: u8 = 0x04;
-const KEY_FLAG: u8 = 0x08;
-
-/// What a DATA submessage carries.
-pub fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
-    match found.record.submessage_flags & (DATA_FLAG | KEY_FLAG) {
-        0 => Payload::None,
-        KEY_FLAG => Payload::Key(found.payload),
-        _ => Payload::Data(found.payload),
-    }
-}
-
-/// Inline QoS of a DATA submessage: behind `octetsToInlineQos`, which counts from its own end.
-pub fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireError> {
-    let flags = found.record.submessage_flags;
-    if flags & INLINE_QOS_FLAG == 0 {
-        return Ok(InlineQos::default());
-    }
-    let endianness = if flags & 1 == 1 {
-        Endianness::Little
-    } else {
-        Endianness::Big
-    };
-    let mut cursor = Cursor::new(found.body, endianness);
-    cursor.u16("extraFlags")?;
-    let octets = cursor.u16("octetsToInlineQos")?;
-    cursor.take("octetsToInlineQos", octets.into())?;
-    InlineQos::parse(ParameterList::inline(cursor), vendor)
 }

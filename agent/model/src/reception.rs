@@ -5,6 +5,7 @@
 //! what it finds is for the caller to count.
 
 use ros2probe_wire::record::kind;
+use ros2probe_wire::rtps::SubmessageFlags;
 use ros2probe_wire::{Record, RtpsTime, Timestamp};
 
 use super::samples::{Budget, Facts, Progress, Samples};
@@ -15,8 +16,6 @@ use super::size::Size;
 const REPAIR: i64 = 5_000_000;
 /// Numbers below the newest whose fragments a sampled view still waits for.
 const UNDER_WAY: u64 = 8;
-const DATA_FLAG: u8 = 0x04;
-const FRAGMENT_KEY_FLAG: u8 = 0x04;
 
 /// State of one writer's samples at one place.
 #[derive(Debug, Default)]
@@ -387,7 +386,8 @@ const fn whole_data(record: &Record) -> Whole {
 }
 
 const fn whole_fragments(record: &Record, facts: &Facts) -> Whole {
-    let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
+    let flags = SubmessageFlags(record.submessage_flags);
+    let is_key = flags.contains(SubmessageFlags::FRAGMENT_KEY);
     Whole {
         number: record.sequence_number,
         bytes: facts.size as u64,
@@ -404,7 +404,8 @@ const fn whole_fragments(record: &Record, facts: &Facts) -> Whole {
 
 /// Whether a DATA is no disposal: a key alone is one.
 pub const fn is_message(record: &Record) -> bool {
-    record.submessage_flags & DATA_FLAG != 0 && record.status_info == 0
+    let flags = SubmessageFlags(record.submessage_flags);
+    flags.contains(SubmessageFlags::DATA) && record.status_info == 0
 }
 
 fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Decision {

@@ -24,7 +24,7 @@ use super::departures::Departures;
 use super::header::PLAUSIBLE;
 use super::journal::Journal;
 use super::receivers::{Around, Matched};
-use super::reception::Whole;
+use super::reception::{Whole, is_message};
 use super::samples::Budget;
 use super::size::Size;
 use super::snapshot::{AcknowledgementFacts, Breakdown, Direction};
@@ -38,7 +38,6 @@ const LOOK_BACK: u64 = 4096;
 /// Largest UDP payload that fits one Ethernet frame over IPv4: a larger datagram may die in IP
 /// reassembly.
 const ONE_FRAME: u16 = 1472;
-const DATA_FLAG: u8 = 0x04;
 
 /// All receivers and destinations of one writer.
 #[derive(Debug, Default)]
@@ -274,7 +273,7 @@ impl Subscribers {
         };
         let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
         if matched == Matched::No {
-            let is_whole = record.kind == kind::DATA && record.submessage_flags & DATA_FLAG != 0
+            let is_whole = record.kind == kind::DATA && is_message(record)
                 || record.kind == kind::DATA_FRAG && record.ends_sample();
             if is_whole && record.flags & flag::NO_ROOM == 0 && record.status_info == 0 {
                 let place = self.find(receiver);

@@ -19,7 +19,6 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 use super::message::{
     MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER, SUBSCRIPTIONS_READER, Speaker,
 };
-use crate::model::observer::{data_payload, inline_qos};
 use crate::model::pieces::Pieces;
 
 /// Packets sent to one participant, goodbye included.
@@ -331,8 +330,8 @@ impl Session {
         vendor: VendorId,
     ) -> Option<(Whole<'a>, InlineQos)> {
         if found.record.kind == kind::DATA {
-            let qos = inline_qos(found, vendor).ok()?;
-            return Some((Whole::Borrowed(data_payload(found)), qos));
+            let qos = found.inline_qos(vendor).ok()?;
+            return Some((Whole::Borrowed(found.payload()), qos));
         }
         let record = &found.record;
         let sample = (record.writer().entity, record.sequence_number);

@@ -210,7 +210,7 @@ fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
     assert!(record.is_some(), "the walk missed {submessage:?}");
     let Some(record) = record else { return };
     assert_eq!(record.kind, kind, "{submessage:?}");
-    assert_eq!(record.submessage_flags, submessage.flags);
+    assert_eq!(record.submessage_flags, submessage.flags.0);
     assert_eq!(record.sequence_number, number.0.cast_unsigned());
     if kind == kind::DATA || kind == kind::DATA_FRAG {
         assert_eq!(record.source_timestamp, submessage.receiver.timestamp.0);

@@ -4,6 +4,7 @@
 //! stepped over by their length; a malformed one ends the message (8.3.4.1), what came before it
 //! stands. Nothing here decides what is worth keeping: that is `walk`'s and the model's matter.
 
+mod flags;
 mod inline_qos;
 mod locator;
 mod sets;
@@ -15,6 +16,7 @@ use crate::cursor::{Cursor, Endianness, Reason, WireError};
 use crate::guid::GuidPrefix;
 use crate::time::RtpsTime;
 
+pub use flags::SubmessageFlags;
 pub use inline_qos::{InlineQos, SampleIdentity, StatusInfo};
 pub use locator::{Locator, LocatorKind, LocatorList};
 pub use sets::{FragmentNumberSet, SequenceNumberSet};
@@ -275,7 +277,7 @@ pub struct Submessage<'a> {
     /// Its kind.
     pub id: SubmessageId,
     /// The flags octet.
-    pub flags: u8,
+    pub flags: SubmessageFlags,
     /// Where its header begins in the message.
     pub offset: usize,
     /// Its content.
@@ -321,12 +323,8 @@ impl<'a> Message<'a> {
     fn submessage(&mut self) -> Result<Submessage<'a>, WireError> {
         let offset = self.rest.offset();
         let id = SubmessageId(self.rest.u8("submessage id")?);
-        let flags = self.rest.u8("submessage flags")?;
-        let endianness = if flags & 1 == 0 {
-            Endianness::Big
-        } else {
-            Endianness::Little
-        };
+        let flags = SubmessageFlags(self.rest.u8("submessage flags")?);
+        let endianness = flags.endianness();
         let length: [u8; 2] = self.rest.array("octetsToNextHeader")?;
         let length = match endianness {
             Endianness::Big => u16::from_be_bytes(length),

@@ -2,7 +2,7 @@
 
 use super::{
     FragmentNumberSet, Locator, LocatorKind, LocatorList, ProtocolVersion, Receiver,
-    SequenceNumber, SequenceNumberSet, SubmessageId, VendorId,
+    SequenceNumber, SequenceNumberSet, SubmessageFlags, SubmessageId, VendorId,
 };
 use crate::cursor::{Cursor, Reason, WireError};
 use crate::guid::{EntityId, Guid, GuidPrefix};
@@ -210,29 +210,17 @@ impl<'a> DataFrag<'a> {
     }
 }
 
-/// Flag bits besides E.
-const FINAL: u8 = 0x02;
-const LIVELINESS: u8 = 0x04;
-const INVALIDATE: u8 = 0x02;
-const MULTICAST: u8 = 0x02;
-const INLINE_QOS: u8 = 0x02;
-const DATA: u8 = 0x04;
-const KEY: u8 = 0x08;
-/// In DATA_FRAG the key flag stands where DATA has its data flag (RTPS 2.5, 9.4.5.5).
-const FRAGMENT_KEY: u8 = 0x04;
-
 /// Reads one body and applies it to the receiver state.
 pub(super) fn read<'a>(
     id: SubmessageId,
-    flags: u8,
+    flags: SubmessageFlags,
     mut body: Cursor<'a>,
     receiver: &mut Receiver,
 ) -> Result<Body<'a>, WireError> {
-    let has = |flag: u8| flags & flag != 0;
     Ok(match id {
         SubmessageId::PAD => Body::Pad,
         SubmessageId::INFO_TS => {
-            receiver.timestamp = if has(INVALIDATE) {
+            receiver.timestamp = if flags.contains(SubmessageFlags::INVALIDATE) {
                 RtpsTime::default()
             } else {
                 let seconds = body.u32("INFO_TS seconds")?;
@@ -260,14 +248,18 @@ pub(super) fn read<'a>(
         }
         SubmessageId::INFO_REPLY => {
             let unicast = LocatorList::read(&mut body)?;
-            let multicast = has(MULTICAST)
+            let multicast = flags
+                .contains(SubmessageFlags::MULTICAST)
                 .then(|| LocatorList::read(&mut body))
                 .transpose()?;
             Body::InfoReply(InfoReply::Lists(unicast, multicast))
         }
         SubmessageId::INFO_REPLY_IP4 => {
             let unicast = locator_ip4(&mut body)?;
-            let multicast = has(MULTICAST).then(|| locator_ip4(&mut body)).transpose()?;
+            let multicast = flags
+                .contains(SubmessageFlags::MULTICAST)
+                .then(|| locator_ip4(&mut body))
+                .transpose()?;
             Body::InfoReply(InfoReply::Ip4(unicast, multicast))
         }
         SubmessageId::ACKNACK => {
@@ -277,7 +269,7 @@ pub(super) fn read<'a>(
                 writer,
                 missing: SequenceNumberSet::read(&mut body)?,
                 count: body.u32("ACKNACK count")?,
-                is_final: has(FINAL),
+                is_final: flags.contains(SubmessageFlags::FINAL),
             })
         }
         SubmessageId::NACK_FRAG => {
@@ -300,8 +292,8 @@ pub(super) fn read<'a>(
                 first,
                 last,
                 count: body.u32("HEARTBEAT count")?,
-                is_final: has(FINAL),
-                is_liveliness: has(LIVELINESS),
+                is_final: flags.contains(SubmessageFlags::FINAL),
+                is_liveliness: flags.contains(SubmessageFlags::LIVELINESS),
             })
         }
         SubmessageId::HEARTBEAT_FRAG => {
@@ -358,18 +350,26 @@ fn from_reader(body: &mut Cursor<'_>, receiver: &Receiver) -> Result<(Guid, Guid
     ))
 }
 
-fn data<'a>(flags: u8, mut body: Cursor<'a>, receiver: &Receiver) -> Result<Data<'a>, WireError> {
-    let has = |flag: u8| flags & flag != 0;
-    if has(DATA) && has(KEY) {
+fn data<'a>(
+    flags: SubmessageFlags,
+    mut body: Cursor<'a>,
+    receiver: &Receiver,
+) -> Result<Data<'a>, WireError> {
+    let (has_data, has_key) = (
+        flags.contains(SubmessageFlags::DATA),
+        flags.contains(SubmessageFlags::KEY),
+    );
+    if has_data && has_key {
         return Err(body.error("DATA flags", Reason::BadValue));
     }
     let mut rest = after_octets_to_inline_qos(&mut body, 16)?;
     let (reader, writer) = from_writer(&mut body, receiver)?;
     let sequence_number = SequenceNumber::read_from(&mut body, "DATA writerSN", 1)?;
-    let inline_qos = has(INLINE_QOS)
+    let inline_qos = flags
+        .contains(SubmessageFlags::INLINE_QOS)
         .then(|| ParameterList::take(&mut rest))
         .transpose()?;
-    let payload = match (has(DATA), has(KEY)) {
+    let payload = match (has_data, has_key) {
         (true, _) => Payload::Data(rest.rest()),
         (_, true) => Payload::Key(rest.rest()),
         _ => Payload::None,
@@ -384,7 +384,7 @@ fn data<'a>(flags: u8, mut body: Cursor<'a>, receiver: &Receiver) -> Result<Data
 }
 
 fn data_frag<'a>(
-    flags: u8,
+    flags: SubmessageFlags,
     mut body: Cursor<'a>,
     receiver: &Receiver,
 ) -> Result<DataFrag<'a>, WireError> {
@@ -396,7 +396,8 @@ fn data_frag<'a>(
     let count = body.u16("DATA_FRAG fragmentsInSubmessage")?;
     let fragment_size = body.u16("DATA_FRAG fragmentSize")?;
     let sample_size = body.u32("DATA_FRAG sampleSize")?;
-    let inline_qos = (flags & INLINE_QOS != 0)
+    let inline_qos = flags
+        .contains(SubmessageFlags::INLINE_QOS)
         .then(|| ParameterList::take(&mut rest))
         .transpose()?;
 
@@ -418,7 +419,7 @@ fn data_frag<'a>(
         fragment_size,
         sample_size,
         inline_qos,
-        is_key: flags & FRAGMENT_KEY != 0,
+        is_key: flags.contains(SubmessageFlags::FRAGMENT_KEY),
         bytes: rest.take("DATA_FRAG fragments", length)?,
     })
 }

@@ -132,6 +132,76 @@ fn status_info_is_big_endian_and_inline_qos_is_not_payload() {
     assert_eq!(walk_all(&bytes).1[0].0.payload_len, 8);
 }
 
+/// The one DATA of a message, its body behind `octets` octets of fixed fields.
+fn inline_qos_of(little: bool, octets: u8, tail: &[u8]) -> Result<InlineQos, WireError> {
+    let mut body = data_body(little, 9, tail);
+    body[if little { 2 } else { 3 }] = octets;
+    let bytes = message(&[submessage(0x15, 0x02 | u8::from(little), &body)]);
+    let mut found = Vec::new();
+    datagram(&bytes, &Envelope::default(), None, |each| {
+        found.push(each.inline_qos(VendorId::CYCLONE));
+    });
+    found.pop().expect("one DATA")
+}
+
+#[test]
+fn inline_qos_are_read_in_the_submessages_byte_order_behind_octets_to_inline_qos() {
+    let list = |little: bool| {
+        let [key, hash, status, four, end] =
+            [0x70_u16, 16, 0x71, 4, 1].map(|number| match little {
+                true => number.to_le_bytes(),
+                false => number.to_be_bytes(),
+            });
+        [
+            &[key, hash].concat()[..],
+            &[7; 16],
+            &[status, four].concat(),
+            &[0, 0, 0, 3],
+            &end,
+            &[0; 2],
+        ]
+        .concat()
+    };
+    for little in [true, false] {
+        let inline_qos = inline_qos_of(little, 16, &list(little)).unwrap();
+        assert_eq!(inline_qos.key_hash, Some([7; 16]));
+        assert_eq!(inline_qos.status_info.0, 3);
+        // A later version's field stands before them.
+        let behind = [&b"new!"[..], &list(little)].concat();
+        assert_eq!(inline_qos_of(little, 20, &behind), Ok(inline_qos));
+    }
+}
+
+#[test]
+fn inline_qos_behind_those_that_the_walk_follows_are_read_and_have_to_be_well_formed() {
+    let unknown = [0x00, 0x7a, 0, 0].repeat(INLINE_QOS_PARAMETERS as usize);
+    let status = [0x71, 0, 4, 0, 0, 0, 0, 1, 1, 0, 0, 0];
+    let inline_qos = inline_qos_of(true, 16, &[&unknown[..], &status].concat()).unwrap();
+    assert!(inline_qos.status_info.is_disposed());
+    let cut = inline_qos_of(true, 16, &[&unknown[..], &status[..8]].concat());
+    assert_eq!(cut.unwrap_err().reason, Reason::Truncated);
+}
+
+#[test]
+fn flags_say_whether_a_payload_is_a_value_or_a_key() {
+    let bytes = [0, 1, 0, 0, 5, 5, 5, 5];
+    for (flags, expected) in [
+        (0x05, Payload::Data(&bytes)),
+        (0x09, Payload::Key(&bytes)),
+        (0x01, Payload::None),
+        // The specification knows no such submessage; the value is the more telling.
+        (0x0d, Payload::Data(&bytes)),
+    ] {
+        let message = message(&[submessage(0x15, flags, &data_body(true, 1, &bytes))]);
+        let mut found = Vec::new();
+        datagram(&message, &Envelope::default(), None, |each| {
+            assert_eq!(each.inline_qos(VendorId::UNKNOWN), Ok(InlineQos::default()));
+            found.push(each.payload() == expected);
+        });
+        assert_eq!(found, [true], "{flags:#04x}");
+    }
+}
+
 #[test]
 fn data_frag_gives_fragment_numbers_and_sizes() {
     let head = [
