@@ -730,8 +730,11 @@ pub fn datagram<'a>(
             Step::Passed => {}
             Step::Endpoint | Step::LongGap => {
                 let body = slice(payload, start + 4, walk.offset);
-                let is_data = matches!(walk.record.kind, kind::DATA | kind::DATA_FRAG);
-                let payload_len = if is_data { walk.record.payload_len } else { 0 };
+                let payload_len = if walk.record.is_sample() {
+                    walk.record.payload_len
+                } else {
+                    0
+                };
                 let data = slice(payload, walk.offset - payload_len, walk.offset);
                 show(Found {
                     record: walk.record,
@@ -755,9 +758,8 @@ pub fn datagram<'a>(
 /// from there on, with an empty range before it.
 fn long_gap_tail(record: &Record, body: &[u8]) -> Record {
     let order = Order::of(record.submessage_flags.into());
-    let base = record
-        .second_sequence_number()
-        .wrapping_add(Record::BITMAP_BITS.into());
+    let gap_list_base = u64::from(record.payload_len) << 32 | u64::from(record.encapsulation);
+    let base = gap_list_base.wrapping_add(Record::BITMAP_BITS.into());
     // reader, writer, gapStart, base, numBits, then five words that the first record holds
     let map = |index: u32| {
         body.words::<1>(28 + 20 + 4 * index)
