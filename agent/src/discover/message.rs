@@ -274,7 +274,7 @@ mod tests {
 
     use ros2probe_wire::discovery::{self, Discovery, Role};
     use ros2probe_wire::record;
-    use ros2probe_wire::rtps::{self, Body, InlineQos, Payload};
+    use ros2probe_wire::rtps::{InlineQos, Payload};
     use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
     use ros2probe_wire::{Duration, Record};
 
@@ -404,12 +404,17 @@ mod tests {
         let bytes = message()
             .ask_fragments(NODES_READER, NODES_READER, 48, [2, 4, 33], 1)
             .bytes();
-        let mut parsed = rtps::Message::parse(&bytes).unwrap();
-        let Body::NackFrag(nack) = parsed.nth(1).unwrap().unwrap().body else {
-            panic!("no NACK_FRAG")
-        };
-        assert_eq!((nack.sequence_number.0, nack.missing.base), (48, 2));
-        assert_eq!(nack.missing.iter().collect::<Vec<_>>(), [2, 4, 33]);
+        // Behind the header and INFO_DST (RTPS 2.5, 9.4.5.14).
+        let nack_frag = [
+            &[0x12, 0x01, 32, 0][..],
+            &NODES_READER.0,
+            &NODES_READER.0,
+            &[0, 0, 0, 0, 48, 0, 0, 0],
+            // FragmentNumberSet: base, numBits, one word.
+            &[2, 0, 0, 0, 32, 0, 0, 0, 0x01, 0, 0, 0xa0],
+            &[1, 0, 0, 0],
+        ];
+        assert_eq!(bytes[36..], nack_frag.concat());
         let (record, _) = asked(10, &(1..1000).collect::<Vec<_>>());
         let set = missing_of(&record);
         assert_eq!(set.num_bits, 256, "what does not fit is left out");

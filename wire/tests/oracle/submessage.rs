@@ -1,13 +1,14 @@
 //! The submessages' bodies (RTPS 2.5, 9.4.5), with GUIDs made whole from the receiver state.
 
-use super::{
-    FragmentNumberSet, Locator, LocatorKind, LocatorList, ProtocolVersion, Receiver,
-    SequenceNumber, SequenceNumberSet, SubmessageFlags, SubmessageId, VendorId,
+use ros2probe_wire::parameters::{ParameterId, ParameterList};
+use ros2probe_wire::rtps::{
+    Locator, LocatorKind, Payload, ProtocolVersion, SequenceNumber, SubmessageFlags, SubmessageId,
+    VendorId,
 };
-use crate::cursor::{Cursor, Reason, WireError};
-use crate::guid::{EntityId, Guid, GuidPrefix};
-use crate::parameters::ParameterList;
-use crate::time::RtpsTime;
+use ros2probe_wire::{Cursor, EntityId, Guid, GuidPrefix, Reason, RtpsTime, WireError};
+
+use super::Receiver;
+use super::sets::{FragmentNumberSet, SequenceNumberSet, sequence_number};
 
 /// What a submessage holds.
 #[derive(Clone, Copy, Debug)]
@@ -144,28 +145,6 @@ pub struct Data<'a> {
     pub payload: Payload<'a>,
 }
 
-/// What a change carries, encapsulation header included; up to three bytes of it may be padding.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Payload<'a> {
-    /// The whole value.
-    Data(&'a [u8]),
-    /// Its key only: the instance is disposed or unregistered.
-    Key(&'a [u8]),
-    /// Nothing; what there is to know stands in the inline QoS.
-    None,
-}
-
-impl<'a> Payload<'a> {
-    /// The bytes, whatever they are; empty for none.
-    #[must_use]
-    pub const fn bytes(self) -> &'a [u8] {
-        match self {
-            Self::Data(bytes) | Self::Key(bytes) => bytes,
-            Self::None => &[],
-        }
-    }
-}
-
 /// Consecutive fragments of one change.
 #[derive(Clone, Copy, Debug)]
 pub struct DataFrag<'a> {
@@ -277,15 +256,15 @@ pub(super) fn read<'a>(
             Body::NackFrag(NackFrag {
                 reader,
                 writer,
-                sequence_number: SequenceNumber::read_from(&mut body, "NACK_FRAG writerSN", 1)?,
+                sequence_number: sequence_number(&mut body, "NACK_FRAG writerSN", 1)?,
                 missing: FragmentNumberSet::read(&mut body)?,
                 count: body.u32("NACK_FRAG count")?,
             })
         }
         SubmessageId::HEARTBEAT => {
             let (reader, writer) = from_writer(&mut body, receiver)?;
-            let first = SequenceNumber::read_from(&mut body, "HEARTBEAT firstSN", 1)?;
-            let last = SequenceNumber::read_from(&mut body, "HEARTBEAT lastSN", first.0 - 1)?;
+            let first = sequence_number(&mut body, "HEARTBEAT firstSN", 1)?;
+            let last = sequence_number(&mut body, "HEARTBEAT lastSN", first.0 - 1)?;
             Body::Heartbeat(Heartbeat {
                 reader,
                 writer,
@@ -301,11 +280,7 @@ pub(super) fn read<'a>(
             Body::HeartbeatFrag(HeartbeatFrag {
                 reader,
                 writer,
-                sequence_number: SequenceNumber::read_from(
-                    &mut body,
-                    "HEARTBEAT_FRAG writerSN",
-                    1,
-                )?,
+                sequence_number: sequence_number(&mut body, "HEARTBEAT_FRAG writerSN", 1)?,
                 last_fragment: body.u32("HEARTBEAT_FRAG lastFragmentNum")?,
                 count: body.u32("HEARTBEAT_FRAG count")?,
             })
@@ -315,7 +290,7 @@ pub(super) fn read<'a>(
             Body::Gap(Gap {
                 reader,
                 writer,
-                start: SequenceNumber::read_from(&mut body, "GAP gapStart", 1)?,
+                start: sequence_number(&mut body, "GAP gapStart", 1)?,
                 list: SequenceNumberSet::read(&mut body)?,
             })
         }
@@ -364,10 +339,10 @@ fn data<'a>(
     }
     let mut rest = after_octets_to_inline_qos(&mut body, 16)?;
     let (reader, writer) = from_writer(&mut body, receiver)?;
-    let sequence_number = SequenceNumber::read_from(&mut body, "DATA writerSN", 1)?;
+    let sequence_number = sequence_number(&mut body, "DATA writerSN", 1)?;
     let inline_qos = flags
         .contains(SubmessageFlags::INLINE_QOS)
-        .then(|| ParameterList::take(&mut rest))
+        .then(|| parameter_list(&mut rest))
         .transpose()?;
     let payload = match (has_data, has_key) {
         (true, _) => Payload::Data(rest.rest()),
@@ -390,7 +365,7 @@ fn data_frag<'a>(
 ) -> Result<DataFrag<'a>, WireError> {
     let mut rest = after_octets_to_inline_qos(&mut body, 28)?;
     let (reader, writer) = from_writer(&mut body, receiver)?;
-    let sequence_number = SequenceNumber::read_from(&mut body, "DATA_FRAG writerSN", 1)?;
+    let sequence_number = sequence_number(&mut body, "DATA_FRAG writerSN", 1)?;
     let numbers = body.error("DATA_FRAG fragment numbers", Reason::BadValue);
     let starting = body.u32("DATA_FRAG fragmentStartingNum")?;
     let count = body.u16("DATA_FRAG fragmentsInSubmessage")?;
@@ -398,7 +373,7 @@ fn data_frag<'a>(
     let sample_size = body.u32("DATA_FRAG sampleSize")?;
     let inline_qos = flags
         .contains(SubmessageFlags::INLINE_QOS)
-        .then(|| ParameterList::take(&mut rest))
+        .then(|| parameter_list(&mut rest))
         .transpose()?;
 
     // The fragments in here span [begin, end) of the payload; the last one may be shorter.
@@ -442,6 +417,20 @@ fn after_octets_to_inline_qos<'a>(
     Ok(rest)
 }
 
+/// The list at the cursor, which moves behind the sentinel: only the sentinel shows where a payload
+/// begins.
+fn parameter_list<'a>(cursor: &mut Cursor<'a>) -> Result<ParameterList<'a>, WireError> {
+    let list = ParameterList::inline(*cursor);
+    loop {
+        let id = ParameterId(cursor.u16("parameter id")?);
+        let length = usize::from(cursor.u16("parameter length")?);
+        if id == ParameterId::SENTINEL {
+            return Ok(list);
+        }
+        cursor.take("parameter", length.next_multiple_of(4))?;
+    }
+}
+
 /// `LocatorUDPv4_t` (RTPS 2.5, 9.4.2.10): address and port as numbers.
 fn locator_ip4(body: &mut Cursor<'_>) -> Result<Locator, WireError> {
     let [a, b, c, d] = body.u32("INFO_REPLY_IP4 address")?.to_be_bytes();
@@ -452,4 +441,30 @@ fn locator_ip4(body: &mut Cursor<'_>) -> Result<Locator, WireError> {
         port,
         address,
     })
+}
+
+/// A counted list of locators, shown to be there but not copied.
+#[derive(Clone, Copy, Debug)]
+pub struct LocatorList<'a> {
+    rest: Cursor<'a>,
+}
+
+impl<'a> LocatorList<'a> {
+    /// `u32` count, then that many locators.
+    fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
+        let error = cursor.error("locator list", Reason::BadLength);
+        let count = usize::try_from(cursor.u32("locator count")?).map_err(|_| error)?;
+        let length = count.checked_mul(Locator::LEN).ok_or(error)?;
+        Ok(Self {
+            rest: cursor.sub("locator list", length)?,
+        })
+    }
+}
+
+impl Iterator for LocatorList<'_> {
+    type Item = Locator;
+
+    fn next(&mut self) -> Option<Locator> {
+        Locator::read(&mut self.rest).ok()
+    }
 }
