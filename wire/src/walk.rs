@@ -302,13 +302,16 @@ fn zero() -> u32 {
     core::hint::black_box(0)
 }
 
-/// Where the inline QoS, or the payload, begin in the body of a DATA or DATA_FRAG whose first word
-/// is `extra`: octetsToInlineQos counts from behind itself (RTPS 2.5, 9.4.5.4). Later versions may
-/// put fields behind those of this one, so the offset is followed, not assumed.
+/// Length of extraFlags and octetsToInlineQos, which begin a DATA or DATA_FRAG.
+const EXTRA_LEN: u32 = 4;
+
+/// octetsToInlineQos of a DATA or DATA_FRAG whose first word is `extra`. It counts from behind
+/// itself to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions may put fields
+/// behind those of this one, so the offset is followed, not assumed.
 #[inline(always)]
-const fn inline_qos_offset(order: Order, extra: u32) -> u32 {
-    let (_extra_flags, octets_to_inline_qos) = order.halves(extra);
-    4 + octets_to_inline_qos
+const fn octets_to_inline_qos(order: Order, extra: u32) -> u32 {
+    let (_extra_flags, octets) = order.halves(extra);
+    octets
 }
 
 /// DATA and DATA_FRAG (RTPS 2.5, 9.4.5.4 and 9.4.5.5).
@@ -343,7 +346,7 @@ fn data<B: Bytes>(
         walk.record.fragments = in_submessage << 16 | fragment_size;
         walk.record.sample_size = order.word(size);
     }
-    let mut at = body + inline_qos_offset(order, extra);
+    let mut at = body + EXTRA_LEN + octets_to_inline_qos(order, extra);
     if at < body + fixed || at > end {
         return Step::Malformed;
     }
@@ -671,8 +674,8 @@ impl<'a> Found<'a> {
         let mut cursor = Cursor::new(self.body, flags.endianness());
         let error = cursor.error("octetsToInlineQos", Reason::Truncated);
         let [extra] = self.body.words::<1>(0).ok_or(error)?;
-        let offset = inline_qos_offset(Order::of(flags.0.into()), extra);
-        let offset = usize::try_from(offset).map_err(|_| error)?;
+        let octets = octets_to_inline_qos(Order::of(flags.0.into()), extra);
+        let offset = usize::try_from(EXTRA_LEN + octets).map_err(|_| error)?;
         cursor.take("octetsToInlineQos", offset)?;
         InlineQos::parse(ParameterList::inline(cursor), vendor)
     }
