@@ -4,6 +4,7 @@ SHELL := /bin/bash
 
 TARGET := $(abspath $(or $(CARGO_TARGET_DIR),target))
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo -E)
+CORPUS := $(abspath $(or $(ROS2PROBE_FIXTURES),../shared/fixtures))
 # What is shipped for this machine.
 SHIPPED := $(shell uname -m)-unknown-linux-musl
 HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_')
@@ -45,8 +46,15 @@ test: ## format, lints, kernel object, and all tests with real DDS participants 
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
 	cargo test --package ros2probe --features tls --test surface --quiet -- web_config:: otlp_tls::
-	@.ci/prerequisites.sh --left-out
-	cargo nextest run --workspace
+	cargo nextest run --workspace $$(.ci/prerequisites.sh --left-out)
+	@if [ -d "$(CORPUS)" ]; then $(MAKE) --no-print-directory test-corpus; fi
+
+test-fast: ## unit tests, model and surface, without root and namespaces: under 90 s after a build
+	@.ci/prerequisites.sh fast
+	@env -u CARGO_TARGET_$(HOST)_RUNNER cargo nextest run --workspace --profile fast
+
+test-corpus: ## tests against the whole corpus of captures in ROS2PROBE_FIXTURES (../shared/fixtures)
+	ROS2PROBE_FIXTURES=$(CORPUS) cargo nextest run --package ros2probe --run-ignored only --filterset 'test(corpus)'
 
 test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
 	@.ci/prerequisites.sh test ros2
@@ -75,10 +83,10 @@ page-bench: ## first paint with 500 topics, layout and memory of the page; MEASU
 screenshots: ## the pictures of README and docs, from the demo, in target/screenshots (needs root)
 	@.ci/prerequisites.sh demo page
 	cargo build --package ros2probe --bin rp --example robot --example demo
-	$(SUDO) env PATH=$(PATH) node agent/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
+	$(SUDO) env PATH=$(PATH) node agent/cli/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
 
 peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
-	@$(MAKE) --no-print-directory -C agent/tests/peers OUT=$(TARGET)/peers
+	@$(MAKE) --no-print-directory -C agent/cli/tests/peers OUT=$(TARGET)/peers
 
 arm: ## build rp for aarch64, static and unoptimized, which the tests run under qemu
 	CARGO_PROFILE_DEV_DEBUG=0 cargo build --package ros2probe --bin rp --target aarch64-unknown-linux-musl
@@ -86,7 +94,7 @@ arm: ## build rp for aarch64, static and unoptimized, which the tests run under 
 dist: ## release both binaries, packages, bills of materials and checksums into target/dist, tested
 	@.ci/prerequisites.sh dist
 	packaging/dist.sh
-	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist
+	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist -- --include-ignored
 
 distcheck: ## build what make dist has built again, elsewhere, and compare every byte
 	packaging/dist.sh --again
@@ -106,14 +114,14 @@ soak: ## an hour of a changing graph, and faults, on what is shipped; SOAK_SECON
 	ROS2PROBE_SOAK=1 ROS2PROBE_SOAK_SECONDS=$(or $(SOAK_SECONDS),3600) \
 	    ROS2PROBE_SOAK_PROGRAM=$(TARGET)/$(SHIPPED)/release/rp cargo test --release \
 	    --package ros2probe --test live --no-fail-fast -- endurance:: faults:: \
-	    --nocapture --test-threads 1
+	    --nocapture --test-threads 1 $(if $(ROS2PROBE_SOAK_CLOCK),--include-ignored)
 	@cat $(TARGET)/soak/faults.md
 
 fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	@.ci/prerequisites.sh fuzz
-	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list); do \
+	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list --fuzz-dir fuzz); do \
 	    mkdir -p "fuzz/corpus/$$target"; \
-	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run "$$target" "fuzz/corpus/$$target" \
+	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run --fuzz-dir fuzz "$$target" "fuzz/corpus/$$target" \
 	        $$(ls -d "fuzz/seeds/$$target" "tests/data/$${target}s" 2>/dev/null) -- \
 	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
 	done) || exit 1; done
@@ -131,4 +139,4 @@ deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri deny prerequisites
+.PHONY: help demo test test-fast test-corpus test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri deny prerequisites

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
 # Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
 #
-#   prerequisites.sh demo|test|dist|ebpf|fuzz|miri|deny...   install what those targets need
+#   prerequisites.sh demo|test|fast|dist|ebpf|fuzz|miri|deny...   install what those targets need
 #   prerequisites.sh types                    install what the dashboards are type-checked with
 #   prerequisites.sh page                     install the browser that the page is tested in
 #   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
-#   prerequisites.sh --left-out               print which tests `make test` leaves out
+#   prerequisites.sh --left-out               print which tests `make test` leaves out, and why
 #
 # Made for Debian 12 and Ubuntu 22.04 or newer. It starts no service, adds no package source and
 # changes no system setting; what cannot be had ends it with a line that says how to get it.
@@ -71,12 +71,12 @@ prometheus() {
 
 # What the dashboards are type-checked with. Without it one test fails and says so.
 types() {
-    local directory=$tools/grafana lock=agent/tests/dashboard/types/package-lock.json
+    local directory=$tools/grafana lock=agent/cli/tests/dashboard/types/package-lock.json
     cmp -s "$lock" "$directory/package-lock.json" && [ -d "$directory/node_modules/typescript" ] && return
     command -v npm >/dev/null || packages npm
     say "installing @grafana/schema and typescript into target/tools/grafana"
     mkdir -p "$directory"
-    cp agent/tests/dashboard/types/package.json "$lock" "$directory"
+    cp agent/cli/tests/dashboard/types/package.json "$lock" "$directory"
     (cd "$directory" && npm ci --ignore-scripts --no-audit --no-fund --silent) ||
         { rm -f "$directory/package-lock.json"; say "npm failed: the dashboards cannot be type-checked"; }
 }
@@ -106,7 +106,7 @@ node_version() { command node --version 2>/dev/null | sed -E 's/v([0-9]+).*/\1/'
 # A real browser, what drives it, and the rules of accessibility. Debian has Chromium's headless
 # shell as a package. Ubuntu has none: playwright fetches its own build there, into target/tools.
 page() {
-    local place=$tools/page tests=agent/tests/page
+    local place=$tools/page tests=agent/cli/tests/page
     nodejs
     [ -x "$tools/node/bin/node" ] && export PATH=$tools/node/bin:$PATH
     if ! cmp -s "$tests/package-lock.json" "$place/package-lock.json" ||
@@ -246,10 +246,27 @@ ros2() {
     as_root bash "$installer"
 }
 
+# Names each test that `make test` leaves out, with the reason, and prints the arguments that leave out
+# what this system lacks.
 left_out() {
-    local tests
-    tests=$(cat agent/tests/humble/*.rs | grep -c '^#\[ignore = "needs ROS 2 Humble')
-    say "left out here: the $tests tests with real ROS 2 Humble nodes (make test-ros2)"
+    local version elsewhere="started by another test"
+    # `make test` runs these where the corpus is.
+    [ -d "${ROS2PROBE_FIXTURES:-../shared/fixtures}" ] && elsewhere+="|make test-corpus"
+    say "left out here:"
+    find agent wire -name target -prune -o -name '*.rs' -print | sort | xargs awk -v elsewhere="$elsewhere" '
+        /#\[ignore = / { sub(/.*#\[ignore = "/, ""); sub(/"\].*/, ""); reason = $0 ~ elsewhere ? "" : $0; next }
+        reason != "" && match($0, /fn [a-z0-9_]+/) {
+            file = FILENAME
+            gsub(/^agent\/(cli\/(tests|src)|daemon\/src)\/|\.rs$/, "", file)
+            printf "  %s::%s: %s\n", file, substr($0, RSTART + 3, RLENGTH - 3), reason
+            reason = ""
+        }' >&2
+    # Ubuntu 22.04 has 249 and nothing newer.
+    version=$(systemd-analyze --version 2>/dev/null | awk 'NR == 1 { print $2 + 0 }')
+    if [ "${version:-0}" -lt 250 ]; then
+        say "  dist/systemd::the_exposure_level_is_at_most_2: needs systemd 250, here is ${version:-none}"
+        echo "--filterset !test(the_exposure_level_is_at_most_2)"
+    fi
 }
 
 rust() {
@@ -338,6 +355,14 @@ for need; do
         cargo_deb
         ebpf
         ;;
+    fast)
+        packages curl ca-certificates gcc libc6-dev systemd
+        prometheus
+        rotel
+        bags
+        rust
+        nextest
+        ;;
     dist)
         packages gcc libc6-dev python3
         rust
@@ -378,6 +403,6 @@ for need; do
             cargo install cargo-deny --version 0.20.2 --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, dist, types, page, ebpf, fuzz, miri, deny" ;;
+    *) die "prerequisites.sh: $need is none of demo, test, fast, dist, types, page, ebpf, fuzz, miri, deny" ;;
     esac
 done

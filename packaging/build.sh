@@ -5,7 +5,7 @@
 #
 # writes DIRECTORY/ros2probe_VERSION_ARCHITECTURE.deb. Manual pages and completions are what the
 # binary says of itself; where it cannot run here, RP names one of the same sources that can.
-# What is in the package is listed in agent/Cargo.toml, [package.metadata.deb].
+# What is in the package is listed in agent/cli/Cargo.toml, [package.metadata.deb].
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 
@@ -90,7 +90,7 @@ libraries() {
 libraries | gzip -9n >"$parts/libraries.gz"
 
 package=$directory/ros2probe_${version}_$architecture.deb
-cd "$root/agent"
+cd "$root/agent/cli"
 CARGO_TARGET_DIR=$stage cargo deb --quiet --locked --no-build --no-strip --no-dbgsym --compress-system \
     --target "$target" --deb-version "$version" --output "$package" "$@" >/dev/null
 printf '%s\n' "$package"

@@ -1,5 +1,5 @@
 //! What the fuzz targets do with their bytes: plain functions, so that the tests run them too, over
-//! the committed seeds and all their truncations (`agent/tests/surface/fuzz_seeds.rs`).
+//! the committed seeds and all their truncations (`agent/cli/tests/surface/fuzz_seeds.rs`).
 //!
 //! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic,
 //! nothing delivered that was not there, an end, and an end that stays.
@@ -177,7 +177,7 @@ static TYPES: LazyLock<Vec<MessageType>> = LazyLock::new(|| {
     macro_rules! text {
         ($name:literal) => {
             include_str!(concat!(
-                "../../tests/data/definitions/test_msgs/msg/",
+                "../../testing/data/definitions/test_msgs/msg/",
                 $name,
                 ".msg"
             ))

@@ -143,9 +143,9 @@ mod tests {
     use super::super::{Library, NotFound, Sources};
     use super::*;
 
-    const HASHES: &str = include_str!("../../tests/data/message/type_hashes.txt");
-    const ANNOUNCED: &str = include_str!("../../tests/data/message/announced.txt");
-    const SCHEMAS: &str = include_str!("../../tests/data/message/schemas.txt");
+    const HASHES: &str = include_str!("../../testing/data/message/type_hashes.txt");
+    const ANNOUNCED: &str = include_str!("../../testing/data/message/announced.txt");
+    const SCHEMAS: &str = include_str!("../../testing/data/message/schemas.txt");
     const DIALECTS: [(&str, Dialect); 4] = [
         ("humble", Dialect::Humble),
         ("jazzy", Dialect::Jazzy),

@@ -26,6 +26,24 @@ pub mod truth;
 
 use std::path::{Path, PathBuf};
 
+/// The directory of the whole corpus of captures, which `ROS2PROBE_FIXTURES` names
+/// (`make test-corpus`).
+///
+/// # Panics
+///
+/// Panics if nothing is there: a test that needs it must not pass without it.
+#[must_use]
+pub fn corpus() -> PathBuf {
+    let named = std::env::var_os("ROS2PROBE_FIXTURES").map(PathBuf::from);
+    let corpus = named.unwrap_or_else(|| repository("../shared/fixtures"));
+    assert!(
+        corpus.is_dir(),
+        "no captures in {}: name their directory in ROS2PROBE_FIXTURES",
+        corpus.display()
+    );
+    corpus
+}
+
 /// A file of the repository, named from its top.
 #[must_use]
 pub fn repository(path: &str) -> PathBuf {

@@ -43,7 +43,7 @@ struct Line {
 }
 
 pub fn data() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data")
 }
 
 pub fn cases() -> Vec<Case> {

@@ -1,4 +1,4 @@
-//! Real DDS participants: one command line for three stacks (see `agent/tests/peers/peer.hpp`).
+//! Real DDS participants: one command line for three stacks (see `agent/cli/tests/peers/peer.hpp`).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

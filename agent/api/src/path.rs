@@ -1,0 +1,26 @@
+//! Names in paths and queries.
+
+/// Percent-encodes a name for a path or the value of a query. Slashes stay.
+#[must_use]
+pub fn encoded(name: &str) -> String {
+    let mut path = String::with_capacity(name.len());
+    for byte in name.bytes() {
+        if byte.is_ascii_alphanumeric() || b"/_-.~".contains(&byte) {
+            path.push(char::from(byte));
+        } else {
+            path.push_str(&format!("%{byte:02X}"));
+        }
+    }
+    path
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_keep_their_slashes_and_nothing_that_ends_a_path() {
+        assert_eq!(encoded("/robot1/imu_data"), "/robot1/imu_data");
+        assert_eq!(encoded("/a?b#c d%é"), "/a%3Fb%23c%20d%25%C3%A9");
+    }
+}

@@ -1,0 +1,77 @@
+//! `rp discover`: whom to ask, and how.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use ros2probe_model::discovery::hexadecimal;
+use ros2probe_wire::GuidPrefix;
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+An agent started after the robot knows the participants, but not their topics and nodes, which are
+announced only once. This command finds participants by listening, prints what it will send, and
+requests the announcements again: at most 6 unicast packets for each, from a participant that lives
+for a few milliseconds and says goodbye. A running agent on this host sees the answers too. Without
+--participant and --all it lists the participants.
+Participants with DDS security are not asked. Needs the same capabilities as `rp run`.
+Exit codes: 0 all answered, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
+
+Examples:
+  sudo rp discover --all --dry-run                print what would be sent
+  sudo rp discover --all                          all participants
+  sudo rp discover --participant 010f1a2b3c4d5e6f00000000")]
+pub(crate) struct Discover {
+    /// Only participants of this domain
+    #[arg(long, value_name = "N")]
+    pub(crate) domain: Option<u32>,
+    /// Ask this participant, by its GUID prefix: 24 hexadecimal digits
+    #[arg(long, value_name = "PREFIX", value_parser = prefix, conflicts_with = "all")]
+    pub(crate) participant: Option<GuidPrefix>,
+    /// Ask every participant that is heard
+    #[arg(long)]
+    pub(crate) all: bool,
+    /// Print what would be sent, but send nothing
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+    /// Request endpoints only: one packet less
+    #[arg(long)]
+    pub(crate) no_nodes: bool,
+    /// Listen on the wire of this interface instead of at the host's sockets
+    #[arg(long, value_name = "NAME")]
+    pub(crate) interface: Option<String>,
+    /// How long to listen for participants: most announce themselves every 3 to 8 seconds
+    #[arg(long, value_name = "SECONDS", default_value_t = 10,
+        value_parser = clap::value_parser!(u64).range(1..=120))]
+    pub(crate) listen: u64,
+    /// Configuration file, for its `capture`; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+}
+
+fn prefix(text: &str) -> Result<GuidPrefix, String> {
+    // The label `participant` goes on with the entity.
+    let text = text.strip_suffix(".000001c1").unwrap_or(text);
+    let prefix = hexadecimal(text).map(GuidPrefix);
+    prefix.ok_or_else(|| "must be 24 hexadecimal digits, as in ros2_participant_info".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_participant_is_named_as_the_metrics_name_it() {
+        let digits = "010f1a2b3c4d5e6f00000000";
+        assert_eq!(prefix(digits).unwrap().to_string(), digits);
+        assert_eq!(prefix(&format!("{digits}.000001c1")), prefix(digits));
+        for wrong in [
+            "",
+            "010f",
+            "all",
+            &digits[1..],
+            &format!("{digits}.00000103"),
+        ] {
+            assert!(prefix(wrong).is_err(), "{wrong}");
+        }
+    }
+}

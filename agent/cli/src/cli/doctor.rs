@@ -1,0 +1,126 @@
+//! `rp doctor`.
+
+use std::io::IsTerminal as _;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Args;
+use ros2probe::client::{Agent, ClientError, Target};
+use ros2probe::doctor::answers::Answers;
+use ros2probe::doctor::host::Host;
+use ros2probe::doctor::report::Report;
+use ros2probe::doctor::text::{Style, text};
+use ros2probe::doctor::{Configured, Reach, examine, examine_capture, examine_remote};
+use ros2probe_daemon::config::{Config, ConfigError};
+
+use super::Output;
+use ros2probe_daemon::agent::DEFAULT_CONFIG;
+
+/// `rp doctor`.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+It checks the kernel, privileges, interfaces, ROS variables and processes, buffers and the clock of
+this host, and asks the agent, if one is running, what it sees. It changes nothing. If no agent is
+running and privileges allow, it briefly loads the agent's kernel programs to test the kernel.
+Checks that this user may not do are `unknown`, with the command for them: mostly `sudo rp doctor`.
+With --host it reports only on that agent and its graph, with --replay on the capture's graph.
+Without --domain it reports on every domain, whatever ROS_DOMAIN_ID is.
+Verdicts: ok, note (by choice, or good to know), unknown, warning (something will be missing or
+wrong), problem (broken). A line with `>` is the remedy: a command, or a line of the configuration.
+Exit codes: 0 no problem (warnings are none), 1 a problem, or no answer with --host, 2 wrong usage.
+
+Examples:
+  sudo rp doctor                        all of it
+  rp doctor --json | jq -r '.findings[] | select(.verdict == \"problem\").sentence'
+  rp doctor --host robot2 --token-file ~/robot2.token
+  rp doctor --replay robot.pcap.gz")]
+pub(crate) struct Doctor {
+    /// Print JSON: one object, for fleets
+    #[arg(long)]
+    json: bool,
+    /// Also show the evidence of lines without a problem
+    #[arg(short, long, conflicts_with = "json")]
+    verbose: bool,
+    /// Configuration file of the agent; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Doctor {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let report = if self.target.host.is_some() || self.target.replay.is_some() {
+            let agent = Agent::reach(&self.target)?;
+            let answers = Answers::ask(&agent, self.target.domain_id)?;
+            match self.target.replay {
+                Some(_) => examine_capture(&answers, &agent.place()),
+                None => examine_remote(&answers, &agent.place()),
+            }
+        } else {
+            let configured = configured(self.config.as_deref())?;
+            examine(&Host::read(), &configured, &reach(&self.target))
+        };
+        self.print(&report)?;
+        Ok(match report.has_problems() {
+            false => ExitCode::SUCCESS,
+            true => ExitCode::FAILURE,
+        })
+    }
+
+    fn print(&self, report: &Report) -> Result<()> {
+        let text = if self.json {
+            serde_json::to_string_pretty(report)? + "\n"
+        } else {
+            let style = Style {
+                verbose: self.verbose,
+                colours: colours(),
+            };
+            text(report, style)
+        };
+        Ok(Output::new().write(&text)?)
+    }
+}
+
+/// The agent on this host, if one is to be had.
+fn reach(target: &Target) -> Reach {
+    let asked = Agent::reach(target).and_then(|agent| {
+        let answers = Answers::ask(&agent, target.domain_id)?;
+        Ok((answers, agent.place()))
+    });
+    match asked {
+        Ok((answers, place)) => Reach::Answered(Box::new(answers), place),
+        Err(error @ ClientError::Denied { .. }) => Reach::Denied(error.to_string()),
+        Err(error) => Reach::Nobody(error.to_string()),
+    }
+}
+
+/// What an agent here runs with. A file that was named must be there.
+fn configured(file: Option<&Path>) -> Result<Configured> {
+    let path = file.unwrap_or(Path::new(DEFAULT_CONFIG));
+    if file.is_none() && !path.exists() {
+        return Ok(Configured {
+            config: Config::default(),
+            mistakes: None,
+        });
+    }
+    match Config::load(path) {
+        Ok(config) => Ok(Configured {
+            config,
+            mistakes: None,
+        }),
+        Err(error @ ConfigError::Read { .. }) if file.is_some() => Err(error.into()),
+        Err(error) => Ok(Configured {
+            config: Config::default(),
+            mistakes: Some((path.to_path_buf(), error.to_string())),
+        }),
+    }
+}
+
+/// See <https://no-color.org>.
+fn colours() -> bool {
+    let is_set = |name| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+    let is_dumb = std::env::var_os("TERM").is_some_and(|terminal| terminal == "dumb");
+    std::io::stdout().is_terminal() && !is_set("NO_COLOR") && !is_dumb
+}

@@ -1,0 +1,268 @@
+//! `rp topic echo`: what a topic's messages say.
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Args;
+use ros2probe::client::{Agent, Target};
+use ros2probe::ros2::Refused;
+use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
+use ros2probe::ros2::facts::Topic;
+use ros2probe::ros2::name::full_name;
+use ros2probe_daemon::visible::visible_lines;
+use ros2probe_message::TypeName;
+use ros2probe_message::filter::Filter;
+
+use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
+use super::notes::{NOT_ALL_PRINTED, Notes};
+use super::shared::{Matching, Spinning, names_of};
+use super::{Output, Said};
+
+/// Moves the cursor home and clears the terminal.
+const CLEAR: &str = "\x1b[H\x1b[2J\n";
+
+/// `rp topic echo`.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+--filter takes an expression over `m`, the message (or the field that --field selects): m.pose.x > 1.5,
+'error' in m.msg, len(m.ranges) == 0, 0 <= m.level < 3 and not m.done. It knows fields, [index],
+numbers, strings, comparisons, in, and, or, not, + - * / // % **, lists, abs, all, any, bool, float,
+int, len, max, min, str, sum, and of strings startswith, endswith, lower, upper.
+
+rp does not subscribe, so it cannot request messages that were sent before.
+
+Examples:
+  rp topic echo /chatter --once
+  rp topic echo /odom --field pose.pose.position --filter 'm.x > 10'
+  rp topic echo /points --replay robot.pcap --no-arr")]
+pub(crate) struct Echo {
+    /// Name of the topic, as /chatter
+    topic_name: String,
+    /// Type of its messages, as std_msgs/msg/String [default: the announced one]
+    message_type: Option<String>,
+    #[command(flatten)]
+    printing: Printing,
+    /// Print only this field of messages, as pose.pose.position or ranges.[0]; may be repeated
+    #[arg(long, value_name = "FIELD")]
+    field: Vec<String>,
+    /// Print the serialized message
+    #[arg(long)]
+    raw: bool,
+    /// Print only messages for which this expression is true
+    #[arg(long, value_name = "EXPR")]
+    filter: Option<String>,
+    /// Print one message, then end
+    #[arg(long)]
+    once: bool,
+    /// End after so many seconds
+    #[arg(long, value_name = "SECONDS", value_parser = positive)]
+    timeout: Option<f64>,
+    /// Print times and sequence number before each message
+    #[arg(long, short = 'i')]
+    include_message_info: bool,
+    /// Do not report lost messages
+    #[arg(long)]
+    no_lost_messages: bool,
+    /// Accepted without effect: lost messages are reported anyway
+    #[arg(long, hide = true)]
+    lost_messages: bool,
+    /// Clear the screen before each message
+    #[arg(long, short = 'c')]
+    clear: bool,
+    /// Accepted without effect: there is no node
+    #[arg(long, short = 'n', value_name = "NAME")]
+    node_name: Option<String>,
+    #[command(flatten)]
+    matching: Matching,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Echo {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let options = self.options()?;
+        let raw = options.raw;
+        let name = full_name(&self.topic_name).map_err(said)?;
+        if self.lost_messages {
+            eprintln!(
+                "WARNING: '--lost-messages' is deprecated; lost messages are reported by default"
+            );
+        }
+        if let Some(message_type) = &self.message_type {
+            let known: Result<TypeName, _> = message_type.parse();
+            known.map_err(|_| Said("The passed message type is invalid".to_owned()))?;
+        }
+        let domain_id = self.target.domain()?;
+        let mut types = Types::new(self.printing.library(&self.target));
+        let agent = Agent::reach_stream(&self.target)?;
+        let mut output = Output::new();
+
+        // What a capture has is known when it has been read.
+        let is_waiting = self.target.replay.is_some();
+        let known = topic(&agent, domain_id, &name)?;
+        let mut expected = match &known {
+            Some(known) => {
+                if !self.matching.any() {
+                    output.write(&mixed_offers(&known.publishers))?;
+                }
+                self.expected(known)?
+            }
+            None if self.message_type.is_none() && !is_waiting => {
+                return self.unknown(&agent, domain_id, &mut output);
+            }
+            None => self.message_type.clone(),
+        };
+        if let Some(expected) = expected.as_deref().filter(|_| !raw) {
+            let publishers = known.as_ref().map(|known| known.publishers.as_slice());
+            let hash = publishers.and_then(|publishers| publishers.first()?.type_hash.as_deref());
+            types.find(expected, hash)?;
+        }
+        if let Some(known) = &known {
+            hint(&name, known, expected.as_deref());
+        }
+
+        let mut echo = echo::Echo::new(options);
+        let mut lost = Lost::default();
+        let mut start = None;
+        let mut is_seen = false;
+        let names = std::slice::from_ref(&name);
+        let mut notes = Notes::begin(&agent, domain_id, is_waiting, names, NOT_ALL_PRINTED);
+        let went = follow(&agent, domain_id, names, &mut notes, |came, now| {
+            let start = *start.get_or_insert(now);
+            let mut text = String::new();
+            let mut is_enough = false;
+            match came {
+                Came::Clock => {}
+                Came::Missed(missed) => text = lost.missed(missed),
+                Came::Message(sample, payload) => {
+                    if !is_seen
+                        && known.is_none()
+                        && self.message_type.is_none()
+                        && let Some(known) = topic(&agent, domain_id, &name)?
+                    {
+                        expected = self.expected(&known)?;
+                    }
+                    is_seen = true;
+                    let wanted = self.message_type.as_ref().or(expected.as_ref());
+                    if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
+                        let message_type = if raw { None } else { types.of(sample) };
+                        let told = echo.message(sample, message_type.as_deref(), &payload);
+                        let told = told.map_err(said)?;
+                        eprint!("{}", visible_lines(&told.err));
+                        if let Some(message) = told.out {
+                            if self.clear {
+                                output.write(CLEAR)?;
+                            }
+                            output.write(&for_stdout(message))?;
+                            is_enough = self.once;
+                        }
+                    }
+                }
+            }
+            if !text.is_empty() && !self.no_lost_messages {
+                output.write(&text)?;
+            }
+            is_enough |= self
+                .timeout
+                .is_some_and(|timeout| elapsed(start, now) >= timeout);
+            Ok(if is_enough { Went::Enough } else { Went::On })
+        })?;
+        let is_over = matches!(went, Went::ToTheEnd | Went::Cut);
+        if is_over && !is_seen && known.is_none() && self.message_type.is_none() {
+            match topic(&agent, domain_id, &name)? {
+                Some(known) => drop(self.expected(&known)?),
+                None => return self.unknown(&agent, domain_id, &mut output),
+            }
+        }
+        if echo.unreadable() > 1 {
+            eprintln!("rp: {} messages could not be read", echo.unreadable());
+        }
+        Ok(ExitCode::from(u8::from(went == Went::Cut)))
+    }
+
+    fn options(&self) -> Result<echo::Options> {
+        let filter = self.filter.as_deref().map(Filter::parse).transpose();
+        let fields = self.field.iter().map(|field| field.parse());
+        Ok(echo::Options {
+            dialect: self.target.dialect(),
+            csv: self.printing.csv,
+            style: self.printing.style(),
+            shown: self.printing.shown(),
+            raw: self.raw,
+            fields: fields
+                .collect::<Result<Vec<FieldPath>, _>>()
+                .map_err(said)?,
+            filter: filter.map_err(|error| Said(error.to_string()))?,
+            include_info: self.include_message_info,
+        })
+    }
+
+    /// The type to print messages by; where the topic has several, one has to be named.
+    fn expected(&self, known: &Topic) -> Result<Option<String>> {
+        if self.message_type.is_some() {
+            return Ok(self.message_type.clone());
+        }
+        match known.message_types.as_slice() {
+            [] => Ok(None),
+            [one] => Ok(Some(one.clone())),
+            several => {
+                let text = format!(
+                    "Cannot echo topic '{}', as it contains more than one type: [{}]",
+                    self.topic_name,
+                    several.join(", ")
+                );
+                Err(Said(text).into())
+            }
+        }
+    }
+
+    fn unknown(&self, agent: &Agent, domain_id: u32, output: &mut Output) -> Result<ExitCode> {
+        output.write(&format!(
+            "WARNING: topic [{}] does not appear to be published yet\n",
+            self.topic_name
+        ))?;
+        names_of(agent, domain_id)?;
+        let text = "Could not determine the type for the passed topic";
+        Err(Said(text.to_owned()).into())
+    }
+}
+
+/// What explains why nothing may come.
+fn hint(name: &str, known: &Topic, expected: Option<&str>) {
+    let types = &known.message_types;
+    if let Some(expected) = expected
+        && !types.is_empty()
+        && types.iter().all(|other| other != expected)
+    {
+        eprintln!("rp: {name} carries {}, not {expected}", types.join(", "));
+    }
+    if known
+        .publishers
+        .iter()
+        .any(|one| one.qos.durability == "TRANSIENT_LOCAL")
+    {
+        eprintln!(
+            "rp: {name} is latched; rp does not subscribe, so it cannot request earlier messages (see \
+             `retain: last`)"
+        );
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "microseconds survive")]
+fn elapsed(start: i64, now: i64) -> f64 {
+    now.saturating_sub(start) as f64 / 1e9
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let value = text
+        .parse()
+        .ok()
+        .filter(|value: &f64| *value > 0.0 && value.is_finite());
+    value.ok_or_else(|| "value must be a positive number".to_owned())
+}
+
+fn said(refused: Refused) -> anyhow::Error {
+    Said(refused.0).into()
+}

@@ -1,0 +1,211 @@
+//! `rp service echo` and `rp action echo`: what services and actions say of themselves.
+
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Args;
+use ros2probe::client::{Agent, Target};
+use ros2probe::ros2::Refused;
+use ros2probe::ros2::echo::{self, Echo};
+use ros2probe::ros2::name::full_name;
+use ros2probe_daemon::visible::visible_lines;
+
+use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
+use super::notes::{NOT_ALL_PRINTED, Notes};
+use super::shared::{Matching, Spinning, names_of};
+use super::{Output, Said};
+
+/// `rp service echo`.
+#[derive(Args, Debug)]
+pub(crate) struct ServiceEcho {
+    /// Name of the service, as /add_two_ints
+    service_name: String,
+    /// Its type, as example_interfaces/srv/AddTwoInts [default: the announced one]
+    service_type: Option<String>,
+    #[command(flatten)]
+    printing: Printing,
+    #[command(flatten)]
+    matching: Matching,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
+/// `rp action echo`.
+#[derive(Args, Debug)]
+pub(crate) struct ActionEcho {
+    /// Name of the action, as /fibonacci
+    action_name: String,
+    /// Its type, as example_interfaces/action/Fibonacci [default: the announced one]
+    action_type: Option<String>,
+    /// Only these parts, separated by `|`: GOAL_SERVICE, CANCEL_SERVICE, RESULT_SERVICE,
+    /// FEEDBACK_TOPIC, STATUS_TOPIC
+    #[arg(long, short = 'i', value_name = "PARTS")]
+    interfaces: Option<String>,
+    #[command(flatten)]
+    printing: Printing,
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    target: Target,
+}
+
+/// An action's parts and their topics below it.
+const PARTS: [(&str, &str); 5] = [
+    ("GOAL_SERVICE", "/_action/send_goal/_service_event"),
+    ("CANCEL_SERVICE", "/_action/cancel_goal/_service_event"),
+    ("RESULT_SERVICE", "/_action/get_result/_service_event"),
+    ("FEEDBACK_TOPIC", "/_action/feedback"),
+    ("STATUS_TOPIC", "/_action/status"),
+];
+
+impl ServiceEcho {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let name = full_name(&self.service_name).map_err(said)?;
+        let events = format!("{name}/_service_event");
+        let domain_id = self.target.domain()?;
+        let agent = Agent::reach_stream(&self.target)?;
+        let mut output = Output::new();
+        // What a capture has is known when it has been read.
+        if self.target.replay.is_none() {
+            if self.service_type.is_none() {
+                let names = names_of(&agent, domain_id)?;
+                if names.services.iter().all(|service| service.name != name) {
+                    let text = format!("Cannot find type for '{}'", self.service_name);
+                    return Err(Said(text).into());
+                }
+            }
+            let known = topic(&agent, domain_id, &events)?;
+            if known.is_none_or(|known| known.publishers.is_empty()) {
+                output.write(&format!(
+                    "No publishers on topic '{events}'; is service introspection on the client or \
+                     server enabled?\n"
+                ))?;
+            }
+        }
+        let expected = self.service_type.map(|name| format!("{name}_Event"));
+        let topics = [(None, events)];
+        print(
+            &agent,
+            &self.target,
+            &self.printing,
+            &topics,
+            expected.as_deref(),
+            output,
+        )
+    }
+}
+
+impl ActionEcho {
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        let parts = chosen(self.interfaces.as_deref()).map_err(said)?;
+        let name = full_name(&self.action_name).map_err(said)?;
+        let domain_id = self.target.domain()?;
+        if let Some(action_type) = &self.action_type {
+            let types = Types::new(self.printing.library(&self.target));
+            types.find(&format!("{action_type}_FeedbackMessage"), None)?;
+        }
+        let agent = Agent::reach_stream(&self.target)?;
+        if self.target.replay.is_none() && self.action_type.is_none() {
+            let names = names_of(&agent, domain_id)?;
+            let feedback = format!("{name}/_action/feedback");
+            if names.topics.iter().all(|topic| topic.name != feedback) {
+                let text = format!("Cannot find type for '{}'", self.action_name);
+                return Err(Said(text).into());
+            }
+        }
+        let topics: Vec<_> = parts
+            .into_iter()
+            .map(|(part, path)| (Some(part), format!("{name}{path}")))
+            .collect();
+        let output = Output::new();
+        print(&agent, &self.target, &self.printing, &topics, None, output)
+    }
+}
+
+/// The parts that are named, in the original's words where one is not.
+fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
+    let Some(interfaces) = interfaces else {
+        return Ok(PARTS.to_vec());
+    };
+    if interfaces.is_empty() {
+        let text = "Input action interface name is empty.";
+        return Err(Refused(text.to_owned()));
+    }
+    let mut chosen = Vec::new();
+    for name in interfaces.split('|').map(str::trim) {
+        let known = PARTS
+            .iter()
+            .find(|(part, _)| part.eq_ignore_ascii_case(name));
+        let part =
+            known.ok_or_else(|| Refused(format!("\"{name}\" is incorrect interface name.")))?;
+        if !chosen.contains(part) {
+            chosen.push(*part);
+        }
+    }
+    Ok(chosen)
+}
+
+fn print(
+    agent: &Agent,
+    target: &Target,
+    printing: &Printing,
+    topics: &[(Option<&str>, String)],
+    expected: Option<&str>,
+    mut output: Output,
+) -> Result<ExitCode> {
+    let mut types = Types::new(printing.library(target));
+    if let Some(expected) = expected {
+        types.find(expected, None)?;
+    }
+    let mut echo = Echo::new(echo::Options {
+        dialect: target.dialect(),
+        csv: printing.csv,
+        style: printing.style(),
+        shown: printing.shown(),
+        ..echo::Options::default()
+    });
+    let names: Vec<_> = topics.iter().map(|(_, name)| name.clone()).collect();
+    let domain_id = target.domain()?;
+    let is_replay = target.replay.is_some();
+    let notes = Notes::begin(agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
+    let mut notes = notes.of_parts();
+    let went = follow(agent, domain_id, &names, &mut notes, |came, _| {
+        if let Came::Message(sample, payload) = came
+            && expected.is_none_or(|expected| expected == sample.message_type)
+            && let Some(message_type) = types.of(sample)
+        {
+            let part = topics.iter().find(|(_, name)| *name == sample.topic);
+            let part = part.and_then(|(part, _)| *part);
+            let told = echo.event(sample, &message_type, &payload, part);
+            eprint!("{}", visible_lines(&told.err));
+            output.write(&for_stdout(told.out.unwrap_or_default()))?;
+        }
+        Ok(Went::On)
+    })?;
+    Ok(ExitCode::from(u8::from(went == Went::Cut)))
+}
+
+fn said(refused: Refused) -> anyhow::Error {
+    Said(refused.0).into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_of_an_action_are_chosen_by_name() {
+        assert_eq!(chosen(None).map(|parts| parts.len()), Ok(5));
+        let two = chosen(Some(" feedback_topic|STATUS_TOPIC | status_topic"));
+        let two: Vec<_> = two.unwrap().into_iter().map(|(part, _)| part).collect();
+        assert_eq!(two, ["FEEDBACK_TOPIC", "STATUS_TOPIC"]);
+        let refused = |text: &str| chosen(Some(text)).unwrap_err().0;
+        assert_eq!(refused(""), "Input action interface name is empty.");
+        assert_eq!(
+            refused("x|STATUS_TOPIC"),
+            "\"x\" is incorrect interface name."
+        );
+    }
+}

@@ -1,0 +1,296 @@
+//! The messages of topics with their bytes and types, for what is printed of them one by one.
+
+use std::collections::HashMap;
+use std::io::IsTerminal as _;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::Result;
+use bytes::Bytes;
+use clap::Args;
+use ros2probe::client::{Agent, ClientError, Target};
+use ros2probe::ros2::facts::Topic;
+use ros2probe_api::path::encoded;
+use ros2probe_daemon::subscriptions::line::{Line, MissedFacts, SampleFacts};
+use ros2probe_daemon::visible::{visible, visible_lines};
+use ros2probe_message::filter::{Filter, Subject};
+use ros2probe_message::yaml::Style;
+use ros2probe_message::{Library, Limits, MessageType, Shown, Sources, decode};
+
+use super::Said;
+use super::notes::Notes;
+
+/// What is wrong when a live agent ends its stream.
+pub(crate) const AGENT_ENDED: &str = "the agent has ended: `systemctl status ros2probe` shows why, `rp run` starts one in a terminal";
+/// How a replay ends.
+pub(crate) const END_OF_CAPTURE: &str = "end of capture";
+/// Writers whose types are remembered.
+const MAX_WRITERS: usize = 1024;
+
+/// How much of messages is printed, and where their definitions are.
+#[derive(Args, Clone, Debug)]
+pub(crate) struct Printing {
+    /// Print all fields of a message in one line, separated by commas
+    #[arg(long)]
+    pub(crate) csv: bool,
+    /// Print all elements of arrays and all of strings
+    #[arg(long, short = 'f')]
+    full_length: bool,
+    /// Print at most this many elements of arrays and characters of strings, then `...`
+    #[arg(long, short = 'l', value_name = "N", default_value_t = 128)]
+    truncate_length: usize,
+    /// Print only type and length of arrays
+    #[arg(long)]
+    no_arr: bool,
+    /// Print only the length of strings
+    #[arg(long)]
+    no_str: bool,
+    /// Print sequences in YAML flow style
+    #[arg(long)]
+    flow_style: bool,
+    /// Directory that has definitions as package/msg/Type.msg; may be repeated. Looked at before
+    /// an installed ROS and the definitions that come with rp
+    #[arg(long, value_name = "DIR")]
+    definitions: Vec<PathBuf>,
+}
+
+impl Printing {
+    pub(crate) fn shown(&self) -> Shown {
+        Shown {
+            truncate: (!self.full_length).then_some(self.truncate_length),
+            no_arrays: self.no_arr,
+            no_strings: self.no_str,
+        }
+    }
+
+    pub(crate) fn style(&self) -> Style {
+        if self.flow_style {
+            Style::Flow
+        } else {
+            Style::Block
+        }
+    }
+
+    pub(crate) fn library(&self, target: &Target) -> Library {
+        library(target, self.definitions.clone())
+    }
+}
+
+/// The definitions in these directories, of an installed ROS, and those that come with `rp`.
+pub(crate) fn library(target: &Target, directories: Vec<PathBuf>) -> Library {
+    let installed = std::env::var_os("AMENT_PREFIX_PATH");
+    Library::new(Sources::new(
+        directories,
+        installed.as_deref(),
+        target.dialect(),
+    ))
+}
+
+/// What comes by a stream.
+pub(crate) enum Came<'a> {
+    Message(&'a SampleFacts, Bytes),
+    Missed(&'a MissedFacts),
+    /// Everything up to here was told.
+    Clock,
+}
+
+/// What messages say, for stdout: as it is for programs, without control characters for a terminal,
+/// which they could command. YAML has none by itself.
+pub(crate) fn for_stdout(text: String) -> String {
+    if std::io::stdout().is_terminal() {
+        visible_lines(&text).into_owned()
+    } else {
+        text
+    }
+}
+
+/// How a stream went on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Went {
+    On,
+    /// Who reads it wants no more.
+    Enough,
+    /// The capture has ended.
+    ToTheEnd,
+    /// The rest of the capture cannot be read, which stderr says.
+    Cut,
+}
+
+/// The messages of topics: each thing that comes, and the time in nanoseconds, until `visit` has
+/// enough.
+pub(crate) fn follow(
+    agent: &Agent,
+    domain_id: u32,
+    topics: &[String],
+    notes: &mut Notes<'_>,
+    mut visit: impl FnMut(Came<'_>, i64) -> Result<Went>,
+) -> Result<Went> {
+    let names: Vec<String> = topics.iter().map(|name| encoded(name)).collect();
+    let names = names.join(",");
+    let path = format!("/samples?topic={names}&domain_id={domain_id}&payload=true");
+    let mut lines = agent.stream(&path)?;
+    let mut now = None;
+    while let Some(line) = lines.line()? {
+        let went = match serde_json::from_slice(&line)? {
+            Line::Open(_) => Went::On,
+            Line::Sample(sample) => {
+                let length = sample.payload_bytes.unwrap_or(0);
+                let payload = lines.bytes(usize::try_from(length)?)?;
+                now = now.max(Some(sample.time_ns));
+                notes.came(&sample.topic, sample.sampled);
+                visit(Came::Message(&sample, payload), sample.time_ns)?
+            }
+            Line::Clock(clock) => {
+                now = now.max(Some(clock.time_ns));
+                notes.now()?;
+                visit(Came::Clock, clock.time_ns)?
+            }
+            Line::Missed(missed) => {
+                notes.missed(&missed);
+                match now {
+                    Some(now) => visit(Came::Missed(&missed), now)?,
+                    None => Went::On,
+                }
+            }
+            Line::End(end) if end.reason == END_OF_CAPTURE => {
+                notes.end()?;
+                return Ok(Went::ToTheEnd);
+            }
+            Line::End(_) if agent.outcome().is_some() => {
+                notes.end()?;
+                return Ok(Went::Cut);
+            }
+            Line::End(_) => break,
+        };
+        if went != Went::On {
+            return Ok(went);
+        }
+    }
+    Err(Said(AGENT_ENDED.to_owned()).into())
+}
+
+/// What an agent knows of a topic.
+pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<Topic>> {
+    let path = encoded(name.strip_prefix('/').unwrap_or(name));
+    match agent.get(&format!("/topics/{path}?domain_id={domain_id}")) {
+        Ok(topic) => Ok(Some(topic)),
+        Err(error @ ClientError::Refused(_)) if error.is("no-such-topic") => Ok(None),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// Which definition each writer's messages are read by.
+pub(crate) struct Types {
+    library: Library,
+    writers: HashMap<String, Option<Arc<MessageType>>>,
+    /// A type without a definition is said once.
+    undefined: Vec<String>,
+}
+
+impl Types {
+    pub(crate) fn new(library: Library) -> Self {
+        Self {
+            library,
+            writers: HashMap::new(),
+            undefined: Vec::new(),
+        }
+    }
+
+    /// The definition of a type that was named, or that all of a topic's writers have.
+    pub(crate) fn find(&self, name: &str, hash: Option<&str>) -> Result<Arc<MessageType>> {
+        let found = self.library.find(name, hash);
+        found.map_err(|error| Said(whole(&error)).into())
+    }
+
+    /// The definition that a message was written by; `None` where there is none.
+    pub(crate) fn of(&mut self, sample: &SampleFacts) -> Option<Arc<MessageType>> {
+        if let Some(known) = self.writers.get(&sample.writer) {
+            return known.clone();
+        }
+        let offered = sample.offered.as_ref();
+        let hash = offered.and_then(|offered| offered.type_hash.as_deref());
+        let found = match self.library.find(&sample.message_type, hash) {
+            Ok(found) => Some(found),
+            Err(error) => {
+                let text = whole(&error);
+                if !self.undefined.contains(&text) && self.undefined.len() < MAX_WRITERS {
+                    eprintln!(
+                        "rp: {}",
+                        visible_lines(&format!("{}: {text}", sample.topic))
+                    );
+                    self.undefined.push(text);
+                }
+                None
+            }
+        };
+        if self.writers.len() < MAX_WRITERS {
+            self.writers.insert(sample.writer.clone(), found.clone());
+        }
+        found
+    }
+}
+
+/// Lets messages through for which an expression is true. What has no definition, or is none of its
+/// type, does not pass; stderr says so once.
+pub(crate) struct Sieve {
+    filter: Filter,
+    types: Types,
+    is_told: bool,
+}
+
+impl Sieve {
+    pub(crate) fn new(filter: &str, library: Library) -> Result<Self> {
+        let filter = Filter::parse(filter).map_err(|error| Said(error.to_string()))?;
+        let types = Types::new(library);
+        Ok(Self {
+            filter,
+            types,
+            is_told: false,
+        })
+    }
+
+    pub(crate) fn passes(&mut self, sample: &SampleFacts, payload: &[u8]) -> Result<bool> {
+        let Some(message_type) = self.types.of(sample) else {
+            return Ok(false);
+        };
+        match decode(&message_type, payload, &Limits::default()) {
+            Ok(decoded) => {
+                let passes = self.filter.passes(Subject::Message(&decoded.message));
+                passes.map_err(|error| Said(error.to_string()).into())
+            }
+            Err(error) => {
+                if !std::mem::replace(&mut self.is_told, true) {
+                    let SampleFacts { topic, writer, .. } = sample;
+                    eprintln!(
+                        "rp: {}",
+                        visible(&format!("{topic} of writer {writer}: {error}"))
+                    );
+                }
+                Ok(false)
+            }
+        }
+    }
+}
+
+/// An error with its causes in one line.
+fn whole(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(cause) = source {
+        text.push_str(": ");
+        text.push_str(&cause.to_string());
+        source = cause.source();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_daemon::visible::visible_lines;
+
+    #[test]
+    fn no_message_commands_a_terminal() {
+        let text = "a\tb\u{1b}[2J\u{9b}1m\u{7}\n\u{e9}";
+        assert_eq!(visible_lines(text), "a\tb\\u{1b}[2J\\u{9b}1m\\u{7}\n\u{e9}");
+    }
+}

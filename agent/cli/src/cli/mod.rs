@@ -1,0 +1,167 @@
+//! The command line: a module for each noun, and what all verbs share. A verb asks an agent, has
+//! the answer put into words, and prints; it decides nothing else.
+
+mod action;
+mod bag;
+mod convert;
+mod discover;
+mod doctor;
+mod echo;
+mod events;
+mod follow;
+mod interrupt;
+mod node;
+mod notes;
+mod output;
+mod page;
+mod rates;
+mod record;
+mod reference;
+mod run;
+mod service;
+mod shared;
+mod top;
+mod topic;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::{CommandFactory as _, Parser, Subcommand};
+use ros2probe_daemon::agent::DEFAULT_CONFIG;
+
+pub(crate) use discover::Discover;
+pub(crate) use output::{Output, Said, is_broken_pipe};
+pub(crate) use run::Run;
+
+/// Watches a ROS 2 robot from copies of its DDS traffic, without joining it.
+#[derive(Debug, Parser)]
+#[command(name = "rp", version, max_term_width = 100)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    pub(crate) command: Option<Command>,
+}
+
+#[derive(Debug, Subcommand)]
+#[expect(clippy::large_enum_variant, reason = "there is one")]
+pub(crate) enum Command {
+    /// Run the agent: observe this host or a capture, serve /metrics
+    Run(Run),
+    /// Check a configuration file and report every mistake
+    #[command(after_help = "Exit code: 0 when it is good, 78 when it is not.")]
+    CheckConfig {
+        /// The file
+        #[arg(default_value = DEFAULT_CONFIG)]
+        file: PathBuf,
+    },
+    /// Ask running participants to repeat their announcements: the only command that sends
+    Discover(Discover),
+    /// Print completions for a shell
+    Completions(reference::Completions),
+    /// Print or write man pages
+    Man(reference::Manual),
+    #[command(flatten)]
+    Ask(Question),
+}
+
+/// What an agent, or a capture, is asked.
+#[derive(Debug, Subcommand)]
+#[expect(clippy::large_enum_variant, reason = "there is one")]
+pub(crate) enum Question {
+    /// Recordings on disk, as `ros2 bag` makes and reads them
+    Bag(bag::Bag),
+    /// List, inspect and measure topics, as `ros2 topic` does
+    Topic(topic::Topic),
+    /// List and inspect nodes, as `ros2 node` does
+    Node(node::Node),
+    /// List and inspect services, as `ros2 service` does
+    Service(service::Service),
+    /// List and inspect actions, as `ros2 action` does
+    Action(action::Action),
+    /// Check what is visible on this host and what is not, with remedies
+    Doctor(doctor::Doctor),
+    /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
+    Top(top::Top),
+    /// Print the address of the page that shows the robot in a browser
+    Page(page::Page),
+}
+
+impl Question {
+    /// Asks, prints, and says with which code to end.
+    pub(crate) fn ask(self) -> Result<ExitCode> {
+        if let Some(code) = self.interrupted() {
+            interrupt::listen(code)?;
+        }
+        match self {
+            Self::Bag(bag) => bag.ask(),
+            Self::Topic(topic) => topic.ask(),
+            Self::Node(node) => node.ask(),
+            Self::Service(service) => service.ask(),
+            Self::Action(action) => action.ask(),
+            Self::Doctor(doctor) => doctor.ask(),
+            Self::Top(top) => top.ask(),
+            Self::Page(page) => page.ask(),
+        }
+    }
+
+    /// The exit code when Ctrl-C ends it at once; `None` for what wants to end by itself.
+    fn interrupted(&self) -> Option<u8> {
+        match self {
+            Self::Bag(bag) => bag.interrupted(),
+            Self::Topic(topic) => Some(topic.interrupted()),
+            Self::Node(_)
+            | Self::Service(_)
+            | Self::Action(_)
+            | Self::Doctor(_)
+            | Self::Page(_) => Some(interrupt::INTERRUPTED),
+            // Gives the terminal back first.
+            Self::Top(_) => None,
+        }
+    }
+}
+
+/// The help of a command that was given no verb, as the original prints it.
+pub(crate) fn help(names: &[&str]) -> Result<ExitCode> {
+    let mut command = Arguments::command();
+    command.build();
+    let named = names
+        .iter()
+        .try_fold(&command, |command, name| command.find_subcommand(name));
+    let text = named.cloned().unwrap_or(command).render_help().to_string();
+    Output::new().write(&text)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn every_option_of_the_original_is_accepted() {
+        let options = include_str!("../../tests/fixtures/cli/options.json");
+        let options: BTreeMap<String, Vec<String>> = serde_json::from_str(options).unwrap();
+        assert!(options.contains_key("topic list"));
+        let mut root = Arguments::command();
+        root.build();
+        for (verb, names) in options {
+            let mut words = verb.split(' ');
+            let found = words.try_fold(&root, |command, word| command.find_subcommand(word));
+            let command = found.unwrap_or_else(|| panic!("there is no `rp {verb}`"));
+            for name in names {
+                let is_called = |argument: &clap::Arg| match name.strip_prefix("--") {
+                    Some(long) => argument.get_long() == Some(long),
+                    None => argument.get_short() == name.chars().nth(1),
+                };
+                let is_there = command.get_arguments().any(is_called);
+                assert!(is_there, "`rp {verb}` has no {name}");
+            }
+        }
+    }
+}

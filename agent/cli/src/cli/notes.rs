@@ -1,0 +1,368 @@
+//! What stderr says beside a verb's output: which topics are sampled, what could not be captured, why
+//! nothing comes. Each at the moment it is known, and once; stdout stays the original's.
+
+use std::collections::{BTreeMap, HashSet};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use ros2probe::client::{Agent, ClientError};
+use ros2probe_api::path::encoded;
+use ros2probe_daemon::recording::{Graph, GraphTopic, SeenTopic, Strangers};
+use ros2probe_daemon::subscriptions::line::{MissedFacts, Reason};
+use ros2probe_daemon::visible::visible;
+use serde::Deserialize;
+
+use super::shared::names_of;
+
+/// After so long without a message the reason is asked for.
+pub(crate) const SILENT: Duration = Duration::from_secs(5);
+/// Missing messages of a topic are told at most this often.
+const PAUSE: Duration = Duration::from_secs(5);
+/// What being sampled means where messages are printed.
+pub(crate) const NOT_ALL_PRINTED: &str = "not every message is printed";
+/// Topics that are named in one line.
+const NAMES: usize = 8;
+/// What makes sampled topics exact.
+const SWITCH: &str = "`capture.shm.exact: auto` captures each message";
+
+/// Notes on the topics of one verb.
+pub(crate) struct Notes<'a> {
+    agent: &'a Agent,
+    domain_id: u32,
+    is_replay: bool,
+    /// Those that were named; none where all are wanted.
+    names: Vec<String>,
+    /// One of them is enough.
+    are_parts: bool,
+    /// What being sampled means here.
+    consequence: &'static str,
+    heard: HashSet<String>,
+    sampled: HashSet<String>,
+    begun: Instant,
+    is_explained: bool,
+}
+
+/// Messages that are missing and not reported yet: a process has one verb, which Ctrl-C may end.
+static MISSING: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
+
+/// Missing messages by topic and reason: how many are not reported yet, and the time of the last
+/// report.
+struct Missing(BTreeMap<(String, &'static str), (u64, Option<Instant>)>);
+
+/// Reports what is missing: the process ends.
+pub(crate) fn end() {
+    // The thread that holds it waits for stderr.
+    if let Ok(mut missing) = MISSING.try_lock() {
+        missing.report(true);
+    }
+}
+
+/// What an agent can see.
+#[derive(Deserialize)]
+struct Health {
+    abilities: Vec<Ability>,
+}
+
+#[derive(Deserialize)]
+struct Ability {
+    ability: String,
+    able: bool,
+}
+
+/// Why a topic is silent.
+#[derive(Deserialize)]
+struct Silence {
+    reasons: Vec<Cause>,
+}
+
+#[derive(Deserialize)]
+struct Cause {
+    code: String,
+    detail: String,
+}
+
+impl<'a> Notes<'a> {
+    /// Names the topics that are sampled. `names` are those that were named.
+    pub(crate) fn begin(
+        agent: &'a Agent,
+        domain_id: u32,
+        is_replay: bool,
+        names: &[String],
+        consequence: &'static str,
+    ) -> Self {
+        let mut notes = Self {
+            agent,
+            domain_id,
+            is_replay,
+            names: names.to_vec(),
+            are_parts: false,
+            consequence,
+            heard: HashSet::new(),
+            sampled: HashSet::new(),
+            begun: Instant::now(),
+            is_explained: false,
+        };
+        // A capture of the network has nothing of shared memory.
+        if !is_replay && samples_shared_memory(agent) {
+            let topics = notes.topics();
+            let topics = topics.iter().filter(|topic| is_sampled(topic));
+            let topics: Vec<String> = topics.map(|topic| topic.name.clone()).collect();
+            notes.say_sampled(&topics);
+        }
+        notes
+    }
+
+    /// The named topics are parts of one thing, of which not all need be there.
+    pub(crate) fn of_parts(self) -> Self {
+        Self {
+            are_parts: true,
+            ..self
+        }
+    }
+
+    /// Those that were said to be sampled.
+    pub(crate) fn sampled(&self) -> impl Iterator<Item = &str> {
+        self.sampled.iter().map(String::as_str)
+    }
+
+    /// A message came.
+    pub(crate) fn came(&mut self, topic: &str, sampled: bool) {
+        if sampled && !self.sampled.contains(topic) {
+            self.say_sampled(&[topic.to_owned()]);
+        }
+        if !self.heard.contains(topic) {
+            self.heard.insert(topic.to_owned());
+        }
+    }
+
+    /// Messages will not come.
+    pub(crate) fn missed(&mut self, missed: &MissedFacts) {
+        let why = match missed.reason {
+            Reason::QueueFull => "were dropped: too slow here",
+            Reason::NotCaptured => "could not be captured",
+            Reason::Unannounced => "were sent before their publisher was announced",
+            // The verb itself reports what its subscriber lost.
+            Reason::Incomplete | Reason::Lost => return,
+        };
+        let mut missing = Missing::all();
+        missing.add((missed.topic.clone(), why), missed.samples);
+        missing.report(false);
+    }
+
+    /// Time passes: says why nothing came, once.
+    pub(crate) fn now(&mut self) -> Result<()> {
+        Missing::all().report(false);
+        if self.is_replay || self.is_explained || self.begun.elapsed() < SILENT {
+            return Ok(());
+        }
+        self.explain()
+    }
+
+    /// Nothing more will come.
+    pub(crate) fn end(&mut self) -> Result<()> {
+        Missing::all().report(true);
+        if self.is_explained {
+            return Ok(());
+        }
+        self.explain()
+    }
+
+    fn explain(&mut self) -> Result<()> {
+        self.is_explained = true;
+        if self.are_parts && !self.heard.is_empty() {
+            return Ok(());
+        }
+        if self.names.is_empty() && self.heard.is_empty() {
+            names_of(self.agent, self.domain_id)?;
+        }
+        for name in &self.names {
+            if self.heard.contains(name) {
+                continue;
+            }
+            let path = path(name, self.domain_id);
+            match self.agent.get::<Silence>(&path) {
+                Ok(Silence { reasons }) => {
+                    let why = reasons.iter().find_map(|cause| self.words(cause));
+                    if let Some(why) = why {
+                        eprintln!("rp: no message on {}: {}", visible(name), visible(&why));
+                    }
+                }
+                Err(error @ ClientError::Refused(_)) if error.is("no-such-topic") => {
+                    let detail = error.to_string();
+                    eprintln!("rp: no message on {}: {}", visible(name), visible(&detail));
+                    names_of(self.agent, self.domain_id)?;
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(())
+    }
+
+    /// A reason and its remedy; `None` where a message may come at any time.
+    fn words(&self, cause: &Cause) -> Option<String> {
+        let text = match cause.code.as_str() {
+            "no_publisher" => "it has no publisher",
+            "no_subscriber" => {
+                "it has no subscriber, so its publishers send nothing; rp does not subscribe: start a \
+                 subscriber"
+            }
+            "encrypted" => "its publisher uses DDS security; its messages may be encrypted",
+            "watch_rejected" => "limits.topics topics are measured already: raise it",
+            "shared_memory" if self.is_replay => {
+                "publisher and subscriber use shared memory, which a capture of the network does not \
+                 hold: record on the robot with `rp bag record`"
+            }
+            "data_sharing" => {
+                "subscribers read the publisher's memory (data sharing), which cannot be observed: \
+                 turn data sharing off, or subscribe from another host"
+            }
+            "same_process" => {
+                "publisher and subscriber share one process; nothing crosses the network: subscribe \
+                 from another process"
+            }
+            "iceoryx" => {
+                "messages pass through iceoryx, which cannot be observed: turn shared memory off in \
+                 Cyclone DDS"
+            }
+            "shared_memory" => {
+                return Some(format!(
+                    "publisher and subscriber use shared memory, and none was seen there: {SWITCH}"
+                ));
+            }
+            "agent_not_ready" | "no_matched_subscriber" | "outside_view" => &cause.detail,
+            _ => return None,
+        };
+        Some(text.to_owned())
+    }
+
+    fn say_sampled(&mut self, topics: &[String]) {
+        let consequence = self.consequence;
+        if let Some(text) = sampled(topics, consequence) {
+            eprintln!("rp: {}", visible(&text));
+        }
+        self.sampled.extend(topics.iter().cloned());
+    }
+
+    /// The named topics, or all of the domain; none where the agent does not answer.
+    fn topics(&self) -> Vec<SeenTopic> {
+        let graph = match self.names.as_slice() {
+            [name] => {
+                let topic = self.agent.get::<GraphTopic>(&path(name, self.domain_id));
+                topic.map(Graph::from)
+            }
+            _ => {
+                let domain_id = self.domain_id;
+                let path = format!("/topics?domain_id={domain_id}&hidden=true");
+                self.agent.get(&path)
+            }
+        };
+        let mut topics = graph.unwrap_or_default().sight(Strangers::default()).topics;
+        topics.retain(|topic| self.names.is_empty() || self.names.contains(&topic.name));
+        topics
+    }
+}
+
+impl Missing {
+    fn all() -> MutexGuard<'static, Self> {
+        MISSING.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn add(&mut self, key: (String, &'static str), samples: u64) {
+        self.0.entry(key).or_insert((0, None)).0 += samples;
+    }
+
+    fn report(&mut self, at_end: bool) {
+        for line in self.due(at_end) {
+            eprintln!("rp: {line}");
+        }
+    }
+
+    fn due(&mut self, at_end: bool) -> Vec<String> {
+        let mut lines = Vec::new();
+        for ((topic, why), (count, reported)) in &mut self.0 {
+            let is_due = reported.is_none_or(|reported| reported.elapsed() >= PAUSE);
+            if *count == 0 || !is_due && !at_end {
+                continue;
+            }
+            let topic = visible(topic);
+            lines.push(match *count {
+                1 => format!("1 message on {topic} {}", why.replacen("were", "was", 1)),
+                count => format!("{count} messages on {topic} {why}"),
+            });
+            (*count, *reported) = (0, Some(Instant::now()));
+        }
+        lines
+    }
+}
+
+/// Whether the agent sees messages in shared memory, but not each of them.
+pub(crate) fn samples_shared_memory(agent: &Agent) -> bool {
+    let Ok(Health { abilities }) = agent.get("/health") else {
+        return false;
+    };
+    let able = |name: &str| {
+        abilities
+            .iter()
+            .any(|each| each.ability == name && each.able)
+    };
+    able("shared_memory") && !able("shared_memory_exact")
+}
+
+/// Whether all messages of a topic pass through shared memory.
+pub(crate) fn is_sampled(topic: &SeenTopic) -> bool {
+    topic.subscribed && topic.aside.as_deref() == Some("shared_memory")
+}
+
+/// That topics are sampled, what follows from it, and what helps.
+pub(crate) fn sampled(topics: &[String], consequence: &str) -> Option<String> {
+    let names = few(topics);
+    let verb = if topics.len() == 1 { "is" } else { "are" };
+    let text = format!("{names} {verb} sampled in shared memory; {consequence}; {SWITCH}");
+    (!topics.is_empty()).then_some(text)
+}
+
+fn few(names: &[String]) -> String {
+    let shown: Vec<&str> = names.iter().take(NAMES).map(String::as_str).collect();
+    let shown = shown.join(", ");
+    match names.len().saturating_sub(NAMES) {
+        0 => shown,
+        more => format!("{shown} and {more} more"),
+    }
+}
+
+fn path(name: &str, domain_id: u32) -> String {
+    let name = encoded(name.strip_prefix('/').unwrap_or(name));
+    format!("/topics/{name}?domain_id={domain_id}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_missing_since_the_last_report_is_reported_at_the_end() {
+        let mut missing = Missing(BTreeMap::new());
+        let mut miss = |samples| {
+            missing.add(("/t".to_owned(), "were dropped"), samples);
+            missing.due(false)
+        };
+        assert_eq!(miss(2), ["2 messages on /t were dropped"]);
+        assert!(miss(1).is_empty());
+        assert_eq!(missing.due(true), ["1 message on /t was dropped"]);
+        assert!(missing.due(true).is_empty());
+    }
+
+    #[test]
+    fn a_long_list_of_sampled_topics_is_one_line() {
+        let names: Vec<String> = (0..10).map(|number| format!("/t{number}")).collect();
+        let text = sampled(&names, "not every message is printed").unwrap();
+        assert!(text.starts_with("/t0, /t1, "), "{text}");
+        assert!(
+            text.contains("/t7 and 2 more are sampled in shared memory; not every"),
+            "{text}"
+        );
+        assert!(text.contains("capture.shm.exact"), "{text}");
+        assert_eq!(sampled(&[], ""), None);
+    }
+}

@@ -1,0 +1,308 @@
+//! `rp topic hz`, `bw` and `delay`: interest in topics for as long as the verb runs, and what comes
+//! of it put into words. How it is reported is decided elsewhere, by the stream's own clock.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use bytes::Bytes;
+use clap::Args;
+use clap::error::ErrorKind;
+use ros2probe::client::{Agent, Target};
+use ros2probe::ros2::name::full_name;
+use ros2probe::ros2::rates::{Arrival, End, Named, Origin, Quantity, Rates};
+use ros2probe::ros2::{Dialect, Refused};
+use ros2probe_api::path::encoded;
+use ros2probe_daemon::subscriptions::line::{Line, Reason};
+
+use super::follow::{AGENT_ENDED, END_OF_CAPTURE, Sieve, library};
+use super::interrupt::INTERRUPTED;
+use super::notes::Notes;
+use super::shared::{Matching, Spinning, names_of};
+use super::{Output, Said};
+
+/// Window of `hz` and `delay`.
+const LONG: usize = 10_000;
+/// Window of `bw`.
+const SHORT: usize = 100;
+/// `rp topic hz`.
+#[derive(Args, Debug)]
+pub(crate) struct Hz {
+    #[command(flatten)]
+    topics: Topics,
+    /// Calculate from so many of the newest intervals
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
+    window: usize,
+    /// Count only messages for which this expression over `m`, the message, is true: as for
+    /// `rp topic echo`
+    #[arg(long, value_name = "EXPR")]
+    filter: Option<String>,
+    /// Directory that has definitions as package/msg/Type.msg, for --filter; may be repeated
+    #[arg(long, value_name = "DIR")]
+    definitions: Vec<PathBuf>,
+    /// Accepted without effect: messages are always timed by the clock of the capture
+    #[arg(long)]
+    wall_time: bool,
+    #[command(flatten)]
+    options: Options,
+}
+
+/// `rp topic bw`.
+#[derive(Args, Debug)]
+pub(crate) struct Bandwidth {
+    #[command(flatten)]
+    topics: Topics,
+    /// Calculate from so many of the newest messages
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = SHORT, value_parser = positive)]
+    window: usize,
+    #[command(flatten)]
+    options: Options,
+}
+
+/// `rp topic delay`.
+#[derive(Args, Debug)]
+pub(crate) struct Delay {
+    #[command(flatten)]
+    topics: Topics,
+    /// Calculate from so many of the newest messages
+    #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
+    window: usize,
+    #[command(flatten)]
+    options: Options,
+}
+
+#[derive(Args, Debug)]
+struct Topics {
+    /// Topics to measure, as /chatter
+    #[arg(value_name = "TOPIC")]
+    names: Vec<String>,
+    /// Measure all topics, also those that appear later
+    #[arg(long, short = 'a')]
+    all: bool,
+}
+
+#[derive(Args, Debug)]
+struct Options {
+    #[command(flatten)]
+    spinning: Spinning,
+    #[command(flatten)]
+    matching: Matching,
+    #[command(flatten)]
+    target: Target,
+}
+
+impl Hz {
+    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+        let target = &self.options.target;
+        let library = || library(target, self.definitions);
+        let sieve = self.filter.map(|filter| Sieve::new(&filter, library()));
+        let sieve = sieve.transpose()?;
+        measure(
+            Quantity::Rate,
+            self.window,
+            self.topics,
+            target,
+            hidden,
+            sieve,
+        )
+    }
+
+    /// With which code Ctrl-C ends it.
+    pub(crate) fn interrupted(&self) -> u8 {
+        since(Dialect::Kilted, &self.options.target)
+    }
+}
+
+impl Bandwidth {
+    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+        measure(
+            Quantity::Bandwidth,
+            self.window,
+            self.topics,
+            &self.options.target,
+            hidden,
+            None,
+        )
+    }
+
+    /// With which code Ctrl-C ends it.
+    pub(crate) fn interrupted(&self) -> u8 {
+        since(Dialect::Rolling, &self.options.target)
+    }
+}
+
+impl Delay {
+    pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
+        measure(
+            Quantity::Delay,
+            self.window,
+            self.topics,
+            &self.options.target,
+            hidden,
+            None,
+        )
+    }
+}
+
+/// From this distribution on, Ctrl-C is how a measurement ends well.
+fn since(first: Dialect, target: &Target) -> u8 {
+    if target.dialect() < first {
+        INTERRUPTED
+    } else {
+        0
+    }
+}
+
+fn measure(
+    quantity: Quantity,
+    window: usize,
+    topics: Topics,
+    target: &Target,
+    hidden: bool,
+    mut sieve: Option<Sieve>,
+) -> Result<ExitCode> {
+    let dialect = target.dialect();
+    let domain_id = target.domain()?;
+    let mut names = Vec::new();
+    let (mut rates, query) = if topics.all {
+        if !topics.names.is_empty() {
+            return Err(Said("Cannot specify both --all/-a and topic names".to_owned()).into());
+        }
+        let query = format!("all=true&hidden={hidden}");
+        (Rates::of_all(quantity, dialect, window), query)
+    } else {
+        if topics.names.is_empty() {
+            return Err(unnamed(quantity, dialect));
+        }
+        let named = topics.names.into_iter().map(|typed| {
+            let name = full_name(&typed)?;
+            Ok(Named { typed, name })
+        });
+        let named: Vec<Named> = named.collect::<Result<_, Refused>>().map_err(said)?;
+        names = named.iter().map(|named| named.name.clone()).collect();
+        let query: Vec<String> = names.iter().map(|name| encoded(name)).collect();
+        let query = format!("topic={}", query.join(","));
+        (Rates::of(quantity, dialect, window, named), query)
+    };
+    let agent = Agent::reach_stream(target)?;
+    let is_replay = target.replay.is_some();
+    let mut notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
+    rates.said_sampled(notes.sampled());
+    let mut code = ExitCode::SUCCESS;
+    let payload = sieve.is_some();
+    let path = format!("/samples?{query}&domain_id={domain_id}&payload={payload}");
+    let mut lines = agent.stream(&path)?;
+    let mut output = Output::new();
+    while let Some(line) = lines.line()? {
+        let line: Line = serde_json::from_slice(&line)?;
+        let over = match line {
+            Line::Open(open) => {
+                let topics = open.topics.into_iter();
+                let present: Vec<_> = topics.map(|topic| (topic.topic, topic.types)).collect();
+                if present.is_empty() {
+                    names_of(&agent, domain_id)?;
+                }
+                rates.opened(&present)
+            }
+            Line::Sample(sample) => {
+                notes.came(&sample.topic, false);
+                let arrival = Arrival {
+                    time: sample.time_ns,
+                    size: sample.size,
+                    header_stamp: sample.header_stamp_ns,
+                };
+                let payload = match sample.payload_bytes {
+                    Some(length) => lines.bytes(usize::try_from(length)?)?,
+                    None => Bytes::new(),
+                };
+                let passes = match &mut sieve {
+                    Some(sieve) => sieve.passes(&sample, &payload)?,
+                    None => true,
+                };
+                let appeared = rates.appeared(&sample.topic, &[sample.message_type]);
+                appeared.and_then(|()| match passes {
+                    false => Ok(()),
+                    // Whether those that were not seen would pass is not known.
+                    true if sample.sampled && sieve.is_none() => {
+                        let origin = Origin {
+                            writer: &sample.writer,
+                            number: sample.sequence_number,
+                        };
+                        rates.sampled(&sample.topic, arrival, origin)
+                    }
+                    true => rates.arrived(&sample.topic, arrival),
+                })
+            }
+            Line::Clock(clock) => {
+                rates.clock(clock.time_ns);
+                notes.now()?;
+                Ok(())
+            }
+            Line::Missed(missed) => {
+                // Arrivals are counted without their bytes.
+                if matches!(missed.reason, Reason::QueueFull | Reason::Unannounced) {
+                    notes.missed(&missed);
+                }
+                Ok(())
+            }
+            Line::End(end) => {
+                rates.finish();
+                if end.reason == END_OF_CAPTURE {
+                    notes.end()?;
+                    Err(End::Idle)
+                } else if agent.outcome().is_some() {
+                    // The rest of the capture cannot be read, which stderr says.
+                    notes.end()?;
+                    code = ExitCode::FAILURE;
+                    Err(End::Idle)
+                } else {
+                    Err(End::Refused(Refused(format!("rp: {AGENT_ENDED}"))))
+                }
+            }
+        };
+        let text = rates.take();
+        if !text.out.is_empty() {
+            output.write(&text.out)?;
+        }
+        eprint!("{}", text.err);
+        match over {
+            Ok(()) => {}
+            Err(End::Idle) => break,
+            Err(End::Refused(refused)) => return Err(said(refused)),
+        }
+    }
+    Ok(code)
+}
+
+/// What being sampled means for this quantity.
+const fn sampled(quantity: Quantity) -> &'static str {
+    match quantity {
+        Quantity::Rate | Quantity::Bandwidth => {
+            "unseen messages are counted from sequence numbers and their times estimated"
+        }
+        Quantity::Delay => "unseen messages have no delay",
+    }
+}
+
+fn said(refused: Refused) -> anyhow::Error {
+    Said(refused.0).into()
+}
+
+/// What the original says when it is given no topic: a usage error as long as it took one alone.
+fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
+    let several = match quantity {
+        Quantity::Rate => dialect >= Dialect::Kilted,
+        Quantity::Bandwidth => dialect >= Dialect::Rolling,
+        Quantity::Delay => false,
+    };
+    let text = "Either specify topic names or use --all/-a option";
+    if several {
+        return Said(text.to_owned()).into();
+    }
+    clap::Error::raw(ErrorKind::MissingRequiredArgument, format!("{text}\n")).exit()
+}
+
+fn positive(text: &str) -> Result<usize, String> {
+    let value = text.parse().ok().filter(|value| *value > 0);
+    value.ok_or_else(|| "value must be a positive integer".to_owned())
+}

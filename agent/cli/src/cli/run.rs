@@ -1,0 +1,107 @@
+//! `rp run`: the agent's options.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use ros2probe_capture::pcap::Speed;
+use ros2probe_daemon::agent::{Listen, Options};
+use ros2probe_daemon::config::{Access, Watch};
+
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Signals: SIGHUP reads the configuration again, SIGTERM and SIGINT end the agent.
+Exit codes: 0 ended on request, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
+RUST_LOG, read at the start, overrides the configured log level.
+
+Examples:
+  sudo rp run                                     observe this host
+  rp run --replay robot.pcap.gz --report          print the capture's metrics to stdout
+  rp run --replay robot.pcap --watch '/camera/**' --metrics 127.0.0.1:9400")]
+pub(crate) struct Run {
+    /// Configuration file; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Observe a capture (pcap or pcapng, may be gzipped) instead of this host; needs no privilege
+    #[arg(long, value_name = "FILE")]
+    pub(crate) replay: Option<PathBuf>,
+    /// How fast to replay: a factor, or `max` [default: 1, with --report max]
+    #[arg(long, value_name = "N|max", requires = "replay")]
+    pub(crate) speed: Option<Speed>,
+    /// At the end of the capture, print the metrics on stdout and exit
+    #[arg(long, requires = "replay")]
+    pub(crate) report: bool,
+    /// Also measure this topic or glob, as /points or '/camera/**'; may be repeated
+    #[arg(long, value_name = "GLOB", value_parser = watch)]
+    pub(crate) watch: Vec<Watch>,
+    /// Address and port of the metrics listener, or `off`, instead of the configured one
+    #[arg(long, value_name = "ADDR|off", value_parser = listen)]
+    pub(crate) metrics: Option<Listen>,
+    /// Address and port of the control API, or `off` (also for its unix socket), instead of the
+    /// configured one
+    #[arg(long, value_name = "ADDR|off", value_parser = listen)]
+    pub(crate) api: Option<Listen>,
+    /// What loopback clients of the control API may do without a token, instead of the configured
+    /// level
+    #[arg(
+        long,
+        value_name = "LEVEL",
+        value_parser = access(),
+        overrides_with = "api_loopback"
+    )]
+    pub(crate) api_loopback: Option<Access>,
+}
+
+impl From<Run> for Options {
+    fn from(run: Run) -> Self {
+        Self {
+            config: run.config,
+            replay: run.replay,
+            speed: run.speed,
+            report: run.report,
+            watch: run.watch,
+            metrics: run.metrics,
+            api: run.api,
+            api_loopback: run.api_loopback,
+        }
+    }
+}
+
+/// Reads the value of `--api-loopback`.
+fn access() -> impl TypedValueParser<Value = Access> {
+    let levels = [
+        (
+            Access::Read,
+            "Graph, figures, events, and which topics are watched",
+        ),
+        (
+            Access::Watch,
+            "Also add and remove watches, and follow messages without their bytes",
+        ),
+        (
+            Access::All,
+            "Also message payloads, recordings, snapshots and reloads",
+        ),
+    ];
+    let values = levels.map(|(access, help)| PossibleValue::new(access.name()).help(help));
+    PossibleValuesParser::new(values).try_map(move |name| {
+        let mut levels = levels.into_iter().map(|(access, _)| access);
+        levels
+            .find(|access| access.name() == name)
+            .ok_or("no level that is known")
+    })
+}
+
+fn watch(pattern: &str) -> Result<Watch, String> {
+    Watch::named(pattern).map_err(|error| format!("the topic {error}"))
+}
+
+fn listen(address: &str) -> Result<Listen, String> {
+    if address == "off" {
+        return Ok(Listen(None));
+    }
+    let address = address.parse();
+    address
+        .map(|address| Listen(Some(address)))
+        .map_err(|_| "must be an IP address and port, as 127.0.0.1:17400, or `off`".to_owned())
+}

@@ -1,0 +1,186 @@
+//! What the verbs of the graph share: options that the original has and that change nothing here,
+//! and asking for names and for one thing by its name.
+
+use std::process::ExitCode;
+use std::sync::Once;
+
+use anyhow::Result;
+use clap::Args;
+use ros2probe::client::{Agent, ClientError, Target};
+use ros2probe::ros2::Refused;
+use ros2probe::ros2::facts::{Names, Node, Topic};
+use ros2probe_api::path::encoded;
+use serde::de::DeserializeOwned;
+
+use super::{Output, Said};
+
+/// Options that concern the original's own node; accepted, so that scripts go on working.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct Spinning {
+    /// Accepted without effect: nothing has to be waited for
+    #[arg(long, value_name = "SPIN_TIME")]
+    spin_time: Option<f64>,
+    /// Accepted without effect
+    #[arg(long, short = 's')]
+    use_sim_time: bool,
+    /// Accepted without effect: rp uses no daemon
+    #[arg(long)]
+    no_daemon: bool,
+}
+
+/// Quality of service of the original's own subscription; accepted, so that scripts go on working.
+#[derive(Args, Clone, Debug, Default)]
+pub(crate) struct Matching {
+    /// Accepted without effect, as all QoS options: rp does not subscribe
+    #[arg(long, value_name = "PROFILE")]
+    qos_profile: Option<String>,
+    #[arg(long, value_name = "N", hide = true)]
+    qos_depth: Option<String>,
+    #[arg(long, value_name = "HISTORY", hide = true)]
+    qos_history: Option<String>,
+    #[arg(long, value_name = "RELIABILITY", hide = true)]
+    qos_reliability: Option<String>,
+    #[arg(long, value_name = "DURABILITY", hide = true)]
+    qos_durability: Option<String>,
+    #[arg(long, value_name = "LIVELINESS", hide = true)]
+    qos_liveliness: Option<String>,
+    #[arg(long, value_name = "SECONDS", hide = true)]
+    qos_liveliness_lease_duration_seconds: Option<String>,
+}
+
+impl Matching {
+    /// Any was given that keeps the original from looking at what publishers offer.
+    pub(crate) fn any(&self) -> bool {
+        let given = [
+            &self.qos_depth,
+            &self.qos_history,
+            &self.qos_reliability,
+            &self.qos_durability,
+            &self.qos_liveliness,
+            &self.qos_liveliness_lease_duration_seconds,
+        ];
+        given.into_iter().any(Option::is_some)
+    }
+}
+
+/// One domain of an agent.
+#[derive(Debug)]
+pub(crate) struct Graph {
+    agent: Agent,
+    domain_id: u32,
+}
+
+impl Graph {
+    pub(crate) fn reach(target: &Target) -> Result<Self> {
+        let domain_id = target.domain()?;
+        let agent = Agent::reach(target)?;
+        Ok(Self { agent, domain_id })
+    }
+
+    /// All names, as [`names_of`] has them.
+    pub(crate) fn names(&self) -> Result<Names> {
+        names_of(&self.agent, self.domain_id)
+    }
+
+    /// The topic of this name, if there is one.
+    pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic>> {
+        self.thing("topics", name, "no-such-topic")
+    }
+
+    /// The node of this name, if there is one, with all that is hidden.
+    pub(crate) fn node(&self, name: &str) -> Result<Option<Node>> {
+        self.thing("nodes", name, "no-such-node")
+    }
+
+    fn thing<T: DeserializeOwned>(&self, noun: &str, name: &str, code: &str) -> Result<Option<T>> {
+        let Some(name) = name.strip_prefix('/').filter(|name| !name.is_empty()) else {
+            return Ok(None);
+        };
+        let hidden = if noun == "nodes" { "&hidden=true" } else { "" };
+        let (name, domain_id) = (encoded(name), self.domain_id);
+        let path = format!("/{noun}/{name}?domain_id={domain_id}{hidden}");
+        match self.agent.get(&path) {
+            Ok(found) => Ok(Some(found)),
+            Err(error @ ClientError::Refused(_)) if error.is(code) => Ok(None),
+            Err(error) => Err(error.into()),
+        }
+    }
+}
+
+/// Whether stderr says already why names are lacking.
+static EXPLAINED: Once = Once::new();
+
+/// All names in a domain, also hidden ones. Why they are lacking, stderr says once.
+pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
+    let names: Names = agent.get(&format!("/names?domain_id={domain_id}&hidden=true"))?;
+    let others = names.domains.iter().filter(|other| **other != domain_id);
+    let others: Vec<String> = others.map(u32::to_string).collect();
+    if names.is_empty() && !others.is_empty() {
+        eprintln!(
+            "rp: domain {domain_id} is empty; the agent sees domain {}: pass `--domain N`",
+            others.join(", ")
+        );
+    }
+    if let Some(text) = late(&names, agent.is_replay()) {
+        EXPLAINED.call_once(|| eprintln!("rp: {text}"));
+    }
+    Ok(names)
+}
+
+/// What was announced before the agent, or the capture, began, or not at all: endpoints are announced
+/// once, and to other participants.
+fn late(names: &Names, is_replay: bool) -> Option<String> {
+    let Names {
+        participants,
+        unknown_writers,
+        ..
+    } = names;
+    let what = match (names.topics.is_empty(), unknown_writers) {
+        (true, _) if *participants == 1 => {
+            let what =
+                "1 participant is known, but none of its topics: a participant that is alone";
+            return Some(if is_replay {
+                format!("{what} announces none")
+            } else {
+                format!(
+                    "{what} announces them when a second one starts; `rp discover --all` asks for \
+                     them"
+                )
+            });
+        }
+        (true, _) if *participants > 1 => {
+            format!("{participants} participants are known, but none of their topics")
+        }
+        (_, 0) => return None,
+        (_, 1) => {
+            "1 writer is active whose announcement was missed; its topic is unknown".to_owned()
+        }
+        (_, many) => format!(
+            "{many} writers are active whose announcement was missed; their topics are unknown"
+        ),
+    };
+    Some(if is_replay {
+        format!("{what}: the capture does not hold their announcements")
+    } else {
+        format!("{what}: the agent started after them; `rp discover` has them announced again")
+    })
+}
+
+/// Prints what there is to say.
+pub(crate) fn say(text: &str) -> Result<ExitCode> {
+    Output::new().write(text)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// As [`say`]; a refusal goes to stderr.
+pub(crate) fn answer(text: Result<String, Refused>) -> Result<ExitCode> {
+    say(&text.map_err(|refused| Said(refused.0))?)
+}
+
+/// As [`say`]; where there is nothing, the exit code says so alone.
+pub(crate) fn say_or_fail(text: Option<&str>) -> Result<ExitCode> {
+    match text {
+        Some(text) => say(text),
+        None => Ok(ExitCode::FAILURE),
+    }
+}

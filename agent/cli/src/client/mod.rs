@@ -1,0 +1,295 @@
+//! The connection to an agent, with a blocking face: on this host by its unix socket or loopback
+//! address, on another robot by `--host` and a token. A capture is replayed into an agent within
+//! this process, which is asked the same way.
+//!
+//! It asks and decodes; what answers mean is said elsewhere. It never reads a clock for what it
+//! shows, and keeps nothing between requests.
+
+mod error;
+mod lines;
+mod replayed;
+mod samples;
+mod target;
+mod way;
+
+use std::time::Duration;
+
+use bytes::{Bytes, BytesMut};
+use http_body_util::{BodyExt as _, Full, Limited};
+use hyper::body::Incoming;
+use hyper::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
+use hyper::{Method, Request, Response, StatusCode};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use tokio::runtime::Runtime;
+use tokio::time::timeout;
+
+pub use error::{ClientError, Refusal};
+pub use lines::{Lines, Next};
+pub use replayed::Outcome;
+use replayed::Stop;
+use ros2probe_capture::pcap::Speed;
+pub use samples::Samples;
+pub use target::{Target, Unfit};
+use way::Way;
+
+/// The longest wait for a whole answer: graphs of thousands of topics come within a second.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// The longest silence of an agent: before its answer, within it, and in a stream of messages, which
+/// has a clock.
+const SILENCE: Duration = Duration::from_secs(5);
+/// The longest silence in a stream of events, which has a beat every 15 s.
+const BEATS: Duration = Duration::from_secs(40);
+/// More than any answer has; a stream is not bounded by it.
+const MAX_ANSWER: usize = 256 << 20;
+
+/// An agent that can be asked.
+pub struct Agent {
+    runtime: Runtime,
+    way: Way,
+    token: Option<String>,
+}
+
+impl Agent {
+    /// Finds the agent that `target` means. A capture is replayed to its end, or to `--until`:
+    /// what it is asked for is how things stand then.
+    ///
+    /// # Errors
+    /// There is none, its token cannot be read, or the capture cannot.
+    pub fn reach(target: &Target) -> Result<Self, ClientError> {
+        Self::find(target, Stop::AtEnd)
+    }
+
+    /// As [`Self::reach`], but a capture is replayed only to `--from`, else not at all, and goes on
+    /// with the first [`Self::stream`].
+    ///
+    /// # Errors
+    /// As [`Self::reach`].
+    pub fn reach_stream(target: &Target) -> Result<Self, ClientError> {
+        Self::find(target, Stop::AtBeginning)
+    }
+
+    /// As [`Self::reach`], but all topics of a capture are measured, and it goes on at `speed`, where
+    /// one is given, while it is asked.
+    ///
+    /// # Errors
+    /// As [`Self::reach`].
+    pub fn reach_measured(target: &Target, speed: Option<Speed>) -> Result<Self, ClientError> {
+        Self::find(target, speed.map_or(Stop::AtEndMeasured, Stop::Never))
+    }
+
+    /// As [`Self::reach_stream`], but all topics of a capture are measured.
+    ///
+    /// # Errors
+    /// As [`Self::reach`].
+    pub fn reach_stream_measured(target: &Target) -> Result<Self, ClientError> {
+        Self::find(target, Stop::AtBeginningMeasured)
+    }
+
+    fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .map_err(|source| ClientError::Runtime { source })?;
+        let token = target.token()?;
+        let way = runtime.block_on(Way::find(target, stop))?;
+        Ok(Self {
+            runtime,
+            way,
+            token,
+        })
+    }
+
+    /// What is at `path`, which may have a query; names in it go through [`ros2probe_api::path::encoded`].
+    ///
+    /// # Errors
+    /// The agent is gone, refuses, or answers something else.
+    pub fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        self.exchange(Method::GET, path, None, PATIENCE)
+    }
+
+    /// As [`Self::get`], with an answer within `patience`.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn get_within<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        patience: Duration,
+    ) -> Result<T, ClientError> {
+        self.exchange(Method::GET, path, None, patience)
+    }
+
+    /// Sends `body`.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn post<B: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
+        self.exchange(Method::POST, path, Some(json(body)), PATIENCE)
+    }
+
+    /// Puts `body` there.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn put<B: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
+        self.exchange(Method::PUT, path, Some(json(body)), PATIENCE)
+    }
+
+    /// Removes what is there.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn delete(&self, path: &str) -> Result<(), ClientError> {
+        self.runtime.block_on(async {
+            let answer = self.send(Method::DELETE, path, None).await?;
+            self.whole(path, answer).await.map(drop)
+        })
+    }
+
+    /// Lines that go on coming, perhaps with raw bytes between them, until this end or the other
+    /// one hangs up.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn stream(&self, path: &str) -> Result<Lines<'_>, ClientError> {
+        self.runtime.block_on(async {
+            let answer = self.send(Method::GET, path, None).await?;
+            if answer.status().is_success() {
+                self.way.go_on();
+                let silence = if path.starts_with("/events") {
+                    BEATS
+                } else {
+                    SILENCE
+                };
+                // A replay within this process has the pace of its capture.
+                let silence = (!self.way.is_replayed()).then_some(silence);
+                Ok(Lines::new(self, answer.into_body(), silence))
+            } else {
+                let refused = self.whole(path, answer).await;
+                Err(refused.err().unwrap_or_else(|| self.way.not_an_agent()))
+            }
+        })
+    }
+
+    /// A line or an answer, read.
+    fn decoded<T: DeserializeOwned>(&self, path: &str, text: &[u8]) -> Result<T, ClientError> {
+        serde_json::from_slice(text).map_err(|source| self.way.unreadable(path, source))
+    }
+
+    /// It ended before it said anything.
+    fn hung_up(&self, path: &str) -> ClientError {
+        self.way
+            .broke(format!("{path} ended before its first byte"))
+    }
+
+    /// It is a capture that is asked.
+    #[must_use]
+    pub const fn is_replay(&self) -> bool {
+        matches!(self.way, Way::Replayed(_))
+    }
+
+    /// How the replay of a capture ended; `None` for a live agent, and while it goes on.
+    #[must_use]
+    pub fn outcome(&self) -> Option<Outcome> {
+        self.way.outcome()
+    }
+
+    /// Where it is, for people.
+    #[must_use]
+    pub fn place(&self) -> String {
+        self.way.to_string()
+    }
+
+    fn exchange<T: DeserializeOwned>(
+        &self,
+        method: Method,
+        path: &str,
+        body: Option<Bytes>,
+        patience: Duration,
+    ) -> Result<T, ClientError> {
+        let answer = self.runtime.block_on(async {
+            let exchange = async {
+                let answer = self.send(method, path, body).await?;
+                self.whole(path, answer).await
+            };
+            let answer = timeout(patience, exchange).await;
+            answer.unwrap_or_else(|_| Err(self.way.slow()))
+        })?;
+        self.decoded(path, &answer)
+    }
+
+    async fn send(
+        &self,
+        method: Method,
+        path: &str,
+        body: Option<Bytes>,
+    ) -> Result<Response<Incoming>, ClientError> {
+        let mut request = Request::builder()
+            .method(method)
+            .uri(path)
+            .header(HOST, self.way.host())
+            .header(ACCEPT, "*/*");
+        if let Some(token) = &self.token {
+            request = request.header(AUTHORIZATION, format!("Bearer {token}"));
+        }
+        if body.is_some() {
+            request = request.header(CONTENT_TYPE, "application/json");
+        }
+        let request = request.body(Full::new(body.unwrap_or_default()));
+        let request = request.map_err(|_| ClientError::Path {
+            path: path.to_owned(),
+        })?;
+        if self.way.is_replayed() {
+            return self.way.send(request).await;
+        }
+        let answer = timeout(SILENCE, self.way.send(request)).await;
+        answer.unwrap_or_else(|_| Err(self.way.slow()))
+    }
+
+    /// The whole body of an answer that is no refusal.
+    async fn whole(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
+        let status = answer.status();
+        let mut body = Limited::new(answer.into_body(), MAX_ANSWER);
+        let mut whole = BytesMut::new();
+        loop {
+            let frame = timeout(SILENCE, body.frame()).await;
+            let Some(frame) = frame.map_err(|_| self.way.slow())? else {
+                break;
+            };
+            let frame = frame.map_err(|source| self.way.broke(source))?;
+            whole.extend_from_slice(&frame.into_data().unwrap_or_default());
+        }
+        let body = whole.freeze();
+        if status.is_success() {
+            return Ok(body);
+        }
+        let Some(refusal) = Refusal::read(status.as_u16(), &body) else {
+            return Err(self.way.not_an_agent());
+        };
+        Err(match (status, refusal.code.as_str()) {
+            (StatusCode::UNAUTHORIZED, _) => self.way.unauthorized(self.token.is_some()),
+            (_, "not-found") => self.way.older(path),
+            _ => ClientError::Refused(refusal),
+        })
+    }
+}
+
+impl std::fmt::Debug for Agent {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Agent({})", self.way)
+    }
+}
+
+/// What has no JSON form would be refused by the agent as an empty body.
+fn json<B: Serialize>(body: &B) -> Bytes {
+    serde_json::to_vec(body).unwrap_or_default().into()
+}

@@ -1,0 +1,205 @@
+//! The messages of an agent's stream, with their bytes, as a subscription within the agent would
+//! give them.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+use super::{Agent, ClientError, Lines, Next};
+use ros2probe_daemon::subscriptions::line::{Line, OfferedFacts, Open, Reason, SampleFacts};
+use ros2probe_daemon::subscriptions::{Got, Item, Missed, MissedReason, Topic};
+use ros2probe_model::discovery::hexadecimal;
+use ros2probe_model::payloads::Sample;
+
+const SECOND: i64 = 1_000_000_000;
+/// Writers that are remembered; of further ones each message makes its own description.
+const WRITERS: usize = 65_536;
+
+/// What an agent gives of topics, until it is dropped.
+#[derive(Debug)]
+pub struct Samples<'a> {
+    lines: Lines<'a>,
+    topics: HashMap<(u32, String), Arc<Topic>>,
+    /// By writer, with what it announced.
+    writers: HashMap<String, Arc<Topic>>,
+    open: Open,
+}
+
+impl<'a> Samples<'a> {
+    /// Opens the stream that `query` asks for, as `/samples` documents it, with payloads. When this
+    /// returns, the agent knows what is wanted.
+    ///
+    /// # Errors
+    /// The agent is gone, refuses, or says something else.
+    pub fn open(agent: &'a Agent, query: &str) -> Result<Self, ClientError> {
+        let path = format!("/samples?payload=true&{query}");
+        let mut lines = agent.stream(&path)?;
+        let open = loop {
+            match lines.line()? {
+                None => return Err(agent.hung_up(&path)),
+                Some(line) => {
+                    if let Line::Open(open) = agent.decoded(&path, &line)? {
+                        break open;
+                    }
+                }
+            }
+        };
+        Ok(Self {
+            lines,
+            topics: HashMap::new(),
+            writers: HashMap::new(),
+            open,
+        })
+    }
+
+    /// What was there when it began.
+    #[must_use]
+    pub const fn opened(&self) -> &Open {
+        &self.open
+    }
+
+    /// What comes next.
+    ///
+    /// # Errors
+    /// The connection broke, or what comes cannot be read.
+    pub fn next_within(&mut self, patience: Duration) -> Result<Got, ClientError> {
+        let agent = self.lines.agent();
+        let line = match self.lines.line_within(patience)? {
+            Next::Line(line) => agent.decoded("/samples", &line)?,
+            Next::Nothing => return Ok(Got::Nothing),
+            Next::End => return Ok(Got::Gone),
+        };
+        Ok(match line {
+            Line::Open(_) => Got::Nothing,
+            Line::Clock(clock) => Got::Item(Item::Clock(time(clock.time_ns))),
+            Line::End(_) => Got::Item(Item::End("the agent's stream ended")),
+            Line::Sample(facts) => {
+                let count = facts.payload_bytes.unwrap_or(0);
+                let count = usize::try_from(count).unwrap_or(usize::MAX);
+                let payload = self.lines.bytes(count)?;
+                let topic = self.writers_topic(&facts);
+                Got::Item(Item::Sample(Arc::new(sample(topic, &facts, payload))))
+            }
+            Line::Missed(facts) => {
+                let topic = self.topic(facts.domain_id, &facts.topic, None, None);
+                Got::Item(Item::Missed(Missed {
+                    topic,
+                    writer: guid(&facts.writer),
+                    first: facts.first_sequence_number,
+                    last: facts.last_sequence_number,
+                    samples: facts.samples,
+                    reason: match facts.reason {
+                        Reason::Incomplete => MissedReason::Incomplete,
+                        Reason::Lost => MissedReason::Lost,
+                        Reason::Unannounced => MissedReason::Unannounced,
+                        Reason::NotCaptured => MissedReason::NotCaptured,
+                        Reason::QueueFull => MissedReason::QueueFull,
+                    },
+                }))
+            }
+        })
+    }
+
+    fn writers_topic(&mut self, facts: &SampleFacts) -> Arc<Topic> {
+        let known = self.writers.get(&facts.writer);
+        if let Some(known) = known.filter(|_| facts.offered.is_none()) {
+            return Arc::clone(known);
+        }
+        let message_type = Some(facts.message_type.as_str());
+        let offered = facts.offered.as_deref();
+        let topic = self.topic(facts.domain_id, &facts.topic, message_type, offered);
+        if self.writers.len() < WRITERS {
+            self.writers
+                .insert(facts.writer.clone(), Arc::clone(&topic));
+        }
+        topic
+    }
+
+    /// Without a type it is the one known from before.
+    fn topic(
+        &mut self,
+        domain_id: u32,
+        name: &str,
+        message_type: Option<&str>,
+        offered: Option<&OfferedFacts>,
+    ) -> Arc<Topic> {
+        let key = (domain_id, name.to_owned());
+        let known = self.topics.get(&key);
+        let same = |known: &&Arc<Topic>| {
+            offered.is_none() && message_type.is_none_or(|it| it == &*known.message_type)
+        };
+        if let Some(known) = known.filter(same) {
+            return Arc::clone(known);
+        }
+        let opened = || {
+            let mut topics = self.open.topics.iter();
+            let topic = topics.find(|topic| topic.domain_id == domain_id && topic.topic == name)?;
+            topic.types.first().map(String::as_str)
+        };
+        let message_type = message_type.or_else(opened).unwrap_or_default();
+        let topic = Arc::new(Topic {
+            domain_id,
+            name: name.into(),
+            dds_name: format!("rt{name}").into(),
+            message_type: message_type.into(),
+            offered: offered.map(|offered| Arc::new(offered.offered())),
+        });
+        self.topics.insert(key, Arc::clone(&topic));
+        topic
+    }
+}
+
+fn sample(topic: Arc<Topic>, facts: &SampleFacts, payload: bytes::Bytes) -> Sample {
+    Sample {
+        topic,
+        time: time(facts.time_ns),
+        writer: guid(&facts.writer),
+        sequence_number: facts.sequence_number,
+        source_timestamp: facts.source_timestamp_ns.map(time),
+        header_stamp: facts.header_stamp_ns.and_then(stamp),
+        size: facts.size,
+        sampled: facts.sampled,
+        payload: Some(payload),
+    }
+}
+
+fn time(nanoseconds: i64) -> Timestamp {
+    Timestamp(u64::try_from(nanoseconds).unwrap_or(0))
+}
+
+fn stamp(nanoseconds: i64) -> Option<(i32, u32)> {
+    let seconds = i32::try_from(nanoseconds.div_euclid(SECOND)).ok()?;
+    let rest = u32::try_from(nanoseconds.rem_euclid(SECOND)).ok()?;
+    Some((seconds, rest))
+}
+
+/// Unknown where it is written in some other way.
+fn guid(text: &str) -> Guid {
+    let parts = text.split_once('.').and_then(|(prefix, entity)| {
+        Some(Guid {
+            prefix: GuidPrefix(hexadecimal(prefix)?),
+            entity: EntityId(hexadecimal(entity)?),
+        })
+    });
+    parts.unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn writers_and_stamps_are_read_as_they_are_written() {
+        let writer = Guid {
+            prefix: GuidPrefix([1, 0x0f, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]),
+            entity: EntityId([0, 0, 0x12, 3]),
+        };
+        assert_eq!(guid(&writer.to_string()), writer);
+        assert_eq!(guid("hello"), Guid::default());
+        assert_eq!(stamp(1_500_000_000), Some((1, 500_000_000)));
+        assert_eq!(stamp(-1), Some((-1, 999_999_999)));
+        assert_eq!(stamp(i64::MAX), None);
+    }
+}

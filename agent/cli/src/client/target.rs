@@ -1,0 +1,103 @@
+//! Which agent a command is for, and what it is asked about: the options that all verbs share.
+
+use std::io;
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::ClientError;
+use crate::ros2::{Dialect, dialect};
+use ros2probe_daemon::run::Moment;
+
+/// Highest domain there is.
+const MAX_DOMAIN: u32 = 232;
+/// A longer file is no token.
+const MAX_TOKEN: u64 = 4096;
+
+/// Which agent, which domain, which `ros2`. To be flattened last, for its heading.
+#[derive(Args, Clone, Debug, Default)]
+#[command(next_help_heading = "Which agent")]
+pub struct Target {
+    /// The agent on another host; its port is 17401 when left out
+    #[arg(long, value_name = "HOST[:PORT]", conflicts_with = "socket")]
+    pub host: Option<String>,
+    /// File that holds the agent's token [default: $ROS2PROBE_TOKEN_FILE]
+    #[arg(long, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
+    /// The agent behind this unix socket [default: /run/ros2probe/api.sock, then loopback]
+    #[arg(long, value_name = "PATH")]
+    pub socket: Option<PathBuf>,
+    /// Ask a capture (pcap or pcapng, may be gzipped) instead of an agent
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["host", "socket"])]
+    pub replay: Option<PathBuf>,
+    /// Messages from this time of the capture on: Unix seconds, or +S from its beginning
+    #[arg(long, value_name = "T", requires = "replay")]
+    pub from: Option<Moment>,
+    /// The capture up to this time
+    #[arg(long, value_name = "T", requires = "replay")]
+    pub until: Option<Moment>,
+    /// The robot's domain [default: $ROS_DOMAIN_ID, else 0]
+    #[arg(long = "domain", value_name = "N",
+        value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN)))]
+    pub domain_id: Option<u32>,
+    /// Whose output to print [default: $ROS_DISTRO, else jazzy]
+    #[arg(long, value_name = "DISTRO", value_parser = dialect::parser(), hide_possible_values = true)]
+    pub distro: Option<Dialect>,
+}
+
+/// The environment says what cannot be.
+#[derive(Debug, thiserror::Error)]
+#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN}")]
+pub struct Unfit(String);
+
+impl Target {
+    /// The domain that is asked about.
+    ///
+    /// # Errors
+    /// The environment names none that there is.
+    pub fn domain(&self) -> Result<u32, Unfit> {
+        if let Some(domain_id) = self.domain_id {
+            return Ok(domain_id);
+        }
+        match std::env::var("ROS_DOMAIN_ID") {
+            Ok(text) if !text.trim().is_empty() => {
+                let domain_id = text.trim().parse().ok();
+                domain_id
+                    .filter(|domain_id| *domain_id <= MAX_DOMAIN)
+                    .ok_or(Unfit(text))
+            }
+            _ => Ok(0),
+        }
+    }
+
+    /// The output's dialect.
+    #[must_use]
+    pub fn dialect(&self) -> Dialect {
+        let named = || Dialect::of_distro(&std::env::var("ROS_DISTRO").ok()?);
+        self.distro.or_else(named).unwrap_or_default()
+    }
+
+    /// The token, where one was named.
+    pub(super) fn token(&self) -> Result<Option<String>, ClientError> {
+        let named = || std::env::var_os("ROS2PROBE_TOKEN_FILE").filter(|path| !path.is_empty());
+        let path = self.token_file.clone();
+        let Some(path) = path.or_else(|| named().map(PathBuf::from)) else {
+            return Ok(None);
+        };
+        let read = || {
+            let mut text = String::new();
+            let file = std::fs::File::open(&path)?;
+            io::Read::read_to_string(&mut io::Read::take(file, MAX_TOKEN), &mut text)?;
+            let token = text.trim();
+            if token.is_empty() || !token.bytes().all(|byte| byte.is_ascii_graphic()) {
+                let reason = "it must hold one line of printable characters";
+                return Err(io::Error::new(io::ErrorKind::InvalidData, reason));
+            }
+            Ok(token.to_owned())
+        };
+        match read() {
+            Ok(token) => Ok(Some(token)),
+            Err(source) => Err(ClientError::Token { path, source }),
+        }
+    }
+}

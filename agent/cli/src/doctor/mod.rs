@@ -1,0 +1,205 @@
+//! `rp doctor`: what this host will show and what not, and what to do about it.
+//!
+//! A module for each area gives findings; this one decides which areas there are to look at and in
+//! what order they are told. It looks and changes nothing; where no agent runs and it may, it loads
+//! the agent's kernel programs for a moment, since only a trial tells whether they can be had.
+
+pub mod agent;
+pub mod answers;
+pub mod buffers;
+pub mod clock;
+pub mod finding;
+pub mod graph;
+pub mod host;
+pub mod interfaces;
+pub mod kernel;
+pub mod privileges;
+pub mod processes;
+pub mod report;
+pub mod shell;
+pub mod sight;
+pub mod text;
+pub mod variables;
+
+use std::path::PathBuf;
+
+use answers::Answers;
+use finding::Finding;
+use host::Host;
+use processes::Processes;
+use report::Report;
+use ros2probe_capture::live::in_words;
+use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice};
+use ros2probe_daemon::privilege;
+use ros2probe_daemon::run;
+use sight::Sight;
+use variables::{Range, Variables};
+
+/// What became of asking for an agent on this host.
+#[derive(Debug)]
+pub enum Reach {
+    /// It answered.
+    Answered(Box<Answers>, String),
+    /// Nobody did.
+    Nobody(String),
+    /// One is there that this user may not ask.
+    Denied(String),
+}
+
+/// The configuration on this host.
+#[derive(Debug)]
+pub struct Configured {
+    /// What an agent would run with; the default where the file is wrong.
+    pub config: Config,
+    /// The file and its mistakes, if it has any.
+    pub mistakes: Option<(PathBuf, String)>,
+}
+
+/// This host, with or without an agent.
+#[must_use]
+pub fn examine(host: &Host, configured: &Configured, reach: &Reach) -> Report {
+    let config = &configured.config;
+    let answers = match reach {
+        Reach::Answered(answers, _) => Some(answers.as_ref()),
+        Reach::Nobody(_) | Reach::Denied(_) => None,
+    };
+    let health = answers.map(|answers| &answers.health);
+    let processes = Processes::find(host, answers.map(|answers| &answers.participants));
+    let shell = Variables::of(&host.environment);
+    let is_local = processes.is_any_local() || shell.is_ros() && shell.range() == Range::Localhost;
+    let mut findings = Vec::new();
+    if let Some((path, mistakes)) = &configured.mistakes {
+        findings.push(agent::misconfigured(path, mistakes));
+    }
+    findings.extend(match reach {
+        Reach::Answered(answers, place) => agent::check(answers, place, env!("CARGO_PKG_VERSION")),
+        Reach::Nobody(reason) => agent::absent(host, config, reason, false),
+        Reach::Denied(reason) => agent::absent(host, config, reason, true),
+    });
+    findings.extend(match health {
+        Some(health) => sight::check(&Sight::of_agent(health)),
+        None => tried(host, &config.capture),
+    });
+    findings.extend(kernel::check(host));
+    findings.extend(privileges::check(host, &config.capture, answers));
+    findings.extend(interfaces::check(host, health, is_local));
+    findings.extend(shell::check(host));
+    findings.extend(processes.check(host));
+    findings.extend(
+        answers
+            .map(|answers| graph::check(answers, Some(processes.count())))
+            .into_iter()
+            .flatten(),
+    );
+    findings.extend(buffers::check(host, answers));
+    findings.extend(clock::check(host));
+    let name = host.files.text("/proc/sys/kernel/hostname");
+    Report::new(name.unwrap_or_else(|_| "this host".to_owned()), findings)
+}
+
+/// An agent on another host: what it says of itself and of the graph. The rest is that host's to say.
+#[must_use]
+pub fn examine_remote(answers: &Answers, place: &str) -> Report {
+    let mut findings = agent::check(answers, place, env!("CARGO_PKG_VERSION"));
+    findings.extend(sight::check(&Sight::of_agent(&answers.health)));
+    findings.extend(graph::check(answers, None));
+    Report::new(place, findings)
+}
+
+/// The graph of a capture.
+#[must_use]
+pub fn examine_capture(answers: &Answers, name: &str) -> Report {
+    Report::new(name, graph::check(answers, None))
+}
+
+/// What an agent would see: tried, where that is allowed. Not in other processes' code.
+fn tried(host: &Host, settings: &CaptureSettings) -> Vec<Finding> {
+    if let Some(missing) = privilege::missing(&host.capabilities, settings) {
+        return sight::untried(&format!("lacks {}", missing.needs()));
+    }
+    let mut settings = settings.clone();
+    settings.shm.exact = ExactChoice::Off;
+    match run::look(&settings) {
+        Ok(facts) => sight::check(&Sight::of_trial(facts)),
+        Err(error) => sight::failed(&in_words(&error)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::host::tests::host;
+    use super::*;
+    use finding::{Area, Verdict};
+
+    fn areas(report: &Report) -> Vec<Area> {
+        let mut areas: Vec<_> = report.findings.iter().map(|finding| finding.area).collect();
+        areas.dedup();
+        areas
+    }
+
+    fn configured() -> Configured {
+        Configured {
+            config: Config::default(),
+            mistakes: None,
+        }
+    }
+
+    #[test]
+    fn without_files_and_privileges_everything_is_still_said_once_and_in_order() {
+        let (_directory, host) = host(&[]);
+        let report = examine(&host, &configured(), &Reach::Nobody("no agent".to_owned()));
+        let told = areas(&report);
+        let mut once = told.clone();
+        once.sort();
+        once.dedup();
+        assert_eq!(told, once);
+        assert!(!told.contains(&Area::Graph));
+        assert!(
+            report
+                .findings
+                .iter()
+                .any(|each| each.verdict == Verdict::Unknown)
+        );
+        for finding in &report.findings {
+            assert!(!finding.evidence.is_empty(), "{finding:?}");
+            assert!(!finding.sentence.ends_with('.'), "{finding:?}");
+        }
+    }
+
+    #[test]
+    fn an_agent_that_answers_is_asked_instead_of_trying() {
+        let (_directory, host) = host(&[]);
+        let answers = Box::<Answers>::default();
+        let report = examine(
+            &host,
+            &configured(),
+            &Reach::Answered(answers, "here".to_owned()),
+        );
+        assert!(areas(&report).contains(&Area::Graph));
+        let tried = report
+            .findings
+            .iter()
+            .any(|each| each.check == "source" && each.verdict == Verdict::Unknown);
+        assert!(!tried, "{report:?}");
+    }
+
+    #[test]
+    fn elsewhere_and_in_a_capture_this_host_is_not_looked_at() {
+        let answers = Answers::default();
+        assert_eq!(
+            areas(&examine_remote(&answers, "robot2")),
+            [Area::Agent, Area::Sight, Area::Graph]
+        );
+        assert_eq!(areas(&examine_capture(&answers, "x.pcap")), [Area::Graph]);
+    }
+
+    #[test]
+    fn a_wrong_configuration_comes_first() {
+        let (_directory, host) = host(&[]);
+        let mut configured = configured();
+        configured.mistakes = Some((PathBuf::from("/etc/x.yaml"), "bad".to_owned()));
+        let report = examine(&host, &configured, &Reach::Nobody("no agent".to_owned()));
+        assert_eq!(report.findings[0].check, "configuration");
+        assert!(report.has_problems());
+    }
+}

@@ -1,0 +1,296 @@
+//! What this process, the running agent and the service may do, and what grants the rest. Which
+//! capabilities are needed is `crate::privilege`'s to say.
+
+use super::answers::{Answers, Health};
+use super::finding::{Area, Finding, Verdict};
+use super::host::Host;
+use ros2probe_daemon::config::{CaptureSettings, ExactChoice, ShmMode};
+use ros2probe_daemon::privilege;
+
+const AREA: Area = Area::Privileges;
+const UNIT: &str = "ros2probe.service";
+/// Where units are, in the order in which they count.
+const UNITS: [&str; 3] = [
+    "/etc/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
+];
+const ENABLED: &str = "/etc/systemd/system/multi-user.target.wants/ros2probe.service";
+const SYSTEMD: &str = "/run/systemd/system";
+/// Where a service's processes are listed, of a hierarchy of control groups v2 and of v1.
+const SERVICES: [&str; 3] = [
+    "/sys/fs/cgroup/system.slice/ros2probe.service/cgroup.procs",
+    "/sys/fs/cgroup/unified/system.slice/ros2probe.service/cgroup.procs",
+    "/sys/fs/cgroup/systemd/system.slice/ros2probe.service/cgroup.procs",
+];
+/// Words in control groups of containers.
+const CONTAINERS: [&str; 4] = ["docker", "containerd", "kubepods", "libpod"];
+
+/// All of them.
+#[must_use]
+pub fn check(host: &Host, settings: &CaptureSettings, answers: Option<&Answers>) -> Vec<Finding> {
+    let mut findings = vec![own(host, settings, answers.is_some())];
+    findings.extend(answers.map(|answers| of_agent(&answers.health)));
+    findings.extend(answers.and_then(containers));
+    findings.extend(probes(host, settings));
+    findings.extend(unit(host, answers.is_some()));
+    findings
+}
+
+fn own(host: &Host, settings: &CaptureSettings, is_running: bool) -> Finding {
+    let mut held: Vec<_> = host.capabilities.iter().map(ToString::to_string).collect();
+    held.sort();
+    let held = match held.len() {
+        0 => "none".to_owned(),
+        1..=8 => held.join(", "),
+        count => format!("{count} capabilities"),
+    };
+    let say = |verdict, sentence: String| {
+        Finding::new(AREA, "capabilities", verdict, sentence).seen(&held, "CapEff, this process")
+    };
+    match privilege::missing(&host.capabilities, settings) {
+        None => say(Verdict::Ok, "this shell may capture".to_owned()),
+        Some(_) if is_running => say(
+            Verdict::Ok,
+            "this shell may not capture; the running agent does".to_owned(),
+        ),
+        Some(missing) => say(
+            Verdict::Note,
+            format!("this shell may not capture: it lacks {}", missing.needs()),
+        )
+        .remedy("sudo rp run    # or the service ros2probe")
+        .remedy(missing.command()),
+    }
+}
+
+fn of_agent(health: &Health) -> Finding {
+    let held = match health.capabilities.as_slice() {
+        [] => "no capabilities".to_owned(),
+        held => held.join(", "),
+    };
+    let say = |verdict, sentence: String| {
+        let finding = Finding::new(AREA, "agent_capabilities", verdict, sentence);
+        finding.seen(&held, "GET /health capabilities")
+    };
+    if let Some(reason) = &health.unfiltered_reason {
+        let sentence =
+            format!("the agent kept {held}, but its system calls are not filtered: {reason}");
+        return say(Verdict::Note, sentence);
+    }
+    say(
+        Verdict::Ok,
+        format!("the agent kept {held} and dropped the rest"),
+    )
+}
+
+/// Shared memory of containers is behind `/proc/<pid>/root`.
+fn containers(answers: &Answers) -> Option<Finding> {
+    let has = |name: &str| answers.health.capabilities.iter().any(|held| held == name);
+    let looks = answers
+        .health
+        .abilities
+        .iter()
+        .any(|each| each.able && each.ability == "shared_memory");
+    let is_container = |group: &String| CONTAINERS.iter().any(|word| group.contains(word));
+    let mut participants = answers.participants.participants.iter();
+    let contained = participants.any(|each| each.cgroup.as_ref().is_some_and(is_container));
+    if !looks || !contained || has("CAP_SYS_PTRACE") {
+        return None;
+    }
+    let sentence = "ROS runs in containers here, but the agent may not read their shared memory";
+    let finding = Finding::new(AREA, "containers", Verdict::Warning, sentence);
+    let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
+    Some(finding.elsewhere(
+        "AmbientCapabilities=CAP_SYS_PTRACE    # and CapabilityBoundingSet, with systemctl edit ros2probe",
+    ))
+}
+
+/// Exact mode, if it is asked for.
+fn probes(host: &Host, settings: &CaptureSettings) -> Option<Finding> {
+    if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
+        return None;
+    }
+    let missing = ros2probe_capture::exact::lacking(&host.capabilities);
+    if missing.is_empty() {
+        return None;
+    }
+    let missing = missing.join(" and ");
+    let sentence = format!("capture.shm.exact needs {missing}, which this shell lacks");
+    let finding = Finding::new(AREA, "probes", Verdict::Note, sentence);
+    let finding = finding.seen(&missing, "CapEff, this process");
+    Some(finding.elsewhere(
+        "AmbientCapabilities=CAP_SYS_ADMIN CAP_SYS_PTRACE    # and SystemCallFilter=perf_event_open, with systemctl edit ros2probe",
+    ))
+}
+
+/// Whether there is a service to start.
+#[must_use]
+pub fn is_installed(host: &Host) -> bool {
+    host.files.exists(SYSTEMD) && installed(host).is_some()
+}
+
+/// Where its unit is.
+fn installed(host: &Host) -> Option<&'static str> {
+    let mut places = UNITS.into_iter();
+    places.find(|place| host.files.exists(&format!("{place}/{UNIT}")))
+}
+
+/// The service, where there is systemd.
+fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
+    if !host.files.exists(SYSTEMD) {
+        return None;
+    }
+    let say = |verdict, sentence| Finding::new(AREA, "unit", verdict, sentence);
+    let installed = UNITS
+        .iter()
+        .find(|place| host.files.exists(&format!("{place}/{UNIT}")));
+    let Some(place) = installed else {
+        return Some(
+            match is_answering {
+                true => say(
+                    Verdict::Note,
+                    "the agent was started by hand: no service is installed to restart it",
+                ),
+                false => say(Verdict::Note, "the service ros2probe is not installed"),
+            }
+            .seen(
+                "not there",
+                format!("/etc/systemd/system/{UNIT} and others"),
+            )
+            .remedy("sudo apt install ./ros2probe_*.deb    # docs/install.md"),
+        );
+    };
+    let is_running = SERVICES.iter().any(|path| {
+        host.files
+            .text(path)
+            .is_ok_and(|processes| !processes.is_empty())
+    });
+    let is_enabled = std::fs::symlink_metadata(host.files.path(ENABLED)).is_ok();
+    let finding = match (is_running, is_enabled) {
+        (true, true) => say(Verdict::Ok, "the service ros2probe is running and enabled"),
+        (true, false) => say(
+            Verdict::Note,
+            "the service ros2probe is running but not enabled at boot",
+        )
+        .remedy("sudo systemctl enable ros2probe"),
+        (false, true) => say(
+            Verdict::Problem,
+            "the service ros2probe is enabled but not running",
+        )
+        .remedy("systemctl status ros2probe; journalctl -u ros2probe -b"),
+        (false, false) => say(
+            Verdict::Note,
+            "the service ros2probe is installed but not running",
+        )
+        .remedy("sudo systemctl enable --now ros2probe"),
+    };
+    let state = |is: bool, yes: &'static str, no: &'static str| if is { yes } else { no };
+    let (running, enabled) = (
+        state(is_running, "running", "not running"),
+        state(is_enabled, "enabled", "not enabled"),
+    );
+    Some(finding.seen(
+        format!("{running}, {enabled}"),
+        format!("{place}/{UNIT}, /sys/fs/cgroup"),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use caps::{Capability, CapsHashSet};
+
+    use super::super::host::tests::host;
+    use super::*;
+    use ros2probe_daemon::config::Config;
+
+    const INSTALLED: (&str, &str) = ("/usr/lib/systemd/system/ros2probe.service", "[Unit]");
+    const BOOTED: (&str, &str) = ("/run/systemd/system/x", "");
+    const ON: (&str, &str) = (ENABLED, "");
+    const RUNNING: (&str, &str) = (SERVICES[0], "811\n");
+
+    #[test]
+    fn the_service_is_told_in_each_of_its_states() {
+        let of = |files: &[(&str, &str)]| {
+            let (_directory, host) = host(files);
+            unit(&host, false).map(|finding| finding.verdict)
+        };
+        assert_eq!(of(&[]), None);
+        assert_eq!(of(&[BOOTED]), Some(Verdict::Note));
+        assert_eq!(of(&[BOOTED, INSTALLED]), Some(Verdict::Note));
+        assert_eq!(of(&[BOOTED, INSTALLED, ON]), Some(Verdict::Problem));
+        assert_eq!(of(&[BOOTED, INSTALLED, ON, RUNNING]), Some(Verdict::Ok));
+        assert_eq!(of(&[BOOTED, INSTALLED, RUNNING]), Some(Verdict::Note));
+    }
+
+    #[test]
+    fn a_shell_without_capabilities_is_told_which_and_how() {
+        let (_directory, mut host) = host(&[]);
+        let settings = Config::default().capture;
+        let finding = own(&host, &settings, false);
+        assert_eq!(finding.verdict, Verdict::Note);
+        assert!(
+            finding.sentence.contains("CAP_NET_ADMIN"),
+            "{}",
+            finding.sentence
+        );
+        assert!(
+            finding
+                .remedies
+                .iter()
+                .any(|remedy| remedy.line.starts_with("sudo setcap "))
+        );
+        assert_eq!(own(&host, &settings, true).verdict, Verdict::Ok);
+        host.capabilities =
+            CapsHashSet::from([Capability::CAP_SYS_ADMIN, Capability::CAP_NET_ADMIN]);
+        assert_eq!(own(&host, &settings, false).verdict, Verdict::Ok);
+    }
+
+    #[test]
+    fn what_the_agent_kept_is_told_and_a_missing_sandbox_with_its_reason() {
+        let health = |held: &[&str], reason: Option<&str>| Health {
+            capabilities: held.iter().map(|held| (*held).to_owned()).collect(),
+            unfiltered_reason: reason.map(str::to_owned),
+            ..Health::default()
+        };
+        let kept = of_agent(&health(&["CAP_SYS_PTRACE"], None));
+        assert_eq!(kept.verdict, Verdict::Ok);
+        assert!(kept.sentence.contains("kept CAP_SYS_PTRACE"));
+        assert_eq!(of_agent(&health(&[], None)).verdict, Verdict::Ok);
+        let open = of_agent(&health(&[], Some("no filters here")));
+        assert_eq!(open.verdict, Verdict::Note);
+        assert!(open.sentence.ends_with(": no filters here"));
+    }
+
+    #[test]
+    fn shared_memory_of_containers_takes_a_capability() {
+        let answers = |held: &str, group: &str| {
+            let health = format!(
+                r#"{{"abilities":[{{"ability":"shared_memory","able":true}}],"capabilities":["{held}"]}}"#
+            );
+            let participants = format!(r#"{{"participants":[{{"cgroup":"{group}"}}]}}"#);
+            Answers {
+                health: serde_json::from_str(&health).unwrap(),
+                participants: serde_json::from_str(&participants).unwrap(),
+                ..Answers::default()
+            }
+        };
+        assert!(containers(&answers("CAP_BPF", "/system.slice/docker-0123.scope")).is_some());
+        assert!(
+            containers(&answers(
+                "CAP_SYS_PTRACE",
+                "/system.slice/docker-0123.scope"
+            ))
+            .is_none()
+        );
+        assert!(containers(&answers("CAP_BPF", "/user.slice")).is_none());
+    }
+
+    #[test]
+    fn exact_mode_is_checked_where_it_is_asked_for() {
+        let (_directory, host) = host(&[]);
+        let mut settings = Config::default().capture;
+        assert_eq!(probes(&host, &settings), None);
+        settings.shm.exact = ExactChoice::Uprobe;
+        assert_eq!(probes(&host, &settings).unwrap().verdict, Verdict::Note);
+    }
+}

@@ -1,0 +1,542 @@
+//! ROS processes of this host, as far as this user may look at them: those that differ in what makes
+//! nodes find each other are the classic fault.
+//!
+//! A process is one of ROS when it maps a DDS or RMW library, or when the agent says that it has a
+//! participant. What a process says of itself is hostile: it is bounded here and escaped when printed.
+
+use std::collections::BTreeMap;
+
+use super::answers::Participants;
+use super::finding::{Area, Finding, Verdict};
+use super::host::{Host, Unread, base_name};
+use super::variables::{Range, Variables};
+use ros2probe_capture::exact::processes::is_library;
+
+const AREA: Area = Area::Processes;
+/// Text of a process's map that is read.
+const MAX_MAP: u64 = 4 << 20;
+/// Bytes of its command line and of its variables.
+const MAX_LINE: u64 = 64 << 10;
+/// Letters of a command that are shown.
+const MAX_COMMAND: usize = 40;
+/// Processes that are named in one sentence, for each group.
+const NAMED: usize = 4;
+/// Processes of ROS that are looked at.
+const MAX_PROCESSES: usize = 2000;
+
+/// One process.
+#[derive(Clone, Debug)]
+struct Process {
+    id: u32,
+    command: String,
+    variables: Variables,
+    implementation: Option<&'static str>,
+    /// The domain that its participant is in.
+    domain_id: Option<u32>,
+}
+
+/// All of them.
+#[derive(Clone, Debug, Default)]
+pub struct Processes {
+    found: Vec<Process>,
+    /// Others that this user may not look at.
+    closed: Vec<u32>,
+}
+
+impl Processes {
+    /// Looks for them. `known`: what the agent says of participants.
+    #[must_use]
+    pub fn find(host: &Host, known: Option<&Participants>) -> Self {
+        let mut domains = BTreeMap::new();
+        for participant in known.into_iter().flat_map(|known| &known.participants) {
+            // Of those with a socket here the number is the process's, and no announced one.
+            if let (Some(id), Some(_)) = (participant.process_id, &participant.cgroup) {
+                let node = participant.nodes.first().cloned();
+                domains.insert(id, (participant.domain_id, node));
+            }
+        }
+        let mut processes = Self::default();
+        for id in host.files.processes() {
+            let command = command(host, id);
+            if command.is_empty() || id == std::process::id() {
+                // A thread of the kernel, or a process that has ended.
+                continue;
+            }
+            let (domain_id, node) = match domains.remove(&id) {
+                Some((domain_id, node)) => (Some(domain_id), node),
+                None => (None, None),
+            };
+            let command = match node {
+                Some(node) => format!("{command} {node}")
+                    .chars()
+                    .take(MAX_COMMAND)
+                    .collect(),
+                None => command,
+            };
+            match look(host, id, command, domain_id) {
+                Ok(Some(_)) if processes.found.len() >= MAX_PROCESSES => break,
+                Ok(Some(process)) => processes.found.push(process),
+                Ok(None) | Err(Unread::Missing | Unread::Other(_)) => {}
+                Err(Unread::NotPermitted) => processes.closed.push(id),
+            }
+        }
+        processes
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.found.len()
+    }
+
+    /// Some node is to talk to its own host only.
+    #[must_use]
+    pub fn is_any_local(&self) -> bool {
+        let mut found = self.found.iter();
+        found.any(|process| process.variables.range() == Range::Localhost)
+    }
+
+    /// Where they differ from each other and from this shell.
+    #[must_use]
+    pub fn check(&self, host: &Host) -> Vec<Finding> {
+        let mut findings = vec![self.overview()];
+        findings.extend(self.unseen(host.is_root()));
+        let domains = self.differing(
+            "domain",
+            "nodes in different domains do not see each other",
+            "export ROS_DOMAIN_ID=N    # the same for all nodes",
+            |process| Some(process.domain()),
+        );
+        let implementations = self.differing(
+            "rmw",
+            "mixed RMWs: topics may work only partly, services are unreliable",
+            "export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # the same for all nodes",
+            |process| process.implementation.map(str::to_owned),
+        );
+        let ranges = self.differing(
+            "range",
+            "nodes limited to localhost are not discovered from other hosts",
+            "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET    # the same for all; unset ROS_LOCALHOST_ONLY",
+            |process| Some(process.variables.range().words()),
+        );
+        let servers = self.differing(
+            "discovery_server",
+            "nodes with different discovery servers do not discover each other",
+            "export ROS_DISCOVERY_SERVER=ADDRESS:11811    # the same for all, or unset for all",
+            |process| {
+                let server = process.variables.shown("ROS_DISCOVERY_SERVER");
+                Some(server.map_or_else(
+                    || "no server".to_owned(),
+                    |server| format!("server {server}"),
+                ))
+            },
+        );
+        let security = self.differing(
+            "security",
+            "secured and unsecured nodes do not communicate",
+            "export ROS_SECURITY_ENABLE=true    # for all, or for none",
+            |process| {
+                let is_secured = process.variables.is_secured();
+                Some(if is_secured { "secured" } else { "not secured" }.to_owned())
+            },
+        );
+        let all = [domains, implementations, ranges, servers, security];
+        findings.extend(all.into_iter().flatten());
+        findings.extend(self.unlike(&Variables::of(&host.environment)));
+        findings
+    }
+
+    /// Those that may not be looked at.
+    fn unseen(&self, is_root: bool) -> Option<Finding> {
+        let first = self.closed.first()?;
+        let which = match self.closed.len() {
+            1 => format!("process {first}"),
+            count => format!("{count} processes"),
+        };
+        let sentence = format!("{which} cannot be inspected; skipped");
+        let verdict = if is_root {
+            Verdict::Note
+        } else {
+            Verdict::Unknown
+        };
+        let finding = Finding::new(AREA, "closed", verdict, sentence);
+        let finding = finding.seen("not permitted", "/proc/<pid>/maps, /proc/<pid>/environ");
+        Some(match is_root {
+            true => finding,
+            false => finding.remedy("sudo rp doctor"),
+        })
+    }
+
+    fn overview(&self) -> Finding {
+        let say = |verdict, sentence: String| Finding::new(AREA, "processes", verdict, sentence);
+        let Some(first) = self.found.first() else {
+            let sentence = "no ROS process was found on this host";
+            return say(Verdict::Note, sentence.to_owned()).seen("0", "/proc/<pid>/maps");
+        };
+        let mut finding = say(
+            Verdict::Ok,
+            match self.found.len() {
+                1 => format!("1 ROS process: {}", first.name()),
+                count => format!("{count} ROS processes"),
+            },
+        );
+        for process in &self.found {
+            let (implementation, range) = (process.implementation, process.variables.range());
+            let value = format!(
+                "{}: {}, {}, {}",
+                process.name(),
+                process.domain(),
+                implementation.unwrap_or("unknown implementation"),
+                range.words()
+            );
+            finding = finding.seen(value, format!("/proc/{}/environ, maps", process.id));
+        }
+        finding
+    }
+
+    /// A warning where processes differ in what `key` says of them.
+    fn differing(
+        &self,
+        check: &'static str,
+        consequence: &str,
+        remedy: &str,
+        key: impl Fn(&Process) -> Option<String>,
+    ) -> Option<Finding> {
+        let mut groups: BTreeMap<String, Vec<&Process>> = BTreeMap::new();
+        for process in &self.found {
+            if let Some(key) = key(process) {
+                groups.entry(key).or_default().push(process);
+            }
+        }
+        if groups.len() < 2 {
+            return None;
+        }
+        // The few are what somebody looks for: they come first.
+        let mut groups: Vec<_> = groups.into_iter().collect();
+        groups.sort_by_key(|(_, group)| group.len());
+        let named: Vec<_> = groups
+            .iter()
+            .take(NAMED)
+            .map(|(key, group)| format!("{key}: {}", names(group)))
+            .collect();
+        let sentence = format!("{consequence}; {}", named.join("; "));
+        let mut finding = Finding::new(AREA, check, Verdict::Warning, sentence);
+        for (key, group) in &groups {
+            let from = group.iter().map(|process| process.id.to_string());
+            let from: Vec<_> = from.collect();
+            finding = finding.seen(key, format!("processes {}", from.join(", ")));
+        }
+        Some(finding.remedy(remedy))
+    }
+
+    /// All processes are in a domain that this shell is not in.
+    fn unlike(&self, shell: &Variables) -> Option<Finding> {
+        let own = shell.domain().ok().filter(|_| shell.is_ros())?;
+        let mut domains: Vec<_> = self.found.iter().map(Process::domain_id).collect();
+        domains.sort_unstable();
+        domains.dedup();
+        let first = (*domains.first()?)?;
+        if domains.contains(&Some(own)) {
+            return None;
+        }
+        let listed: Vec<_> = domains.iter().flatten().map(u32::to_string).collect();
+        let sentence = format!(
+            "this shell uses domain {own}, all ROS processes use {}: its tools will not find them",
+            listed.join(", ")
+        );
+        let finding = Finding::new(AREA, "shell_domain", Verdict::Warning, sentence);
+        let finding = finding.seen(own.to_string(), "ROS_DOMAIN_ID, this shell");
+        Some(finding.remedy(format!("export ROS_DOMAIN_ID={first}")))
+    }
+}
+
+impl Process {
+    fn domain_id(&self) -> Option<u32> {
+        self.domain_id.or_else(|| self.variables.domain().ok())
+    }
+
+    fn domain(&self) -> String {
+        match (self.domain_id(), self.variables.domain()) {
+            (Some(domain), _) => format!("domain {domain}"),
+            (None, Err(text)) => format!("ROS_DOMAIN_ID `{text}`"),
+            (None, Ok(domain)) => format!("domain {domain}"),
+        }
+    }
+
+    fn name(&self) -> String {
+        format!("{} ({})", self.command, self.id)
+    }
+}
+
+/// A process if it is one of ROS.
+fn look(
+    host: &Host,
+    id: u32,
+    command: String,
+    domain_id: Option<u32>,
+) -> Result<Option<Process>, Unread> {
+    let map = host.files.bytes(&format!("/proc/{id}/maps"), MAX_MAP)?;
+    let implementation = implementation(&String::from_utf8_lossy(&map));
+    if implementation.is_none() && domain_id.is_none() {
+        return Ok(None);
+    }
+    let variables = host.files.bytes(&format!("/proc/{id}/environ"), MAX_LINE)?;
+    Ok(Some(Process {
+        id,
+        command,
+        variables: Variables::parse(&variables),
+        implementation,
+        domain_id,
+    }))
+}
+
+/// By the libraries that it maps.
+fn implementation(map: &str) -> Option<&'static str> {
+    const LIBRARIES: [(&str, &str); 7] = [
+        ("librmw_zenoh_cpp.so", "Zenoh"),
+        ("libddsc.so", "Cyclone DDS"),
+        ("librmw_cyclonedds_cpp.so", "Cyclone DDS"),
+        ("librmw_fastrtps_cpp.so", "Fast DDS"),
+        ("libnddsc.so", "Connext"),
+        ("librmw_connextdds.so", "Connext"),
+        ("librmw_gurumdds_cpp.so", "GurumDDS"),
+    ];
+    let names = map.lines().filter_map(|line| {
+        let path = line.find('/').and_then(|at| line.get(at..))?;
+        path.rsplit('/').next()
+    });
+    let mut found: Vec<_> = names
+        .filter_map(|name| {
+            let by_name = LIBRARIES.iter().find(|(library, _)| {
+                let rest = name.strip_prefix(library);
+                rest.is_some_and(|rest| rest.is_empty() || rest.starts_with(['.', ' ']))
+            });
+            let fast = is_library(name).then_some("Fast DDS");
+            by_name.map(|(_, implementation)| *implementation).or(fast)
+        })
+        .collect();
+    found.sort_unstable();
+    found.dedup();
+    match found.as_slice() {
+        [] => None,
+        [one] => Some(one),
+        _ => Some("several implementations"),
+    }
+}
+
+/// What it was started as; a script by its own name. Empty for threads of the kernel.
+fn command(host: &Host, id: u32) -> String {
+    let line = host.files.bytes(&format!("/proc/{id}/cmdline"), MAX_LINE);
+    let line = line.unwrap_or_default();
+    let words: Vec<_> = line
+        .split(|byte| *byte == 0)
+        .map(|word| String::from_utf8_lossy(word).into_owned())
+        .collect();
+    let first = words
+        .first()
+        .map(|word| base_name(word))
+        .unwrap_or_default();
+    let script = words.iter().skip(1).find(|word| !word.starts_with('-'));
+    let is_interpreter = first.starts_with("python") || matches!(first, "bash" | "sh" | "node");
+    let has_no_file = words.get(1).is_some_and(|word| word == "-c");
+    let name = match script {
+        Some(code) if is_interpreter && code.contains("ros2cli.daemon") => "ros2 daemon",
+        Some(_) if is_interpreter && has_no_file => first,
+        Some(script) if is_interpreter && !script.is_empty() => base_name(script),
+        _ => first,
+    };
+    let node = words.iter().find_map(|word| word.strip_prefix("__node:="));
+    let name = match node {
+        Some(node) => format!("{name} {node}"),
+        None => name.to_owned(),
+    };
+    name.chars().take(MAX_COMMAND).collect()
+}
+
+fn names(processes: &[&Process]) -> String {
+    let names: Vec<_> = processes
+        .iter()
+        .take(NAMED)
+        .map(|each| each.name())
+        .collect();
+    let names = names.join(", ");
+    match processes.len().saturating_sub(NAMED) {
+        0 => names,
+        more => format!("{names} and {more} more"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::host::tests::host;
+    use super::*;
+
+    const FAST: &str = "7f00-7f01 r-xp 0 fe:00 12 /opt/ros/lib/libfastrtps.so.2.14\n";
+    const CYCLONE: &str = "7f00-7f01 r-xp 0 fe:00 12 /opt/ros/lib/libddsc.so.0.10.5\n";
+
+    /// Command, variables and map of each.
+    fn found(processes: &[(u32, &str, &str, &str)], shell: &[(&str, &str)]) -> Vec<Finding> {
+        let mut files = Vec::new();
+        for (id, command, variables, map) in processes {
+            files.push((format!("/proc/{id}/cmdline"), command.replace(' ', "\0")));
+            files.push((format!("/proc/{id}/environ"), variables.replace(' ', "\0")));
+            files.push((format!("/proc/{id}/maps"), (*map).to_owned()));
+        }
+        let files: Vec<_> = files
+            .iter()
+            .map(|(path, text)| (path.as_str(), text.as_str()))
+            .collect();
+        let (_directory, mut host) = host(&files);
+        host.environment = shell
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), (*value).to_owned()))
+            .collect();
+        Processes::find(&host, None).check(&host)
+    }
+
+    fn sentence<'a>(findings: &'a [Finding], check: &str) -> Option<&'a str> {
+        let found = findings.iter().find(|finding| finding.check == check);
+        found.map(|finding| finding.sentence.as_str())
+    }
+
+    #[test]
+    fn processes_that_agree_are_one_line() {
+        let findings = found(
+            &[
+                (11, "/opt/talker", "ROS_DOMAIN_ID=3", FAST),
+                (12, "python3 /opt/listener.py --x", "ROS_DOMAIN_ID=3", FAST),
+                (13, "/bin/bash", "ROS_DOMAIN_ID=9", ""),
+                (2, "", "", ""),
+            ],
+            &[],
+        );
+        assert_eq!(findings.len(), 1, "{findings:?}");
+        assert_eq!(findings[0].sentence, "2 ROS processes");
+        let second = &findings[0].evidence[1];
+        assert_eq!(
+            second.value,
+            "listener.py (12): domain 3, Fast DDS, the subnet"
+        );
+    }
+
+    #[test]
+    fn those_that_differ_are_named_the_few_first() {
+        let findings = found(
+            &[
+                (11, "talker", "ROS_DOMAIN_ID=3", FAST),
+                (12, "listener", "ROS_DOMAIN_ID=3", FAST),
+                (
+                    13,
+                    "rviz2 --ros-args -r __node:=eyes",
+                    "ROS_LOCALHOST_ONLY=1",
+                    CYCLONE,
+                ),
+            ],
+            &[],
+        );
+        assert_eq!(
+            sentence(&findings, "domain").unwrap(),
+            "nodes in different domains do not see each other; domain 0: rviz2 eyes (13); \
+             domain 3: talker (11), listener (12)"
+        );
+        assert!(
+            sentence(&findings, "rmw")
+                .unwrap()
+                .contains("Cyclone DDS: rviz2 eyes (13)")
+        );
+        assert!(
+            sentence(&findings, "range")
+                .unwrap()
+                .contains("localhost only: rviz2")
+        );
+        assert_eq!(sentence(&findings, "security"), None);
+        assert_eq!(sentence(&findings, "discovery_server"), None);
+    }
+
+    #[test]
+    fn code_on_the_command_line_is_not_taken_for_a_name() {
+        let daemon = "python3\0-c\0from ros2cli.daemon.daemonize import main; main()\0--name";
+        for (line, expected) in [
+            (daemon, "ros2 daemon"),
+            ("python3\0-c\0import rclpy; rclpy.spin()", "python3"),
+            ("python3\0-u\0/opt/talker.py", "talker.py"),
+        ] {
+            let (_directory, host) = host(&[("/proc/7/cmdline", line)]);
+            assert_eq!(command(&host, 7), expected);
+        }
+    }
+
+    #[test]
+    fn servers_and_security_are_compared_too() {
+        let findings = found(
+            &[
+                (11, "talker", "ROS_DISCOVERY_SERVER=10.0.0.1:11811", FAST),
+                (12, "listener", "ROS_SECURITY_ENABLE=true", FAST),
+            ],
+            &[],
+        );
+        assert!(sentence(&findings, "discovery_server").is_some());
+        assert!(sentence(&findings, "security").is_some());
+    }
+
+    #[test]
+    fn a_shell_in_another_domain_than_all_is_told_the_command() {
+        let one = [(11, "talker", "ROS_DOMAIN_ID=3", FAST)];
+        let findings = found(&one, &[("ROS_DISTRO", "jazzy")]);
+        let finding = findings
+            .iter()
+            .find(|each| each.check == "shell_domain")
+            .unwrap();
+        assert_eq!(finding.remedies[0].line, "export ROS_DOMAIN_ID=3");
+        let same = found(&one, &[("ROS_DOMAIN_ID", "3")]);
+        assert_eq!(sentence(&same, "shell_domain"), None);
+        // Nothing is said of a shell that is none of ROS.
+        assert_eq!(sentence(&found(&one, &[]), "shell_domain"), None);
+    }
+
+    #[test]
+    fn the_agent_knows_a_process_by_its_participant() {
+        let (_directory, host) = host(&[
+            ("/proc/21/cmdline", "robot"),
+            ("/proc/21/environ", "ROS_DOMAIN_ID=nonsense"),
+            ("/proc/21/maps", ""),
+        ]);
+        assert_eq!(Processes::find(&host, None).count(), 0);
+        let known: Participants = serde_json::from_str(
+            r#"{"participants":[{"domain_id":4,"process_id":21,"cgroup":"/robot","nodes":["/arm","/hand"]},
+            {"domain_id":5,"process_id":22}]}"#,
+        )
+        .unwrap();
+        let processes = Processes::find(&host, Some(&known));
+        assert_eq!(processes.count(), 1);
+        assert_eq!(processes.found[0].domain(), "domain 4");
+        assert_eq!(processes.found[0].name(), "robot /arm (21)");
+    }
+
+    #[test]
+    fn what_may_not_be_looked_at_is_unknown_until_root_asks() {
+        let closed = |closed: &[u32]| Processes {
+            closed: closed.to_vec(),
+            ..Processes::default()
+        };
+        assert_eq!(closed(&[]).unseen(false), None);
+        let finding = closed(&[3, 4]).unseen(false).unwrap();
+        assert_eq!(
+            (finding.verdict, finding.remedies.len()),
+            (Verdict::Unknown, 1)
+        );
+        assert!(finding.sentence.starts_with("2 processes "));
+        let finding = closed(&[3]).unseen(true).unwrap();
+        assert_eq!(
+            (finding.verdict, finding.remedies.len()),
+            (Verdict::Note, 0)
+        );
+    }
+
+    #[test]
+    fn a_hostile_command_is_cut_and_does_no_harm() {
+        let long = format!("{}\x1b[2J", "a".repeat(1000));
+        let findings = found(&[(11, &long, "ROS_DOMAIN_ID=\x1b[2J", FAST)], &[]);
+        assert!(findings[0].sentence.len() < 80, "{}", findings[0].sentence);
+    }
+}

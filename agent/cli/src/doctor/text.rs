@@ -1,0 +1,271 @@
+//! A report for people: grouped, aligned, eighty columns wide, commands on lines of their own.
+//!
+//! What comes from the network or from other processes reaches the terminal escaped.
+
+use std::borrow::Cow;
+
+use super::finding::{Finding, Place, Remedy, Verdict};
+use super::report::Report;
+use ros2probe_daemon::visible::visible;
+
+const WIDTH: usize = 80;
+/// Before sentences: two spaces, a verdict, a space.
+const INDENT: usize = 11;
+/// Lines of evidence of one finding, unless all of it is wanted.
+const EVIDENCE: usize = 3;
+/// Where the configuration is.
+const FILE: &str = "in /etc/ros2probe/ros2probe.yaml";
+/// Letters of one value.
+const MAX_VALUE: usize = 200;
+
+/// How a report is printed.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Style {
+    /// Evidence also of what is fine, and all of it.
+    pub verbose: bool,
+    /// With colours.
+    pub colours: bool,
+}
+
+/// The whole report.
+#[must_use]
+pub fn text(report: &Report, style: Style) -> String {
+    let mut page = Page {
+        style,
+        text: String::new(),
+    };
+    page.line(&report.headline());
+    let mut area = None;
+    for finding in &report.findings {
+        if area != Some(finding.area) {
+            area = Some(finding.area);
+            page.text.push('\n');
+            let title = page.painted(BOLD, finding.area.title());
+            page.line(&title);
+        }
+        page.finding(finding);
+    }
+    page.text
+}
+
+struct Page {
+    style: Style,
+    text: String,
+}
+
+const BOLD: &str = "1";
+const DIM: &str = "2";
+
+impl Page {
+    fn finding(&mut self, finding: &Finding) {
+        let verdict = format!("{:8}", finding.verdict.label());
+        let verdict = self.painted(colour(finding.verdict), &verdict);
+        for (number, line) in wrapped(&visible(&finding.sentence)).iter().enumerate() {
+            let start = if number == 0 {
+                verdict.as_str()
+            } else {
+                "        "
+            };
+            self.line(&format!("  {start} {line}"));
+        }
+        if self.style.verbose || finding.verdict >= Verdict::Unknown {
+            self.evidence(finding);
+        }
+        if finding.verdict != Verdict::Ok {
+            for remedy in &finding.remedies {
+                self.remedy(remedy);
+            }
+        }
+    }
+
+    fn evidence(&mut self, finding: &Finding) {
+        let shown = if self.style.verbose {
+            usize::MAX
+        } else {
+            EVIDENCE
+        };
+        for evidence in finding.evidence.iter().take(shown) {
+            let value: String = visible(&evidence.value).chars().take(MAX_VALUE).collect();
+            let line = format!("{}: {value}", visible(&evidence.from));
+            for line in wrapped(&line) {
+                let line = self.painted(DIM, &line);
+                self.line(&format!("{:INDENT$}{line}", ""));
+            }
+        }
+        let left = finding.evidence.len().saturating_sub(shown);
+        if left > 0 {
+            let line = self.painted(DIM, &format!("{left} more with --verbose"));
+            self.line(&format!("{:INDENT$}{line}", ""));
+        }
+    }
+
+    /// A command is not broken, for it is to be pasted; a long comment goes above it.
+    fn remedy(&mut self, remedy: &Remedy) {
+        let line = visible(&remedy.line);
+        let own = remedy.comment.as_deref().map(visible);
+        let comment = match (remedy.kind, own) {
+            (Place::Configuration, None) => Some(FILE.to_owned()),
+            (Place::Configuration, Some(own)) => Some(format!("{FILE}; {own}")),
+            (Place::Command | Place::Elsewhere, own) => own.map(Cow::into_owned),
+        };
+        let mut short = String::new();
+        if let Some(comment) = comment {
+            let both = format!("{line}    # {comment}");
+            if INDENT + 2 + both.chars().count() <= WIDTH {
+                short = self.painted(DIM, &format!("    # {comment}"));
+            } else {
+                for line in wrapped(&format!("# {comment}")) {
+                    let line = self.painted(DIM, &line);
+                    self.line(&format!("{:INDENT$}{line}", ""));
+                }
+            }
+        }
+        self.line(&format!("{:INDENT$}> {line}{short}", ""));
+    }
+
+    fn painted(&self, code: &str, text: &str) -> String {
+        if self.style.colours {
+            format!("\x1b[{code}m{text}\x1b[0m")
+        } else {
+            text.to_owned()
+        }
+    }
+
+    fn line(&mut self, line: &str) {
+        self.text.push_str(line.trim_end());
+        self.text.push('\n');
+    }
+}
+
+const fn colour(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Ok => "32",
+        Verdict::Note => "36",
+        Verdict::Unknown => "35",
+        Verdict::Warning => "33",
+        Verdict::Problem => "1;31",
+    }
+}
+
+/// Lines that fit behind the indentation; a word that does not is left whole unless it is no word of
+/// anybody's.
+fn wrapped(text: &str) -> Vec<String> {
+    let width = WIDTH - INDENT;
+    let mut lines = vec![String::new()];
+    for word in text.split(' ') {
+        for piece in pieces(word, width) {
+            let Some(line) = lines.last_mut() else { break };
+            let used = line.chars().count();
+            if used > 0 && used + 1 + piece.chars().count() > width {
+                lines.push(piece);
+            } else {
+                if used > 0 {
+                    line.push(' ');
+                }
+                line.push_str(&piece);
+            }
+        }
+    }
+    lines
+}
+
+fn pieces(word: &str, width: usize) -> Vec<String> {
+    let letters: Vec<char> = word.chars().collect();
+    letters
+        .chunks(width)
+        .map(|piece| piece.iter().collect())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::finding::Area;
+    use super::*;
+
+    fn report() -> Report {
+        Report::new(
+            "robot1",
+            vec![
+                Finding::new(Area::Kernel, "version", Verdict::Ok, "Linux 6.8")
+                    .seen("6.8", "/proc/x"),
+                Finding::new(
+                    Area::Buffers,
+                    "receive",
+                    Verdict::Warning,
+                    "a socket may buffer 213 KB: two messages of /points (2.7 MB each) do not fit",
+                )
+                .seen("212992", "/proc/sys/net/core/rmem_max")
+                .remedy(
+                    "sudo sysctl -w net.core.rmem_max=6291456    # permanent: \
+                    /etc/sysctl.d/60-ros.conf",
+                ),
+            ],
+        )
+    }
+
+    #[test]
+    fn a_report_is_grouped_and_aligned() {
+        let version = env!("CARGO_PKG_VERSION");
+        let expected = format!(
+            "rp doctor {version} on robot1: 1 warning, 1 ok
+
+Kernel
+  ok       Linux \
+             6.8
+
+Buffers
+  warning  a socket may buffer 213 KB: two messages of /points (2.7 MB \
+             each) do
+           not fit
+           /proc/sys/net/core/rmem_max: 212992
+           \
+             # permanent: /etc/sysctl.d/60-ros.conf
+           > sudo sysctl -w \
+             net.core.rmem_max=6291456
+"
+        );
+        assert_eq!(text(&report(), Style::default()), expected);
+    }
+
+    #[test]
+    fn evidence_of_what_is_fine_comes_when_asked_for() {
+        let style = Style {
+            verbose: true,
+            colours: false,
+        };
+        assert!(text(&report(), style).contains("\n           /proc/x: 6.8\n"));
+    }
+
+    #[test]
+    fn colours_come_only_when_asked_for() {
+        assert!(!text(&report(), Style::default()).contains('\x1b'));
+        let style = Style {
+            verbose: false,
+            colours: true,
+        };
+        assert!(text(&report(), style).contains("\x1b[33mwarning \x1b[0m"));
+    }
+
+    #[test]
+    fn what_a_terminal_would_obey_is_escaped() {
+        let hostile = "x\x1b]0;gotcha\x07".repeat(100);
+        let finding = Finding::new(Area::Graph, "x", Verdict::Warning, hostile.clone())
+            .seen(hostile.clone(), hostile)
+            .remedy("ls");
+        let text = text(
+            &Report::new("\x1b[31mhost", vec![finding]),
+            Style::default(),
+        );
+        assert!(
+            !text
+                .chars()
+                .any(|letter| letter.is_control() && letter != '\n')
+        );
+        assert!(
+            text.lines()
+                .skip(1)
+                .all(|line| line.chars().count() <= WIDTH),
+            "{text}"
+        );
+    }
+}

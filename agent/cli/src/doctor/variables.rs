@@ -1,0 +1,222 @@
+//! What the variables of a shell or a process make of ROS: domain, implementation, who is looked for.
+//!
+//! Only the variables named here are ever shown. Those of security are paths and switches, and no
+//! file that they name is opened.
+
+use std::collections::BTreeMap;
+
+/// Longest value that is shown.
+const MAX_VALUE: usize = 120;
+/// Those that say how ROS talks.
+const NAMES: [&str; 20] = [
+    "ROS_DISTRO",
+    "RMW_IMPLEMENTATION",
+    "ROS_DOMAIN_ID",
+    "ROS_LOCALHOST_ONLY",
+    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+    "ROS_STATIC_PEERS",
+    "ROS_DISCOVERY_SERVER",
+    "ROS_SUPER_CLIENT",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_BUILTIN_TRANSPORTS",
+    "RMW_FASTRTPS_USE_QOS_FROM_XML",
+    "CYCLONEDDS_URI",
+    "ROS_SECURITY_ENABLE",
+    "ROS_SECURITY_STRATEGY",
+    "ROS_SECURITY_KEYSTORE",
+    "ROS_SECURITY_ENCLAVE_OVERRIDE",
+    "ROS_DISABLE_LOANED_MESSAGES",
+    "AMENT_PREFIX_PATH",
+    "ROS_VERSION",
+];
+
+/// Variables about ROS.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Variables(BTreeMap<&'static str, String>);
+
+/// Whom nodes look for.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Range {
+    /// Everybody who is reached by multicast: the default.
+    Subnet,
+    /// Nodes of their own host.
+    Localhost,
+    /// Nobody.
+    Off,
+    /// What the implementation's own settings say.
+    System,
+    /// None of the values that ROS knows, which then takes `LOCALHOST`.
+    Wrong(String),
+}
+
+impl Variables {
+    /// Of a shell.
+    #[must_use]
+    pub fn of(environment: &BTreeMap<String, String>) -> Self {
+        let known = NAMES.into_iter().filter_map(|name| {
+            let value = environment.get(name).filter(|value| !value.is_empty())?;
+            Some((name, value.clone()))
+        });
+        Self(known.collect())
+    }
+
+    /// Of a process, from `/proc/<pid>/environ`.
+    #[must_use]
+    pub fn parse(bytes: &[u8]) -> Self {
+        let mut known = BTreeMap::new();
+        for variable in bytes.split(|byte| *byte == 0) {
+            let text = String::from_utf8_lossy(variable);
+            let Some((name, value)) = text.split_once('=') else {
+                continue;
+            };
+            if let Some(name) = NAMES.into_iter().find(|known| *known == name)
+                && !value.is_empty()
+            {
+                // Of several the first is what getenv(3) finds.
+                known.entry(name).or_insert_with(|| value.to_owned());
+            }
+        }
+        Self(known)
+    }
+
+    /// One of them.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&str> {
+        self.0.get(name).map(String::as_str)
+    }
+
+    /// One of them, short enough to be shown.
+    #[must_use]
+    pub fn shown(&self, name: &str) -> Option<String> {
+        let value = self.get(name)?;
+        Some(match value.char_indices().nth(MAX_VALUE) {
+            Some((end, _)) => format!("{}...", value.get(..end).unwrap_or_default()),
+            None => value.to_owned(),
+        })
+    }
+
+    /// ROS was set up here.
+    #[must_use]
+    pub fn is_ros(&self) -> bool {
+        self.0.keys().any(|name| *name != "CYCLONEDDS_URI")
+    }
+
+    /// The domain; an error where it is none.
+    ///
+    /// # Errors
+    /// What stands there instead.
+    pub fn domain(&self) -> Result<u32, String> {
+        let Some(text) = self.get("ROS_DOMAIN_ID") else {
+            return Ok(0);
+        };
+        let number = text.trim().parse().ok();
+        let number = number.filter(|number| *number <= ros2probe_daemon::config::watch::MAX_DOMAIN);
+        number.ok_or_else(|| self.shown("ROS_DOMAIN_ID").unwrap_or_default())
+    }
+
+    /// `ROS_LOCALHOST_ONLY` as rcl reads it.
+    #[must_use]
+    pub fn is_localhost_only(&self) -> bool {
+        self.get("ROS_LOCALHOST_ONLY") == Some("1")
+    }
+
+    /// Whom nodes look for.
+    #[must_use]
+    pub fn range(&self) -> Range {
+        if self.is_localhost_only() {
+            return Range::Localhost;
+        }
+        match self.get("ROS_AUTOMATIC_DISCOVERY_RANGE") {
+            None | Some("SUBNET" | "NOT_SET") => Range::Subnet,
+            Some("LOCALHOST") => Range::Localhost,
+            Some("OFF") => Range::Off,
+            Some("SYSTEM_DEFAULT") => Range::System,
+            Some(_) => Range::Wrong(
+                self.shown("ROS_AUTOMATIC_DISCOVERY_RANGE")
+                    .unwrap_or_default(),
+            ),
+        }
+    }
+
+    /// DDS security is on.
+    #[must_use]
+    pub fn is_secured(&self) -> bool {
+        self.get("ROS_SECURITY_ENABLE") == Some("true")
+    }
+}
+
+impl Range {
+    /// In words.
+    #[must_use]
+    pub fn words(&self) -> String {
+        match self {
+            Self::Subnet => "the subnet".to_owned(),
+            Self::Localhost => "localhost only".to_owned(),
+            Self::Off => "no discovery".to_owned(),
+            Self::System => "as the implementation is configured".to_owned(),
+            Self::Wrong(value) => format!("`{value}`, treated as localhost only"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn variables(text: &str) -> Variables {
+        Variables::parse(text.replace(' ', "\0").as_bytes())
+    }
+
+    #[test]
+    fn only_what_is_known_is_taken_from_a_process() {
+        let found = variables(
+            "SECRET=x ROS_DOMAIN_ID=7 ROS_DOMAIN_ID=8 ROS_SECURITY_X=pass RMW_IMPLEMENTATION=",
+        );
+        assert_eq!(found.domain(), Ok(7));
+        assert_eq!(found.get("ROS_SECURITY_X"), None);
+        assert_eq!(found.get("RMW_IMPLEMENTATION"), None);
+        assert_eq!(found.0.len(), 1);
+        assert_eq!(
+            Variables::parse(b"\xff\xfe\0=\0=x\0ROS_DOMAIN_ID"),
+            Variables::default()
+        );
+    }
+
+    #[test]
+    fn a_domain_is_a_number_that_has_ports() {
+        assert_eq!(variables("A=b").domain(), Ok(0));
+        assert_eq!(variables("ROS_DOMAIN_ID=232").domain(), Ok(232));
+        assert_eq!(
+            variables("ROS_DOMAIN_ID=233").domain(),
+            Err("233".to_owned())
+        );
+        assert_eq!(variables("ROS_DOMAIN_ID=-1").domain(), Err("-1".to_owned()));
+        let long = format!("ROS_DOMAIN_ID={}", "\u{e9}".repeat(500));
+        let shown = variables(&long).domain().unwrap_err();
+        assert_eq!(shown.chars().count(), MAX_VALUE + 3);
+    }
+
+    #[test]
+    fn the_old_variable_goes_before_the_new_one() {
+        for (text, range) in [
+            ("", Range::Subnet),
+            ("ROS_LOCALHOST_ONLY=0", Range::Subnet),
+            (
+                "ROS_LOCALHOST_ONLY=1 ROS_AUTOMATIC_DISCOVERY_RANGE=OFF",
+                Range::Localhost,
+            ),
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE=OFF", Range::Off),
+            (
+                "ROS_AUTOMATIC_DISCOVERY_RANGE=SYSTEM_DEFAULT",
+                Range::System,
+            ),
+            (
+                "ROS_AUTOMATIC_DISCOVERY_RANGE=localhost",
+                Range::Wrong("localhost".to_owned()),
+            ),
+        ] {
+            assert_eq!(variables(text).range(), range, "{text}");
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! `rp`: the agent and its tools.
+
+mod ask;
+mod cli;
+
+use std::io::Write as _;
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::Parser as _;
+use ros2probe_daemon::agent;
+use ros2probe_daemon::config::{Config, ConfigError};
+use ros2probe_daemon::privilege::{ConfineError, Missing, StillPowerful};
+use ros2probe_daemon::surface::otlp::SettingsError;
+use ros2probe_daemon::visible::visible_lines;
+
+use cli::{Arguments, Command, Said};
+
+/// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
+const NO_PERMISSION: u8 = 77;
+const BAD_CONFIG: u8 = 78;
+/// What a shell sees of a process that `SIGPIPE` ended.
+const BROKEN_PIPE: u8 = 141;
+
+fn main() -> ExitCode {
+    let done = |done: Result<()>| done.map(|()| ExitCode::SUCCESS);
+    let ended = match Arguments::parse().command {
+        None => cli::help(&[]),
+        Some(Command::Run(options)) => done(agent::run(options.into())),
+        Some(Command::CheckConfig { file }) => done(check_config(&file)),
+        Some(Command::Discover(options)) => done(ask::discover(&options)),
+        Some(Command::Completions(completions)) => completions.print(),
+        Some(Command::Man(manual)) => manual.print(),
+        Some(Command::Ask(question)) => question.ask(),
+    };
+    ended.unwrap_or_else(|error| {
+        if cli::is_broken_pipe(&error) {
+            return ExitCode::from(BROKEN_PIPE);
+        }
+        // Where nobody can be told, the exit code is left.
+        // Errors quote files, names and answers.
+        let _ = writeln!(std::io::stderr(), "{}", visible_lines(&message(&error)));
+        exit_code(&error)
+    })
+}
+
+fn check_config(file: &Path) -> Result<()> {
+    let config = Config::load(file)?;
+    println!(
+        "{} is good: {} watched",
+        file.display(),
+        config.watches.len()
+    );
+    Ok(())
+}
+
+/// The error with its causes, once. Mistakes of a configuration are one line each, as they are.
+fn message(error: &anyhow::Error) -> String {
+    match error.downcast_ref::<ConfigError>() {
+        Some(mistakes @ ConfigError::Invalid { .. }) => mistakes.to_string(),
+        _ if error.is::<Said>() => error.to_string(),
+        _ => format!("rp: {error:#}"),
+    }
+}
+
+fn exit_code(error: &anyhow::Error) -> ExitCode {
+    if error.is::<Missing>() || error.is::<StillPowerful>() || error.is::<ConfineError>() {
+        ExitCode::from(NO_PERMISSION)
+    } else if error.is::<ConfigError>() || error.is::<SettingsError>() {
+        ExitCode::from(BAD_CONFIG)
+    } else {
+        ExitCode::FAILURE
+    }
+}

@@ -1,0 +1,57 @@
+//! Messages that were sent and never came. The original learns of them from its middleware; here the
+//! stream says which ones are lost, as the agent counts them.
+
+use ros2probe_daemon::subscriptions::line::{MissedFacts, Reason};
+
+/// Counts lost messages.
+#[derive(Debug, Default)]
+pub struct Lost {
+    total: u64,
+}
+
+impl Lost {
+    /// The stream says that messages will not come; the words for it where they are lost, without a
+    /// space and an end of the line where the original has none.
+    pub fn missed(&mut self, missed: &MissedFacts) -> String {
+        match missed.reason {
+            Reason::Incomplete | Reason::Lost => {}
+            // They were on the wire.
+            Reason::Unannounced | Reason::NotCaptured | Reason::QueueFull => {
+                return String::new();
+            }
+        }
+        self.total += missed.samples;
+        format!(
+            "A message was lost!!!\n\ttotal count change:{}\n\ttotal count: {}---\n",
+            missed.samples, self.total
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn missed(first: u64, last: u64, reason: Reason) -> MissedFacts {
+        MissedFacts {
+            topic: "/a".to_owned(),
+            domain_id: 0,
+            writer: "01".to_owned(),
+            samples: last - first + 1,
+            first_sequence_number: first,
+            last_sequence_number: last,
+            reason,
+        }
+    }
+
+    #[test]
+    fn lost_and_incomplete_messages_add_up_and_what_this_reader_missed_does_not_count() {
+        let mut lost = Lost::default();
+        let text = "A message was lost!!!\n\ttotal count change:2\n\ttotal count: 2---\n";
+        assert_eq!(lost.missed(&missed(2, 3, Reason::Lost)), text);
+        assert_eq!(lost.missed(&missed(4, 4, Reason::QueueFull)), "");
+        assert_eq!(lost.missed(&missed(5, 5, Reason::NotCaptured)), "");
+        let text = "A message was lost!!!\n\ttotal count change:1\n\ttotal count: 3---\n";
+        assert_eq!(lost.missed(&missed(6, 6, Reason::Incomplete)), text);
+    }
+}

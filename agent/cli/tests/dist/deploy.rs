@@ -1,0 +1,520 @@
+//! What `deploy/` ships fits together: files that are mounted and named exist, Prometheus accepts its
+//! configurations, and the DaemonSet's container may do what the agent needs and nothing else.
+//! There is no container engine here: that the images start is not tested.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use anyhow::{Context as _, Result, ensure};
+use serde::Deserialize as _;
+use serde_yaml::Value;
+
+/// What `promtool` of Debian was built without.
+const NOT_BUILT_IN: &str = "kubernetes_sd_configs";
+
+#[test]
+fn what_compose_mounts_exists_and_images_are_pinned() -> Result<()> {
+    let compose = yaml("compose.yaml")?;
+    for (name, service) in compose["services"].as_mapping().context("no services")? {
+        let image = service["image"].as_str().context("no image")?;
+        let (_, tag) = image.rsplit_once(':').context("no tag")?;
+        ensure!(
+            tag.contains('.') && tag.contains(|c: char| c.is_ascii_digit()),
+            "{image}"
+        );
+        for mount in service["volumes"].as_sequence().context("no volumes")? {
+            let mount = mount.as_str().context("not text")?;
+            let (source, _) = mount.split_once(':').context("no target")?;
+            let there = match source.starts_with('.') {
+                true => deploy().join(source).exists(),
+                false => compose["volumes"].get(source).is_some(),
+            };
+            ensure!(there, "{name:?} mounts {source}, which is not there");
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn no_port_but_the_collector_s_is_published_beyond_this_machine() -> Result<()> {
+    let compose = yaml("compose.yaml")?;
+    for service in ["prometheus", "grafana", "collector"] {
+        for port in compose["services"][service]["ports"]
+            .as_sequence()
+            .context("no ports")?
+        {
+            let port = port.as_str().context("not text")?;
+            let local = port.starts_with("127.0.0.1:");
+            ensure!(
+                local || port.starts_with("${OTLP_ADDRESS:-127.0.0.1}:"),
+                "{service}: {port}"
+            );
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn grafana_finds_the_data_source_and_the_dashboards() -> Result<()> {
+    let compose = yaml("compose.yaml")?;
+    let mounts = mounts(&compose["services"]["grafana"])?;
+    let provisioned: Vec<&str> = mounts.iter().map(|(_, inside)| inside.as_str()).collect();
+    for kind in ["datasources", "dashboards"] {
+        let directory = format!("/etc/grafana/provisioning/{kind}/");
+        ensure!(
+            provisioned.iter().any(|path| path.starts_with(&directory)),
+            "{kind}"
+        );
+    }
+    let source = &yaml("grafana/datasources.yaml")?["datasources"][0];
+    ensure!(source["type"] == "prometheus" && source["isDefault"] == true);
+    let address = source["url"].as_str().context("no url")?;
+    ensure!(reaches(&compose, address), "{address} is no service's");
+
+    let provider = &yaml("grafana/dashboards.yaml")?["providers"][0];
+    let path = provider["options"]["path"].as_str().context("no path")?;
+    let mounted = mounts.iter().find(|(_, inside)| inside == path);
+    let (outside, _) = mounted.with_context(|| format!("{path} is not mounted"))?;
+    // Grafana takes every JSON file below for a dashboard.
+    let mut found = BTreeSet::new();
+    for file in json_files(outside)? {
+        let dashboard: serde_json::Value = serde_json::from_str(&std::fs::read_to_string(&file)?)?;
+        let uid = dashboard["uid"].as_str().unwrap_or_default().to_owned();
+        ensure!(
+            !uid.is_empty() && dashboard["title"].is_string(),
+            "{}",
+            file.display()
+        );
+        found.insert(uid);
+    }
+    ensure!(found.len() == 2, "{found:?}");
+    // Links from one to the other.
+    for file in json_files(outside)? {
+        for link in std::fs::read_to_string(file)?.split("\"/d/").skip(1) {
+            let end = link.find(|c: char| !(c.is_ascii_alphanumeric() || c == '-'));
+            ensure!(
+                found.contains(&link[..end.unwrap_or(link.len())]),
+                "{link:.40}"
+            );
+        }
+    }
+    Ok(())
+}
+
+#[test]
+fn prometheus_accepts_its_configurations() -> Result<()> {
+    // As in the container: what it names is where compose mounts it.
+    let compose = yaml("compose.yaml")?;
+    let mut text = std::fs::read_to_string(deploy().join("prometheus/prometheus.yaml"))?;
+    for (outside, inside) in mounts(&compose["services"]["prometheus"])? {
+        text = text.replace(&format!("{inside}/"), &format!("{}/", outside.display()));
+    }
+    ensure!(text.matches("/dashboards/rules/").count() == 2, "{text}");
+    let directory = tempfile::tempdir()?;
+    let copy = directory.path().join("prometheus.yaml");
+    std::fs::write(&copy, text)?;
+    std::fs::copy(
+        deploy().join("prometheus/robots.yaml"),
+        directory.path().join("robots.yaml"),
+    )?;
+    let said = promtool(&["check", "config"], &copy)?;
+    ensure!(said.matches("rules found").count() == 2, "{said}");
+
+    let said = promtool(
+        &["check", "config"],
+        &deploy().join("fleet/prometheus-scrape.yaml"),
+    )?;
+    ensure!(said.matches("rules found").count() == 2, "{said}");
+    promtool(
+        &["check", "config", "--agent"],
+        &deploy().join("fleet/prometheus-agent.yaml"),
+    )?;
+
+    let mut cluster = yaml("kubernetes/prometheus.yaml")?;
+    let job = cluster["scrape_configs"][0]
+        .as_mapping_mut()
+        .context("no job")?;
+    ensure!(job.remove(NOT_BUILT_IN).is_some(), "no {NOT_BUILT_IN}");
+    std::fs::write(&copy, serde_yaml::to_string(&cluster)?)?;
+    promtool(&["check", "config"], &copy)?;
+    Ok(())
+}
+
+#[test]
+fn the_alert_rules_know_the_agents_by_the_job_of_every_scrape() -> Result<()> {
+    for file in [
+        "prometheus/prometheus.yaml",
+        "fleet/prometheus-agent.yaml",
+        "fleet/prometheus-scrape.yaml",
+        "kubernetes/prometheus.yaml",
+    ] {
+        let configuration = yaml(file)?;
+        ensure!(
+            configuration["scrape_configs"][0]["job_name"] == "ros2probe",
+            "{file}"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+fn collectors_use_what_they_define_and_reach_prometheus() -> Result<()> {
+    let compose = yaml("compose.yaml")?;
+    for file in ["collector/collector.yaml", "fleet/collector-robot.yaml"] {
+        let collector = yaml(file)?;
+        let mut used = BTreeSet::new();
+        for (_, pipeline) in collector["service"]["pipelines"]
+            .as_mapping()
+            .context("no pipelines")?
+        {
+            for kind in ["receivers", "processors", "exporters"] {
+                for name in pipeline[kind]
+                    .as_sequence()
+                    .with_context(|| kind.to_owned())?
+                {
+                    used.insert((kind, name.as_str().context("not text")?.to_owned()));
+                }
+            }
+        }
+        for name in collector["service"]["extensions"]
+            .as_sequence()
+            .into_iter()
+            .flatten()
+        {
+            used.insert(("extensions", name.as_str().context("not text")?.to_owned()));
+        }
+        let storage = &collector["exporters"]["otlp"]["sending_queue"]["storage"];
+        if let Some(storage) = storage.as_str() {
+            ensure!(
+                used.contains(&("extensions", storage.to_owned())),
+                "{file}: {storage}"
+            );
+        }
+        let mut defined = BTreeSet::new();
+        for kind in ["receivers", "processors", "exporters", "extensions"] {
+            let Some(components) = collector[kind].as_mapping() else {
+                continue;
+            };
+            for (name, _) in components {
+                defined.insert((kind, name.as_str().context("not text")?.to_owned()));
+            }
+        }
+        ensure!(
+            used == defined,
+            "{file}: used {used:?}, defined {defined:?}"
+        );
+    }
+    let central = yaml("collector/collector.yaml")?;
+    let address = central["exporters"]["prometheusremotewrite"]["endpoint"].as_str();
+    ensure!(reaches(&compose, address.context("no endpoint")?));
+    let receives = compose["services"]["prometheus"]["command"].as_sequence();
+    let receives = receives.context("no command")?;
+    ensure!(
+        receives
+            .iter()
+            .any(|word| word == "--web.enable-remote-write-receiver")
+    );
+    Ok(())
+}
+
+#[test]
+fn the_daemon_set_may_do_what_the_unit_may_and_nothing_else() -> Result<()> {
+    let pod = pod()?;
+    let container = &pod["containers"][0];
+    ensure!(pod["hostNetwork"] == true && pod["hostPID"] == true);
+    ensure!(pod["automountServiceAccountToken"] == false);
+    let security = &container["securityContext"];
+    ensure!(security["privileged"] == false && security["allowPrivilegeEscalation"] == false);
+    ensure!(security["readOnlyRootFilesystem"] == true);
+    ensure!(security["seccompProfile"]["type"] == "RuntimeDefault");
+    ensure!(security["capabilities"]["drop"] == Value::Sequence(vec!["ALL".into()]));
+    let added = security["capabilities"]["add"]
+        .as_sequence()
+        .context("adds none")?;
+    let added: BTreeSet<String> = added
+        .iter()
+        .map(|name| format!("CAP_{}", name.as_str().unwrap_or_default()))
+        .collect();
+    let bounding = bounding_set()?;
+    ensure!(added == bounding, "DaemonSet {added:?}, unit {bounding:?}");
+    Ok(())
+}
+
+#[test]
+fn the_daemon_set_s_configuration_is_one_and_its_paths_are_mounted() -> Result<()> {
+    let documents = documents("kubernetes/ros2probe.yaml")?;
+    let map = documents.iter().find(|one| one["kind"] == "ConfigMap");
+    let text = map.context("no ConfigMap")?["data"]["ros2probe.yaml"].as_str();
+    let text = text.context("no configuration")?;
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("ros2probe.yaml");
+    std::fs::write(&file, text)?;
+    let checked = Command::new(env!("CARGO_BIN_EXE_rp"))
+        .arg("check-config")
+        .arg(&file)
+        .output()?;
+    ensure!(
+        checked.status.success(),
+        "{}",
+        String::from_utf8_lossy(&checked.stdout)
+    );
+
+    let configuration: Value = serde_yaml::from_str(text)?;
+    let pod = pod()?;
+    let container = &pod["containers"][0];
+    let mounted: BTreeMap<&str, bool> = container["volumeMounts"]
+        .as_sequence()
+        .context("no mounts")?
+        .iter()
+        .map(|mount| {
+            (
+                mount["mountPath"].as_str().unwrap(),
+                mount["readOnly"] == true,
+            )
+        })
+        .collect();
+    let cgroup = configuration["capture"]["cgroup"]
+        .as_str()
+        .context("no cgroup")?;
+    ensure!(
+        mounted.get(cgroup) == Some(&true),
+        "{cgroup} in {mounted:?}"
+    );
+    ensure!(
+        mounted.get("/var/lib/ros2probe") == Some(&false),
+        "{mounted:?}"
+    );
+    let arguments = container["args"].as_sequence().context("no arguments")?;
+    let file = arguments.last().and_then(Value::as_str).unwrap_or_default();
+    let (directory, _) = file.rsplit_once('/').context("no path")?;
+    ensure!(mounted.contains_key(directory), "{file} in {mounted:?}");
+
+    let volumes = pod["volumes"].as_sequence().context("no volumes")?;
+    let names: BTreeSet<&str> = volumes
+        .iter()
+        .filter_map(|volume| volume["name"].as_str())
+        .collect();
+    for mount in container["volumeMounts"]
+        .as_sequence()
+        .into_iter()
+        .flatten()
+    {
+        ensure!(
+            names.contains(mount["name"].as_str().unwrap_or_default()),
+            "{mount:?}"
+        );
+    }
+    let listen = configuration["metrics"]["listen"]
+        .as_str()
+        .unwrap_or_default();
+    let port = &container["ports"][0]["containerPort"];
+    ensure!(
+        listen.ends_with(&format!(":{}", port.as_u64().context("no port")?)),
+        "{listen}"
+    );
+    let image = container["image"].as_str().unwrap_or_default();
+    ensure!(
+        image.ends_with(concat!(":", env!("CARGO_PKG_VERSION"))),
+        "{image}"
+    );
+    Ok(())
+}
+
+#[test]
+fn the_image_is_what_make_dist_makes_with_the_unit_s_capabilities_and_without_root() -> Result<()> {
+    let text = std::fs::read_to_string(deploy().join("Dockerfile"))?.replace("\\\n", " ");
+    let of = |instruction: &str| -> Vec<&str> {
+        let lines = text.lines();
+        lines
+            .filter_map(|line| line.strip_prefix(instruction)?.strip_prefix(' '))
+            .collect()
+    };
+    let arguments = of("ARG");
+    ensure!(
+        arguments.contains(&concat!("VERSION=", env!("CARGO_PKG_VERSION"))),
+        "{arguments:?}"
+    );
+    ensure!(arguments.contains(&"ARCHITECTURE=x86_64"), "{arguments:?}");
+    ensure!(
+        of("FROM").last() == Some(&"scratch"),
+        "something else is in the image"
+    );
+    let [user] = of("USER")[..] else {
+        anyhow::bail!("no user")
+    };
+    let ids: Vec<u32> = user.split(':').map(str::parse).collect::<Result<_, _>>()?;
+    ensure!(ids.len() == 2 && !ids.contains(&0), "{user}");
+
+    let ignored = std::fs::read_to_string(deploy().join("Dockerfile.dockerignore"))?;
+    let taken: Vec<&str> = ignored
+        .lines()
+        .filter_map(|line| line.strip_prefix('!'))
+        .collect();
+    let copied: Vec<(&str, &str)> = of("COPY")
+        .iter()
+        .filter_map(|line| line.split_once(' '))
+        .collect();
+    let binary = (
+        "target/dist/rp-${VERSION}-${ARCHITECTURE}",
+        "/image/usr/bin/rp",
+    );
+    let settings = (
+        "config/ros2probe.yaml",
+        "/image/etc/ros2probe/ros2probe.yaml",
+    );
+    ensure!(
+        copied == [binary, settings, ("--from=image", "/image /")],
+        "{copied:?}"
+    );
+    ensure!(taken == ["target/dist/rp-*", settings.0], "{taken:?}");
+    ensure!(deploy().join("..").join(settings.0).exists());
+    ensure!(of("ENTRYPOINT") == [r#"["/usr/bin/rp"]"#]);
+    ensure!(of("CMD") == [r#"["run", "--config", "/etc/ros2probe/ros2probe.yaml"]"#]);
+
+    let set = text
+        .split("setcap ")
+        .nth(1)
+        .and_then(|rest| rest.split("+ep ").next());
+    let set: BTreeSet<String> = set
+        .context("no setcap")?
+        .split(',')
+        .map(str::to_uppercase)
+        .collect();
+    let readme = std::fs::read_to_string(deploy().join("README.md"))?;
+    let run = readme
+        .split("docker run ")
+        .nth(1)
+        .and_then(|rest| rest.split("```").next());
+    let run = run.context("no docker run")?;
+    let added = run
+        .split("--cap-add ")
+        .skip(1)
+        .filter_map(|rest| rest.split(' ').next());
+    let added: BTreeSet<String> = added.map(|name| format!("CAP_{name}")).collect();
+    let unit = bounding_set()?;
+    ensure!(
+        set == unit && added == unit,
+        "file {set:?}, container {added:?}, unit {unit:?}"
+    );
+    for option in [
+        "--network host",
+        "--cgroupns host",
+        "--cap-drop ALL",
+        "/var/lib/ros2probe",
+    ] {
+        ensure!(run.contains(option), "no {option} in {run}");
+    }
+    Ok(())
+}
+
+#[test]
+fn every_file_that_the_documents_link_to_exists() -> Result<()> {
+    let root = deploy().join("..");
+    for document in ["docs/fleet.md", "deploy/README.md", "dashboards/README.md"] {
+        let text = std::fs::read_to_string(root.join(document))?;
+        let directory = root.join(document).parent().unwrap().to_owned();
+        let links = text
+            .split("](")
+            .skip(1)
+            .filter_map(|rest| Some(rest.split_once(')')?.0));
+        let mut found = 0;
+        for link in links.filter(|link| !link.starts_with("http") && !link.starts_with('#')) {
+            let path = link.split_once('#').map_or(link, |(path, _)| path);
+            ensure!(directory.join(path).exists(), "{document} links to {link}");
+            found += 1;
+        }
+        ensure!(found > 0, "{document} links to nothing");
+    }
+    Ok(())
+}
+
+fn deploy() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy")
+}
+
+fn yaml(file: &str) -> Result<Value> {
+    let text = std::fs::read_to_string(deploy().join(file)).with_context(|| file.to_owned())?;
+    serde_yaml::from_str(&text).with_context(|| file.to_owned())
+}
+
+fn documents(file: &str) -> Result<Vec<Value>> {
+    let text = std::fs::read_to_string(deploy().join(file))?;
+    let documents = serde_yaml::Deserializer::from_str(&text).map(Value::deserialize);
+    Ok(documents.collect::<Result<_, _>>()?)
+}
+
+/// What the unit's process may have.
+fn bounding_set() -> Result<BTreeSet<String>> {
+    let unit = std::fs::read_to_string(deploy().join("../systemd/ros2probe.service"))?;
+    let set = unit
+        .lines()
+        .find_map(|line| line.strip_prefix("CapabilityBoundingSet="));
+    let set = set.context("the unit bounds nothing")?;
+    Ok(set.split(' ').map(str::to_owned).collect())
+}
+
+/// The pod of the DaemonSet.
+fn pod() -> Result<Value> {
+    let documents = documents("kubernetes/ros2probe.yaml")?;
+    let set = documents.into_iter().find(|one| one["kind"] == "DaemonSet");
+    let set = set.context("no DaemonSet")?;
+    let selector = &set["spec"]["selector"]["matchLabels"];
+    ensure!(
+        *selector == set["spec"]["template"]["metadata"]["labels"],
+        "selects no pod"
+    );
+    Ok(set["spec"]["template"]["spec"].clone())
+}
+
+/// What a service has from here: where it is, and where the service sees it.
+fn mounts(service: &Value) -> Result<Vec<(PathBuf, String)>> {
+    let mounts = service["volumes"].as_sequence().context("no volumes")?;
+    let mut bound = Vec::new();
+    for mount in mounts.iter().filter_map(Value::as_str) {
+        let mut parts = mount.split(':');
+        let (outside, inside) = parts.next().zip(parts.next()).context("no target")?;
+        if outside.starts_with('.') {
+            bound.push((deploy().join(outside).canonicalize()?, inside.to_owned()));
+        }
+    }
+    Ok(bound)
+}
+
+/// Whether a URL is that of a service and of the port that it publishes.
+fn reaches(compose: &Value, url: &str) -> bool {
+    let address = url
+        .strip_prefix("http://")
+        .and_then(|rest| rest.split('/').next());
+    let Some((host, port)) = address.and_then(|address| address.split_once(':')) else {
+        return false;
+    };
+    let published = compose["services"][host]["ports"].as_sequence();
+    let mut published = published.into_iter().flatten().filter_map(Value::as_str);
+    published.any(|each| each.ends_with(&format!(":{port}")))
+}
+
+fn json_files(directory: &Path) -> Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(directory)? {
+        let path = entry?.path();
+        if path.is_dir() {
+            found.extend(json_files(&path)?);
+        } else if path
+            .extension()
+            .is_some_and(|extension| extension == "json")
+        {
+            found.push(path);
+        }
+    }
+    Ok(found)
+}
+
+fn promtool(arguments: &[&str], file: &Path) -> Result<String> {
+    let output = Command::new("promtool").args(arguments).arg(file).output();
+    let output = output.context("run `make prerequisites` or `apt-get install prometheus`")?;
+    let said = [output.stdout, output.stderr].concat();
+    let said = String::from_utf8_lossy(&said).into_owned();
+    ensure!(output.status.success(), "{}: {said}", file.display());
+    Ok(said)
+}

@@ -1,0 +1,346 @@
+//! The Debian package: what is in it, and what a host is like after it was installed, upgraded,
+//! removed and purged, with systemd and without.
+//!
+//! Tried is a package of the binary that the tests are built with, or, where `ROS2PROBE_PACKAGES`
+//! names a directory, the packages that are there. Hosts are containers of a fresh Debian
+//! (`.ci/prerequisites.sh test` makes it) whose writes go to memory.
+
+mod installation;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
+use installation::archive::Archive;
+use installation::debian::{Debian, Start};
+use installation::{all, built, changed, given, installable};
+use ros2probe_testing::harness::wait_until;
+
+const CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
+const RUNS: &str = "systemctl is-active ros2probe.service";
+const STARTS_AT_BOOT: &str = "systemctl is-enabled ros2probe.service";
+
+#[test]
+fn the_package_holds_what_an_operator_looks_for() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let mut packages = given()?;
+    if packages.is_empty() {
+        packages.push(built(directory.path(), &["--fast"])?);
+    }
+    for package in packages {
+        let archive = Archive::open(&package)?;
+        complete(&archive).with_context(|| format!("{}", package.display()))?;
+    }
+    Ok(())
+}
+
+#[test]
+fn the_same_binary_makes_the_same_package() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let mut made = Vec::new();
+    for place in ["once", "again/elsewhere"] {
+        let place = directory.path().join(place);
+        made.push(std::fs::read(built(&place, &["--fast"])?)?);
+    }
+    ensure!(made[0] == made[1], "the packages differ");
+    Ok(())
+}
+
+#[test]
+fn a_host_with_systemd_is_served_until_the_package_is_purged() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let old = installable(directory.path())?;
+    let new = changed(&old, directory.path())?;
+    let host = Debian::start(Start::Systemd, directory.path())?;
+    let (old, new) = (inside(&old)?, inside(&new)?);
+    let is = |command: &str, what: &str| -> Result<()> {
+        let said = host.text(command)?;
+        ensure!(said.trim() == what, "{command}: {said}, not {what}");
+        Ok(())
+    };
+
+    host.run(&format!("dpkg --install {old}"))?;
+    is(RUNS, "active")?;
+    is(STARTS_AT_BOOT, "enabled")?;
+    ensure!(host.run("dpkg --verify ros2probe")?.is_empty());
+    let page = host.get(17400, "/metrics")?;
+    ensure!(page.contains("ros2probe_capture_source_info{"), "{page}");
+    let others = "find /var/lib/ros2probe /run/ros2probe ! -user ros2probe";
+    ensure!(host.run(others)?.is_empty(), "{}", host.run(others)?);
+    let process = host.run("systemctl show --property MainPID --value ros2probe")?;
+    is(&format!("stat -c %U /proc/{}", process.trim()), "ros2probe")?;
+
+    // What systemd before 247 is given instead comes to the same.
+    host.run(
+        "mkdir /run/systemd/system/ros2probe.service.d && \
+         cp /usr/share/ros2probe/systemd-before-247.conf /run/systemd/system/ros2probe.service.d/ && \
+         systemctl daemon-reload && systemctl restart ros2probe",
+    )?;
+    is(RUNS, "active")?;
+    let process = host.run("systemctl show --property MainPID --value ros2probe")?;
+    let process = process.trim();
+    is(&format!("stat -c %U /proc/{process}"), "ros2probe")?;
+    let bounds = host.run(&format!("grep CapBnd /proc/{process}/status"))?;
+    ensure!(bounds.trim().ends_with("\t000000c000003000"), "{bounds}");
+    host.run("rm -r /run/systemd/system/ros2probe.service.d && systemctl daemon-reload")?;
+
+    // Members of the group are let in by the socket, others by nothing when the address is off.
+    host.run(&format!(
+        "sed -i 's/^  # listen: 127.0.0.1:17401/  listen: off/' {CONFIG}; systemctl restart ros2probe"
+    ))?;
+    host.run("useradd --groups ros2probe member; useradd stranger")?;
+    let list = |user: &str| {
+        let ids = format!("--reuid {user} --regid {user} --init-groups");
+        host.attempt(&format!("setpriv {ids} rp topic list"))
+    };
+    ensure!(
+        list("member")?.status.success(),
+        "{}",
+        all(&list("member")?)
+    );
+    ensure!(
+        all(&list("stranger")?).contains("usermod -aG ros2probe"),
+        "{}",
+        all(&list("stranger")?)
+    );
+
+    // The default changed and the operator's file did, too: the operator's stays.
+    let upgrade = format!("dpkg --force-confold --install {new}");
+    let before = host.run("systemctl show --property MainPID --value ros2probe")?;
+    host.run(&upgrade)?;
+    is(RUNS, "active")?;
+    let after = host.run("systemctl show --property MainPID --value ros2probe")?;
+    ensure!(before != after, "the service was not restarted");
+    host.run(&format!(
+        "grep -q 'listen: off' {CONFIG} && grep -q changed {CONFIG}.dpkg-dist"
+    ))?;
+
+    // What the operator stopped or disabled stays so, from an upgrade on and a downgrade back.
+    host.run("systemctl stop ros2probe")?;
+    host.run(&format!("dpkg --force-confold --install {old}"))?;
+    is(RUNS, "inactive")?;
+    is(STARTS_AT_BOOT, "enabled")?;
+    host.run("systemctl disable --now ros2probe")?;
+    host.run(&upgrade)?;
+    is(RUNS, "inactive")?;
+    is(STARTS_AT_BOOT, "disabled")?;
+
+    // A wrong configuration is said and fails nothing but the service; put right, it starts.
+    host.run(&format!(
+        "systemctl enable --now ros2probe; cp {CONFIG} /srv/; echo wach: [] >>{CONFIG}"
+    ))?;
+    let said = host.attempt(&upgrade)?;
+    ensure!(
+        said.status.success() && all(&said).contains("wach: unknown key"),
+        "{}",
+        all(&said)
+    );
+    is(
+        "dpkg-query -W -f '${db:Status-Status}' ros2probe",
+        "installed",
+    )?;
+    is(RUNS, "failed")?;
+    host.run(&format!(
+        "cp /srv/ros2probe.yaml {CONFIG}; rm /srv/ros2probe.yaml"
+    ))?;
+    host.run(&upgrade)?;
+    is(RUNS, "active")?;
+
+    host.run("dpkg --remove ros2probe")?;
+    is(RUNS, "inactive")?;
+    host.run(&format!(
+        "test -e {CONFIG} && test -d /var/lib/ros2probe && ! test -e /usr/bin/rp"
+    ))?;
+    host.run(&upgrade)?;
+    is(RUNS, "active")?;
+    is(STARTS_AT_BOOT, "enabled")?;
+    host.run("dpkg --purge ros2probe")?;
+    nothing_left(&host)
+}
+
+#[test]
+fn a_host_without_systemd_takes_the_package_too() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let old = installable(directory.path())?;
+    let new = changed(&old, directory.path())?;
+    let host = Debian::start(Start::Nothing, directory.path())?;
+    let (old, new) = (inside(&old)?, inside(&new)?);
+
+    host.run(&format!("dpkg --install {old}"))?;
+    host.run("test -L /etc/systemd/system/multi-user.target.wants/ros2probe.service")?;
+    ensure!(host.run("stat -c '%U:%G %a' /var/lib/ros2probe")?.trim() == "ros2probe:ros2probe 750");
+    let user = host.run("getent passwd ros2probe")?;
+    ensure!(
+        user.trim()
+            .ends_with("/var/lib/ros2probe:/usr/sbin/nologin"),
+        "{user}"
+    );
+    host.run(&format!("rp check-config {CONFIG}"))?;
+    host.run("bash -uc '. /usr/share/bash-completion/completions/rp && complete -p rp'")?;
+    serves_as_the_unit_says(&host)?;
+
+    host.run(&format!("echo '# mine' >>{CONFIG}"))?;
+    host.run(&format!("dpkg --force-confold --install {new}"))?;
+    host.run(&format!(
+        "grep -q mine {CONFIG} && test -e {CONFIG}.dpkg-dist"
+    ))?;
+    host.run("dpkg --remove ros2probe")?;
+    host.run(&format!("test -e {CONFIG} && test -d /var/lib/ros2probe"))?;
+    host.run("dpkg --purge ros2probe")?;
+    nothing_left(&host)
+}
+
+/// Nobody but dpkg remembers it, and the user is kept.
+fn nothing_left(host: &Debian) -> Result<()> {
+    let left = host.run(
+        "find / -xdev \\( -path /proc -o -path /sys -o -path /packages -o -path /var/log \\) -prune \
+         -o \\( -name '*ros2probe*' -o -path '/usr/share/man/*/rp*' \\) -print",
+    )?;
+    ensure!(left.is_empty(), "left behind:\n{left}");
+    host.run("getent passwd ros2probe && getent group ros2probe")
+        .map(drop)
+}
+
+/// The agent with the unit's user and capabilities, where nobody reads units; nothing that it writes
+/// is root's.
+fn serves_as_the_unit_says(host: &Debian) -> Result<()> {
+    let unit = host.run("cat /usr/lib/systemd/system/ros2probe.service")?;
+    let setting = |key: &str| {
+        let line = unit.lines().find_map(|line| line.strip_prefix(key));
+        line.with_context(|| format!("no {key} in the unit"))
+    };
+    let (user, group) = (setting("User=")?, setting("Group=")?);
+    let capabilities: Vec<String> = setting("AmbientCapabilities=")?
+        .split_whitespace()
+        .map(|name| name.replace("CAP_", "+").to_lowercase())
+        .collect();
+    let only = format!("-all,{}", capabilities.join(","));
+    let command = setting("ExecStart=")?;
+    host.run("install -d -o ros2probe -g ros2probe /run/ros2probe; touch /srv/before")?;
+    host.run(&format!(
+        "(STATE_DIRECTORY=/var/lib/ros2probe RUNTIME_DIRECTORY=/run/ros2probe setpriv --reuid {user} \
+         --regid {group} --clear-groups --inh-caps {only} --ambient-caps {only} --bounding-set {only} \
+         {command} & echo $! >/tmp/pid; wait $!; echo $? >/tmp/ended) >/tmp/log 2>&1 &"
+    ))?;
+    wait_until("ready", || {
+        Ok(host
+            .get(17400, "/readyz")
+            .is_ok_and(|said| said.contains("200 OK")))
+    })
+    .with_context(|| host.text("cat /tmp/log").unwrap_or_default())?;
+    host.run("kill $(cat /tmp/pid)")?;
+    wait_until("ended", || Ok(host.text("cat /tmp/ended")?.trim() == "0"))
+        .with_context(|| host.text("cat /tmp/log").unwrap_or_default())?;
+    host.run("test -e /var/lib/ros2probe/discovery.json")?;
+    let written = host.run(
+        "find / -xdev \\( -path /proc -o -path /sys -o -path /dev -o -path /packages \\) -prune \
+         -o -newer /srv/before ! -type d ! -path '/tmp/*' -user root -print",
+    )?;
+    ensure!(written.is_empty(), "root owns what was written:\n{written}");
+    Ok(())
+}
+
+/// A package's name as a container sees it.
+fn inside(package: &Path) -> Result<String> {
+    let name = package.file_name().context("no name")?;
+    Ok(format!("/packages/{}", name.to_string_lossy()))
+}
+
+fn complete(archive: &Archive) -> Result<()> {
+    let control = &archive.control;
+    let field = |name: &str| control.get(name).map(String::as_str);
+    ensure!(field("Package") == Some("ros2probe"), "{control:?}");
+    ensure!(
+        field("Version") == Some(env!("CARGO_PKG_VERSION")),
+        "{control:?}"
+    );
+    ensure!(
+        matches!(field("Architecture"), Some("amd64" | "arm64")),
+        "{control:?}"
+    );
+    ensure!(field("Depends") == Some("adduser"), "{control:?}");
+    for name in [
+        "Maintainer",
+        "Description",
+        "Section",
+        "Homepage",
+        "Installed-Size",
+    ] {
+        ensure!(field(name).is_some(), "no {name} in {control:?}");
+    }
+    ensure!(
+        archive.conffiles == format!("{CONFIG}\n"),
+        "{}",
+        archive.conffiles
+    );
+    // What dpkg of Ubuntu 20.04 can read.
+    for member in &archive.members {
+        ensure!(
+            member == "debian-binary" || !member.ends_with(".zst"),
+            "{member}"
+        );
+    }
+    for script in ["preinst", "postinst", "prerm", "postrm"] {
+        let mode = archive.scripts.get(script).copied();
+        ensure!(mode == Some(0o755), "{script}: {mode:?}");
+    }
+    let manual = "usr/share/man/man1/";
+    let (pages, others): (BTreeMap<_, _>, BTreeMap<_, _>) = archive
+        .files
+        .iter()
+        .partition(|(path, _)| path.starts_with(manual));
+    for (path, mode) in FILES {
+        let entry = others
+            .get(&path.to_owned())
+            .with_context(|| format!("no {path}"))?;
+        ensure!(entry.mode == mode, "{path}: {:o}", entry.mode);
+    }
+    let unexpected: Vec<_> = others
+        .keys()
+        .filter(|path| FILES.iter().all(|(known, _)| path.as_str() != *known))
+        .filter(|path| !path.ends_with("/SECURITY.md"))
+        .collect();
+    ensure!(unexpected.is_empty(), "not expected: {unexpected:?}");
+    for (path, entry) in &archive.files {
+        ensure!(entry.owner == "0/0", "{path} is {}", entry.owner);
+    }
+    for page in [
+        "rp.1.gz",
+        "rp-run.1.gz",
+        "rp-topic-hz.1.gz",
+        "rp-bag-record.1.gz",
+    ] {
+        ensure!(pages.contains_key(&format!("{manual}{page}")), "no {page}");
+    }
+    for (path, entry) in &pages {
+        ensure!(
+            entry.mode == 0o644 && path.ends_with(".1.gz"),
+            "{path}: {:o}",
+            entry.mode
+        );
+    }
+    archive.manual_is_readable(&format!("{manual}rp-topic-hz.1.gz"))?;
+    archive.compressed_without_dates()
+}
+
+const FILES: [(&str, u32); 19] = [
+    ("etc/ros2probe/ros2probe.yaml", 0o644),
+    ("usr/bin/rp", 0o755),
+    ("usr/lib/systemd/system/ros2probe.service", 0o644),
+    ("usr/share/bash-completion/completions/rp", 0o644),
+    ("usr/share/doc/ros2probe/CHANGELOG.md.gz", 0o644),
+    ("usr/share/doc/ros2probe/README.md", 0o644),
+    ("usr/share/doc/ros2probe/changelog.gz", 0o644),
+    ("usr/share/doc/ros2probe/copyright", 0o644),
+    ("usr/share/doc/ros2probe/install.md", 0o644),
+    ("usr/share/doc/ros2probe/libraries.gz", 0o644),
+    ("usr/share/fish/vendor_completions.d/rp.fish", 0o644),
+    ("usr/share/lintian/overrides/ros2probe", 0o644),
+    ("usr/share/ros2probe/dashboards/fleet.json", 0o644),
+    ("usr/share/ros2probe/dashboards/robot.json", 0o644),
+    ("usr/share/ros2probe/ros2probe.schema.json", 0o644),
+    ("usr/share/ros2probe/rules/ros2probe.alerts.yaml", 0o644),
+    ("usr/share/ros2probe/rules/ros2probe.rules.yaml", 0o644),
+    ("usr/share/ros2probe/systemd-before-247.conf", 0o644),
+    ("usr/share/zsh/vendor-completions/_rp", 0o644),
+];

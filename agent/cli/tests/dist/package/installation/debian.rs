@@ -1,0 +1,185 @@
+//! A Debian host of its own: a container over a fresh system, whose writes go to memory.
+
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+
+use anyhow::{Context as _, Result, bail, ensure};
+
+use super::all;
+use ros2probe_testing::harness::cgroup::Cgroup;
+use ros2probe_testing::harness::{PREFIX, require, wait_until};
+
+/// What is the container's first process.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Start {
+    Systemd,
+    /// As in a chroot or in most containers.
+    Nothing,
+}
+
+/// Ends when it is dropped.
+pub(crate) struct Debian {
+    container: Child,
+    /// Its first process.
+    first: u32,
+    /// What it and its first process say.
+    console: PathBuf,
+    cgroup: Cgroup,
+}
+
+/// Writes to memory, over the fresh system; `$0` of it, `$1` for the mounts, then a command.
+const OVER: &str = "set -e; mkdir -p \"$1\"; mount -t tmpfs tmpfs \"$1\"; \
+    mkdir \"$1/new\" \"$1/work\" \"$1/root\"; \
+    mount -t overlay -o \"lowerdir=$0,upperdir=$1/new,workdir=$1/work\" overlay \"$1/root\"; \
+    shift; exec \"$@\" </dev/null";
+
+impl Debian {
+    /// A host whose `/packages` is `packages`.
+    pub(crate) fn start(start: Start, packages: &Path) -> Result<Self> {
+        require()?;
+        let system = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/tools/debian");
+        ensure!(
+            system.join("complete").exists(),
+            "no Debian system in {}: run `.ci/prerequisites.sh test`",
+            system.display()
+        );
+        let name = format!("{PREFIX}-{}-{start:?}", std::process::id()).to_lowercase();
+        let cgroup = Cgroup::create(&name)?;
+        let place = packages.join(&name);
+        let mut words = cgroup.inside();
+        words.extend(["unshare", "--mount", "sh", "-c", OVER].map(str::to_owned));
+        words.push(system.display().to_string());
+        words.push(place.display().to_string());
+        words.extend(
+            [
+                "systemd-nspawn",
+                "--quiet",
+                "--register=no",
+                "--keep-unit",
+                "--private-network",
+                "--console=pipe",
+                "--capability=all",
+                "--system-call-filter=bpf perf_event_open",
+            ]
+            .map(str::to_owned),
+        );
+        words.push(format!("--machine={name}"));
+        words.push(format!("--directory={}", place.join("root").display()));
+        words.push(format!("--bind-ro={}:/packages", packages.display()));
+        match start {
+            Start::Systemd => words.push("--boot".to_owned()),
+            Start::Nothing => words.extend(["--as-pid2", "sleep", "infinity"].map(str::to_owned)),
+        }
+        let console = packages.join(format!("{name}.log"));
+        let log = File::create(&console)?;
+        let (program, arguments) = words.split_first().context("no words")?;
+        let container = Command::new(program)
+            .args(arguments)
+            // As hosts have it; a mixture of both versions is this machine's own.
+            .env("SYSTEMD_NSPAWN_UNIFIED_HIERARCHY", "1")
+            .stdin(Stdio::null())
+            .stdout(log.try_clone()?)
+            .stderr(log)
+            .spawn()
+            .context("cannot start the container")?;
+        let mut host = Self {
+            container,
+            first: 0,
+            console,
+            cgroup,
+        };
+        host.wait(start)?;
+        Ok(host)
+    }
+
+    /// What a script says, which must succeed.
+    pub(crate) fn run(&self, script: &str) -> Result<String> {
+        let output = self.attempt(script)?;
+        ensure!(
+            output.status.success(),
+            "{script}: {}\n{}",
+            output.status,
+            all(&output)
+        );
+        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    }
+
+    /// How a script ends and what it says.
+    pub(crate) fn attempt(&self, script: &str) -> Result<Output> {
+        let first = self.first.to_string();
+        let mut command = Command::new("nsenter");
+        command.args(["--target", &first, "--all", "env", "--ignore-environment"]);
+        command.args([
+            "PATH=/usr/sbin:/usr/bin:/sbin:/bin",
+            "LC_ALL=C.UTF-8",
+            "HOME=/root",
+        ]);
+        command.args(["DEBIAN_FRONTEND=noninteractive", "bash", "-c", script]);
+        command.stdin(Stdio::null());
+        command.output().context("nsenter")
+    }
+
+    /// What a script says, however it ends.
+    pub(crate) fn text(&self, script: &str) -> Result<String> {
+        Ok(all(&self.attempt(script)?))
+    }
+
+    /// What a port of it answers.
+    pub(crate) fn get(&self, port: u16, path: &str) -> Result<String> {
+        self.run(&format!(
+            "exec 3<>/dev/tcp/127.0.0.1/{port} && \
+             printf 'GET {path} HTTP/1.0\\r\\nHost: localhost\\r\\n\\r\\n' >&3 && cat <&3"
+        ))
+    }
+
+    fn wait(&mut self, start: Start) -> Result<()> {
+        let nspawn = self.container.id();
+        let children = format!("/proc/{nspawn}/task/{nspawn}/children");
+        wait_until("the container's first process", || {
+            if let Some(status) = self.container.try_wait()? {
+                bail!("{status}\n{}", std::fs::read_to_string(&self.console)?);
+            }
+            let text = std::fs::read_to_string(&children)?;
+            self.first = text.split_whitespace().next().map_or(Ok(0), str::parse)?;
+            let is_there = self.first != 0 && self.attempt("test -d /packages")?.status.success();
+            let is_up = || -> Result<bool> {
+                let said = self.text("systemctl is-system-running")?;
+                Ok(matches!(said.trim(), "running" | "degraded"))
+            };
+            Ok(is_there && (start == Start::Nothing || is_up()?))
+        })
+    }
+}
+
+impl Drop for Debian {
+    fn drop(&mut self) {
+        let _ = self.container.kill();
+        let _ = self.container.wait();
+        // Everybody inside, then the groups that were made for them: also in the hierarchy of
+        // version 1 where that is systemd's own.
+        let _ = std::fs::write(self.cgroup.path().join("cgroup.kill"), "1");
+        let own = self.cgroup.path().file_name().unwrap_or_default();
+        let own = Path::new("/sys/fs/cgroup/systemd").join(own);
+        for group in [self.cgroup.path(), &own] {
+            let gone = || Ok(!group.exists() || remove_below(group).is_ok());
+            if let Err(error) = wait_until("nobody in a container", gone) {
+                eprintln!("{}: {error}", group.display());
+            }
+        }
+        let _ = std::fs::remove_dir(own);
+    }
+}
+
+/// Removes the control groups below one.
+fn remove_below(group: &Path) -> io::Result<()> {
+    for entry in group.read_dir()? {
+        let entry = entry?;
+        if entry.file_type()?.is_dir() {
+            remove_below(&entry.path())?;
+            std::fs::remove_dir(entry.path())?;
+        }
+    }
+    Ok(())
+}

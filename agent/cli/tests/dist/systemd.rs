@@ -1,0 +1,140 @@
+//! The shipped unit: hardened, and free of what systemd would complain about.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn unit() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd/ros2probe.service")
+}
+
+fn systemd_analyze(arguments: &[&str], unit: &Path) -> Output {
+    Command::new("systemd-analyze")
+        .args(arguments)
+        .arg(unit)
+        .output()
+        .unwrap_or_else(|error| panic!("systemd-analyze: {error}; `apt-get install systemd`"))
+}
+
+/// `make test` leaves this out where systemd is older (`.ci/prerequisites.sh --left-out`).
+#[test]
+fn the_exposure_level_is_at_most_2() {
+    let output = systemd_analyze(&["security", "--offline=true", "--no-pager"], &unit());
+    let refused = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        !refused.contains("unrecognized option"),
+        "scoring a unit that is not installed needs systemd 250: {refused}"
+    );
+    let said = String::from_utf8_lossy(&output.stdout).into_owned();
+    let level = said.lines().find_map(|line| {
+        let (_, level) = line.split_once("Overall exposure level for ros2probe.service: ")?;
+        level.split_whitespace().next()?.parse::<f64>().ok()
+    });
+    assert!(
+        level.unwrap_or_else(|| panic!("no level in\n{said}")) <= 2.0,
+        "{said}"
+    );
+}
+
+#[test]
+fn systemd_understands_every_line() {
+    let directory = tempfile::tempdir().unwrap();
+    let copy = directory.path().join("ros2probe.service");
+    let text = std::fs::read_to_string(unit()).unwrap();
+    std::fs::write(&copy, text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"))).unwrap();
+    let output = systemd_analyze(&["verify", "--man=no"], &copy);
+    let said = String::from_utf8_lossy(&output.stderr);
+    // What systemd says of other units on the machine is not ours.
+    let ours: Vec<&str> = said
+        .lines()
+        .filter(|line| line.contains("ros2probe"))
+        .collect();
+    assert!(ours.is_empty(), "{said}");
+}
+
+#[test]
+fn each_claim_of_the_threat_model_names_tests_that_exist() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let places = [
+        "agent/cli/tests",
+        "agent/cli/src",
+        "agent/daemon/src",
+        "wire/src",
+        "wire/tests",
+    ];
+    let source = |file: &str| {
+        let mut paths: Vec<_> = places
+            .iter()
+            .map(|place| root.join(place).join(format!("{file}.rs")))
+            .collect();
+        // `message/library` is a file of the crate in `agent/message`.
+        if let Some((krate, file)) = file.split_once('/') {
+            let folders =
+                ["src", "tests"].map(|folder| root.join("agent").join(krate).join(folder));
+            paths.extend(folders.map(|folder| folder.join(format!("{file}.rs"))));
+        }
+        let mut paths = paths.iter();
+        paths.find_map(|path| std::fs::read_to_string(path).ok())
+    };
+    let is_test = |source: &str, function: &str| {
+        let at = source.find(&format!("fn {function}("));
+        let before = at.and_then(|at| source.get(..at)).unwrap_or_default();
+        // Attributes stand between the last item and the function.
+        let lines = before.lines().rev().take(4).map(str::trim);
+        let mut attributes = lines.take_while(|line| !line.starts_with('}'));
+        attributes.any(|line| line.starts_with("#[test]") || line.starts_with("#[tokio::test"))
+    };
+    let model = std::fs::read_to_string(root.join("SECURITY.md")).unwrap();
+    let (mut claims, mut named, mut is_claim) = (0, 0, false);
+    for line in model.lines() {
+        is_claim = line == "| claim | shown by |" || is_claim && line.starts_with('|');
+        let row = line
+            .strip_prefix("| ")
+            .and_then(|row| row.strip_suffix(" |"));
+        let Some((claim, tests)) = row.and_then(|row| row.rsplit_once(" | ")) else {
+            continue;
+        };
+        if !is_claim || tests == "shown by" || claim.starts_with("---") {
+            continue;
+        }
+        claims += 1;
+        let tests: Vec<_> = tests.split('`').skip(1).step_by(2).collect();
+        assert!(!tests.is_empty(), "no test shows: {claim}");
+        for test in tests {
+            let (file, function) = test.split_once("::").unwrap_or_default();
+            let source = source(file);
+            let exists = source.is_some_and(|source| is_test(&source, function));
+            assert!(exists, "SECURITY.md names {test}, which is no test");
+            named += 1;
+        }
+    }
+    assert!(
+        claims > 40 && named > 60,
+        "{named} tests of {claims} claims"
+    );
+}
+
+#[test]
+fn the_agent_may_do_what_it_needs_and_nothing_else() {
+    let text = std::fs::read_to_string(unit()).unwrap();
+    for set in ["CapabilityBoundingSet", "AmbientCapabilities"] {
+        let line = format!("\n{set}=CAP_NET_ADMIN CAP_NET_RAW CAP_BPF CAP_PERFMON\n");
+        assert!(text.contains(&line), "{set}");
+    }
+    for line in [
+        "Type=notify",
+        "LimitMEMLOCK=infinity",
+        "Before=network.target",
+        "Restart=always",
+        "StartLimitIntervalSec=0",
+        "User=ros2probe",
+        "Group=ros2probe",
+        "LimitRTPRIO=1",
+        "UMask=0077",
+        "StateDirectoryMode=0750",
+        "NoNewPrivileges=yes",
+        "IPAddressDeny=any",
+        "IPAddressAllow=localhost link-local 10.0.0.0/8 172.16.0.0/12 192.168.0.0/16 100.64.0.0/10 fc00::/7",
+    ] {
+        assert!(text.lines().any(|other| other == line), "{line}");
+    }
+}

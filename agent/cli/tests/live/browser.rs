@@ -1,0 +1,284 @@
+//! The page in a real Chromium: beside a robot that runs, on captures of what goes wrong, with names
+//! that mean harm, without rights, and while the agent or the tab is away. Each test plays a scenario
+//! of `agent/cli/tests/page`, in which nothing may leave the agent's origin or reach the console.
+
+mod crowd;
+mod player;
+mod robot;
+
+use std::io::{Read as _, Write as _};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::rp;
+use anyhow::{Context as _, Result, ensure};
+use flate2::read::MultiGzDecoder;
+use player::{play, watch};
+use robot::{Place, Robot};
+use ros2probe_testing::harness::bpf::interest_of;
+use ros2probe_testing::local_agent::LocalAgent;
+use serde_json::{Value, json};
+
+/// Topics of the large robot.
+const CROWD: usize = 500;
+/// The API of an agent whose host is its own.
+const PAGE: &str = "http://127.0.0.1:17401/";
+
+/// What is measured from the start.
+const SENSORS: &str = "watch: [/imu, /points, /scan]\n";
+
+#[test]
+fn every_view_shows_a_robot_that_runs() -> Result<()> {
+    let place = Place::new()?;
+    let _agent = place.agent(SENSORS)?;
+    let robot = Robot::start(&place.host)?;
+    let mut late = None;
+    let mut answers = |question: &str| {
+        ensure!(question == "another node", "{question}");
+        late = Some(place.publisher("/late", "/late_comer")?);
+        Ok(json!({}))
+    };
+    let lidar = robot.lidar.pid().to_string();
+    play(&place.inside(), "robot", &[PAGE, &lidar], &mut answers)
+}
+
+#[test]
+fn every_view_is_accessible_in_both_themes_on_a_phone_and_enlarged() -> Result<()> {
+    let place = Place::new()?;
+    let _agent = place.agent(&format!("{SENSORS}{}", place.recordings()))?;
+    let _robot = Robot::start(&place.host)?;
+    watch(&place.inside(), "access", &[PAGE])
+}
+
+#[test]
+fn a_press_measures_a_topic_down_to_the_kernel() -> Result<()> {
+    let place = Place::new()?;
+    let agent = place.agent("")?;
+    let _robot = Robot::start(&place.host)?;
+    let mut answers = |question: &str| {
+        ensure!(question == "watches", "{question}");
+        let watches = place.ask("/watch")?;
+        let topics: Vec<_> = watches["watches"]
+            .as_array()
+            .context("no list")?
+            .iter()
+            .map(|each| each["topic"].clone())
+            .collect();
+        let interest = interest_of(agent.process.pid())?.len();
+        Ok(json!({"topics": topics, "interest": interest}))
+    };
+    play(&place.inside(), "watch", &[PAGE], &mut answers)
+}
+
+#[test]
+fn the_message_of_a_topic_is_a_tree_with_charts_of_its_numbers() -> Result<()> {
+    let place = Place::new()?;
+    let _agent = place.agent("")?;
+    let _robot = Robot::start(&place.host)?;
+    let mut answers = |question: &str| {
+        ensure!(question == "streams", "{question}");
+        Ok(json!({"messages": place.used("subscriptions")?}))
+    };
+    play(&place.inside(), "message", &[PAGE], &mut answers)
+}
+
+#[test]
+fn a_recording_goes_from_its_start_to_the_files_that_are_downloaded() -> Result<()> {
+    let place = Place::new()?;
+    let bags = place.directory.path().join("bags");
+    let snapshots = "  snapshots: [{name: incident, topics: [/imu], seconds: 5}]\n";
+    let _agent = place.agent(&(place.recordings() + snapshots))?;
+    let _robot = Robot::start(&place.host)?;
+    let mut answers = |question: &str| {
+        if let Some(file) = question.strip_prefix("size ") {
+            let size = std::fs::metadata(bags.join("lap-one").join(file))?.len();
+            return Ok(json!({"size": size}));
+        }
+        let recordings = place.ask("/recordings")?;
+        let recordings = recordings["recordings"].as_array().context("no list")?;
+        let names: Vec<_> = recordings.iter().map(|each| each["name"].clone()).collect();
+        Ok(json!({"names": names}))
+    };
+    play(&place.inside(), "recording", &[PAGE], &mut answers)
+}
+
+#[test]
+fn the_page_goes_on_with_an_agent_that_hung_ended_or_was_killed() -> Result<()> {
+    let place = Place::new()?;
+    let mut agent = Some(place.agent(SENSORS)?);
+    let mut robot = Some(Robot::start(&place.host)?);
+    let mut other = None;
+    let mut answers = |question: &str| {
+        match question {
+            "freeze" => agent
+                .as_ref()
+                .context("no agent runs")?
+                .process
+                .signal("STOP")?,
+            "thaw" => agent
+                .as_ref()
+                .context("no agent runs")?
+                .process
+                .signal("CONT")?,
+            "stop" => drop(agent.take().context("no agent runs")?.process.terminate()?),
+            "kill" => drop(agent.take().context("no agent runs")?),
+            "start" => agent = Some(place.agent("watch: [/**]\n")?),
+            "forget the robot" => robot = None,
+            "another robot" => {
+                other = Some(place.publisher("/after_restart", "/other")?);
+            }
+            "run" => {
+                let page = place.ask("/health")?;
+                return Ok(json!({"run": page["process_id"]}));
+            }
+            _ => anyhow::bail!("{question}"),
+        }
+        Ok(json!({}))
+    };
+    let played = play(&place.inside(), "restart", &[PAGE], &mut answers);
+    drop((robot, other));
+    played
+}
+
+#[test]
+fn a_tab_that_slept_for_a_minute_shows_the_robot_of_now() -> Result<()> {
+    let place = Place::new()?;
+    let _agent = place.agent("watch: [/**]\n")?;
+    let _robot = Robot::start(&place.host)?;
+    let mut other = None;
+    let mut answers = |question: &str| match question {
+        "another topic" => {
+            other = Some(place.publisher("/while_asleep", "/night_watch")?);
+            Ok(json!({}))
+        }
+        _ => Ok(json!({"live": place.streams()?})),
+    };
+    let played = play(&place.inside(), "asleep", &[PAGE], &mut answers);
+    drop(other);
+    played
+}
+
+#[test]
+fn an_incident_of_the_past_is_on_the_page_of_its_capture() -> Result<()> {
+    let capture = data("cyclonedds/points-besteffort-lossy-2ns");
+    let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "1"]);
+    agent.wait_for_log("the capture has ended");
+    watch(&[], "loss", &[&page(&agent)])
+}
+
+#[test]
+fn a_mismatch_of_qos_leads_to_the_policy_that_does_not_fit() -> Result<()> {
+    // Before anybody says goodbye.
+    let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;
+    capture.write_all(&beginning(&data("cyclonedds/qos-mismatch-2ns"), 5)?)?;
+    let agent = replay(capture.path(), &[]);
+    watch(&[], "mismatch", &[&page(&agent)])
+}
+
+#[test]
+fn five_hundred_hostile_names_stay_text() -> Result<()> {
+    let capture = large_robot(true, 20)?;
+    let agent = replay(capture.path(), &[]);
+    watch(&[], "hostile", &[&page(&agent), &CROWD.to_string()])
+}
+
+#[test]
+fn rights_that_loopback_does_not_give_come_with_a_token() -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let socket = directory.path().join("api.sock");
+    let configured = directory.path().join("config.yaml");
+    std::fs::write(
+        &configured,
+        format!("api: {{socket: {}}}\n", socket.display()),
+    )?;
+    let file = directory.path().join("token");
+    std::fs::write(&file, "0123456789abcdef0123\n")?;
+    let strict = directory.path().join("strict.yaml");
+    std::fs::write(
+        &strict,
+        format!("api: {{token_file: {}}}\n", file.display()),
+    )?;
+    let capture = data("cyclonedds/points-besteffort-lossy-2ns");
+    let with = |path: &Path| path.to_str().unwrap().to_owned();
+    let agent = replay(
+        &capture,
+        &["--config", &with(&configured), "--api-loopback", "read"],
+    );
+    let other = replay(&capture, &["--config", &with(&strict)]);
+    let mut answers = |question: &str| {
+        ensure!(question == "rp page", "{question}");
+        let printed = rp().args(["page", "--socket"]).arg(&socket).output()?;
+        ensure!(
+            printed.status.success(),
+            "{}",
+            String::from_utf8_lossy(&printed.stderr)
+        );
+        let printed = String::from_utf8(printed.stdout)?;
+        Ok(json!({"printed": printed.trim()}))
+    };
+    play(&[], "token", &[&page(&agent), &page(&other)], &mut answers)
+}
+
+/// First useful paint with 500 topics, layout of large graphs, memory of a tab.
+#[test]
+#[ignore = "measures for minutes: make page-bench"]
+fn measurements() -> Result<()> {
+    let minutes = std::env::var("MEASURE_MINUTES").map_or(Ok(2), |text| text.parse::<u64>())?;
+    let seconds = 60 + minutes * 60;
+    let capture = large_robot(false, seconds)?;
+    let mut agent = LocalAgent::replay(
+        &mut rp(),
+        capture.path(),
+        &["--watch", "/**", "--speed", "1"],
+    );
+    agent.wait_for_log("ready");
+    let mut nothing = |question: &str| anyhow::bail!("no answer to {question}");
+    let limit = Duration::from_secs(seconds + 120);
+    player::play_for(limit, &[], "measure", &[&page(&agent)], &mut nothing)
+}
+
+/// An agent that has read all of a capture, with everything in it measured.
+fn replay(capture: &Path, arguments: &[&str]) -> LocalAgent {
+    let mut all = vec!["--speed", "max", "--watch", "/**"];
+    all.extend(arguments);
+    let mut agent = LocalAgent::replay(&mut rp(), capture, &all);
+    agent.wait_for_log("the capture has ended");
+    agent
+}
+
+fn page(agent: &LocalAgent) -> String {
+    format!("http://localhost:{}/", agent.api.port())
+}
+
+fn data(name: &str) -> PathBuf {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
+    data.join(name).join("capture.pcap.gz")
+}
+
+/// The packets of a capture's first seconds.
+fn beginning(capture: &Path, seconds: u32) -> Result<Vec<u8>> {
+    let mut all = Vec::new();
+    MultiGzDecoder::new(std::fs::File::open(capture)?).read_to_end(&mut all)?;
+    let number = |at: usize| u32::from_le_bytes(all[at..at + 4].try_into().unwrap());
+    let mut end = 24;
+    while end < all.len() && number(end) < number(24) + seconds {
+        end += 16 + number(end + 8) as usize;
+    }
+    all.truncate(end);
+    Ok(all)
+}
+
+fn large_robot(hostile: bool, seconds: u64) -> Result<tempfile::NamedTempFile> {
+    let mut file = tempfile::NamedTempFile::with_suffix(".pcap")?;
+    file.write_all(&crowd::capture(CROWD, hostile, seconds))?;
+    Ok(file)
+}
+
+/// The number of a list's member with this name.
+fn number(list: &Value, key: &str, name: &str, of: &str) -> Result<u64> {
+    let mut all = list.as_array().context("no list")?.iter();
+    let found = all.find(|each| each[key] == name);
+    found
+        .and_then(|each| each[of].as_u64())
+        .with_context(|| format!("no {name} in {list}"))
+}

@@ -1,0 +1,789 @@
+//! A long time beside a robot that changes all the while: the agent's graph stays the true one, and
+//! its needs stay what they were. Seconds in `make test`, an hour in `make soak`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context as _, Result, anyhow, ensure};
+use ros2probe_testing::forged::crowd::{Crowd, Graph, Scale, Tally};
+use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::{
+    Agent, METRICS, ON_THE_WIRE, Scrape, at_the_sockets_of, get,
+};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::run;
+use ros2probe_testing::harness::soak::{self, Curve, dropped};
+use serde_json::Value;
+use tempfile::TempDir;
+
+const API: &str = "http://127.0.0.1:17401";
+/// How long an agent may take to show what is so.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Of `make soak`: until what the agent holds is what it will be. Topics that vanished are kept for ten
+/// minutes.
+const WARM_UP: f64 = 0.15;
+/// What memory may rise from then on: the allocator finds its level in half an hour, though what is
+/// held stays the same (`docs/endurance.md`).
+const FILLING: f64 = 0.06;
+/// Until it has.
+const LEVEL: f64 = 0.5;
+/// What memory may rise from then on.
+const GROWTH: f64 = 0.02;
+
+#[test]
+fn an_hour_of_a_changing_graph_leaves_the_graph_true_and_memory_flat() -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let program = soak::program(env!("CARGO_BIN_EXE_rp"));
+    let start = |name: &str, host, source: String, watch: &str| {
+        let state = directory.path().join(name);
+        std::fs::create_dir(&state)?;
+        let file = directory.path().join(format!("{name}.yaml"));
+        let state = state.display();
+        let text = format!("watch: [{watch}]\nstate_directory: {state}\nlog: warn\n{source}");
+        std::fs::write(&file, text)?;
+        Agent::start(host, &program, &file)
+    };
+    // All topics, as in the package's configuration; and those that are asked for.
+    let wire = start("wire", &link.monitor, ON_THE_WIRE.to_owned(), "/**")?;
+    let sockets = at_the_sockets_of(&link.robot);
+    let sockets = start("sockets", &link.robot, sockets, "/measured/**")?;
+    // Sockets belong to the cgroup that they were made in.
+    let sender = link
+        .robot
+        .hold(|| Sender::between(&link.robot, &link.monitor))??;
+    let long = soak::long();
+    let scale = match long {
+        // The defaults hold a thousand; those whose lease has just ended count until that is noticed.
+        Some(_) => Scale {
+            participants: 960,
+            life: Duration::from_secs(90),
+            endpoint_changes: 10.0,
+            messages: 200.0,
+            leases: &[(4, 25), (10, 35), (20, 39), (100, 1)],
+        },
+        None => Scale {
+            participants: 250,
+            life: Duration::from_secs(15),
+            endpoint_changes: 10.0,
+            messages: 200.0,
+            leases: &[(4, 60), (7, 40)],
+        },
+    };
+    let mut crowd = Crowd::new(sender, scale);
+    let stop = AtomicBool::new(false);
+    let period = Duration::from_secs(long.map_or(1, |_| 5));
+    let curves = std::thread::scope(|scope| -> Result<Vec<Curve>> {
+        let stop = &stop;
+        let looks = [("on the wire", &wire), ("at the sockets", &sockets)];
+        let pens = looks.map(|(name, agent)| {
+            let (pid, host) = (agent.process.pid(), agent.host);
+            scope.spawn(move || Curve::draw(name, (pid, host), period, stop))
+        });
+        let mut views = Views::of(&[&wire, &sockets]);
+        let lived = live(&mut crowd, &mut views, long);
+        stop.store(true, Ordering::Relaxed);
+        let curves = pens.map(|pen| pen.join().map_err(|_| anyhow!("a pen died"))?);
+        let curves: Vec<Curve> = curves.into_iter().collect::<Result<_>>()?;
+        if long.is_some() {
+            soak::publish(&curves)?;
+        }
+        lived?;
+        let wrong = views.wrong;
+        ensure!(wrong.is_empty(), "{}: {}", wrong.len(), wrong.join("\n"));
+        Ok(curves)
+    })?;
+    for curve in &curves {
+        let last = curve.needs.last().context("nothing was drawn")?;
+        eprintln!("{}: {} births; at the end {last}", curve.name, crowd.born());
+        let Some(long) = long else { continue };
+        curve.is_level()?;
+        let growth = |part: f64| {
+            let growth = curve.growth(long.as_secs_f64() * part);
+            growth.context("too short for a slope")
+        };
+        let ((slope, end), (filling_slope, filling)) = (growth(LEVEL)?, growth(WARM_UP)?);
+        let text = format!(
+            "memory in the second half {:+.2} % by slope, {:+.2} % from begin to end; from minute {:.0} on \
+             {:+.2} and {:+.2} %; graph equal at every checkpoint",
+            slope * 100.0,
+            end * 100.0,
+            long.as_secs_f64() * WARM_UP / 60.0,
+            filling_slope * 100.0,
+            filling * 100.0,
+        );
+        soak::outcome(&format!("changing graph, {}", curve.name), &text)?;
+        ensure!(
+            slope <= GROWTH && end <= GROWTH && filling_slope <= FILLING && filling <= FILLING,
+            "{}: {text}",
+            curve.name
+        );
+    }
+    // More than 1000 topics are measured by no agent of the defaults, and it says so.
+    if long.is_some() {
+        let refused = wire.scrape()?.sum("ros2probe_topics_rejected_total", &[]);
+        ensure!(refused > 0.0, "2000 topics and none refused");
+    }
+    Ok(())
+}
+
+#[test]
+fn who_was_stopped_for_seconds_believes_nobody_gone_and_counts_what_it_missed() -> Result<()> {
+    let link = Link::new()?;
+    // Its ring holds a second and a half; one of the default size holds six.
+    let robot = Robot::start(
+        &link,
+        "watch: [/**]\ncapture: {source: wire, ring_bytes: 1048576}\n",
+    )?;
+    let mut crowd = Crowd::new(robot.sender()?, few(&[(4, 100)]));
+    crowd.live(Duration::from_secs(2))?;
+    let views = &mut Views::of(&[&robot.agent]);
+    views.compare(&mut crowd)?;
+    let pauses = soak::long().map_or(&[5][..], |_| &[5, 60]);
+    for pause in pauses.iter().copied().map(Duration::from_secs) {
+        // Until those are gone that went without a word.
+        crowd.rest(Duration::from_secs(5))?;
+        let expired = robot.expired()?;
+        robot.agent.process.signal("STOP")?;
+        crowd.rest(pause)?;
+        robot.agent.process.signal("CONT")?;
+        let woke = Instant::now();
+        robot.wait_ready()?;
+        let ready = woke.elapsed();
+        crowd.rest(Duration::from_secs(1))?;
+        let page = robot.agent.scrape_until("a fresh page", |page| {
+            page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0
+        })?;
+        let missed = dropped(&page);
+        ensure!(missed > 0.0, "{pause:?} and nothing was dropped");
+        ensure!(
+            robot.expired()? == expired,
+            "somebody is believed gone: {}",
+            page.0
+        );
+        ensure!(
+            graph_of(&link.monitor)? == crowd.graph(),
+            "the graph is another one"
+        );
+        let text = format!(
+            "nobody believed gone, {missed} frames dropped and counted, ready after {ready:?}"
+        );
+        soak::outcome(&format!("SIGSTOP for {pause:?}"), &text)?;
+    }
+    // Who really goes is missed in time.
+    views.compare(&mut crowd)?;
+    crowd.live(Duration::from_secs(2))?;
+    views.compare(&mut crowd)?;
+    ensure!(views.wrong.is_empty(), "{}", views.wrong.join("\n"));
+    Ok(())
+}
+
+#[test]
+fn what_an_overloaded_agent_cannot_take_is_counted_and_what_comes_afterwards_is_exact() -> Result<()>
+{
+    let link = Link::new()?;
+    // Room for some 500 records.
+    let small = "watch: [/**]\ncapture: {source: wire, record_ring_bytes: 65536}\n";
+    let robot = Robot::start(&link, small)?;
+    let (mut real, mut flood) = (Talker::new(1, "/real"), Talker::new(2, "/flood"));
+    let mut sender = robot.sender()?;
+    introduce(&real, &mut sender)?;
+    introduce(&flood, &mut sender)?;
+    talk(&mut real, &mut sender, [320; 100])?;
+    robot.agent.settled_scrape("/real", 100)?;
+    // 2 ms of CPU in 100: less than it takes to look.
+    let brake = Brake::new(&robot.agent)?;
+    let began = Instant::now();
+    let span = Duration::from_secs(soak::long().map_or(3, |_| 30));
+    while began.elapsed() < span {
+        // Their leases are shorter than a long flood.
+        sender.carry(&real.participant())?;
+        sender.carry(&flood.participant())?;
+        for _ in 0..200 {
+            sender.carry(&flood.sample(1200))?;
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    // And for a moment none at all, which is sure to be too little.
+    robot.agent.process.signal("STOP")?;
+    for _ in 0..2000 {
+        sender.carry(&flood.sample(1200))?;
+    }
+    robot.agent.process.signal("CONT")?;
+    let held = robot.readiness()?;
+    drop(brake);
+    let released = Instant::now();
+    robot.wait_ready()?;
+    let ready = released.elapsed();
+    let page = robot.agent.settled_scrape("/flood", 0)?;
+    let topic = |page: &Scrape, name: &str, topic| page.sum(name, &[("topic", topic)]);
+    let counted = topic(&page, "ros2_topic_messages_total", "/flood");
+    let lost = topic(&page, "ros2_topic_lost_messages_total", "/flood");
+    let missed = dropped(&page);
+    let sent = f64::from(flood.sent());
+    // What came after the last one that was seen nobody has missed yet.
+    ensure!(
+        missed > 0.0 && counted < sent,
+        "{counted} of {sent}, {missed} dropped"
+    );
+    ensure!(
+        counted + lost <= sent && counted + missed >= sent,
+        "{counted} and {lost} lost of {sent}"
+    );
+    talk(&mut real, &mut sender, [320; 400])?;
+    let page = robot.agent.settled_scrape("/real", 500)?;
+    let exact = [
+        topic(&page, "ros2_topic_messages_total", "/real"),
+        topic(&page, "ros2_topic_lost_messages_total", "/real"),
+    ];
+    ensure!(exact == [500.0, 0.0], "{exact:?} of /real: {}", page.0);
+    let text = format!(
+        "{missed} of {sent} packets dropped and counted, meanwhile /readyz `{held}`, ready {ready:?} after; \
+         a stream exact before and after"
+    );
+    soak::outcome("more packets than the CPU can take", &text)
+}
+
+#[test]
+fn fragments_count_once_while_the_mtu_changes() -> Result<()> {
+    const MTUS: [u32; 4] = [9000, 576, 9000, 1500];
+    let link = Link::new()?;
+    let robot = Robot::start(&link, &format!("watch: [/**]\n{ON_THE_WIRE}"))?;
+    let mut sender = robot.sender()?;
+    let mut talker = Talker::new(1, "/points");
+    introduce(&talker, &mut sender)?;
+    let stop = AtomicBool::new(false);
+    let bytes = std::thread::scope(|scope| -> Result<usize> {
+        let stream = scope.spawn(|| -> Result<usize> {
+            let mut bytes = 0;
+            for size in [320, 1300, 4000, 20_000, 60_000].into_iter().cycle() {
+                talk(&mut talker, &mut sender, [size])?;
+                std::thread::sleep(Duration::from_millis(6));
+                bytes += size;
+                if stop.load(Ordering::Relaxed) {
+                    break;
+                }
+            }
+            Ok(bytes)
+        });
+        let mut before = 1500;
+        for mtu in MTUS {
+            std::thread::sleep(Duration::from_millis(500));
+            // Never may one end send what the other does not take.
+            let mut hosts = [&link.robot, &link.monitor];
+            if mtu > before {
+                hosts.reverse();
+            }
+            for host in hosts {
+                run(&format!("ip -n {} link set eth0 mtu {mtu}", host.name()))?;
+            }
+            before = mtu;
+        }
+        std::thread::sleep(Duration::from_millis(500));
+        stop.store(true, Ordering::Relaxed);
+        stream.join().map_err(|_| anyhow!("the stream died"))?
+    })?;
+    let page = robot
+        .agent
+        .settled_scrape("/points", talker.sent().into())?;
+    let value = |name| page.sum(name, &[("topic", "/points")]);
+    let found = (
+        value("ros2_topic_messages_total"),
+        value("ros2_topic_bytes_total"),
+        value("ros2_topic_lost_messages_total"),
+    );
+    let unseen = dropped(&page);
+    ensure!(
+        found == (f64::from(talker.sent()), bytes as f64, 0.0) && unseen == 0.0,
+        "{found:?}, {unseen} dropped: {}",
+        page.0
+    );
+    soak::outcome(
+        "MTU 1500, 9000, 576, 9000, 1500 during a stream in fragments",
+        &format!("{} samples, each counted once", talker.sent()),
+    )
+}
+
+#[test]
+fn a_network_namespace_that_goes_is_told_and_takes_nothing_along() -> Result<()> {
+    let link = Link::new()?;
+    let other = Namespace::alone()?;
+    let place = forged::path(&other);
+    let text = format!(
+        "watch: [/**]\ncapture: {{source: wire, network_namespaces: [{}]}}\n",
+        place.display()
+    );
+    let robot = Robot::start(&link, &text)?;
+    let mut inside = Sender::new(&other, "127.0.0.1:0", "127.0.0.1:7400")?;
+    let mut talker = Talker::new(1, "/inside");
+    introduce(&talker, &mut inside)?;
+    talk(&mut talker, &mut inside, [320; 50])?;
+    robot.agent.settled_scrape("/inside", 50)?;
+    drop(inside);
+    let name = other.name().to_owned();
+    drop(other);
+    harness::wait_until("the namespace is not missed", || {
+        Ok(robot
+            .log()?
+            .contains("the network namespace was removed or replaced"))
+    })?;
+    let mut sender = robot.sender()?;
+    let mut talker = Talker::new(2, "/outside");
+    introduce(&talker, &mut sender)?;
+    talk(&mut talker, &mut sender, [320; 200])?;
+    let page = robot.agent.settled_scrape("/outside", 200)?;
+    let counted = |topic| page.sum("ros2_topic_messages_total", &[("topic", topic)]);
+    ensure!(
+        [counted("/inside"), counted("/outside")] == [50.0, 200.0],
+        "{}",
+        page.0
+    );
+    // Another one at the path is not the one that is captured.
+    run(&format!("ip netns add {}", name))?;
+    std::thread::sleep(Duration::from_secs(2));
+    ensure!(robot.readiness()? == "503", "another namespace is observed");
+    run(&format!("ip netns delete {}", name))?;
+    // The robot's whole network goes: the cable with it.
+    drop(sender);
+    run(&format!("ip -n {} link delete eth0", link.robot.name()))?;
+    std::thread::sleep(Duration::from_secs(2));
+    // The cable is no reason, the namespace is one.
+    ensure!(
+        robot.readiness()? == "503",
+        "ready without a namespace that the configuration names"
+    );
+    ensure!(robot.log()?.lines().count() < 10, "{}", robot.log()?);
+    soak::outcome(
+        "captured network namespace removed, and the cable of another",
+        "reported once which one is not seen; the others counted exactly; /readyz answers 503 with the reason",
+    )
+}
+
+#[test]
+#[ignore = "sets the clock of this machine: make soak ROS2PROBE_SOAK_CLOCK=30"]
+fn the_clock_of_this_machine_is_set_an_hour_forth_and_back() -> Result<()> {
+    // Everything on the machine notices: only on request, by so many seconds or an hour.
+    let asked = std::env::var("ROS2PROBE_SOAK_CLOCK").context("ROS2PROBE_SOAK_CLOCK")?;
+    let step = match asked.parse().context("ROS2PROBE_SOAK_CLOCK")? {
+        1 => 3600,
+        seconds => seconds,
+    };
+    let link = Link::new()?;
+    let robot = Robot::start(&link, &format!("watch: [/**]\n{ON_THE_WIRE}"))?;
+    let mut crowd = Crowd::new(robot.sender()?, few(&[(4, 100)]));
+    crowd.live(Duration::from_secs(4))?;
+    let views = &mut Views::of(&[&robot.agent]);
+    views.compare(&mut crowd)?;
+    for seconds in [step, -step] {
+        crowd.rest(Duration::from_secs(5))?;
+        let expired = robot.expired()?;
+        let set = SetClock::by(seconds)?;
+        crowd.rest(Duration::from_millis(1200))?;
+        let page = robot.agent.scrape()?;
+        let shown = page.sum("ros2probe_snapshot_age_seconds", &[]);
+        let rate = page
+            .samples("ros2_topic_rate_hertz", &[])
+            .fold(0.0, f64::max);
+        drop(set);
+        crowd.rest(Duration::from_millis(1500))?;
+        let ready = robot.readiness()?;
+        ensure!(
+            (0.0..5.0).contains(&shown) && rate < 1000.0,
+            "{shown} s old, {rate} Hz"
+        );
+        ensure!(ready == "200", "{ready}");
+        ensure!(robot.expired()? == expired, "leases ended by a clock");
+        crowd.live(Duration::from_secs(1))?;
+        views.compare(&mut crowd)?;
+        let text = "no lease ended, no absurd rate, ready, events and messages exact";
+        soak::outcome(&format!("the clock set by {seconds} s and back"), text)?;
+    }
+    ensure!(views.wrong.is_empty(), "{}", views.wrong.join("\n"));
+    Ok(())
+}
+
+/// A few dozen participants with these leases.
+fn few(leases: &'static [(u64, u64)]) -> Scale {
+    Scale {
+        participants: 60,
+        life: Duration::from_secs(20),
+        endpoint_changes: 5.0,
+        messages: 100.0,
+        leases,
+    }
+}
+
+/// An agent on the monitor, and the robot that it looks at.
+struct Robot<'a> {
+    link: &'a Link,
+    agent: Agent<'a>,
+    directory: TempDir,
+}
+
+impl<'a> Robot<'a> {
+    fn start(link: &'a Link, configuration: &str) -> Result<Robot<'a>> {
+        let directory = tempfile::tempdir()?;
+        let file = directory.path().join("ros2probe.yaml");
+        std::fs::write(
+            &file,
+            format!("state_directory: off\nlog: warn\n{configuration}"),
+        )?;
+        let program = soak::program(env!("CARGO_BIN_EXE_rp"));
+        let log = directory.path().join("log");
+        let agent = Agent::start_logging(&link.monitor, program, &file, &log)?;
+        Ok(Robot {
+            link,
+            agent,
+            directory,
+        })
+    }
+
+    fn sender(&self) -> Result<Sender> {
+        Sender::between(&self.link.robot, &self.link.monitor)
+    }
+
+    fn log(&self) -> Result<String> {
+        Ok(std::fs::read_to_string(self.directory.path().join("log"))?)
+    }
+
+    /// How many participants are believed gone because of their leases.
+    fn expired(&self) -> Result<f64> {
+        let labels = [("entity", "participant"), ("event", "expired")];
+        Ok(self
+            .agent
+            .scrape()?
+            .sum("ros2_discovery_events_total", &labels))
+    }
+
+    /// Status of `/readyz`; 000 when there is no answer within three seconds.
+    fn readiness(&self) -> Result<String> {
+        let [enter, network] = self.link.monitor.outside();
+        let output = Command::new(enter)
+            .arg(network)
+            .args([
+                "curl",
+                "-s",
+                "-m",
+                "3",
+                "-o",
+                "/dev/null",
+                "-w",
+                "%{http_code}",
+            ])
+            .arg(format!("{METRICS}/readyz"))
+            .output()?;
+        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    }
+
+    fn wait_ready(&self) -> Result<()> {
+        harness::wait_until("/readyz", || Ok(self.readiness()? == "200"))
+    }
+}
+
+/// Leaves a process two hundredths of a CPU.
+struct Brake(PathBuf);
+
+impl Brake {
+    fn new(agent: &Agent<'_>) -> Result<Brake> {
+        let group = format!("/sys/fs/cgroup/cpu/r2p-{}-brake", std::process::id());
+        std::fs::create_dir(&group).with_context(|| format!("cannot create {group}"))?;
+        let brake = Brake(group.into());
+        std::fs::write(brake.0.join("cpu.cfs_quota_us"), "2000")?;
+        std::fs::write(
+            brake.0.join("cgroup.procs"),
+            agent.process.pid().to_string(),
+        )?;
+        Ok(brake)
+    }
+}
+
+impl Drop for Brake {
+    fn drop(&mut self) {
+        let above = self.0.with_file_name("cgroup.procs");
+        let own = std::fs::read_to_string(self.0.join("cgroup.procs")).unwrap_or_default();
+        for process in own.lines() {
+            let _ = std::fs::write(&above, process);
+        }
+        if let Err(error) = std::fs::remove_dir(&self.0) {
+            eprintln!("cannot remove {}: {error}", self.0.display());
+        }
+    }
+}
+
+/// The machine's clock is wrong for as long as this lives.
+struct SetClock {
+    right: Duration,
+    since: Instant,
+}
+
+impl SetClock {
+    fn by(seconds: i64) -> Result<SetClock> {
+        let right = SystemTime::now().duration_since(UNIX_EPOCH)?;
+        let set = SetClock {
+            right,
+            since: Instant::now(),
+        };
+        let wrong = right.as_secs().saturating_add_signed(seconds);
+        set_clock(Duration::new(wrong, right.subsec_nanos()))?;
+        Ok(set)
+    }
+}
+
+impl Drop for SetClock {
+    fn drop(&mut self) {
+        if let Err(error) = set_clock(self.right + self.since.elapsed()) {
+            eprintln!("the clock is still wrong: {error:#}");
+        }
+    }
+}
+
+fn set_clock(time: Duration) -> Result<()> {
+    let time = libc::timespec {
+        tv_sec: time.as_secs().try_into()?,
+        tv_nsec: time.subsec_nanos().into(),
+    };
+    // SAFETY: the kernel reads a timespec that outlives the call.
+    let result = unsafe { libc::clock_settime(libc::CLOCK_REALTIME, &raw const time) };
+    ensure!(result == 0, "{}", std::io::Error::last_os_error());
+    Ok(())
+}
+
+/// Lives through all phases and compares after each.
+fn live<C: Carrier>(
+    crowd: &mut Crowd<C>,
+    views: &mut Views<'_>,
+    long: Option<Duration>,
+) -> Result<()> {
+    let Some(long) = long else {
+        crowd.live(Duration::from_secs(6))?;
+        views.compare(crowd)?;
+        crowd.aim(60);
+        crowd.live(Duration::from_secs(3))?;
+        return views.compare(crowd);
+    };
+    let since = Instant::now();
+    let mut round = 0;
+    while since.elapsed() < long {
+        round += 1;
+        crowd.aim(usize::MAX);
+        crowd.live(
+            long.mul_f64(0.03)
+                .clamp(Duration::from_secs(20), Duration::from_secs(150)),
+        )?;
+        views.compare(crowd)?;
+        // Most of them go at once, every ten minutes or so.
+        if round % 4 == 0 {
+            crowd.aim(200);
+            crowd.live(Duration::from_secs(20))?;
+            views.compare(crowd)?;
+        }
+    }
+    Ok(())
+}
+
+/// What each agent says, and what it could not have seen.
+struct Views<'a> {
+    agents: Vec<&'a Agent<'a>>,
+    /// What was dropped and what was miscounted for it, by the last checkpoint.
+    excused: Vec<(f64, Tally, Vec<f64>)>,
+    since: Instant,
+    wrong: Vec<String>,
+}
+
+impl<'a> Views<'a> {
+    fn of(agents: &[&'a Agent<'a>]) -> Views<'a> {
+        Views {
+            agents: agents.to_vec(),
+            excused: vec![Default::default(); agents.len()],
+            since: Instant::now(),
+            wrong: Vec::new(),
+        }
+    }
+
+    /// Notes where an agent's graph is another one than the crowd's, or its counts are.
+    fn compare<C: Carrier>(&mut self, crowd: &mut Crowd<C>) -> Result<()> {
+        for index in 0..self.agents.len() {
+            let began = Instant::now();
+            let mut said = None;
+            loop {
+                crowd.rest(Duration::from_millis(500))?;
+                let is_late = began.elapsed() > PATIENCE;
+                if crowd.is_grey() && !is_late {
+                    continue;
+                }
+                // The crowd stays alive while the agent is asked.
+                let (host, before) = (self.agents[index].host, crowd.graph());
+                let answer = std::thread::scope(|scope| -> Result<Answer> {
+                    let asked = scope.spawn(|| Answer::of(host));
+                    while !asked.is_finished() {
+                        crowd.rest(Duration::from_millis(10))?;
+                    }
+                    asked.join().map_err(|_| anyhow!("nobody asked"))?
+                })?;
+                if crowd.graph() != before && !is_late {
+                    continue;
+                }
+                // What the kernel had no room for nobody can know: it is said again, and counts differ.
+                let blind = dropped(&answer.page) > self.excused[index].0;
+                let difference = self.difference(index, crowd, &answer, blind || is_late);
+                let Some(difference) = difference else { break };
+                if is_late {
+                    let text = format!("{} s: {difference}", self.since.elapsed().as_secs());
+                    eprintln!("agent {index} (0 wire, 1 sockets), {text}");
+                    self.wrong.push(text);
+                    break;
+                }
+                if blind && said.is_none_or(|at: Instant| at.elapsed() > PATIENCE / 4) {
+                    eprintln!(
+                        "{} dropped: everything is said again",
+                        dropped(&answer.page)
+                    );
+                    crowd.repeat()?;
+                    said = Some(Instant::now());
+                }
+            }
+        }
+        crowd.forget();
+        eprintln!(
+            "{} s: {} participants of {} compared",
+            self.since.elapsed().as_secs(),
+            crowd.size(),
+            crowd.born()
+        );
+        Ok(())
+    }
+
+    /// What is wrong in an answer; `excused` takes the counts as they are from now on.
+    fn difference<C: Carrier>(
+        &mut self,
+        index: usize,
+        crowd: &Crowd<C>,
+        answer: &Answer,
+        excused: bool,
+    ) -> Option<String> {
+        let (seen, truth, page) = (&answer.graph, &crowd.graph(), &answer.page);
+        let counted = |(entity, event): (&str, &str)| {
+            let labels = [("entity", entity), ("event", event)];
+            page.sum("ros2_discovery_events_total", &labels) as u64
+        };
+        let messages: Vec<f64> = crowd
+            .messages()
+            .map(|(topic, sent)| f64::from(sent) - answer.messages.get(&topic).unwrap_or(&0.0))
+            .collect();
+        let tally = crowd.tally().iter();
+        let errors: Tally = tally
+            .map(|(what, count)| (*what, count.wrapping_sub(counted(*what))))
+            .collect();
+        let (unseen, tally_errors, message_errors) = &mut self.excused[index];
+        let wrong_events: Vec<_> = errors
+            .iter()
+            .filter(|(what, error)| tally_errors.get(what).unwrap_or(&0) != *error)
+            .map(|(what, error)| format!("{what:?} {} too few", error.cast_signed()))
+            .collect();
+        let wrong_messages: Vec<_> = (0..messages.len())
+            .filter(|topic| message_errors.get(*topic).unwrap_or(&0.0) != &messages[*topic])
+            .map(|topic| format!("topic {topic} {} too few", messages[topic]))
+            .collect();
+        let strangers = page.sum("ros2_unknown_writers", &[]);
+        let wrong: Vec<_> = [wrong_events, wrong_messages].concat();
+        let difference = if seen != truth {
+            Some(differing(seen, truth))
+        } else if strangers > 0.0 || !wrong.is_empty() && dropped(page) <= *unseen {
+            let some: Vec<_> = wrong.iter().take(12).cloned().collect();
+            Some(format!("{strangers} strangers, {}", some.join(", ")))
+        } else {
+            None
+        };
+        if excused && seen == truth {
+            *unseen = dropped(page);
+            (*tally_errors, *message_errors) = (errors, messages);
+        }
+        difference
+    }
+}
+
+/// All that is compared.
+struct Answer {
+    graph: Graph,
+    page: Scrape,
+    /// Of each measured topic, less 1e9 for one that is lost.
+    messages: BTreeMap<String, f64>,
+}
+
+impl Answer {
+    fn of(host: &Namespace) -> Result<Answer> {
+        let graph = graph_of(host)?;
+        let page = Scrape(get(host, &format!("{METRICS}/metrics"))?);
+        let mut messages = BTreeMap::new();
+        let counters = [
+            ("ros2_topic_messages_total{", 1.0),
+            ("ros2_topic_lost_messages_total{", -1e9),
+        ];
+        for line in page.0.lines() {
+            let counter = counters.iter().find(|(name, _)| line.starts_with(name));
+            let topic = line
+                .split("topic=\"")
+                .nth(1)
+                .and_then(|rest| rest.split('"').next());
+            let value = line
+                .rsplit(' ')
+                .next()
+                .and_then(|value| value.parse::<f64>().ok());
+            if let (Some((_, factor)), Some(topic), Some(value)) = (counter, topic, value) {
+                *messages.entry(topic.to_owned()).or_default() += factor * value;
+            }
+        }
+        Ok(Answer {
+            graph,
+            page,
+            messages,
+        })
+    }
+}
+
+/// Everybody that the agent shows.
+fn graph_of(host: &Namespace) -> Result<Graph> {
+    let ask = |path: &str| -> Result<Value> {
+        Ok(serde_json::from_str(&get(host, &format!("{API}{path}"))?)?)
+    };
+    let list = |value: &Value, key: &str| value[key].as_array().cloned().unwrap_or_default();
+    let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
+    let mut graph = Graph::default();
+    for participant in list(&ask("/participants")?, "participants") {
+        let guid = text(&participant["guid"]);
+        for node in list(&participant, "nodes") {
+            graph.nodes.insert((guid.clone(), text(&node)));
+        }
+        graph.participants.insert(guid);
+    }
+    for topic in list(&ask("/topics?hidden=true")?, "topics") {
+        for (role, key) in [("writer", "publishers"), ("reader", "subscriptions")] {
+            for endpoint in list(&topic, key) {
+                let guid = text(&endpoint["guid"]);
+                graph
+                    .endpoints
+                    .insert((text(&topic["dds_name"]), role, guid));
+            }
+        }
+    }
+    Ok(graph)
+}
+
+fn differing(seen: &Graph, truth: &Graph) -> String {
+    fn sides<T: Ord + std::fmt::Debug>(seen: &BTreeSet<T>, truth: &BTreeSet<T>) -> String {
+        let ghosts: Vec<_> = seen.difference(truth).collect();
+        let missing: Vec<_> = truth.difference(seen).collect();
+        let some = |list: &[&T]| format!("{} {:?}", list.len(), &list[..list.len().min(3)]);
+        format!("ghosts {}, missing {}", some(&ghosts), some(&missing))
+    }
+    format!(
+        "participants: {}; endpoints: {}; nodes: {}",
+        sides(&seen.participants, &truth.participants),
+        sides(&seen.endpoints, &truth.endpoints),
+        sides(&seen.nodes, &truth.nodes)
+    )
+}

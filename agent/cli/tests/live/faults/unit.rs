@@ -1,0 +1,205 @@
+//! What the unit allows the agent, and control groups that hold a process to it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, bail};
+
+/// Of `CPUQuota`, as systemd has it by default.
+const PERIOD: Duration = Duration::from_millis(100);
+
+/// Read from the packaged unit.
+pub(super) struct Allowance {
+    /// `MemoryMax`, bytes.
+    pub(super) memory: u64,
+    /// `CPUQuota`, percent of a CPU.
+    pub(super) cpu_percent: u64,
+}
+
+impl Allowance {
+    pub(super) fn of_the_unit() -> Result<Allowance> {
+        let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd/ros2probe.service");
+        let text = fs::read_to_string(unit)?;
+        let value = |key: &str, unit: char| -> Result<u64> {
+            let value = text
+                .lines()
+                .find_map(|line| line.strip_prefix(key)?.strip_suffix(unit));
+            Ok(value
+                .with_context(|| format!("no {key} in the unit"))?
+                .parse()?)
+        };
+        Ok(Allowance {
+            memory: value("MemoryMax=", 'M')? << 20,
+            cpu_percent: value("CPUQuota=", '%')?,
+        })
+    }
+}
+
+/// Control groups of a test's own: one of the second version, or one for each controller of the first.
+pub(super) struct Confined {
+    memory: PathBuf,
+    cpu: Option<PathBuf>,
+    is_second: bool,
+}
+
+impl Confined {
+    /// No more memory than this, and no swap.
+    pub(super) fn to_memory(limit: u64) -> Result<Confined> {
+        Confined::create("memory", limit, None)
+    }
+
+    /// No more memory and time on CPUs than the unit allows.
+    pub(super) fn to(allowance: &Allowance) -> Result<Confined> {
+        Confined::create("unit", allowance.memory, Some(allowance.cpu_percent))
+    }
+
+    fn create(name: &str, memory: u64, cpu_percent: Option<u64>) -> Result<Confined> {
+        static CREATED: AtomicU32 = AtomicU32::new(0);
+        let number = CREATED.fetch_add(1, Ordering::Relaxed);
+        let name = format!("r2p-{}-{name}-{number}", std::process::id());
+        let period = PERIOD.as_micros() as u64;
+        let quota = cpu_percent.map(|percent| period * percent / 100);
+        let make = |path: PathBuf| -> Result<PathBuf> {
+            fs::create_dir(&path).with_context(|| format!("cannot create {}", path.display()))?;
+            Ok(path)
+        };
+        if let Some(first) = mount("cgroup", "memory")? {
+            let mut group = Confined {
+                memory: make(first.join(&name))?,
+                cpu: None,
+                is_second: false,
+            };
+            write(&group.memory, "memory.limit_in_bytes", &memory)?;
+            // Nothing of sockets is counted where no limit is set.
+            write(&group.memory, "memory.kmem.tcp.limit_in_bytes", &memory)?;
+            if let Some(quota) = quota {
+                let first = mount("cgroup", "cpu")?.context("no CPU controller is mounted")?;
+                let cpu = make(first.join(&name))?;
+                let cpu = group.cpu.insert(cpu);
+                write(cpu, "cpu.cfs_period_us", &period)?;
+                write(cpu, "cpu.cfs_quota_us", &quota)?;
+            }
+            return Ok(group);
+        }
+        let second = mount("cgroup2", "")?.context("no control groups are mounted")?;
+        let controllers = fs::read_to_string(second.join("cgroup.controllers"))?;
+        for controller in ["memory", "cpu"] {
+            if !controllers.split_whitespace().any(|it| it == controller) {
+                bail!(
+                    "no {controller} controller in {}: boot with `cgroup_enable={controller}`, or mount it with \
+                     `mount -t cgroup -o {controller} none /sys/fs/cgroup/{controller}`",
+                    second.display()
+                );
+            }
+            write(&second, "cgroup.subtree_control", &format!("+{controller}"))
+                .context("controllers cannot be handed down: run as root on the host")?;
+        }
+        let path = make(second.join(name))?;
+        let group = Confined {
+            cpu: quota.map(|_| path.clone()),
+            memory: path,
+            is_second: true,
+        };
+        write(&group.memory, "memory.max", &memory)?;
+        // Absent where the kernel has no swap.
+        let _ = write(&group.memory, "memory.swap.max", &0);
+        if let Some(quota) = quota {
+            write(&group.memory, "cpu.max", &format!("{quota} {period}"))?;
+        }
+        Ok(group)
+    }
+
+    /// What a shell does to run the words behind it inside.
+    pub(super) fn enter(&self) -> String {
+        let groups = self.groups();
+        let enter = groups.map(|path| format!("echo 0 >{}/cgroup.procs && ", path.display()));
+        enter.chain(["exec \"$0\" \"$@\"".to_owned()]).collect()
+    }
+
+    /// What cannot be taken back: neither the page cache nor what is mapped from files.
+    pub(super) fn needed(&self) -> Result<u64> {
+        let number = |file: &str| -> Result<u64> { Ok(read(&self.memory, file)?.trim().parse()?) };
+        if self.is_second {
+            let used = number("memory.current")?;
+            return Ok(used.saturating_sub(value(&self.memory, "memory.stat", "file")?));
+        }
+        // Counted apart there, and with the rest in the second version.
+        let used = number("memory.usage_in_bytes")? + number("memory.kmem.tcp.usage_in_bytes")?;
+        Ok(used.saturating_sub(value(&self.memory, "memory.stat", "cache")?))
+    }
+
+    pub(super) fn kills(&self) -> Result<u64> {
+        match self.is_second {
+            true => value(&self.memory, "memory.events", "oom_kill"),
+            false => value(&self.memory, "memory.oom_control", "oom_kill"),
+        }
+    }
+
+    /// For how long its threads waited for their next share of a CPU, taken together.
+    pub(super) fn throttled(&self) -> Result<Duration> {
+        let cpu = self.cpu.as_ref().context("time on CPUs is not confined")?;
+        Ok(match self.is_second {
+            true => Duration::from_micros(value(cpu, "cpu.stat", "throttled_usec")?),
+            false => Duration::from_nanos(value(cpu, "cpu.stat", "throttled_time")?),
+        })
+    }
+
+    /// Each once.
+    fn groups(&self) -> impl Iterator<Item = &Path> {
+        let other = self.cpu.as_ref().filter(|cpu| **cpu != self.memory);
+        std::iter::once(self.memory.as_path()).chain(other.map(PathBuf::as_path))
+    }
+}
+
+impl Drop for Confined {
+    fn drop(&mut self) {
+        let deadline = Instant::now() + Duration::from_secs(5);
+        for path in self.groups() {
+            while let Err(error) = fs::remove_dir(path) {
+                if Instant::now() > deadline {
+                    eprintln!("cannot remove {}: {error}", path.display());
+                    break;
+                }
+                std::thread::sleep(Duration::from_millis(10));
+            }
+        }
+    }
+}
+
+pub(super) fn mebibytes(bytes: u64) -> f64 {
+    bytes as f64 / f64::from(1 << 20)
+}
+
+/// Where control groups of this kind are mounted with this controller.
+fn mount(kind: &str, controller: &str) -> Result<Option<PathBuf>> {
+    let mounts = fs::read_to_string("/proc/self/mounts")?;
+    let path = mounts.lines().find_map(|line| {
+        let words: Vec<_> = line.split(' ').collect();
+        let has = |option: &&str| controller.is_empty() || *option == controller;
+        let fits = words.get(2) == Some(&kind) && words.get(3)?.split(',').any(|it| has(&it));
+        fits.then(|| PathBuf::from(words[1]))
+    });
+    Ok(path)
+}
+
+fn write(group: &Path, file: &str, value: &impl ToString) -> Result<()> {
+    let path = group.join(file);
+    fs::write(&path, value.to_string()).with_context(|| format!("cannot write {}", path.display()))
+}
+
+fn read(group: &Path, file: &str) -> Result<String> {
+    let path = group.join(file);
+    fs::read_to_string(&path).with_context(|| format!("cannot read {}", path.display()))
+}
+
+/// A value of a file with a name and a number in each line.
+fn value(group: &Path, file: &str, name: &str) -> Result<u64> {
+    let text = read(group, file)?;
+    let value = text.lines().find_map(|line| {
+        let (key, value) = line.split_once(' ')?;
+        (key == name).then(|| value.trim().parse().ok())?
+    });
+    value.with_context(|| format!("no {name} in {file}"))
+}

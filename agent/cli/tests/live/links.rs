@@ -1,0 +1,495 @@
+//! Every kind of link a robot talks over, against the agent's counts: each sample once, whatever
+//! carries it, and nothing of what the configuration leaves out.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use ros2probe_testing::forged::frames::{Shuffle, Tun, Wire};
+use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::harness::agent::{Agent, Scrape};
+use ros2probe_testing::harness::network::{Link, Namespace};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::usage::Usage;
+use ros2probe_testing::harness::{run, wait_until};
+use tempfile::TempDir;
+
+const WATCH_ALL: &str = "watch: [/**]\ncapture:\n  source: wire\n";
+/// Whole frames, frames near the MTU, few and many IP fragments.
+const SIZES: [usize; 6] = [320, 1300, 1440, 4000, 20_000, 60_000];
+const ROUNDS: usize = 20;
+
+#[test]
+fn samples_over_ipv6_count_once_in_fragments_of_1500_and_1280() -> Result<()> {
+    for mtu in [1500, 1280] {
+        let link = Link::new()?;
+        for (host, address) in [(&link.robot, "fd99::1/64"), (&link.monitor, "fd99::2/64")] {
+            ip(host, &format!("addr add {address} dev eth0 nodad"))?;
+            ip(host, &format!("link set eth0 mtu {mtu}"))?;
+        }
+        let observed = Observed::start(&link.monitor, WATCH_ALL)?;
+        let mut sender = Sender::new(&link.robot, "[fd99::1]:0", "[fd99::2]:7400")?;
+        observed.counts_each_sample_once("/ula", &mut sender)?;
+
+        let robot = link_local(&link.robot)?;
+        let to = format!("[{}%{}]:7400", link_local(&link.monitor)?.0, robot.1);
+        let mut sender = Sender::new(&link.robot, &format!("[{}%{}]:0", robot.0, robot.1), &to)?;
+        observed.counts_each_sample_once("/link_local", &mut sender)?;
+    }
+    Ok(())
+}
+
+#[test]
+fn cyclone_dds_over_ipv6_is_seen_as_over_ipv4() -> Result<()> {
+    let link = Link::new()?;
+    for (host, address) in [(&link.robot, "fd99::1/64"), (&link.monitor, "fd99::2/64")] {
+        ip(host, &format!("addr add {address} dev eth0 nodad"))?;
+    }
+    let observed = Observed::start(&link.monitor, WATCH_ALL)?;
+    let ipv6 = "CYCLONEDDS_URI=<General><Transport>udp6</Transport></General>";
+    let stream = Stream {
+        rate: 50.0,
+        ..Stream::point_cloud(16_000, 100)
+    };
+    let on_ipv6 =
+        |host: &Namespace| [host.inside(), vec!["env".to_owned(), ipv6.to_owned()]].concat();
+    let start = |host: &Namespace, role, node| {
+        Peer::launch_behind(&on_ipv6(host), Stack::Cyclone, role, &stream, &[node])
+    };
+    let mut subscriber = start(&link.monitor, Role::Subscriber, "/listener")?;
+    let mut publisher = start(&link.robot, Role::Publisher, "/lidar_driver")?;
+    publisher.wait_matched()?;
+    subscriber.wait_matched()?;
+    publisher.go()?;
+    publisher.wait_sent(Duration::from_secs(60))?;
+    let nodes = observed
+        .agent
+        .scrape()?
+        .labels_of("ros2_node_info", "ros_node");
+    assert!(
+        nodes.contains("/listener") && nodes.contains("/lidar_driver"),
+        "{nodes:?}"
+    );
+    let scrape = observed.agent.settled_scrape("/points", stream.count)?;
+    assert_exact(&scrape, "/points", stream.count, stream.count * 16_000);
+    Ok(())
+}
+
+#[test]
+fn vlan_tags_are_looked_behind_one_and_two() -> Result<()> {
+    let link = Link::new()?;
+    let observed = Observed::start(&link.monitor, WATCH_ALL)?;
+    let tags = [[0x88, 0xa8, 0, 7], [0x81, 0, 0, 100]];
+    for (topic, tags) in [("/twice", &tags[..]), ("/once", &tags[1..])] {
+        let mut wire = Wire::new(&link.robot, &link.monitor, "eth0")?;
+        wire.tags = tags.to_vec();
+        observed.counts_each_sample_once(topic, &mut wire)?;
+    }
+    Ok(())
+}
+
+#[test]
+fn a_sample_that_passes_two_interfaces_of_one_host_counts_once() -> Result<()> {
+    let link = Link::new()?;
+    for (host, address) in [(&link.robot, "10.100.0.1"), (&link.monitor, "10.100.0.2")] {
+        ip(
+            host,
+            "link add link eth0 name macvlan0 type macvlan mode bridge",
+        )?;
+        ip(host, &format!("addr add {address}/24 dev macvlan0"))?;
+        ip(host, "link set macvlan0 up")?;
+        wait_carrying_at(host, "macvlan0")?;
+    }
+    for host in [&link.monitor, &link.robot] {
+        let observed = Observed::start(host, WATCH_ALL)?;
+        let mut sender = Sender::new(&link.robot, "10.100.0.1:0", "10.100.0.2:7400")?;
+        observed.counts_each_sample_once("/stacked", &mut sender)?;
+    }
+    Ok(())
+}
+
+#[test]
+fn loopback_traffic_counts_once() -> Result<()> {
+    let host = Namespace::alone()?;
+    let observed = Observed::start(&host, WATCH_ALL)?;
+    let mut sender = Sender::new(&host, "127.0.0.1:0", "127.0.0.1:7400")?;
+    observed.counts_each_sample_once("/v4", &mut sender)?;
+    let mut sender = Sender::new(&host, "[::1]:0", "[::1]:7400")?;
+    observed.counts_each_sample_once("/v6", &mut sender)
+}
+
+#[test]
+fn a_tunnel_without_a_link_layer_is_seen() -> Result<()> {
+    let host = Namespace::alone()?;
+    let observed = Observed::start(&host, WATCH_ALL)?;
+    let mut tun = Tun::new(&host, "tun0", [10, 88, 0, 2], [10, 88, 0, 1])?;
+    ip(&host, "addr add 10.88.0.1/24 dev tun0")?;
+    ip(&host, "link set tun0 up")?;
+    observed.counts_each_sample_once("/tunnelled", &mut tun)?;
+    // And what the host sends into it.
+    let mut sender = Sender::new(&host, "10.88.0.1:0", "10.88.0.2:7400")?;
+    observed.counts_each_sample_once("/into_the_tunnel", &mut sender)
+}
+
+#[test]
+fn an_interface_that_appears_later_is_seen_and_one_that_goes_down_does_not_make_the_agent_spin()
+-> Result<()> {
+    let link = Link::new()?;
+    let observed = Observed::start(&link.monitor, WATCH_ALL)?;
+    add_cable(&link, "eth1", "10.102.0")?;
+    let mut sender = Sender::new(&link.robot, "10.102.0.1:0", "10.102.0.2:7400")?;
+    observed.counts_each_sample_once("/plugged_in", &mut sender)?;
+
+    ip(&link.monitor, "link set eth1 down")?;
+    let pid = observed.agent.process.pid();
+    let before = Usage::of(pid)?;
+    std::thread::sleep(Duration::from_secs(3));
+    let spent = Usage::of(pid)?.since(&before).cpu;
+    assert!(
+        spent < Duration::from_millis(300),
+        "{spent:?} in 3 s with a link down"
+    );
+
+    ip(&link.monitor, "link set eth1 up")?;
+    wait_carrying(&link, "eth1")?;
+    observed.counts_each_sample_once("/up_again", &mut sender)?;
+    ip(&link.monitor, "link del eth1")?;
+    add_cable(&link, "eth2", "10.103.0")?;
+    let mut sender = Sender::new(&link.robot, "10.103.0.1:0", "10.103.0.2:7400")?;
+    observed.counts_each_sample_once("/replaced", &mut sender)
+}
+
+#[test]
+fn nothing_of_an_excluded_interface_is_seen_also_when_it_appears_later() -> Result<()> {
+    let link = Link::new()?;
+    add_cable(&link, "wlan0", "10.104.0")?;
+    let all_but_wlan =
+        "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    exclude: [wlan*]\n";
+    let only_eth = "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    include: [eth*]\n";
+    for (round, configuration) in (0..).zip([all_but_wlan, only_eth]) {
+        let observed = Observed::start(&link.monitor, configuration)?;
+        let (wlan, eth) = (format!("wlan{}", 1 + round), format!("eth{}", 1 + round));
+        add_cable(&link, &wlan, &format!("10.{}.0", 110 + round))?;
+        add_cable(&link, &eth, &format!("10.{}.0", 120 + round))?;
+        for third in [104, 110 + round] {
+            let (from, to) = (format!("10.{third}.0.1:0"), format!("10.{third}.0.2:7400"));
+            let mut sender = Sender::new(&link.robot, &from, &to)?;
+            let mut talker = Talker::new(third, "/private");
+            introduce(&talker, &mut sender)?;
+            talk(&mut talker, &mut sender, [320; 20])?;
+        }
+        let (from, to) = (
+            format!("10.{}.0.1:0", 120 + round),
+            format!("10.{}.0.2:7400", 120 + round),
+        );
+        let mut sender = Sender::new(&link.robot, &from, &to)?;
+        observed.counts_each_sample_once("/public", &mut sender)?;
+        let scrape = observed.agent.settled_scrape("/public", 0)?;
+        assert!(!scrape.0.contains("/private"), "{}", scrape.0);
+        assert_eq!(scrape.sum("ros2_participants", &[]), 1.0);
+        assert_eq!(scrape.sum("ros2_unknown_writers", &[]), 0.0);
+        let event = [("event", "interface_excluded")];
+        assert!(scrape.sum("ros2probe_filter_events_total", &event) >= 40.0);
+        let interfaces = scrape.labels_of("ros2probe_capture_packets_total", "interface");
+        assert!(
+            interfaces.iter().all(|name| !name.starts_with("wlan")),
+            "{interfaces:?}"
+        );
+    }
+    Ok(())
+}
+
+#[test]
+fn an_interface_is_judged_by_its_new_name_after_it_was_renamed() -> Result<()> {
+    let link = Link::new()?;
+    let observed = Observed::start(
+        &link.monitor,
+        "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    include: [eth*]\n",
+    )?;
+    // As udev does with what it finds.
+    add_cable(&link, "wlan0", "10.106.0")?;
+    let rename = |from: &str, to: &str| -> Result<()> {
+        ip(&link.monitor, &format!("link set {from} down"))?;
+        ip(&link.monitor, &format!("link set {from} name {to}"))?;
+        ip(&link.monitor, &format!("link set {to} up"))?;
+        wait_carrying_at(&link.monitor, to)?;
+        wait_carrying_at(&link.robot, "wlan0")
+    };
+    let mut sender = Sender::new(&link.robot, "10.106.0.1:0", "10.106.0.2:7400")?;
+    rename("wlan0", "eth7")?;
+    observed.counts_each_sample_once("/wanted", &mut sender)?;
+    rename("eth7", "wlan7")?;
+    let mut talker = Talker::new(1, "/unwanted");
+    introduce(&talker, &mut sender)?;
+    talk(&mut talker, &mut sender, [320; 20])?;
+    let scrape = observed.agent.settled_scrape("/wanted", 0)?;
+    assert!(!scrape.0.contains("/unwanted"), "{}", scrape.0);
+    assert_eq!(scrape.sum("ros2_unknown_writers", &[]), 0.0);
+    Ok(())
+}
+
+#[test]
+fn interfaces_that_came_and_went_do_not_use_up_the_filters_table() -> Result<()> {
+    let link = Link::new()?;
+    let observed = Observed::start(
+        &link.monitor,
+        "watch: [/**]\ncapture:\n  source: wire\n  interfaces:\n    exclude: [veth*]\n",
+    )?;
+    // The table has room for 1024.
+    for _ in 0..3 {
+        let pair =
+            |number| format!("link add veth{number} group 7 type veth peer name vethx{number}");
+        batch(&link.monitor, (0..200).map(pair))?;
+        ip(&link.monitor, "link delete group 7")?;
+    }
+    add_cable(&link, "eth1", "10.105.0")?;
+    let mut sender = Sender::new(&link.robot, "10.105.0.1:0", "10.105.0.2:7400")?;
+    observed.counts_each_sample_once("/after_the_churn", &mut sender)
+}
+
+#[test]
+fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
+    let link = Link::new()?;
+    let path = forged::path(&link.robot);
+    let observed = Observed::start(
+        &link.monitor,
+        &format!(
+            "watch: [/**]\ncapture:\n  source: wire\n  network_namespaces: [{}]\n",
+            path.display()
+        ),
+    )?;
+    // Inside it, where nothing of it can be seen from outside.
+    let mut sender = Sender::new(&link.robot, "127.0.0.1:0", "127.0.0.1:7400")?;
+    observed.counts_each_sample_once("/inside", &mut sender)?;
+    // From it, seen in both networks.
+    let mut sender = Sender::between(&link.robot, &link.monitor)?;
+    observed.counts_each_sample_once("/across", &mut sender)?;
+    let scrape = observed.agent.scrape()?;
+    let interfaces = scrape.labels_of("ros2probe_capture_packets_total", "interface");
+    let inside = format!("{}:lo", path.display());
+    assert!(interfaces.contains(&inside), "{interfaces:?}");
+    Ok(())
+}
+
+#[test]
+fn a_network_namespace_whose_path_is_gone_for_a_while_is_missed_meanwhile() -> Result<()> {
+    let link = Link::new()?;
+    let path = forged::path(&link.robot);
+    let place = path.display();
+    let capture =
+        format!("watch: [/**]\ncapture: {{source: wire, network_namespaces: [{place}]}}\n");
+    let observed = Observed::start(&link.monitor, &capture)?;
+    let is_ready = || observed.agent.request("/readyz").is_ok();
+    // A process keeps the namespace while its name is gone.
+    let words = ["-c", "echo inside && exec sleep 1000"];
+    let mut keeper = Process::start(&link.robot.on_network(), "sh", words)?;
+    keeper.wait_for("inside", Duration::from_secs(60))?;
+    let told = |name: &str, times: u32| {
+        wait_until(name, || {
+            let page = observed.agent.scrape()?;
+            let told = page.sum("ros2probe_events_total", &[("name", name)]);
+            Ok(told == f64::from(times))
+        })
+    };
+    for round in 1..=2 {
+        run(&format!("umount {place}"))?;
+        wait_until("missed", || Ok(!is_ready()))?;
+        let page = observed.agent.scrape()?;
+        assert_eq!(page.value("ros2probe_ready", &[]), Some(0.0));
+        // The agent looks for events once a second: blindness that is shorter is none.
+        told("ros2probe.capture.blind", round)?;
+        run(&format!(
+            "mount --bind /proc/{}/ns/net {place}",
+            keeper.pid()
+        ))?;
+        wait_until("seen again", || Ok(is_ready()))?;
+        told("ros2probe.capture.blind", round)?;
+        told("ros2probe.capture.seeing", round)?;
+    }
+    let mut sender = Sender::new(&link.robot, "127.0.0.1:0", "127.0.0.1:7400")?;
+    observed.counts_each_sample_once("/inside", &mut sender)
+}
+
+#[test]
+fn fragments_in_any_order_make_one_sample() -> Result<()> {
+    let link = Link::new()?;
+    let observed = Observed::start(&link.monitor, WATCH_ALL)?;
+    let orders: [(&str, Shuffle); 4] = [
+        ("/backwards", |packets| packets.reverse()),
+        ("/first_last", |packets| packets.rotate_left(1)),
+        ("/last_first", |packets| packets.rotate_right(1)),
+        ("/each_twice", |packets| {
+            *packets = packets
+                .iter()
+                .flat_map(|packet| [packet.clone(), packet.clone()])
+                .collect();
+        }),
+    ];
+    for (topic, shuffle) in orders {
+        let mut wire = Wire::new(&link.robot, &link.monitor, "eth0")?;
+        wire.shuffle = shuffle;
+        observed.counts_each_sample_once(topic, &mut wire)?;
+    }
+    Ok(())
+}
+
+#[test]
+fn a_sample_with_a_missing_fragment_never_counts() -> Result<()> {
+    let link = Link::new()?;
+    let observed = Observed::start(&link.monitor, WATCH_ALL)?;
+    let mut wire = Wire::new(&link.robot, &link.monitor, "eth0")?;
+    let mut talker = Talker::new(1, "/torn");
+    introduce(&talker, &mut wire)?;
+    let whole = |_: &mut Vec<Vec<u8>>| {};
+    for round in 0..30 {
+        wire.shuffle = match round % 3 {
+            0 => whole,
+            1 => |packets| drop(packets.pop()),
+            _ => |packets| drop(packets.remove(packets.len() / 2)),
+        };
+        talk(&mut talker, &mut wire, [6000])?;
+    }
+    wire.shuffle = whole;
+    talk(&mut talker, &mut wire, [6000])?;
+    let scrape = observed.agent.settled_scrape("/torn", 11)?;
+    assert!(scrape.sum("ros2probe_records_dropped_total", &[]) == 0.0);
+    let value = |name| value(&scrape, name, "/torn");
+    assert_eq!(value("ros2_topic_messages_total"), 11);
+    assert_eq!(value("ros2_topic_lost_messages_total"), 20);
+    Ok(())
+}
+
+#[test]
+fn a_bridge_and_its_port_show_a_sample_once() -> Result<()> {
+    let link = Link::new()?;
+    // The monitor's end of the cable becomes a port of its bridge, as a container's would.
+    ip(&link.monitor, "link add br0 type bridge")?;
+    let address = link.monitor.address();
+    ip(&link.monitor, &format!("addr del {address}/24 dev eth0"))?;
+    ip(&link.monitor, "link set eth0 master br0")?;
+    ip(&link.monitor, &format!("addr add {address}/24 dev br0"))?;
+    ip(&link.monitor, "link set br0 up")?;
+    wait_carrying_at(&link.monitor, "br0")?;
+    let observed = Observed::start(&link.monitor, WATCH_ALL)?;
+    let mut sender = Sender::between(&link.robot, &link.monitor)?;
+    observed.counts_each_sample_once("/bridged", &mut sender)?;
+    let scrape = observed.agent.scrape()?;
+    assert!(value(&scrape, "ros2_topic_duplicate_messages_total", "/bridged") > 0);
+    // And out through both.
+    let mut sender = Sender::between(&link.monitor, &link.robot)?;
+    observed.counts_each_sample_once("/bridged_out", &mut sender)
+}
+
+/// A host with the agent on it.
+struct Observed<'a> {
+    agent: Agent<'a>,
+    _directory: TempDir,
+}
+
+impl<'a> Observed<'a> {
+    fn start(host: &'a Namespace, configuration: &str) -> Result<Observed<'a>> {
+        let directory = tempfile::tempdir()?;
+        let file = directory.path().join("ros2probe.yaml");
+        std::fs::write(&file, configuration)?;
+        let agent = Agent::start(host, Path::new(env!("CARGO_BIN_EXE_rp")), &file)?;
+        Ok(Observed {
+            agent,
+            _directory: directory,
+        })
+    }
+
+    fn counts_each_sample_once(&self, topic: &str, carrier: &mut impl Carrier) -> Result<()> {
+        let number = topic
+            .bytes()
+            .fold(0_u32, |sum, byte| sum.wrapping_mul(31) + u32::from(byte));
+        let mut talker = Talker::new(number, topic);
+        introduce(&talker, carrier)?;
+        let sizes: Vec<usize> = SIZES
+            .iter()
+            .copied()
+            .cycle()
+            .take(SIZES.len() * ROUNDS)
+            .collect();
+        talk(&mut talker, carrier, sizes.iter().copied())?;
+        let count = sizes.len() as u64;
+        let scrape = self.agent.settled_scrape(topic, count)?;
+        assert_exact(&scrape, topic, count, sizes.iter().sum::<usize>() as u64);
+        Ok(())
+    }
+}
+
+fn assert_exact(scrape: &Scrape, topic: &str, messages: u64, bytes: u64) {
+    let value = |name| value(scrape, name, topic);
+    let found = (
+        value("ros2_topic_messages_total"),
+        value("ros2_topic_bytes_total"),
+        value("ros2_topic_lost_messages_total"),
+        scrape.sum("ros2probe_records_dropped_total", &[]),
+    );
+    assert_eq!(found, (messages, bytes, 0, 0.0), "{topic} in {}", scrape.0);
+}
+
+fn value(scrape: &Scrape, name: &str, topic: &str) -> u64 {
+    scrape.value(name, &[("topic", topic)]).unwrap_or(0.0) as u64
+}
+
+/// Runs `ip` inside a host.
+fn ip(host: &Namespace, arguments: &str) -> Result<String> {
+    run(&format!("ip -n {} {arguments}", host.name()))
+}
+
+/// Runs many `ip` commands at once.
+fn batch(host: &Namespace, commands: impl Iterator<Item = String>) -> Result<()> {
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("batch");
+    std::fs::write(
+        &file,
+        commands.map(|command| command + "\n").collect::<String>(),
+    )?;
+    ip(host, &format!("-batch {}", file.display()))?;
+    Ok(())
+}
+
+/// Joins the hosts by another veth pair; the robot is `.1` and the monitor `.2` on it.
+fn add_cable(link: &Link, name: &str, network: &str) -> Result<()> {
+    let (robot, monitor) = (link.robot.name(), link.monitor.name());
+    run(&format!(
+        "ip link add {name} netns {robot} type veth peer name {name} netns {monitor}"
+    ))?;
+    for (host, number) in [(&link.robot, 1), (&link.monitor, 2)] {
+        ip(host, &format!("addr add {network}.{number}/24 dev {name}"))?;
+        ip(host, &format!("link set {name} up"))?;
+    }
+    wait_carrying(link, name)
+}
+
+/// Waits until both ends of a cable carry frames: the kernel drops them silently for up to a second.
+fn wait_carrying(link: &Link, name: &str) -> Result<()> {
+    wait_carrying_at(&link.robot, name)?;
+    wait_carrying_at(&link.monitor, name)
+}
+
+fn wait_carrying_at(host: &Namespace, name: &str) -> Result<()> {
+    let deadline = Instant::now() + Duration::from_secs(30);
+    while !ip(host, &format!("-o link show dev {name}"))?.contains(" state UP ") {
+        anyhow::ensure!(Instant::now() < deadline, "{name} does not come up");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    Ok(())
+}
+
+/// Address and interface index of the host's link-local address, once it may be used.
+fn link_local(host: &Namespace) -> Result<(String, String)> {
+    let deadline = Instant::now() + Duration::from_secs(30);
+    loop {
+        let listing = ip(host, "-o -6 addr show dev eth0 scope link -tentative")?;
+        let words: Vec<_> = listing.split_whitespace().collect();
+        if let [index, _, _, address, ..] = words[..] {
+            let address = address.split('/').next().unwrap().to_owned();
+            return Ok((address, index.trim_end_matches(':').to_owned()));
+        }
+        anyhow::ensure!(Instant::now() < deadline, "no link-local address");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}

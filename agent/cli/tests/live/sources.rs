@@ -1,0 +1,219 @@
+//! The sources agree: a capture says the same whether it is replayed from the file or sent again
+//! between sockets, where the host source sees whole datagrams and the wire source frames.
+//!
+//! Counted are messages, bytes and losses of each topic and of each writer that was never
+//! announced, and the lost sequence numbers of each writer. Times are not: they are those of the
+//! second sending, and of duplicates the host sees a copy on each side.
+
+mod injection;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use injection::Injection;
+use ros2probe::capture::feed::Feed;
+use ros2probe::capture::pcap::PcapReader;
+use ros2probe::config::{Config, Watchlist};
+use ros2probe::model::journal::Loss;
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe::model::reassembly::Limits;
+use ros2probe::model::snapshot::Snapshot;
+use ros2probe_testing::harness::PREFIX;
+use ros2probe_testing::harness::cgroup::Cgroup;
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::witness::{Testimony, Witness};
+
+/// Every topic, hidden ones too.
+const EVERYTHING: &str = "watch: ['/**', '/**/_action/*', '/**/_service_event']\n";
+/// Longer captures are left to whoever asks for them by `ROS2PROBE_FIXTURES`.
+const LONGEST: Duration = Duration::from_secs(60);
+/// Captures are sent in half their time: windows in which gaps may still be filled are long enough.
+const SPEED: u32 = 2;
+/// Both sources have taken in everything.
+const SETTLE: Duration = Duration::from_millis(800);
+
+#[test]
+fn host_wire_and_file_give_the_same_counts() -> Result<()> {
+    let asked = std::env::var_os("ROS2PROBE_FIXTURES").map(PathBuf::from);
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let corpus = asked
+        .clone()
+        .unwrap_or(here.join("../../../shared/fixtures"));
+    let own = captures(&here.join("../testing/data"));
+    ensure!(own.len() >= 8, "{own:?}");
+    // The corpus holds those of the repository too.
+    let more = captures(&corpus).into_iter().filter(|path| {
+        let end: PathBuf = path.iter().rev().take(3).collect();
+        !own.iter()
+            .any(|own| own.iter().rev().take(3).collect::<PathBuf>() == end)
+    });
+    let all: Vec<PathBuf> = own.iter().cloned().chain(more).collect();
+    // One after the other: what is started while sockets are made would belong to their cgroup.
+    let prepared = (0..)
+        .zip(&all)
+        .map(|(number, path)| Sending::prepare(number, path));
+    let prepared: Vec<Sending<'_>> = prepared
+        .filter_map(Result::transpose)
+        .collect::<Result<_>>()?;
+    let outcomes = std::thread::scope(|scope| {
+        let compare = |each| scope.spawn(move || Sending::compare(each));
+        let running: Vec<_> = prepared.iter().map(compare).collect();
+        let outcomes = running.into_iter().map(std::thread::ScopedJoinHandle::join);
+        outcomes.collect::<Vec<_>>()
+    });
+    let mut faults = Vec::new();
+    for (sending, outcome) in prepared.iter().zip(outcomes) {
+        let capture = sending.capture.display();
+        match outcome {
+            Ok(Ok(agreed)) => println!("{capture}: {agreed}"),
+            Ok(Err(error)) => faults.push(format!("{capture}: {error:#}")),
+            Err(_) => faults.push(format!("{capture}: panicked")),
+        }
+    }
+    ensure!(faults.is_empty(), "{}", faults.join("\n"));
+    let compared = prepared.len();
+    ensure!(compared >= own.len(), "only {compared} can be sent again");
+    Ok(())
+}
+
+/// A capture about to be sent again.
+struct Sending<'a> {
+    capture: &'a Path,
+    injection: Injection,
+    cgroup: Cgroup,
+    host: Namespace,
+}
+
+impl<'a> Sending<'a> {
+    /// `None` for a capture that cannot be sent again, or takes too long.
+    fn prepare(number: usize, capture: &'a Path) -> Result<Option<Self>> {
+        let host = Namespace::alone()?;
+        let cgroup = Cgroup::create(&format!("{PREFIX}-{}-source{number}", std::process::id()))?;
+        let injection = Injection::of(capture, &host, &cgroup)
+            .with_context(|| capture.display().to_string())?;
+        let asked = std::env::var_os("ROS2PROBE_FIXTURES").is_some();
+        let sending = injection.filter(|injection| asked || injection.duration() <= LONGEST);
+        Ok(sending.map(|injection| Self {
+            capture,
+            injection,
+            cgroup,
+            host,
+        }))
+    }
+
+    /// Tells what was compared.
+    fn compare(&self) -> Result<String> {
+        let path = self.cgroup.path().display();
+        let at_sockets = format!("{EVERYTHING}capture: {{source: host, cgroup: {path}}}\n");
+        let on_wire = format!("{EVERYTHING}capture: {{source: wire}}\n");
+        let start = |configuration: &str| Witness::start_on(&self.host, configuration);
+        let mut witnesses = [("host", start(&at_sockets)?), ("wire", start(&on_wire)?)];
+        let sent = self.injection.run(SPEED)?;
+        std::thread::sleep(SETTLE);
+        let file = Counts::replayed(self.capture)?;
+        for (source, witness) in &mut witnesses {
+            let seen = Counts::witnessed(&witness.finish()?)?;
+            let agreed = file.ensure_equal(&seen);
+            agreed.with_context(|| format!("file and {source}"))?;
+        }
+        Ok(format!("{sent} datagrams, {file}"))
+    }
+}
+
+/// What all sources must agree on.
+#[derive(Debug, Default, PartialEq, Eq)]
+struct Counts {
+    /// Messages, bytes and losses by DDS topic or GUID.
+    measured: BTreeMap<String, (u64, u64, u64)>,
+    lost: BTreeMap<String, BTreeSet<u64>>,
+}
+
+impl Counts {
+    fn replayed(capture: &Path) -> Result<Counts> {
+        let config = Config::parse(EVERYTHING.as_bytes())
+            .ok()
+            .context("the watchlist")?;
+        let mut observer = Observer::new(Settings::default());
+        observer.set_watchlist(Watchlist::new(config.watches)?);
+        let mut feed = Feed::new(Limits::default());
+        feed.run(&mut PcapReader::open(capture)?, &mut observer)?;
+        let losses = observer.journal().losses();
+        Ok(Counts::of(&observer.snapshot(feed.last()), losses))
+    }
+
+    fn witnessed(testimony: &Testimony) -> Result<Counts> {
+        testimony.ensure_complete()?;
+        Ok(Counts::of(&testimony.end, testimony.losses.iter()))
+    }
+
+    fn of<'a>(snapshot: &Snapshot, losses: impl Iterator<Item = &'a Loss>) -> Counts {
+        let mut counts = Counts::default();
+        for topic in &snapshot.topics {
+            if let Some(all) = &topic.measurement {
+                let numbers = (all.messages, all.bytes, all.lost);
+                counts.measured.insert(topic.dds_name.clone(), numbers);
+            }
+        }
+        for unknown in &snapshot.unknown_writers {
+            let all = &unknown.measurement;
+            let numbers = (all.messages, all.bytes, all.lost);
+            counts.measured.insert(unknown.guid.to_string(), numbers);
+        }
+        for loss in losses {
+            let lost = counts.lost.entry(loss.writer.to_string()).or_default();
+            lost.extend(loss.first..=loss.last);
+        }
+        counts
+    }
+
+    fn ensure_equal(&self, other: &Counts) -> Result<()> {
+        let names: BTreeSet<&String> = self.measured.keys().chain(other.measured.keys()).collect();
+        let mut faults = Vec::new();
+        for name in names {
+            let (one, two) = (self.measured.get(name), other.measured.get(name));
+            if one != two {
+                faults.push(format!("{name}: {one:?} and {two:?}"));
+            }
+        }
+        if self.lost != other.lost {
+            faults.push(format!("lost {:?} and {:?}", self.lost, other.lost));
+        }
+        ensure!(faults.is_empty(), "{}", faults.join("; "));
+        Ok(())
+    }
+}
+
+impl std::fmt::Display for Counts {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let sum = self.measured.values();
+        let sum = sum.fold((0, 0), |sum, each| (sum.0 + each.0, sum.1 + each.2));
+        write!(
+            f,
+            "{} messages and {} losses of {} topics",
+            sum.0,
+            sum.1,
+            self.measured.len()
+        )
+    }
+}
+
+/// Two levels below `root`; none if it does not exist.
+fn captures(root: &Path) -> Vec<PathBuf> {
+    let children = |directory: &Path| {
+        let entries = std::fs::read_dir(directory).into_iter().flatten().flatten();
+        let mut paths: Vec<_> = entries.map(|entry| entry.path()).collect();
+        paths.sort();
+        paths
+    };
+    // What Zenoh sends is no RTPS.
+    let directories = children(root)
+        .into_iter()
+        .filter(|label| !label.ends_with("zenoh"))
+        .flat_map(|label| children(&label));
+    let files = directories.flat_map(|directory| children(&directory));
+    files
+        .filter(|file| file.to_string_lossy().ends_with(".pcap.gz"))
+        .collect()
+}

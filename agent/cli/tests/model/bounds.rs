@@ -1,0 +1,496 @@
+//! Who forges messages with every field another each time fills every table, and none beyond its
+//! cap.
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::net::{Ipv4Addr, SocketAddrV4};
+use std::path::Path;
+use std::sync::Arc;
+
+use crate::allocator;
+use ros2probe::config::{Limits, Watch, Watchlist};
+use ros2probe::model::history::History;
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::model::size::Size;
+use ros2probe::model::snapshot::SocketFacts;
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::record::{flag, guid_words, kind};
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
+
+const START: u64 = 1_700_000_000_000_000_000;
+const MESSAGES: u64 = 60_000;
+/// Of the history.
+const SECONDS: usize = 20;
+const DISCOVERY_INFO: EntityId = EntityId([0, 0, 2, 3]);
+const ALICE: GuidPrefix = GuidPrefix([1; 12]);
+const SAMPLES: EntityId = EntityId([0, 0, 3, 3]);
+
+/// Repeatable random numbers (xorshift64).
+struct Dice(u64);
+
+impl Dice {
+    fn roll(&mut self) -> u64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        self.0
+    }
+
+    fn pick(&mut self, sides: u64) -> u64 {
+        (self.roll() >> 20) % sides
+    }
+
+    fn prefix(&mut self) -> GuidPrefix {
+        // Every other one is of a few that are there already.
+        let number = match self.pick(2) {
+            0 => self.pick(40),
+            _ => self.roll(),
+        };
+        let mut prefix = [7; 12];
+        prefix[4..].copy_from_slice(&number.to_be_bytes());
+        GuidPrefix(prefix)
+    }
+
+    fn locators(&mut self) -> Vec<SocketAddrV4> {
+        let any = (0..20).map(|_| self.roll());
+        any.map(|bits| SocketAddrV4::new(Ipv4Addr::from(bits as u32 | 1), (bits >> 40) as u16 | 1))
+            .collect()
+    }
+
+    fn number(&mut self) -> u64 {
+        match self.pick(4) {
+            0 => self.roll() >> 2,
+            1 => 1 << self.pick(62),
+            _ => 1 + self.pick(5000),
+        }
+    }
+
+    fn name(&mut self) -> String {
+        format!(
+            "rt/{:x}/{}",
+            self.roll(),
+            "x".repeat(self.pick(200) as usize)
+        )
+    }
+}
+
+fn words(number: u64) -> [u8; 8] {
+    let high = ((number >> 32) as u32).to_le_bytes();
+    let low = (number as u32).to_le_bytes();
+    [high, low].concat().try_into().unwrap()
+}
+
+/// HEARTBEAT, GAP or ACKNACK of any numbers.
+fn control(dice: &mut Dice, id: u8) -> Vec<u8> {
+    let [_, a, b, c, ..] = dice.roll().to_ne_bytes();
+    let reader = EntityId([a, b, c, 4]);
+    let mut body = [reader.0, SAMPLES.0].concat();
+    body.extend_from_slice(&words(dice.number()));
+    if id != 0x06 {
+        body.extend_from_slice(&words(dice.number()));
+    }
+    if id != 0x07 {
+        body.extend_from_slice(&256_u32.to_le_bytes());
+        body.extend((0..4).flat_map(|_| dice.roll().to_ne_bytes()));
+    }
+    body.extend_from_slice(&(dice.roll() as u32).to_le_bytes());
+    body
+}
+
+fn forged(dice: &mut Dice) -> Vec<u8> {
+    let prefix = dice.prefix();
+    let message = Message::from(prefix);
+    match dice.pick(14) {
+        0 | 1 => {
+            let payload =
+                forge::participant_at(prefix, 100, Some(dice.roll() as u32), &dice.locators());
+            message.data(SPDP, dice.number(), &payload)
+        }
+        kind @ (2 | 3) => {
+            let (by, last) = [(SEDP_WRITERS, 3), (SEDP_READERS, 4)][kind as usize - 2];
+            let [_, a, b, c, ..] = dice.roll().to_ne_bytes();
+            let guid = Guid::new(prefix, EntityId([a, b, c, last]));
+            let (topic, partition) = (dice.name(), "p".repeat(dice.pick(250) as usize));
+            let text = [
+                &(partition.len() as u32 + 1).to_le_bytes()[..],
+                partition.as_bytes(),
+                b"\0",
+            ];
+            let partitions = [&1_u32.to_le_bytes()[..], &text.concat()].concat();
+            let others: [(u16, &[u8]); 1] = [(0x29, &partitions)];
+            let payload = forge::endpoint_with(guid, &topic, &dice.name(), &others);
+            message.data(by, dice.number(), &payload)
+        }
+        4 => {
+            let guid = Guid::new(prefix, SAMPLES);
+            let payload = forge::endpoint(guid, "rt/known", &dice.name(), true);
+            message.data(SEDP_WRITERS, dice.number(), &payload)
+        }
+        5 => {
+            let names: Vec<_> = (0..dice.pick(60))
+                .map(|_| format!("n{:x}", dice.roll()))
+                .collect();
+            let mut guid = || Guid::new(prefix, EntityId([0, 0, dice.roll() as u8, 3]));
+            let mut nodes = Vec::new();
+            for name in &names {
+                nodes.push(("/somewhere", name.as_str(), guid()));
+            }
+            let payload = forge::entities(prefix, 24, &nodes);
+            message.data(DISCOVERY_INFO, dice.number(), &payload)
+        }
+        6 | 7 => {
+            let number = dice.number();
+            message.info_ts(START + dice.pick(1 << 60)).data(
+                SAMPLES,
+                number,
+                &[0, 1, 0, 0, 5, 5, 5, 5],
+            )
+        }
+        8 => {
+            let size = 100 + dice.pick(60_000) as usize;
+            let payload = vec![5; size];
+            message.fragment(SAMPLES, dice.number(), 1, 64, &payload)
+        }
+        9 => message.submessage(0x07, 1, &control(dice, 0x07)),
+        10 => message.submessage(0x08, 1, &control(dice, 0x08)),
+        11 => {
+            let guid = Guid::new(prefix, SAMPLES);
+            message.dispose_by_hash(SEDP_WRITERS, dice.number(), guid)
+        }
+        12 => {
+            // Announcements that never end.
+            let payload = vec![5; 100 + dice.pick(20_000) as usize];
+            message.fragment(SEDP_WRITERS, dice.number(), 1, 64, &payload)
+        }
+        _ => message.submessage(0x06, 1, &control(dice, 0x06)),
+    }
+    .bytes()
+}
+
+fn observer() -> Observer {
+    let mut observer = Observer::new(Settings::default());
+    let mut watch = Watch::named("/**").unwrap();
+    watch.trace = 1.0;
+    observer.set_watchlist(Watchlist::new(vec![watch]).unwrap());
+    observer.set_wishes(Arc::new(vec![Wish {
+        id: 1,
+        selection: Arc::new(Selection::all()),
+        domain_id: None,
+        depth: Depth::Payloads,
+    }]));
+    observer.advance(Timestamp(START));
+    observer
+}
+
+fn somewhere(dice: &mut Dice, time: u64) -> Envelope {
+    let mut envelope = forge::multicast(time, dice.pick(300) as u16 % 200);
+    if dice.pick(2) == 0 {
+        envelope.destination[12..].copy_from_slice(&(dice.roll() as u32).to_be_bytes());
+        envelope.destination_port = dice.roll() as u16;
+    }
+    envelope
+}
+
+/// The largest size of every table, and its cap.
+type Largest = BTreeMap<&'static str, (usize, usize)>;
+
+/// One step: the model, random numbers and the time.
+type Step<'a> = &'a mut dyn FnMut(&mut Observer, &mut Dice, u64);
+
+/// Drives the model, a step every `pause` nanoseconds; the sizes of its tables, and how much the heap grew in the first half and in all.
+fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
+    let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
+    let before = allocator::held();
+    let mut observer = observer();
+    let mut history = History::new(SECONDS, Limits::default().topics);
+    let mut largest = Largest::new();
+    let (mut half, mut now) = (0, START);
+    for turn in 0..messages {
+        now += pause;
+        step(&mut observer, &mut dice, now);
+        if turn % 2_000 == 0 {
+            observer.advance(Timestamp(now));
+            look(&observer.sizes(), &mut largest);
+            history.take(Timestamp(now), observer.measured(Timestamp(now)));
+            look(&history.sizes(), &mut largest);
+            observer.take_given();
+            observer.take_events();
+            observer.take_spans();
+            observer.interest_changes();
+        }
+        if turn == messages / 2 {
+            half = allocator::held().saturating_sub(before);
+        }
+    }
+    let whole = allocator::held().saturating_sub(before);
+    (largest, half, whole)
+}
+
+/// Asserts that no table is beyond its cap.
+fn look(sizes: &[Size], largest: &mut Largest) {
+    for size in sizes {
+        let seen = largest.entry(size.table).or_insert((0, size.cap));
+        *seen = (seen.0.max(size.entries), size.cap);
+        assert!(size.entries <= size.cap, "{size:?}");
+    }
+}
+
+/// Asserts that these tables were at their caps, but for a tenth.
+fn assert_filled(largest: &Largest, tables: &[&str]) {
+    for table in tables {
+        let (entries, cap) = largest[table];
+        assert!(
+            entries * 10 >= cap * 9,
+            "{table} was not filled: {entries} of {cap}"
+        );
+    }
+}
+
+fn any_datagram(observer: &mut Observer, dice: &mut Dice, now: u64) {
+    let mut message = forged(dice);
+    if dice.pick(20) == 0 {
+        let at = dice.pick(message.len() as u64) as usize;
+        message[at] ^= 0x55;
+    }
+    let envelope = somewhere(dice, now);
+    observer.datagram(&envelope, &message, None);
+}
+
+fn readers_of(number: u64) -> GuidPrefix {
+    let mut prefix = [2; 12];
+    prefix[4..].copy_from_slice(&number.to_be_bytes());
+    GuidPrefix(prefix)
+}
+
+/// One reliable writer, and 600 participants that read its topic.
+fn announce_one_writer(observer: &mut Observer) {
+    let mut put = |message: Message| {
+        let envelope = forge::multicast(START, 0);
+        observer.datagram(&envelope, &message.bytes(), None);
+    };
+    let string = "std_msgs::msg::dds_::String_";
+    let payload = forge::participant(ALICE, 1_000_000, Some(0));
+    put(Message::from(ALICE).data(SPDP, 1, &payload));
+    let payload = forge::endpoint(Guid::new(ALICE, SAMPLES), "rt/known", string, true);
+    put(Message::from(ALICE).data(SEDP_WRITERS, 1, &payload));
+    for number in 0..600 {
+        let prefix = readers_of(number);
+        let payload = forge::participant(prefix, 1_000_000, Some(0));
+        put(Message::from(prefix).data(SPDP, 1, &payload));
+        let reader = Guid::new(prefix, EntityId([0, 0, 1, 4]));
+        let payload = forge::endpoint(reader, "rt/known", string, true);
+        put(Message::from(prefix).data(SEDP_READERS, 1, &payload));
+    }
+}
+
+/// What this host's kernel reports of one writer's samples, with every field another, the numbers
+/// about `newest`.
+fn forged_record(dice: &mut Dice, newest: u64, now: u64) -> Record {
+    const KINDS: [u8; 7] = [
+        kind::DATA,
+        kind::DATA,
+        kind::DATA_FRAG,
+        kind::DATA_FRAG,
+        kind::ACKNACK,
+        kind::HEARTBEAT,
+        kind::GAP,
+    ];
+    let kind = KINDS[dice.pick(7) as usize];
+    let is_sent = kind == kind::ACKNACK || dice.pick(4) == 0;
+    let mut flags = flag::HOST * u16::from(dice.pick(8) != 0);
+    if is_sent {
+        flags |= flag::OUTGOING;
+    } else if dice.pick(3) == 0 {
+        flags |= [flag::NO_ROOM, flag::NOT_REASSEMBLED][dice.pick(2) as usize];
+    }
+    let directed = match dice.pick(3) {
+        0 if kind != kind::ACKNACK => Guid::default(),
+        _ => Guid::new(readers_of(dice.pick(600)), EntityId([0, 0, 1, 4])),
+    };
+    let number = newest.saturating_sub(dice.pick(3000)).max(1);
+    let mut record = Record {
+        kind,
+        submessage_flags: 5,
+        writer: guid_words(Guid::new(ALICE, SAMPLES)),
+        reader: guid_words(directed),
+        time: now,
+        sequence_number: number,
+        destination: [0, 0, u32::from_be(0xffff), dice.pick(700) as u32],
+        destination_port: 7411,
+        datagram_len: 60_000,
+        payload_len: 100,
+        flags,
+        socket: u64::from(flags & flag::HOST) * (1 + dice.pick(700)),
+        elapsed: 1_000_000,
+        ..Record::default()
+    };
+    match kind {
+        kind::DATA_FRAG => {
+            record.fragment_start = 1 + dice.pick(65_000) as u32;
+            record.fragments = 1 << 16 | 100;
+            record.sample_size = 65_536 * 100;
+        }
+        kind::HEARTBEAT => {
+            record.sequence_number = number.saturating_sub(4000).max(1);
+            record.payload_len = 0;
+            record.encapsulation = newest as u32;
+        }
+        kind::GAP => (record.payload_len, record.encapsulation) = (0, number as u32 + 1),
+        _ => {}
+    }
+    record
+}
+
+fn one_writer(observer: &mut Observer, dice: &mut Dice, now: u64) {
+    let step = (now - START) / 1_000_000;
+    if step == 1 {
+        announce_one_writer(observer);
+    }
+    let newest = 10_000 + 20 * step;
+    match dice.pick(40) {
+        0 => {
+            let message = Message::from(ALICE).data(SAMPLES, newest, &[0, 1, 0, 0, 5, 5, 5, 5]);
+            let envelope = forge::multicast(now, 0);
+            observer.shared_memory(&envelope, &message.bytes());
+        }
+        1 => observer.socket_closed(1 + dice.pick(5000)),
+        2 | 3 => observer.socket(SocketFacts {
+            cookie: 1 + dice.pick(5000),
+            process_id: Some(dice.pick(5000) as u32),
+            ..SocketFacts::default()
+        }),
+        _ => observer.record(&forged_record(dice, newest, now)),
+    }
+}
+
+/// Crowds of forty participants that fill the tables of endpoints and nodes, newcomers of a topic that
+/// is watched by its exact name, and a watchlist that changes.
+fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
+    let step = (now - START) / 1_000_000;
+    if step % 4_000 == 1 {
+        // So many that not all topics are matched at once.
+        let globs = (0..20).map(|number| format!("/g{number}/**"));
+        let names = globs.chain(["/exact".to_owned()]);
+        let watches = names.map(|name| Watch::named(&name).unwrap()).collect();
+        observer.set_watchlist(Watchlist::new(watches).unwrap());
+    }
+    let is_newcomer = dice.pick(20) == 0;
+    let mut prefix = [if is_newcomer { 8 } else { 9 }; 12];
+    prefix[11] = dice.pick(40) as u8;
+    let prefix = GuidPrefix(prefix);
+    let [_, a, b, c, ..] = dice.roll().to_ne_bytes();
+    let guid = Guid::new(prefix, EntityId([a, b, c, 3]));
+    let (number, message) = (1 + step, Message::from(prefix));
+    let message = match (dice.pick(12), is_newcomer) {
+        (0, _) => message.data(
+            SPDP,
+            number,
+            &forge::participant(prefix, 1_000_000, Some(0)),
+        ),
+        (1, _) => {
+            let names: Vec<_> = (0..60).map(|each| format!("n{step}_{each}")).collect();
+            let nodes: Vec<_> = names
+                .iter()
+                .map(|name| ("/", name.as_str(), guid))
+                .collect();
+            let payload = forge::entities(prefix, 24, &nodes);
+            message.data(DISCOVERY_INFO, number, &payload)
+        }
+        (_, true) => {
+            let payload = forge::endpoint(guid, "rt/exact", "a::msg::dds_::B_", true);
+            message.data(SEDP_WRITERS, number, &payload)
+        }
+        (_, false) => {
+            let payload = forge::endpoint(guid, &dice.name(), "a::msg::dds_::B_", true);
+            message.data(SEDP_WRITERS, number, &payload)
+        }
+    };
+    observer.datagram(&forge::multicast(now, 0), &message.bytes(), None);
+}
+
+/// The names of all tables in these sources.
+fn tables(directory: &Path, into: &mut BTreeSet<String>) {
+    for entry in fs::read_dir(directory).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            tables(&path, into);
+            continue;
+        }
+        let text = fs::read_to_string(path).unwrap();
+        let named = text.split("Size::new(").skip(1);
+        into.extend(named.filter_map(|rest| Some(rest.split('"').nth(1)?.to_owned())));
+    }
+}
+
+#[test]
+fn no_table_grows_beyond_its_cap_whatever_is_forged() {
+    let (mut largest, half, whole) = drive(MESSAGES, 200_000, &mut any_datagram);
+    println!("{half} bytes after half of it, {whole} at the end\n{largest:#?}");
+    assert_filled(
+        &largest,
+        &[
+            "discovery.applicants",
+            "discovery.participants",
+            "discovery.pending_endpoints",
+            "discovery.pending_nodes",
+            "pieces.samples",
+            "profiler.strangers",
+            "receivers.places",
+        ],
+    );
+    assert!(whole < 96 << 20, "{whole} bytes");
+
+    let (of_one, half, whole) = drive(MESSAGES / 3, 1_000_000, &mut one_writer);
+    println!("{half} bytes after half of it, {whole} at the end\n{of_one:#?}");
+    assert_filled(
+        &of_one,
+        &[
+            "acknowledgements.readers",
+            "sequence.gaps",
+            "trace.finished",
+            "ways.ways",
+        ],
+    );
+    assert!(whole < 96 << 20, "{whole} bytes");
+
+    let (crowded, half, whole) = drive(MESSAGES * 2 / 5, 1_000_000, &mut newcomers_in_a_crowd);
+    println!("{half} bytes after half of it, {whole} at the end\n{crowded:#?}");
+    assert_filled(&crowded, &["discovery.endpoints", "discovery.nodes"]);
+    assert!(whole < 96 << 20, "{whole} bytes");
+
+    for (table, (entries, cap)) in of_one.into_iter().chain(crowded) {
+        let seen = largest.entry(table).or_insert((0, cap));
+        seen.0 = seen.0.max(entries);
+    }
+    let mut listed = BTreeSet::new();
+    tables(
+        &Path::new(env!("CARGO_MANIFEST_DIR")).join("../model/src"),
+        &mut listed,
+    );
+    // Those two are in front of the model.
+    listed.retain(|table| !table.starts_with("ahead.") && !table.starts_with("reassembly."));
+    let asked: BTreeSet<_> = largest.keys().map(|table| (*table).to_owned()).collect();
+    assert_eq!(asked, listed);
+    // Taken after each datagram.
+    for drained in ["discovery.changes", "journal.missing"] {
+        largest.remove(drained);
+    }
+    let empty = largest
+        .iter()
+        .filter(|(_, (entries, cap))| *entries == 0 && *cap > 0);
+    let empty: Vec<_> = empty.map(|(table, _)| *table).collect();
+    assert!(empty.is_empty(), "nothing came into {empty:?}");
+}
+
+#[test]
+fn one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone() {
+    let prefix = GuidPrefix([9; 12]);
+    let (largest, _, whole) = drive(MESSAGES, 20_000, &mut |observer, dice, now| {
+        let payload = forge::participant_at(prefix, 100, None, &dice.locators());
+        let message = Message::from(prefix).data(SPDP, 1, &payload).bytes();
+        observer.datagram(&somewhere(dice, now), &message, None);
+    });
+    assert_eq!(largest["receivers.places"].0, 16);
+    assert!(whole < 2 << 20, "{whole} bytes");
+}

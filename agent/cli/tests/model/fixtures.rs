@@ -1,0 +1,481 @@
+//! Real ROS 2 traffic through the whole core, against what is known to have happened.
+//!
+//! Each capture is replayed frame by frame in its own time. What the core then says of graph,
+//! quality of service, removal times, counts and losses must equal what an independent decoder
+//! found in the same file (`*.facts.json`), what a real participant believed at the time
+//! (`ev: graph` lines) and what the nodes logged. The captures in `data` stand alone; when the
+//! corpus they were taken from lies beside the repository, all of it is replayed.
+
+mod replayed;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use replayed::Replayed;
+use ros2probe::model::snapshot::Measurement;
+use ros2probe_testing::truth::{self, Facts, GraphLine, Scenario};
+use ros2probe_wire::names::DdsType;
+
+/// Times in the facts are rounded to microseconds.
+const ROUNDING: f64 = 2e-6;
+
+#[test]
+fn the_captures_in_the_repository_reproduce_their_ground_truth() {
+    let scenarios =
+        truth::scenarios(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data"));
+    assert!(scenarios.len() >= 8, "{scenarios:?}");
+    scenarios.iter().for_each(check);
+}
+
+#[test]
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn the_whole_corpus_reproduces_its_ground_truth() {
+    let scenarios = truth::scenarios(&ros2probe_testing::corpus());
+    assert!(!scenarios.is_empty());
+    scenarios.iter().for_each(check);
+}
+
+#[test]
+fn what_a_keep_last_writer_overwrote_is_lost_as_the_subscribers_log_says() {
+    for (label, lost) in [("fastrtps-udp", 8), ("cyclonedds", 78)] {
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
+        let directory = data.join(label).join("keep-last-lossy-2ns");
+        let [received] = &truth::received(&directory)[..] else {
+            panic!("one subscriber")
+        };
+        assert_eq!(received.lost_between.len(), lost, "{label}");
+        let replayed = Replayed::of(&directory.join("capture.pcap.gz"));
+        compare_losses(label, received, &replayed);
+        let topics = &replayed.end.topics;
+        let topic = topics.iter().find(|topic| topic.name == received.topic);
+        let delivered = topic.unwrap().received.as_deref().unwrap();
+        assert_eq!(delivered.messages, received.count, "{label}");
+        let counts = (delivered.lost(), delivered.irrelevant);
+        assert_eq!(counts, (lost as u64, 0), "{label}");
+    }
+}
+
+fn check(scenario: &Scenario) {
+    let name = scenario.name();
+    let facts = scenario.facts();
+    let replayed = Replayed::of(&scenario.capture);
+    participants(&name, &facts, &replayed);
+    endpoints(&name, &facts, &replayed);
+    disposals(&name, &facts, &replayed);
+    leases(&name, &facts, &replayed);
+    nodes(&name, &facts, &replayed);
+    counts(&name, &facts, &replayed);
+    losses(&name, &facts, &replayed);
+    logged_losses(&name, scenario, &replayed);
+    // The captures with the command line begin late and lack all large frames: what the nodes
+    // believed was not to be seen there.
+    let graphs = if name.contains("cli-observed") {
+        Vec::new()
+    } else {
+        scenario.graphs()
+    };
+    for (witness, lines) in graphs {
+        graph(
+            &format!("{name} as {witness} saw it"),
+            &lines,
+            &facts,
+            &replayed,
+        );
+    }
+    witnessed_removals(&name, scenario, &replayed);
+    let truncated = name.contains("snap256");
+    for error in &replayed.end.decode_errors {
+        assert!(truncated && error.stage == "frame", "{name}: {error:?}");
+    }
+    for table in &replayed.end.tables {
+        assert_eq!(table.evictions, 0, "{name}: {table:?}");
+    }
+}
+
+fn participants(name: &str, facts: &Facts, replayed: &Replayed) {
+    let theirs: BTreeSet<_> = facts.participants.keys().collect();
+    assert_eq!(
+        theirs,
+        replayed.participants.keys().collect(),
+        "{name}: participants"
+    );
+    for (guid, theirs) in &facts.participants {
+        let ours = &replayed.participants[guid];
+        let vendor = match theirs.vendor.as_str() {
+            "1.16" => "Eclipse Cyclone DDS",
+            _ => "eProsima Fast DDS",
+        };
+        assert!(
+            ours.vendor.contains(vendor) || vendor.contains(&ours.vendor),
+            "{ours:?}"
+        );
+        let lease = ours.lease_nanoseconds.map(|lease| lease as f64 / 1e9);
+        assert_eq!(lease, Some(theirs.lease), "{name}: lease of {guid}");
+        assert_eq!(
+            (ours.domain_id, ours.enclave.as_deref()),
+            (0, Some("/")),
+            "{name}: {guid}"
+        );
+        let property = |key| theirs.property_list.get(key).map(String::as_str);
+        if let Some(process) = property("__Pid") {
+            assert_eq!(
+                ours.process.id.map(|id| id.to_string()).as_deref(),
+                Some(process)
+            );
+            assert_eq!(ours.process.host.as_deref(), property("__Hostname"));
+            assert_eq!(ours.process.name.as_deref(), property("__ProcessName"));
+        }
+        assert!((ours.first_seen.seconds() - theirs.first_seen).abs() < ROUNDING);
+    }
+}
+
+fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
+    // An endpoint that was announced and gone between two looks is known from its events only.
+    let appeared: BTreeSet<_> = replayed
+        .events
+        .iter()
+        .filter(|event| matches!(event.entity, "writer" | "reader") && event.event == "appeared")
+        .map(|event| event.guid.to_string())
+        .collect();
+    let theirs: BTreeSet<_> = facts.endpoints.keys().cloned().collect();
+    assert_eq!(theirs, appeared, "{name}: endpoints");
+    let mut compared = 0;
+    for (guid, theirs) in &facts.endpoints {
+        let Some((topic, role, ours)) = replayed.endpoints.get(guid) else {
+            continue;
+        };
+        compared += 1;
+        let what = format!("{name}: {guid} on {}", theirs.topic);
+        assert_eq!(
+            (topic, *role),
+            (&theirs.topic, theirs.kind.as_str()),
+            "{what}"
+        );
+        let message_type = DdsType::parse(&theirs.type_name).unwrap().message();
+        assert_eq!(ours.message_type, message_type.as_str(), "{what}");
+        let role_default = if *role == "writer" {
+            "RELIABLE"
+        } else {
+            "BEST_EFFORT"
+        };
+        assert_eq!(
+            ours.reliability,
+            theirs.reliability.as_deref().unwrap_or(role_default)
+        );
+        assert_eq!(
+            ours.durability,
+            theirs.durability.as_deref().unwrap_or("VOLATILE"),
+            "{what}"
+        );
+        let history = match (&theirs.history, theirs.vendor.as_str()) {
+            (Some(text), _) if text.starts_with("KEEP_ALL") => "KEEP_ALL".to_owned(),
+            (Some(text), _) => text.replace('(', " ("),
+            (None, "1.16") => "KEEP_LAST (1)".to_owned(),
+            (None, _) => "UNKNOWN".to_owned(),
+        };
+        assert_eq!(ours.history, history, "{what}");
+        let lifespan = theirs.lifespan.as_ref().and_then(serde_json::Value::as_f64);
+        assert_eq!(
+            ours.lifespan_nanoseconds.map(|span| span as f64 / 1e9),
+            lifespan,
+            "{what}"
+        );
+        assert_eq!(
+            (ours.deadline_nanoseconds, ours.liveliness.as_str()),
+            (None, "AUTOMATIC")
+        );
+        let hash = theirs
+            .user_data
+            .as_deref()
+            .and_then(|data| data.split("typehash=").nth(1));
+        let hash = hash.and_then(|rest| rest.split(';').next());
+        assert_eq!(ours.type_hash.as_deref(), hash, "{what}");
+    }
+    assert!(
+        compared * 10 >= theirs.len() * 9,
+        "{name}: {compared} of {}",
+        theirs.len()
+    );
+}
+
+/// What was disposed of went at that very datagram.
+fn disposals(name: &str, facts: &Facts, replayed: &Replayed) {
+    let mut theirs: BTreeMap<String, f64> = BTreeMap::new();
+    for event in &facts.events {
+        theirs.entry(event.guid.clone()).or_insert(event.t);
+    }
+    for (guid, at) in &theirs {
+        let ended = replayed.ended.get(guid);
+        let Some(ended) = ended else {
+            // Disposed of although it was never announced in this capture.
+            assert!(!replayed.was_announced(guid), "{name}: {guid} lives on");
+            continue;
+        };
+        let (ended, event) = (ended.0.seconds(), ended.1);
+        match event {
+            "disposed" => assert!((ended - at).abs() < ROUNDING, "{name}: {guid} {ended} {at}"),
+            // Its participant went first.
+            _ => assert!(
+                event == "cascaded" && ended < *at,
+                "{name}: {guid} {event} {ended} {at}"
+            ),
+        }
+    }
+    for (guid, (_, event)) in &replayed.ended {
+        assert!(
+            *event != "disposed" || theirs.contains_key(guid),
+            "{name}: {guid}"
+        );
+    }
+}
+
+/// What said no goodbye went with its lease, counted from its last datagram.
+fn leases(name: &str, facts: &Facts, replayed: &Replayed) {
+    for (guid, participant) in &replayed.participants {
+        let Some((ended, event)) = replayed.ended.get(guid) else {
+            continue;
+        };
+        if *event != "expired" {
+            continue;
+        }
+        let lease = facts.participants[guid].lease;
+        let silent = ended.seconds() - participant.last_seen.seconds();
+        assert!(
+            (silent - lease).abs() < 1e-6,
+            "{name}: {guid} was silent for {silent} s"
+        );
+    }
+}
+
+/// Node names follow `ros_discovery_info`, sample by sample.
+fn nodes(name: &str, facts: &Facts, replayed: &Replayed) {
+    let mut newest: BTreeMap<&str, u64> = BTreeMap::new();
+    let mut names: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
+    let mut theirs = Vec::new();
+    for sample in &facts.ros_discovery_info {
+        let known = newest.entry(&sample.writer).or_default();
+        if sample.seq <= *known || !replayed.is_alive(&sample.gid, sample.t) {
+            continue;
+        }
+        *known = sample.seq;
+        let now: BTreeSet<_> = sample.nodes.iter().map(truth::FactsNode::name).collect();
+        let before = names.insert(&sample.gid, now.clone()).unwrap_or_default();
+        theirs.extend(
+            before
+                .difference(&now)
+                .map(|node| (node.clone(), "disposed", sample.t)),
+        );
+        theirs.extend(
+            now.difference(&before)
+                .map(|node| (node.clone(), "appeared", sample.t)),
+        );
+    }
+    let ours: Vec<_> = replayed
+        .events
+        .iter()
+        .filter(|event| event.entity == "node" && event.event != "cascaded")
+        .map(|event| (event.name.to_string(), event.event, event.at.seconds()))
+        .collect();
+    assert_eq!(theirs.len(), ours.len(), "{name}: {theirs:?} {ours:?}");
+    for (theirs, ours) in theirs.iter().zip(&ours) {
+        assert_eq!((&theirs.0, theirs.1), (&ours.0, ours.1), "{name}");
+        assert!(
+            (theirs.2 - ours.2).abs() < ROUNDING,
+            "{name}: {theirs:?} {ours:?}"
+        );
+    }
+}
+
+/// Samples and bytes per topic.
+fn counts(name: &str, facts: &Facts, replayed: &Replayed) {
+    let mut theirs: BTreeMap<&str, (u64, Option<u64>)> = BTreeMap::new();
+    for (guid, writer) in &facts.writers {
+        if !guid.ends_with("03") || writer.topic == "?" || writer.topic == "ros_discovery_info" {
+            continue;
+        }
+        let (messages, bytes) = theirs.entry(&writer.topic).or_insert((0, Some(0)));
+        *messages += writer.distinct_seqs - writer.frag_samples_incomplete;
+        *bytes = bytes.and_then(|bytes| Some(bytes + writer.bytes()?));
+    }
+    for (topic, (messages, bytes)) in theirs {
+        let ours = replayed.measurement(topic);
+        assert_eq!(ours.messages, messages, "{name}: messages of {topic}");
+        if let Some(bytes) = bytes {
+            assert_eq!(ours.bytes, bytes, "{name}: bytes of {topic}");
+        }
+        assert_eq!(
+            ours.interarrival.count(),
+            intervals(facts, topic, &ours),
+            "{name}: {topic}"
+        );
+    }
+    let unknown: BTreeMap<_, _> = facts
+        .writers
+        .iter()
+        .filter(|(guid, writer)| guid.ends_with("03") && writer.topic == "?")
+        .map(|(guid, writer)| {
+            (
+                guid.clone(),
+                writer.distinct_seqs - writer.frag_samples_incomplete,
+            )
+        })
+        .filter(|(_, messages)| *messages > 1)
+        .collect();
+    let strangers = replayed.end.unknown_writers.iter();
+    let mut strangers: BTreeMap<_, _> = strangers
+        .map(|each| (each.guid.to_string(), each.measurement.messages))
+        .collect();
+    // The independent decoder cannot put cut fragments together; this is the 10 Hz point cloud.
+    if let Some(cloud) = strangers.remove("0110f04d1e86334b8f3fc2bb.00001403") {
+        assert_eq!((name.contains("snap256"), cloud), (true, 29), "{name}");
+    }
+    assert_eq!(strangers, unknown, "{name}: unknown writers");
+}
+
+/// One interval between each two messages of one writer.
+fn intervals(facts: &Facts, topic: &str, ours: &Measurement) -> u64 {
+    let writers = facts
+        .writers
+        .values()
+        .filter(|writer| writer.topic == topic);
+    ours.messages - writers.filter(|writer| writer.complete() > 0).count() as u64
+}
+
+/// Exactly these sequence numbers were lost on the wire: missing ones and incomplete ones.
+fn losses(name: &str, facts: &Facts, replayed: &Replayed) {
+    let mut theirs: BTreeMap<&str, BTreeSet<u64>> = BTreeMap::new();
+    for (guid, writer) in &facts.writers {
+        if !replayed.measured.contains(guid) {
+            continue;
+        }
+        let incomplete = writer
+            .frags_missing
+            .keys()
+            .map(|number| number.parse().unwrap());
+        let lost: BTreeSet<u64> = writer
+            .missing_in_range
+            .iter()
+            .copied()
+            .chain(incomplete)
+            .collect();
+        if !lost.is_empty() {
+            theirs.insert(guid, lost);
+        }
+    }
+    let ours: BTreeMap<&str, BTreeSet<u64>> = replayed
+        .losses
+        .iter()
+        .map(|(guid, lost)| (guid.as_str(), lost.clone()))
+        .collect();
+    assert_eq!(ours, theirs, "{name}: lost sequence numbers");
+    for topic in &replayed.end.topics {
+        let Some(measurement) = &topic.measurement else {
+            continue;
+        };
+        let writers = facts
+            .writers
+            .iter()
+            .filter(|(_, writer)| writer.topic == topic.dds_name);
+        let lost: usize = writers
+            .map(|(guid, _)| ours.get(guid.as_str()).map_or(0, BTreeSet::len))
+            .sum();
+        assert_eq!(measurement.lost, lost as u64, "{name}: {}", topic.name);
+    }
+}
+
+/// Small best-effort messages: the wire's losses are those of the subscriber's log.
+fn logged_losses(name: &str, scenario: &Scenario, replayed: &Replayed) {
+    if !name.contains("loss-small") {
+        return;
+    }
+    for received in scenario.received() {
+        compare_losses(name, &received, replayed);
+    }
+}
+
+/// A writer sequence number is the logged sequence + 1.
+fn compare_losses(name: &str, received: &truth::Received, replayed: &Replayed) {
+    let theirs: BTreeSet<_> = received.lost_between.iter().map(|seq| seq + 1).collect();
+    let topic = format!("rt{}", received.topic);
+    let (_, ours) = replayed
+        .losses
+        .iter()
+        .find(|(guid, _)| replayed.topic_of(guid) == Some(topic.as_str()))
+        .unzip();
+    assert_eq!(ours.cloned().unwrap_or_default(), theirs, "{name}: {topic}");
+    let messages = replayed.measurement(&topic).messages;
+    assert_eq!(messages, received.count, "{name}: {topic}");
+}
+
+/// When the graph stood still for a real participant, it was the same here.
+fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
+    const SETTLED: u64 = 500_000_000;
+    let mut compared = 0;
+    for (line, next) in lines.iter().zip(lines.iter().skip(1)) {
+        if next.t - line.t < 2 * SETTLED {
+            continue;
+        }
+        let at = line.t + SETTLED;
+        // A node knows itself before it has told anybody.
+        let told = facts
+            .ros_discovery_info
+            .iter()
+            .filter(|sample| sample.t < at as f64 / 1e9);
+        let told: BTreeSet<_> = told
+            .flat_map(|sample| sample.nodes.iter().map(truth::FactsNode::name))
+            .collect();
+        if !line.nodes.iter().all(|node| told.contains(node)) {
+            continue;
+        }
+        let Some(view) = replayed.view_at(at) else {
+            continue;
+        };
+        compared += 1;
+        let nodes: BTreeSet<_> = line.nodes.iter().cloned().collect();
+        assert_eq!(view.nodes, nodes, "{name}: nodes at {}", line.t);
+        let topics: BTreeMap<_, _> = line
+            .topics
+            .iter()
+            .map(|(topic, facts)| (topic.clone(), (facts.types.clone(), facts.pubs, facts.subs)))
+            .collect();
+        assert_eq!(view.topics, topics, "{name}: topics at {}", line.t);
+        let services: BTreeMap<_, _> = line.services.clone().into_iter().collect();
+        assert_eq!(view.services, services, "{name}: services at {}", line.t);
+    }
+    assert!(
+        compared > 0 || lines.len() < 3,
+        "{name}: nothing to compare"
+    );
+}
+
+/// A node goes here when it goes for the real participant that stayed to the end.
+fn witnessed_removals(name: &str, scenario: &Scenario, replayed: &Replayed) {
+    let Some((_, lines)) = scenario
+        .graphs()
+        .into_iter()
+        .find(|(role, _)| role == "late")
+    else {
+        return;
+    };
+    let mut removals = 0;
+    for (before, after) in lines.iter().zip(lines.iter().skip(1)) {
+        for node in before
+            .nodes
+            .iter()
+            .filter(|node| !after.nodes.contains(node))
+        {
+            let ours = replayed.events.iter().find(|event| {
+                event.entity == "node" && event.event != "appeared" && *event.name == **node
+            });
+            let ours = ours.unwrap_or_else(|| panic!("{name}: {node} stays"));
+            let late = after.t as f64 / 1e9 - ours.at.seconds();
+            // The witness polls every 50 ms, on a busy machine.
+            assert!(
+                (-0.1..0.5).contains(&late),
+                "{name}: {node} went {late} s apart"
+            );
+            removals += 1;
+        }
+    }
+    assert!(removals >= 3, "{name}: {removals}");
+}

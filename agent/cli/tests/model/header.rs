@@ -1,0 +1,36 @@
+//! The model's list of types that begin with a header, compared with their definitions.
+
+use ros2probe::message::{Dialect, Element, Library, Sources};
+use ros2probe::model::header::begins_with_header;
+
+/// The types that come with the program; a unit test there finds every one of them in this list.
+#[test]
+fn types_that_begin_with_a_header_are_those_that_latency_is_measured_of() {
+    let listed = include_str!("../../../testing/data/message/type_hashes.txt");
+    let names = listed.lines().filter_map(|line| line.split(' ').next());
+    let messages = names.filter(|name| name.contains("/msg/"));
+    let header = Element::Nested("std_msgs/msg/Header".parse().unwrap());
+    let dialects = [
+        Dialect::Humble,
+        Dialect::Jazzy,
+        Dialect::Kilted,
+        Dialect::Rolling,
+    ];
+    let libraries = dialects.map(|dialect| {
+        Library::new(Sources {
+            dialect,
+            ..Sources::default()
+        })
+    });
+    let mut count = 0;
+    for name in messages {
+        for library in &libraries {
+            let found = library.find(name, None).unwrap();
+            let first = found.structure(&found.root).unwrap().fields.first();
+            let begins = first.is_some_and(|field| field.element == header);
+            assert_eq!(begins_with_header(name), begins, "{name}");
+            count += 1;
+        }
+    }
+    assert!(count > 4 * 150, "{count}");
+}

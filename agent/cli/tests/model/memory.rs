@@ -1,0 +1,249 @@
+//! What deliveries take: resident memory of a process in which nothing else happens, as nextest runs
+//! each test. `cargo test` needs the filter `memory::`.
+
+use std::fs;
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
+
+use ros2probe::bag::{Options, Storage, TopicDescription, Writer};
+use ros2probe::config::{Limit, Limits, Watch, Watchlist};
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe::surface::{AgentFacts, Board, Exposition, Format, SourceKind};
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_testing::model::host::{self, BOB, Host, Seen};
+use ros2probe_wire::record::{flag, guid_words, kind};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
+
+/// Held while memory is measured: tests may run beside each other in one process.
+static ALONE: Mutex<()> = Mutex::new(());
+
+/// Bytes of this process in memory.
+fn resident() -> usize {
+    let status = fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmRSS:"));
+    let kibibytes = line.and_then(|line| line.split_whitespace().nth(1));
+    1024 * kibibytes.unwrap().parse::<usize>().unwrap()
+}
+
+#[test]
+fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
+    const DELIVERIES: u64 = 500;
+    const ROUNDS: u64 = 6;
+    let _alone = ALONE.lock().unwrap();
+    let mut worlds: Vec<_> = (0..ROUNDS).map(|_| Host::new()).collect();
+    let address = worlds[0].reader(BOB, 7411);
+    let at = |socket: u64| Seen {
+        socket,
+        ..address.multicast(socket)
+    };
+    for world in &mut worlds {
+        world.data(at(1), 1);
+    }
+    let before = resident();
+    for world in &mut worlds {
+        // Busy for longer than a gap stays open, then idle.
+        for number in 2..=150 {
+            (1..=DELIVERIES).for_each(|socket| world.data(at(socket), number));
+            world.wait(100);
+        }
+        (0..20).for_each(|_| world.wait(1000));
+        assert_eq!(world.deliveries().len() as u64, DELIVERIES);
+    }
+    let each = (resident() - before) / usize::try_from(DELIVERIES * ROUNDS).unwrap();
+    assert!((300..1536).contains(&each), "{each} bytes");
+    println!("{each} bytes a delivery");
+}
+
+/// What the table of limits takes for granted, on a robot on which participants, endpoints, topics,
+/// unknown writers and flows are all at their caps, each with names of usual length: with what is
+/// shown of it and the one before, while a page is written.
+#[test]
+fn entries_take_no_more_than_the_table_of_limits_says() {
+    let _alone = ALONE.lock().unwrap();
+    let limits = Limits::default();
+    let before = resident();
+    let mut observer = Observer::new(Settings::default().with_limits(&limits));
+    observer.set_watchlist(Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap());
+    let mut now = host::START;
+    observer.advance(Timestamp(now));
+    let put = |observer: &mut Observer, now: u64, message: Message| {
+        observer.datagram(&forge::multicast(now, 0), &message.bytes(), None);
+    };
+    let prefix = |number: usize| {
+        let [a, b, c, d] = u32::try_from(number).unwrap().to_be_bytes();
+        GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, a, b, c, d])
+    };
+    let each = limits.endpoints / limits.participants;
+    let mut writers = Vec::new();
+    for participant in 0..limits.participants {
+        let payload = forge::participant(prefix(participant), 10_000, None);
+        put(
+            &mut observer,
+            now,
+            Message::from(prefix(participant)).data(SPDP, 1, &payload),
+        );
+        for number in 0..each {
+            let index = participant * each + number;
+            let [_, _, high, low] = u32::try_from(number + 1).unwrap().to_be_bytes();
+            let is_writer = index.is_multiple_of(2);
+            let entity = EntityId([0, high, low, if is_writer { 3 } else { 4 }]);
+            let guid = Guid::new(prefix(participant), entity);
+            let topic = format!("rt/robot/sensor_{:04}/data_raw", index / 2 % limits.topics);
+            let payload = forge::endpoint(guid, &topic, "sensor_msgs::msg::dds_::Imu_", true);
+            let by = if is_writer {
+                SEDP_WRITERS
+            } else {
+                SEDP_READERS
+            };
+            let number = number as u64 + 1;
+            put(
+                &mut observer,
+                now,
+                Message::from(prefix(participant)).data(by, number, &payload),
+            );
+            writers.extend(is_writer.then_some(guid));
+        }
+    }
+    let mut strangers: Vec<_> = (0..limits.unknown_writers)
+        .map(|number| Guid::new(prefix(1 << 20 | number), EntityId([0, 0, 1, 3])))
+        .collect();
+    strangers.extend(&writers);
+    for number in 1..=100 {
+        for (place, writer) in strangers.iter().enumerate() {
+            observer.record(&Record {
+                kind: kind::DATA,
+                submessage_flags: 5,
+                writer: guid_words(*writer),
+                time: now,
+                sequence_number: number,
+                source_timestamp: now,
+                destination: [0, 0, u32::from_ne_bytes([0, 0, 0xff, 0xff]), 0x0100_000a],
+                destination_port: 7401,
+                datagram_len: 200,
+                payload_len: 100,
+                flags: flag::HOST,
+                socket: place as u64 + 1,
+                ..Record::default()
+            });
+        }
+        now += 100 * host::MILLISECOND;
+        observer.advance(Timestamp(now));
+    }
+    let modelled = resident() - before;
+    let board = Arc::new(Board::new(
+        SourceKind::Host,
+        ros2probe::surface::Settings {
+            histograms: true,
+            ..Default::default()
+        },
+    ));
+    let exposition = Exposition::new(Arc::clone(&board));
+    let mut pages = Vec::new();
+    let mut kept = Vec::new();
+    for _ in 0..2 {
+        let agent = AgentFacts::new(SourceKind::Host, Instant::now());
+        board.publish(observer.snapshot(Timestamp(now)), agent);
+        kept.push(board.state());
+        pages.push(exposition.render(Format::Classic).unwrap());
+    }
+    let all = resident() - before;
+    let mut told = String::new();
+    let mut expected = 0;
+    for facts in board.limits().facts(&board.state()) {
+        let row = facts.limit.row();
+        let is_modelled = matches!(
+            facts.limit,
+            Limit::Participants
+                | Limit::Endpoints
+                | Limit::Topics
+                | Limit::UnknownWriters
+                | Limit::Flows
+        );
+        if is_modelled {
+            told.push_str(&format!("{} {} of {}, ", row.key, facts.used, facts.cap));
+            assert!(facts.used * 10 >= facts.cap * 9, "{told}");
+            expected += row.bytes * row.default;
+        }
+    }
+    println!(
+        "{told}model {} KiB, with two snapshots and pages ({} KiB each) {} KiB, table {} KiB",
+        modelled >> 10,
+        pages[0].len() >> 10,
+        all >> 10,
+        expected >> 10
+    );
+    assert!(all <= expected, "{all} bytes, {expected} in the table");
+    assert!(
+        all * 3 >= expected,
+        "the table says far too much: {all} of {expected}"
+    );
+}
+
+/// Topics as many as may be measured, messages smaller and larger than a chunk, compressed and not.
+#[test]
+fn a_recording_takes_no_more_than_the_table_of_limits_says() {
+    const BAGS: usize = 4;
+    let _alone = ALONE.lock().unwrap();
+    let place = tempfile::tempdir().unwrap();
+    let large: Vec<u8> = (0..3_000_000_u32).map(|at| (at / 7) as u8).collect();
+    let before = resident();
+    let mut most = before;
+    let mut bags: Vec<_> = (0..BAGS)
+        .map(|number| {
+            let preset = ["", "zstd_fast", "fastwrite", ""][number];
+            let mut options = Options {
+                storage: Storage::preset(preset).unwrap(),
+                max_index_bytes: Some(1 << 20),
+                ..Options::default()
+            };
+            options.storage.chunk_bytes = 1 << 20;
+            let path = place.path().join(format!("bag{number}"));
+            let mut bag = Writer::create(&path, options).unwrap();
+            let topics: Vec<_> = (0..Limits::default().topics)
+                .map(|topic| {
+                    let description = TopicDescription {
+                        name: format!("/robot/sensor_{topic:04}/data_raw"),
+                        type_name: "sensor_msgs/msg/Imu".to_owned(),
+                        type_hash: None,
+                        publishers: Vec::new(),
+                        schema: None,
+                    };
+                    bag.topic(description).unwrap()
+                })
+                .collect();
+            (bag, topics)
+        })
+        .collect();
+    for round in 0..12_u64 {
+        let at = Timestamp(host::START + round * 1_000_000_000);
+        for (bag, topics) in &mut bags {
+            for topic in topics.iter() {
+                bag.write(*topic, at, at, round, &large[..2000]).unwrap();
+            }
+            bag.write(topics[0], at, at, round, &large).unwrap();
+            bag.flush().unwrap();
+            most = most.max(resident());
+        }
+    }
+    let each = (most - before) / BAGS;
+    let row = Limit::Recordings.row();
+    println!("{} KiB each, {} in the table", each >> 10, row.bytes >> 10);
+    assert!(
+        each <= row.bytes,
+        "{each} bytes, {} in the table",
+        row.bytes
+    );
+    assert!(each * 8 >= row.bytes, "the table says far too much: {each}");
+}
+
+#[test]
+fn all_limits_reached_together_fit_into_the_unit_s_memory() {
+    let unit = include_str!("../../../../systemd/ros2probe.service");
+    let megabytes = unit
+        .lines()
+        .find_map(|line| line.strip_prefix("MemoryMax="));
+    let allowed = megabytes.unwrap().strip_suffix('M').unwrap();
+    let allowed = allowed.parse::<usize>().unwrap() << 20;
+    let all = Limits::default().bytes() + Limits::BESIDE;
+    assert!(all <= allowed, "{} of {} KiB", all >> 10, allowed >> 10);
+}

@@ -1,0 +1,224 @@
+// A real browser that shows the agent's page, and what the page must never do: write to the console,
+// ask another origin, open a dialog of the browser, break a rule of accessibility.
+//
+// A scenario runs beside a Rust test (agent/cli/tests/live/browser.rs), which has started the agent. `ask`
+// puts a question to that test, such as to restart the agent.
+
+import assert from 'node:assert/strict';
+import { existsSync, mkdirSync, readFileSync } from 'node:fs';
+import { createRequire } from 'node:module';
+import { basename } from 'node:path';
+import { createInterface } from 'node:readline';
+import { fileURLToPath } from 'node:url';
+
+/** What .ci/prerequisites.sh installs. */
+const TOOLS = fileURLToPath(new URL('../../../target/tools/page/', import.meta.url));
+const FAILURES = fileURLToPath(new URL('../../../target/page-failures/', import.meta.url));
+const CHROMIUM = '/usr/bin/chromium-headless-shell';
+/** Longest wait for anything; other tests keep the machine busy. */
+const PATIENCE_MS = 30_000;
+
+if (!existsSync(`${TOOLS}node_modules/playwright-core`)) {
+  console.error('playwright-core is missing: run .ci/prerequisites.sh page');
+  process.exit(1);
+}
+const load = createRequire(`${TOOLS}package.json`);
+const { chromium } = load('playwright-core');
+const AXE = readFileSync(load.resolve('axe-core/axe.min.js'), 'utf8');
+
+/** Files of this folder take the place of the agent's own, for those who work on the page. */
+const EDITED = process.env.ROS2PROBE_PAGE_FROM;
+
+/** The address that the Rust test gave. */
+export const ADDRESS = process.argv[2] ?? 'http://127.0.0.1:17401/';
+
+/** Debian's browser, or the one playwright-core fetched where the system has no package. */
+export function launch() {
+  if (!existsSync(CHROMIUM)) process.env.PLAYWRIGHT_BROWSERS_PATH ??= `${TOOLS}browsers`;
+  return chromium.launch({
+    ...(existsSync(CHROMIUM) ? { executablePath: CHROMIUM } : {}),
+    args: ['--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage'],
+  });
+}
+
+/** Waits until something holds, and returns it. */
+export async function until(what, holds, patience = PATIENCE_MS) {
+  const deadline = Date.now() + patience;
+  let last;
+  for (;;) {
+    try {
+      last = await holds();
+      if (last) return last;
+    } catch (error) {
+      last = error;
+    }
+    if (Date.now() > deadline) throw new Error(`${what}: not within ${patience} ms, last: ${last}`);
+    await new Promise((wake) => setTimeout(wake, 100));
+  }
+}
+
+/** Answers with the agent's headers and the edited file. */
+async function edited(route) {
+  const response = await route.fetch();
+  const path = new URL(route.request().url()).pathname.replace('/page/', '');
+  await route.fulfill({ response, body: readFileSync(`${EDITED}/${path}`) });
+}
+
+let lines = null;
+
+/** Puts a question to the Rust test and returns its answer. */
+export async function ask(question) {
+  lines ??= createInterface({ input: process.stdin })[Symbol.asyncIterator]();
+  process.stdout.write(`@${question}\n`);
+  const { done, value } = await lines.next();
+  assert.ok(!done, `no answer to "${question}"`);
+  return JSON.parse(value);
+}
+
+/** One tab, and what has been seen of it. */
+export class Tab {
+  constructor(page, address) {
+    this.page = page;
+    this.address = address;
+    this.origin = new URL(address).origin;
+    /** Everything the console showed, and every mistake no one caught. */
+    this.messages = [];
+    /** Requests of the tab and of its workers. */
+    this.requests = [];
+    this.dialogs = [];
+    /** Console messages that the browser itself writes about a request that fails. */
+    this.expected = [];
+    page.on('console', (message) => this.messages.push(`${message.type()}: ${message.text()} (${
+      message.location().url})`));
+    page.on('pageerror', (error) => this.messages.push(`uncaught: ${error.stack}`));
+    page.on('dialog', (dialog) => {
+      this.dialogs.push(dialog.message());
+      dialog.dismiss();
+    });
+    page.context().on('request', (request) => this.requests.push(request));
+  }
+
+  /** Messages that match are of the browser's own making, not the page's. */
+  expect(pattern) {
+    this.expected.push(pattern);
+  }
+
+  /** Fails where the tab did what it may not. */
+  verify() {
+    const said = this.messages.filter((each) => !this.expected.some((known) => known.test(each)));
+    assert.deepEqual(said, [], 'the console stays empty');
+    assert.deepEqual(this.dialogs, [], 'the page opens no dialog of the browser');
+    const foreign = this.requests.map((request) => request.url())
+      .filter((url) => !url.startsWith(`${this.origin}/`) && !url.startsWith('blob:')
+        && !url.startsWith('data:'));
+    assert.deepEqual(foreign, [], 'no request leaves the origin');
+    assert.ok(this.requests.length > 0);
+  }
+
+  /** Opens a view by its address, as a bookmark does. */
+  async go(fragment) {
+    await this.page.goto('about:blank');
+    await this.page.goto(`${this.address}${fragment}`);
+    await this.live();
+  }
+
+  /** Waits for figures. */
+  async live() {
+    await this.page.locator('.status', { hasText: /live/ }).waitFor({ timeout: PATIENCE_MS });
+    await this.page.locator('main h1').waitFor();
+  }
+
+  heading(name) {
+    return this.page.getByRole('heading', { level: 1, name, exact: true }).waitFor();
+  }
+
+  fragment() {
+    return new URL(this.page.url()).hash;
+  }
+
+  text(selector = 'main') {
+    return this.page.locator(selector).innerText();
+  }
+
+  /** Waits until a part of the page shows a text. */
+  shows(text, selector = 'main') {
+    return until(`${selector} shows ${text}`, async () => {
+      const shown = await this.text(selector);
+      return text instanceof RegExp ? text.test(shown) : shown.includes(text);
+    }).catch(async (error) => {
+      throw new Error(`${error.message}\n${await this.text(selector)}`);
+    });
+  }
+
+  /** Fails with what axe finds against WCAG 2.2 A and AA. */
+  async accessible(what) {
+    await this.page.evaluate(AXE);
+    const found = await this.page.evaluate(() => globalThis.axe.run(document, {
+      runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa', 'best-practice'],
+      resultTypes: ['violations'],
+    }));
+    const words = found.violations.map((each) => `${each.id}: ${each.help}\n${each.nodes.slice(0, 4)
+      .map((node) => `    ${node.target.join(' ')}: ${node.html.slice(0, 300)}\n      ${
+        node.failureSummary.replaceAll('\n', ' ')}`).join('\n')}`);
+    assert.equal(words.length, 0, `${what}:\n${words.join('\n')}`);
+  }
+
+  /** Fails where the page scrolls sideways; names what is too wide. */
+  async narrow(what) {
+    const wide = await this.page.evaluate(() => {
+      const { scrollWidth, clientWidth } = document.documentElement;
+      if (scrollWidth <= clientWidth) return null;
+      const names = [];
+      for (const each of document.querySelectorAll('body *')) {
+        const { right } = each.getBoundingClientRect();
+        if (right > clientWidth + 0.5 && !each.closest('.scroll, .canvas, pre, .plot')) {
+          names.push(`${each.tagName}.${each.getAttribute('class')} to ${right.toFixed(0)}: ${
+            each.textContent.slice(0, 40)}`);
+        }
+      }
+      return `${scrollWidth} of ${clientWidth}: ${names.slice(0, 8).join('; ')}`;
+    });
+    assert.equal(wide, null, `${what} scrolls sideways`);
+  }
+}
+
+/**
+ * Runs a scenario in a browser of its own and ends the process: 0 where it holds.
+ * @param {(open: (options?: object) => Promise<Tab>, browser: any) => Promise<void>} story
+ */
+export async function scenario(story) {
+  const browser = await launch();
+  const tabs = [];
+  const open = async ({ address = ADDRESS, context, theme = 'light', width = 1280, height = 800,
+    scale = 1, fragment = '', init } = {}) => {
+    const own = context ?? await browser.newContext({
+      colorScheme: theme, viewport: { width, height }, deviceScaleFactor: scale,
+      acceptDownloads: true, reducedMotion: 'reduce',
+    });
+    own.setDefaultTimeout(PATIENCE_MS);
+    if (EDITED) await own.route('**/page/**', edited);
+    const page = await own.newPage();
+    const tab = new Tab(page, address);
+    tabs.push(tab);
+    if (init) await page.addInitScript(init);
+    await page.goto(`${address}${fragment}`);
+    return tab;
+  };
+  let code = 0;
+  try {
+    await story(open, browser);
+    for (const tab of tabs) tab.verify();
+  } catch (error) {
+    code = 1;
+    console.error(error.stack ?? error);
+    mkdirSync(FAILURES, { recursive: true });
+    for (const [at, tab] of tabs.entries()) {
+      for (const message of tab.messages) console.error(`console of tab ${at}: ${message}`);
+      const file = `${FAILURES}${basename(process.argv[1], '.mjs')}-${at}.png`;
+      await tab.page.screenshot({ path: file, timeout: 5000 })
+        .then(() => console.error(`tab ${at} at ${tab.page.url()}: ${file}`), () => {});
+    }
+  }
+  await browser.close();
+  process.exit(code);
+}

@@ -1,0 +1,530 @@
+//! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
+
+use std::collections::BTreeSet;
+use std::net::Ipv4Addr;
+use std::path::Path;
+use std::sync::Arc;
+
+use ros2probe::config::{Expectations, Watch};
+use ros2probe::config::{Limits, limits_markdown};
+use ros2probe::model::snapshot::{
+    DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
+};
+use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
+use ros2probe::surface::events;
+use ros2probe::surface::otlp::Signal;
+use ros2probe::surface::{
+    Ability, AgentFacts, Board, Exposition, Format, Settings, SnapshotFigures, SourceKind,
+};
+use ros2probe_testing::local_agent::promtool;
+use ros2probe_testing::sample_robot;
+
+fn settings() -> Settings {
+    let expectations = Expectations {
+        min_rate_hz: Some(10.0),
+        ..Expectations::default()
+    };
+    Settings {
+        watches: vec![Arc::new(Watch {
+            expectations,
+            per_subscriber: true,
+            ..Watch::named("/**").unwrap()
+        })],
+        histograms: true,
+        per_writer: true,
+        limits: Limits::default(),
+    }
+}
+
+fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
+    let board = Arc::new(Board::new(SourceKind::Wire, settings));
+    board.publish(snapshot, sample_robot::agent());
+    board.exports().enable(Signal::Metrics);
+    board
+        .recordings()
+        .snapshot("incident", SnapshotFigures::default());
+    Exposition::new(board).render(format).unwrap()
+}
+
+fn sample<'a>(page: &'a str, series: &str) -> Option<&'a str> {
+    page.lines()
+        .find_map(|line| line.strip_prefix(series)?.strip_prefix(' '))
+}
+
+#[test]
+fn the_page_shows_the_whole_catalogue_and_nothing_else() {
+    let page = page(
+        sample_robot::snapshot(["/points"]),
+        settings(),
+        Format::Classic,
+    );
+    let kind = |kind: Kind| {
+        if kind == Kind::Info {
+            "gauge"
+        } else {
+            kind.label()
+        }
+    };
+    let wanted: Vec<String> = CATALOGUE
+        .iter()
+        .map(|metric| format!("# TYPE {} {}", metric.name, kind(metric.kind)))
+        .collect();
+    let shown: Vec<&str> = page
+        .lines()
+        .filter(|line| line.starts_with("# TYPE"))
+        .collect();
+    assert_eq!(shown, wanted);
+    for metric in CATALOGUE {
+        let bucket = |line: &&str| line.starts_with(metric.name) && !line.starts_with('#');
+        assert!(
+            page.lines().any(|line| bucket(&line)),
+            "{} has no sample",
+            metric.name
+        );
+        assert!(page.contains(&format!("# HELP {} {}\n", metric.name, metric.help)));
+    }
+}
+
+#[test]
+fn the_readme_s_tables_are_those_of_the_sources() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../README.md");
+    let mut readme = std::fs::read_to_string(&path).unwrap();
+    let hint = "run `UPDATE_README=1 cargo test -p ros2probe --test surface metrics::` and commit";
+    for (begin, end, wanted) in [
+        ("catalogue.rs -->\n", "<!-- metrics: end", markdown()),
+        (
+            "events/table.rs -->\n",
+            "<!-- events: end",
+            events::markdown(),
+        ),
+        (
+            "model/src/limits.rs -->\n",
+            "<!-- limits: end",
+            limits_markdown(),
+        ),
+    ] {
+        let (before, rest) = readme.split_once(begin).unwrap();
+        let (table, after) = rest.split_once(end).unwrap();
+        if std::env::var_os("UPDATE_README").is_none() {
+            assert_eq!(table, wanted, "{hint}");
+        }
+        readme = format!("{before}{begin}{wanted}{end}{after}");
+    }
+    if std::env::var_os("UPDATE_README").is_some() {
+        std::fs::write(path, readme).unwrap();
+    }
+}
+
+#[test]
+fn values_are_what_the_snapshot_says() {
+    let page = page(
+        sample_robot::snapshot(["/points"]),
+        settings(),
+        Format::Classic,
+    );
+    let topic = "{domain_id=\"0\",topic=\"/points\"}";
+    for (series, value) in [
+        ("ros2_topic_messages_total", "123456"),
+        ("ros2_topic_bytes_total", "79504384000"),
+        ("ros2_topic_lost_messages_total", "12"),
+        ("ros2_topic_publishers", "1"),
+        ("ros2_topic_rate_hertz", "19.98"),
+        (
+            "ros2_topic_last_message_timestamp_seconds",
+            "1700000000.1234567",
+        ),
+        ("ros2_topic_interarrival_seconds_count", "1000"),
+    ] {
+        assert_eq!(
+            sample(&page, &format!("{series}{topic}")),
+            Some(value),
+            "{series}\n{page}"
+        );
+    }
+    let bucket = |le: &str| {
+        let labels = format!("{{le=\"{le}\",domain_id=\"0\",topic=\"/points\"}}");
+        sample(
+            &page,
+            &format!("ros2_topic_interarrival_seconds_bucket{labels}"),
+        )
+    };
+    assert_eq!(
+        (bucket("0.02"), bucket("+Inf")),
+        (Some("540"), Some("1000"))
+    );
+    let watch = "domain_id=\"0\",topic=\"/points\",watch=\"/**\"";
+    for (series, value) in [
+        (
+            format!("ros2_watch_state{{{watch},state=\"violated\"}}"),
+            "1",
+        ),
+        (format!("ros2_watch_state{{{watch},state=\"ok\"}}"), "0"),
+        (
+            format!("ros2_watch_expectation_violated{{{watch},expectation=\"min_rate_hz\"}}"),
+            "1",
+        ),
+    ] {
+        assert_eq!(sample(&page, &series), Some(value), "{series}");
+    }
+}
+
+#[test]
+fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
+    let snapshot = sample_robot::snapshot(["/points"]);
+    let asked = page(snapshot.clone(), settings(), Format::Classic);
+    let topic = "domain_id=\"0\",topic=\"/points\"";
+    let prefix = "01".repeat(12);
+    let sent = format!("{topic},writer=\"{prefix}.00000103\",destination=\"10.0.0.2:7411\"");
+    let received = format!("{sent},subscriber=\"participant {prefix}.000001c1\"");
+    let reader = format!(
+        "{topic},writer=\"{prefix}.00000103\",reader=\"{prefix}.00000203\",ros_node=\"/mapper\""
+    );
+    let details = format!(
+        "{topic},destination=\"10.0.0.2:7411\",subscriber=\"participant {prefix}.000001c1\",\
+         ros_node=\"/mapper\",participant=\"{prefix}.000001c1\",process=\"mapper\",pid=\"42\",\
+         cgroup=\"/robot.slice\""
+    );
+    let sums = [
+        ("ros2_topic_sent_messages_total", "", "1000"),
+        ("ros2_topic_delivered_messages_total", "", "900"),
+        (
+            "ros2_topic_delivery_lost_messages_total",
+            "before_host",
+            "60",
+        ),
+        (
+            "ros2_topic_delivery_lost_messages_total",
+            "reassembly",
+            "20",
+        ),
+        (
+            "ros2_topic_delivery_lost_messages_total",
+            "socket_buffer",
+            "15",
+        ),
+        ("ros2_topic_delivery_pending_messages", "", "1"),
+        ("ros2_topic_delivery_recovered_messages_total", "", "3"),
+        ("ros2_topic_delivery_irrelevant_messages_total", "", "5"),
+        ("ros2_topic_delivery_unmatched_messages_total", "", "4"),
+        ("ros2_topic_acknowledgement_lag_messages", "", "56"),
+        ("ros2_topic_acknowledgement_lag_seconds", "", "2.75"),
+        ("ros2_topic_transit_seconds_count", "", "1000"),
+    ];
+    let each = [
+        ("ros2_writer_sent_messages_total", &sent, "", "1000"),
+        (
+            "ros2_subscriber_received_messages_total",
+            &received,
+            "",
+            "900",
+        ),
+        (
+            "ros2_subscriber_lost_messages_total",
+            &received,
+            "reassembly",
+            "20",
+        ),
+        (
+            "ros2_subscriber_lost_messages_total",
+            &received,
+            "socket_buffer",
+            "15",
+        ),
+        ("ros2_subscriber_pending_messages", &received, "", "1"),
+        (
+            "ros2_subscriber_recovery_seconds_total",
+            &received,
+            "",
+            "0.25",
+        ),
+        (
+            "ros2_reader_acknowledgement_lag_messages",
+            &reader,
+            "",
+            "56",
+        ),
+        ("ros2_reader_requested_messages_total", &reader, "", "9"),
+        ("ros2_subscriber_info", &details, "", "1"),
+    ];
+    let series = |name: &str, labels: &str, cause: &str| match cause {
+        "" => format!("{name}{{{labels}}}"),
+        cause => format!("{name}{{{labels},cause=\"{cause}\"}}"),
+    };
+    for (name, cause, value) in sums {
+        let series = series(name, topic, cause);
+        assert_eq!(sample(&asked, &series), Some(value), "{series}\n{asked}");
+    }
+    for (name, labels, cause, value) in each {
+        let series = series(name, labels, cause);
+        assert_eq!(sample(&asked, &series), Some(value), "{series}\n{asked}");
+    }
+    let drops = "socket=\"77\",process=\"mapper\",pid=\"42\",cgroup=\"/robot.slice\"";
+    let drops = format!("ros2_socket_unidentified_drops_total{{{drops}}}");
+    assert_eq!(sample(&asked, &drops), Some("5"));
+
+    let mut plain = settings();
+    Arc::make_mut(&mut plain.watches[0]).per_subscriber = false;
+    let plain = page(snapshot, plain, Format::Classic);
+    for (name, cause, value) in sums {
+        let series = series(name, topic, cause);
+        assert_eq!(sample(&plain, &series), Some(value), "{series}");
+    }
+    for (name, ..) in each {
+        assert!(!plain.contains(&format!("\n{name}{{")), "{name}");
+    }
+}
+
+#[test]
+fn series_of_deliveries_are_capped_and_never_twice() {
+    let mut snapshot = sample_robot::snapshot(["/points"]);
+    let topic = &mut snapshot.topics[0];
+    // A reader whose oldest unacknowledged message is older than is remembered.
+    topic.acknowledgements[0].lag_seconds = None;
+    let one = sample_robot::delivery(Direction::Received);
+    topic.deliveries = (0..2_000_u16)
+        .flat_map(|host| {
+            let destination = (Ipv4Addr::from(0x0a00_0000 + u32::from(host)), 7411).into();
+            let delivery = DeliveryFacts {
+                destination,
+                process: Some("\"}\n\\".to_owned()),
+                ..one.clone()
+            };
+            // Two sockets that no label tells apart are one series.
+            [delivery.clone(), delivery]
+        })
+        .collect();
+    let page = page(snapshot, settings(), Format::Classic);
+    let shown = |line: &&str| line.starts_with("ros2_subscriber_received_messages_total{");
+    assert_eq!(page.lines().filter(shown).count(), 1_000);
+    assert!(
+        page.lines()
+            .filter(shown)
+            .all(|line| line.ends_with(" 1800"))
+    );
+    assert_eq!(
+        sample(&page, "ros2probe_deliveries_not_shown"),
+        Some("2000")
+    );
+    let lag = "ros2_topic_acknowledgement_lag_seconds{domain_id=\"0\",topic=\"/points\"}";
+    assert_eq!(sample(&page, lag), Some("+Inf"));
+    assert_eq!(promtool(&page), "");
+}
+
+#[test]
+fn promtool_finds_nothing_to_say() {
+    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
+    let starting = Exposition::new(board).render(Format::Classic).unwrap();
+    assert_eq!(promtool(&starting), "");
+    let page = page(
+        sample_robot::snapshot(["/points", "/imu"]),
+        settings(),
+        Format::Classic,
+    );
+    assert_eq!(promtool(&page), "");
+}
+
+#[test]
+fn hostile_names_stay_inside_their_label() {
+    let long = format!("/{}", "\u{e9}".repeat(10_000));
+    let longer = format!("{long}x");
+    let names = [
+        "/a\"} 1\nros2_topic_messages_total{topic=\"forged",
+        "/back\\slash",
+        "/tab\tand\rreturn",
+        "/\u{1F916}",
+        "",
+        &long,
+        &longer,
+    ];
+    let page = page(sample_robot::snapshot(names), settings(), Format::Classic);
+    assert_eq!(promtool(&page), "");
+    assert!(page.lines().all(|line| line.len() < 1_000));
+    let messages = |line: &&str| line.starts_with("ros2_topic_messages_total{");
+    let series: Vec<&str> = page.lines().filter(messages).collect();
+    assert_eq!(series.len(), names.len());
+    assert_eq!(series.iter().collect::<BTreeSet<_>>().len(), names.len());
+}
+
+#[test]
+fn no_series_appears_twice() {
+    let mut snapshot = sample_robot::snapshot(["/points", "/points"]);
+    let mut dds = sample_robot::topic("/points");
+    (dds.kind, dds.dds_name) = ("dds", "/points".to_owned());
+    snapshot.topics.push(dds);
+    let mut request = sample_robot::topic("/points");
+    (request.kind, request.dds_name) = ("service_request", "rq/pointsRequest".to_owned());
+    snapshot.topics.push(request);
+    let nodes = snapshot.nodes.clone();
+    snapshot.nodes.extend(nodes);
+    snapshot.watches.clear();
+    let page = page(snapshot, settings(), Format::Classic);
+    let series: Vec<&str> = page
+        .lines()
+        .filter(|line| !line.starts_with('#'))
+        .map(|line| line.rsplit_once(' ').unwrap().0)
+        .collect();
+    assert_eq!(series.iter().collect::<BTreeSet<_>>().len(), series.len());
+    assert_eq!(sample(&page, "ros2probe_topics_not_shown"), Some("1"));
+    for name in ["/points", "dds:/points", "rq/pointsRequest"] {
+        let series = format!("ros2_topic_publishers{{domain_id=\"0\",topic=\"{name}\"}}");
+        assert_eq!(sample(&page, &series), Some("1"), "{name}");
+    }
+}
+
+#[test]
+fn a_watched_topic_that_nobody_announced_begins_with_zero() {
+    let missing = WatchedTopicFacts {
+        domain_id: 0,
+        topic: "/cmd_vel".to_owned(),
+        state: WatchState::NotPublished,
+        violations: Vec::new(),
+    };
+    let watch = WatchFacts {
+        pattern: "/cmd_vel".to_owned(),
+        domain_id: Some(0),
+        topics: vec![missing],
+    };
+    let snapshot = Snapshot {
+        watches: vec![watch],
+        ..Snapshot::default()
+    };
+    let page = page(snapshot, settings(), Format::Classic);
+    for name in [
+        "publishers",
+        "messages_total",
+        "bytes_total",
+        "lost_messages_total",
+    ] {
+        let series = format!("ros2_topic_{name}{{domain_id=\"0\",topic=\"/cmd_vel\"}}");
+        assert_eq!(sample(&page, &series), Some("0"), "{name}");
+    }
+    let labels = "domain_id=\"0\",topic=\"/cmd_vel\",watch=\"/cmd_vel@0\",state=\"not_published\"";
+    assert_eq!(
+        sample(&page, &format!("ros2_watch_state{{{labels}}}")),
+        Some("1")
+    );
+}
+
+#[test]
+fn measured_topics_come_first_when_the_cap_is_reached() {
+    let mut snapshot = sample_robot::snapshot(["/z_measured"]);
+    snapshot.watches.clear();
+    for index in 0..2_000 {
+        let mut topic = sample_robot::topic(&format!("/forged{index:04}"));
+        topic.measurement = None;
+        snapshot.topics.push(topic);
+    }
+    let page = page(snapshot, settings(), Format::Classic);
+    let series = |line: &&str| line.starts_with("ros2_topic_publishers{");
+    assert_eq!(page.lines().filter(series).count(), 1_000);
+    assert!(page.contains("topic=\"/z_measured\""));
+    assert_eq!(sample(&page, "ros2probe_topics_not_shown"), Some("1001"));
+    assert_eq!(sample(&page, "ros2probe_tracked_topics"), Some("1"));
+}
+
+#[test]
+fn what_the_source_sees_and_why_it_is_not_the_other_one_is_said() {
+    let facts = AgentFacts {
+        source_reason: Some("no cgroup v2 hierarchy".to_owned()),
+        ..sample_robot::agent()
+    };
+    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
+    board.publish(Snapshot::default(), facts);
+    let wire = Exposition::new(board).render(Format::Classic).unwrap();
+    let info = "source=\"wire\",reason=\"no cgroup v2 hierarchy\"";
+    let info = format!("ros2probe_capture_source_info{{{info}}}");
+    assert_eq!(sample(&wire, &info), Some("1"), "{wire}");
+    for ability in Ability::ALL {
+        let series = format!(
+            "ros2probe_capture_ability{{ability=\"{}\"}}",
+            ability.label()
+        );
+        let able = [Ability::Sent, Ability::Forwarded].contains(&ability);
+        let value = if able { "1" } else { "0" };
+        assert_eq!(sample(&wire, &series), Some(value), "{series}");
+    }
+}
+
+#[test]
+fn both_formats_hold_the_same_samples() {
+    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
+    board.publish(
+        sample_robot::snapshot(["/points", "/imu"]),
+        sample_robot::agent(),
+    );
+    let exposition = Exposition::new(board);
+    let (open, classic) = (
+        exposition.render(Format::OpenMetrics).unwrap(),
+        exposition.render(Format::Classic).unwrap(),
+    );
+    assert!(open.ends_with("# EOF\n"));
+    assert!(open.contains("# TYPE ros2_topic_messages counter\n"));
+    assert!(open.contains("# TYPE ros2_topic info\n"));
+    assert!(open.contains("# UNIT ros2_topic_interarrival_seconds seconds\n"));
+    // What changes from scrape to scrape is left out.
+    let samples = |page: &str| -> Vec<String> {
+        let steady = |line: &&str| {
+            ![
+                "#",
+                "process_",
+                "ros2probe_scrape",
+                "ros2probe_snapshot_age",
+            ]
+            .iter()
+            .any(|prefix| line.starts_with(prefix))
+        };
+        page.lines().filter(steady).map(str::to_owned).collect()
+    };
+    assert_eq!(samples(&open), samples(&classic));
+}
+
+#[test]
+fn the_format_follows_the_accept_header() {
+    for (accept, format) in [
+        ("", Format::Classic),
+        ("*/*", Format::Classic),
+        ("text/html,application/xhtml+xml,*/*;q=0.8", Format::Classic),
+        ("application/openmetrics-text", Format::OpenMetrics),
+        (
+            "application/openmetrics-text;version=1.0.0,application/openmetrics-text;\
+             version=0.0.1;q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1",
+            Format::OpenMetrics,
+        ),
+        (
+            "application/openmetrics-text; version=1.0.0; q=0.2, text/plain; q=0.9",
+            Format::Classic,
+        ),
+        (
+            "application/openmetrics-text;version=2.0.0",
+            Format::Classic,
+        ),
+        ("application/openmetrics-text;q=0", Format::Classic),
+    ] {
+        assert_eq!(Format::negotiate(accept), format, "{accept}");
+    }
+}
+
+#[test]
+fn a_page_of_a_thousand_measured_topics_stays_below_16_kb_a_topic() {
+    let names: Vec<String> = (0..1_000)
+        .map(|index| format!("/robot/sensor_{index:04}"))
+        .collect();
+    let snapshot = sample_robot::snapshot(names.iter().map(String::as_str));
+    let mut settings = Settings {
+        per_writer: false,
+        ..settings()
+    };
+    Arc::make_mut(&mut settings.watches[0]).per_subscriber = false;
+    let all = page(snapshot.clone(), settings.clone(), Format::Classic).len();
+    assert!(all < 16_000_000, "{all} bytes");
+    let lean = page(
+        snapshot,
+        Settings {
+            histograms: false,
+            ..settings
+        },
+        Format::Classic,
+    )
+    .len();
+    assert!(lean < 4_000_000, "{lean} bytes");
+}

@@ -1,0 +1,236 @@
+//! `rp topic echo` on a capture: what the original printed of the same messages.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use super::{fails_with, run, stderr, stdout};
+
+#[derive(Deserialize)]
+struct Recorded {
+    name: String,
+    command: Vec<String>,
+    start: String,
+    end: String,
+    code: i32,
+    stdout: String,
+    stderr: String,
+}
+
+fn own() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo")
+}
+
+/// Runs with the capture; what is between `from` and `until` is echoed.
+fn echo(arguments: &[&str], from: &str, until: &str) -> std::process::Output {
+    let capture = own().join("capture.pcap.gz");
+    let capture = ["--replay", capture.to_str().unwrap()];
+    let times = ["--from", from, "--until", until];
+    run(&[arguments, &["--distro", "humble"], &capture, &times].concat())
+}
+
+/// When the original's subscription was there is not known, only that it was between the command's
+/// start and its end: what it printed is a part of all that is printed of that time.
+#[test]
+fn what_the_original_echoed_is_echoed() {
+    let text = std::fs::read_to_string(own().join("recorded.jsonl")).unwrap();
+    let differences =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/ros2cli-differences.md");
+    let differences = std::fs::read_to_string(differences).unwrap();
+    let mut same = 0;
+    let mut listed = 0;
+    for line in text.lines() {
+        let recorded: Recorded = serde_json::from_str(line).unwrap();
+        let Recorded {
+            name,
+            command,
+            start,
+            end,
+            ..
+        } = &recorded;
+        if differences.contains(&format!("| `{name}` |")) {
+            listed += 1;
+            continue;
+        }
+        let arguments: Vec<&str> = command.iter().map(String::as_str).collect();
+        let arguments: Vec<&str> = arguments
+            .into_iter()
+            .filter(|argument| *argument != "--once")
+            .collect();
+        let output = echo(&arguments, start, end);
+        let said = stdout(&output);
+        let whole = said.split_inclusive('\n').collect::<Vec<_>>();
+        let part = recorded.stdout.split_inclusive('\n').collect::<Vec<_>>();
+        let is_part = part.is_empty() && whole.is_empty()
+            || !part.is_empty() && whole.windows(part.len()).any(|window| window == part);
+        assert!(is_part, "{name}: {said}{}", stderr(&output));
+        if recorded.code == 1 {
+            assert_eq!(said, recorded.stdout, "{name}");
+            // Beside what the original says stands why nothing came.
+            let why = |line: &&str| !line.starts_with("rp: no message on ");
+            let err = stderr(&output);
+            let err: String = err.split_inclusive('\n').filter(why).collect();
+            assert_eq!(err, recorded.stderr, "{name}");
+            assert_eq!(output.status.code(), Some(1), "{name}");
+        } else {
+            assert_eq!(output.status.code(), Some(0), "{name}: {}", stderr(&output));
+        }
+        same += 1;
+    }
+    assert_eq!((same, listed), (16, 5));
+}
+
+const START: &str = "1795142521.395070661";
+const END: &str = "1795142522.806041638";
+const IMU: &str = "/robot1/imu/data";
+
+#[test]
+fn options_choose_what_is_echoed_and_when_it_ends() {
+    let lines = |further: &[&str]| {
+        let output = echo(&[&["topic", "echo", IMU], further].concat(), START, END);
+        assert_eq!(
+            (output.status.code(), stderr(&output).as_str()),
+            (Some(0), "")
+        );
+        stdout(&output)
+    };
+    let all = lines(&["--field", "linear_acceleration.x"]);
+    assert!(all.starts_with("260"), "{all}");
+    let count = all.matches("---\n").count();
+    assert!((200..400).contains(&count), "{count}");
+    let once = lines(&["--field", "linear_acceleration.x", "--once"]);
+    assert_eq!(
+        once.lines().collect::<Vec<_>>(),
+        all.lines().take(2).collect::<Vec<_>>()
+    );
+    let half = lines(&["--field", "linear_acceleration.x", "--timeout", "0.5"]);
+    let count = half.matches("---\n").count();
+    assert!((95..=105).contains(&count), "{count}");
+    let filter = "26100 <= m.linear_acceleration.x < 26103 and m.header.frame_id == 'imu_link'";
+    let chosen = lines(&["--filter", filter, "--csv"]);
+    assert_eq!(chosen.lines().count(), 3, "{chosen}");
+    let array = lines(&["--field", "orientation_covariance", "--once"]);
+    assert_eq!(array, "[-1.  0.  0.  0.  0.  0.  0.  0.  0.]\n---\n");
+    let flow = lines(&["--once", "--flow-style"]);
+    assert!(flow.starts_with("header:\n  stamp:\n"), "{flow}");
+    assert!(
+        flow.contains("\norientation_covariance: [-1.0, 0.0, 0.0, 0.0,"),
+        "{flow}"
+    );
+    let words = lines(&["--once", "--flow-style", "--no-arr"]);
+    assert!(
+        words.contains("\norientation_covariance: '<array type: double[9]>'\n"),
+        "{words}"
+    );
+    let raw = lines(&["--once", "--raw"]);
+    assert!(raw.starts_with("b'\\x00\\x01\\x00\\x00"), "{raw}");
+    let twice = lines(&[
+        "--once",
+        "--field",
+        "header.frame_id",
+        "--field",
+        "orientation",
+    ]);
+    assert_eq!(twice, "imu_link\nx: 0.0\ny: 0.0\nz: 0.0\nw: 1.0\n---\n");
+}
+
+#[test]
+fn what_cannot_be_echoed_is_said_in_one_line() {
+    let ask = |further: &[&str]| echo(&[&["topic", "echo", IMU], further].concat(), START, END);
+    fails_with(
+        &ask(&["--field", "orientation.v"]),
+        "Invalid field 'orientation.v': 'Quaternion' object has no attribute 'v'",
+    );
+    fails_with(&ask(&["--field", "."]), "Invalid field value '.'");
+    fails_with(
+        &ask(&["--filter", "m.x = 1"]),
+        "filter, column 5: `=` assigns",
+    );
+    fails_with(
+        &ask(&["--filter", "m.x > 1"]),
+        "'Imu' object has no attribute 'x'",
+    );
+    fails_with(
+        &ask(&["sensor_msgs/Imu"]),
+        "The passed message type is invalid",
+    );
+    fails_with(
+        &ask(&["no_msgs/msg/None"]),
+        "no definition of no_msgs/msg/None",
+    );
+    assert_eq!(ask(&["--timeout", "0"]).status.code(), Some(2));
+    assert_eq!(ask(&["-l", "-1"]).status.code(), Some(2));
+    // Another type than the writer's: nothing comes, and stderr says why.
+    let other = ask(&["std_msgs/msg/String"]);
+    assert_eq!(
+        (stdout(&other).as_str(), other.status.code()),
+        ("", Some(0))
+    );
+    assert!(
+        stderr(&other).contains("carries sensor_msgs/msg/Imu"),
+        "{}",
+        stderr(&other)
+    );
+}
+
+#[test]
+fn only_messages_that_pass_the_filter_are_timed() {
+    let hz = |further: &[&str]| {
+        let output = echo(&[&["topic", "hz", IMU], further].concat(), START, END);
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        stdout(&output)
+    };
+    let rate = hz(&["--filter", "m.linear_acceleration.x % 2 == 0"]);
+    assert!(
+        rate.starts_with("average rate: 100.0") || rate.starts_with("average rate: 99.9"),
+        "{rate}"
+    );
+    assert!(
+        hz(&[]).starts_with("average rate: 200.0") || hz(&[]).starts_with("average rate: 199.9")
+    );
+}
+
+/// Goals of order 4 in three recordings; Jazzy announces type hashes.
+#[test]
+fn an_action_tells_feedback_and_states_with_every_middleware() {
+    let directory = tempfile::tempdir().unwrap();
+    let place = directory.path().join("example_interfaces/action");
+    std::fs::create_dir_all(&place).unwrap();
+    let another = "int64 order\n---\nint64 sum\n---\nint64 sum\n";
+    std::fs::write(place.join("Fibonacci.action"), another).unwrap();
+    let definitions = ["--definitions", directory.path().to_str().unwrap()];
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
+    for software in ["cyclonedds", "fastrtps-udp", "jazzy-cyclonedds"] {
+        let capture = data.join(software).join("lifecycle-2ns/capture.pcap.gz");
+        let command = ["action", "echo", "/robot1/fibonacci", "--csv", "--replay"];
+        let arguments = [&command[..], &[capture.to_str().unwrap()]].concat();
+        let output = run(&arguments);
+        assert_eq!(stderr(&output), "", "{software}");
+        let said = stdout(&output);
+        let lines: Vec<&str> = said.lines().collect();
+        let of = |part: &str| -> Vec<&str> {
+            let pairs = lines.chunks_exact(2);
+            pairs
+                .filter(|pair| pair[0] == format!("interface: {part}"))
+                .map(|pair| pair[1])
+                .collect()
+        };
+        let feedback = of("FEEDBACK_TOPIC");
+        let sequences = [",0,1,1", ",0,1,1,2", ",0,1,1,2,3", ",0,1,1,2,3,5"];
+        assert_eq!(feedback.len(), sequences.len(), "{software}: {said}");
+        for (line, sequence) in feedback.iter().zip(sequences) {
+            let goal = line.strip_suffix(sequence).unwrap();
+            assert_eq!(goal.split(',').count(), 16, "{line}");
+        }
+        let states: Vec<_> = of("STATUS_TOPIC")
+            .iter()
+            .map(|line| line.rsplit(',').next().unwrap().to_owned())
+            .collect();
+        assert_eq!(states, ["2", "4"], "executing, succeeded");
+        // Another definition of the name is not used where the announced hash is not its own.
+        if software == "jazzy-cyclonedds" {
+            let again = run(&[&arguments[..], &definitions].concat());
+            assert_eq!((stdout(&again), stderr(&again).as_str()), (said, ""));
+        }
+    }
+}

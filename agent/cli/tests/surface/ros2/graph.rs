@@ -1,0 +1,163 @@
+//! The verbs of the graph against what the original printed about the same robot, byte for byte,
+//! and the list of differences.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+use super::{run, stderr, stdout};
+
+pub fn own() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/cli")
+}
+
+/// Names of recorded commands in the table of `docs/ros2cli-differences.md` below this heading.
+fn listed(heading: &str) -> BTreeSet<String> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/ros2cli-differences.md");
+    let text = std::fs::read_to_string(path).unwrap();
+    let section = text
+        .split("\n## ")
+        .find(|section| section.starts_with(heading));
+    let rows = section.unwrap().lines();
+    let names = rows.filter_map(|row| row.strip_prefix("| `")?.split_once("` |"));
+    names.map(|(name, _)| name.to_owned()).collect()
+}
+
+/// GIDs of another run are others.
+fn without_gids(text: &str) -> String {
+    let line = |line: &str| match line.split_once("GID: ") {
+        Some((head, gid)) => format!("{head}GID: {} bytes\n", gid.split('.').count()),
+        None => format!("{line}\n"),
+    };
+    text.lines().map(line).collect()
+}
+
+#[test]
+fn what_the_original_says_of_a_graph_is_said() {
+    let capture = own().join("graph.pcap.gz");
+    let recorded = std::fs::read_to_string(own().join("recorded.jsonl")).unwrap();
+    let differing = listed("Recorded commands");
+    let (mut same, mut different) = (0, BTreeSet::new());
+    for line in recorded.lines() {
+        let line: Value = serde_json::from_str(line).unwrap();
+        let text = |key: &str| line[key].as_str().unwrap();
+        let words = line["arguments"].as_array().unwrap();
+        let mut words: Vec<&str> = words.iter().map(|word| word.as_str().unwrap()).collect();
+        words.extend(["--distro", "humble", "--until", text("until")]);
+        words.extend(["--replay", capture.to_str().unwrap()]);
+        let output = run(&words);
+        let code = line["code"].as_i64().map(|code| code as i32);
+        assert_eq!(output.status.code(), code, "{}", text("name"));
+        assert_eq!(stderr(&output), text("stderr"), "{}", text("name"));
+        let (mut out, mut expected) = (stdout(&output), text("stdout").to_owned());
+        if line["second_run"] == true {
+            (out, expected) = (without_gids(&out), without_gids(&expected));
+        }
+        if differing.contains(text("name")) {
+            assert_ne!(out, expected, "{} is listed as different", text("name"));
+            different.insert(text("name").to_owned());
+        } else {
+            assert_eq!(out, expected, "{}", text("name"));
+            same += 1;
+        }
+    }
+    assert_eq!((same, different), (56, differing));
+}
+
+/// Nodes of one name, and a topic and a service of two types (`fixtures/cli/mixed.py`).
+#[test]
+fn a_node_has_the_types_of_its_own_endpoints_where_a_topic_has_several() {
+    let capture = own().join("mixed.pcap.gz");
+    let recorded = std::fs::read_to_string(own().join("mixed.jsonl")).unwrap();
+    let mut count = 0;
+    for line in recorded.lines() {
+        let line: Value = serde_json::from_str(line).unwrap();
+        let text = |key: &str| line[key].as_str().unwrap();
+        let words = line["arguments"].as_array().unwrap();
+        let mut words: Vec<&str> = words.iter().map(|word| word.as_str().unwrap()).collect();
+        words.extend(["--distro", "humble", "--replay", capture.to_str().unwrap()]);
+        let output = run(&words);
+        let code = line["code"].as_i64().map(|code| code as i32);
+        assert_eq!(output.status.code(), code, "{}", text("name"));
+        assert_eq!(stdout(&output), text("stdout"), "{}", text("name"));
+        // The warning of later releases, and both nodes instead of one (`ros2cli-differences.md`).
+        let expected = text("stderr")
+            .replace("aware that are nodes", "aware that there are nodes")
+            .replace("exact name, this can", "exact name, which can")
+            .replace("about only one of them", "about all of them");
+        assert_eq!(stderr(&output), expected, "{}", text("name"));
+        count += 1;
+    }
+    assert_eq!(count, 12);
+}
+
+/// As of a topic that is known at the start: a replay knows it when it has been read.
+#[test]
+fn a_topic_of_two_types_is_not_echoed_from_a_capture() {
+    let capture = own().join("mixed.pcap.gz");
+    let capture = capture.to_str().unwrap();
+    let output = run(&["topic", "echo", "/mixed/value", "--replay", capture]);
+    assert_eq!(
+        (stdout(&output).as_str(), output.status.code()),
+        ("", Some(1))
+    );
+    assert_eq!(
+        stderr(&output),
+        "Cannot echo topic '/mixed/value', as it contains more than one type: [std_msgs/msg/Int32, \
+         std_msgs/msg/String]\n"
+    );
+    let chosen = ["topic", "echo", "/mixed/value", "std_msgs/msg/String"];
+    let output = run(&[&chosen[..], &["--replay", capture]].concat());
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+}
+
+/// What the original prints of `/robot1/sensor_node` as `//r/o/b/o/t/1sensor_node`.
+#[test]
+fn the_nodes_of_an_action_bear_their_names() {
+    let capture = own().join("graph.pcap.gz");
+    let words = ["action", "info", "-t", "/robot1/fibonacci"];
+    let output = run(&[&words[..], &["--replay", capture.to_str().unwrap()]].concat());
+    assert_eq!(
+        stdout(&output),
+        "Action: /robot1/fibonacci\n\
+         Action clients: 1\n    /robot2/listener_node [example_interfaces/action/Fibonacci]\n\
+         Action servers: 1\n    /robot1/sensor_node [example_interfaces/action/Fibonacci]\n"
+    );
+}
+
+#[test]
+fn what_humble_has_not_is_said_as_jazzy_says_it() {
+    let capture = own().join("graph.pcap.gz");
+    let ask = |words: &str| {
+        let mut words: Vec<&str> = words.split(' ').collect();
+        words.extend(["--replay", capture.to_str().unwrap()]);
+        let output = run(&words);
+        (stdout(&output), stderr(&output), output.status.code())
+    };
+    let said = |out: &str| (out.to_owned(), String::new(), Some(0));
+    assert_eq!(
+        ask("service info /robot1/add_two_ints"),
+        said("Type: example_interfaces/srv/AddTwoInts\nClients count: 1\nServices count: 1\n")
+    );
+    let (out, err, code) = ask("service info /robot1/nope");
+    assert_eq!((out.as_str(), code), ("", Some(1)));
+    assert_eq!(err, "Unknown service '/robot1/nope'\n");
+    let fibonacci = "example_interfaces/action/Fibonacci\n";
+    assert_eq!(ask("action type /robot1/fibonacci"), said(fibonacci));
+    assert_eq!(
+        ask("action type /nope"),
+        (String::new(), String::new(), Some(1))
+    );
+    let found = said("/robot1/fibonacci\n");
+    assert_eq!(ask(&format!("action find {}", fibonacci.trim())), found);
+    // Hidden, and asked for by the command's option as well as by the verb's.
+    let hidden = "/robot1/fibonacci/_action/send_goal";
+    assert_eq!(ask(&format!("service type {hidden}")).2, Some(1));
+    let shown = ask(&format!("service --include-hidden-services type {hidden}"));
+    assert_eq!(shown.0, "example_interfaces/action/Fibonacci_SendGoal\n");
+    let (out, ..) = ask("topic info -v /chatter --distro jazzy");
+    assert!(out.contains("\nTopic type hash: INVALID\n"), "{out}");
+    let gid = "\nGID: 01.10.b4.2b.fd.42.e1.d5.5f.39.f0.30.00.00.30.03\n";
+    assert!(out.contains(gid), "{out}");
+}

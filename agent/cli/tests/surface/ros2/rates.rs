@@ -1,0 +1,330 @@
+//! `rp topic hz`, `bw` and `delay` on captures: what the original printed on the same capture, within
+//! the tolerances that docs/ros2cli-differences.md lists, and what was really sent and received.
+
+use std::collections::BTreeMap;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+
+use flate2::read::MultiGzDecoder;
+use serde_json::Value;
+
+use super::{run, stderr, stdout};
+
+/// Seconds after which the original was ended.
+const LASTED: f64 = 7.0;
+
+/// A row of the list.
+#[derive(Debug)]
+struct Tolerance {
+    start_up: f64,
+    rate: f64,
+    time: f64,
+    messages: f64,
+}
+
+/// A command of the original, and what it said.
+struct Recorded {
+    name: String,
+    arguments: Vec<String>,
+    start: f64,
+    out: String,
+    err: String,
+}
+
+fn own() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/rates")
+}
+
+/// Recordings of the corpus.
+fn corpus() -> PathBuf {
+    ros2probe_testing::corpus().join("cyclonedds/cli-observed-2ns")
+}
+
+#[test]
+fn what_the_original_said_is_said() {
+    let list = tolerances();
+    let mut compared = 0;
+    for recorded in recorded(&own()) {
+        recorded.compare(&own().join("capture.pcap.gz"), &list[&recorded.name]);
+        compared += 1;
+    }
+    assert_eq!(compared, 6);
+}
+
+#[test]
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn what_the_original_said_in_the_corpus_is_said() {
+    let (list, corpus) = (tolerances(), corpus());
+    let mut compared = 0;
+    for recorded in recorded(&corpus.join("cli")) {
+        if let Some(tolerance) = list.get(&recorded.name) {
+            recorded.compare(&corpus.join("capture-with-observers.pcap.gz"), tolerance);
+            compared += 1;
+        } else {
+            assert!(recorded.name.ends_with("_points"), "{}", recorded.name);
+        }
+    }
+    assert_eq!(compared, list.len());
+}
+
+#[test]
+fn what_was_received_of_a_lossy_topic_is_counted() {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
+    let on = |capture: &str, arguments: &str| {
+        let capture = data.join(capture);
+        let mut words: Vec<&str> = arguments.split(' ').collect();
+        words.extend(["--replay", capture.to_str().unwrap()]);
+        let output = run(&[&["topic"], &words[..]].concat());
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        stdout(&output)
+    };
+    let small = "cyclonedds/loss-small-2ns/capture-senderside.pcap.gz";
+    let truth = std::fs::read(data.join("cyclonedds/loss-small-2ns/groundtruth.json")).unwrap();
+    let truth: Value = serde_json::from_slice(&truth).unwrap();
+    let received = truth["received"].as_array().unwrap();
+    let imu = received
+        .iter()
+        .find(|one| one["topic"] == "/robot1/imu/data")
+        .unwrap();
+    // 902 of 1000 were received: 901 intervals.
+    let said = on(small, "hz /robot1/imu/data --distro kilted");
+    let window = imu["count"].as_u64().unwrap() - 1;
+    assert!(said.ends_with(&format!(" window: {window}\n")), "{said}");
+    let (rate, truth) = (
+        last(&said, "average rate: "),
+        imu["rate_hz"].as_f64().unwrap(),
+    );
+    assert!((rate - truth).abs() <= truth / 1000.0, "{rate} of {truth}");
+    // All repairs of a reliable topic, each once; in a table with the other topic.
+    let said = on(small, "hz /chatter robot1/imu/data --distro kilted");
+    assert!(
+        said.contains("\n/chatter          ") && said.contains("   249   \n"),
+        "{said}"
+    );
+    assert!(said.contains("\nrobot1/imu/data   180.19"), "{said}");
+    let said = on(small, "delay /robot1/imu/data");
+    assert!(
+        said.contains(&format!("window: {window}\nno new messages\n")),
+        "{said}"
+    );
+
+    // 4 of 10 point clouds were complete; 9 intervals of a reliable topic, fragments repeated.
+    let lossy = "cyclonedds/points-besteffort-lossy-2ns/capture.pcap.gz";
+    let said = on(lossy, "hz /robot1/points --distro kilted");
+    assert!(
+        said.contains("average rate: 3.77") && said.ends_with("window: 3\n"),
+        "{said}"
+    );
+    let said = on(lossy, "bw /robot1/points --distro rolling");
+    let sizes = "Message size mean: 0.64 MB min: 0.64 MB max: 0.64 MB";
+    assert!(
+        said.ends_with(&format!("from 4 messages\n\t{sizes}\n")),
+        "{said}"
+    );
+    let repeated = "fastrtps-udp/points-reliable-2ns/capture.pcap.gz";
+    let said = on(repeated, "hz /robot1/points --distro kilted");
+    assert!(said.ends_with("window: 9\n"), "{said}");
+}
+
+#[test]
+fn what_cannot_be_measured_is_refused() {
+    let capture = own().join("capture.pcap.gz");
+    let on = |arguments: &str| {
+        let mut words: Vec<&str> = arguments.split(' ').collect();
+        words.extend(["--replay", capture.to_str().unwrap()]);
+        let output = run(&[&["topic"], &words[..]].concat());
+        (output.status.code(), stderr(&output))
+    };
+    let neither = "Either specify topic names or use --all/-a option\n".to_owned();
+    assert_eq!(on("hz --distro kilted"), (Some(1), neither.clone()));
+    assert_eq!(on("bw --distro rolling"), (Some(1), neither));
+    assert_eq!(on("hz").0, Some(2));
+    let both = "Cannot specify both --all/-a and topic names\n".to_owned();
+    assert_eq!(on("hz -a /chatter"), (Some(1), both));
+    let (code, said) = on("delay /a//b");
+    assert!(
+        code == Some(1) && said.starts_with("Invalid topic name: "),
+        "{said}"
+    );
+    let (code, said) = on("hz -w 0 /chatter");
+    assert!(
+        code == Some(2) && said.contains("value must be a positive integer"),
+        "{said}"
+    );
+}
+
+/// What the nodes themselves noted: rates are theirs to a thousandth, where the original is off by
+/// thirty.
+#[test]
+#[ignore = "needs the corpus of captures: make test-corpus"]
+fn rates_of_the_corpus_are_those_that_were_sent() {
+    let (list, corpus) = (tolerances(), corpus());
+    let sent = sent(&corpus.join("sensor.jsonl.gz"));
+    for recorded in recorded(&corpus.join("cli")) {
+        let is_whole = ["hz_chatter", "hz_imu"].contains(&recorded.name.as_str());
+        let Some(tolerance) = list.get(&recorded.name).filter(|_| is_whole) else {
+            continue;
+        };
+        let said = recorded.replayed(&corpus.join("capture-with-observers.pcap.gz"), tolerance);
+        let times = &sent[recorded.arguments.last().unwrap()];
+        let first = times.partition_point(|time| *time < recorded.start + tolerance.start_up);
+        for block in said.0.split("average rate: ").skip(1) {
+            let rate: f64 = block.split('\n').next().unwrap().parse().unwrap();
+            let window: usize = block
+                .trim_end()
+                .rsplit(' ')
+                .next()
+                .unwrap()
+                .parse()
+                .unwrap();
+            let truth = window as f64 / (times[first + window] - times[first]);
+            let name = &recorded.name;
+            assert!(
+                (rate - truth).abs() <= truth / 1000.0,
+                "{name}: {rate} of {truth}"
+            );
+        }
+    }
+}
+
+impl Recorded {
+    fn compare(&self, capture: &Path, tolerance: &Tolerance) {
+        let (out, err) = self.replayed(capture, tolerance);
+        let name = &self.name;
+        // Beside what the original says stands why nothing came.
+        let why = |line: &&str| {
+            let reasons = ["rp: no message on ", "whose announcement was missed"];
+            !reasons.iter().any(|reason| line.contains(reason))
+        };
+        let err: String = err.split_inclusive('\n').filter(why).collect();
+        assert_eq!(err, self.err, "{name}");
+        let said = format!("{name} said\n{out}and the original\n{}", self.out);
+        assert_eq!(out.lines().count(), self.out.lines().count(), "{said}");
+        for (line, original) in out.lines().zip(self.out.lines()) {
+            let (line, original) = (words(line), words(original));
+            assert_eq!(line.len(), original.len(), "{said}");
+            let mut before = "";
+            for (word, original) in line.iter().zip(&original) {
+                let same = tolerance.admits(before, word, original);
+                assert!(same, "`{before} {word}` is not `{original}`: {said}");
+                before = word;
+            }
+        }
+    }
+
+    /// Both outputs of the same command on a capture.
+    fn replayed(&self, capture: &Path, tolerance: &Tolerance) -> (String, String) {
+        let from = format!("{:.9}", self.start + tolerance.start_up);
+        let until = format!("{:.9}", self.start + LASTED);
+        let mut words: Vec<&str> = self.arguments.iter().map(String::as_str).collect();
+        words.extend(["--distro", "humble", "--replay", capture.to_str().unwrap()]);
+        words.extend(["--from", &from, "--until", &until]);
+        let output = run(&words);
+        (stdout(&output), stderr(&output))
+    }
+}
+
+impl Tolerance {
+    fn admits(&self, before: &str, word: &str, original: &str) -> bool {
+        let (Some(value), Some(wanted)) = (number(word), number(original)) else {
+            return word == original;
+        };
+        match before {
+            "rate:" => (value - wanted).abs() <= wanted * self.rate,
+            // Bandwidths begin their line.
+            "" => (value - wanted).abs() <= wanted * self.rate,
+            "window:" | "from" => (value - wanted).abs() <= self.messages,
+            _ if word.ends_with('s') || before == "delay:" => (value - wanted).abs() <= self.time,
+            _ => word == original,
+        }
+    }
+}
+
+fn words(line: &str) -> Vec<&str> {
+    line.split_whitespace().collect()
+}
+
+fn number(word: &str) -> Option<f64> {
+    word.strip_suffix('s').unwrap_or(word).parse().ok()
+}
+
+fn last(said: &str, words: &str) -> f64 {
+    let mut numbers = said
+        .lines()
+        .rev()
+        .filter_map(|line| line.strip_prefix(words)?.parse().ok());
+    numbers.next().unwrap()
+}
+
+/// The commands of these verbs.
+fn recorded(directory: &Path) -> Vec<Recorded> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(directory).unwrap() {
+        let path = entry.unwrap().path();
+        let name = path.file_stem().unwrap().to_str().unwrap().to_owned();
+        let verb = name.split('_').next().unwrap();
+        if path.extension().is_none_or(|end| end != "cmd") || !["hz", "bw", "delay"].contains(&verb)
+        {
+            continue;
+        }
+        let text = std::fs::read_to_string(&path).unwrap();
+        let command = text
+            .lines()
+            .find_map(|line| line.strip_prefix("$ ros2 "))
+            .unwrap();
+        let start = text
+            .lines()
+            .find_map(|line| line.strip_prefix("start "))
+            .unwrap();
+        let read = |end| std::fs::read_to_string(path.with_extension(end)).unwrap_or_default();
+        found.push(Recorded {
+            name,
+            arguments: command.split(' ').map(str::to_owned).collect(),
+            start: start.parse().unwrap(),
+            out: read("stdout"),
+            err: read("stderr"),
+        });
+    }
+    found
+}
+
+/// The list of tolerances.
+fn tolerances() -> BTreeMap<String, Tolerance> {
+    let list = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/ros2cli-differences.md");
+    let list = std::fs::read_to_string(list).unwrap();
+    let (_, rows) = list.split_once("| recorded | start-up |").unwrap();
+    let mut tolerances = BTreeMap::new();
+    for row in rows.lines().skip(2).take_while(|row| row.starts_with('|')) {
+        let cells: Vec<&str> = row.split('|').map(str::trim).collect();
+        let [_, name, start_up, rate, time, messages, ..] = cells[..] else {
+            panic!("{row}");
+        };
+        let number = |cell: &str| cell.parse::<f64>().unwrap();
+        let tolerance = Tolerance {
+            start_up: number(start_up),
+            rate: number(rate.trim_end_matches(" %")) / 100.0,
+            time: number(time),
+            messages: number(messages),
+        };
+        tolerances.insert(name.trim_matches('`').to_owned(), tolerance);
+    }
+    assert_eq!(tolerances.len(), 8, "{tolerances:?}");
+    tolerances
+}
+
+/// When messages were sent, by topic.
+fn sent(log: &Path) -> BTreeMap<String, Vec<f64>> {
+    let mut text = String::new();
+    let file = std::fs::File::open(log).unwrap();
+    MultiGzDecoder::new(file).read_to_string(&mut text).unwrap();
+    let mut sent: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    for line in text.lines() {
+        let event: Value = serde_json::from_str(line).unwrap();
+        if event["ev"] == "pub" {
+            let topic = event["topic"].as_str().unwrap().to_owned();
+            let time = event["t"].as_u64().unwrap() as f64 / 1e9;
+            sent.entry(topic).or_default().push(time);
+        }
+    }
+    sent
+}

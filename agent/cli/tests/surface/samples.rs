@@ -1,0 +1,648 @@
+//! Samples one by one: from the model over replayed captures, and from the real binary by
+//! `GET /samples`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::rp;
+use bytes::Bytes;
+use ros2probe::capture::feed::Feed;
+use ros2probe::capture::pcap::PcapReader;
+use ros2probe::config::{Watch, Watchlist};
+use ros2probe::model::observer::{Observer, Settings};
+use ros2probe::model::payloads::{MissedReason, News};
+use ros2probe::model::reassembly::Limits;
+use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::model::snapshot::Snapshot;
+use ros2probe::subscriptions::line::Line;
+use ros2probe_testing::local_agent;
+use ros2probe_testing::local_agent::LocalAgent;
+use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+const SECOND: u64 = 1_000_000_000;
+const START: u64 = 1_795_143_000 * SECOND;
+const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
+const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
+const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
+
+/// The captures of the repository, and those of large messages where there are more.
+fn captures() -> Vec<PathBuf> {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut captures = Vec::new();
+    find(&here.join("../../wire/tests/data"), &mut captures);
+    find(&here.join("../testing/data"), &mut captures);
+    let own = captures.len();
+    find(&here.join("../../../shared/fixtures"), &mut captures);
+    let mut others = captures.split_off(own);
+    others.retain(|path| path.to_string_lossy().contains("/points-"));
+    captures.extend(others);
+    assert!(own >= 10, "{captures:?}");
+    captures
+}
+
+fn find(folder: &Path, captures: &mut Vec<PathBuf>) {
+    for file in std::fs::read_dir(folder).into_iter().flatten() {
+        let path = file.unwrap().path();
+        if path.is_dir() {
+            find(&path, captures);
+        } else if path.to_string_lossy().ends_with(".pcap.gz") {
+            captures.push(path);
+        }
+    }
+}
+
+fn wish(id: u64, depth: Depth) -> Wish {
+    Wish {
+        id,
+        selection: Arc::new(Selection::all()),
+        domain_id: None,
+        depth,
+    }
+}
+
+/// What a capture says when everything is watched and, with a depth, everything wished for.
+fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
+    let mut observer = Observer::new(Settings::default());
+    let everything = vec![Watch::named("/**").unwrap()];
+    observer.set_watchlist(Watchlist::new(everything).unwrap());
+    if let Some(depth) = depth {
+        observer.set_wishes(Arc::new(vec![wish(1, depth)]));
+    }
+    let mut reader = PcapReader::open(capture).unwrap();
+    let mut feed = Feed::new(Limits::default());
+    let mut news = Vec::new();
+    let mut take = |observer: &mut Observer| {
+        for given in observer.take_given() {
+            assert_eq!(*given.to, [1]);
+            news.push(given.news);
+        }
+    };
+    while let Some(captured) = reader.next_packet().unwrap() {
+        feed.packet(&captured, &mut observer);
+        take(&mut observer);
+    }
+    observer.settle();
+    take(&mut observer);
+    let mut snapshot = observer.snapshot(feed.last());
+    snapshot.tables.retain(|table| table.table != "payloads");
+    // It says that samples are wanted, and is no number.
+    for topic in &mut snapshot.topics {
+        topic.is_read = false;
+    }
+    (snapshot, news)
+}
+
+/// Samples and their bytes by topic, each sample checked to be the next and the only one.
+fn counts(news: &[News], depth: Depth) -> BTreeMap<(u32, String), (u64, u64)> {
+    let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
+    let mut seen = BTreeSet::new();
+    let mut last = 0;
+    for news in news {
+        let News::Sample(sample) = news else { continue };
+        assert!(seen.insert((sample.writer, sample.sequence_number)));
+        assert!(sample.time.0 >= last);
+        last = sample.time.0;
+        let len = sample.payload.as_ref().map(Bytes::len);
+        let expected = (depth == Depth::Payloads).then_some(sample.size as usize);
+        assert_eq!(len, expected, "{sample:?}");
+        let key = (sample.topic.domain_id, sample.topic.dds_name.to_string());
+        let count = counts.entry(key).or_default();
+        count.0 += 1;
+        count.1 += u64::from(sample.size);
+    }
+    counts
+}
+
+fn unannounced(news: &[News], dds_name: &str) -> u64 {
+    let missed = news.iter().filter_map(|news| match news {
+        News::Missed(missed) if missed.reason == MissedReason::Unannounced => Some(missed),
+        _ => None,
+    });
+    let of_topic = missed.filter(|missed| &*missed.topic.dds_name == dds_name);
+    of_topic.map(|missed| missed.samples).sum()
+}
+
+#[test]
+fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
+    let mut messages = 0;
+    for capture in captures() {
+        let (alone, none) = replayed(&capture, None);
+        assert!(none.is_empty());
+        let is_cut = |snapshot: &Snapshot| {
+            let mut errors = snapshot.decode_errors.iter();
+            errors.any(|error| error.stage == "frame")
+        };
+        for depth in [Depth::Arrivals, Depth::Payloads] {
+            if depth == Depth::Payloads && is_cut(&alone) {
+                continue;
+            }
+            let (with, news) = replayed(&capture, Some(depth));
+            let name = capture.display();
+            assert_eq!(format!("{alone:?}"), format!("{with:?}"), "{name}");
+            let mut counts = counts(&news, depth);
+            let (mut incomplete, mut lost) = (0, 0);
+            for topic in &with.topics {
+                let Some(measured) = &topic.measurement else {
+                    continue;
+                };
+                let key = (topic.domain_id, topic.dds_name.clone());
+                let given = counts.remove(&key).unwrap_or_default();
+                // A stranger's samples count for its topic once it is announced.
+                let unannounced = unannounced(&news, &key.1);
+                assert_eq!(given.0 + unannounced, measured.messages, "{name}: {key:?}");
+                if unannounced == 0 {
+                    assert_eq!(given.1, measured.bytes, "{name}: {key:?}");
+                }
+                messages += given.0;
+                incomplete += measured.incomplete;
+                lost += measured.lost;
+            }
+            assert!(counts.is_empty(), "{name}: {counts:?}");
+            let missed = news.iter().filter_map(|news| match news {
+                News::Missed(missed) => Some((missed.reason, missed.samples)),
+                News::Sample(_) => None,
+            });
+            let mut told: BTreeMap<_, u64> = BTreeMap::new();
+            for (reason, samples) in missed {
+                *told.entry(reason).or_default() += samples;
+            }
+            told.remove(&MissedReason::Unannounced);
+            let mut expected = BTreeMap::from([
+                (MissedReason::Incomplete, incomplete),
+                (MissedReason::Lost, lost - incomplete),
+            ]);
+            expected.retain(|_, samples| *samples > 0);
+            assert_eq!(told, expected, "{name}");
+        }
+    }
+    assert!(messages >= 64, "{messages}");
+}
+
+/// What a subscriber of a capture logged.
+#[derive(serde::Deserialize)]
+struct Logged {
+    lost_between: Vec<u64>,
+    /// When each message reached its callback.
+    t: Vec<u64>,
+}
+
+#[derive(serde::Deserialize)]
+struct GroundTruth {
+    received: Vec<Logged>,
+}
+
+#[test]
+fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_times() {
+    for (label, unannounced) in [
+        ("fastrtps-udp/keep-last-lossy-2ns", 0),
+        ("cyclonedds/keep-last-lossy-2ns", 0),
+        ("fastrtps-udp/announced-late-2ns", 50),
+    ] {
+        let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
+        let directory = data.join(label);
+        let truth = std::fs::read(directory.join("groundtruth.json")).unwrap();
+        let truth: GroundTruth = serde_json::from_slice(&truth).unwrap();
+        let logged = truth.received.first().unwrap();
+        let capture = directory.join("capture.pcap.gz");
+        for depth in [Depth::Arrivals, Depth::Payloads] {
+            let (mut given, mut lost, mut early) = (Vec::new(), BTreeSet::new(), 0);
+            for news in replayed(&capture, Some(depth)).1 {
+                match news {
+                    News::Sample(sample) if &*sample.topic.name == "/chatter" => {
+                        given.push((sample.sequence_number - 1, sample.time.0));
+                    }
+                    News::Missed(missed) if &*missed.topic.name == "/chatter" => {
+                        match missed.reason {
+                            MissedReason::Lost => lost.extend(missed.first - 1..missed.last),
+                            MissedReason::Unannounced => early += missed.samples,
+                            reason => panic!("{label}: {reason:?}"),
+                        }
+                    }
+                    _ => {}
+                }
+            }
+            let lacking = logged.lost_between.iter().copied();
+            assert_eq!(lost, lacking.collect(), "{label} {depth:?}");
+            assert_eq!(early, unannounced, "{label} {depth:?}");
+            let numbers = given.iter().map(|(number, _)| *number);
+            assert!(numbers.is_sorted(), "{label}");
+            assert_eq!(given.len(), logged.t.len(), "{label}");
+            // A callback runs some time after the datagram that it was waiting for.
+            let late = given.iter().zip(&logged.t);
+            let late = late.filter(|((_, at), t)| !(0..20_000_000).contains(&t.wrapping_sub(*at)));
+            let late: Vec<_> = late.collect();
+            assert!(late.len() * 50 <= given.len(), "{label}: {late:?}");
+        }
+    }
+}
+
+/// A domain in which two participants announce a writer of a topic each.
+struct Robot {
+    observer: Observer,
+    at: u64,
+}
+
+impl Robot {
+    fn new(settings: Settings) -> Self {
+        let mut robot = Self {
+            observer: Observer::new(settings),
+            at: START,
+        };
+        robot.observer.advance(Timestamp(START));
+        for (prefix, topic) in [(ALICE, "rt/points"), (BOB, "rt/add/_service_event")] {
+            let payload = forge::participant(prefix, 100, None);
+            robot.put(Message::from(prefix).data(SPDP, 1, &payload));
+            let guid = Guid::new(prefix, WRITER);
+            let payload = forge::endpoint(guid, topic, "a::msg::dds_::B_", true);
+            robot.put(Message::from(prefix).data(SEDP_WRITERS, 1, &payload));
+        }
+        robot
+    }
+
+    fn put(&mut self, message: Message) {
+        self.at += 1_000_000;
+        let envelope = forge::multicast(self.at, 0);
+        self.observer.datagram(&envelope, &message.bytes(), None);
+    }
+
+    /// Read in shared memory, where others may have been missed.
+    fn look(&mut self, message: Message) {
+        self.at += 1_000_000;
+        let envelope = forge::multicast(self.at, 0);
+        self.observer.shared_memory(&envelope, &message.bytes());
+    }
+
+    fn fragment(&mut self, prefix: GuidPrefix, number: u64, start: u32, payload: &[u8]) {
+        self.put(Message::from(prefix).fragment(WRITER, number, start, 1000, payload));
+    }
+
+    fn subscribe(&mut self, topics: &[&str], depth: Depth) {
+        let selection = Selection::named(topics.iter().copied()).unwrap();
+        let wishes = vec![Wish {
+            selection: Arc::new(selection),
+            ..wish(3, depth)
+        }];
+        self.observer.set_wishes(Arc::new(wishes));
+    }
+
+    /// Writer, number and payload, or the reason why not, of what is given.
+    fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
+        let given = self.observer.take_given().into_iter();
+        given
+            .map(|given| match given.news {
+                News::Sample(sample) => {
+                    let payload = sample.payload.as_ref().map(|bytes| bytes.to_vec());
+                    let payload = payload.unwrap_or_default();
+                    (sample.writer.prefix, sample.sequence_number, Ok(payload))
+                }
+                News::Missed(missed) => (missed.writer.prefix, missed.first, Err(missed.reason)),
+            })
+            .collect()
+    }
+}
+
+/// A payload in which every place can be told.
+fn payload(size: usize) -> Vec<u8> {
+    (0..size).map(|place| (place * 7 % 251) as u8).collect()
+}
+
+#[test]
+fn fragments_make_the_payload_that_was_sent_in_the_order_of_counting() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points", "/add/_service_event"], Depth::Payloads);
+    let (large, small) = (payload(4321), payload(1234));
+    for start in [1, 3, 3, 2] {
+        robot.fragment(ALICE, 1, start, &large);
+        robot.fragment(BOB, 1, start.min(2), &small);
+    }
+    assert_eq!(robot.given(), [(BOB, 1, Ok(small.clone()))]);
+    for start in [5, 1, 4] {
+        robot.fragment(ALICE, 1, start, &large);
+    }
+    robot.fragment(ALICE, 1, 2, &large);
+    robot.put(Message::from(BOB).data(WRITER, 2, &small[..400]));
+    robot.put(Message::from(BOB).data(WRITER, 2, &small[..400]));
+    let guid = Guid::new(BOB, WRITER);
+    robot.put(Message::from(BOB).dispose_by_key(WRITER, 3, 0x70, guid));
+    let expected = [(ALICE, 1, Ok(large)), (BOB, 2, Ok(small[..400].to_vec()))];
+    assert_eq!(robot.given(), expected);
+}
+
+#[test]
+fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    robot.at += SECOND;
+    let large = payload(3000);
+    for start in [1, 2, 3] {
+        robot.look(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
+    }
+    // Looks at two ports may find them in another order, and twice.
+    for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
+        robot.look(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
+    }
+    let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
+    let given = robot.given();
+    let (whole, missed): (Vec<_>, Vec<_>) = given.into_iter().partition(|each| each.2.is_ok());
+    // The last fragment of 2 was seen while one was missing: it was given up then.
+    assert_eq!(whole, [expected[0].clone(), expected[2].clone()]);
+    assert_eq!(missed, [(ALICE, 2, Err(MissedReason::NotCaptured))]);
+    robot.look(Message::from(ALICE).data(WRITER, 4, &payload(24)));
+    // A fragment was overwritten before it was read.
+    for start in [1, 3] {
+        robot.look(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
+    }
+    let expected = [
+        (ALICE, 4, Ok(payload(24))),
+        (ALICE, 5, Err(MissedReason::NotCaptured)),
+    ];
+    assert_eq!(robot.given(), expected);
+}
+
+#[test]
+fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_for_them() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    let look = |robot: &mut Robot, number| {
+        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+    };
+    for number in [1, 2, 5] {
+        look(&mut robot, number);
+    }
+    let given = |number| (ALICE, number, Ok(small.clone()));
+    assert_eq!(robot.given(), [given(1), given(2), given(5)]);
+    let sent = robot.at;
+    let now = Timestamp(sent + SECOND / 20);
+    robot.observer.advance(now);
+    assert!(robot.observer.given_until(now).0 < sent);
+    // One of them comes late.
+    look(&mut robot, 3);
+    assert_eq!(robot.given(), [given(3)]);
+    let now = Timestamp(sent + SECOND);
+    robot.observer.advance(now);
+    assert_eq!(robot.observer.given_until(now), now);
+    let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
+    assert_eq!(robot.given(), [not_captured]);
+    // The end of a capture waits for nothing.
+    look(&mut robot, 8);
+    robot.observer.settle();
+    assert_eq!(
+        robot.given(),
+        [given(8), (ALICE, 6, Err(MissedReason::NotCaptured))]
+    );
+}
+
+#[test]
+fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
+    let mut robot = Robot::new(Settings::default());
+    let reader = Guid::new(BOB, EntityId([0, 0, 0x12, 0x04]));
+    let subscription = forge::endpoint(reader, "rt/points", "a::msg::dds_::B_", true);
+    robot.put(Message::from(BOB).data(SEDP_READERS, 1, &subscription));
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    let mut times = BTreeMap::new();
+    // 3 is sent again, 5 was not seen.
+    for number in [1, 2, 4, 6, 3, 7] {
+        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+        times.insert(number, robot.at);
+    }
+    let now = Timestamp(robot.at + SECOND / 20);
+    robot.observer.advance(now);
+    let end = Timestamp(robot.at + SECOND);
+    let mut given = Vec::new();
+    for now in [now, end] {
+        robot.observer.advance(now);
+        for each in robot.observer.take_given() {
+            match each.news {
+                News::Sample(sample) => given.push((sample.sequence_number, Some(sample.time.0))),
+                News::Missed(missed) => given.push((missed.first, None)),
+            }
+        }
+    }
+    // A reader gets 4 with 3, and 6 when it came: it may have had 5.
+    let repaired = times[&3];
+    let expected = [
+        (1, Some(times[&1])),
+        (2, Some(times[&2])),
+        (3, Some(repaired)),
+        (4, Some(repaired + 1)),
+        (5, None),
+        (6, Some(repaired + 2)),
+        (7, Some(times[&7])),
+    ];
+    assert_eq!(given, expected);
+}
+
+#[test]
+fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_reader() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    robot.look(Message::from(ALICE).data(WRITER, 1, &small));
+    // INFO_DST and ACKNACK: all below 4.
+    let body = [
+        &[0, 0, 0x12, 0x04][..],
+        &WRITER.0,
+        &[0, 0, 0, 0, 4, 0, 0, 0],
+        &[0; 8],
+    ];
+    let acknowledgement = Message::from(BOB).submessage(0x0e, 0x01, &ALICE.0);
+    robot.look(acknowledgement.submessage(0x06, 0x03, &body.concat()));
+    robot.observer.advance(Timestamp(robot.at + SECOND / 20));
+    robot.observer.advance(Timestamp(robot.at + SECOND));
+    let mut missed = 0;
+    for each in robot.observer.take_given() {
+        if let News::Missed(each) = each.news {
+            assert_eq!(each.reason, MissedReason::NotCaptured);
+            missed += each.samples;
+        }
+    }
+    assert_eq!(missed, 2);
+}
+
+#[test]
+fn a_sample_that_stays_incomplete_is_told_and_not_given() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    robot.at += SECOND;
+    robot.put(Message::from(ALICE).data(WRITER, 1, &payload(20)));
+    robot.fragment(ALICE, 2, 1, &payload(3000));
+    robot.fragment(ALICE, 2, 3, &payload(3000));
+    robot.put(Message::from(ALICE).data(WRITER, 3, &payload(24)));
+    robot.observer.advance(Timestamp(robot.at + 30 * SECOND));
+    let given: Vec<_> = robot.given();
+    let expected = [
+        (ALICE, 1, Ok(payload(20))),
+        (ALICE, 3, Ok(payload(24))),
+        (ALICE, 2, Err(MissedReason::Incomplete)),
+    ];
+    assert_eq!(given, expected);
+}
+
+#[test]
+fn each_subscription_is_told_of_the_losses_since_it_began() {
+    let mut robot = Robot::new(Settings::default());
+    let data = |robot: &mut Robot, number| {
+        robot.put(Message::from(ALICE).data(WRITER, number, b"\0\x01\0\0anything"));
+    };
+    let wishes = |robot: &mut Robot, ids: &[u64]| {
+        let wishes = ids.iter().map(|id| wish(*id, Depth::Arrivals));
+        robot.observer.set_wishes(Arc::new(wishes.collect()));
+    };
+    wishes(&mut robot, &[3]);
+    data(&mut robot, 1);
+    data(&mut robot, 4);
+    wishes(&mut robot, &[3, 5]);
+    data(&mut robot, 8);
+    robot.at += 12 * SECOND;
+    robot.observer.advance(Timestamp(robot.at));
+    let given = robot.observer.take_given().into_iter();
+    let mut missed: Vec<_> = given
+        .filter_map(|given| match given.news {
+            News::Missed(missed) => {
+                assert_eq!(missed.reason, MissedReason::Lost);
+                assert_eq!(missed.samples, missed.last - missed.first + 1);
+                Some((given.to.to_vec(), missed.first, missed.last))
+            }
+            News::Sample(_) => None,
+        })
+        .collect();
+    missed.sort();
+    assert_eq!(missed, [(vec![3], 2, 3), (vec![3, 5], 5, 7)]);
+}
+
+#[test]
+fn interest_measures_what_nobody_watches_and_ends_with_the_last_wish() {
+    let mut robot = Robot::new(Settings::default());
+    let guid = Guid::new(ALICE, WRITER);
+    let verdict = |robot: &mut Robot| {
+        let changes = robot.observer.interest_changes().into_iter();
+        let mut of_it = changes.filter(|(endpoint, _)| *endpoint == guid);
+        of_it.next().and_then(|(_, verdict)| verdict)
+    };
+    assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
+    robot.put(Message::from(ALICE).data(WRITER, 1, &payload(20)));
+    robot.subscribe(&["/points"], Depth::Arrivals);
+    assert_eq!(verdict(&mut robot), Some(Verdict::Meter));
+    robot.put(Message::from(ALICE).data(WRITER, 2, &payload(20)));
+    assert_eq!(robot.given(), [(ALICE, 2, Ok(Vec::new()))]);
+    robot.subscribe(&["/points"], Depth::Payloads);
+    assert_eq!(verdict(&mut robot), Some(Verdict::Capture));
+    robot.put(Message::from(ALICE).data(WRITER, 3, &payload(20)));
+    assert_eq!(robot.given(), [(ALICE, 3, Ok(payload(20)))]);
+    robot.observer.set_wishes(Arc::default());
+    assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
+    robot.put(Message::from(ALICE).data(WRITER, 4, &payload(20)));
+    assert!(robot.given().is_empty());
+    let snapshot = robot.observer.snapshot(Timestamp(robot.at));
+    assert!(snapshot.watches.is_empty());
+    let points = snapshot.topics.iter().find(|topic| topic.name == "/points");
+    assert_eq!(points.unwrap().measurement.as_ref().unwrap().messages, 2);
+}
+
+#[test]
+fn what_finds_no_room_is_told_and_memory_stays_bounded() {
+    let mut robot = Robot::new(Settings {
+        payload_bytes: 100_000,
+        ..Settings::default()
+    });
+    robot.subscribe(&["/points"], Depth::Payloads);
+    robot.at += SECOND;
+    let held = |robot: &Robot| {
+        let snapshot = robot.observer.snapshot(Timestamp(robot.at));
+        let table = snapshot
+            .tables
+            .iter()
+            .find(|table| table.table == "payloads");
+        table.unwrap().size
+    };
+    // Nobody takes what is given.
+    for number in 1..=20 {
+        robot.put(Message::from(ALICE).data(WRITER, number, &payload(10_000)));
+        assert!(held(&robot) <= 100_000);
+    }
+    let given = robot.given();
+    let (whole, missed): (Vec<_>, Vec<_>) = given.iter().partition(|given| given.2.is_ok());
+    assert_eq!(given.len(), 20);
+    assert!(
+        whole.len() >= 8 && missed.len() >= 8,
+        "{} {}",
+        whole.len(),
+        missed.len()
+    );
+    assert!(
+        missed
+            .iter()
+            .all(|given| given.2 == Err(MissedReason::NotCaptured))
+    );
+    // Samples that are begun and never ended make room for one that is.
+    for number in 30..60 {
+        robot.fragment(ALICE, number, 1, &payload(50_000));
+        assert!(held(&robot) <= 100_000);
+    }
+    let large = payload(30_000);
+    for start in 1..=30 {
+        robot.fragment(ALICE, 60, start, &large);
+    }
+    assert!(robot.given().contains(&(ALICE, 60, Ok(large))));
+}
+
+#[test]
+fn a_stream_tells_what_comes_and_when_that_was_all() {
+    let agent = LocalAgent::start(&mut rp(), &["--speed", "4"]);
+    let answer = local_agent::request(agent.api, "GET", "/samples?all=true", "");
+    assert_eq!(answer.status, 200, "{}", answer.body);
+    assert!(
+        answer
+            .headers
+            .contains("content-type: application/x-ndjson")
+    );
+    let lines = answer.body.lines().filter(|line| line.starts_with('{'));
+    let lines: Vec<Line> = lines
+        .map(|line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}")))
+        .collect();
+    assert!(matches!(lines[0], Line::Open(_)), "{:?}", lines[0]);
+    assert!(matches!(lines.last(), Some(Line::End(end)) if end.reason == "end of capture"));
+    let mut clock = 0;
+    let mut samples = 0;
+    for line in &lines[1..lines.len() - 1] {
+        match line {
+            Line::Clock(now) => {
+                let is_in_steps = clock == 0 || now.time_ns - clock <= 110_000_000;
+                assert!(now.time_ns > clock && is_in_steps, "{clock} {now:?}");
+                clock = now.time_ns;
+            }
+            Line::Sample(sample) => {
+                assert!(sample.time_ns >= clock, "{clock} {sample:?}");
+                assert!(sample.payload_bytes.is_none() && sample.size > 4);
+                samples += 1;
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    assert!(samples > 10 && clock > 0, "{samples} samples until {clock}");
+}
+
+#[test]
+fn what_no_topic_can_be_called_is_refused() {
+    let agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
+    for query in [
+        "",
+        "?topic=",
+        "?topic=/a//b",
+        "?all=true&domain_id=233",
+        "?regex=(",
+        "?x=1",
+    ] {
+        let answer = local_agent::request(agent.api, "GET", &format!("/samples{query}"), "");
+        assert!(
+            matches!(answer.status, 400 | 422),
+            "{query}: {}",
+            answer.body
+        );
+    }
+}

@@ -1,0 +1,388 @@
+//! The life of an agent in order, and the composition root of live agents and replays.
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result};
+use ros2probe_capture::live::LiveSource;
+use ros2probe_capture::pcap::Speed;
+use ros2probe_capture::system::give_back_memory;
+use ros2probe_message::{Dialect, Library, Sources};
+use ros2probe_model::history::History;
+use ros2probe_model::observer::{self, Observer};
+use ros2probe_model::reassembly::Limits;
+use tokio_util::sync::CancellationToken;
+
+use crate::config::{Access, Config, ConfigError, PageChoice, Watch};
+use crate::logging::Log;
+use crate::privilege::{self, Identity, Powerless, Role, Sandbox};
+use crate::recording::{Recordings, Refusal, Snapshots};
+use crate::run::replay::Replay;
+use crate::run::{Run, Source};
+use crate::state::{Keeper, StateDirectory};
+use crate::subscriptions::{Caps, Subscriptions};
+use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
+use crate::surface::api::reload::Reloads;
+use crate::surface::api::{self, reload};
+use crate::surface::http::Server;
+use crate::surface::otlp::{self, Exporter, Host};
+use crate::surface::{Board, Exposition, Format, Settings};
+use crate::watches::Watches;
+use crate::{control, memory};
+
+/// Configuration that is read when no other is named and it exists.
+pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
+
+/// What the command line asks of an agent.
+#[derive(Debug, Default)]
+pub struct Options {
+    /// Configuration file; `None` = [`DEFAULT_CONFIG`] if it exists.
+    pub config: Option<PathBuf>,
+    /// Capture to replay instead of observing this host.
+    pub replay: Option<PathBuf>,
+    /// Speed of the replay; `None` = as captured, or as fast as possible for a report.
+    pub speed: Option<Speed>,
+    /// Prints the metrics on stdout at the end of the capture and ends.
+    pub report: bool,
+    /// Topics and globs to measure besides those of the configuration.
+    pub watch: Vec<Watch>,
+    /// Metrics listener instead of the configured one.
+    pub metrics: Option<Listen>,
+    /// API listener instead of the configured one.
+    pub api: Option<Listen>,
+    /// Rights of loopback clients instead of the configured ones.
+    pub api_loopback: Option<Access>,
+}
+
+/// Address of a listener; `None` = off.
+#[derive(Clone, Copy, Debug)]
+pub struct Listen(pub Option<SocketAddr>);
+
+/// What an agent is made of.
+pub struct Blueprint<'a> {
+    /// Limits, recordings and whether the page is served.
+    pub config: &'a Config,
+    /// Where datagrams come from.
+    pub source: Source,
+    /// The model, restored if it knew something before.
+    pub observer: Observer,
+    /// Where snapshots are published.
+    pub board: Arc<Board>,
+    /// What is watched.
+    pub watches: Arc<Watches>,
+    /// Writes down what discovery knows.
+    pub keeper: Option<Keeper>,
+    /// Directory of recordings; `None` = recordings are refused.
+    pub recordings: Option<PathBuf>,
+    /// Finds definitions of messages.
+    pub library: Library,
+    /// For how long figures of topics are kept; zero = not at all.
+    pub history: Duration,
+    /// Addresses at which the page is served.
+    pub addresses: Vec<SocketAddr>,
+    /// Ends the working thread and all streams.
+    pub stop: CancellationToken,
+}
+
+/// An agent that is ready to run.
+pub struct Parts {
+    /// The loop of the working thread.
+    pub run: Run,
+    /// What the API answers from.
+    pub context: api::Context,
+    /// Reloads that clients ask for.
+    pub reloads: Reloads,
+}
+
+impl Blueprint<'_> {
+    /// Connects the parts. Starts the threads of configured snapshots, and no other.
+    ///
+    /// # Errors
+    /// Returns [`Refusal`] if a snapshot cannot be kept.
+    pub fn assemble(self) -> Result<Parts, Refusal> {
+        let Self { config, board, .. } = self;
+        let caps = Caps {
+            subscriptions: config.limits.subscriptions,
+            // The other half is for samples that are being assembled.
+            bytes: config.limits.payload_bytes / 2,
+        };
+        let subscriptions = Subscriptions::new(Arc::clone(&board), caps, self.stop.clone());
+        let subscriptions = Arc::new(subscriptions);
+        let library = Arc::new(self.library);
+        let recordings = Arc::new(Recordings::new(
+            self.recordings,
+            config.recordings.limits,
+            caps.bytes / 2,
+            Arc::clone(&board),
+            Arc::clone(&subscriptions),
+            Arc::clone(&library),
+        ));
+        let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings, &board) {
+            // A disk that is missing today is no reason to observe nothing.
+            Err(refusal @ Refusal::NoDirectory)
+                if config.recordings.is_in(&config.state_directory) =>
+            {
+                tracing::error!(%refusal, "no snapshots are kept");
+                Snapshots::default()
+            }
+            started => started?,
+        };
+        let run = Run::new(
+            self.source,
+            self.observer,
+            Arc::clone(&board),
+            Arc::clone(&self.watches),
+            Arc::clone(&subscriptions),
+            self.stop.clone(),
+        );
+        let seconds = usize::try_from(self.history.as_secs()).unwrap_or(usize::MAX);
+        let history = (seconds > 0).then(|| History::new(seconds, config.limits.topics));
+        let (reloader, reloads) = reload::channel();
+        let context = api::Context {
+            board,
+            watches: self.watches,
+            subscriptions,
+            recordings,
+            snapshots: Arc::new(snapshots),
+            live: Arc::new(api::Live::new(config.history)),
+            library,
+            page: Arc::new(api::Page::new(self.addresses)),
+            reloader,
+            stop: self.stop,
+        };
+        Ok(Parts {
+            run: run.keeping(self.keeper).remembering(history),
+            context,
+            reloads,
+        })
+    }
+}
+
+/// Runs an agent until a signal, a failure or the end of a report.
+///
+/// # Errors
+/// Returns the reason why it did not start or could not go on.
+pub fn run(options: Options) -> Result<()> {
+    let (mut config, file) = configuration(options.config.as_deref())?;
+    let configured = config.clone();
+    if let Some(listen) = options.metrics {
+        config.metrics.listen = listen.0;
+    } else if options.report {
+        config.metrics.listen = None;
+    }
+    control::choose(
+        &mut config.api,
+        options.api,
+        options.api_loopback,
+        options.report,
+    );
+    let log = Log::start(config.log);
+    let export = otlp::Settings::resolve(
+        &config.otlp,
+        &|name| std::env::var(name).ok(),
+        &Host::read(),
+    )?;
+    let mut source = open(&options, &config)?;
+    source.announce(&config.capture);
+    let board = Board::new(source.kind(), Settings::new(&config));
+    let board = Arc::new(board.counting_lost_lines(log.lost_lines()));
+    let watches = Watches::new(Arc::clone(&board), config.watches.clone(), options.watch);
+    let watches = Arc::new(watches.context("the watchlist is unusable")?);
+    let (server, mut control) = listeners(&config, &board)?;
+    // A replay is a person's own command, which reads and writes that person's files.
+    if matches!(source, Source::Live(_)) {
+        announce(privilege::become_own_user());
+    }
+    control::open_socket(&mut control, &config.api)?;
+    let state = match &source {
+        Source::Live(_) => memory::open(&config.state_directory),
+        Source::Replay(_) => None,
+    };
+    let recordings = memory::recordings(&config.recordings.directory, state.as_deref());
+    let known = state.as_deref().map(memory::load);
+    let (known, keeps_known) = known.unwrap_or_default();
+    let keeps_watches = state
+        .as_deref()
+        .is_some_and(|state| memory::restore_watches(state, &watches));
+    let role = match &mut source {
+        Source::Live(live) => {
+            live.start(privilege::spawn_source);
+            Role::capture()
+        }
+        Source::Replay(_) => Role::Service,
+    };
+    let worker = Worker::start(role).context("cannot start the working thread")?;
+    let responder = Responder::start().context("cannot start the thread that answers requests")?;
+    let exporter = export.map(|settings| Exporter::start(settings, &board));
+    let exporter = exporter.transpose()?;
+    let powerless = give_up()?;
+    report_listeners(server.as_ref(), &control, &watches);
+
+    let mut observer = Observer::new(settings(&config, options.replay.is_none()));
+    if let (Some(known), Source::Live(live)) = (known, &source) {
+        observer.restore(&known, live.clock());
+        drop(known);
+        // Reading it takes several times what stays of it.
+        give_back_memory();
+    }
+    let keep = |directory: Arc<StateDirectory>| {
+        if keeps_watches {
+            watches.keep_in(Arc::clone(&directory))?;
+        }
+        keeps_known.then(|| Keeper::start(directory)).transpose()
+    };
+    let keeper = state.map_or(Ok(None), keep);
+    let stop = CancellationToken::new();
+    let blueprint = Blueprint {
+        config: &config,
+        source,
+        observer,
+        board: Arc::clone(&board),
+        watches: Arc::clone(&watches),
+        keeper: keeper.context("cannot start the threads that keep state")?,
+        recordings,
+        library: library(),
+        // Only clients of the API read the history.
+        history: match control.is_empty() {
+            true => Duration::ZERO,
+            false => config.history,
+        },
+        addresses: match config.api.page {
+            PageChoice::On => control.addresses().collect(),
+            PageChoice::Off => Vec::new(),
+        },
+        stop: stop.clone(),
+    };
+    let parts = blueprint.assemble().context("recordings.snapshots")?;
+    if options.report && server.is_none() && control.is_empty() {
+        let ended = worker.finish(parts.run);
+        print!("{}", Exposition::new(board).render(Format::Classic)?);
+        return ended;
+    }
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = runtime.context("cannot start the runtime of signals")?;
+    let (recordings, snapshots) = (
+        Arc::clone(&parts.context.recordings),
+        Arc::clone(&parts.context.snapshots),
+    );
+    let supervisor = Supervisor {
+        board: Arc::clone(&board),
+        config: configured,
+        file,
+        watches: Arc::clone(&watches),
+        reloads: parts.reloads,
+        stop,
+        log,
+        exporter,
+    };
+    let surfaces = Surfaces {
+        metrics: server,
+        control,
+        context: parts.context,
+        powerless,
+    };
+    let ended = supervisor.run(worker, parts.run, responder, surfaces, options.report);
+    let ended = runtime.block_on(ended);
+    snapshots.finish();
+    recordings.finish();
+    watches.finish();
+    ended?;
+    if options.report {
+        print!("{}", Exposition::new(board).render(Format::Classic)?);
+    }
+    Ok(())
+}
+
+/// Reads the configuration, and returns it with its file. Without `file`, a missing
+/// [`DEFAULT_CONFIG`] gives the defaults.
+///
+/// # Errors
+/// Returns [`ConfigError`] if the file cannot be read or has mistakes.
+pub fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>), ConfigError> {
+    let default = Path::new(DEFAULT_CONFIG);
+    match file {
+        None if !default.exists() => Ok((Config::default(), None)),
+        file => {
+            let file = file.unwrap_or(default);
+            Ok((Config::load(file)?, Some(file.to_path_buf())))
+        }
+    }
+}
+
+/// Binds the listeners that are opened before privileges are given up.
+fn listeners(config: &Config, board: &Arc<Board>) -> Result<(Option<Server>, api::Server)> {
+    let web_config = config.metrics.web_config.as_deref();
+    let bind = |address| Server::bind(address, web_config, Arc::clone(board));
+    let server = config.metrics.listen.map(bind).transpose()?;
+    Ok((server, control::open(&config.api)?))
+}
+
+/// Gives up the privileges of this thread, and reads back that none is left.
+fn give_up() -> Result<Powerless> {
+    privilege::confine(Role::Service)?;
+    let powerless = Powerless::verify()?;
+    if let Sandbox::Unfiltered(reason) = privilege::sandbox() {
+        tracing::warn!(reason, "system calls are not filtered");
+    }
+    Ok(powerless)
+}
+
+fn report_listeners(server: Option<&Server>, control: &api::Server, watches: &Watches) {
+    if let Some(address) = server.and_then(|server| server.local_addr().ok()) {
+        let watches = watches.in_force().entries().len();
+        tracing::info!(%address, watches, "serving metrics");
+    }
+    for door in control.doors() {
+        tracing::info!(address = door, "serving the control API");
+    }
+}
+
+fn settings(config: &Config, is_live: bool) -> observer::Settings {
+    observer::Settings {
+        topic_grace: u64::try_from(config.topic_grace.as_nanos()).unwrap_or(u64::MAX),
+        directed: is_live,
+        ..observer::Settings::default().with_limits(&config.limits)
+    }
+}
+
+fn library() -> Library {
+    Library::new(Sources::new(
+        Vec::new(),
+        std::env::var_os("AMENT_PREFIX_PATH").as_deref(),
+        Dialect::default(),
+    ))
+}
+
+fn open(options: &Options, config: &Config) -> Result<Source> {
+    let limits = Limits {
+        bytes: config.limits.reassembly_bytes,
+        ..Limits::default()
+    };
+    let Some(file) = &options.replay else {
+        privilege::check(&config.capture)?;
+        let live = LiveSource::open(&config.capture, limits)?;
+        return Ok(Source::Live(Box::new(live)));
+    };
+    let pace = match options.report {
+        true => Speed::Max,
+        false => Speed::Times(1.0),
+    };
+    let replay = Replay::open(file, options.speed.unwrap_or(pace), limits)
+        .with_context(|| format!("cannot replay {}", file.display()))?;
+    Ok(Source::Replay(Box::new(replay)))
+}
+
+/// Logs the user of an agent that root started.
+fn announce(identity: Identity) {
+    match identity {
+        Identity::AsStarted => {}
+        Identity::Own => tracing::info!("switched from root to user ros2probe"),
+        Identity::Root(reason) => {
+            tracing::info!("running as root with capabilities dropped ({reason})");
+        }
+    }
+}

@@ -1,0 +1,775 @@
+//! From shape to meaning: what the types and ranges of the shape cannot say.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use globset::Glob;
+
+use super::check::check;
+use super::document::Node;
+use super::mistake::{Mistakes, Position};
+use super::shape::{
+    ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
+    WatchShape,
+};
+use super::watch::{Expectations, Retain, Watch, check_globs, check_pattern};
+use super::{
+    ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
+    RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice,
+    StateChoice,
+};
+use crate::surface::otlp::endpoint;
+
+/// Each keeps memory and a thread.
+const MAX_SNAPSHOTS: usize = 8;
+
+/// The whole way from bytes to a configuration.
+pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
+    let mut mistakes = Mistakes::default();
+    let source = match std::str::from_utf8(bytes) {
+        Ok(source) => source,
+        Err(error) => {
+            let valid = bytes.get(..error.valid_up_to()).unwrap_or_default();
+            let last = valid
+                .rsplit(|byte| *byte == b'\n')
+                .next()
+                .unwrap_or_default();
+            let line = 1 + valid.iter().filter(|byte| **byte == b'\n').count();
+            let column = 1 + String::from_utf8_lossy(last).chars().count();
+            mistakes.add(Position { line, column }, "", "not UTF-8");
+            return mistakes.none_or(Config::default());
+        }
+    };
+    let document = Node::parse(source)?;
+    if document.is_empty() {
+        return Ok(Config::default());
+    }
+    let read = reader(&document, &mut mistakes);
+    let Some(read) = read else {
+        return mistakes.none_or(Config::default());
+    };
+    read(source, &document)
+}
+
+/// What reads each version of the file, the oldest first.
+const READERS: &[(u32, Read)] = &[(1, read_1)];
+type Read = fn(&str, &Node) -> Result<Config, Mistakes>;
+
+/// What reads the version that the file names; the first where it names none. Of a newer one nothing
+/// else is said: what it means by its other keys is not known here.
+fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
+    let newest = READERS.last().map_or(0, |(version, _)| *version);
+    let Some((version, position)) = document.version() else {
+        return READERS.first().map(|(_, read)| *read);
+    };
+    let known = READERS
+        .iter()
+        .find(|(known, _)| i128::from(*known) == version);
+    if known.is_none() {
+        let message = if version > i128::from(newest) {
+            format!(
+                "is {version}, this rp {} reads up to {newest}: upgrade rp, or write the file for \
+                 version {newest}",
+                env!("CARGO_PKG_VERSION")
+            )
+        } else {
+            format!("is {version}, must be between 1 and {newest}")
+        };
+        mistakes.add(position, "version", message);
+    }
+    known.map(|(_, read)| *read)
+}
+
+/// Version 1.
+fn read_1(source: &str, document: &Node) -> Result<Config, Mistakes> {
+    let mut mistakes = Mistakes::default();
+    let schema = Config::schema();
+    let places = document.index(&mut mistakes);
+    check(document, "", &schema, &schema, &mut mistakes);
+    mistakes = match mistakes.none_or(()) {
+        Ok(()) => Mistakes::default(),
+        Err(mistakes) => return Err(mistakes),
+    };
+    let mut reader = Reader { places, mistakes };
+    match serde_yaml::from_str::<ConfigShape>(source) {
+        Ok(shape) => {
+            let config = reader.config(shape);
+            reader.mistakes.none_or(config)
+        }
+        // The two YAML readers disagree: rare, and still said with its place.
+        Err(error) => {
+            let place = error.location().map(|at| Position {
+                line: at.line(),
+                column: at.column(),
+            });
+            reader
+                .mistakes
+                .add(place.unwrap_or_default(), "", error.to_string());
+            reader.mistakes.none_or(Config::default())
+        }
+    }
+}
+
+/// Where values stand, and what was found wrong with them.
+struct Reader {
+    places: BTreeMap<String, Position>,
+    mistakes: Mistakes,
+}
+
+impl Reader {
+    fn wrong(&mut self, key: &str, message: impl Into<String>) {
+        let position = self.places.get(key).copied().unwrap_or_default();
+        self.mistakes.add(position, key, message);
+    }
+
+    fn config(&mut self, shape: ConfigShape) -> Config {
+        let limits = Limits::from(shape.limits.unwrap_or_default());
+        Config {
+            watches: self.watches(shape.watch.unwrap_or_default(), limits.watches),
+            limits,
+            capture: self.capture(shape.capture.unwrap_or_default()),
+            metrics: metrics(shape.metrics.unwrap_or_default()),
+            api: self.api(shape.api.unwrap_or_default()),
+            history: Duration::from_secs(shape.page.unwrap_or_default().history_s.into()),
+            otlp: otlp(shape.otlp.unwrap_or_default()),
+            recordings: self.recordings(shape.recordings.unwrap_or_default()),
+            topic_grace: Duration::from_secs(shape.topic_grace_s),
+            state_directory: state(&shape.state_directory),
+            log: shape.log,
+        }
+    }
+
+    fn recordings(&mut self, shape: RecordingsShape) -> RecordingSettings {
+        let shapes = shape.snapshots.unwrap_or_default();
+        if shapes.len() > MAX_SNAPSHOTS {
+            let message = format!(
+                "has {} entries, at most {MAX_SNAPSHOTS} are allowed",
+                shapes.len()
+            );
+            self.wrong("recordings.snapshots", message);
+        }
+        let mut snapshots: Vec<SnapshotSettings> = Vec::new();
+        for (index, shape) in shapes.into_iter().enumerate() {
+            let key = format!("recordings.snapshots[{index}]");
+            if snapshots.iter().any(|other| other.name == shape.name) {
+                self.wrong(&format!("{key}.name"), "is another snapshot's already");
+            }
+            if shape.topics.is_empty() {
+                self.wrong(&format!("{key}.topics"), "names no topic");
+            }
+            snapshots.push(SnapshotSettings {
+                name: shape.name,
+                topics: shape.topics,
+                domain_id: shape.domain,
+                span: Duration::from_secs(shape.seconds),
+                max_bytes: shape.max_bytes,
+                on_violation: shape.on_violation,
+            });
+        }
+        RecordingSettings {
+            directory: state(&shape.directory),
+            snapshots,
+            limits: RecordingLimits {
+                max_bytes: shape.max_bytes,
+                max_total_bytes: shape.max_total_bytes,
+                reserve_percent: shape.reserve_percent,
+                reserve_bytes: shape.reserve_bytes,
+            },
+        }
+    }
+
+    fn watches(&mut self, shapes: Vec<WatchShape>, limit: usize) -> Vec<Watch> {
+        if shapes.len() > limit {
+            let message = format!(
+                "has {} entries, at most {limit} are allowed: use globs, or raise limits.watches",
+                shapes.len()
+            );
+            self.wrong("watch", message);
+            return Vec::new();
+        }
+        let mut watches: Vec<Watch> = Vec::with_capacity(shapes.len());
+        for (index, shape) in shapes.into_iter().enumerate() {
+            let key = format!("watch[{index}]");
+            let watch = match shape {
+                WatchShape::Pattern(pattern) => Watch {
+                    pattern,
+                    domain_id: None,
+                    expectations: Expectations::default(),
+                    per_subscriber: false,
+                    trace: 0.0,
+                    retain: Retain::None,
+                },
+                WatchShape::Entry(entry) => self.entry(&key, *entry),
+            };
+            let twin = |other: &Watch| {
+                other.pattern == watch.pattern && other.domain_id == watch.domain_id
+            };
+            if let Some(first) = watches.iter().position(twin) {
+                self.wrong(&key, format!("repeats watch[{first}]"));
+            }
+            watches.push(watch);
+        }
+        if let Err(many) = check_globs(watches.iter().map(|watch| watch.pattern.as_str())) {
+            self.wrong("watch", format!("has {many}"));
+        }
+        watches
+    }
+
+    fn entry(&mut self, key: &str, entry: WatchEntryShape) -> Watch {
+        if let (Some(low), Some(high)) = (entry.min_rate_hz, entry.max_rate_hz)
+            && low > high
+        {
+            self.wrong(
+                &format!("{key}.max_rate_hz"),
+                format!("is {high}, below min_rate_hz, which is {low}"),
+            );
+        }
+        Watch {
+            pattern: entry.topic,
+            domain_id: entry.domain,
+            expectations: Expectations {
+                min_rate_hz: entry.min_rate_hz,
+                max_rate_hz: entry.max_rate_hz,
+                max_loss_ratio: entry.max_loss_ratio,
+                max_latency_ms: entry.max_latency_ms,
+                max_silence_s: entry.max_silence_s,
+            },
+            per_subscriber: entry.per_subscriber,
+            trace: entry.trace.unwrap_or_default(),
+            retain: entry.retain.into(),
+        }
+    }
+
+    /// Who can reach an address beyond this host has to prove that he may change what is watched.
+    fn api(&mut self, shape: ApiShape) -> ApiSettings {
+        let listen: Option<SocketAddr> = shape.listen.parse().ok();
+        let open = listen.filter(|address| !address.ip().is_loopback());
+        if let (Some(address), None) = (open, &shape.token_file) {
+            let message = format!(
+                "is {address}, which others can reach: that needs `token_file` too, or use \
+                 127.0.0.1"
+            );
+            self.wrong("api.listen", message);
+        }
+        ApiSettings {
+            // Text that is no address is `off`: everything else was refused before.
+            listen,
+            socket: match shape.socket.as_str() {
+                "auto" => SocketChoice::Auto,
+                "off" => SocketChoice::Off,
+                path => SocketChoice::At(PathBuf::from(path)),
+            },
+            loopback: shape.loopback,
+            token_file: shape.token_file.map(PathBuf::from),
+            page: shape.page,
+        }
+    }
+
+    fn capture(&mut self, shape: CaptureShape) -> CaptureSettings {
+        let interfaces = shape.interfaces.unwrap_or_default();
+        let namespaces = shape.network_namespaces.unwrap_or_default();
+        let shm = shape.shm.unwrap_or_default();
+        let settings = CaptureSettings {
+            source: shape.source,
+            cgroup: shape.cgroup.map(PathBuf::from),
+            mirror_interfaces: shape.mirror_interfaces.unwrap_or_default(),
+            include_interfaces: interfaces.include.unwrap_or_default(),
+            exclude_interfaces: interfaces.exclude.unwrap_or_default(),
+            network_namespaces: namespaces.into_iter().map(PathBuf::from).collect(),
+            ring_bytes: shape.ring_bytes,
+            record_ring_bytes: shape.record_ring_bytes,
+            shm: ShmSettings {
+                mode: shm.mode,
+                exact: shm.exact,
+                cpu_percent: shm.cpu_percent,
+                reading_cpu_percent: shm.reading_cpu_percent,
+            },
+        };
+        self.check_source(&settings);
+        settings
+    }
+
+    /// Keys that have a meaning for one source alone.
+    fn check_source(&mut self, settings: &CaptureSettings) {
+        let set = |keys: [(&'static str, bool); 2]| {
+            let set = keys.into_iter().filter(|(_, set)| *set);
+            set.map(|(key, _)| key).collect::<Vec<_>>()
+        };
+        let of_wire = set([
+            (
+                "interfaces.include",
+                !settings.include_interfaces.is_empty(),
+            ),
+            (
+                "interfaces.exclude",
+                !settings.exclude_interfaces.is_empty(),
+            ),
+        ]);
+        let of_host = set([
+            ("cgroup", settings.cgroup.is_some()),
+            ("mirror_interfaces", !settings.mirror_interfaces.is_empty()),
+        ]);
+        for key in &of_wire {
+            let message = match (settings.source, of_host.first()) {
+                (SourceChoice::Host, _) => {
+                    "selects frames on a wire, which `source: host` does not look at; use \
+                     mirror_interfaces or `source: wire`"
+                        .to_owned()
+                }
+                (SourceChoice::Auto, Some(other)) => {
+                    format!("makes the wire the source, for which {other} has no meaning")
+                }
+                _ => continue,
+            };
+            self.wrong(&format!("capture.{key}"), message);
+        }
+        if settings.source == SourceChoice::Wire {
+            for key in of_host {
+                let message = "has no meaning for `source: wire`";
+                self.wrong(&format!("capture.{key}"), message);
+            }
+        }
+    }
+}
+
+/// What text at this key must be, where any text will not do.
+pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
+    match without_indices(key).as_str() {
+        "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => {
+            check_pattern(text).map_err(|error| error.to_string())
+        }
+        "capture.interfaces.include[]"
+        | "capture.interfaces.exclude[]"
+        | "capture.mirror_interfaces[]" => {
+            if text.is_empty() || text.contains(|c: char| c.is_whitespace() || c == '/') {
+                return Err("must be an interface name or glob, as in `eth*`".to_owned());
+            }
+            Glob::new(text)
+                .map(|_| ())
+                .map_err(|error| error.kind().to_string())
+        }
+        "capture.cgroup" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/sys/fs/cgroup/robot.slice`".to_owned())
+        }
+        "capture.network_namespaces[]" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/run/netns/robot`".to_owned())
+        }
+        "state_directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/var/lib/ros2probe`, `auto` or `off`".to_owned())
+        }
+        "recordings.snapshots[].name" if !is_plain(text) => {
+            Err("must be 1 to 64 letters, digits, `_` or `-`: it names directories".to_owned())
+        }
+        "recordings.directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/data/bags`, `auto` or `off`".to_owned())
+        }
+        "api.socket" if !matches!(text, "auto" | "off") && !text.starts_with('/') => Err(
+            "must be an absolute path, as in `/run/ros2probe/api.sock`, `auto` or `off`".to_owned(),
+        ),
+        "metrics.web_config" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/etc/ros2probe/web.yml`".to_owned())
+        }
+        "api.token_file" if !text.starts_with('/') => Err(
+            "must be an absolute path, as in `/run/credentials/ros2probe.service/token`".to_owned(),
+        ),
+        key @ ("metrics.listen" | "api.listen")
+            if text != "off" && text.parse::<SocketAddr>().is_err() =>
+        {
+            let port = if key == "api.listen" { 17401 } else { 17400 };
+            Err(format!(
+                "is `{text}`, must be an IP address and port, as in `127.0.0.1:{port}` or \
+                 `[::1]:{port}`, or `off`"
+            ))
+        }
+        "otlp.endpoint" if text != "off" && endpoint(text).is_none() => Err(
+            "must be an URL of a gRPC receiver, as in `http://collector:4317`, or `off`".to_owned(),
+        ),
+        "otlp.endpoint" if text.starts_with("https://") && !cfg!(feature = "tls") => Err(
+            "wants TLS, which this build has not: use http:// to a collector on this host, or \
+             build with `--features tls`"
+                .to_owned(),
+        ),
+        "otlp.headers_file" if !text.starts_with('/') => {
+            Err("must be an absolute path, as in `/etc/ros2probe/otlp.headers`".to_owned())
+        }
+        _ => Ok(()),
+    }
+}
+
+/// What a file may be called anywhere.
+fn is_plain(name: &str) -> bool {
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
+    (1..=64).contains(&name.len()) && name.chars().all(plain)
+}
+
+/// `watch[2].topic` as `watch[].topic`.
+fn without_indices(key: &str) -> String {
+    let mut inside = false;
+    let mut shown = |c: char| {
+        let shown = !inside || c == ']';
+        inside = c == '[' || (inside && c != ']');
+        shown
+    };
+    key.chars().filter(|c| shown(*c)).collect()
+}
+
+fn state(text: &str) -> StateChoice {
+    match text {
+        "auto" => StateChoice::Auto,
+        "off" => StateChoice::Off,
+        path => StateChoice::At(PathBuf::from(path)),
+    }
+}
+
+fn metrics(shape: MetricsShape) -> MetricsSettings {
+    MetricsSettings {
+        // Text that is no address is `off`: everything else was refused before.
+        listen: shape.listen.parse().ok(),
+        histograms: shape.histograms,
+        per_writer: shape.per_writer,
+        web_config: shape.web_config.map(PathBuf::from),
+    }
+}
+
+fn otlp(shape: OtlpShape) -> OtlpSettings {
+    OtlpSettings {
+        endpoint: match shape.endpoint.as_deref() {
+            None => Endpoint::Environment,
+            Some("off") => Endpoint::Off,
+            Some(endpoint) => Endpoint::At(endpoint.to_owned()),
+        },
+        interval: shape.interval_s.map(Duration::from_secs),
+        timeout: shape.timeout_s.map(Duration::from_secs),
+        headers: shape.headers.unwrap_or_default(),
+        headers_file: shape.headers_file.map(PathBuf::from),
+        compression: shape.compression,
+        metrics: shape.metrics,
+        events: shape.events,
+        traces: shape.traces,
+        robot: shape.robot,
+        attributes: shape.attributes.unwrap_or_default(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fmt::Write as _;
+
+    use super::*;
+
+    fn report(source: &str) -> String {
+        parse(source.as_bytes()).map_or_else(|mistakes| mistakes.report("f"), |_| String::new())
+    }
+
+    #[test]
+    fn an_empty_file_means_the_defaults() {
+        for empty in [
+            "",
+            "# nothing\n",
+            "---\n",
+            "watch:\nlimits:\ncapture:\nmetrics:\n",
+            "{}",
+        ] {
+            assert_eq!(parse(empty.as_bytes()), Ok(Config::default()), "{empty:?}");
+        }
+        assert!(Config::default().watches.is_empty());
+        assert_eq!(
+            Config::default().metrics.listen.unwrap().to_string(),
+            "127.0.0.1:17400"
+        );
+    }
+
+    #[test]
+    fn every_mistake_is_reported_with_its_place() {
+        let source = "\
+watch:
+  - /points
+  - topic: /imu
+    min_rate: 5
+    max_loss_ratio: 3
+  - topik: /scan
+  - scan
+metrics:
+  listen: 17400
+  per_writer: maybe
+log: loud
+limtis: {}
+lgo: 1
+";
+        assert_eq!(
+            report(source),
+            "f:4:5: watch[1].min_rate: unknown key; did you mean `min_rate_hz`?\n\
+             f:5:21: watch[1].max_loss_ratio: is 3, must be between 0 and 1\n\
+             f:6:5: watch[2]: the key `topic` is missing\n\
+             f:6:5: watch[2].topik: unknown key; did you mean `topic`?\n\
+             f:7:5: watch[3]: must begin with a slash, as in `/points`\n\
+             f:9:11: metrics.listen: is `17400`, must be text\n\
+             f:10:15: metrics.per_writer: is the text `maybe`, must be true or false\n\
+             f:11:6: log: is the text `loud`, must be one of error, warn, info, debug, trace\n\
+             f:12:1: limtis: unknown key; did you mean `limits`?\n\
+             f:13:1: lgo: unknown key; did you mean `log`?"
+        );
+    }
+
+    #[test]
+    fn what_types_cannot_say_is_checked_too() {
+        let source = "\
+watch:
+  - points
+  - {topic: /a b}
+capture:
+  interfaces: {include: ['eth[']}
+  network_namespaces: [robot]
+metrics: {listen: localhost}
+";
+        assert_eq!(
+            report(source),
+            "f:2:5: watch[0]: must begin with a slash, as in `/points`\n\
+             f:3:13: watch[1].topic: has the character ` `: ROS names have letters, digits and \
+             `_`, globs also `*`\n\
+             f:5:26: capture.interfaces.include[0]: unclosed character class; missing ']'\n\
+             f:6:24: capture.network_namespaces[0]: must be an absolute path, as in \
+             `/run/netns/robot`\n\
+             f:7:19: metrics.listen: is `localhost`, must be an IP address and port, as in \
+             `127.0.0.1:17400` or `[::1]:17400`, or `off`"
+        );
+    }
+
+    #[test]
+    fn values_are_compared_with_each_other() {
+        let source = "\
+watch:
+  - {topic: /a, min_rate_hz: 5, max_rate_hz: 1}
+  - /x
+  - {topic: /x, domain: 3}
+  - /x
+";
+        assert_eq!(
+            report(source),
+            "f:2:46: watch[0].max_rate_hz: is 1, below min_rate_hz, which is 5\n\
+             f:5:5: watch[3]: repeats watch[1]"
+        );
+    }
+
+    #[test]
+    fn what_belongs_to_the_other_source_is_a_mistake() {
+        let source = "\
+capture:
+  source: host
+  cgroup: robot.slice
+  interfaces: {include: [eth0], exclude: []}
+";
+        assert_eq!(
+            report(source),
+            "f:3:11: capture.cgroup: must be an absolute path, as in `/sys/fs/cgroup/robot.slice`"
+        );
+        let source = source.replace("robot.slice", "/cg");
+        assert_eq!(
+            report(&source),
+            "f:4:25: capture.interfaces.include: selects frames on a wire, which `source: host` \
+             does not look at; use mirror_interfaces or `source: wire`"
+        );
+        assert_eq!(
+            report(&source.replace("host", "auto")),
+            "f:4:25: capture.interfaces.include: makes the wire the source, for which cgroup has \
+             no meaning"
+        );
+        assert_eq!(
+            report("capture: {source: wire, mirror_interfaces: [mirror0], cgroup: /cg}"),
+            "f:1:44: capture.mirror_interfaces: has no meaning for `source: wire`\n\
+             f:1:63: capture.cgroup: has no meaning for `source: wire`"
+        );
+        assert_eq!(
+            report("capture: {source: both, mirror_interfaces: ['a b']}"),
+            "f:1:19: capture.source: is the text `both`, must be one of auto, host, wire\n\
+             f:1:45: capture.mirror_interfaces[0]: must be an interface name or glob, as in `eth*`"
+        );
+        for good in [
+            "capture: {source: host, mirror_interfaces: [mirror*], cgroup: /sys/fs/cgroup/robot}",
+            "capture: {source: wire, interfaces: {include: [eth0]}}",
+            "capture: {interfaces: {exclude: [docker*]}}",
+            "capture: {mirror_interfaces: [eth1]}",
+            "capture: {source: wire, mirror_interfaces: [], cgroup: }",
+        ] {
+            assert_eq!(report(good), "", "{good}");
+        }
+    }
+
+    #[test]
+    fn an_otlp_section_is_checked_down_to_the_names_an_operator_chooses() {
+        let source = "\
+otlp:
+  endpoint: collector:4317
+  headers: {a: b, c: 3}
+  headers_file: secret
+  compression: zip
+  attributes: {site: roof, floor: [2]}
+";
+        assert_eq!(
+            report(source),
+            "f:2:13: otlp.endpoint: must be an URL of a gRPC receiver, as in \
+             `http://collector:4317`, or `off`\n\
+             f:3:22: otlp.headers.c: is `3`, must be text\n\
+             f:4:17: otlp.headers_file: must be an absolute path, as in \
+             `/etc/ros2probe/otlp.headers`\n\
+             f:5:16: otlp.compression: is the text `zip`, must be one of none, gzip\n\
+             f:6:35: otlp.attributes.floor: is a list, must be text"
+        );
+        assert_eq!(report("otlp: {endpoint: 'off', headers: }"), "");
+    }
+
+    #[test]
+    fn a_version_that_is_known_or_left_out_changes_nothing() {
+        for same in [
+            "version: 1\nlog: debug\n",
+            "log: debug\n",
+            "log: debug\nversion: 1",
+        ] {
+            assert_eq!(
+                parse(same.as_bytes()).unwrap().log.label(),
+                "debug",
+                "{same}"
+            );
+        }
+        assert_eq!(
+            report("version: 0"),
+            "f:1:10: version: is 0, must be between 1 and 1"
+        );
+        assert_eq!(
+            report("version: '1'\nlgo: x"),
+            "f:1:10: version: is the text `1`, must be a whole number\n\
+             f:2:1: lgo: unknown key; did you mean `log`?"
+        );
+    }
+
+    #[test]
+    fn of_a_newer_file_one_line_says_what_to_do() {
+        let newer = "watch: {points: {colour: red}}\nversion: 2\nclouds: 7\n";
+        let version = env!("CARGO_PKG_VERSION");
+        assert_eq!(
+            report(newer),
+            format!(
+                "f:2:10: version: is 2, this rp {version} reads up to 1: upgrade rp, or write the \
+                 file for version 1"
+            )
+        );
+    }
+
+    #[test]
+    fn a_key_that_is_called_otherwise_is_named() {
+        assert_eq!(
+            report("watchlist: []"),
+            "f:1:1: watchlist: unknown key; it is called `watch`"
+        );
+        let source = "watch: [{topic: /a, max_delay_ms: 3}]";
+        assert!(report(source).ends_with("unknown key; it is called `max_latency_ms`"));
+    }
+
+    #[test]
+    fn a_key_written_twice_is_reported() {
+        assert_eq!(
+            report("log: info\nlog: warn"),
+            "f:2:1: log: written twice, first at 1:6"
+        );
+    }
+
+    #[test]
+    fn broken_yaml_is_reported_with_its_place() {
+        for (source, place) in [
+            ("watch: [", "f:2:1:"),
+            ("watch:\n\t- /a", "f:2:2:"),
+            ("a: 'x", "f:1:"),
+            ("--- 1\n--- 2\n", "f:2:1:"),
+            ("- 1", "f:1:1: is a list, must be a map of keys"),
+            ("? [a]\n: 1", "f:1:3:"),
+        ] {
+            let report = report(source);
+            assert!(report.starts_with(place), "{source:?}: {report}");
+            assert!(!report.contains('\n'), "{source:?}: {report}");
+        }
+        assert!(
+            parse(b"log: \xff")
+                .unwrap_err()
+                .report("f")
+                .starts_with("f:1:6: not UTF-8")
+        );
+    }
+
+    #[test]
+    fn bombs_are_refused_quickly() {
+        let aliases = "a: &a [x,x]\nb: &b [*a,*a]\nc: [*b,*b]\n";
+        assert!(report(aliases).contains("aliases are not supported"));
+        assert!(report(&"[".repeat(200)).contains("nested too deep"));
+        assert!(report(&"[".repeat(100_000)).contains("recursion limit"));
+        let steps: String = (0..1000)
+            .map(|depth| format!("{}a:\n", " ".repeat(depth)))
+            .collect();
+        assert!(report(&steps).contains("nested too deep"));
+        let mut long = "watch:\n".to_owned();
+        (0..100_000)
+            .try_for_each(|i| writeln!(long, "  - /t{i}"))
+            .unwrap();
+        assert!(report(&long).contains("too many values"));
+        let mut many = "watch:\n".to_owned();
+        (0..2_000)
+            .try_for_each(|i| writeln!(many, "  - /t{i}"))
+            .unwrap();
+        assert!(report(&many).contains("f:2:3: watch: has 2000 entries"));
+        let mut wrong = "watch:\n".to_owned();
+        (0..500)
+            .try_for_each(|i| writeln!(wrong, "  - t{i}"))
+            .unwrap();
+        assert!(report(&wrong).ends_with("f: and 450 more"));
+    }
+
+    #[test]
+    fn a_full_file_is_understood() {
+        let source = "\
+watch:
+  - /tf
+  - {topic: /points, domain: 5, min_rate_hz: 18, max_rate_hz: 22.5, max_loss_ratio: 0.01,
+     max_latency_ms: 50, max_silence_s: 1, per_subscriber: true, trace: 0.25}
+limits: {topics: 5, participants: 6, endpoints: 7, unknown_writers: 8, reassembly_bytes: 65536}
+capture:
+  source: wire
+  interfaces: {include: [eth*], exclude: [docker0]}
+  network_namespaces: [/run/netns/a]
+  ring_bytes: 4194304
+  record_ring_bytes: 65536
+metrics: {listen: 'off', histograms: false, per_writer: true}
+topic_grace_s: 60
+log: debug
+";
+        let config = parse(source.as_bytes()).unwrap();
+        let points = config.watches.get(1).unwrap();
+        assert_eq!(
+            (points.pattern.as_str(), points.domain_id),
+            ("/points", Some(5))
+        );
+        assert_eq!(points.expectations.max_rate_hz, Some(22.5));
+        assert!((points.trace - 0.25).abs() < 1e-9);
+        assert!(points.per_subscriber && !config.watches.first().unwrap().per_subscriber);
+        assert_eq!(config.capture.source, SourceChoice::Wire);
+        assert_eq!(config.limits.unknown_writers, 8);
+        assert_eq!(config.capture.exclude_interfaces, ["docker0"]);
+        assert_eq!(config.metrics.listen, None);
+        assert_eq!(
+            (config.topic_grace, config.log.label()),
+            (Duration::from_mins(1), "debug")
+        );
+        assert_eq!(
+            Config::default().needs_restart(&config),
+            ["limits", "capture", "metrics.listen", "topic_grace_s"]
+        );
+    }
+
+    #[test]
+    fn no_cut_of_a_good_file_panics() {
+        let source = include_bytes!("../../../../config/ros2probe.yaml");
+        for end in 0..source.len() {
+            let _ = parse(source.get(..end).unwrap());
+        }
+    }
+}

@@ -1,0 +1,79 @@
+//! Where the control API listens, as the configuration, the command line and the service manager
+//! say.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::{Path, PathBuf};
+
+use crate::config::{Access, ApiSettings, SocketChoice};
+use crate::surface::api::Server;
+use anyhow::Result;
+
+use crate::agent::Listen;
+
+/// Where the package and the service manager put it.
+const DEFAULT: &str = "/run/ros2probe";
+/// Set by the service manager: directories, separated by colons.
+const VARIABLE: &str = "RUNTIME_DIRECTORY";
+const SOCKET: &str = "api.sock";
+
+/// What the command line says goes before what the configuration says. A report is over before
+/// anybody could ask.
+pub(crate) fn choose(
+    settings: &mut ApiSettings,
+    asked: Option<Listen>,
+    loopback: Option<Access>,
+    is_report: bool,
+) {
+    settings.loopback = loopback.unwrap_or(settings.loopback);
+    match asked {
+        Some(Listen(Some(address))) => settings.listen = Some(address),
+        None if !is_report => {}
+        Some(Listen(None)) | None => {
+            settings.listen = None;
+            settings.socket = SocketChoice::Off;
+        }
+    }
+}
+
+/// Binds the address that is asked for, and reads the token.
+pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
+    let token = settings.token_file.as_deref();
+    let mut server = Server::new(token, settings.loopback)?;
+    if let Some(path) = token
+        && fs::metadata(path).is_ok_and(|file| file.permissions().mode() & 0o004 != 0)
+    {
+        tracing::warn!(path = %path.display(), "every user of this host can read the token");
+    }
+    if let Some(address) = settings.listen {
+        server.bind(address)?;
+    }
+    Ok(server)
+}
+
+/// Binds the socket that is asked for, which makes files.
+pub(crate) fn open_socket(server: &mut Server, settings: &ApiSettings) -> Result<()> {
+    match &settings.socket {
+        SocketChoice::Off => {}
+        SocketChoice::At(path) => server.bind_socket(path)?,
+        SocketChoice::Auto => {
+            if let Some(path) = socket()
+                && let Err(error) = server.bind_socket(&path)
+            {
+                let reason = format!("{:#}", anyhow::anyhow!(error));
+                tracing::warn!(reason, "the control API has no unix socket");
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The socket of this agent, where there is a directory for it.
+fn socket() -> Option<PathBuf> {
+    let named = std::env::var_os(VARIABLE).filter(|paths| !paths.is_empty());
+    if let Some(paths) = named {
+        return Some(std::env::split_paths(&paths).next()?.join(SOCKET));
+    }
+    let default = Path::new(DEFAULT);
+    default.is_dir().then(|| default.join(SOCKET))
+}

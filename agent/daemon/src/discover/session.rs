@@ -1,0 +1,643 @@
+//! One conversation with one participant: introduce, ask, say goodbye. A plain state machine: time
+//! and datagrams in, datagrams out; no socket, no clock.
+//!
+//! Whatever the other side does, at most [`MOST_PACKETS`] packets are sent and the last one is the
+//! goodbye. HEARTBEATs are never answered one by one: Fast DDS sends several while it repeats
+//! itself, and each answer would make it begin anew.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddrV4;
+use std::ops::RangeInclusive;
+
+use ros2probe_wire::discovery::{self, Discovery, EndpointAnnouncement, Role};
+use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
+use ros2probe_wire::record::{Body, Gap, Sample};
+use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
+use ros2probe_wire::walk::{self, Envelope, Found};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+use super::message::{
+    MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER, SUBSCRIPTIONS_READER, Speaker,
+};
+use ros2probe_model::pieces::Pieces;
+
+/// Packets sent to one participant, goodbye included.
+pub const MOST_PACKETS: u32 = 6;
+
+const MILLISECOND: u64 = 1_000_000;
+/// Both announce themselves within 2 ms; when nothing comes for this long, the introduction is
+/// repeated once.
+const DEAF: u64 = 500 * MILLISECOND;
+/// Between the first HEARTBEAT and asking, for the second one.
+const GATHER: u64 = 20 * MILLISECOND;
+/// What was asked for comes within this, or it is asked for again.
+const PATIENCE: u64 = 300 * MILLISECOND;
+/// How long the node list may take after everything else.
+const NODES_PATIENCE: u64 = 500 * MILLISECOND;
+/// The whole conversation.
+const LIMIT: u64 = 3_000 * MILLISECOND;
+/// Announcements of one kind believed to exist, whatever a HEARTBEAT says.
+const MOST_ANNOUNCEMENTS: u64 = 4096;
+/// Samples waited for that come in fragments.
+const MOST_PARTIAL: usize = 8;
+/// User writers whose HEARTBEAT is remembered until it is known which one tells of nodes.
+const MOST_WRITERS: usize = 256;
+const NODES_TOPIC: &str = "ros_discovery_info";
+
+/// Whom to ask, and where it is reached.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Target {
+    /// Its GUID prefix.
+    pub prefix: GuidPrefix,
+    /// Where its discovery endpoints are.
+    pub metatraffic: SocketAddrV4,
+    /// Where its other endpoints are.
+    pub default: SocketAddrV4,
+}
+
+/// A datagram to send.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Outgoing {
+    /// Where to.
+    pub to: SocketAddrV4,
+    /// What it is for, for people.
+    pub what: &'static str,
+    /// The datagram.
+    pub bytes: Vec<u8>,
+}
+
+/// Packets and their bytes (UDP payload).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Tally {
+    /// Packets.
+    pub packets: u32,
+    /// Bytes.
+    pub bytes: u64,
+}
+
+/// One conversation.
+#[derive(Debug)]
+pub struct Session {
+    speaker: Speaker,
+    target: Target,
+    wants_nodes: bool,
+    began: Timestamp,
+    announced: Timestamp,
+    publications: Announcer,
+    subscriptions: Announcer,
+    /// When the first HEARTBEAT of either came.
+    heard: Option<Timestamp>,
+    /// When something was last asked for, and how often.
+    asked: Option<Timestamp>,
+    requests: u32,
+    pieces: Pieces,
+    /// Samples of which some fragments have come, and when the last one did.
+    partial: BTreeMap<(EntityId, u64), Timestamp>,
+    endpoints: BTreeMap<Guid, EndpointAnnouncement>,
+    /// First and last number of user writers, by HEARTBEAT.
+    user_writers: BTreeMap<EntityId, RangeInclusive<u64>>,
+    nodes: Nodes,
+    sent: Tally,
+    received: Tally,
+    over: bool,
+}
+
+/// A writer of announcements, and what came of it.
+#[derive(Debug)]
+struct Announcer {
+    writer: EntityId,
+    reader: EntityId,
+    role: Role,
+    /// First and last number, by HEARTBEAT.
+    there: Option<RangeInclusive<u64>>,
+    came: BTreeSet<u64>,
+    /// Asked for last.
+    wanted: BTreeSet<u64>,
+}
+
+#[derive(Debug)]
+enum Nodes {
+    /// Not asked for, since when.
+    Open { since: Option<Timestamp> },
+    /// Asked for.
+    Asked(Timestamp),
+    /// This is the list.
+    Told(Vec<NodeEntities>),
+    /// It cannot be had.
+    Missing,
+}
+
+impl Session {
+    /// Ready to speak; [`Self::advance`] begins.
+    #[must_use]
+    pub fn new(speaker: Speaker, target: Target, wants_nodes: bool) -> Self {
+        Self {
+            speaker,
+            target,
+            wants_nodes,
+            began: Timestamp(0),
+            announced: Timestamp(0),
+            publications: Announcer::of(Role::Writer),
+            subscriptions: Announcer::of(Role::Reader),
+            heard: None,
+            asked: None,
+            requests: 0,
+            pieces: Pieces::default(),
+            partial: BTreeMap::new(),
+            endpoints: BTreeMap::new(),
+            user_writers: BTreeMap::new(),
+            nodes: Nodes::Open { since: None },
+            sent: Tally::default(),
+            received: Tally::default(),
+            over: false,
+        }
+    }
+
+    /// The packets that are sent when all goes well, the requests as large as they can be.
+    #[must_use]
+    pub fn plan(&self) -> Vec<Outgoing> {
+        let full = || (1, 1..=MOST_NUMBERS);
+        let mut plan = vec![
+            self.to_discovery("introduction", self.message().announce(self.speaker)),
+            self.to_discovery("request", self.request([full(), full()])),
+        ];
+        if self.wants_nodes {
+            let message = self.message();
+            let message = message.ask(NODES_READER, EntityId::UNKNOWN, 1, [1], 1);
+            plan.push(self.to_user("node request", message));
+        }
+        plan.push(self.to_discovery("goodbye", self.message().goodbye(self.speaker)));
+        plan
+    }
+
+    /// Takes in a datagram that came to the speaker's socket.
+    pub fn datagram(&mut self, now: Timestamp, bytes: &[u8]) {
+        self.received.add(bytes.len());
+        let vendor = bytes.get(6..8).and_then(|vendor| vendor.try_into().ok());
+        let vendor = VendorId(vendor.unwrap_or_default());
+        walk::datagram(bytes, &Envelope::default(), None, |found| {
+            let record = &found.record;
+            let for_us = [self.speaker.prefix, GuidPrefix::UNKNOWN];
+            if record.writer().prefix == self.target.prefix
+                && for_us.contains(&record.reader().prefix)
+            {
+                self.take_in(now, &found, vendor);
+            }
+        });
+    }
+
+    /// Says what time it is; what is to be sent now.
+    pub fn advance(&mut self, now: Timestamp) -> Vec<Outgoing> {
+        let mut outgoing = Vec::new();
+        if self.over {
+            return outgoing;
+        }
+        if self.sent.packets == 0 {
+            self.began = now;
+            self.introduce(now, &mut outgoing);
+        }
+        let is_deaf = self.heard.is_none() && since(self.announced, now) >= DEAF;
+        if is_deaf && self.sent.packets == 1 {
+            self.introduce(now, &mut outgoing);
+        } else if is_deaf || since(self.began, now) >= LIMIT {
+            self.end(&mut outgoing);
+            return outgoing;
+        }
+        self.ask(now, &mut outgoing);
+        self.ask_for_nodes(now, &mut outgoing);
+        self.ask_for_fragments(now, &mut outgoing);
+        if self.is_complete(now) {
+            self.end(&mut outgoing);
+        }
+        outgoing
+    }
+
+    /// Says goodbye now, if that was not done.
+    pub fn hang_up(&mut self) -> Vec<Outgoing> {
+        let mut outgoing = Vec::new();
+        if !self.over && self.sent.packets > 0 {
+            self.end(&mut outgoing);
+        }
+        outgoing
+    }
+
+    /// Whom it is with.
+    #[must_use]
+    pub const fn target(&self) -> &Target {
+        &self.target
+    }
+
+    /// Whether everything was said.
+    #[must_use]
+    pub const fn is_over(&self) -> bool {
+        self.over
+    }
+
+    /// Whether the participant answered at all.
+    #[must_use]
+    pub const fn was_answered(&self) -> bool {
+        self.heard.is_some()
+    }
+
+    /// Announcements that did not come although they are there.
+    #[must_use]
+    pub fn missing(&self) -> usize {
+        let both = [&self.publications, &self.subscriptions];
+        both.map(|announcer| announcer.missing().count())
+            .iter()
+            .sum()
+    }
+
+    /// The endpoints it has.
+    #[must_use]
+    pub const fn endpoints(&self) -> &BTreeMap<Guid, EndpointAnnouncement> {
+        &self.endpoints
+    }
+
+    /// Its nodes; `None` if it did not tell.
+    #[must_use]
+    pub fn nodes(&self) -> Option<&[NodeEntities]> {
+        match &self.nodes {
+            Nodes::Told(nodes) => Some(nodes),
+            _ => None,
+        }
+    }
+
+    /// Whether it tells of nodes, and was asked to.
+    #[must_use]
+    pub fn expects_nodes(&self) -> bool {
+        self.wants_nodes && self.nodes_writer().is_some()
+    }
+
+    /// What was sent, and what came.
+    #[must_use]
+    pub const fn cost(&self) -> (Tally, Tally) {
+        (self.sent, self.received)
+    }
+
+    fn take_in(&mut self, now: Timestamp, found: &Found<'_>, vendor: VendorId) {
+        let record = &found.record;
+        let entity = record.writer().entity;
+        let announcers = [&mut self.publications, &mut self.subscriptions];
+        let announcer = announcers.into_iter().find(|it| it.writer == entity);
+        match record.body() {
+            Body::Heartbeat(heartbeat) => {
+                let range = heartbeat.first()..=heartbeat.last();
+                if let Some(announcer) = announcer {
+                    announcer.there = Some(range);
+                    self.heard.get_or_insert(now);
+                } else if !entity.is_builtin()
+                    && (self.user_writers.len() < MOST_WRITERS
+                        || self.user_writers.contains_key(&entity))
+                {
+                    self.user_writers.insert(entity, range);
+                }
+            }
+            Body::Gap(gap) => {
+                if let Some(announcer) = announcer {
+                    announcer.skip(gap);
+                } else if Some(entity) == self.nodes_writer() {
+                    self.nodes = Nodes::Missing;
+                }
+            }
+            Body::Sample(sample) => {
+                let number = sample.sequence_number();
+                let came = match &announcer {
+                    Some(announcer) => announcer.came.contains(&number),
+                    None => matches!(self.nodes, Nodes::Told(_)),
+                };
+                if came || announcer.is_none() && Some(entity) != self.nodes_writer() {
+                    return;
+                }
+                let Some((payload, qos)) = self.whole(now, found, sample, vendor) else {
+                    return;
+                };
+                let payload = payload.borrow();
+                if Some(entity) == self.nodes_writer() {
+                    self.told_nodes(payload);
+                } else {
+                    self.told(entity, number, vendor, payload, &qos);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// The payload of a sample that is complete.
+    fn whole<'a>(
+        &mut self,
+        now: Timestamp,
+        found: &Found<'a>,
+        sample: Sample<'_>,
+        vendor: VendorId,
+    ) -> Option<(Whole<'a>, InlineQos)> {
+        let Sample::DataFrag(fragments) = sample else {
+            let qos = found.inline_qos(vendor).ok()?;
+            return Some((Whole::Borrowed(found.payload()), qos));
+        };
+        let key = (found.record.writer().entity, sample.sequence_number());
+        let Some(bytes) = self.pieces.put(fragments, found.payload) else {
+            if self.partial.len() < MOST_PARTIAL || self.partial.contains_key(&key) {
+                self.partial.insert(key, now);
+            }
+            return None;
+        };
+        self.partial.remove(&key);
+        let qos = InlineQos {
+            status_info: sample.status_info(),
+            ..InlineQos::default()
+        };
+        Some((Whole::Joined(bytes), qos))
+    }
+
+    /// An announcement of an endpoint.
+    fn told(
+        &mut self,
+        entity: EntityId,
+        number: u64,
+        vendor: VendorId,
+        payload: Payload<'_>,
+        qos: &InlineQos,
+    ) {
+        let announcers = [&mut self.publications, &mut self.subscriptions];
+        let Some(announcer) = announcers.into_iter().find(|it| it.writer == entity) else {
+            return;
+        };
+        if announcer.came.len() < usize::try_from(MOST_ANNOUNCEMENTS).unwrap_or(usize::MAX) {
+            announcer.came.insert(number);
+        }
+        match discovery::endpoint(announcer.role, vendor, payload, qos) {
+            Ok(Discovery::Alive(endpoint)) if endpoint.guid.prefix == self.target.prefix => {
+                self.endpoints.insert(endpoint.guid, endpoint);
+            }
+            Ok(Discovery::Gone { guid, .. }) => {
+                self.endpoints.remove(&guid);
+            }
+            Ok(Discovery::Alive(_)) | Err(_) => {}
+        }
+    }
+
+    fn told_nodes(&mut self, payload: Payload<'_>) {
+        if let Ok(entities) = ParticipantEntities::parse(payload.bytes())
+            && entities.participant.prefix == self.target.prefix
+        {
+            self.nodes = Nodes::Told(entities.nodes);
+        }
+    }
+
+    /// The writer that tells of nodes, once it is announced.
+    fn nodes_writer(&self) -> Option<EntityId> {
+        let mut endpoints = self.endpoints.values();
+        let writer = endpoints.find(|endpoint| {
+            endpoint.role == Role::Writer && endpoint.topic.as_str() == NODES_TOPIC
+        });
+        writer.map(|endpoint| endpoint.guid.entity)
+    }
+
+    fn introduce(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
+        self.announced = now;
+        let message = self.message().announce(self.speaker);
+        self.send(self.to_discovery("introduction", message), outgoing);
+    }
+
+    /// Asks for announcements: once both writers have said what there is, again when all that was
+    /// asked for has come and there is more, or when it does not come.
+    fn ask(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
+        let Some(heard) = self.heard else { return };
+        let both = self.publications.there.is_some() && self.subscriptions.there.is_some();
+        let due = match self.asked {
+            None => both || since(heard, now) >= GATHER,
+            Some(asked) => {
+                let came = self.publications.has_come() && self.subscriptions.has_come();
+                came || since(asked, now) >= PATIENCE
+            }
+        };
+        // Of the packets left, one is the node request and one the goodbye.
+        let reserved = 1 + u32::from(self.wants_nodes && matches!(self.nodes, Nodes::Open { .. }));
+        if !due || self.missing() == 0 || self.sent.packets + reserved >= MOST_PACKETS {
+            return;
+        }
+        let wanted = [&mut self.publications, &mut self.subscriptions].map(Announcer::want);
+        self.requests += 1;
+        let message = self.request(wanted.map(|wanted| {
+            let base = wanted.first().copied().unwrap_or(0);
+            (base, wanted)
+        }));
+        self.asked = Some(now);
+        self.send(self.to_discovery("request", message), outgoing);
+    }
+
+    /// Asks for the list of nodes: the last sample of the writer that tells it.
+    fn ask_for_nodes(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
+        if !self.wants_nodes || !matches!(self.nodes, Nodes::Open { .. }) {
+            return;
+        }
+        let Some(writer) = self.nodes_writer() else {
+            return;
+        };
+        let Some(last) = self.user_writers.get(&writer).map(|range| *range.end()) else {
+            return;
+        };
+        if last == 0 || self.sent.packets + 1 >= MOST_PACKETS {
+            self.nodes = Nodes::Missing;
+            return;
+        }
+        let message = self.message().ask(NODES_READER, writer, last, [last], 1);
+        self.nodes = Nodes::Asked(now);
+        self.send(self.to_user("node request", message), outgoing);
+    }
+
+    /// Asks for the rest of samples of which fragments came and others did not follow.
+    fn ask_for_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
+        let due = |(_, at): &(&(EntityId, u64), &Timestamp)| since(**at, now) >= GATHER;
+        let stuck: Vec<_> = self.partial.iter().filter(due).map(|(it, _)| *it).collect();
+        if stuck.is_empty() || self.partial.values().any(|at| since(*at, now) < GATHER) {
+            return;
+        }
+        for is_builtin in [true, false] {
+            let mut message = self.message();
+            let mut asked = false;
+            for (writer, number) in &stuck {
+                if writer.is_builtin() != is_builtin {
+                    continue;
+                }
+                let reader = match *writer {
+                    EntityId::SEDP_PUBLICATIONS_WRITER => PUBLICATIONS_READER,
+                    EntityId::SEDP_SUBSCRIPTIONS_WRITER => SUBSCRIPTIONS_READER,
+                    _ => NODES_READER,
+                };
+                let guid = Guid::new(self.target.prefix, *writer);
+                let missing = self.pieces.missing(guid, *number);
+                self.requests += 1;
+                message = message.ask_fragments(reader, *writer, *number, missing, self.requests);
+                asked = true;
+            }
+            if !asked || self.sent.packets + 1 >= MOST_PACKETS {
+                continue;
+            }
+            let what = "request for fragments";
+            let datagram = if is_builtin {
+                self.to_discovery(what, message)
+            } else {
+                self.to_user(what, message)
+            };
+            self.send(datagram, outgoing);
+        }
+        // They have as long as anything that was asked for.
+        let later = Timestamp(now.0.saturating_add(PATIENCE - GATHER));
+        for at in self.partial.values_mut() {
+            *at = later;
+        }
+    }
+
+    /// Whether nothing more is to be had.
+    fn is_complete(&mut self, now: Timestamp) -> bool {
+        let Some(heard) = self.heard else {
+            return false;
+        };
+        let settled = match self.asked {
+            Some(asked) => self.missing() == 0 || since(asked, now) >= PATIENCE,
+            // A participant without endpoints says so: 1..0.
+            None => since(heard, now) >= GATHER && self.missing() == 0,
+        };
+        if !settled {
+            return false;
+        }
+        if !self.expects_nodes() {
+            return true;
+        }
+        match &mut self.nodes {
+            Nodes::Told(_) | Nodes::Missing => true,
+            Nodes::Asked(asked) => since(*asked, now) >= NODES_PATIENCE,
+            Nodes::Open { since: open } => since(*open.get_or_insert(now), now) >= NODES_PATIENCE,
+        }
+    }
+
+    fn end(&mut self, outgoing: &mut Vec<Outgoing>) {
+        let message = self.message().goodbye(self.speaker);
+        self.send(self.to_discovery("goodbye", message), outgoing);
+        self.over = true;
+    }
+
+    fn message(&self) -> Message {
+        Message::new(self.speaker, self.target.prefix)
+    }
+
+    /// Asks for these numbers from their bases on; the first request introduces the reader of nodes.
+    fn request<N: IntoIterator<Item = u64>>(&self, wanted: [(u64, N); 2]) -> Message {
+        let mut message = self.message();
+        if self.wants_nodes && self.asked.is_none() {
+            message = message.read_nodes(self.speaker);
+        }
+        let both = [&self.publications, &self.subscriptions];
+        for (announcer, (base, numbers)) in both.into_iter().zip(wanted) {
+            if base > 0 {
+                let (reader, writer) = (announcer.reader, announcer.writer);
+                message = message.ask(reader, writer, base, numbers, self.requests.max(1));
+            }
+        }
+        message
+    }
+
+    fn to_discovery(&self, what: &'static str, message: Message) -> Outgoing {
+        Outgoing {
+            to: self.target.metatraffic,
+            what,
+            bytes: message.bytes(),
+        }
+    }
+
+    fn to_user(&self, what: &'static str, message: Message) -> Outgoing {
+        Outgoing {
+            to: self.target.default,
+            what,
+            bytes: message.bytes(),
+        }
+    }
+
+    fn send(&mut self, datagram: Outgoing, outgoing: &mut Vec<Outgoing>) {
+        self.sent.add(datagram.bytes.len());
+        outgoing.push(datagram);
+    }
+}
+
+/// The payload of a sample, as it came or put together.
+enum Whole<'a> {
+    Borrowed(Payload<'a>),
+    Joined(Vec<u8>),
+}
+
+impl Whole<'_> {
+    fn borrow(&self) -> Payload<'_> {
+        match self {
+            Self::Borrowed(payload) => *payload,
+            Self::Joined(bytes) => Payload::Data(bytes),
+        }
+    }
+}
+
+impl Announcer {
+    const fn of(role: Role) -> Self {
+        let (writer, reader) = match role {
+            Role::Writer => (EntityId::SEDP_PUBLICATIONS_WRITER, PUBLICATIONS_READER),
+            Role::Reader => (EntityId::SEDP_SUBSCRIPTIONS_WRITER, SUBSCRIPTIONS_READER),
+        };
+        Self {
+            writer,
+            reader,
+            role,
+            there: None,
+            came: BTreeSet::new(),
+            wanted: BTreeSet::new(),
+        }
+    }
+
+    /// Numbers that are there and have not come, lowest first.
+    fn missing(&self) -> impl Iterator<Item = u64> + '_ {
+        let (first, last) = match &self.there {
+            Some(range) => (*range.start(), *range.end()),
+            None => (1, 0),
+        };
+        let first = first.max(1);
+        let last = last.min(first.saturating_add(MOST_ANNOUNCEMENTS - 1));
+        (first..=last).filter(|number| !self.came.contains(number))
+    }
+
+    /// The next numbers to ask for, as many as one request holds.
+    fn want(&mut self) -> BTreeSet<u64> {
+        let first = self.missing().next().unwrap_or(0);
+        let wanted: BTreeSet<_> = self
+            .missing()
+            .take_while(|number| number - first < MOST_NUMBERS)
+            .collect();
+        self.wanted.clone_from(&wanted);
+        wanted
+    }
+
+    /// Whether all that was asked for has come.
+    fn has_come(&self) -> bool {
+        self.wanted.is_subset(&self.came)
+    }
+
+    /// A GAP: these will never come.
+    fn skip(&mut self, gap: Gap<'_>) {
+        let (irrelevant, list) = (gap.start()..gap.list().base, gap.list());
+        let listed: BTreeSet<u64> = list.iter().collect();
+        let skipped: Vec<u64> = self
+            .missing()
+            .filter(|number| irrelevant.contains(number) || listed.contains(number))
+            .collect();
+        self.came.extend(skipped);
+    }
+}
+
+impl Tally {
+    fn add(&mut self, length: usize) {
+        self.packets += 1;
+        self.bytes += length as u64;
+    }
+}
+
+fn since(earlier: Timestamp, now: Timestamp) -> u64 {
+    now.0.saturating_sub(earlier.0)
+}

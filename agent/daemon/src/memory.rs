@@ -1,0 +1,132 @@
+//! Where state is kept, as the configuration or the service manager says, and what was found there.
+//! Whatever is wrong with it is said in the log: an agent without memory still observes.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::config::{StateChoice, Watch};
+use crate::state::{Loaded, Newer, StateDirectory};
+use crate::watches::{self, Kept, Watches};
+use anyhow::anyhow;
+use ros2probe_model::discovery::Memory;
+
+/// Where the package and the service manager put it.
+const DEFAULT: &str = "/var/lib/ros2probe";
+/// Set by the service manager.
+const VARIABLE: &str = "STATE_DIRECTORY";
+/// In the state directory.
+const RECORDINGS: &str = "recordings";
+
+/// The directory to use; `None` = none.
+pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
+    let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
+    let opened = match (choice, named) {
+        (StateChoice::Off, _) => return None,
+        (StateChoice::At(path), _) => StateDirectory::open(path),
+        (StateChoice::Auto, Some(path)) => StateDirectory::open(Path::new(&path)),
+        (StateChoice::Auto, None) if !Path::new(DEFAULT).exists() => return None,
+        (StateChoice::Auto, None) => StateDirectory::open(Path::new(DEFAULT)),
+    };
+    match opened {
+        Ok(directory) => Some(Arc::new(directory)),
+        Err(error) => {
+            let reason = format!("{:#}", anyhow!(error));
+            tracing::warn!(
+                reason,
+                "no state is kept: a restart loses names and added watches"
+            );
+            None
+        }
+    }
+}
+
+/// Where bags go; `None` = nowhere. Made when the first one is.
+pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -> Option<PathBuf> {
+    match choice {
+        StateChoice::Off => None,
+        StateChoice::At(path) => Some(path.clone()),
+        StateChoice::Auto => Some(state?.path().join(RECORDINGS)),
+    }
+}
+
+/// What the last agent knew, and whether this one may keep what it knows in its place.
+pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
+    let path = directory.path().display();
+    let known = match directory.load() {
+        Loaded::Newer(newer) => {
+            left_alone(&newer);
+            return (None, false);
+        }
+        Loaded::Known(memory) => {
+            let participants = memory.participants.len();
+            tracing::info!(%path, participants, "restored from saved state, awaiting confirmation");
+            Some(memory)
+        }
+        Loaded::Nothing => None,
+        Loaded::AnotherBoot => {
+            tracing::info!(%path, "the state is from another boot and is ignored");
+            None
+        }
+        Loaded::Unusable { reason, aside } => {
+            let aside = aside.map(|aside| aside.display().to_string());
+            tracing::warn!(%path, reason, aside, "the state cannot be used");
+            None
+        }
+    };
+    (known, true)
+}
+
+/// The operator went back to an older rp, and may go forth again.
+fn left_alone(newer: &Newer) {
+    let Newer {
+        path,
+        version,
+        known,
+    } = newer;
+    tracing::error!(
+        path = %path.display(),
+        version,
+        known,
+        "a newer rp wrote this state: starting without it and leaving the file untouched; \
+         upgrade rp, or remove the file"
+    );
+}
+
+/// Watches again what clients of the last agent had asked for; whether this one may keep in its
+/// place what they ask for.
+pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> bool {
+    let Some(kept) = load_watches(directory) else {
+        return false;
+    };
+    match watches.restore(kept) {
+        Ok(0) => {}
+        Ok(left_out) => {
+            let limit = "limits.watches";
+            tracing::warn!(left_out, limit, "not all watches that were added fit in");
+        }
+        Err(error) => tracing::warn!(%error, "the watches that were added cannot be used"),
+    }
+    true
+}
+
+/// `None` = those of a newer rp.
+fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
+    let path = directory.path().display();
+    Some(match watches::load(directory) {
+        Kept::Nothing => Vec::new(),
+        Kept::Newer(newer) => {
+            left_alone(&newer);
+            return None;
+        }
+        Kept::These(watches) => {
+            tracing::info!(%path, watches = watches.len(), "restored the watches that clients \
+                added");
+            watches
+        }
+        Kept::Unusable { reason, aside } => {
+            let aside = aside.map(|aside| aside.display().to_string());
+            tracing::warn!(%path, reason, aside, "the watches that were added cannot be used");
+            Vec::new()
+        }
+    })
+}

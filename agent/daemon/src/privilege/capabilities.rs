@@ -1,0 +1,297 @@
+//! Which capabilities each source needs, what a thread goes on needing, and giving up the rest.
+
+use std::fmt;
+
+use caps::errors::CapsError;
+use caps::{CapSet, Capability, CapsHashSet};
+
+use crate::config::{CaptureSettings, SourceChoice};
+
+/// Attaching programs to a cgroup (`CAP_NET_ADMIN`); loading them; tracepoints, iterators and the
+/// verifier's leave to skip Spectre barriers, without which 5.15 to 6.8 refuse the filter.
+const HOST: [Capability; 3] = [
+    Capability::CAP_NET_ADMIN,
+    Capability::CAP_BPF,
+    Capability::CAP_PERFMON,
+];
+
+/// Packet sockets (`CAP_NET_RAW`); the rest as for the host's sockets.
+const WIRE: [Capability; 3] = [
+    Capability::CAP_NET_RAW,
+    Capability::CAP_BPF,
+    Capability::CAP_PERFMON,
+];
+
+/// Live capture is not possible for lack of these.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Missing {
+    /// Each source that would do, with what it lacks.
+    sources: Vec<(SourceChoice, Vec<Capability>)>,
+    /// What grants everything that the configuration can make use of.
+    grant: Vec<Capability>,
+}
+
+/// Why privileges could not be given up.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot give up privileges: {0}")]
+pub struct DropError(CapsError);
+
+/// The calling thread has no capability in any set that would give it one, and can gain none: what
+/// is asked for to serve HTTP.
+#[derive(Debug)]
+pub struct Powerless(());
+
+/// It has.
+#[derive(Debug, thiserror::Error)]
+pub enum StillPowerful {
+    /// These are left.
+    #[error("refusing to serve: {left} left in the {set:?} set after all were given up")]
+    Capabilities {
+        /// Their names.
+        left: String,
+        /// Where.
+        set: CapSet,
+    },
+    /// A program that it executes could.
+    #[error("refusing to serve: no_new_privs is not set after it was")]
+    MayGain,
+    /// The kernel does not say.
+    #[error("refusing to serve: cannot read which capabilities are left: {0}")]
+    Unreadable(CapsError),
+    /// Likewise.
+    #[error("refusing to serve: cannot read no_new_privs")]
+    Unknown(#[source] std::io::Error),
+}
+
+/// Looks for what capturing as `settings` say needs. Where the choice of the source is the
+/// agent's, having what one of them needs is enough.
+///
+/// # Errors
+/// The capabilities that are not effective. When they cannot be read, opening the sockets will tell.
+pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
+    let Ok(effective) = caps::read(None, CapSet::Effective) else {
+        return Ok(());
+    };
+    missing(&effective, settings).map_or(Ok(()), Err)
+}
+
+/// What a process with these effective capabilities lacks; `None` = nothing.
+#[must_use]
+pub fn missing(effective: &CapsHashSet, settings: &CaptureSettings) -> Option<Missing> {
+    // The old, wider capability still counts for its successors.
+    let admin = effective.contains(&Capability::CAP_SYS_ADMIN);
+    let has = |capability: &Capability| {
+        let inherited = matches!(capability, Capability::CAP_BPF | Capability::CAP_PERFMON);
+        effective.contains(capability) || (admin && inherited)
+    };
+    let mut sources = Vec::new();
+    let mut grant = Vec::new();
+    for (source, needed) in candidates(settings) {
+        let lacking = needed.iter().copied().filter(|one| !has(one)).collect();
+        sources.push((source, lacking));
+        let new = needed.into_iter().filter(|one| !grant.contains(one));
+        grant.extend(new.collect::<Vec<_>>());
+    }
+    let able = |(_, lacking): &(_, Vec<_>)| lacking.is_empty();
+    (!sources.iter().any(able)).then_some(Missing { sources, grant })
+}
+
+/// The sources that `settings` allow, each with what it needs.
+fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)> {
+    let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
+    let mirrors = !settings.mirror_interfaces.is_empty();
+    let entering = (!settings.network_namespaces.is_empty()).then_some(Capability::CAP_SYS_ADMIN);
+    let wire = || WIRE.into_iter().chain(entering).collect();
+    let host = || {
+        let packets = [Some(Capability::CAP_NET_RAW), entering];
+        let packets = packets.into_iter().flatten().filter(|_| mirrors);
+        HOST.into_iter().chain(packets).collect()
+    };
+    match settings.source {
+        SourceChoice::Host => vec![(SourceChoice::Host, host())],
+        SourceChoice::Auto if !named => {
+            vec![(SourceChoice::Host, host()), (SourceChoice::Wire, wire())]
+        }
+        SourceChoice::Auto | SourceChoice::Wire => vec![(SourceChoice::Wire, wire())],
+    }
+}
+
+/// Gives up what the calling thread does not keep, from every set; from the bounding set where it
+/// may, and where it may not nothing can be gained from it any more.
+pub(super) fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError> {
+    let permitted = caps::read(None, CapSet::Permitted).map_err(DropError)?;
+    if caps::has_cap(None, CapSet::Effective, Capability::CAP_SETPCAP).map_err(DropError)? {
+        for capability in caps::read(None, CapSet::Bounding).map_err(DropError)? {
+            caps::drop(None, CapSet::Bounding, capability).map_err(DropError)?;
+        }
+    }
+    let kept: CapsHashSet = permitted.into_iter().filter(|one| is_kept(*one)).collect();
+    caps::clear(None, CapSet::Ambient).map_err(DropError)?;
+    caps::clear(None, CapSet::Inheritable).map_err(DropError)?;
+    caps::set(None, CapSet::Effective, &kept).map_err(DropError)?;
+    caps::set(None, CapSet::Permitted, &kept).map_err(DropError)
+}
+
+impl Powerless {
+    /// Reads back what the calling thread has left.
+    ///
+    /// # Errors
+    /// There is something, or it cannot be read.
+    pub fn verify() -> Result<Self, StillPowerful> {
+        for set in [
+            CapSet::Effective,
+            CapSet::Permitted,
+            CapSet::Inheritable,
+            CapSet::Ambient,
+        ] {
+            let left = caps::read(None, set).map_err(StillPowerful::Unreadable)?;
+            if !left.is_empty() {
+                let mut left: Vec<_> = left.iter().map(Capability::to_string).collect();
+                left.sort();
+                return Err(StillPowerful::Capabilities {
+                    left: left.join(", "),
+                    set,
+                });
+            }
+        }
+        match rustix::thread::no_new_privs() {
+            Ok(true) => Ok(Self(())),
+            Ok(false) => Err(StillPowerful::MayGain),
+            Err(error) => Err(StillPowerful::Unknown(error.into())),
+        }
+    }
+}
+
+impl Missing {
+    /// The capabilities that each source lacks.
+    #[must_use]
+    pub fn needs(&self) -> String {
+        let needs: Vec<String> = self
+            .sources
+            .iter()
+            .map(|(source, lacking)| {
+                let names: Vec<String> = lacking.iter().map(Capability::to_string).collect();
+                format!("{} for the source `{}`", names.join(", "), source.label())
+            })
+            .collect();
+        needs.join(", or ")
+    }
+
+    /// The command that grants them to this program.
+    #[must_use]
+    pub fn command(&self) -> String {
+        let grant = self.grant.iter().map(|one| one.to_string().to_lowercase());
+        let grant: Vec<_> = grant.collect();
+        let program = std::env::current_exe();
+        let program = program.map_or_else(|_| "rp".to_owned(), |path| path.display().to_string());
+        format!("sudo setcap {}+ep {program}", grant.join(","))
+    }
+}
+
+impl fmt::Display for Missing {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "live capture needs {}: run `{}`, use sudo, or start the service ros2probe",
+            self.needs(),
+            self.command(),
+        )
+    }
+}
+
+impl std::error::Error for Missing {}
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::config::Config;
+
+    fn set(capabilities: &[Capability]) -> CapsHashSet {
+        capabilities.iter().copied().collect()
+    }
+
+    fn settings(source: SourceChoice) -> CaptureSettings {
+        CaptureSettings {
+            source,
+            ..Config::default().capture
+        }
+    }
+
+    fn lacks(has: &[Capability], settings: &CaptureSettings) -> Vec<Vec<Capability>> {
+        let missing = missing(&set(has), settings);
+        let sources = missing.map_or_else(Vec::new, |missing| missing.sources);
+        sources.into_iter().map(|(_, lacking)| lacking).collect()
+    }
+
+    #[test]
+    fn three_capabilities_are_enough_for_either_source() {
+        let nothing: [Vec<Capability>; 0] = [];
+        let auto = settings(SourceChoice::Auto);
+        assert_eq!(lacks(&HOST, &settings(SourceChoice::Host)), nothing);
+        assert_eq!(lacks(&WIRE, &settings(SourceChoice::Wire)), nothing);
+        assert_eq!(lacks(&HOST, &auto), nothing);
+        assert_eq!(lacks(&WIRE, &auto), nothing);
+        assert_eq!(lacks(&[], &auto), [HOST, WIRE]);
+        assert_eq!(
+            lacks(&WIRE, &settings(SourceChoice::Host)),
+            [[Capability::CAP_NET_ADMIN]]
+        );
+        assert_eq!(
+            lacks(&HOST, &settings(SourceChoice::Wire)),
+            [[Capability::CAP_NET_RAW]]
+        );
+    }
+
+    #[test]
+    fn the_daemon_set_grants_what_either_source_needs_and_nothing_else() {
+        let manifest = include_str!("../../../../deploy/kubernetes/ros2probe.yaml");
+        let mut lines = manifest.lines().map(str::trim);
+        let added = lines.find_map(|line| line.strip_prefix("add: [")?.strip_suffix(']'));
+        let added = added.unwrap().split(", ");
+        let added: CapsHashSet = added
+            .map(|name| format!("CAP_{name}").parse().unwrap())
+            .collect();
+        assert_eq!(added, set(&[HOST, WIRE].concat()));
+    }
+
+    #[test]
+    fn what_the_configuration_asks_for_beyond_that_is_needed_too() {
+        let named = CaptureSettings {
+            include_interfaces: vec!["eth0".to_owned()],
+            ..settings(SourceChoice::Auto)
+        };
+        assert_eq!(lacks(&HOST, &named), [[Capability::CAP_NET_RAW]]);
+        let mirroring = CaptureSettings {
+            mirror_interfaces: vec!["mirror0".to_owned()],
+            ..settings(SourceChoice::Host)
+        };
+        assert_eq!(lacks(&HOST, &mirroring), [[Capability::CAP_NET_RAW]]);
+        let entering = CaptureSettings {
+            network_namespaces: vec![PathBuf::from("/run/netns/a")],
+            ..settings(SourceChoice::Wire)
+        };
+        assert_eq!(lacks(&WIRE, &entering), [[Capability::CAP_SYS_ADMIN]]);
+        let old = [Capability::CAP_NET_RAW, Capability::CAP_SYS_ADMIN];
+        assert!(lacks(&old, &entering).is_empty());
+    }
+
+    #[test]
+    fn the_message_names_what_each_source_lacks_and_the_command_that_grants_it() {
+        let has = set(&[Capability::CAP_BPF, Capability::CAP_PERFMON]);
+        let missing = missing(&has, &settings(SourceChoice::Auto)).unwrap();
+        let message = missing.to_string();
+        assert!(
+            message.starts_with(
+                "live capture needs CAP_NET_ADMIN for the source `host`, or CAP_NET_RAW for the \
+                 source `wire`: "
+            ),
+            "{message}"
+        );
+        assert!(
+            message.contains("sudo setcap cap_net_admin,cap_bpf,cap_perfmon,cap_net_raw+ep /"),
+            "{message}"
+        );
+    }
+}

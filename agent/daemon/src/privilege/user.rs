@@ -1,0 +1,110 @@
+//! An agent that root has started by hand becomes the user that the package has made, so that no
+//! file of root's is ever written. It keeps its capabilities for what is still to be given up.
+
+use std::fs;
+use std::io;
+
+use caps::{CapSet, Capability};
+use rustix::process::{Gid, Uid, geteuid};
+use rustix::thread::{
+    set_keep_capabilities, set_thread_groups, set_thread_res_gid, set_thread_res_uid,
+};
+
+/// The user and the group.
+const NAME: &str = "ros2probe";
+
+/// Who the agent is.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Identity {
+    /// Not root, and nobody else now.
+    AsStarted,
+    /// The package's user.
+    Own,
+    /// Root, soon without capabilities, for this reason.
+    Root(String),
+}
+
+/// Becomes that user if this process is root and there is one. Call it while the process has one
+/// thread, after everything is opened and before any file is written.
+#[must_use]
+pub fn become_own_user() -> Identity {
+    if !geteuid().is_root() {
+        return Identity::AsStarted;
+    }
+    let read = |path| fs::read_to_string(path).unwrap_or_default();
+    let Some((user, group)) = find(&read("/etc/passwd"), &read("/etc/group")) else {
+        return Identity::Root(format!("user {NAME} does not exist"));
+    };
+    let effective = caps::read(None, CapSet::Effective).unwrap_or_default();
+    let needed = [Capability::CAP_SETUID, Capability::CAP_SETGID];
+    if let Some(missing) = needed.iter().find(|one| !effective.contains(one)) {
+        return Identity::Root(format!("becoming the user {NAME} takes {missing}"));
+    }
+    match become_user(user, group) {
+        Ok(()) => Identity::Own,
+        Err(error) => Identity::Root(format!("cannot become the user {NAME}: {error}")),
+    }
+}
+
+/// The numbers of the user and of the group of that name, or else of the user's own group.
+fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
+    let line = |text: &str| -> Option<Vec<String>> {
+        let mut lines = text.lines().map(|line| line.split(':'));
+        let found = lines.find(|fields| fields.clone().next() == Some(NAME))?;
+        Some(found.map(str::to_owned).collect())
+    };
+    let number = |fields: &[String], index: usize| fields.get(index)?.parse::<u32>().ok();
+    let user = line(users)?;
+    let group = line(groups).and_then(|group| number(&group, 2));
+    let group = group.or_else(|| number(&user, 3))?;
+    let user = number(&user, 2).filter(|user| *user != 0)?;
+    Some((Uid::from_raw(user), Gid::from_raw(group)))
+}
+
+fn become_user(user: Uid, group: Gid) -> io::Result<()> {
+    set_thread_groups(&[])?;
+    set_thread_res_gid(group, group, group)?;
+    // Otherwise all capabilities would go with root's number.
+    set_keep_capabilities(true)?;
+    set_thread_res_uid(user, user, user)?;
+    set_keep_capabilities(false)?;
+    let permitted = caps::read(None, CapSet::Permitted).map_err(io::Error::other)?;
+    caps::set(None, CapSet::Effective, &permitted).map_err(io::Error::other)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_user_is_found_by_its_name_and_is_never_root() {
+        let users = "root:x:0:0:root:/root:/bin/sh\nros2probe2:x:7:7::/:/bin/false\n\
+            ros2probe:x:998:997:agent:/var/lib/ros2probe:/usr/sbin/nologin\n";
+        let found = |user, group| Some((Uid::from_raw(user), Gid::from_raw(group)));
+        assert_eq!(
+            find(users, "root:x:0:\nros2probe:x:996:ada\n"),
+            found(998, 996)
+        );
+        assert_eq!(find(users, "root:x:0:\n"), found(998, 997));
+        assert_eq!(find("root:x:0:0::/:/bin/sh\n", "ros2probe:x:996:\n"), None);
+        assert_eq!(find("ros2probe:x:0:0::/:/bin/sh\n", ""), None);
+        assert_eq!(find("ros2probe:x\n", ""), None);
+    }
+
+    #[test]
+    fn who_becomes_another_user_keeps_capabilities_and_nothing_of_root() {
+        assert!(geteuid().is_root(), "this takes root: run `make test`");
+        let thread = std::thread::spawn(|| {
+            let before = caps::read(None, CapSet::Effective).unwrap();
+            become_user(Uid::from_raw(65534), Gid::from_raw(65533)).unwrap();
+            assert_eq!(caps::read(None, CapSet::Effective).unwrap(), before);
+            fs::read_to_string("/proc/thread-self/status").unwrap()
+        });
+        let status = thread.join().unwrap();
+        let line = |name| status.lines().find(|line| line.starts_with(name)).unwrap();
+        assert_eq!(line("Uid:"), "Uid:\t65534\t65534\t65534\t65534");
+        assert_eq!(line("Gid:"), "Gid:\t65533\t65533\t65533\t65533");
+        assert_eq!(line("Groups:").trim_end(), "Groups:\t".trim_end());
+        assert!(geteuid().is_root(), "only that thread has become another");
+    }
+}

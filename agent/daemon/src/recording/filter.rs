@@ -1,0 +1,457 @@
+//! Which topics a recording takes: the options of `ros2 bag record`, as one question to each topic.
+//!
+//! The question is asked again whenever the graph changes, so that topics that come later are taken,
+//! too. Topics of service events are a service's: topics' options do not reach them.
+
+use std::collections::HashSet;
+
+use regex::bytes::Regex;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::subscriptions::{Choice, ChoiceError, Selection};
+use ros2probe_api::path::encoded;
+
+/// The end of the name of a service's event topic.
+const SERVICE_EVENT: &str = "/_service_event";
+const EVERY_SERVICE_EVENT: &str = "/_service_event$";
+/// Names, types and services in one choice.
+const MAX_NAMES: usize = 1024;
+/// Characters of a regular expression.
+const MAX_EXPRESSION: usize = 1024;
+
+/// What was asked for; empty asks for nothing.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, default)]
+#[schema(as = RecordedTopics)]
+pub struct Asked {
+    /// These topics, by ROS name.
+    pub topics: Vec<String>,
+    /// Every topic.
+    pub all_topics: bool,
+    /// Topics of these types, `pkg/msg/Type`.
+    pub topic_types: Vec<String>,
+    /// These services, by name: their event topics.
+    pub services: Vec<String>,
+    /// Every service's event topic.
+    pub all_services: bool,
+    /// Topics and services whose name contains this regular expression.
+    pub regex: Option<String>,
+    /// None whose name contains this regular expression.
+    pub exclude_regex: Option<String>,
+    /// Not these topics.
+    pub exclude_topics: Vec<String>,
+    /// No topics of these types.
+    pub exclude_topic_types: Vec<String>,
+    /// Not these services.
+    pub exclude_services: Vec<String>,
+    /// Also topics with a token that begins with `_`.
+    pub include_hidden_topics: bool,
+    /// Also topics that nobody publishes: declared in the bag, without a message.
+    pub include_unpublished_topics: bool,
+    /// Not topics that nobody subscribes to.
+    pub ignore_leaf_topics: bool,
+}
+
+/// One topic of the graph, as far as the choice looks at it.
+#[derive(Clone, Copy, Debug)]
+pub struct Candidate<'a> {
+    /// ROS name.
+    pub name: &'a str,
+    /// Types announced on it.
+    pub types: &'a [String],
+    /// Somebody publishes it.
+    pub published: bool,
+    /// Somebody subscribes to it.
+    pub subscribed: bool,
+}
+
+/// What was asked for, ready to be held against topics.
+#[derive(Clone, Debug)]
+pub struct Filter {
+    asked: Asked,
+    regex: Option<Regex>,
+    exclude_regex: Option<Regex>,
+    only: Option<HashSet<String>>,
+}
+
+/// Why nothing can be chosen like this.
+#[derive(Debug, thiserror::Error)]
+pub enum FilterError {
+    /// No topic can ever match.
+    #[error("name topics, or ask for all of them or those that match a regular expression")]
+    Nothing,
+    /// Too long a list.
+    #[error("more than {MAX_NAMES} names")]
+    TooMany,
+    /// A name without its leading slash, or a wrong one.
+    #[error("`{0}` is no topic or service name: it must begin with `/`")]
+    Name(String),
+    /// A regular expression that cannot be used.
+    #[error("the regular expression `{expression}` cannot be used: {reason}")]
+    Expression {
+        /// As given.
+        expression: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+impl Asked {
+    /// Every topic, as `-a` of Humble.
+    #[must_use]
+    pub fn everything() -> Self {
+        Self {
+            all_topics: true,
+            ..Self::default()
+        }
+    }
+}
+
+impl Filter {
+    /// Checks what was asked for.
+    ///
+    /// # Errors
+    /// Nothing could match, or an expression or a name is wrong.
+    pub fn new(asked: Asked) -> Result<Self, FilterError> {
+        let names = [
+            &asked.topics,
+            &asked.services,
+            &asked.exclude_topics,
+            &asked.exclude_services,
+        ];
+        let types = [&asked.topic_types, &asked.exclude_topic_types];
+        if names
+            .iter()
+            .chain(&types)
+            .any(|list| list.len() > MAX_NAMES)
+        {
+            return Err(FilterError::TooMany);
+        }
+        if let Some(wrong) = names.into_iter().flatten().find(|name| !is_absolute(name)) {
+            return Err(FilterError::Name(wrong.clone()));
+        }
+        let something = asked.all_topics
+            || asked.all_services
+            || asked.regex.is_some()
+            || !asked.topics.is_empty()
+            || !asked.topic_types.is_empty()
+            || !asked.services.is_empty();
+        if !something {
+            return Err(FilterError::Nothing);
+        }
+        let regex = asked.regex.as_deref().map(expression).transpose()?;
+        let exclude_regex = asked.exclude_regex.as_deref().map(expression).transpose()?;
+        Ok(Self {
+            asked,
+            regex,
+            exclude_regex,
+            only: None,
+        })
+    }
+
+    /// What was asked for.
+    #[must_use]
+    pub const fn asked(&self) -> &Asked {
+        &self.asked
+    }
+
+    /// What to subscribe to: everything that [`Self::takes`] may take, and little more.
+    ///
+    /// # Errors
+    /// A name cannot be a topic's.
+    pub fn selection(&self) -> Result<Selection, ChoiceError> {
+        let asked = &self.asked;
+        let event = |service: &String| Choice::Name(format!("{service}{SERVICE_EVENT}"));
+        let mut include = Vec::new();
+        if asked.all_topics || !asked.topic_types.is_empty() {
+            include.push(Choice::All);
+        }
+        if asked.all_services || asked.regex.is_some() {
+            include.push(Choice::regex(EVERY_SERVICE_EVENT)?);
+        }
+        include.extend(asked.services.iter().map(event));
+        if let Some(regex) = &asked.regex {
+            include.push(Choice::regex(regex)?);
+        }
+        include.extend(asked.topics.iter().cloned().map(Choice::Name));
+        let mut exclude = Vec::new();
+        if let Some(regex) = &asked.exclude_regex {
+            exclude.push(Choice::regex(regex)?);
+        }
+        exclude.extend(asked.exclude_topics.iter().cloned().map(Choice::Name));
+        exclude.extend(asked.exclude_services.iter().map(event));
+        Ok(Selection {
+            include,
+            exclude,
+            // A service's events are hidden; what else is hidden is for `takes` to leave out.
+            hidden: asked.include_hidden_topics || asked.all_services || asked.regex.is_some(),
+        })
+    }
+
+    /// The same as a query of the API's `/samples`, with so much room for what waits.
+    #[must_use]
+    pub fn query(&self, domain_id: u32, queue_bytes: u64) -> String {
+        let asked = &self.asked;
+        let event = |service: &String| format!("{service}{SERVICE_EVENT}");
+        let list = |names: &[String], services: &[String]| {
+            let names = names.iter().cloned().chain(services.iter().map(event));
+            names.collect::<Vec<_>>().join(",")
+        };
+        let every_event = asked.all_services || asked.regex.is_some();
+        let events = every_event.then(|| EVERY_SERVICE_EVENT.to_owned());
+        let regex = asked.regex.as_ref().map(|regex| format!("(?:{regex})"));
+        let regex: Vec<String> = regex.into_iter().chain(events).collect();
+        let all = asked.all_topics || !asked.topic_types.is_empty();
+        let hidden = asked.include_hidden_topics || every_event;
+        let mut query = format!("domain_id={domain_id}&queue_bytes={queue_bytes}");
+        query.push_str(&format!("&all={all}&hidden={hidden}"));
+        let texts = [
+            ("topic", list(&asked.topics, &asked.services)),
+            ("regex", regex.join("|")),
+            (
+                "exclude",
+                list(&asked.exclude_topics, &asked.exclude_services),
+            ),
+            (
+                "exclude_regex",
+                asked.exclude_regex.clone().unwrap_or_default(),
+            ),
+        ];
+        for (key, text) in texts.into_iter().filter(|(_, text)| !text.is_empty()) {
+            query.push_str(&format!("&{key}={}", encoded(&text)));
+        }
+        query
+    }
+
+    /// Of those it takes, only these topics.
+    #[must_use]
+    pub fn only(self, names: &[String]) -> Self {
+        Self {
+            only: Some(names.iter().cloned().collect()),
+            ..self
+        }
+    }
+
+    /// Whether `topic` is to be recorded.
+    #[must_use]
+    pub fn takes(&self, topic: &Candidate<'_>) -> bool {
+        let asked = &self.asked;
+        let found = |expression: &Option<Regex>, name: &str| {
+            let expression = expression.as_ref();
+            expression.is_some_and(|expression| expression.is_match(name.as_bytes()))
+        };
+        let only = self.only.as_ref();
+        if found(&self.exclude_regex, topic.name)
+            || only.is_some_and(|only| !only.contains(topic.name))
+        {
+            return false;
+        }
+        if let Some(service) = topic.name.strip_suffix(SERVICE_EVENT) {
+            let named = |list: &[String]| list.iter().any(|name| name == service);
+            return !named(&asked.exclude_services)
+                && (asked.all_services || named(&asked.services) || found(&self.regex, service));
+        }
+        let named = |list: &[String]| list.iter().any(|name| name == topic.name);
+        let typed = |list: &[String]| topic.types.iter().any(|each| list.contains(each));
+        if named(&asked.exclude_topics)
+            || typed(&asked.exclude_topic_types)
+            || (asked.ignore_leaf_topics && !topic.subscribed)
+            || (!asked.include_unpublished_topics && !topic.published)
+        {
+            return false;
+        }
+        // Who names a hidden topic means it.
+        named(&asked.topics)
+            || ((asked.include_hidden_topics || !is_hidden(topic.name))
+                && (asked.all_topics
+                    || typed(&asked.topic_types)
+                    || found(&self.regex, topic.name)))
+    }
+}
+
+fn expression(text: &str) -> Result<Regex, FilterError> {
+    let refuse = |reason: String| FilterError::Expression {
+        expression: text.chars().take(80).collect(),
+        reason,
+    };
+    if text.len() > MAX_EXPRESSION {
+        return Err(refuse(format!("longer than {MAX_EXPRESSION} bytes")));
+    }
+    ros2probe_model::selection::expression(text).map_err(|error| {
+        let text = error.to_string();
+        let last = text.lines().last().unwrap_or_default();
+        refuse(last.trim_start_matches("error: ").to_owned())
+    })
+}
+
+fn is_absolute(name: &str) -> bool {
+    name.len() > 1 && name.starts_with('/') && !name.ends_with('/')
+}
+
+fn is_hidden(name: &str) -> bool {
+    name.split('/').any(|token| token.starts_with('_'))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn takes(asked: Asked, name: &str) -> bool {
+        let types = ["std_msgs/msg/String".to_owned()];
+        Filter::new(asked).unwrap().takes(&Candidate {
+            name,
+            types: &types,
+            published: true,
+            subscribed: true,
+        })
+    }
+
+    fn strings(list: &[&str]) -> Vec<String> {
+        list.iter().map(|&each| each.to_owned()).collect()
+    }
+
+    #[test]
+    fn all_topics_are_those_that_are_not_hidden_and_no_service_events() {
+        let all = Asked::everything();
+        assert!(takes(all.clone(), "/chatter"));
+        assert!(!takes(all.clone(), "/fibonacci/_action/feedback"));
+        assert!(!takes(all.clone(), "/add/_service_event"));
+        let hidden = Asked {
+            include_hidden_topics: true,
+            ..all
+        };
+        assert!(takes(hidden.clone(), "/fibonacci/_action/feedback"));
+        assert!(!takes(hidden, "/add/_service_event"));
+    }
+
+    #[test]
+    fn a_named_topic_is_taken_though_it_is_hidden() {
+        let asked = Asked {
+            topics: strings(&["/a/_hidden"]),
+            ..Asked::default()
+        };
+        assert!(takes(asked.clone(), "/a/_hidden"));
+        assert!(!takes(asked, "/a"));
+    }
+
+    #[test]
+    fn a_regular_expression_adds_and_another_takes_away() {
+        let asked = Asked {
+            topics: strings(&["/chatter"]),
+            regex: Some("camera/.*".to_owned()),
+            exclude_regex: Some("raw$|chat".to_owned()),
+            ..Asked::default()
+        };
+        assert!(takes(asked.clone(), "/camera/info"));
+        assert!(!takes(asked.clone(), "/camera/raw"));
+        assert!(!takes(asked.clone(), "/chatter"));
+        assert!(!takes(asked, "/odom"));
+    }
+
+    #[test]
+    fn services_are_chosen_by_their_own_names() {
+        let asked = Asked {
+            services: strings(&["/add"]),
+            ..Asked::default()
+        };
+        assert!(takes(asked.clone(), "/add/_service_event"));
+        assert!(!takes(asked, "/add"));
+        let asked = Asked {
+            all_services: true,
+            exclude_services: strings(&["/add"]),
+            ..Asked::default()
+        };
+        assert!(takes(asked.clone(), "/sub/_service_event"));
+        assert!(!takes(asked, "/add/_service_event"));
+    }
+
+    #[test]
+    fn types_and_the_graph_around_a_topic_decide() {
+        let typed = Asked {
+            topic_types: strings(&["std_msgs/msg/String"]),
+            ..Asked::default()
+        };
+        assert!(takes(typed, "/chatter"));
+        let excluded = Asked {
+            exclude_topic_types: strings(&["std_msgs/msg/String"]),
+            ..Asked::everything()
+        };
+        assert!(!takes(excluded, "/chatter"));
+        let lonely = |asked| {
+            let topic = Candidate {
+                name: "/chatter",
+                types: &[],
+                published: false,
+                subscribed: false,
+            };
+            Filter::new(asked).unwrap().takes(&topic)
+        };
+        assert!(!lonely(Asked::everything()));
+        let unpublished = Asked {
+            include_unpublished_topics: true,
+            ..Asked::everything()
+        };
+        assert!(lonely(unpublished.clone()));
+        assert!(!lonely(Asked {
+            ignore_leaf_topics: true,
+            ..unpublished
+        }));
+    }
+
+    #[test]
+    fn what_cannot_be_chosen_is_told() {
+        let error = |asked| Filter::new(asked).unwrap_err().to_string();
+        assert!(error(Asked::default()).starts_with("name topics"));
+        let relative = Asked {
+            topics: strings(&["chatter"]),
+            ..Asked::default()
+        };
+        assert!(error(relative).contains("`chatter` is no topic"));
+        for wrong in ["(", r"(a)\1", "a{1000000}"] {
+            let regex = Some(wrong.to_owned());
+            let asked = Asked {
+                regex,
+                ..Asked::default()
+            };
+            assert!(error(asked).contains("cannot be used: "), "{wrong}");
+        }
+        let long = Asked {
+            regex: Some("a".repeat(MAX_EXPRESSION + 1)),
+            ..Asked::default()
+        };
+        assert!(error(long).ends_with("longer than 1024 bytes"));
+    }
+
+    #[test]
+    fn what_is_asked_of_an_agent_is_no_less_than_what_is_taken() {
+        let asked = Asked {
+            topics: strings(&["/a", "/b"]),
+            services: strings(&["/add"]),
+            regex: Some("^/c&d".to_owned()),
+            exclude_topics: strings(&["/x"]),
+            ..Asked::default()
+        };
+        assert_eq!(
+            Filter::new(asked).unwrap().query(3, 100),
+            "domain_id=3&queue_bytes=100&all=false&hidden=true\
+             &topic=/a%2C/b%2C/add/_service_event\
+             &regex=%28%3F%3A%5E/c%26d%29%7C/_service_event%24&exclude=/x"
+        );
+        let all = Filter::new(Asked::everything()).unwrap();
+        assert_eq!(
+            all.query(0, 1),
+            "domain_id=0&queue_bytes=1&all=true&hidden=false"
+        );
+        let only = all.only(&strings(&["/a"]));
+        let takes = |name| {
+            only.takes(&Candidate {
+                name,
+                types: &[],
+                published: true,
+                subscribed: true,
+            })
+        };
+        assert!(takes("/a") && !takes("/b"));
+    }
+}

@@ -1,0 +1,884 @@
+//! One recording: samples in, a bag and a report out.
+//!
+//! No thread and no clock of its own: whoever owns it feeds it from a subscription or from an agent's
+//! stream, and time comes with what it is fed. The first error of the storage ends it; what was
+//! taken before is in the bag, and what is not is counted.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::sync::Arc;
+
+use ros2probe_wire::qos::Qos;
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::announced::{Announced, SeenTopic, Sight};
+use super::filter::{Asked, Candidate, Filter};
+use super::report::{NO_SUBSCRIBER, OtherDomain, Report};
+use super::ring::Ring;
+use super::room::Room;
+use crate::subscriptions::{Item, Topic};
+use ros2probe_bag::{
+    Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
+};
+use ros2probe_model::payloads::{Offered, Sample};
+
+const SECOND: u64 = 1_000_000_000;
+/// How often what was taken is handed to the system, by the time of the samples: so much is lost
+/// when the process is killed.
+const FLUSH: u64 = SECOND;
+/// How often it is waited for until it is on the disk: so much is lost with the power.
+const SYNC: u64 = 5 * SECOND;
+/// Writers of one topic whose first number is remembered.
+const WRITERS: usize = 256;
+
+/// Where a recorder learns what it does not see in samples.
+pub struct Sources<'a> {
+    /// What is announced at the moment of the topics of these names, in their order.
+    pub announced: Box<Announcements<'a>>,
+    /// What is there at the moment, in all domains.
+    pub sight: Box<dyn FnMut() -> Sight + Send + 'a>,
+    /// How messages of a type look; the type and its announced hash.
+    pub schema: Box<Schemas<'a>>,
+}
+
+/// What is announced of topics, asked for all at once: each question may take a while.
+pub type Announcements<'a> = dyn FnMut(&[String]) -> Vec<Announced> + Send + 'a;
+
+/// The schema of a type, by its name and announced hash.
+pub type Schemas<'a> = dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send + 'a;
+
+/// A bag in the making.
+pub struct Recorder<'a> {
+    writer: Writer,
+    domain_id: u32,
+    /// What was counted when it began.
+    before: Before,
+    filter: Filter,
+    sources: Sources<'a>,
+    topics: HashMap<String, Place>,
+    /// Of those, the ones in the bag.
+    order: Vec<String>,
+    report: Report,
+    sampled: BTreeSet<String>,
+    paused: bool,
+    /// In snapshot mode: samples that wait for being asked for.
+    ring: Option<Ring>,
+    /// What it may take of the disk.
+    room: Option<Room>,
+    flushed: Timestamp,
+    synced: Timestamp,
+}
+
+/// Counts at the beginning: messages of topics in other domains, and of writers that were never
+/// announced.
+#[derive(Default)]
+struct Before {
+    topics: HashMap<(u32, String), u64>,
+    unknown_writers: HashMap<String, u64>,
+}
+
+/// What was decided for a topic.
+enum Place {
+    /// It is in the bag.
+    Taken(Box<Taken>),
+    /// The filter does not take it.
+    LeftOut,
+}
+
+struct Taken {
+    id: TopicId,
+    description: TopicDescription,
+    /// Of each publisher by its GUID, for the description.
+    offered: BTreeMap<String, Qos>,
+    /// Number of the first recorded sample of each writer.
+    first: HashMap<Guid, u64>,
+}
+
+/// What became of a recording.
+#[derive(Debug)]
+pub struct Ended {
+    /// The bag, where it could be completed.
+    pub summary: Option<Summary>,
+    /// What it has and has not.
+    pub report: Report,
+    /// What the storage refused; the bag is whole up to there.
+    pub error: Option<Error>,
+}
+
+impl<'a> Recorder<'a> {
+    /// Records what `filter` takes of a domain into `writer`'s bag. `before` is what was there before
+    /// the first sample.
+    #[must_use]
+    pub fn new(
+        writer: Writer,
+        filter: Filter,
+        domain_id: u32,
+        before: Sight,
+        sources: Sources<'a>,
+    ) -> Self {
+        let Sight {
+            topics,
+            unknown_writers,
+        } = before;
+        let topics = topics.into_iter();
+        let topics = topics.filter(|topic| topic.domain_id != domain_id);
+        let topics = topics.filter_map(|topic| {
+            let messages = topic.messages?;
+            Some(((topic.domain_id, topic.name), messages))
+        });
+        Self {
+            before: Before {
+                topics: topics.collect(),
+                unknown_writers,
+            },
+            domain_id,
+            writer,
+            filter,
+            sources,
+            topics: HashMap::new(),
+            order: Vec::new(),
+            report: Report::default(),
+            sampled: BTreeSet::new(),
+            paused: false,
+            ring: None,
+            room: None,
+            flushed: Timestamp(0),
+            synced: Timestamp(0),
+        }
+    }
+
+    /// Keeps the last samples in memory and writes them when [`Self::snapshot`] asks for them.
+    #[must_use]
+    pub fn waiting_in(self, ring: Ring) -> Self {
+        Self {
+            ring: Some(ring),
+            ..self
+        }
+    }
+
+    /// Ends with an error when the room is used up.
+    #[must_use]
+    pub fn within(self, room: Room) -> Self {
+        Self {
+            room: Some(room),
+            ..self
+        }
+    }
+
+    /// Writes what waits in memory; nothing where it does not wait.
+    ///
+    /// # Errors
+    /// The storage takes no more.
+    pub fn snapshot(&mut self) -> Result<(), Error> {
+        let waiting: Vec<_> = self.ring.iter_mut().flat_map(Ring::drain).collect();
+        for sample in waiting {
+            self.write(&sample)?;
+        }
+        self.writer.flush()
+    }
+
+    /// What it has so far.
+    #[must_use]
+    pub const fn report(&self) -> &Report {
+        &self.report
+    }
+
+    /// Of these topics, the published ones that it takes and that have no message yet although the
+    /// reason is known: by name, the reason as in [`Report::unobserved`].
+    #[must_use]
+    pub fn unobserved(&self, sight: &Sight) -> BTreeMap<String, String> {
+        let topics = sight.topics.iter();
+        let topics = topics.filter(|topic| topic.domain_id == self.domain_id && self.takes(topic));
+        let topics = topics.filter_map(|topic| {
+            let recorded = self.report.topics.get(&topic.name);
+            if recorded.is_some_and(|topic| topic.messages > 0 || topic.paused > 0) {
+                return None;
+            }
+            let why = match &topic.aside {
+                _ if !topic.subscribed => NO_SUBSCRIBER.to_owned(),
+                aside => aside.clone()?,
+            };
+            Some((topic.name.clone(), why))
+        });
+        topics.collect()
+    }
+
+    /// What was asked for.
+    #[must_use]
+    pub const fn asked(&self) -> &Asked {
+        self.filter.asked()
+    }
+
+    /// Whether this topic is recorded, in whichever domain it is.
+    #[must_use]
+    pub fn takes(&self, topic: &SeenTopic) -> bool {
+        self.filter.takes(&Candidate {
+            name: &topic.name,
+            types: &topic.message_types,
+            published: true,
+            subscribed: topic.subscribed,
+        })
+    }
+
+    /// Topics of which messages were sampled in shared memory.
+    #[must_use]
+    pub const fn sampled(&self) -> &BTreeSet<String> {
+        &self.sampled
+    }
+
+    /// Topics in the bag, in the order in which they came into it.
+    pub fn topics(&self) -> impl Iterator<Item = &str> {
+        self.order.iter().map(String::as_str)
+    }
+
+    /// The bag so far.
+    #[must_use]
+    pub const fn writer(&self) -> &Writer {
+        &self.writer
+    }
+
+    /// Whether samples are let go by.
+    #[must_use]
+    pub const fn is_paused(&self) -> bool {
+        self.paused
+    }
+
+    /// Lets samples go by, or takes them again.
+    pub const fn pause(&mut self, paused: bool) {
+        self.paused = paused;
+    }
+
+    /// Goes on in a new file.
+    ///
+    /// # Errors
+    /// The storage takes no more.
+    pub fn split(&mut self) -> Result<(), Error> {
+        self.writer.split()
+    }
+
+    /// Complete files that are to be compressed, by another thread.
+    pub fn take_compressions(&mut self) -> Vec<FileCompression> {
+        self.writer.take_file_compressions()
+    }
+
+    /// One of them is.
+    ///
+    /// # Errors
+    /// The storage takes no more.
+    pub fn compressed(&mut self, done: &Compressed) -> Result<(), Error> {
+        self.writer.compressed(done)
+    }
+
+    /// Takes topics into the bag that may never have a message: each by its name and type, as
+    /// discovery knows them.
+    ///
+    /// # Errors
+    /// The storage takes no more.
+    pub fn declare<'t>(
+        &mut self,
+        topics: impl IntoIterator<Item = (&'t str, &'t str)>,
+    ) -> Result<(), Error> {
+        let mut topics: Vec<(&str, &str)> = topics.into_iter().collect();
+        topics.retain(|(name, _)| !self.topics.contains_key(*name));
+        let names: Vec<String> = topics.iter().map(|(name, _)| (*name).to_owned()).collect();
+        let announced = self.ask(&names);
+        for ((name, message_type), announced) in topics.into_iter().zip(announced) {
+            let place = self.decide(name, message_type, None, &announced, false)?;
+            // One that is left out may yet be published.
+            if matches!(place, Place::Taken(_)) {
+                self.topics.insert(name.to_owned(), place);
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes what the subscription gives.
+    ///
+    /// # Errors
+    /// The storage takes no more; [`Self::finish`] completes the bag all the same.
+    pub fn take(&mut self, item: &Item) -> Result<(), Error> {
+        match item {
+            Item::Sample(sample) if sample.payload.is_none() => Ok(()),
+            Item::Sample(sample) => match &mut self.ring {
+                Some(ring) if !self.paused => {
+                    ring.push(Arc::clone(sample));
+                    Ok(())
+                }
+                _ => self.write(sample),
+            },
+            Item::Clock(now) => self.clock(*now),
+            Item::Missed(missed) => {
+                if self.paused {
+                    return Ok(());
+                }
+                if self.place(&missed.topic)?.is_some() {
+                    self.report.missed(missed);
+                }
+                Ok(())
+            }
+            Item::End(_) => Ok(()),
+        }
+    }
+
+    /// Completes the bag. `error` is what ended it, if that was the storage.
+    #[must_use]
+    pub fn finish(self, error: Option<Error>) -> Ended {
+        self.finish_with(error, |work| work.run().map(Some))
+    }
+
+    /// As [`Self::finish`], with whole files compressed by `compress`: see [`Writer::close_with`].
+    #[must_use]
+    pub fn finish_with(
+        mut self,
+        error: Option<Error>,
+        compress: impl FnMut(FileCompression) -> Result<Option<Compressed>, Error>,
+    ) -> Ended {
+        if let Some(Error::Limit(limit)) = &error {
+            self.report.limit_reached = Some(limit.clone());
+        }
+        let sight = (self.sources.sight)();
+        self.note_what_was_sent_before(&sight);
+        self.note_what_was_not_observed(sight);
+        // Before the report goes into the bag.
+        self.writer.settle();
+        for (topic, messages, bytes) in self.writer.unwritten() {
+            self.report.unwritten(topic, messages, bytes);
+        }
+        let custom_data = self.report.custom_data();
+        let closed = self.writer.close_with(custom_data, compress);
+        let (summary, close_error) = match closed {
+            Ok(summary) => (Some(summary), None),
+            Err(error) => (None, Some(error)),
+        };
+        Ended {
+            summary,
+            report: self.report,
+            error: error.or(close_error),
+        }
+    }
+
+    fn write(&mut self, sample: &Sample) -> Result<(), Error> {
+        let Some(payload) = &sample.payload else {
+            return Ok(());
+        };
+        let topic = &*sample.topic;
+        if self.paused {
+            if self.would_take(&topic.name) {
+                self.report.paused(&topic.name);
+            }
+            return Ok(());
+        }
+        let Some(taken) = self.place(topic)? else {
+            return Ok(());
+        };
+        let id = taken.id;
+        if let Some(first) = taken.first.get_mut(&sample.writer) {
+            *first = sample.sequence_number.min(*first);
+        } else if taken.first.len() < WRITERS {
+            taken.first.insert(sample.writer, sample.sequence_number);
+            self.introduce(topic, sample.writer)?;
+        }
+        if let Some(room) = &mut self.room {
+            room.take(self.writer.expected_bytes(), payload.len() as u64)?;
+        }
+        let sent = sample.source_timestamp.unwrap_or(sample.time);
+        self.writer
+            .write(id, sample.time, sent, sample.sequence_number, payload)?;
+        self.report.written(&topic.name, payload.len());
+        if sample.sampled && !self.sampled.contains(&*topic.name) {
+            self.sampled.insert(topic.name.to_string());
+        }
+        Ok(())
+    }
+
+    fn clock(&mut self, now: Timestamp) -> Result<(), Error> {
+        if self.synced.0 == 0 {
+            (self.flushed, self.synced) = (now, now);
+        }
+        let since = |before: Timestamp| now.0.abs_diff(before.0);
+        if since(self.flushed) >= FLUSH
+            && let Some(room) = &self.room
+        {
+            room.check()?;
+        }
+        if since(self.synced) >= SYNC {
+            (self.flushed, self.synced) = (now, now);
+            self.writer.sync()
+        } else if since(self.flushed) >= FLUSH {
+            self.flushed = now;
+            self.writer.flush()
+        } else {
+            Ok(())
+        }
+    }
+
+    fn would_take(&self, name: &str) -> bool {
+        !matches!(self.topics.get(name), Some(Place::LeftOut))
+    }
+
+    /// The place of a topic of which something came; `None` where it is not recorded.
+    fn place(&mut self, topic: &Topic) -> Result<Option<&mut Taken>, Error> {
+        let Topic {
+            name, message_type, ..
+        } = topic;
+        if !self.topics.contains_key(&**name) {
+            let offered = topic.offered.as_deref();
+            // What the writer announced comes with its messages; the rest has to be asked for.
+            let announced = match offered {
+                Some(_) if !self.filter.asked().ignore_leaf_topics => Announced::default(),
+                _ => self.ask_one(name),
+            };
+            let place = self.decide(name, message_type, offered, &announced, true)?;
+            self.topics.insert(name.to_string(), place);
+        }
+        let Some(Place::Taken(taken)) = self.topics.get_mut(&**name) else {
+            return Ok(None);
+        };
+        // A loss may be told before the first message, and without a type.
+        if !message_type.is_empty() && taken.description.type_name != **message_type {
+            if !self
+                .report
+                .left_out
+                .iter()
+                .any(|left_out| **left_out == **name)
+            {
+                self.report.left_out.push(name.to_string());
+            }
+            return Ok(None);
+        }
+        Ok(Some(taken))
+    }
+
+    /// What is announced of these topics: as many answers as there are names.
+    fn ask(&mut self, names: &[String]) -> Vec<Announced> {
+        if names.is_empty() {
+            return Vec::new();
+        }
+        let mut announced = (self.sources.announced)(names);
+        announced.resize_with(names.len(), Announced::default);
+        announced
+    }
+
+    fn ask_one(&mut self, name: &str) -> Announced {
+        self.ask(&[name.to_owned()]).pop().unwrap_or_default()
+    }
+
+    fn decide(
+        &mut self,
+        name: &str,
+        message_type: &str,
+        offered: Option<&Offered>,
+        announced: &Announced,
+        came: bool,
+    ) -> Result<Place, Error> {
+        let known = announced
+            .message_types
+            .first()
+            .filter(|_| message_type.is_empty());
+        let message_type = known.map_or(message_type, String::as_str);
+        let types = [message_type.to_owned()];
+        let candidate = Candidate {
+            name,
+            types: &types,
+            published: came || !announced.publishers.is_empty(),
+            subscribed: !announced.subscriptions.is_empty(),
+        };
+        if !self.filter.takes(&candidate) {
+            return Ok(Place::LeftOut);
+        }
+        let type_hash = offered.and_then(|offered| offered.type_hash.as_ref());
+        let type_hash = type_hash.map(ToString::to_string);
+        let type_hash = type_hash.or_else(|| announced.type_hashes.first().cloned());
+        let publishers = announced.publishers.iter();
+        let offered: BTreeMap<_, _> = publishers
+            .map(|publisher| (publisher.guid.clone(), publisher.qos.qos()))
+            .collect();
+        let mut description = TopicDescription {
+            name: name.to_owned(),
+            type_name: message_type.to_owned(),
+            schema: (self.sources.schema)(message_type, type_hash.as_deref()),
+            type_hash,
+            publishers: offered.values().cloned().collect(),
+        };
+        // Before its first message comes its description: with that of its writer.
+        let id = self.writer.topic(description.clone())?;
+        // The bag has it now.
+        description.schema = None;
+        self.report.topic(name);
+        self.order.push(name.to_owned());
+        Ok(Place::Taken(Box::new(Taken {
+            id,
+            description,
+            offered,
+            first: HashMap::new(),
+        })))
+    }
+
+    /// Describes a topic again when a writer is new that offers something.
+    fn introduce(&mut self, topic: &Topic, writer: Guid) -> Result<(), Error> {
+        let (Some(offered), Some(Place::Taken(taken))) =
+            (&topic.offered, self.topics.get_mut(&*topic.name))
+        else {
+            return Ok(());
+        };
+        let before = taken
+            .offered
+            .insert(writer.to_string(), offered.qos.clone());
+        if before.is_some_and(|before| before == offered.qos) {
+            return Ok(());
+        }
+        taken.description.publishers = taken.offered.values().cloned().collect();
+        self.writer.topic(taken.description.clone()).map(drop)
+    }
+
+    /// Publishers that keep samples for late joiners, of which the first ones are not in the bag.
+    fn note_what_was_sent_before(&mut self, sight: &Sight) {
+        let mut names: Vec<String> = Vec::new();
+        for topic in sight
+            .topics
+            .iter()
+            .filter(|topic| topic.domain_id == self.domain_id)
+        {
+            let Some(Place::Taken(taken)) = self.topics.get(&topic.name) else {
+                continue;
+            };
+            let begun: HashSet<String> = taken
+                .first
+                .iter()
+                .filter(|(_, first)| **first <= 1)
+                .map(|(writer, _)| writer.to_string())
+                .collect();
+            if topic.keepers.iter().any(|keeper| !begun.contains(keeper)) {
+                names.push(topic.name.clone());
+            }
+        }
+        names.sort();
+        self.report.sent_before = names;
+    }
+
+    /// What would have been taken, had it been seen, announced, or in this domain.
+    fn note_what_was_not_observed(&mut self, sight: Sight) {
+        let mut domains: BTreeMap<u32, OtherDomain> = BTreeMap::new();
+        self.report.unobserved = self.unobserved(&sight);
+        for topic in sight.topics {
+            if topic.domain_id == self.domain_id || !self.takes(&topic) {
+                continue;
+            }
+            let domain = domains.entry(topic.domain_id).or_default();
+            domain.domain_id = topic.domain_id;
+            domain.topics += 1;
+            if let Some(messages) = topic.messages {
+                let before = self.before.topics.get(&(topic.domain_id, topic.name));
+                let new = messages.saturating_sub(before.copied().unwrap_or(0));
+                *domain.messages.get_or_insert(0) += new;
+            }
+        }
+        self.report.other_domains = domains.into_values().collect();
+        for (writer, messages) in sight.unknown_writers {
+            let before = self.before.unknown_writers.get(&writer);
+            let new = messages.saturating_sub(before.copied().unwrap_or(0));
+            if new > 0 {
+                self.report.unknown_writers.writers += 1;
+                self.report.unknown_writers.messages += new;
+            }
+        }
+    }
+}
+
+impl std::fmt::Debug for Recorder<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Recorder")
+            .field("writer", &self.writer)
+            .field("report", &self.report)
+            .finish_non_exhaustive()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::{EntityId, GuidPrefix};
+
+    use super::*;
+    use crate::subscriptions::{Missed, MissedReason};
+    use ros2probe_bag::Options;
+
+    const KEEPER: &str = r#"{"reliability": "RELIABLE", "durability": "TRANSIENT_LOCAL",
+        "history": "KEEP_LAST (1)", "deadline_seconds": null, "lifespan_seconds": null,
+        "liveliness": "AUTOMATIC", "liveliness_lease_seconds": null}"#;
+
+    fn writer(number: u8) -> Guid {
+        Guid {
+            prefix: GuidPrefix([number; 12]),
+            entity: EntityId([0, 0, number, 3]),
+        }
+    }
+
+    fn topic(name: &str, message_type: &str) -> Arc<Topic> {
+        Arc::new(Topic {
+            domain_id: 0,
+            name: name.into(),
+            dds_name: format!("rt{name}").into(),
+            message_type: message_type.into(),
+            offered: None,
+        })
+    }
+
+    fn sample(name: &str, number: u64) -> Item {
+        Item::Sample(Arc::new(Sample {
+            topic: topic(name, "std_msgs/msg/String"),
+            time: Timestamp(1_000 + number),
+            writer: writer(1),
+            sequence_number: number,
+            source_timestamp: Some(Timestamp(number)),
+            header_stamp: None,
+            size: 12,
+            sampled: false,
+            payload: Some(vec![0, 1, 0, 0, 4, 0, 0, 0, b'a', b'b', b'c', 0].into()),
+        }))
+    }
+
+    fn keepers() -> Announced {
+        let publishers = format!(r#"[{{"guid": "{}", "qos": {KEEPER}}}]"#, writer(1));
+        let json = format!(
+            r#"{{"message_types": [], "type_hashes": [], "publishers": {publishers},
+                "subscriptions": []}}"#
+        );
+        serde_json::from_str(&json).unwrap()
+    }
+
+    /// A publisher of `/tf_static` that keeps its samples.
+    fn static_transforms() -> Sight {
+        Sight {
+            topics: vec![SeenTopic {
+                name: "/tf_static".to_owned(),
+                subscribed: true,
+                keepers: vec![writer(1).to_string()],
+                ..SeenTopic::default()
+            }],
+            ..Sight::default()
+        }
+    }
+
+    fn recorder(directory: &std::path::Path, asked: Asked) -> Recorder<'static> {
+        recorder_of(directory, asked, Sight::default(), static_transforms())
+    }
+
+    /// With what is there when it begins and when it ends.
+    fn recorder_of(
+        directory: &std::path::Path,
+        asked: Asked,
+        before: Sight,
+        after: Sight,
+    ) -> Recorder<'static> {
+        let sources = Sources {
+            sight: Box::new(move || after.clone()),
+            announced: Box::new(|names| {
+                let announced = names.iter().map(|name| match name.as_str() {
+                    "/tf_static" => keepers(),
+                    _ => Announced::default(),
+                });
+                announced.collect()
+            }),
+            schema: Box::new(|_, _| None),
+        };
+        let bag = Writer::create(directory, Options::default()).unwrap();
+        Recorder::new(bag, Filter::new(asked).unwrap(), 0, before, sources)
+    }
+
+    fn numbers(ended: &Ended) -> Vec<(String, u32)> {
+        let mut found = Vec::new();
+        for file in &ended.summary.as_ref().unwrap().files {
+            let bytes = std::fs::read(file).unwrap();
+            for message in mcap::MessageStream::new(&bytes).unwrap() {
+                let message = message.unwrap();
+                found.push((message.channel.topic.clone(), message.sequence));
+            }
+        }
+        found
+    }
+
+    #[test]
+    fn what_the_filter_takes_is_in_the_bag_and_what_is_missing_in_the_report() {
+        let directory = tempfile::tempdir().unwrap();
+        let asked = Asked {
+            exclude_topics: vec!["/noise".to_owned()],
+            ..Asked::everything()
+        };
+        let mut recorder = recorder(&directory.path().join("bag"), asked);
+        for item in [sample("/a", 1), sample("/noise", 1), sample("/a", 2)] {
+            recorder.take(&item).unwrap();
+        }
+        let missed = |name| {
+            Item::Missed(Missed {
+                topic: topic(name, "std_msgs/msg/String"),
+                writer: writer(1),
+                first: 3,
+                last: 4,
+                samples: 2,
+                reason: MissedReason::QueueFull,
+            })
+        };
+        recorder.take(&missed("/a")).unwrap();
+        recorder.take(&missed("/noise")).unwrap();
+        let ended = recorder.finish(None);
+        assert_eq!(
+            numbers(&ended),
+            [("/a".to_owned(), 1), ("/a".to_owned(), 2)]
+        );
+        assert_eq!((ended.report.messages, ended.report.missing), (2, 2));
+        assert_eq!(ended.report.topics.keys().collect::<Vec<_>>(), ["/a"]);
+        let metadata = ended.summary.unwrap().directory.join("metadata.yaml");
+        assert!(
+            std::fs::read_to_string(metadata)
+                .unwrap()
+                .contains("first_sequence_number")
+        );
+    }
+
+    #[test]
+    fn a_recording_ends_at_its_size_with_the_limit_in_its_report() {
+        let directory = tempfile::tempdir().unwrap();
+        let limits = crate::config::RecordingLimits {
+            max_bytes: Some(10_000),
+            ..Default::default()
+        };
+        let room = Room::new(directory.path(), limits);
+        let mut recorder =
+            recorder(&directory.path().join("bag"), Asked::everything()).within(room);
+        let refused = (1..).find_map(|number| recorder.take(&sample("/a", number)).err());
+        let ended = recorder.finish(refused);
+        let limit = ended.report.limit_reached.clone().unwrap();
+        assert!(limit.contains("recordings.max_bytes"), "{limit}");
+        assert_eq!(ended.report.missing, 0);
+        assert_eq!(numbers(&ended).len() as u64, ended.report.messages);
+        assert!(
+            (50..250).contains(&ended.report.messages),
+            "{:?}",
+            ended.report
+        );
+        assert!(
+            ended
+                .report
+                .shortfalls()
+                .concat()
+                .contains("ended by a limit")
+        );
+    }
+
+    #[test]
+    fn samples_go_by_while_it_is_paused() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+        recorder.take(&sample("/a", 1)).unwrap();
+        recorder.pause(true);
+        recorder.take(&sample("/a", 2)).unwrap();
+        recorder.pause(false);
+        recorder.take(&sample("/a", 3)).unwrap();
+        let ended = recorder.finish(None);
+        assert_eq!(numbers(&ended).len(), 2);
+        assert_eq!(
+            (ended.report.topics["/a"].paused, ended.report.missing),
+            (1, 0)
+        );
+    }
+
+    #[test]
+    fn a_topic_of_two_types_keeps_the_first_and_says_so() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+        recorder.take(&sample("/a", 1)).unwrap();
+        let Item::Sample(other) = sample("/a", 2) else {
+            unreachable!()
+        };
+        let other = Sample {
+            topic: topic("/a", "std_msgs/msg/Int32"),
+            ..Sample::clone(&other)
+        };
+        recorder.take(&Item::Sample(Arc::new(other))).unwrap();
+        let ended = recorder.finish(None);
+        assert_eq!(numbers(&ended).len(), 1);
+        assert_eq!(ended.report.left_out, ["/a"]);
+        assert!(
+            ended.report.shortfalls()[0].ends_with("other types than the first are not recorded")
+        );
+    }
+
+    #[test]
+    fn what_publishers_sent_before_is_named_unless_it_is_there() {
+        for (number, expected) in [(1, 0), (2, 1)] {
+            let directory = tempfile::tempdir().unwrap();
+            let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+            recorder.take(&sample("/tf_static", number)).unwrap();
+            recorder.take(&sample("/a", 2)).unwrap();
+            assert_eq!(recorder.finish(None).report.sent_before.len(), expected);
+        }
+        // Nothing came at all: it is in the bag by its name.
+        let directory = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+        let topics = [
+            ("/tf_static", "tf2_msgs/msg/TFMessage"),
+            ("/nobody", "std_msgs/msg/String"),
+        ];
+        recorder.declare(topics).unwrap();
+        let ended = recorder.finish(None);
+        assert_eq!(ended.report.sent_before, ["/tf_static"]);
+        assert_eq!(ended.report.topics.len(), 1);
+    }
+
+    #[test]
+    fn what_came_is_on_the_disk_after_a_second_of_samples() {
+        let directory = tempfile::tempdir().unwrap();
+        let bag = directory.path().join("bag");
+        let mut recorder = recorder(&bag, Asked::everything());
+        recorder.take(&Item::Clock(Timestamp(1))).unwrap();
+        recorder.take(&sample("/a", 1)).unwrap();
+        let size = || std::fs::metadata(bag.join("bag_0.mcap")).unwrap().len();
+        let before = size();
+        recorder.take(&Item::Clock(Timestamp(SECOND + 1))).unwrap();
+        assert!(size() > before);
+    }
+
+    #[test]
+    fn what_was_not_observed_is_counted_from_the_beginning_of_the_recording() {
+        let topic = |domain_id, name: &str, aside: Option<&str>, messages| SeenTopic {
+            domain_id,
+            name: name.to_owned(),
+            subscribed: name != "/alone",
+            aside: aside.map(str::to_owned),
+            messages,
+            ..SeenTopic::default()
+        };
+        let sight = |writers: &[(&str, u64)], others: u64| Sight {
+            topics: vec![
+                topic(0, "/alone", None, None),
+                topic(0, "/quiet", None, None),
+                topic(0, "/a", Some("same_process"), None),
+                topic(0, "/imu", Some("same_process"), None),
+                topic(7, "/imu", None, Some(others)),
+                topic(7, "/odom", None, Some(0)),
+                topic(8, "/imu", None, None),
+            ],
+            unknown_writers: writers
+                .iter()
+                .map(|(writer, messages)| ((*writer).to_owned(), *messages))
+                .collect(),
+        };
+        let directory = tempfile::tempdir().unwrap();
+        let before = sight(&[("01", 5), ("02", 7)], 100);
+        let after = sight(&[("01", 5), ("02", 10), ("03", 1)], 140);
+        let bag = directory.path().join("bag");
+        let mut recorder = recorder_of(&bag, Asked::everything(), before, after);
+        recorder.take(&sample("/a", 1)).unwrap();
+        let report = recorder.finish(None).report;
+        let why = |name: &str| report.unobserved.get(name).map(String::as_str);
+        assert_eq!(report.unobserved.len(), 2);
+        assert_eq!(why("/alone"), Some(NO_SUBSCRIBER));
+        assert_eq!(why("/imu"), Some("same_process"));
+        let unknown = report.unknown_writers;
+        assert_eq!((unknown.writers, unknown.messages), (2, 4));
+        let others = report.other_domains.iter();
+        let others: Vec<_> = others
+            .map(|each| (each.domain_id, each.topics, each.messages))
+            .collect();
+        assert_eq!(others, [(7, 2, Some(40)), (8, 1, None)]);
+    }
+}

@@ -1,0 +1,527 @@
+//! The agent's own recordings: begun and ended by clients, each on a thread of its own, written where
+//! the configuration allows and nowhere else.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, SystemTime};
+
+use jiff::Zoned;
+use tokio::sync::Notify;
+
+use super::announced::{Announced, Sight};
+use super::filter::{Asked, Filter, FilterError};
+use super::recorder::{Ended, Recorder, Sources};
+use super::report::Report;
+use super::room::Room;
+use super::session::{self, Going, Order};
+use crate::config::{Limit, RecordingLimits};
+use crate::subscriptions::{
+    ChoiceError, Depth, Got, Overflow, Refused, Request, Selection, Subscription, Subscriptions,
+};
+use crate::surface::{AgentEvent, Board, Place, Places};
+use ros2probe_bag::{Options, Schema, Writer};
+use ros2probe_capture::system::give_back_memory;
+use ros2probe_message::Library;
+
+/// Ended ones whose report is kept.
+const ENDED: usize = 16;
+/// A larger chunk of a bag is not kept in memory, nor a larger index of a file.
+const CHUNK_BYTES: u64 = 1 << 20;
+const INDEX_BYTES: u64 = 1 << 20;
+/// Longest name of a recording.
+const NAME: usize = 128;
+
+/// All recordings of an agent.
+#[derive(Debug)]
+pub struct Recordings {
+    /// Where they are written; `None` = nowhere.
+    directory: Option<PathBuf>,
+    limits: RecordingLimits,
+    queue_bytes: usize,
+    board: Arc<Board>,
+    subscriptions: Arc<Subscriptions>,
+    library: Arc<Library>,
+    list: Mutex<Vec<Arc<Recording>>>,
+    places: Arc<Places>,
+}
+
+/// What a client wants to be recorded.
+#[derive(Debug)]
+pub struct Wanted {
+    /// Name of the directory; the time when it is left out.
+    pub name: Option<String>,
+    /// Which topics.
+    pub asked: Asked,
+    /// Of which domain.
+    pub domain_id: u32,
+    /// How it is written.
+    pub options: Options,
+    /// Begins paused.
+    pub paused: bool,
+}
+
+/// One recording.
+#[derive(Debug)]
+pub struct Recording {
+    /// Name of its directory.
+    pub name: String,
+    /// Where it lies.
+    pub directory: PathBuf,
+    /// Of which domain.
+    pub domain_id: u32,
+    /// What is recorded.
+    pub asked: Asked,
+    /// When it began.
+    pub began: SystemTime,
+    status: Mutex<Status>,
+    orders: Mutex<Sender<Order>>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+    over: Notify,
+}
+
+/// How it goes.
+#[derive(Clone, Debug, Default)]
+pub struct Status {
+    /// What it is doing.
+    pub stage: Stage,
+    /// What it has and has not.
+    pub report: Report,
+    /// Bytes of its files.
+    pub file_bytes: u64,
+    /// Files begun.
+    pub files: usize,
+    /// Why it ended, if that was not asked for.
+    pub error: Option<String>,
+}
+
+/// What a recording is doing.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Stage {
+    /// Taking what comes.
+    #[default]
+    Recording,
+    /// Letting it go by.
+    Paused,
+    /// The bag is complete.
+    Ended,
+}
+
+/// Why nothing is recorded.
+#[derive(Debug, thiserror::Error)]
+pub enum Refusal {
+    /// There is no place.
+    #[error(
+        "the agent has no place for recordings: set `recordings.directory`, or record with \
+         `rp bag record`"
+    )]
+    NoDirectory,
+    /// No name of a directory.
+    #[error("`{0}` is no name: letters, digits, `_`, `-` and `.`, not first a `.`")]
+    Name(String),
+    /// There is one of that name.
+    #[error("there is a recording `{0}` already")]
+    Exists(String),
+    /// As many as may are under way.
+    #[error("{0} recordings are under way, which is the limit (limits.recordings)")]
+    TooMany(usize),
+    /// The topics.
+    #[error(transparent)]
+    Filter(#[from] FilterError),
+    /// A topic's name.
+    #[error(transparent)]
+    Choice(#[from] ChoiceError),
+    /// Too many subscriptions.
+    #[error(transparent)]
+    Subscription(#[from] Refused),
+    /// It cannot be written.
+    #[error("{reason}")]
+    Storage {
+        /// With its causes.
+        reason: String,
+    },
+}
+
+impl Recordings {
+    /// None yet. They are written below `directory` within `limits`, and `queue_bytes` of each may wait
+    /// for that.
+    #[must_use]
+    pub fn new(
+        directory: Option<PathBuf>,
+        limits: RecordingLimits,
+        queue_bytes: usize,
+        board: Arc<Board>,
+        subscriptions: Arc<Subscriptions>,
+        library: Arc<Library>,
+    ) -> Self {
+        let places = board.limits().places(Limit::Recordings);
+        Self {
+            directory,
+            limits,
+            queue_bytes,
+            places,
+            board,
+            subscriptions,
+            library,
+            list: Mutex::new(Vec::new()),
+        }
+    }
+
+    /// Begins one. The subscription is open when this returns; see [`Subscription::in_force`].
+    ///
+    /// # Errors
+    /// It cannot be.
+    pub fn begin(&self, wanted: Wanted) -> Result<Arc<Recording>, Refusal> {
+        let filter = Filter::new(wanted.asked.clone())?;
+        let (name, directory) = self.place(wanted.name)?;
+        let mut list = self.list();
+        let Some(place) = self.places.take() else {
+            self.board.limits().reached(Limit::Recordings, 1);
+            return Err(Refusal::TooMany(self.places.cap()));
+        };
+        let room = self.room(&directory);
+        room.check().map_err(|error| refusal(&name, error))?;
+        let before = Sight::from(self.board.state().known());
+        let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
+        let mut options = wanted.options;
+        options.storage.chunk_bytes = options.storage.chunk_bytes.min(CHUNK_BYTES);
+        options.max_index_bytes = Some(INDEX_BYTES);
+        let writer = Writer::create(&directory, options);
+        let writer = writer.map_err(|error| refusal(&name, error))?;
+        let sources = self.sources(wanted.domain_id);
+        let mut recorder =
+            Recorder::new(writer, filter, wanted.domain_id, before, sources).within(room);
+        recorder.pause(wanted.paused);
+        let known = self.board.state();
+        let covered = known.known().topics.iter().filter(|topic| {
+            let (kind, hidden) = (topic.kind, topic.hidden);
+            topic.domain_id == wanted.domain_id
+                && subscription
+                    .selection()
+                    .covers(kind, &topic.name, &topic.dds_name, hidden)
+        });
+        // Messages come of no more than are measured; whoever announces thousands fills no bag.
+        let covered = covered.take(self.board.limits().caps().topics);
+        let covered = covered.filter_map(|topic| {
+            let message_type = topic.message_types.first()?;
+            Some((topic.name.as_str(), message_type.as_str()))
+        });
+        let declared = recorder.declare(covered);
+        declared.map_err(|error| refusal(&name, error))?;
+        let (give, orders) = channel();
+        let recording = Arc::new(Recording {
+            name,
+            directory,
+            domain_id: wanted.domain_id,
+            asked: wanted.asked,
+            began: SystemTime::now(),
+            status: Mutex::default(),
+            orders: Mutex::new(give),
+            thread: Mutex::default(),
+            over: Notify::new(),
+        });
+        self.board.events().tell(AgentEvent::RecordingStarted {
+            recording: recording.name.clone(),
+        });
+        let (worker, board) = (Arc::clone(&recording), Arc::clone(&self.board));
+        let work = move || worker.work(recorder, subscription, &orders, &board, place);
+        let thread = std::thread::Builder::new().name("recording".to_owned());
+        let thread = thread.spawn(work).map_err(|error| {
+            // The bag was made just now, and nothing is in it.
+            let _ = std::fs::remove_dir_all(&recording.directory);
+            let reason = format!("no thread for it: {error}");
+            self.board.events().tell(AgentEvent::RecordingEnded {
+                recording: recording.name.clone(),
+                messages: 0,
+                missing: 0,
+                reason: Some(reason.clone()),
+            });
+            Refusal::Storage { reason }
+        })?;
+        *locked(&recording.thread) = Some(thread);
+        list.push(Arc::clone(&recording));
+        forget_ended(&mut list);
+        Ok(recording)
+    }
+
+    /// All of them, as they began.
+    #[must_use]
+    pub fn all(&self) -> Vec<Arc<Recording>> {
+        let mut list = self.list();
+        forget_ended(&mut list);
+        list.clone()
+    }
+
+    /// The one of this name.
+    #[must_use]
+    pub fn find(&self, name: &str) -> Option<Arc<Recording>> {
+        // The latest, should one have been deleted and begun again.
+        self.list().iter().rfind(|each| each.name == name).cloned()
+    }
+
+    /// Completes all bags, when the agent ends.
+    pub fn finish(&self) {
+        let list = self.all();
+        for recording in &list {
+            recording.order(Order::Stop);
+        }
+        for recording in list {
+            let thread = locked(&recording.thread).take();
+            if let Some(thread) = thread
+                && thread.join().is_err()
+            {
+                tracing::error!(recording = recording.name, "the recording's thread failed");
+            }
+        }
+    }
+
+    /// Where the agent writes.
+    #[must_use]
+    pub fn directory(&self) -> Option<&Path> {
+        self.directory.as_deref()
+    }
+
+    /// What they may take of the disk.
+    #[must_use]
+    pub const fn limits(&self) -> RecordingLimits {
+        self.limits
+    }
+
+    /// The room of a bag that is to lie there.
+    pub(super) fn room(&self, bag: &Path) -> Room {
+        Room::new(bag.parent().unwrap_or(bag), self.limits)
+    }
+
+    /// Opens what `filter` takes, of one domain.
+    fn subscribe(
+        &self,
+        filter: &Filter,
+        domain_id: u32,
+        name: &str,
+    ) -> Result<Subscription, Refusal> {
+        self.open(filter.selection()?, domain_id, name)
+    }
+
+    /// Opens these topics of one domain.
+    pub(super) fn open(
+        &self,
+        topics: Selection,
+        domain_id: u32,
+        name: &str,
+    ) -> Result<Subscription, Refusal> {
+        Ok(self.subscriptions.open(Request {
+            topics,
+            domain_id: Some(domain_id),
+            depth: Depth::Payloads,
+            queue_bytes: self.queue_bytes,
+            overflow: Overflow::DropOldest,
+            label: format!("recording {name}"),
+        })?)
+    }
+
+    /// What the snapshot and the library know.
+    pub(super) fn sources(&self, domain_id: u32) -> Sources<'static> {
+        let (board, library) = (Arc::clone(&self.board), Arc::clone(&self.library));
+        let seen = Arc::clone(&self.board);
+        Sources {
+            sight: Box::new(move || Sight::from(seen.state().known())),
+            announced: Box::new(move |names| {
+                let state = board.state();
+                let topics = state.known().topics.iter();
+                let topics = topics.filter(|topic| topic.domain_id == domain_id);
+                let topics: HashMap<_, _> =
+                    topics.map(|topic| (topic.name.as_str(), topic)).collect();
+                let announced = names.iter().map(|name| {
+                    let topic = topics.get(name.as_str());
+                    topic.map_or_else(Announced::default, |topic| Announced::from(*topic))
+                });
+                announced.collect()
+            }),
+            schema: Box::new(move |name, hash| schema(&library, name, hash)),
+        }
+    }
+
+    /// Name and directory, checked.
+    pub(super) fn place(&self, name: Option<String>) -> Result<(String, PathBuf), Refusal> {
+        let Some(directory) = &self.directory else {
+            return Err(Refusal::NoDirectory);
+        };
+        let name = name.unwrap_or_else(default_name);
+        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.');
+        let is_name = !name.is_empty()
+            && name.len() <= NAME
+            && !name.starts_with('.')
+            && name.chars().all(plain);
+        if !is_name {
+            return Err(Refusal::Name(name.chars().take(NAME).collect()));
+        }
+        let place = directory.join(&name);
+        Ok((name, place))
+    }
+
+    fn list(&self) -> MutexGuard<'_, Vec<Arc<Recording>>> {
+        locked(&self.list)
+    }
+}
+
+impl Recording {
+    /// How it goes, at most half a second ago.
+    #[must_use]
+    pub fn status(&self) -> Status {
+        locked(&self.status).clone()
+    }
+
+    /// Asks for something; nothing happens where it is over.
+    pub fn order(&self, order: Order) {
+        // Nobody takes orders where it is over.
+        let _ = locked(&self.orders).send(order);
+    }
+
+    /// Waits until the bag is complete, but no longer than `patience`.
+    pub async fn over(&self, patience: Duration) -> bool {
+        let wait = async {
+            loop {
+                let over = self.over.notified();
+                if self.is_over() {
+                    return;
+                }
+                over.await;
+            }
+        };
+        tokio::time::timeout(patience, wait).await.is_ok()
+    }
+
+    fn is_over(&self) -> bool {
+        locked(&self.status).stage == Stage::Ended
+    }
+
+    fn work(
+        &self,
+        recorder: Recorder<'static>,
+        mut subscription: Subscription,
+        orders: &Receiver<Order>,
+        board: &Board,
+        place: Place,
+    ) {
+        let next = |patience| {
+            let item = subscription.next_blocking(patience);
+            Ok::<_, std::convert::Infallible>(item.map_or(Got::Nothing, Got::Item))
+        };
+        let figures = board.recordings();
+        figures.active.fetch_add(1, Ordering::Relaxed);
+        let mut counted = (0, 0, 0);
+        let mut count = |report: &Report| {
+            let now = (report.messages, report.bytes, report.missing);
+            figures.add(
+                now.0.saturating_sub(counted.0),
+                now.1.saturating_sub(counted.1),
+                now.2.saturating_sub(counted.2),
+            );
+            counted = now;
+        };
+        let (ended, _) = session::record(recorder, next, orders, |going| {
+            if let Going::Recording(recorder) = going {
+                count(recorder.report());
+                self.tell(recorder);
+            }
+        });
+        count(&ended.report);
+        figures.active.fetch_sub(1, Ordering::Relaxed);
+        drop((subscription, place));
+        let error = ended.error.as_ref().map(causes);
+        board.events().tell(AgentEvent::RecordingEnded {
+            recording: self.name.clone(),
+            messages: ended.report.messages,
+            missing: ended.report.missing,
+            reason: error.clone(),
+        });
+        self.finish(ended, error);
+        // A bag of many topics takes much, and it may be long until the next one.
+        give_back_memory();
+    }
+
+    fn tell(&self, recorder: &Recorder<'_>) {
+        let status = Status {
+            stage: if recorder.is_paused() {
+                Stage::Paused
+            } else {
+                Stage::Recording
+            },
+            report: recorder.report().clone(),
+            file_bytes: recorder.writer().bytes(),
+            files: recorder.writer().files(),
+            error: None,
+        };
+        *locked(&self.status) = status;
+    }
+
+    fn finish(&self, ended: Ended, error: Option<String>) {
+        let summary = ended.summary.as_ref();
+        let status = Status {
+            stage: Stage::Ended,
+            report: ended.report,
+            file_bytes: summary.map_or(0, |summary| summary.bytes),
+            files: summary.map_or(0, |summary| summary.files.len()),
+            error,
+        };
+        *locked(&self.status) = status;
+        self.over.notify_waiters();
+    }
+}
+
+/// What is behind a lock here is whole at any moment.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// The definition of a type for a bag, where there is one that its hash agrees with.
+pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schema> {
+    let found = library.find(name, hash).ok()?;
+    let (encoding, text) = found.schema_text();
+    Some(Schema {
+        encoding: encoding.to_owned(),
+        text: text.into(),
+    })
+}
+
+/// Local time, as rosbag2 names its directories.
+#[must_use]
+pub fn default_name() -> String {
+    Zoned::now()
+        .strftime("rosbag2_%Y_%m_%d-%H_%M_%S")
+        .to_string()
+}
+
+pub(super) fn refusal(name: &str, error: ros2probe_bag::Error) -> Refusal {
+    match error {
+        ros2probe_bag::Error::Exists(_) => Refusal::Exists(name.to_owned()),
+        error => Refusal::Storage {
+            reason: causes(&error),
+        },
+    }
+}
+
+/// An error with its causes.
+pub(super) fn causes(error: &ros2probe_bag::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = std::error::Error::source(error);
+    while let Some(next) = cause {
+        text.push_str(&format!(": {next}"));
+        cause = next.source();
+    }
+    text
+}
+
+/// Keeps the latest of those that ended.
+fn forget_ended(list: &mut Vec<Arc<Recording>>) {
+    let mut surplus = list.iter().filter(|each| each.is_over()).count();
+    surplus = surplus.saturating_sub(ENDED);
+    list.retain(|each| {
+        let goes = surplus > 0 && each.is_over();
+        surplus -= usize::from(goes);
+        !goes
+    });
+}

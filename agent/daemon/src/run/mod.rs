@@ -1,0 +1,306 @@
+//! The agent's one working thread: takes packets from the source, feeds the model, pins a snapshot
+//! to the board once a second and when a scrape asks for one. Surfaces never reach in here; they read the board.
+
+mod moment;
+pub mod replay;
+mod source;
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::{GuidPrefix, Timestamp};
+use tokio_util::sync::CancellationToken;
+
+use crate::state::Keeper;
+use crate::subscriptions::Subscriptions;
+use crate::surface::Board;
+use crate::surface::events::Drops;
+use crate::watches::Watches;
+pub use moment::Moment;
+use ros2probe_capture::live::{CaptureError, LiveSource};
+use ros2probe_capture::pcap::PcapError;
+use ros2probe_capture::system::give_back_memory;
+use ros2probe_model::history::History;
+use ros2probe_model::observer::Observer;
+use ros2probe_model::selection::Wish;
+use ros2probe_model::snapshot::Snapshot;
+pub use source::{Source, look};
+
+/// Longest time without looking at commands and the clock. Captured frames and a record ring that
+/// is half full end it earlier; each round costs a wake-up, and on a quiet host nothing else does.
+const SLICE: Duration = Duration::from_millis(250);
+/// How often surfaces get a new snapshot unasked, and how often at most when they ask.
+const PUBLISH: Duration = Duration::from_secs(1);
+const PUBLISH_ASKED: Duration = Duration::from_millis(50);
+/// Subscribers learn at least this often that nothing came.
+const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
+const CLOCK_NANOSECONDS: u64 = 100_000_000;
+/// A clock that is so far behind what was told was set back.
+const SET_BACK: u64 = 1_000_000_000;
+
+/// Why the working thread ended although nobody asked it to.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// The host's interfaces can no longer be captured.
+    #[error("capturing ended")]
+    Capture(#[from] CaptureError),
+    /// The rest of a capture cannot be read; what came before it is on the board.
+    #[error("the capture was replayed up to a fault")]
+    Replay(#[source] PcapError),
+}
+
+/// Source, model and board, for one thread.
+pub struct Run {
+    source: Source,
+    observer: Observer,
+    /// Participants whose last message the kernel filter notes.
+    followed: BTreeSet<GuidPrefix>,
+    board: Arc<Board>,
+    drops: Drops,
+    watches: Arc<Watches>,
+    subscriptions: Arc<Subscriptions>,
+    /// Those that subscriptions wait for to be in force.
+    wishes: Option<Arc<Vec<Wish>>>,
+    /// The time that subscriptions were last told.
+    told: Timestamp,
+    stop: CancellationToken,
+    keeper: Option<Keeper>,
+    history: Option<History>,
+}
+
+impl Run {
+    /// Ready to run.
+    #[must_use]
+    pub fn new(
+        source: Source,
+        observer: Observer,
+        board: Arc<Board>,
+        watches: Arc<Watches>,
+        subscriptions: Arc<Subscriptions>,
+        stop: CancellationToken,
+    ) -> Self {
+        Self {
+            source,
+            observer,
+            followed: BTreeSet::new(),
+            board,
+            drops: Drops::default(),
+            watches,
+            subscriptions,
+            wishes: None,
+            told: Timestamp::default(),
+            stop,
+            keeper: None,
+            history: None,
+        }
+    }
+
+    /// Keeps what discovery knows for the next start.
+    #[must_use]
+    pub fn keeping(self, keeper: Option<Keeper>) -> Self {
+        Self { keeper, ..self }
+    }
+
+    /// Remembers what was measured in the last seconds.
+    #[must_use]
+    pub fn remembering(self, history: Option<History>) -> Self {
+        Self { history, ..self }
+    }
+
+    /// Works until told to stop or until the capture ends; the last state stays on the board.
+    ///
+    /// # Errors
+    /// When the source fails for good.
+    pub fn run(mut self) -> Result<(), RunError> {
+        let ended = self.work();
+        self.subscriptions.end(match &ended {
+            Ok(()) if self.source.is_finished() => "end of capture",
+            Ok(()) => "agent ends",
+            Err(_) => "the capture failed",
+        });
+        if let Some(keeper) = self.keeper.take() {
+            keeper.finish(self.observer.memory());
+        }
+        ended
+    }
+
+    fn work(&mut self) -> Result<(), RunError> {
+        self.take_watches();
+        self.publish();
+        let mut published = Instant::now();
+        while !self.stop.is_cancelled() {
+            let subscribed = self.subscriptions.is_open();
+            let slice = if !self.observer.has_asked_all() {
+                Duration::ZERO
+            } else if self.board.is_asked() {
+                PUBLISH_ASKED
+            } else if subscribed {
+                SLICE_SUBSCRIBED
+            } else {
+                SLICE
+            };
+            let step = self.step(subscribed);
+            let bell = self.board.bell();
+            let polled = self.source.poll(slice, step, bell, &mut self.observer);
+            self.board.hear();
+            self.take_watches();
+            let finished = self.source.is_finished();
+            if finished {
+                if let Some(end) = self.source.cut() {
+                    self.observer.advance(end);
+                }
+                self.observer.settle();
+            } else {
+                self.observer.advance(self.source.clock());
+            }
+            self.remember();
+            self.tell_interest();
+            self.hand_over();
+            let age = published.elapsed();
+            let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
+            let held = self.source.takes_a_rest();
+            if finished || held || polled.is_err() || due {
+                self.publish();
+                published = Instant::now();
+            }
+            if held {
+                self.source.rest();
+            }
+            if finished {
+                self.board.events().settle();
+            }
+            polled?;
+            if finished {
+                return Ok(());
+            }
+        }
+        if let Source::Live(live) = &mut self.source {
+            live.drain(&mut self.observer);
+        }
+        self.hand_over();
+        self.publish();
+        Ok(())
+    }
+
+    /// Where a replay has to stop for a moment: where subscribers are told the time, or where a
+    /// second ends.
+    fn step(&self, subscribed: bool) -> Option<Timestamp> {
+        let told = subscribed.then(|| Timestamp(self.told.0.saturating_add(CLOCK_NANOSECONDS)));
+        let second = self.history.as_ref().map(History::due);
+        // Before the first packet nothing is known of the capture's time.
+        let second = second.filter(|second| second.0 > 0);
+        match (told, second) {
+            (Some(told), Some(second)) => Some(told.min(second)),
+            (told, second) => told.or(second),
+        }
+    }
+
+    /// Takes the second that has just ended.
+    fn remember(&mut self) {
+        let now = self.source.clock();
+        let Some(history) = self.history.as_mut().filter(|history| history.is_due(now)) else {
+            return;
+        };
+        history.take(now, self.observer.measured(now));
+        self.board.remember(history.past());
+    }
+
+    /// Gives away what happened since the last time; nobody makes this wait.
+    fn hand_over(&mut self) {
+        let now = self.source.clock();
+        self.board.events().add(self.observer.take_events(), now);
+        self.board.add_spans(self.observer.take_spans());
+        let given = self.observer.take_given();
+        let clock = self.observer.given_until(now);
+        if clock.0.saturating_add(SET_BACK) < self.told.0 {
+            self.told = clock;
+        }
+        let news = (clock > self.told).then_some(clock);
+        self.told = self.told.max(clock);
+        self.subscriptions.deliver(given, news);
+    }
+
+    /// Watches and gives what is asked for since the last look. The kernel knows it before the next
+    /// packets. Where many topics are matched against many globs, packets are taken in between, and
+    /// lists that change meanwhile wait.
+    fn take_watches(&mut self) {
+        if self.ask() {
+            if let Some(watchlist) = self.watches.take_news() {
+                self.subscriptions.retain(watchlist.watches());
+                self.observer.set_watchlist(watchlist);
+            }
+            if let Some(wishes) = self.subscriptions.take_news() {
+                self.observer.set_wishes(Arc::clone(&wishes));
+                self.wishes = Some(wishes);
+            }
+        }
+        let has_asked_all = self.ask();
+        self.tell_interest();
+        if has_asked_all && let Some(wishes) = self.wishes.take() {
+            self.subscriptions.in_force(&wishes);
+            if wishes.is_empty() {
+                // Those of large messages are gone, and it may be long until somebody asks again.
+                give_back_memory();
+            }
+        }
+    }
+
+    /// Goes on with what new lists say of each topic; whether that is done. A replay waits for it.
+    fn ask(&mut self) -> bool {
+        while !self.observer.ask_more() {
+            if let Source::Live(_) = self.source {
+                return false;
+            }
+        }
+        true
+    }
+
+    fn tell_interest(&mut self) {
+        if let Source::Live(live) = &mut self.source {
+            live.apply(&self.observer.interest_changes());
+        }
+    }
+
+    fn publish(&mut self) {
+        if let Source::Live(live) = &mut self.source {
+            self.observer.participants_alive(live.last_seen());
+        }
+        let mut snapshot = self.observer.snapshot(self.source.clock());
+        if let Some(history) = &self.history {
+            snapshot.tables.push(history.table());
+        }
+        if let Source::Live(live) = &mut self.source {
+            follow(live, &mut self.followed, &snapshot);
+        }
+        let mut facts = self.source.facts();
+        facts.subscriptions = self.subscriptions.facts();
+        if let Some(keeper) = &mut self.keeper {
+            let (revision, now) = (self.observer.memory_revision(), Instant::now());
+            if keeper.wants(revision, now) {
+                keeper.keep(self.observer.memory(), revision, now);
+            }
+            facts.state = Some(keeper.facts());
+        }
+        for drop in self.drops.look(&facts, Instant::now()) {
+            self.board.events().tell(drop);
+        }
+        self.board.publish(snapshot, facts);
+    }
+}
+
+/// Keeps the kernel filter's list of participants the model's.
+fn follow(live: &mut LiveSource, followed: &mut BTreeSet<GuidPrefix>, snapshot: &Snapshot) {
+    let present: BTreeSet<_> = snapshot
+        .participants
+        .iter()
+        .map(|participant| participant.guid.prefix)
+        .collect();
+    for gone in followed.difference(&present) {
+        live.follow(*gone, false);
+    }
+    for new in present.difference(followed) {
+        live.follow(*new, true);
+    }
+    *followed = present;
+}

@@ -1,0 +1,415 @@
+//! A capture as a source: its packets at the pace asked for, in slices short enough that the agent
+//! stays responsive.
+
+use std::collections::BTreeMap;
+use std::io::IsTerminal as _;
+use std::path::Path;
+use std::sync::mpsc::{self, RecvTimeoutError};
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::frame::Link;
+use tokio::sync::watch;
+
+use super::Moment;
+use ros2probe_capture::feed::Feed;
+use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
+use ros2probe_model::observer::Observer;
+use ros2probe_model::reassembly::{Limits, Reassembly};
+
+/// How often a terminal is told how far it is.
+const PROGRESS: Duration = Duration::from_secs(1);
+/// A packet this far from the last one is gone to at once, not step by step.
+const FAR: u64 = 3600 * 1_000_000_000;
+
+/// While it rests, what the agent is asked is answered so often.
+const REST: Duration = Duration::from_millis(5);
+
+/// Both ends of a rest that a replay takes at some moment, until it is told to go on.
+#[must_use]
+pub fn rest(at: Option<Moment>) -> (Rest, Waiter) {
+    let (go_on, told) = mpsc::channel();
+    let (resting, rests) = watch::channel(false);
+    let rest = Rest { at, told, resting };
+    (rest, Waiter { go_on, rests })
+}
+
+/// Where a replay waits.
+#[derive(Debug)]
+pub struct Rest {
+    /// The beginning when left out.
+    at: Option<Moment>,
+    told: mpsc::Receiver<()>,
+    resting: watch::Sender<bool>,
+}
+
+/// Who waits for the replay's rest, and ends it.
+#[derive(Debug)]
+pub struct Waiter {
+    go_on: mpsc::Sender<()>,
+    rests: watch::Receiver<bool>,
+}
+
+impl Waiter {
+    /// Returns when the replay rests, or when it has ended before.
+    pub async fn rests(&mut self) {
+        let _ = self.rests.wait_for(|resting| *resting).await;
+    }
+
+    /// Has the replay go on.
+    pub fn go_on(&self) {
+        let _ = self.go_on.send(());
+    }
+}
+
+/// A capture being replayed.
+pub struct Replay {
+    reader: PcapReader,
+    feed: Feed,
+    pacer: Pacer,
+    speed: Speed,
+    /// Read but not due yet.
+    waiting: Option<Waiting>,
+    clock: Timestamp,
+    packets: u64,
+    bytes: u64,
+    /// Packets of link layers that cannot be read, by number.
+    unsupported: BTreeMap<u16, u64>,
+    began: Option<Timestamp>,
+    progress: Option<Instant>,
+    until: Option<Moment>,
+    rest: Option<Rest>,
+    /// The capture goes on where the replay ends.
+    cut: bool,
+    finished: bool,
+}
+
+/// A packet's facts; its bytes are in `bytes`.
+struct Waiting {
+    time: Timestamp,
+    link: Link,
+    interface: u32,
+    bytes: Vec<u8>,
+    length: u32,
+}
+
+impl Replay {
+    /// Opens a capture.
+    ///
+    /// # Errors
+    /// When it cannot be read, is none, or has a link layer that cannot be read.
+    pub fn open(path: &Path, speed: Speed, limits: Limits) -> Result<Self, PcapError> {
+        let reader = PcapReader::open(path)?;
+        if let Some(link) = reader.link().filter(|link| !link.is_supported()) {
+            return Err(PcapError::UnsupportedLink { link });
+        }
+        Ok(Self {
+            reader,
+            feed: Feed::new(limits),
+            pacer: Pacer::new(speed),
+            speed,
+            waiting: None,
+            clock: Timestamp::default(),
+            packets: 0,
+            bytes: 0,
+            unsupported: BTreeMap::new(),
+            began: None,
+            progress: std::io::stderr().is_terminal().then(Instant::now),
+            until: None,
+            rest: None,
+            cut: false,
+            finished: false,
+        })
+    }
+
+    /// Ends at this moment, as if the capture ended there.
+    #[must_use]
+    pub fn until(self, until: Option<Moment>) -> Self {
+        Self { until, ..self }
+    }
+
+    /// Tells nobody how far it is: the terminal is used for something else.
+    #[must_use]
+    pub fn quiet(self) -> Self {
+        Self {
+            progress: None,
+            ..self
+        }
+    }
+
+    /// Waits at some moment until it is told to go on.
+    #[must_use]
+    pub fn resting(self, rest: Rest) -> Self {
+        Self {
+            rest: Some(rest),
+            ..self
+        }
+    }
+
+    /// Delivers what is due within `timeout`, then returns: at the latest after it, earlier at the
+    /// end of the capture, before a packet that is not older than `until`, and when the model has
+    /// much to give.
+    ///
+    /// # Errors
+    /// When the rest of the capture cannot be read; what came before has been delivered.
+    pub fn poll(
+        &mut self,
+        timeout: Duration,
+        until: Option<Timestamp>,
+        observer: &mut Observer,
+    ) -> Result<(), PcapError> {
+        let end = Instant::now() + timeout;
+        while !self.finished {
+            let now = Instant::now();
+            if now >= end || observer.has_much_to_give() {
+                break;
+            }
+            if let Some(waiting) = &self.waiting {
+                let (time, beginning) = (waiting.time, self.began.unwrap_or_default());
+                let rest = self.rest.as_ref();
+                if rest.is_some_and(|rest| rest.at_or_behind(time, beginning)) {
+                    self.wait();
+                    break;
+                }
+                let last = self.until.map(|moment| moment.in_capture(beginning));
+                let last = last.filter(|last| *last < time);
+                let time = last.unwrap_or(time);
+                let delay = self.pacer.delay(waiting.time, now);
+                let later = until.filter(|until| time > *until);
+                if let Some(until) = later
+                    && delay.is_zero()
+                {
+                    let is_far = time.0 - until.0 > FAR;
+                    let time = if is_far { time.0 - 1 } else { until.0 };
+                    self.clock = self.clock.max(Timestamp(time));
+                    break;
+                }
+                if last.is_some() {
+                    self.clock = self.clock.max(time);
+                    (self.cut, self.finished) = (true, true);
+                    break;
+                }
+                let slice = delay.min(end.saturating_duration_since(now));
+                let slice = slice.min(until.map_or(slice, |_| step(self.speed)));
+                if !slice.is_zero() {
+                    std::thread::sleep(slice);
+                }
+                if slice < delay {
+                    let clock = before(waiting.time, delay - slice, self.speed);
+                    self.clock = until
+                        .map_or(clock, |until| clock.min(until))
+                        .max(self.clock);
+                    break;
+                }
+                if later.is_some() {
+                    continue;
+                }
+                let Waiting {
+                    time,
+                    link,
+                    interface,
+                    length,
+                    ..
+                } = *waiting;
+                let bytes = &waiting.bytes;
+                self.clock = self.clock.max(time);
+                let captured = Captured {
+                    time,
+                    link,
+                    interface,
+                    bytes,
+                    length,
+                };
+                self.feed.packet(&captured, observer);
+            }
+            self.next()?;
+        }
+        self.show_progress();
+        Ok(())
+    }
+
+    /// Reads one packet ahead, into the memory of the one before.
+    fn next(&mut self) -> Result<(), PcapError> {
+        let memory = self.waiting.take().map(|waiting| waiting.bytes);
+        match self.reader.next_packet() {
+            Ok(Some(Captured {
+                time,
+                link,
+                interface,
+                bytes,
+                length,
+            })) => {
+                let mut memory = memory.unwrap_or_default();
+                memory.clear();
+                memory.extend_from_slice(bytes);
+                self.packets += 1;
+                self.bytes += bytes.len() as u64;
+                if !link.is_supported() {
+                    *self.unsupported.entry(link.0).or_default() += 1;
+                }
+                if self.began.is_none() {
+                    (self.began, self.clock) = (Some(time), time);
+                }
+                self.waiting = Some(Waiting {
+                    time,
+                    link,
+                    interface,
+                    bytes: memory,
+                    length,
+                });
+                Ok(())
+            }
+            Ok(None) => {
+                self.finished = true;
+                for (link, packets) in &self.unsupported {
+                    let link_type = link_name(Link(*link));
+                    tracing::warn!(
+                        link_type,
+                        packets,
+                        "packets of an unsupported link type left out"
+                    );
+                }
+                self.is_readable()
+            }
+            Err(error) => {
+                self.finished = true;
+                Err(error)
+            }
+        }
+    }
+
+    /// Fails where every packet is of a link layer that cannot be read.
+    fn is_readable(&self) -> Result<(), PcapError> {
+        match self.unsupported.first_key_value() {
+            Some((link, _)) if self.unsupported.values().sum::<u64>() == self.packets => {
+                let link = Link(*link);
+                Err(PcapError::UnsupportedLink { link })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Waits a moment for being told to go on. What was asked for meanwhile is to be taken before the
+    /// next packets.
+    fn wait(&mut self) {
+        let Some(rest) = &self.rest else { return };
+        let begins = rest
+            .at
+            .map(|moment| moment.in_capture(self.began.unwrap_or_default()));
+        self.clock = self.clock.max(begins.unwrap_or_default());
+        if *rest.resting.borrow() && rest.told.recv_timeout(REST) != Err(RecvTimeoutError::Timeout)
+        {
+            self.rest = None;
+        }
+    }
+
+    /// It has come to where it waits and nobody was told yet.
+    #[must_use]
+    pub fn takes_a_rest(&self) -> bool {
+        let time = self.waiting.as_ref().map(|waiting| waiting.time);
+        let beginning = self.began.unwrap_or_default();
+        time.zip(self.rest.as_ref()).is_some_and(|(time, rest)| {
+            rest.at_or_behind(time, beginning) && !*rest.resting.borrow()
+        })
+    }
+
+    /// Tells who waits for the rest.
+    pub fn rest(&mut self) {
+        if let Some(rest) = &self.rest {
+            rest.resting.send_replace(true);
+        }
+    }
+
+    /// Where it ended although the capture goes on.
+    #[must_use]
+    pub fn cut(&self) -> Option<Timestamp> {
+        self.cut.then_some(self.clock)
+    }
+
+    /// The capture's clock: the time of its last packet, running on while the next one is waited
+    /// for.
+    #[must_use]
+    pub const fn clock(&self) -> Timestamp {
+        self.clock
+    }
+
+    /// All packets were delivered.
+    #[must_use]
+    pub const fn is_finished(&self) -> bool {
+        self.finished
+    }
+
+    /// When the capture begins; `None` until its first packet is read.
+    #[must_use]
+    pub const fn began(&self) -> Option<Timestamp> {
+        self.began
+    }
+
+    /// Which part of the file was read, 0 to 1; `None` where that cannot be told.
+    #[must_use]
+    pub fn part_read(&self) -> Option<f64> {
+        if self.finished {
+            return Some(1.0);
+        }
+        self.reader.part_read()
+    }
+
+    /// Packets and their bytes so far.
+    #[must_use]
+    pub const fn progress(&self) -> (u64, u64) {
+        (self.packets, self.bytes)
+    }
+
+    /// Packets of link layers that cannot be read, by the layer's number.
+    #[must_use]
+    pub const fn unsupported(&self) -> &BTreeMap<u16, u64> {
+        &self.unsupported
+    }
+
+    /// What puts its fragments together, for its counters.
+    #[must_use]
+    pub const fn reassembly(&self) -> &Reassembly {
+        self.feed.reassembly()
+    }
+
+    fn show_progress(&mut self) {
+        let Some(last) = self.progress else { return };
+        if self.finished {
+            eprint!("\r\x1b[K");
+            self.progress = None;
+        } else if last.elapsed() >= PROGRESS {
+            self.progress = Some(Instant::now());
+            let seconds =
+                self.clock.nanoseconds_since(self.began.unwrap_or_default()) / 1_000_000_000;
+            eprint!(
+                "\rreplayed {} packets, {seconds} s of the capture\x1b[K",
+                self.packets
+            );
+        }
+    }
+}
+
+/// How long a tenth of a second of the capture takes.
+fn step(speed: Speed) -> Duration {
+    match speed {
+        Speed::Max => Duration::ZERO,
+        Speed::Times(factor) => Duration::try_from_secs_f64(0.1 / factor).unwrap_or(Duration::MAX),
+    }
+}
+
+impl Rest {
+    fn at_or_behind(&self, time: Timestamp, beginning: Timestamp) -> bool {
+        self.at.is_none_or(|at| at.in_capture(beginning) <= time)
+    }
+}
+
+/// The capture's time when a packet is `delay` away.
+fn before(time: Timestamp, delay: Duration, speed: Speed) -> Timestamp {
+    let Speed::Times(factor) = speed else {
+        return time;
+    };
+    let distance =
+        Duration::try_from_secs_f64(delay.as_secs_f64() * factor).unwrap_or(Duration::MAX);
+    let nanoseconds = u64::try_from(distance.as_nanos()).unwrap_or(u64::MAX);
+    Timestamp(time.0.saturating_sub(nanoseconds))
+}

@@ -1,0 +1,342 @@
+//! Where packets come from: this host or a capture, behind one face for the working thread.
+//!
+//! Also what the agent says of it: in the log once, at the start, and on the board.
+
+use std::os::fd::BorrowedFd;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::filter::Counter;
+
+use super::RunError;
+use super::replay::Replay;
+use crate::config::CaptureSettings;
+use crate::surface::{
+    Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
+};
+use ros2probe_capture::host::HostTap;
+use ros2probe_capture::live::{CaptureError, LiveSource};
+use ros2probe_capture::shm;
+use ros2probe_model::observer::Observer;
+use ros2probe_model::reassembly::Limits;
+
+/// Where packets come from.
+pub enum Source {
+    /// This host.
+    Live(Box<LiveSource>),
+    /// A capture.
+    Replay(Box<Replay>),
+}
+
+/// What an agent with these settings would see on this host: its taps are opened for a moment, and
+/// read nothing.
+///
+/// # Errors
+/// A capability is missing, or the kernel refuses.
+pub fn look(settings: &CaptureSettings) -> Result<AgentFacts, CaptureError> {
+    let live = LiveSource::open(settings, Limits::default())?;
+    Ok(Source::Live(Box::new(live)).facts())
+}
+
+impl Source {
+    /// Sockets, wire or replay.
+    #[must_use]
+    pub const fn kind(&self) -> SourceKind {
+        match self {
+            Self::Live(live) => kind(live),
+            Self::Replay(_) => SourceKind::Replay,
+        }
+    }
+
+    /// Says in the log what this looks at, what it can tell and what it cannot.
+    pub fn announce(&self, settings: &CaptureSettings) {
+        let Self::Live(live) = self else { return };
+        if let Some(reason) = live.without_host() {
+            tracing::warn!("host hook not used: {reason}; using packet sockets");
+        }
+        if let Some(reason) = live.without_exact() {
+            tracing::warn!("capture.shm.exact not used: {reason}; shared memory is sampled");
+        }
+        if !live.is_on_the_wire() && !settings.network_namespaces.is_empty() {
+            tracing::info!("capture.network_namespaces is not needed: all sockets are seen");
+        }
+        for (ability, able) in inside(live).into_iter().flatten() {
+            if let Err(reason) = able {
+                tracing::warn!(ability = ability.label(), reason, "not available here");
+            }
+        }
+        let able = abilities(live);
+        let (sees, blind): (Vec<_>, Vec<_>) = Ability::ALL
+            .into_iter()
+            .partition(|ability| able.contains(ability));
+        let words = |list: Vec<Ability>| list.into_iter().map(Ability::label).collect::<Vec<_>>();
+        tracing::info!(
+            source = self.kind().label(),
+            cgroup = live.host().map(|host| host.cgroup().display().to_string()),
+            sees = words(sees).join(", "),
+            blind = words(blind).join(", "),
+            "looking"
+        );
+    }
+
+    /// Takes in what comes, for `timeout` at most; of a capture nothing from `until` on.
+    pub(super) fn poll(
+        &mut self,
+        timeout: Duration,
+        until: Option<Timestamp>,
+        bell: Option<BorrowedFd<'_>>,
+        observer: &mut Observer,
+    ) -> Result<(), RunError> {
+        match self {
+            Self::Live(live) => Ok(live.poll(timeout, bell, observer)?),
+            Self::Replay(replay) => replay
+                .poll(timeout, until, observer)
+                .map_err(RunError::Replay),
+        }
+    }
+
+    pub(super) fn clock(&self) -> Timestamp {
+        match self {
+            Self::Live(live) => live.clock(),
+            Self::Replay(replay) => replay.clock(),
+        }
+    }
+
+    pub(super) fn is_finished(&self) -> bool {
+        match self {
+            Self::Live(_) => false,
+            Self::Replay(replay) => replay.is_finished(),
+        }
+    }
+
+    /// Where a replay was told to end although the capture goes on.
+    pub(super) fn cut(&self) -> Option<Timestamp> {
+        match self {
+            Self::Live(_) => None,
+            Self::Replay(replay) => replay.cut(),
+        }
+    }
+
+    /// A replay has just come to where it waits: what is known there is to be shown.
+    pub(super) fn takes_a_rest(&self) -> bool {
+        match self {
+            Self::Live(_) => false,
+            Self::Replay(replay) => replay.takes_a_rest(),
+        }
+    }
+
+    /// It is shown.
+    pub(super) fn rest(&mut self) {
+        if let Self::Replay(replay) = self {
+            replay.rest();
+        }
+    }
+
+    pub(super) fn facts(&mut self) -> AgentFacts {
+        let now = Instant::now();
+        match self {
+            Self::Live(live) => live_facts(live, now),
+            Self::Replay(replay) => {
+                let (packets, bytes) = replay.progress();
+                let reassembly = replay.reassembly();
+                let counters = reassembly.counters();
+                AgentFacts {
+                    finished: replay.is_finished(),
+                    capture_begin: replay.began(),
+                    replayed: replay.part_read(),
+                    unsupported_packets: replay
+                        .unsupported()
+                        .iter()
+                        .map(|(link, packets)| (*link, *packets))
+                        .collect(),
+                    interfaces: vec![InterfaceFacts {
+                        name: "replay".to_owned(),
+                        packets: Some(packets),
+                        dropped: None,
+                    }],
+                    copied_bytes: bytes,
+                    incomplete_datagrams: counters.evicted + counters.timed_out,
+                    reassembly_bytes: reassembly.bytes() as u64,
+                    reassembly_evicted: counters.evicted,
+                    ..AgentFacts::new(SourceKind::Replay, now)
+                }
+            }
+        }
+    }
+}
+
+fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
+    let named = |namespace: Option<PathBuf>, name: &str| match namespace {
+        Some(path) => format!("{}:{name}", path.display()),
+        None => name.to_owned(),
+    };
+    // A socket for all interfaces of a namespace has one drop counter.
+    let drops = live.drops().unwrap_or_default();
+    let mut interfaces: Vec<_> = drops
+        .into_iter()
+        .map(|count| InterfaceFacts {
+            name: named(count.namespace, "any"),
+            packets: None,
+            dropped: Some(count.dropped),
+        })
+        .collect();
+    interfaces.extend(live.packets().map(|count| InterfaceFacts {
+        name: named(count.namespace, &count.name),
+        packets: Some(count.packets),
+        dropped: None,
+    }));
+    interfaces.extend(live.host().map(|host| InterfaceFacts {
+        name: "sockets".to_owned(),
+        packets: Some(host.intake().datagrams()),
+        dropped: None,
+    }));
+    interfaces.extend(live.messages_of_processes().map(|messages| InterfaceFacts {
+        name: "processes".to_owned(),
+        packets: Some(messages),
+        dropped: None,
+    }));
+    let gone = live.gone();
+    let counters = live.counters().unwrap_or_default();
+    let value = |wanted: Counter| {
+        counters
+            .iter()
+            .find(|(counter, _)| *counter == wanted)
+            .map_or(0, |(_, value)| *value)
+    };
+    AgentFacts {
+        interfaces,
+        // Bytes are no events; those copied are counted below.
+        filter_events: counters
+            .iter()
+            .filter(|(counter, _)| *counter != Counter::CapturedBytes)
+            .map(|(counter, value)| (counter.label(), *value))
+            .collect(),
+        copied_bytes: live.copied_bytes(),
+        records_dropped: value(Counter::RecordsLost),
+        incomplete_datagrams: live.incomplete_datagrams(),
+        reassembly_bytes: live.reassembly_bytes() as u64,
+        reassembly_evicted: live.reassembly_evicted(),
+        pieces_bytes: live.waiting_bytes() as u64,
+        refused_updates: live.refused_updates(),
+        source_reason: live.without_host().map(str::to_owned),
+        abilities: abilities(live),
+        blind: blind(live),
+        gone,
+        attached_anew: live.attached_anew(),
+        pieces_dropped: value(Counter::PiecesLost),
+        contended: value(Counter::Contended),
+        shared_memory: live.shared_memory().map(shared_memory),
+        exact: exact(live),
+        ..AgentFacts::new(kind(live), now)
+    }
+}
+
+/// What exact mode covers, and why not everything; nothing where it was not asked for.
+fn exact(live: &LiveSource) -> Vec<ExactFacts> {
+    let whole = |reason: &str| ExactFacts {
+        library: String::new(),
+        refused: Some(reason.to_owned()),
+    };
+    let Some(facts) = live.exact() else {
+        return live.without_exact().map(whole).into_iter().collect();
+    };
+    let libraries = facts.libraries.into_iter().map(|library| ExactFacts {
+        library: library.path.display().to_string(),
+        refused: library.refused,
+    });
+    // Containers have the same library by the same name.
+    let mut libraries: Vec<_> = libraries.collect();
+    libraries.sort();
+    libraries.dedup();
+    libraries.extend(facts.uncovered.as_deref().map(whole));
+    libraries
+}
+
+fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
+    let counters = facts.counters;
+    SharedMemoryFacts {
+        open: vec![
+            ("port", counters.ports),
+            ("segment", counters.segments),
+            ("directory", counters.places),
+        ],
+        events: vec![
+            ("announced", counters.announced),
+            ("read", counters.read),
+            ("captured", counters.captured),
+            ("missed", counters.missed),
+            ("unfilled", counters.unfilled),
+            ("unreachable", counters.unreachable),
+            ("malformed", counters.malformed),
+            ("abandoned", counters.abandoned),
+            ("uncertain", counters.uncertain),
+            ("left_out", counters.left_out),
+            ("refused", facts.refused),
+        ],
+        cpu_seconds: facts.cpu_seconds,
+        looks: facts.looks,
+    }
+}
+
+/// What this source can see on this kernel and with this configuration.
+fn abilities(live: &LiveSource) -> Vec<Ability> {
+    let mut abilities = kind(live).abilities().to_vec();
+    if live.host().is_some_and(|host| host.detached().is_some()) {
+        // Its sockets, its processes and their shared memory are gone with the cgroup.
+        return match live.is_on_the_wire() {
+            true => vec![Ability::Forwarded],
+            false => Vec::new(),
+        };
+    }
+    if live.host().is_some_and(HostTap::is_whole_host) {
+        abilities.push(Ability::Containers);
+    }
+    let inside = inside(live).into_iter().flatten();
+    abilities.extend(inside.filter_map(|(ability, able)| able.is_ok().then_some(ability)));
+    if live.host().is_some() && live.is_on_the_wire() {
+        abilities.push(Ability::Forwarded);
+    }
+    if live.looks_at_shared_memory() {
+        abilities.push(Ability::SharedMemory);
+    }
+    if live.exact().is_some_and(|facts| facts.uncovered.is_none()) {
+        abilities.push(Ability::SharedMemoryExact);
+    }
+    abilities
+}
+
+/// Why it cannot see the rest, where that is known.
+fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
+    if let Some(reason) = live.host().and_then(HostTap::detached) {
+        let able = abilities(live);
+        let lost = Ability::ALL.into_iter().filter(|one| !able.contains(one));
+        return lost.map(|ability| (ability, reason.clone())).collect();
+    }
+    let inside = inside(live).into_iter().flatten();
+    let mut blind: Vec<_> = inside
+        .filter_map(|(ability, able)| Some((ability, able.as_ref().err()?.clone())))
+        .collect();
+    let uncovered = live.exact().and_then(|facts| facts.uncovered);
+    let exact = live.without_exact().map(str::to_owned).or(uncovered);
+    blind.extend(exact.map(|reason| (Ability::SharedMemoryExact, reason)));
+    blind
+}
+
+/// What depends on the kernel.
+fn inside(live: &LiveSource) -> Option<[(Ability, &Result<(), String>); 3]> {
+    let abilities = live.host()?.abilities()?;
+    Some([
+        (Ability::SocketLosses, &abilities.socket_losses),
+        (Ability::ReassemblyLosses, &abilities.reassembly_losses),
+        (Ability::Owners, &abilities.owners),
+    ])
+}
+
+const fn kind(live: &LiveSource) -> SourceKind {
+    if live.host().is_some() {
+        SourceKind::Host
+    } else {
+        SourceKind::Wire
+    }
+}

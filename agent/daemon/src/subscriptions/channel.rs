@@ -1,0 +1,363 @@
+//! The queue between the capture thread and one reader, bounded in bytes.
+//!
+//! The capture thread holds its lock for the time of a push, the reader for that of a pop. What is
+//! put into it is for its reader: it chooses no topics.
+
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::Timestamp;
+use tokio::sync::Notify;
+use tokio_util::sync::CancellationToken;
+
+use super::backlog::Backlog;
+use super::{Depth, Item, Overflow, Request, Selection};
+use ros2probe_model::payloads::{Missed, MissedReason, Sample};
+use ros2probe_model::selection::Wish;
+
+/// What a queued entry costs besides a payload.
+const OVERHEAD: usize = 256;
+/// Losses that wait to be told one by one, by writer and reason; more are told together.
+const MISSED: usize = 1024;
+/// How often a source that waits for a reader looks whether the agent ends.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// One subscription, shared by both ends.
+#[derive(Debug)]
+pub(super) struct Channel {
+    id: u64,
+    selection: Arc<Selection>,
+    request: Terms,
+    queue: Mutex<Queue>,
+    /// Bytes in the queue, to be read without its lock.
+    bytes: AtomicUsize,
+    /// Something may be read, for readers that are tasks and for those that are threads.
+    readable: Notify,
+    changed: Condvar,
+    in_force: AtomicBool,
+    known: Notify,
+}
+
+#[derive(Debug)]
+struct Terms {
+    domain_id: Option<u32>,
+    depth: Depth,
+    queue_bytes: usize,
+    overflow: Overflow,
+    label: String,
+}
+
+#[derive(Debug, Default)]
+struct Queue {
+    waiting: Backlog,
+    /// Samples dropped since the reader was last told.
+    dropped: Vec<Missed>,
+    /// Of those, how many are not counted yet.
+    uncounted: u64,
+    end: Option<&'static str>,
+    /// The reader has gone.
+    closed: bool,
+}
+
+/// Bytes that count in the sum of all queues for as long as this lives.
+#[derive(Debug)]
+pub(super) struct Charge {
+    queued: Arc<AtomicUsize>,
+    bytes: usize,
+}
+
+impl Charge {
+    /// For one payload, in however many queues.
+    pub(super) fn new(queued: &Arc<AtomicUsize>, bytes: usize) -> Arc<Self> {
+        queued.fetch_add(bytes, Ordering::Relaxed);
+        Arc::new(Self {
+            queued: Arc::clone(queued),
+            bytes,
+        })
+    }
+}
+
+impl Drop for Charge {
+    fn drop(&mut self) {
+        self.queued.fetch_sub(self.bytes, Ordering::Relaxed);
+    }
+}
+
+impl Channel {
+    pub(super) fn new(id: u64, request: Request) -> Self {
+        Self {
+            id,
+            selection: Arc::new(request.topics),
+            request: Terms {
+                domain_id: request.domain_id,
+                depth: request.depth,
+                queue_bytes: request.queue_bytes,
+                overflow: request.overflow,
+                label: request.label,
+            },
+            queue: Mutex::default(),
+            bytes: AtomicUsize::new(0),
+            readable: Notify::new(),
+            changed: Condvar::new(),
+            in_force: AtomicBool::new(false),
+            known: Notify::new(),
+        }
+    }
+
+    pub(super) const fn id(&self) -> u64 {
+        self.id
+    }
+
+    pub(super) fn label(&self) -> &str {
+        &self.request.label
+    }
+
+    pub(super) const fn depth(&self) -> Depth {
+        self.request.depth
+    }
+
+    pub(super) fn selection(&self) -> &Selection {
+        &self.selection
+    }
+
+    pub(super) fn wish(&self) -> Wish {
+        Wish {
+            id: self.id,
+            selection: Arc::clone(&self.selection),
+            domain_id: self.request.domain_id,
+            depth: self.request.depth,
+        }
+    }
+
+    pub(super) fn is_in_force(&self) -> bool {
+        self.in_force.load(Ordering::Acquire)
+    }
+
+    pub(super) fn set_in_force(&self) {
+        if !self.in_force.swap(true, Ordering::Release) {
+            self.known.notify_one();
+        }
+    }
+
+    pub(super) async fn in_force(&self) {
+        if !self.in_force.load(Ordering::Acquire) {
+            self.known.notified().await;
+        }
+    }
+
+    /// Queues a sample. On a replay, this and all else waits for room until the reader goes or the
+    /// agent ends.
+    pub(super) fn sample(
+        &self,
+        sample: &Arc<Sample>,
+        charge: Option<&Arc<Charge>>,
+        stop: &CancellationToken,
+    ) {
+        let bytes = OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len);
+        let mut queue = self.wait_for_room(bytes, stop);
+        let item = Item::Sample(Arc::clone(sample));
+        self.push(&mut queue, item, bytes, charge.map(Arc::clone));
+    }
+
+    /// Tells of samples that will not be given.
+    pub(super) fn miss(&self, missed: Missed, stop: &CancellationToken) {
+        let mut queue = self.wait_for_room(OVERHEAD, stop);
+        if let Some(Item::Missed(last)) = queue.waiting.last_mut()
+            && follows(last, &missed)
+        {
+            last.last = missed.last;
+            last.samples += missed.samples;
+            return;
+        }
+        self.push(&mut queue, Item::Missed(missed), OVERHEAD, None);
+    }
+
+    /// Everything up to `now` is in the queue.
+    pub(super) fn clock(&self, now: Timestamp, stop: &CancellationToken) {
+        let mut queue = self.wait_for_room(OVERHEAD, stop);
+        if let Some(Item::Clock(last)) = queue.waiting.last_mut()
+            && self.request.overflow == Overflow::DropOldest
+        {
+            *last = now.max(*last);
+            return;
+        }
+        self.push(&mut queue, Item::Clock(now), OVERHEAD, None);
+    }
+
+    /// Nothing will follow.
+    pub(super) fn end(&self, reason: &'static str) {
+        self.lock().end.get_or_insert(reason);
+        self.wake();
+    }
+
+    /// The reader has gone.
+    pub(super) fn close(&self) {
+        let mut queue = self.lock();
+        queue.closed = true;
+        queue.waiting = Backlog::default();
+        drop(queue);
+        self.changed.notify_all();
+    }
+
+    /// Tells the reader that there may be something.
+    pub(super) fn wake(&self) {
+        self.readable.notify_one();
+        self.changed.notify_all();
+    }
+
+    /// Bytes that could be taken from it.
+    pub(super) fn droppable(&self) -> usize {
+        match self.request.overflow {
+            Overflow::DropOldest => self.bytes.load(Ordering::Relaxed),
+            Overflow::Wait => 0,
+        }
+    }
+
+    /// Takes what can be missed best.
+    pub(super) fn drop_oldest(&self) {
+        let mut queue = self.lock();
+        self.drop_one(&mut queue);
+    }
+
+    /// Samples that found no room, each told once.
+    pub(super) fn take_dropped(&self) -> u64 {
+        std::mem::take(&mut self.lock().uncounted)
+    }
+
+    /// What the reader gets next, if there is anything.
+    pub(super) fn take(&self) -> Option<Item> {
+        let mut queue = self.lock();
+        self.pop(&mut queue)
+    }
+
+    pub(super) async fn next(&self) -> Option<Item> {
+        loop {
+            let readable = self.readable.notified();
+            {
+                let mut queue = self.lock();
+                if let Some(item) = self.pop(&mut queue) {
+                    return Some(item);
+                }
+                if queue.closed {
+                    return None;
+                }
+            }
+            readable.await;
+        }
+    }
+
+    pub(super) fn next_blocking(&self, timeout: Duration) -> Option<Item> {
+        let end = Instant::now() + timeout;
+        let mut queue = self.lock();
+        loop {
+            if let Some(item) = self.pop(&mut queue) {
+                return Some(item);
+            }
+            let left = end.saturating_duration_since(Instant::now());
+            if queue.closed || left.is_zero() {
+                return None;
+            }
+            let waited = self.changed.wait_timeout(queue, left);
+            (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+
+    fn pop(&self, queue: &mut Queue) -> Option<Item> {
+        if let Some(missed) = queue.dropped.pop() {
+            return Some(Item::Missed(missed));
+        }
+        if let Some(item) = queue.waiting.pop() {
+            self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
+            if self.request.overflow == Overflow::Wait {
+                self.changed.notify_all();
+            }
+            return Some(item);
+        }
+        let reason = queue.end.filter(|_| !queue.closed)?;
+        queue.closed = true;
+        Some(Item::End(reason))
+    }
+
+    /// The queue; on a replay, once it has room.
+    fn wait_for_room(&self, bytes: usize, stop: &CancellationToken) -> MutexGuard<'_, Queue> {
+        let mut queue = self.lock();
+        while self.request.overflow == Overflow::Wait
+            && queue.waiting.bytes() > 0
+            && queue.waiting.bytes() + bytes > self.request.queue_bytes
+            && !queue.closed
+            && !stop.is_cancelled()
+        {
+            self.wake();
+            let waited = self.changed.wait_timeout(queue, LOOK);
+            (queue, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        }
+        queue
+    }
+
+    fn push(&self, queue: &mut Queue, item: Item, bytes: usize, charge: Option<Arc<Charge>>) {
+        if queue.closed {
+            return;
+        }
+        queue.waiting.push(item, bytes, charge);
+        self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
+        while self.request.overflow == Overflow::DropOldest
+            && queue.waiting.bytes() > self.request.queue_bytes
+            && self.drop_one(queue)
+        {}
+    }
+
+    /// Drops an entry; `false` when there is none.
+    fn drop_one(&self, queue: &mut Queue) -> bool {
+        let Some(item) = queue.waiting.sacrifice() else {
+            return false;
+        };
+        self.bytes.store(queue.waiting.bytes(), Ordering::Relaxed);
+        match item {
+            Item::Sample(sample) => {
+                queue.uncounted += 1;
+                queue.note_dropped(Missed {
+                    topic: Arc::clone(&sample.topic),
+                    writer: sample.writer,
+                    first: sample.sequence_number,
+                    last: sample.sequence_number,
+                    samples: 1,
+                    reason: MissedReason::QueueFull,
+                });
+            }
+            Item::Missed(missed) => queue.note_dropped(missed),
+            Item::Clock(_) | Item::End(_) => {}
+        }
+        true
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Queue {
+    fn note_dropped(&mut self, missed: Missed) {
+        let mut known = self.dropped.iter_mut();
+        let same = known.find(|known| {
+            (known.writer, known.reason) == (missed.writer, missed.reason)
+                && known.topic == missed.topic
+        });
+        if let Some(known) = same {
+            known.first = known.first.min(missed.first);
+            known.last = known.last.max(missed.last);
+            known.samples += missed.samples;
+        } else if self.dropped.len() < MISSED {
+            self.dropped.push(missed);
+        } else if let Some(last) = self.dropped.last_mut() {
+            // Whose they were is no longer told; how many is.
+            last.samples += missed.samples;
+        }
+    }
+}
+
+fn follows(last: &Missed, next: &Missed) -> bool {
+    (last.writer, last.reason) == (next.writer, next.reason)
+        && last.topic == next.topic
+        && next.first == last.last + 1
+}

@@ -1,0 +1,230 @@
+//! The last sample of writers that keep theirs for late joiners, of topics whose watch says
+//! `retain: last`: what was sent before a recording begins cannot be asked for without joining.
+//!
+//! Bounded in number and bytes, the oldest go first. Kept by the capture thread alone.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use ros2probe_wire::Guid;
+use ros2probe_wire::names::DdsTopic;
+use ros2probe_wire::qos::Durability;
+
+use crate::config::{Retain, Watch};
+use ros2probe_model::payloads::{Sample, Topic};
+use ros2probe_model::selection::{Depth, Selection, Wish};
+use ros2probe_model::topic::Naming;
+
+/// From here on ids are those of wishes for what is retained, not of readers.
+const FIRST: u64 = 1 << 63;
+/// Writers.
+const WRITERS: usize = 256;
+/// Bytes of all of them together.
+const BYTES: usize = 4 << 20;
+
+/// What is retained.
+#[derive(Debug, Default)]
+pub(super) struct Retained {
+    wishes: Vec<Wish>,
+    samples: BTreeMap<Guid, Arc<Sample>>,
+    bytes: usize,
+}
+
+impl Retained {
+    /// Retains what these watches ask for, and nothing else any more.
+    pub(super) fn set<'a>(&mut self, watches: impl Iterator<Item = &'a Watch>) {
+        let asking = watches.filter(|watch| watch.retain == Retain::Last);
+        let wishes = asking.zip(FIRST..).filter_map(|(watch, id)| {
+            Some(Wish {
+                id,
+                // Checked when it was configured.
+                selection: Arc::new(Selection::named([watch.pattern.as_str()]).ok()?),
+                domain_id: watch.domain_id,
+                depth: Depth::Payloads,
+            })
+        });
+        self.wishes = wishes.collect();
+        let wishes = &self.wishes;
+        self.samples
+            .retain(|_, sample| wishes.iter().any(|wish| covers(wish, &sample.topic)));
+        self.bytes = self.samples.values().map(|sample| size(sample)).sum();
+    }
+
+    /// What the model has to give for that.
+    pub(super) fn wishes(&self) -> impl Iterator<Item = &Wish> {
+        self.wishes.iter()
+    }
+
+    /// Bytes kept.
+    pub(super) const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Keeps a sample that was given to `to`, if that means here.
+    pub(super) fn keep(&mut self, to: &[u64], sample: &Arc<Sample>) {
+        let is_ours = to.iter().any(|id| *id >= FIRST);
+        let offered = sample.topic.offered.as_ref();
+        let lasts = offered.is_some_and(|offered| offered.qos.durability != Durability::VOLATILE);
+        if !is_ours || !lasts || sample.payload.is_none() || size(sample) > BYTES {
+            return;
+        }
+        self.bytes += size(sample);
+        if let Some(before) = self.samples.insert(sample.writer, Arc::clone(sample)) {
+            self.bytes -= size(&before);
+        }
+        while self.bytes > BYTES || self.samples.len() > WRITERS {
+            let oldest = self.samples.iter().min_by_key(|(_, sample)| sample.time);
+            let Some(oldest) = oldest.map(|(writer, _)| *writer) else {
+                return;
+            };
+            self.forget(oldest);
+        }
+    }
+
+    /// What a new reader is to get first, oldest first; of writers that are still there.
+    pub(super) fn for_reader(
+        &mut self,
+        wish: &Wish,
+        is_there: impl Fn(Guid) -> bool,
+    ) -> Vec<Arc<Sample>> {
+        let writers: Vec<Guid> = self.samples.keys().copied().collect();
+        for gone in writers.into_iter().filter(|writer| !is_there(*writer)) {
+            self.forget(gone);
+        }
+        let samples = self.samples.values();
+        let wanted = samples.filter(|sample| covers(wish, &sample.topic));
+        let mut wanted: Vec<_> = wanted.map(Arc::clone).collect();
+        wanted.sort_by_key(|sample| sample.time);
+        wanted
+    }
+
+    fn forget(&mut self, writer: Guid) {
+        if let Some(sample) = self.samples.remove(&writer) {
+            self.bytes -= size(&sample);
+        }
+    }
+}
+
+fn size(sample: &Sample) -> usize {
+    sample.payload.as_ref().map_or(0, bytes::Bytes::len)
+}
+
+fn covers(wish: &Wish, topic: &Topic) -> bool {
+    DdsTopic::parse(&topic.dds_name)
+        .is_ok_and(|name| wish.covers(topic.domain_id, &Naming::of(&name)))
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::qos::{Qos, Role};
+    use ros2probe_wire::rtps::VendorId;
+    use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
+
+    use super::*;
+    use ros2probe_model::payloads::Offered;
+
+    fn writer(number: u8) -> Guid {
+        Guid {
+            prefix: GuidPrefix([number; 12]),
+            entity: EntityId([0, 0, 1, 3]),
+        }
+    }
+
+    fn sample(
+        name: &str,
+        number: u8,
+        time: u64,
+        durability: Durability,
+        size: usize,
+    ) -> Arc<Sample> {
+        let qos = Qos {
+            durability,
+            ..Qos::defaults(Role::Writer, VendorId([0, 0]))
+        };
+        Arc::new(Sample {
+            topic: Arc::new(Topic {
+                domain_id: 0,
+                name: name.into(),
+                dds_name: format!("rt{name}").into(),
+                message_type: "tf2_msgs/msg/TFMessage".into(),
+                offered: Some(Arc::new(Offered {
+                    type_hash: None,
+                    qos,
+                })),
+            }),
+            time: Timestamp(time),
+            writer: writer(number),
+            sequence_number: time,
+            source_timestamp: None,
+            header_stamp: None,
+            size: 0,
+            sampled: false,
+            payload: Some(vec![0; size].into()),
+        })
+    }
+
+    fn retaining(pattern: &str) -> (Retained, u64) {
+        let watch = Watch {
+            retain: Retain::Last,
+            ..Watch::named(pattern).unwrap()
+        };
+        let mut retained = Retained::default();
+        retained.set([&watch, &Watch::named("/other").unwrap()].into_iter());
+        let ids: Vec<u64> = retained.wishes().map(|wish| wish.id).collect();
+        assert_eq!(ids.len(), 1);
+        (retained, ids[0])
+    }
+
+    fn reader() -> Wish {
+        Wish {
+            id: 7,
+            selection: Arc::new(Selection::all()),
+            domain_id: Some(0),
+            depth: Depth::Payloads,
+        }
+    }
+
+    fn times(retained: &mut Retained) -> Vec<u64> {
+        let samples = retained.for_reader(&reader(), |_| true);
+        samples.iter().map(|sample| sample.time.0).collect()
+    }
+
+    #[test]
+    fn the_last_sample_of_each_writer_that_keeps_its_own_is_there_for_a_new_reader() {
+        let (mut retained, id) = retaining("/tf_static");
+        let lasting =
+            |number, time| sample("/tf_static", number, time, Durability::TRANSIENT_LOCAL, 10);
+        for kept in [lasting(1, 1), lasting(2, 2), lasting(1, 3)] {
+            retained.keep(&[id], &kept);
+        }
+        retained.keep(&[id], &sample("/tf_static", 3, 4, Durability::VOLATILE, 10));
+        // Of somebody else's interest.
+        retained.keep(&[5], &lasting(4, 5));
+        assert_eq!((times(&mut retained), retained.bytes()), (vec![2, 3], 20));
+        // A node that has gone would give nothing to a late joiner either.
+        let left = retained.for_reader(&reader(), |guid| guid == writer(1));
+        assert_eq!((left.len(), retained.bytes()), (1, 10));
+        retained.set([].into_iter());
+        assert_eq!((times(&mut retained), retained.bytes()), (vec![], 0));
+    }
+
+    #[test]
+    fn bytes_and_writers_stay_bounded_and_the_oldest_go() {
+        let (mut retained, id) = retaining("/maps/**");
+        for number in 1..=5 {
+            let large = sample(
+                "/maps/a",
+                number,
+                number.into(),
+                Durability::TRANSIENT_LOCAL,
+                BYTES / 4,
+            );
+            retained.keep(&[id], &large);
+            assert!(retained.bytes() <= BYTES);
+        }
+        assert_eq!(times(&mut retained), [2, 3, 4, 5]);
+        let huge = sample("/maps/a", 9, 9, Durability::TRANSIENT_LOCAL, BYTES + 1);
+        retained.keep(&[id], &huge);
+        assert_eq!(times(&mut retained), [2, 3, 4, 5]);
+    }
+}

@@ -1,0 +1,389 @@
+//! What goes on around the working thread: signals, reloads, the metrics listener, the service
+//! manager and its watchdog, and an orderly end.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use crate::config::{Config, ConfigError};
+use crate::privilege::{self, Powerless, Role, SpawnError};
+use crate::run::{Run, RunError};
+use crate::surface::api;
+use crate::surface::api::reload::{NotReloaded, Reloaded, Reloads};
+use crate::surface::events::Sight;
+use crate::surface::http::Server;
+use crate::surface::otlp::Exporter;
+use crate::surface::{Board, Settings};
+use crate::watches::Watches;
+use anyhow::{Context as _, Result, anyhow};
+use sd_notify::NotifyState;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::oneshot;
+use tokio::task::JoinSet;
+use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
+use tokio_util::sync::CancellationToken;
+
+use crate::logging::Log;
+
+/// How often readiness is looked at until the agent is ready, and the watchdog from then on.
+const STARTING_TICK: Duration = Duration::from_millis(100);
+const TICK: Duration = Duration::from_secs(2);
+/// For answers that have begun and the working thread's last round.
+const DRAIN: Duration = Duration::from_secs(3);
+
+/// The agent around its working thread.
+pub(crate) struct Supervisor {
+    pub(crate) board: Arc<Board>,
+    /// As it was read at the start, before the command line changed it.
+    pub(crate) config: Config,
+    /// Where the configuration came from; read again on SIGHUP and when a client asks.
+    pub(crate) file: Option<PathBuf>,
+    pub(crate) watches: Arc<Watches>,
+    pub(crate) reloads: Reloads,
+    pub(crate) stop: CancellationToken,
+    pub(crate) log: Log,
+    /// Pushes what is on the board, where something is to be pushed.
+    pub(crate) exporter: Option<Exporter>,
+}
+
+/// What is served, bound and not answered yet.
+pub(crate) struct Surfaces {
+    pub(crate) metrics: Option<Server>,
+    pub(crate) control: api::Server,
+    pub(crate) context: api::Context,
+    /// Nothing is served by a thread that has any privilege.
+    pub(crate) powerless: Powerless,
+}
+
+/// Signals that are listened to from before the working thread starts.
+struct Signals {
+    terminate: Signal,
+    interrupt: Signal,
+    hangup: Signal,
+    /// Writes what the snapshots keep.
+    snapshot: Signal,
+}
+
+/// The thread that answers requests, waiting for its listeners. It is another one than the thread
+/// that feeds the watchdog, so that no page that is made delays that.
+pub(crate) struct Responder {
+    begin: oneshot::Sender<Surfaces>,
+    ended: oneshot::Receiver<Result<()>>,
+}
+
+/// The working thread, waiting for what it is to do, and the news of its end.
+pub(crate) struct Worker {
+    thread: JoinHandle<()>,
+    begin: oneshot::Sender<Run>,
+    ended: oneshot::Receiver<Result<(), RunError>>,
+}
+
+/// The working thread at work.
+struct Working {
+    thread: JoinHandle<()>,
+    ended: oneshot::Receiver<Result<(), RunError>>,
+}
+
+impl Supervisor {
+    /// Runs everything until a signal or a failure, or with `once` until the capture ends, and says
+    /// in the log how it ended.
+    pub(crate) async fn run(
+        mut self,
+        worker: Worker,
+        run: Run,
+        responder: Responder,
+        surfaces: Surfaces,
+        once: bool,
+    ) -> Result<()> {
+        let mut signals = Signals::listen().context("cannot listen to signals")?;
+        let mut worker = worker.begin(run);
+        let snapshots = Arc::clone(&surfaces.context.snapshots);
+        let mut serving = responder.begin(surfaces);
+        let mut watchdog = Watchdog::new();
+        let mut tick = ticks(STARTING_TICK);
+        let (mut working, mut answering) = (true, true);
+
+        let outcome = loop {
+            tokio::select! {
+                _ = signals.terminate.recv() => break Ok("SIGTERM"),
+                _ = signals.interrupt.recv() => break Ok("SIGINT"),
+                _ = signals.hangup.recv() => {
+                    let _ = self.reload();
+                }
+                _ = signals.snapshot.recv() => snapshots.write_all(),
+                Some(answer) = self.reloads.next() => {
+                    // Who asked may have gone.
+                    let _ = answer.send(self.reload());
+                }
+                ended = &mut serving => {
+                    answering = false;
+                    let died = |_| Err(anyhow!("the thread that answers requests died"));
+                    let ended = ended.unwrap_or_else(died);
+                    break Err(ended.err().unwrap_or_else(|| anyhow!("a listener ended")));
+                }
+                ended = &mut worker.ended, if working => {
+                    working = false;
+                    match ended {
+                        Ok(Ok(())) if once => break Ok("end of capture"),
+                        Ok(Ok(())) => {
+                            tracing::info!("the capture has ended; its final state remains");
+                        }
+                        Ok(Err(error)) => break Err(error.into()),
+                        // Its sender went without a word: the panic is in the log.
+                        Err(_) => break Err(anyhow!("the working thread panicked")),
+                    }
+                }
+                _ = tick.tick() => {
+                    if watchdog.look(&self.board) {
+                        tick = ticks(watchdog.period.map_or(TICK, |period| period.min(TICK)));
+                    }
+                }
+            }
+        };
+
+        let _ = sd_notify::notify(&[NotifyState::Stopping]);
+        self.stop.cancel();
+        let drained = timeout(DRAIN, async {
+            if working {
+                let _ = (&mut worker.ended).await;
+            }
+            if answering {
+                let _ = (&mut serving).await;
+            }
+        });
+        let drained = drained.await.is_ok();
+        if drained && worker.thread.join().is_err() {
+            tracing::error!("the working thread panicked while shutting down");
+        }
+        // After the working thread, whose last state it exports.
+        if let Some(exporter) = self.exporter.take() {
+            exporter.finish().await;
+        }
+        match outcome {
+            Ok(reason) => {
+                tracing::info!(reason, drained, "ended");
+                Ok(())
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Reads the configuration again; a mistake changes nothing.
+    fn reload(&mut self) -> Result<Reloaded, NotReloaded> {
+        let Some(file) = &self.file else {
+            tracing::warn!("nothing to reload: the agent was started without a configuration file");
+            return Err(NotReloaded::NoFile);
+        };
+        if let Ok(now) = NotifyState::monotonic_usec_now() {
+            let _ = sd_notify::notify(&[NotifyState::Reloading, now]);
+        }
+        let done = Config::load(file)
+            .map_err(|error| mistakes(&error))
+            .and_then(|config| self.take_over(&config));
+        let _ = sd_notify::notify(&[NotifyState::Ready]);
+        done.map_err(|mistakes| {
+            self.board.reload_failed(&mistakes.join("\n"));
+            for line in &mistakes {
+                tracing::error!(error = line, "the configuration was not reloaded");
+            }
+            NotReloaded::Mistakes(mistakes)
+        })
+    }
+
+    fn take_over(&mut self, config: &Config) -> Result<Reloaded, Vec<String>> {
+        let configured = self.watches.configure(config.watches.clone());
+        configured.map_err(|error| vec![error.to_string()])?;
+        let needs_restart = self.config.needs_restart(config);
+        for key in &needs_restart {
+            tracing::warn!(key, "the change takes effect after a restart");
+        }
+        self.log.set(config.log);
+        let in_force = self.watches.in_force();
+        self.board.reloaded(Settings {
+            watches: in_force.watchlist().watches().to_vec(),
+            // The caps are those the agent was started with.
+            limits: *self.board.limits().caps(),
+            ..Settings::new(config)
+        });
+        let watches = in_force.entries().len();
+        tracing::info!(watches, "the configuration was reloaded");
+        Ok(Reloaded {
+            watches,
+            needs_restart,
+        })
+    }
+}
+
+fn ticks(period: Duration) -> Interval {
+    let mut ticks = interval(period);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
+}
+
+/// One line each.
+fn mistakes(error: &ConfigError) -> Vec<String> {
+    let mut text = error.to_string();
+    let mut cause = std::error::Error::source(error);
+    while let Some(error) = cause {
+        text = format!("{text}: {error}");
+        cause = error.source();
+    }
+    text.lines().map(str::to_owned).collect()
+}
+
+impl Signals {
+    fn listen() -> std::io::Result<Self> {
+        Ok(Self {
+            terminate: signal(SignalKind::terminate())?,
+            interrupt: signal(SignalKind::interrupt())?,
+            hangup: signal(SignalKind::hangup())?,
+            snapshot: signal(SignalKind::user_defined1())?,
+        })
+    }
+}
+
+impl Responder {
+    /// Starts the thread, confined to its role already.
+    pub(crate) fn start() -> Result<Self, SpawnError> {
+        let (begin, begins) = oneshot::channel::<Surfaces>();
+        let (tell, ended) = oneshot::channel();
+        let thread = std::thread::Builder::new().name("http".to_owned());
+        privilege::spawn(Role::Serve, thread, move || {
+            // An agent that fails to start, or a report, has nothing to answer.
+            if let Ok(surfaces) = begins.blocking_recv() {
+                let _ = tell.send(surfaces.answer());
+            }
+        })?;
+        Ok(Self { begin, ended })
+    }
+
+    fn begin(self, surfaces: Surfaces) -> oneshot::Receiver<Result<()>> {
+        // The thread takes it or has died, which is heard next.
+        let _ = self.begin.send(surfaces);
+        self.ended
+    }
+}
+
+impl Surfaces {
+    /// Answers requests until the agent stops.
+    fn answer(self) -> Result<()> {
+        // Capabilities belong to threads: those of this one are read back, too.
+        let _: (Powerless, Powerless) = (self.powerless, Powerless::verify()?);
+        // Threads that block make bags for clients; the unit allows 32 threads in all.
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .max_blocking_threads(4)
+            .enable_all()
+            .build()
+            .context("cannot start the runtime of the listeners")?;
+        let stop = self.context.stop.clone();
+        let served = runtime.block_on(async {
+            let mut serving = JoinSet::new();
+            if let Some(metrics) = self.metrics {
+                serving.spawn(metrics.serve(stop.clone()));
+            }
+            self.control.serve(&self.context, &mut serving)?;
+            drop(self.context);
+            tokio::select! {
+                () = stop.cancelled() => {}
+                Some(ended) = serving.join_next() => {
+                    ended??;
+                    return Err(anyhow!("a listener ended"));
+                }
+            }
+            while serving.join_next().await.is_some() {}
+            Ok(())
+        });
+        // A bag that is being finished for a client is waited for elsewhere.
+        runtime.shutdown_background();
+        served
+    }
+}
+
+impl Worker {
+    /// Starts the thread, confined to its role already: the caller need not keep what it needs.
+    pub(crate) fn start(role: Role) -> Result<Self, SpawnError> {
+        let (begin, begins) = oneshot::channel::<Run>();
+        let (tell, ended) = oneshot::channel();
+        let thread = std::thread::Builder::new().name("capture".to_owned());
+        let thread = privilege::spawn(role, thread, move || {
+            // An agent that fails to start has nothing to do.
+            if let Ok(run) = begins.blocking_recv() {
+                let _ = tell.send(run.run());
+            }
+        })?;
+        Ok(Self {
+            thread,
+            begin,
+            ended,
+        })
+    }
+
+    /// Works until the capture ends.
+    pub(crate) fn finish(self, run: Run) -> Result<()> {
+        let ended = self.begin(run).ended.blocking_recv();
+        Ok(ended.map_err(|_| anyhow!("the working thread panicked"))??)
+    }
+
+    fn begin(self, run: Run) -> Working {
+        // Nobody takes it when the thread has died, which is what is heard next.
+        let _ = self.begin.send(run);
+        Working {
+            thread: self.thread,
+            ended: self.ended,
+        }
+    }
+}
+
+/// Tells the service manager that the agent sees, as long as it does.
+struct Watchdog {
+    period: Option<Duration>,
+    fed: Option<Instant>,
+    ready: bool,
+    sight: Sight,
+}
+
+impl Watchdog {
+    fn new() -> Self {
+        // A third of what is allowed: one late round does not kill.
+        let period = sd_notify::watchdog_enabled().map(|allowed| allowed / 3);
+        Self {
+            period,
+            fed: None,
+            ready: false,
+            sight: Sight::default(),
+        }
+    }
+
+    /// Not a timer: what feeds the watchdog is the capture's progress. Whether the agent has just
+    /// become ready.
+    fn look(&mut self, board: &Board) -> bool {
+        let now = Instant::now();
+        let state = board.state();
+        let ready = state.ready(now);
+        for event in self.sight.look(&ready, state.agent.attached_anew, now) {
+            board.events().tell(event);
+        }
+        // A restart does not bring back what is gone.
+        if state.progresses(now).is_err() || (ready.is_err() && !self.ready) {
+            return false;
+        }
+        let first = !self.ready;
+        if first {
+            self.ready = true;
+            tracing::info!("ready");
+            let _ = sd_notify::notify(&[NotifyState::Ready]);
+        }
+        let Some(period) = self.period else {
+            return first;
+        };
+        if self
+            .fed
+            .is_none_or(|fed| now.saturating_duration_since(fed) >= period)
+        {
+            self.fed = Some(now);
+            let _ = sd_notify::notify(&[NotifyState::Watchdog]);
+        }
+        first
+    }
+}

@@ -1,0 +1,133 @@
+//! `/actions`: each put together from its three services and two topics.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::finding::FindingView;
+use super::index::Index;
+use super::parameters::Parameters;
+use super::party::{Parties, PartyView, action, action_type};
+use super::problem::Problem;
+use super::scope::Scope;
+use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+
+/// Actions.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ActionList)]
+struct ActionsView<'a> {
+    /// Unix time of the facts.
+    timestamp_seconds: f64,
+    /// By domain and name.
+    actions: Vec<ActionView<'a>>,
+}
+
+/// One action.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Action)]
+struct ActionView<'a> {
+    /// Domain.
+    domain_id: u32,
+    /// ROS name.
+    #[schema(example = "/fibonacci")]
+    name: String,
+    /// ROS types; more than one is a fault.
+    #[schema(value_type = Vec<String>, example = json!(["example_interfaces/action/Fibonacci"]))]
+    types: BTreeSet<&'a str>,
+    /// Who serves.
+    servers: Vec<PartyView<'a>>,
+    /// Who calls: whoever only reads the feedback is not among them.
+    clients: Vec<PartyView<'a>>,
+    /// Its topics and services, by their DDS names.
+    #[schema(value_type = Vec<String>)]
+    parts: Vec<&'a str>,
+    /// What is wrong with them.
+    diagnoses: Vec<FindingView<'a>>,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(list))
+}
+
+/// All actions
+#[utoipa::path(
+    get,
+    path = "/actions",
+    tag = "graph",
+    params(Scope),
+    responses((status = 200, description = "Actions.", body = ActionsView<'static>))
+)]
+async fn list(
+    State(context): State<Context>,
+    Parameters(scope): Parameters<Scope>,
+) -> Result<Response, Problem> {
+    let scope = scope.checked()?;
+    let state = context.state().await;
+    let snapshot = state.known();
+    let index = Index::new(snapshot);
+    let actions = actions(snapshot, scope).into_iter();
+    let answer = ActionsView {
+        timestamp_seconds: snapshot.at.seconds(),
+        actions: actions
+            .filter_map(|((domain_id, name), parts)| view(domain_id, name, &parts, &index))
+            .collect(),
+    };
+    Ok(Json(answer).into_response())
+}
+
+/// The parts of actions by domain and name. Parts are hidden; an action is so when its own name is.
+pub(super) fn actions(
+    snapshot: &Snapshot,
+    scope: Scope,
+) -> BTreeMap<(u32, String), Vec<&TopicFacts>> {
+    let mut actions: BTreeMap<_, Vec<_>> = BTreeMap::new();
+    let admitted = snapshot.topics.iter();
+    for topic in admitted.filter(|topic| scope.admits(topic.domain_id)) {
+        if let Some((name, _)) = action(topic)
+            && (!name.is_hidden() || scope.shows_hidden())
+        {
+            let key = (topic.domain_id, name.as_str().to_owned());
+            actions.entry(key).or_default().push(topic);
+        }
+    }
+    actions
+}
+
+/// Both ends of an action.
+pub(super) fn parties<'a>(parts: &[&'a TopicFacts]) -> Parties<'a> {
+    let mut parties = Parties::default();
+    parts.iter().for_each(|part| parties.add(part));
+    parties
+}
+
+/// `None` once nobody is there any more.
+fn view<'a>(
+    domain_id: u32,
+    name: String,
+    parts: &[&'a TopicFacts],
+    index: &Index<'a>,
+) -> Option<ActionView<'a>> {
+    let parties = parties(parts);
+    if parties.is_empty() {
+        return None;
+    }
+    let [servers, clients] = parties.views();
+    let types = parts.iter().flat_map(|part| &part.message_types);
+    let findings = parts.iter().flat_map(|part| index.findings(part));
+    Some(ActionView {
+        domain_id,
+        name,
+        types: types.filter_map(|each| action_type(each)).collect(),
+        servers,
+        clients,
+        parts: parts.iter().map(|part| part.dds_name.as_str()).collect(),
+        diagnoses: findings.map(|finding| (*finding).into()).collect(),
+    })
+}

@@ -1,0 +1,88 @@
+//! Who is who in one snapshot: built once for an answer, asked for every line of it.
+
+use std::collections::HashMap;
+
+use ros2probe_wire::{Guid, GuidPrefix};
+
+use ros2probe_model::diagnosis::Diagnosis;
+use ros2probe_model::snapshot::{
+    EndpointFacts, ParticipantFacts, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
+};
+
+/// A watchlist entry and how a topic stands with it.
+pub(super) type Watching<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
+
+/// What an answer looks up.
+#[derive(Debug)]
+pub(super) struct Index<'a> {
+    participants: HashMap<GuidPrefix, &'a ParticipantFacts>,
+    findings: HashMap<(u32, &'a str), Vec<&'a Diagnosis>>,
+    watches: HashMap<(u32, &'a str), Vec<Watching<'a>>>,
+}
+
+/// Endpoints and their topics, by GUID.
+#[derive(Debug)]
+pub(super) struct Ends<'a>(HashMap<Guid, (&'a TopicFacts, &'a EndpointFacts)>);
+
+impl<'a> Index<'a> {
+    pub(super) fn new(snapshot: &'a Snapshot) -> Self {
+        let participants = snapshot.participants.iter();
+        let mut findings: HashMap<_, Vec<_>> = HashMap::new();
+        for finding in &snapshot.diagnoses.list {
+            if let Some(topic) = finding.topic() {
+                let key = (topic.domain_id, &*topic.dds_name);
+                findings.entry(key).or_default().push(finding);
+            }
+        }
+        let mut watches: HashMap<_, Vec<_>> = HashMap::new();
+        for watch in &snapshot.watches {
+            for topic in &watch.topics {
+                let key = (topic.domain_id, topic.topic.as_str());
+                watches.entry(key).or_default().push((watch, topic));
+            }
+        }
+        Self {
+            participants: participants.map(|each| (each.guid.prefix, each)).collect(),
+            findings,
+            watches,
+        }
+    }
+
+    pub(super) fn participant(&self, guid: Guid) -> Option<&'a ParticipantFacts> {
+        self.participants.get(&guid.prefix).copied()
+    }
+
+    /// What is wrong with a topic.
+    pub(super) fn findings(&self, topic: &'a TopicFacts) -> &[&'a Diagnosis] {
+        let found = self
+            .findings
+            .get(&(topic.domain_id, topic.dds_name.as_str()));
+        found.map_or(&[], Vec::as_slice)
+    }
+
+    /// Entries that cover a topic. A service's requests and replies bear the service's name: they
+    /// are covered only when they are measured.
+    pub(super) fn watches(&self, topic: &'a TopicFacts) -> &[Watching<'a>] {
+        if topic.measurement.is_none() {
+            return &[];
+        }
+        let found = self.watches.get(&(topic.domain_id, topic.name.as_str()));
+        found.map_or(&[], Vec::as_slice)
+    }
+}
+
+impl<'a> Ends<'a> {
+    pub(super) fn new(snapshot: &'a Snapshot) -> Self {
+        let mut ends = HashMap::new();
+        for topic in &snapshot.topics {
+            for endpoint in topic.publishers.iter().chain(&topic.subscriptions) {
+                ends.insert(endpoint.guid, (topic, endpoint));
+            }
+        }
+        Self(ends)
+    }
+
+    pub(super) fn endpoint(&self, guid: Guid) -> Option<(&'a TopicFacts, &'a EndpointFacts)> {
+        self.0.get(&guid).copied()
+    }
+}

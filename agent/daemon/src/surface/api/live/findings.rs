@@ -1,0 +1,528 @@
+//! What is wrong, in words: where, since when and what helps. Texts hold no figure that changes
+//! every second, so that the list is sent only when something has changed.
+
+use std::collections::HashMap;
+
+use ros2probe_wire::Guid;
+
+use super::line::{Finding, Severity};
+use super::structure::Ids;
+use super::values::{LOSS, lost_lately};
+use crate::surface::{Ability, AgentFacts, SourceKind};
+use ros2probe_model::diagnosis::{Diagnosis, Policy};
+use ros2probe_model::history::Past;
+use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
+
+/// Findings of one stream at most, so that a storm of them stays readable.
+const MOST: usize = 512;
+
+/// What findings are made of.
+pub(super) struct Circumstances<'a> {
+    pub(super) snapshot: &'a Snapshot,
+    pub(super) agent: &'a AgentFacts,
+    pub(super) past: &'a Past,
+    pub(super) ids: &'a Ids,
+    /// Why the agent sees nothing.
+    pub(super) unready: Option<&'a str>,
+}
+
+/// Everything, the worst first.
+pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
+    let mut list = of_agent(circumstances);
+    list.extend(of_graph(circumstances));
+    list.extend(of_watches(circumstances));
+    list.extend(losses(circumstances));
+    list.sort_by(|one, other| {
+        (one.severity, one.kind, &one.id).cmp(&(other.severity, other.kind, &other.id))
+    });
+    list.truncate(MOST);
+    list
+}
+
+fn finding(kind: &'static str, severity: Severity, about: &str, text: String) -> Finding {
+    Finding {
+        id: format!("{kind}|{about}"),
+        kind,
+        severity,
+        domain_id: None,
+        topic: None,
+        node: None,
+        since: None,
+        text,
+        remedy: None,
+        writer: None,
+        reader: None,
+        policies: Vec::new(),
+    }
+}
+
+impl Finding {
+    fn helped_by(self, remedy: impl Into<String>) -> Self {
+        Self {
+            remedy: Some(remedy.into()),
+            ..self
+        }
+    }
+}
+
+fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
+    let (agent, snapshot) = (all.agent, all.snapshot);
+    let mut list = Vec::new();
+    if let Some(reason) = all.unready {
+        let text = format!("The agent does not see the robot: {reason}");
+        let unready = finding("agent_not_ready", Severity::Error, "", text);
+        list.push(unready.helped_by("rp doctor"));
+    }
+    let dropped = dropped(agent);
+    if dropped > 0 {
+        let text =
+            "The agent lost packets for want of room: its counts are lower bounds".to_owned();
+        let drops = finding("agent_drops", Severity::Warning, "", text);
+        list.push(drops.helped_by("raise capture.ring_bytes and capture.record_ring_bytes"));
+    }
+    if !snapshot.unknown_writers.is_empty() {
+        let text = "Writers are active whose announcement was missed; their topics are unknown";
+        let unknown = finding("unknown_writers", Severity::Warning, "", text.to_owned());
+        list.push(unknown.helped_by("sudo rp discover --all"));
+    }
+    if snapshot.topics_rejected > 0 {
+        let text = "Watched topics are not measured: limits.topics is reached".to_owned();
+        let rejected = finding("topics_rejected", Severity::Warning, "", text);
+        list.push(rejected.helped_by("raise limits.topics, or watch fewer topics"));
+    }
+    list.extend(unseen(agent));
+    list
+}
+
+/// What the agent cannot observe: a note for each reason, and one for all that its source lacks.
+fn unseen(agent: &AgentFacts) -> Vec<Finding> {
+    let mut list = Vec::new();
+    let mut lacking = Vec::new();
+    for ability in Ability::ALL {
+        if agent.abilities.contains(&ability) {
+            continue;
+        }
+        let mut blind = agent.blind.iter();
+        let Some((_, reason)) = blind.find(|(blind, _)| *blind == ability) else {
+            lacking.push(object(ability));
+            continue;
+        };
+        let text = format!("The agent does not see {}: {reason}", object(ability));
+        list.push(finding("ability", Severity::Note, ability.label(), text));
+    }
+    if !lacking.is_empty() {
+        let source = match agent.source {
+            SourceKind::Host => "The agent looks at the sockets of this host",
+            SourceKind::Wire => "The agent looks at packets on network interfaces",
+            SourceKind::Replay => "A capture holds packets alone",
+        };
+        let text = format!("{source}. It does not show {}", lacking.join(", "));
+        list.push(finding("ability", Severity::Note, "source", text));
+    }
+    list
+}
+
+/// An ability's object, in words.
+const fn object(ability: Ability) -> &'static str {
+    match ability {
+        Ability::Subscribers => "what each subscriber receives",
+        Ability::Sent => "messages that leave this host",
+        Ability::SocketLosses => "losses in the buffers of sockets",
+        Ability::ReassemblyLosses => "losses in IP reassembly",
+        Ability::Owners => "the processes of sockets",
+        Ability::Containers => "the sockets of containers",
+        Ability::Forwarded => "traffic without a local socket",
+        Ability::SharedMemory => "messages through shared memory",
+        Ability::SharedMemoryExact => "each single message through shared memory",
+    }
+}
+
+/// Packets, records and datagrams that were lost for want of room.
+pub(super) fn dropped(agent: &AgentFacts) -> u64 {
+    let packets: u64 = agent
+        .interfaces
+        .iter()
+        .filter_map(|each| each.dropped)
+        .sum();
+    packets + agent.records_dropped + agent.pieces_dropped
+}
+
+fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
+    let snapshot = all.snapshot;
+    let ends = Ends::new(snapshot);
+    let list = snapshot.diagnoses.list.iter();
+    // Without times where the lists do not go together.
+    let times = snapshot
+        .diagnosed
+        .iter()
+        .map(Some)
+        .chain(std::iter::repeat(None));
+    let found = list.zip(times).map(|(diagnosis, since)| {
+        let mut finding = in_words(all, diagnosis, &ends);
+        finding.since = since.map(|since| since.seconds());
+        if let Some(topic) = diagnosis.topic() {
+            finding.domain_id = Some(topic.domain_id);
+            finding.topic = all.ids.topic(topic.domain_id, &topic.dds_name);
+        }
+        finding
+    });
+    found.collect()
+}
+
+fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> Finding {
+    let kind = diagnosis.kind();
+    match diagnosis {
+        Diagnosis::QosIncompatible {
+            topic,
+            writer,
+            reader,
+            policies,
+        } => {
+            let differ: Vec<_> = policies
+                .iter()
+                .map(|policy| ends.difference(policy, *writer, *reader))
+                .collect();
+            let text = format!(
+                "{} sends nothing to {} on {}: {}",
+                ends.who(*writer),
+                ends.who(*reader),
+                topic.name,
+                differ.join("; ")
+            );
+            let about = format!("{}|{}|{writer}|{reader}", topic.domain_id, topic.dds_name);
+            Finding {
+                writer: Some(writer.to_string()),
+                reader: Some(reader.to_string()),
+                policies: policies.iter().map(Policy::label).collect(),
+                ..finding(kind, Severity::Error, &about, text)
+            }
+            .helped_by("let the publisher offer what the subscription requests, or request less")
+        }
+        Diagnosis::TypeConflict { topic, types } => {
+            let types: Vec<&str> = types.iter().map(AsRef::as_ref).collect();
+            let text = format!(
+                "{} has several types, whose endpoints do not talk to each other: {}",
+                topic.name,
+                types.join(", ")
+            );
+            let about = format!("{}|{}", topic.domain_id, topic.dds_name);
+            finding(kind, Severity::Error, &about, text)
+                .helped_by("rename one of the topics, or use one type")
+        }
+        Diagnosis::TypeHashConflict {
+            topic,
+            message_type,
+            ..
+        } => {
+            let text = format!(
+                "{} has several definitions of {message_type}, which endpoints misread",
+                topic.name
+            );
+            let about = format!("{}|{}|{message_type}", topic.domain_id, topic.dds_name);
+            finding(kind, Severity::Error, &about, text)
+                .helped_by("build all nodes with one version of the interface package")
+        }
+        Diagnosis::DuplicateNode {
+            domain_id, node, ..
+        } => {
+            let text = format!("Several nodes bear the name {node}");
+            Finding {
+                domain_id: Some(*domain_id),
+                node: all.ids.node(*domain_id, node),
+                ..finding(
+                    kind,
+                    Severity::Warning,
+                    &format!("{domain_id}|{node}"),
+                    text,
+                )
+            }
+            .helped_by("give each node a name or a namespace of its own")
+        }
+        Diagnosis::UnheardPublisher {
+            topic,
+            writer,
+            reason,
+        } => {
+            let who = ends.who(*writer);
+            let text = format!(
+                "{who} publishes {}, and {}",
+                topic.name,
+                lacks(reason.label(), "subscription")
+            );
+            let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
+            Finding {
+                writer: Some(writer.to_string()),
+                ..finding(kind, alone(reason.label()), &about, text)
+            }
+        }
+        Diagnosis::UnfedSubscriber {
+            topic,
+            reader,
+            reason,
+        } => {
+            let who = ends.who(*reader);
+            let text = format!(
+                "{who} subscribes to {}, and {}",
+                topic.name,
+                lacks(reason.label(), "publisher")
+            );
+            let about = format!("{}|{}|{reader}", topic.domain_id, topic.dds_name);
+            Finding {
+                reader: Some(reader.to_string()),
+                ..finding(kind, alone(reason.label()), &about, text)
+            }
+        }
+        Diagnosis::NodeInSeveralDomains { node, domains, .. } => {
+            let listed: Vec<_> = domains.iter().map(u32::to_string).collect();
+            let text = format!("{node} is in several domains: {}", listed.join(", "));
+            let first = domains.first().copied();
+            Finding {
+                domain_id: first,
+                node: first.and_then(|domain_id| all.ids.node(domain_id, node)),
+                ..finding(kind, Severity::Warning, node, text)
+            }
+            .helped_by("start all of its processes with the same ROS_DOMAIN_ID")
+        }
+    }
+}
+
+/// Why an endpoint has no counterpart.
+fn lacks(reason: &str, counterpart: &str) -> String {
+    match reason {
+        "qos" => format!("no {counterpart} has a matching QoS"),
+        "type" => format!("every {counterpart} has another type"),
+        "partition" => format!("every {counterpart} is in another partition"),
+        _ => format!("there is no {counterpart}"),
+    }
+}
+
+/// To be alone is common; to be alone among others is not.
+fn alone(reason: &str) -> Severity {
+    match reason {
+        "qos" | "type" | "partition" => Severity::Warning,
+        _ => Severity::Note,
+    }
+}
+
+fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
+    let mut list = Vec::new();
+    for watch in &all.snapshot.watches {
+        for topic in &watch.topics {
+            let (kind, text) = match topic.state {
+                WatchState::Violated => {
+                    let broken = topic.violations.join(", ");
+                    let text = format!("{} does not do as expected: {broken}", topic.topic);
+                    ("watch_violated", text)
+                }
+                WatchState::Silent => {
+                    let text = format!("{} is silent for longer than expected", topic.topic);
+                    ("watch_silent", text)
+                }
+                WatchState::Ok | WatchState::NotPublished | WatchState::NoSubscriber => continue,
+            };
+            let mut topics = all.snapshot.topics.iter();
+            let facts = topics
+                .find(|facts| facts.domain_id == topic.domain_id && facts.name == topic.topic);
+            let about = format!("{}|{}|{}", topic.domain_id, topic.topic, watch.pattern);
+            list.push(Finding {
+                domain_id: Some(topic.domain_id),
+                topic: facts.and_then(|facts| all.ids.topic(facts.domain_id, &facts.dds_name)),
+                ..finding(kind, Severity::Error, &about, text)
+            });
+        }
+    }
+    list
+}
+
+/// Topics that lost messages lately, and where those died.
+fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
+    let lost = lost_lately(all.past);
+    let topics = all.snapshot.topics.iter();
+    let found = topics.filter_map(|topic| {
+        let known = all.past.id(topic.domain_id, &topic.dds_name)?;
+        lost.get(&known)?;
+        let (place, remedy) = died(topic);
+        let text = format!("{} loses messages{place}", topic.name);
+        let about = format!("{}|{}", topic.domain_id, topic.dds_name);
+        let loss = Finding {
+            domain_id: Some(topic.domain_id),
+            topic: all.ids.topic(topic.domain_id, &topic.dds_name),
+            since: began(all.past, known),
+            ..finding("loss", Severity::Error, &about, text)
+        };
+        Some(loss.helped_by(remedy))
+    });
+    found.collect()
+}
+
+/// Where most of a topic's messages died, as far as that is seen, and what helps there.
+fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
+    let received = topic.received.as_deref();
+    let at = received.map_or([0; 3], |received| {
+        [
+            received.lost_before_host,
+            received.lost_in_reassembly,
+            received.lost_in_socket_buffer,
+        ]
+    });
+    let most = at.iter().copied().max().unwrap_or_default();
+    let [before, reassembly, _] = at;
+    if most == 0 {
+        (
+            "",
+            "compare the loss of each subscriber on the topic's page; `rp doctor` checks buffers",
+        )
+    } else if most == before {
+        (
+            ", most of them before they reach this host",
+            "look at the network and at the sender's host",
+        )
+    } else if most == reassembly {
+        (
+            ", most of them in IP reassembly",
+            "raise net.ipv4.ipfrag_high_thresh, or send smaller messages; `rp doctor` checks it",
+        )
+    } else {
+        (
+            ", most of them in the full buffer of a subscriber's socket",
+            "raise net.core.rmem_max and the receive buffer, or read faster; `rp doctor` checks it",
+        )
+    }
+}
+
+/// When a loss began that has gone on since, with pauses shorter than [`LOSS`].
+fn began(past: &Past, topic: u32) -> Option<f64> {
+    let mut began = None;
+    let mut pause = 0;
+    for second in past.seconds().iter().rev() {
+        if second.row(topic).is_some_and(|row| row.lost > 0) {
+            (began, pause) = (Some(second.at.seconds()), 0);
+        } else {
+            pause += 1;
+        }
+        if pause > LOSS {
+            break;
+        }
+    }
+    began
+}
+
+/// Endpoints by GUID.
+struct Ends<'a>(HashMap<Guid, &'a EndpointFacts>);
+
+impl<'a> Ends<'a> {
+    fn new(snapshot: &'a Snapshot) -> Self {
+        let about = snapshot.diagnoses.list.iter();
+        // Nothing is looked up where nothing is wrong.
+        if about.len() == 0 {
+            return Self(HashMap::new());
+        }
+        let topics = snapshot.topics.iter();
+        let all = topics.flat_map(|topic| topic.publishers.iter().chain(&topic.subscriptions));
+        Self(all.map(|endpoint| (endpoint.guid, endpoint)).collect())
+    }
+
+    /// The node of an endpoint, else its GUID.
+    fn who(&self, guid: Guid) -> String {
+        let node = self.0.get(&guid).and_then(|endpoint| endpoint.node.clone());
+        node.unwrap_or_else(|| guid.to_string())
+    }
+
+    /// What the one offers and the other requests.
+    fn difference(&self, policy: Policy, writer: Guid, reader: Guid) -> String {
+        let value = |guid: Guid| {
+            let endpoint = self.0.get(&guid)?;
+            let seconds = |nanoseconds: Option<u64>| match nanoseconds {
+                Some(nanoseconds) => format!("{} ms", nanoseconds / 1_000_000),
+                None => "infinite".to_owned(),
+            };
+            match policy {
+                Policy::Reliability => Some(endpoint.reliability.clone()),
+                Policy::Durability => Some(endpoint.durability.clone()),
+                Policy::Deadline => Some(seconds(endpoint.deadline_nanoseconds)),
+                Policy::Liveliness => Some(format!(
+                    "{}, {}",
+                    endpoint.liveliness,
+                    seconds(endpoint.liveliness_lease_nanoseconds)
+                )),
+                Policy::Ownership => Some(endpoint.ownership.to_owned()),
+                Policy::LatencyBudget
+                | Policy::DestinationOrder
+                | Policy::Presentation
+                | Policy::DataRepresentation => None,
+            }
+        };
+        let name = policy.label().replace('_', " ");
+        match (value(writer), value(reader)) {
+            (Some(offered), Some(requested)) => {
+                format!("{name} offered {offered}, requested {requested}")
+            }
+            _ => format!("{name} differs"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::time::Instant;
+
+    use super::*;
+    use ros2probe_model::diagnosis::Diagnoses;
+
+    #[test]
+    fn of_more_findings_than_are_sent_the_worst_are() {
+        let list = (0..2 * MOST).map(|number| Diagnosis::DuplicateNode {
+            domain_id: 0,
+            node: format!("/node_{number}").into(),
+            participants: Vec::new(),
+        });
+        let snapshot = Snapshot {
+            diagnoses: Arc::new(Diagnoses {
+                list: list.collect(),
+                ..Diagnoses::default()
+            }),
+            ..Snapshot::default()
+        };
+        let found = findings(&Circumstances {
+            snapshot: &snapshot,
+            agent: &AgentFacts::new(SourceKind::Wire, Instant::now()),
+            past: &Past::default(),
+            ids: &Ids::default(),
+            unready: Some("no packet was seen"),
+        });
+        assert_eq!(found.len(), MOST);
+        let first = found.first().unwrap();
+        assert_eq!(
+            (first.kind, first.severity),
+            ("agent_not_ready", Severity::Error)
+        );
+        assert!(found.is_sorted_by_key(|each| each.severity));
+    }
+
+    #[test]
+    fn what_a_source_does_not_show_is_in_words() {
+        let mut agent = AgentFacts::new(SourceKind::Replay, Instant::now());
+        let text = |agent: &AgentFacts| -> Vec<String> {
+            let notes = unseen(agent).into_iter();
+            notes.map(|note| note.text).collect()
+        };
+        let lacking = text(&agent);
+        assert_eq!(lacking.len(), 1, "{lacking:?}");
+        assert!(
+            lacking[0].starts_with("A capture holds packets alone. It does not show what each")
+                && lacking[0].contains("losses in the buffers of sockets"),
+            "{lacking:?}"
+        );
+        let reason = "the kernel is too old".to_owned();
+        agent.blind.push((Ability::SocketLosses, reason));
+        let both = text(&agent);
+        assert_eq!(
+            both[0],
+            "The agent does not see losses in the buffers of sockets: the kernel is too old"
+        );
+        assert!(both.len() == 2 && !both[1].contains("buffers"), "{both:?}");
+        agent.abilities = Ability::ALL.to_vec();
+        assert!(text(&agent).is_empty());
+    }
+}

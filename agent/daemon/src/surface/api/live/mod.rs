@@ -1,0 +1,233 @@
+//! `GET /live`: everything that the page shows, first the whole state, then once a second what has
+//! changed since.
+//!
+//! Nothing waits for a slow client: each stream knows the last moment that it has sent, and takes
+//! what changed since then when the client takes more. What lies between is not sent. Nothing is
+//! computed while no stream is open.
+
+mod findings;
+mod line;
+mod scene;
+mod structure;
+mod values;
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::{Extension, State};
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Instant, sleep_until};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::body_stream::{Pieces, stream_of};
+use super::events::EventView;
+use super::health::HOST;
+use super::problem::{Code, Problem, ProblemBody};
+use super::security::Granted;
+use crate::surface::SourceKind;
+use crate::surface::events::Reader;
+use line::{End, Events, Line, Open, Replay};
+use ros2probe_model::snapshot::Passage;
+use scene::Scene;
+
+/// Streams at once, of all listeners: fewer than connections, so that requests find one.
+const MAX_TABS: usize = 16;
+/// Time between two batches. The agent publishes what it knows once a second.
+const INTERVAL: Duration = Duration::from_secs(1);
+/// So much earlier the next moment is waited for.
+const EARLY: Duration = Duration::from_millis(100);
+/// Events in one batch.
+const EVENTS: usize = 64;
+
+/// What all streams have in common; kept only while there is one.
+#[derive(Debug)]
+pub struct Live {
+    /// How long figures are kept.
+    history: Duration,
+    places: Arc<Semaphore>,
+    scene: Mutex<Option<Scene>>,
+}
+
+/// One client's stream.
+struct Stream {
+    context: Context,
+    access: String,
+    /// The last moment that was sent; `None` = none yet.
+    seen: Option<u64>,
+    sent: Instant,
+    /// The number of the last event that was looked at.
+    place: u64,
+    ended: bool,
+    permit: Option<OwnedSemaphorePermit>,
+}
+
+impl Live {
+    /// Of an agent that keeps figures for so long.
+    #[must_use]
+    pub fn new(history: Duration) -> Self {
+        Self {
+            history,
+            places: Arc::new(Semaphore::new(MAX_TABS)),
+            scene: Mutex::new(None),
+        }
+    }
+
+    fn scene(&self) -> MutexGuard<'_, Option<Scene>> {
+        self.scene.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(live))
+}
+
+/// The robot, as it changes
+///
+/// Each line is a JSON object with one member. First `open`, `graph`, `agent`, `findings`,
+/// `history` and `values` with every row; then once a second those that have changed, and always
+/// `values`, with the rows that have. A client that reads slowly gets fewer batches, each complete.
+/// Numbers of topics, nodes and participants are valid within one stream.
+#[utoipa::path(
+    get,
+    path = "/live",
+    tag = "graph",
+    responses(
+        (status = 200, description = "Lines, until the client disconnects or the agent stops.",
+            body = line::Line<'static>, content_type = "application/x-ndjson"),
+        (status = 503, description = "Too many streams, or the agent is shutting down.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn live(
+    State(context): State<Context>,
+    Extension(granted): Extension<Granted>,
+) -> Result<Response, Problem> {
+    let permit = Arc::clone(&context.live.places).try_acquire_owned();
+    let permit = permit.map_err(|_| {
+        let detail = format!("{MAX_TABS} pages are open, which is the limit");
+        Problem::new(Code::TooManyStreams, detail)
+    })?;
+    let stream = Stream {
+        access: granted.access().to_string(),
+        seen: None,
+        sent: Instant::now(),
+        place: context.board.events().last(),
+        ended: false,
+        permit: Some(permit),
+        context,
+    };
+    let headers = [
+        (CACHE_CONTROL, "no-store"),
+        (CONTENT_TYPE, "application/x-ndjson"),
+    ];
+    Ok((headers, Body::from_stream(stream_of(stream))).into_response())
+}
+
+impl Pieces for Stream {
+    type Piece = Bytes;
+
+    /// The next batch.
+    async fn next(&mut self) -> Option<Bytes> {
+        if self.ended {
+            return None;
+        }
+        let mut lines = Vec::new();
+        if self.seen.is_none() {
+            self.context.state().await;
+        } else if !self.moment().await {
+            self.ended = true;
+            let reason = "the agent ends";
+            Line::End(End { reason }).write(&mut lines);
+            return Some(lines.into());
+        }
+        self.sent = Instant::now();
+        self.batch(&mut lines);
+        Some(lines.into())
+    }
+}
+
+impl Stream {
+    /// Waits for the next moment that is shown; whether there is one.
+    async fn moment(&self) -> bool {
+        let board = &self.context.board;
+        let next = async {
+            sleep_until(self.sent + INTERVAL - EARLY).await;
+            tokio::select! {
+                () = board.published() => {}
+                // Nothing is published any more once a capture has ended.
+                () = sleep_until(self.sent + INTERVAL + EARLY * 3) => {}
+            }
+        };
+        tokio::select! {
+            () = self.context.stop.cancelled() => false,
+            () = next => true,
+        }
+    }
+
+    fn batch(&mut self, lines: &mut Vec<u8>) {
+        let context = &self.context;
+        let (state, past) = (context.board.state(), context.board.past());
+        let mut scene = context.live.scene();
+        let scene = scene.get_or_insert_default();
+        scene.update(&state, &past, &context.watches.in_force());
+        let seen = self.seen.unwrap_or(0);
+        if self.seen.is_none() {
+            let replay = (state.agent.source == SourceKind::Replay).then(|| Replay {
+                begin: state.agent.capture_begin.map(|begin| begin.seconds()),
+            });
+            let open = Open {
+                run: context.board.events().run(),
+                host: HOST.clone(),
+                version: env!("CARGO_PKG_VERSION"),
+                source: state.agent.source.label(),
+                access: self.access.clone(),
+                interval_seconds: 1,
+                history_seconds: context.live.history.as_secs(),
+                flags: &values::FLAGS,
+                passages: Passage::ALL.map(Passage::label).into(),
+                replay,
+            };
+            Line::Open(open).write(lines);
+        }
+        for part in scene.parts(seen) {
+            lines.extend_from_slice(part);
+        }
+        if self.seen.is_none() {
+            let history = values::history(state.known(), &past, &scene.ids);
+            Line::History(history).write(lines);
+        }
+        let log = context.board.events();
+        let batch = log.read(self.place, EVENTS);
+        self.place = batch.last;
+        if batch.lagged > 0 || !batch.records.is_empty() {
+            log.overtook(Reader::Stream, batch.lagged);
+            let events = Events {
+                missed: batch.lagged,
+                list: batch
+                    .records
+                    .iter()
+                    .map(|record| EventView::new(log, record))
+                    .collect(),
+            };
+            Line::Events(events).write(lines);
+        }
+        Line::Values(scene.values(seen)).write(lines);
+        self.seen = Some(scene.round());
+    }
+}
+
+impl Drop for Stream {
+    fn drop(&mut self) {
+        self.permit = None;
+        let live = &self.context.live;
+        if live.places.available_permits() == MAX_TABS {
+            *live.scene() = None;
+        }
+    }
+}

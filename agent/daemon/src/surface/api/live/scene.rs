@@ -1,0 +1,173 @@
+//! What all streams show of one moment, made once for all of them: each part has the number of the
+//! round in which it changed last, and a stream takes what changed since its own last round.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Instant;
+
+use bytes::Bytes;
+
+use super::super::index::Index;
+use super::findings::{Circumstances, dropped, findings};
+use super::line::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
+use super::structure::Ids;
+use super::values::{Figures, lost_lately, totals};
+use crate::surface::board::State;
+use crate::surface::{Ability as Able, SourceKind};
+use crate::watches::InForce;
+use ros2probe_model::history::Past;
+
+/// One moment, and what it took to come there.
+#[derive(Debug, Default)]
+pub(super) struct Scene {
+    /// Counts the moments.
+    round: u64,
+    state: Option<Arc<State>>,
+    past: Option<Arc<Past>>,
+    in_force: Option<Arc<InForce>>,
+    pub(super) ids: Ids,
+    structure: Part,
+    agent: Part,
+    findings: Part,
+    rows: BTreeMap<u32, (u64, Row)>,
+    at: f64,
+    totals: Totals,
+    progress: Option<Progress>,
+}
+
+/// Lines that are sent whole when they have changed.
+#[derive(Debug, Default)]
+struct Part {
+    changed: u64,
+    text: Bytes,
+}
+
+impl Part {
+    fn set(&mut self, line: &Line<'_>, round: u64) {
+        let mut text = Vec::with_capacity(self.text.len());
+        line.write(&mut text);
+        if self.text != text {
+            (self.changed, self.text) = (round, text.into());
+        }
+    }
+}
+
+impl Scene {
+    /// Takes in a moment, unless it is the one that is shown.
+    pub(super) fn update(&mut self, state: &Arc<State>, past: &Arc<Past>, in_force: &Arc<InForce>) {
+        let is_same = self
+            .state
+            .as_ref()
+            .is_some_and(|own| Arc::ptr_eq(own, state))
+            && self.past.as_ref().is_some_and(|own| Arc::ptr_eq(own, past))
+            && self
+                .in_force
+                .as_ref()
+                .is_some_and(|own| Arc::ptr_eq(own, in_force));
+        if is_same {
+            return;
+        }
+        self.round += 1;
+        let round = self.round;
+        let (snapshot, agent) = (state.known(), &state.agent);
+        let index = Index::new(snapshot);
+        let version = self.structure.changed;
+        let graph = self.ids.structure(snapshot, &index, in_force, round);
+        self.structure
+            .set(&Line::Graph(Graph { version, ..graph }), round);
+        if self.structure.changed == round {
+            // The version is the round, so a graph has another one whenever it differs.
+            let graph = self.ids.structure(snapshot, &index, in_force, round);
+            self.structure.set(
+                &Line::Graph(Graph {
+                    version: round,
+                    ..graph
+                }),
+                round,
+            );
+        }
+        let unready = state.ready(Instant::now()).err();
+        self.agent.set(
+            &Line::Agent(Agent {
+                ready: unready.is_none(),
+                reason: unready.clone(),
+                finished: agent.finished,
+                dropped: dropped(agent),
+                unknown_writers: snapshot.unknown_writers.len(),
+                topics_rejected: snapshot.topics_rejected,
+                abilities: Able::ALL
+                    .iter()
+                    .map(|ability| {
+                        let reason = agent.blind.iter().find(|(blind, _)| blind == ability);
+                        Ability(
+                            ability.label(),
+                            agent.abilities.contains(ability).into(),
+                            reason.map(|(_, reason)| reason.as_str()),
+                        )
+                    })
+                    .collect(),
+                watches: in_force.entries().len(),
+            }),
+            round,
+        );
+        let list = findings(&Circumstances {
+            snapshot,
+            agent,
+            past,
+            ids: &self.ids,
+            unready: unready.as_deref(),
+        });
+        self.findings.set(&Line::Findings(list), round);
+        let figures = Figures {
+            snapshot,
+            index: &index,
+            past,
+            watchlist: in_force.watchlist(),
+            sees_memory: agent.shared_memory.is_some(),
+            lost: lost_lately(past),
+        };
+        let rows = figures.rows(&self.ids);
+        // A topic without figures has an empty row once, so that no mark is left behind.
+        let emptied = self.rows.keys().filter(|id| !rows.contains_key(id));
+        let emptied = emptied.map(|id| (*id, Row::empty(*id)));
+        let emptied: Vec<_> = emptied.collect();
+        for (id, row) in rows.into_iter().chain(emptied) {
+            let (changed, own) = self.rows.entry(id).or_insert((round, row));
+            if *own != row {
+                (*changed, *own) = (round, row);
+            }
+        }
+        let topics = self.ids.topics();
+        self.rows.retain(|id, _| topics.contains(id));
+        self.at = snapshot.at.seconds();
+        self.totals = totals(snapshot, past);
+        self.progress = (agent.source == SourceKind::Replay)
+            .then(|| Progress(agent.replayed, agent.finished.into()));
+        self.state = Some(Arc::clone(state));
+        self.past = Some(Arc::clone(past));
+        self.in_force = Some(Arc::clone(in_force));
+    }
+
+    /// What changed of the graph, the agent and the findings since the round `seen`.
+    pub(super) fn parts(&self, seen: u64) -> impl Iterator<Item = &Bytes> {
+        let parts = [&self.structure, &self.agent, &self.findings];
+        let news = parts.into_iter().filter(move |part| part.changed > seen);
+        news.map(|part| &part.text)
+    }
+
+    /// The figures that changed since then.
+    pub(super) fn values(&self, seen: u64) -> Values {
+        let news = self.rows.values().filter(|(changed, _)| *changed > seen);
+        Values {
+            t: self.at,
+            topics: news.map(|(_, row)| *row).collect(),
+            totals: self.totals,
+            replay: self.progress,
+        }
+    }
+
+    /// The number of this moment.
+    pub(super) const fn round(&self) -> u64 {
+        self.round
+    }
+}

@@ -1,0 +1,262 @@
+//! Figures of topics as rows, their flags, and the rates of the minutes before.
+
+use std::collections::{BTreeMap, HashMap};
+
+use super::super::history::{short, thousandths};
+use super::super::index::Index;
+use super::line::{History, Rates, Row, Totals};
+use super::structure::{Ids, is_measured, is_shown};
+use crate::config::Watchlist;
+use ros2probe_model::diagnosis::Diagnosis;
+use ros2probe_model::history::{Past, Second};
+use ros2probe_model::snapshot::{Passage, Snapshot, TopicFacts, WatchState};
+
+/// Seconds and steps of what a stream begins with.
+const STEP: usize = 10;
+const STEPS: usize = 60;
+/// How long a loss is worth a mark, in seconds.
+pub(super) const LOSS: usize = 60;
+
+/// What a topic's flags mean, from the lowest bit on.
+pub(super) const FLAGS: [&str; 12] = [
+    "qos",
+    "type",
+    "definition",
+    "unheard",
+    "unfed",
+    "silent",
+    "violated",
+    "loss",
+    "unseen",
+    "sampled",
+    "encrypted",
+    "rejected",
+];
+
+/// A flag, by its place in [`FLAGS`].
+#[derive(Clone, Copy)]
+enum Flag {
+    Qos,
+    Type,
+    Definition,
+    Unheard,
+    Unfed,
+    Silent,
+    Violated,
+    Loss,
+    Unseen,
+    Sampled,
+    Encrypted,
+    Rejected,
+}
+
+/// What rows are made of.
+pub(super) struct Figures<'a> {
+    pub(super) snapshot: &'a Snapshot,
+    pub(super) index: &'a Index<'a>,
+    pub(super) past: &'a Past,
+    pub(super) watchlist: &'a Watchlist,
+    /// Messages in shared memory are seen.
+    pub(super) sees_memory: bool,
+    /// Messages lost in the last [`LOSS`] seconds, by the id that the past has for a topic.
+    pub(super) lost: HashMap<u32, u32>,
+}
+
+impl Figures<'_> {
+    /// The row of every topic that has one.
+    pub(super) fn rows(&self, ids: &Ids) -> BTreeMap<u32, Row> {
+        let last = self.past.seconds().last();
+        let topics = self.snapshot.topics.iter().filter(|topic| is_shown(topic));
+        let rows = topics.filter_map(|topic| {
+            let id = ids.topic(topic.domain_id, &topic.dds_name)?;
+            let row = self.row(id, topic, last.map(AsRef::as_ref));
+            (row.1.is_some() || row.8 != 0).then_some((id, row))
+        });
+        rows.collect()
+    }
+
+    fn row(&self, id: u32, topic: &TopicFacts, last: Option<&Second>) -> Row {
+        let known = self.past.id(topic.domain_id, &topic.dds_name);
+        let flags = self.flags(topic, known);
+        let Some(measured) = topic.measurement.as_deref() else {
+            return Row(id, None, None, None, None, None, None, None, flags, None);
+        };
+        let second = known.and_then(|known| last?.row(known));
+        let latency = second.and_then(|second| second.latency());
+        let part = |place: usize| latency.and_then(|it| it.get(place).copied()).map(short);
+        let at = measured.last_message;
+        Row(
+            id,
+            Some(thousandths(measured.rate_hz)),
+            Some(measured.bandwidth.round()),
+            Some(measured.messages),
+            Some(measured.lost),
+            Some(second.map_or(0, |second| second.lost)),
+            part(0),
+            part(1),
+            flags,
+            at.map(|at| thousandths(at.seconds())),
+        )
+    }
+
+    fn flags(&self, topic: &TopicFacts, known: Option<u32>) -> u32 {
+        let mut flags = 0;
+        let mut mark = |flag: Flag, holds: bool| flags |= u32::from(holds) << flag as u32;
+        let mut unheard = 0;
+        for finding in self.index.findings(topic) {
+            match finding {
+                Diagnosis::QosIncompatible { .. } => mark(Flag::Qos, true),
+                Diagnosis::TypeConflict { .. } => mark(Flag::Type, true),
+                Diagnosis::TypeHashConflict { .. } => mark(Flag::Definition, true),
+                Diagnosis::UnheardPublisher { .. } => {
+                    unheard += 1;
+                    mark(Flag::Unheard, true);
+                }
+                Diagnosis::UnfedSubscriber { .. } => mark(Flag::Unfed, true),
+                Diagnosis::DuplicateNode { .. } | Diagnosis::NodeInSeveralDomains { .. } => {}
+            }
+        }
+        let measured = topic.measurement.as_deref();
+        let is_measured = is_measured(topic, self.index);
+        let is_connected = unheard < topic.publishers.len() && !topic.subscriptions.is_empty();
+        let is_quiet = measured.is_some_and(|measured| measured.rate_hz == 0.0);
+        let watches = self.index.watches(topic);
+        let stands = |state| watches.iter().any(|(_, watch)| watch.state == state);
+        mark(
+            Flag::Silent,
+            is_measured && is_connected && is_quiet || stands(WatchState::Silent),
+        );
+        mark(Flag::Violated, stands(WatchState::Violated));
+        let lost = known.and_then(|known| self.lost.get(&known));
+        mark(Flag::Loss, lost.is_some_and(|lost| *lost > 0));
+        let is_unseen = |passage| match passage {
+            Passage::Network => false,
+            Passage::SharedMemory => !self.sees_memory,
+            Passage::DataSharing | Passage::SameProcess | Passage::Iceoryx => true,
+        };
+        let mut passages = topic.passages.iter();
+        mark(Flag::Unseen, passages.any(|each| is_unseen(each.passage)));
+        let is_sampled = measured.is_some_and(|measured| measured.sampled.is_some());
+        mark(Flag::Sampled, is_sampled);
+        let mut participants = topic
+            .publishers
+            .iter()
+            .map(|each| self.index.participant(each.guid));
+        let is_secured = participants.any(|each| each.is_some_and(|each| each.secured));
+        mark(Flag::Encrypted, is_secured);
+        let is_rejected = self.snapshot.topics_rejected > 0
+            && !is_measured
+            && !topic.hidden
+            && !self
+                .watchlist
+                .matching(topic.domain_id, &topic.name)
+                .is_empty();
+        mark(Flag::Rejected, is_rejected);
+        flags
+    }
+}
+
+/// Of all topics in the last second.
+pub(super) fn totals(snapshot: &Snapshot, past: &Past) -> Totals {
+    let rows = past
+        .seconds()
+        .last()
+        .map_or(&[][..], |second| second.rows());
+    let mut totals = Totals(0, 0, 0, snapshot.topics_measured);
+    let mut bytes = 0.0;
+    for row in rows {
+        totals.0 += u64::from(row.messages);
+        bytes += f64::from(row.bytes);
+        totals.2 += u64::from(row.lost);
+    }
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "a sum of bytes of one second"
+    )]
+    let bytes = bytes as u64;
+    totals.1 = bytes;
+    totals
+}
+
+/// Messages lost lately, by the past's id of their topic.
+pub(super) fn lost_lately(past: &Past) -> HashMap<u32, u32> {
+    let seconds = past.seconds();
+    let first = seconds.len().saturating_sub(LOSS);
+    let mut lost = HashMap::new();
+    for second in seconds.get(first..).unwrap_or_default() {
+        for row in second.rows().iter().filter(|row| row.lost > 0) {
+            let sum: &mut u32 = lost.entry(row.topic()).or_default();
+            *sum = sum.saturating_add(row.lost);
+        }
+    }
+    lost
+}
+
+/// Rates of the last minutes, for those of the topics that were measured.
+pub(super) fn history(snapshot: &Snapshot, past: &Past, ids: &Ids) -> History {
+    let seconds = past.seconds();
+    let first = seconds.len().saturating_sub(STEP * STEPS);
+    let steps: Vec<_> = seconds
+        .get(first..)
+        .unwrap_or_default()
+        .chunks(STEP)
+        .collect();
+    let mut history = History {
+        step_seconds: STEP as u32,
+        ..History::default()
+    };
+    let mut rates: BTreeMap<u32, Vec<Option<f64>>> = BTreeMap::new();
+    for (place, step) in steps.iter().enumerate() {
+        let Some(last) = step.last() else { continue };
+        let mut sums: HashMap<u32, (u32, u32)> = HashMap::new();
+        let (mut messages, mut bytes, mut lost) = (0.0, 0.0, 0.0);
+        for row in step.iter().flat_map(|second| second.rows()) {
+            messages += f64::from(row.messages);
+            bytes += f64::from(row.bytes);
+            lost += f64::from(row.lost);
+            let (sum, rows) = sums.entry(row.topic()).or_default();
+            *sum = sum.saturating_add(row.messages);
+            *rows += 1;
+        }
+        let length = f64::from(u32::try_from(step.len()).unwrap_or(u32::MAX));
+        history.t.push(last.at.seconds());
+        for (column, value) in history.totals.iter_mut().zip([
+            thousandths(messages / length),
+            (bytes / length).round(),
+            lost,
+        ]) {
+            column.push(value);
+        }
+        for (topic, (sum, rows)) in sums {
+            let column = rates
+                .entry(topic)
+                .or_insert_with(|| vec![None; steps.len()]);
+            if let Some(value) = column.get_mut(place) {
+                *value = Some(thousandths(f64::from(sum) / f64::from(rows)));
+            }
+        }
+    }
+    let topics = snapshot.topics.iter().filter_map(|topic| {
+        let known = past.id(topic.domain_id, &topic.dds_name)?;
+        let id = ids.topic(topic.domain_id, &topic.dds_name)?;
+        Some(Rates(id, rates.remove(&known)?))
+    });
+    history.topics = topics.collect();
+    history
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_flag_has_its_name() {
+        let named = |flag: Flag| FLAGS[flag as usize];
+        assert_eq!(named(Flag::Qos), "qos");
+        assert_eq!(named(Flag::Silent), "silent");
+        assert_eq!(named(Flag::Loss), "loss");
+        assert_eq!(named(Flag::Rejected), "rejected");
+        assert_eq!(Flag::Rejected as usize + 1, FLAGS.len());
+    }
+}

@@ -1,0 +1,530 @@
+//! `GET /topics/{topic}/messages`: the decoded messages of a topic, a few a second.
+//!
+//! Messages are taken as fast as they come and the newest one is shown; the topic is measured while
+//! the stream is open. Definitions are read and payloads decoded on threads that may block, away
+//! from the one that captures and the one that answers.
+
+mod tree;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Json;
+use axum::body::Body;
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use ros2probe_wire::Guid;
+use serde::{Deserialize, Serialize};
+use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::task::spawn_blocking;
+use tokio::time::{Instant, sleep_until};
+use utoipa::{IntoParams, ToSchema};
+
+use super::body_stream::{Pieces, stream_of};
+use super::endpoint::text;
+use super::problem::{Code, Problem, ProblemBody};
+use super::scope::Domain;
+use super::security::Granted;
+use super::topics::{TopicParameter, find};
+use super::{Context, Streamed};
+use crate::config::Access;
+use crate::subscriptions::{
+    Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
+};
+use ros2probe_message::{Library, Limits, MessageType, decode};
+use ros2probe_model::payloads::Sample;
+use tree::{ELEMENTS, Tree};
+
+/// Streams at once, of all listeners: each has the bytes of all messages of its topic captured.
+static STREAMS: Semaphore = Semaphore::const_new(MAX_READERS);
+const MAX_READERS: usize = 8;
+/// Messages shown in a second.
+const MOST_HERTZ: f64 = 5.0;
+const LEAST_HERTZ: f64 = 0.1;
+/// Room for messages that come while one is shown.
+const QUEUE_BYTES: usize = 16 << 20;
+/// Longest silence of a stream.
+const BEAT: Duration = Duration::from_secs(1);
+
+#[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct Wanted {
+    /// Its domain; may be left out where the name is in one domain only.
+    #[param(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
+    /// Messages shown in a second at most; 5 when left out.
+    #[param(minimum = 0.1, maximum = 5)]
+    max_hertz: Option<f64>,
+}
+
+/// One line: an object with one member.
+#[derive(Debug, Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+#[schema(as = MessagesLine)]
+pub(super) enum Line {
+    /// The type of the messages that follow.
+    Type(TypeLine),
+    /// A message.
+    Message(MessageLine),
+    /// Messages that will not be shown because their bytes are not known.
+    Missed(MissedLine),
+    /// The stream lives.
+    Beat(Beat),
+    /// Nothing will follow.
+    End(End),
+}
+
+/// A type.
+#[derive(Clone, Debug, Serialize, ToSchema)]
+#[schema(as = MessagesType)]
+pub(super) struct TypeLine {
+    /// ROS name.
+    #[schema(example = "sensor_msgs/msg/Imu")]
+    name: String,
+    /// Whether its definition is known, so that messages can be decoded.
+    known: bool,
+    /// Why not.
+    reason: Option<String>,
+    /// The definition with those of its parts, as ROS bags have it.
+    definition: Option<String>,
+}
+
+/// A message.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = MessagesMessage)]
+pub(super) struct MessageLine {
+    /// Unix time of its arrival.
+    time: f64,
+    /// Unix time at which it was written, by the writer's clock.
+    source_time: Option<f64>,
+    /// GUID of its writer.
+    #[serde(serialize_with = "text")]
+    #[schema(value_type = String)]
+    writer: Guid,
+    /// The writer's node.
+    node: Option<String>,
+    /// Its number among those of this writer.
+    sequence_number: u64,
+    /// Bytes of the serialized message.
+    bytes: u32,
+    /// Messages that came between the one shown before and this one.
+    skipped: u64,
+    /// Its fields, in the order of the definition. 64-bit numbers beyond 2^53, NaN and infinities are
+    /// text; of long arrays and texts there is `$length` and the beginning, `$items` or `$text`.
+    #[schema(value_type = Option<Object>)]
+    value: Option<Box<serde_json::value::RawValue>>,
+    /// Why it cannot be decoded.
+    error: Option<String>,
+}
+
+/// Messages that are not known.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = MessagesMissed)]
+pub(super) struct MissedLine {
+    /// How many.
+    messages: u64,
+    /// Why.
+    #[schema(value_type = String)]
+    reason: &'static str,
+}
+
+/// The stream lives.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = MessagesBeat)]
+pub(super) struct Beat {
+    /// Unix time up to which all messages have come.
+    t: Option<f64>,
+}
+
+/// Why nothing follows.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = MessagesEnd)]
+pub(super) struct End {
+    /// In words.
+    #[schema(value_type = String)]
+    reason: &'static str,
+}
+
+/// One client's stream.
+struct Stream {
+    context: Context,
+    subscription: Subscription,
+    pause: Duration,
+    /// When the last message was shown, and when anything was.
+    shown: Option<Instant>,
+    said: Instant,
+    newest: Option<Arc<Sample>>,
+    skipped: u64,
+    /// Messages that are not known, with the latest reason.
+    missed: Option<MissedLine>,
+    clock: Option<f64>,
+    known: Option<Known>,
+    ended: bool,
+    _permit: SemaphorePermit<'static>,
+}
+
+/// The type in the last `type` line.
+#[derive(Clone)]
+struct Known {
+    name: Arc<str>,
+    hash: Option<String>,
+    found: Option<Arc<MessageType>>,
+}
+
+/// The definition of a topic's type
+///
+/// As the agent finds it: what discovery announces is a name and a hash, which the definition agrees
+/// with. Names: see `/topics/{topic}/history`.
+#[utoipa::path(
+    get,
+    path = "/topics/{topic}/definition",
+    tag = "graph",
+    params(TopicParameter, Domain),
+    responses(
+        (status = 200, description = "Its type, known or not.", body = TypeLine),
+        (status = 404, description = "No such topic.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 409, description = "It is in several domains.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn definition(
+    context: &Context,
+    name: &str,
+    domain: Domain,
+) -> Result<Response, Problem> {
+    let state = context.board.state();
+    let topic = find(state.known(), name, domain.checked()?)?;
+    let hash = topic.type_hashes.first().cloned();
+    let name = topic.message_types.first().cloned().unwrap_or_default();
+    let library = Arc::clone(&context.library);
+    let found = spawn_blocking(move || look_up(&library, &name, hash.as_deref()).0).await;
+    let found = found.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
+    Ok(Json(found).into_response())
+}
+
+/// Messages of a topic, decoded
+///
+/// At most five a second, the newest one each time; the topic is measured meanwhile. Each line is a
+/// JSON object with one member: `type` before the first message and when it changes, `message`,
+/// `missed`, `beat` once a second in which nothing else came, and `end`. Names: see
+/// `/topics/{topic}/history`.
+#[utoipa::path(
+    get,
+    path = "/topics/{topic}/messages",
+    tag = "samples",
+    params(TopicParameter, Wanted),
+    responses(
+        (status = 200, description = "Lines, until the client disconnects, or the capture or the \
+            agent ends.",
+            body = Line, content_type = "application/x-ndjson"),
+        (status = 404, description = "No such topic.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 409, description = "It is in several domains.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 503, description = "Too many streams.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+pub(super) async fn follow(
+    context: Context,
+    granted: &Granted,
+    name: &str,
+    wanted: Wanted,
+) -> Result<Response, Problem> {
+    granted.require(Access::All)?;
+    let hertz = wanted.max_hertz.unwrap_or(MOST_HERTZ);
+    if !(LEAST_HERTZ..=MOST_HERTZ).contains(&hertz) {
+        let detail = format!("max_hertz is {hertz}, must be {LEAST_HERTZ} to {MOST_HERTZ}");
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    let state = context.state().await;
+    let topic = find(state.known(), name, Domain::of(wanted.domain_id).checked()?)?;
+    let choice = Choice::parse(&topic.name)
+        .map_err(|error| Problem::new(Code::InvalidRequest, error.to_string()))?;
+    let permit = STREAMS.try_acquire().map_err(|_| {
+        let detail = format!("{MAX_READERS} topics are being read, which is the limit");
+        Problem::new(Code::TooManyStreams, detail)
+    })?;
+    let opened = context.subscriptions.open(request(choice, topic.domain_id));
+    let subscription = opened.map_err(|refused: Refused| {
+        Problem::new(Code::TooManySubscriptions, refused.to_string())
+    })?;
+    let stream = Stream {
+        subscription,
+        pause: Duration::from_secs_f64(1.0 / hertz),
+        shown: None,
+        said: Instant::now(),
+        newest: None,
+        skipped: 0,
+        missed: None,
+        clock: None,
+        known: None,
+        ended: false,
+        _permit: permit,
+        context,
+    };
+    let headers = [
+        (CACHE_CONTROL, "no-store"),
+        (CONTENT_TYPE, "application/x-ndjson"),
+    ];
+    let mut response = (headers, Body::from_stream(stream_of(stream))).into_response();
+    response.extensions_mut().insert(Streamed);
+    Ok(response)
+}
+
+/// What a stream asks of the capture.
+fn request(topic: Choice, domain_id: u32) -> Request {
+    Request {
+        topics: Selection {
+            include: vec![topic],
+            exclude: Vec::new(),
+            hidden: true,
+        },
+        domain_id: Some(domain_id),
+        depth: Depth::Payloads,
+        queue_bytes: QUEUE_BYTES,
+        // A page is not worth waiting for, on a replay either.
+        overflow: Overflow::DropOldest,
+        label: "GET /topics/{topic}/messages".to_owned(),
+    }
+}
+
+impl Pieces for Stream {
+    type Piece = Bytes;
+
+    /// The next lines.
+    async fn next(&mut self) -> Option<Bytes> {
+        if self.ended {
+            return None;
+        }
+        let mut lines = Vec::new();
+        while lines.is_empty() {
+            let due = self.shown.map_or(self.said, |shown| shown + self.pause);
+            let due = if self.newest.is_some() {
+                due
+            } else {
+                self.said + BEAT
+            };
+            tokio::select! {
+                biased;
+                () = sleep_until(due) => self.say(&mut lines).await,
+                () = self.context.stop.cancelled() => self.end("the agent ends", &mut lines).await,
+                item = self.subscription.next() => match item {
+                    Some(Item::End(reason)) => self.end(reason, &mut lines).await,
+                    None => self.end("the stream has ended", &mut lines).await,
+                    Some(item) => self.take(item),
+                },
+            }
+        }
+        self.said = Instant::now();
+        Some(lines.into())
+    }
+}
+
+impl Stream {
+    fn take(&mut self, item: Item) {
+        match item {
+            Item::Sample(sample) => {
+                let before = self.newest.replace(sample);
+                self.skipped += u64::from(before.is_some());
+            }
+            Item::Clock(clock) => self.clock = Some(clock.seconds()),
+            Item::Missed(missed) => {
+                let messages = self.missed.as_ref().map_or(0, |missed| missed.messages);
+                self.missed = Some(MissedLine {
+                    messages: messages + missed.samples,
+                    reason: missed.reason.label(),
+                });
+            }
+            Item::End(_) => {}
+        }
+    }
+
+    async fn end(&mut self, reason: &'static str, lines: &mut Vec<u8>) {
+        self.ended = true;
+        if self.newest.is_some() {
+            self.say(lines).await;
+        }
+        write(lines, &Line::End(End { reason }));
+    }
+
+    /// Shows the newest message, or that the stream lives.
+    async fn say(&mut self, lines: &mut Vec<u8>) {
+        if let Some(missed) = self.missed.take() {
+            write(lines, &Line::Missed(missed));
+        }
+        let Some(sample) = self.newest.take() else {
+            write(lines, &Line::Beat(Beat { t: self.clock }));
+            return;
+        };
+        self.shown = Some(Instant::now());
+        let message_type = self.find(&sample, lines).await;
+        let shown = Arc::clone(&sample);
+        let decoded = spawn_blocking(move || value(message_type.as_deref(), &shown)).await;
+        let (value, error) = match decoded {
+            Ok(Ok(value)) => (value, None),
+            Ok(Err(error)) => (None, Some(error)),
+            Err(_) => (None, Some("decoding it failed".to_owned())),
+        };
+        let state = self.context.board.state();
+        let mut topics = state.known().topics.iter();
+        let node = topics.find_map(|topic| {
+            let mut publishers = topic.publishers.iter();
+            let publisher = publishers.find(|publisher| publisher.guid == sample.writer)?;
+            publisher.node.clone()
+        });
+        let line = MessageLine {
+            time: sample.time.seconds(),
+            source_time: sample.source_timestamp.map(|time| time.seconds()),
+            writer: sample.writer,
+            node,
+            sequence_number: sample.sequence_number,
+            bytes: sample.size,
+            skipped: std::mem::take(&mut self.skipped),
+            value,
+            error,
+        };
+        write(lines, &Line::Message(line));
+    }
+
+    /// The type of a message; writes a `type` line where it differs from that of the message before.
+    async fn find(&mut self, sample: &Sample, lines: &mut Vec<u8>) -> Option<Arc<MessageType>> {
+        let name = &sample.topic.message_type;
+        let offered = sample.topic.offered.as_ref();
+        let hash = offered.and_then(|offered| offered.type_hash.as_ref());
+        let hash = hash.map(ToString::to_string);
+        if let Some(known) = &self.known
+            && known.name == *name
+            && known.hash == hash
+        {
+            return known.found.clone();
+        }
+        let library = Arc::clone(&self.context.library);
+        let (wanted, announced) = (Arc::clone(name), hash.clone());
+        let found = spawn_blocking(move || look_up(&library, &wanted, announced.as_deref())).await;
+        let (line, found) = found.unwrap_or_else(|_| {
+            let reason = "looking for its definition failed".to_owned();
+            (unknown(name, reason), None)
+        });
+        write(lines, &Line::Type(line));
+        self.known = Some(Known {
+            name: Arc::clone(name),
+            hash,
+            found: found.clone(),
+        });
+        found
+    }
+}
+
+fn look_up(
+    library: &Library,
+    name: &str,
+    hash: Option<&str>,
+) -> (TypeLine, Option<Arc<MessageType>>) {
+    match library.find(name, hash) {
+        Ok(found) => {
+            let line = TypeLine {
+                name: name.to_owned(),
+                known: true,
+                reason: None,
+                definition: Some(found.schema_text().1),
+            };
+            (line, Some(found))
+        }
+        Err(error) => (unknown(name, error.to_string()), None),
+    }
+}
+
+fn unknown(name: &str, reason: String) -> TypeLine {
+    TypeLine {
+        name: name.to_owned(),
+        known: false,
+        reason: Some(reason),
+        definition: None,
+    }
+}
+
+/// The fields of a message; `None` where its type or its bytes are not known.
+fn value(
+    message_type: Option<&MessageType>,
+    sample: &Sample,
+) -> Result<Option<Box<serde_json::value::RawValue>>, String> {
+    let (Some(message_type), Some(payload)) = (message_type, &sample.payload) else {
+        return Ok(None);
+    };
+    let limits = Limits {
+        kept: ELEMENTS,
+        ..Limits::default()
+    };
+    let decoded = decode(message_type, payload, &limits).map_err(|error| error.to_string())?;
+    let shown = serde_json::value::to_raw_value(&Tree::new(&decoded.message));
+    shown.map(Some).map_err(|error| error.to_string())
+}
+
+fn write(lines: &mut Vec<u8>, line: &Line) {
+    // Plain numbers and strings into memory: nothing that could fail.
+    let _ = serde_json::to_writer(&mut *lines, line);
+    lines.push(b'\n');
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
+    use tokio_util::sync::CancellationToken;
+
+    use super::*;
+    use crate::subscriptions::{Caps, Subscriptions};
+    use crate::surface::{Board, Settings, SourceKind};
+    use ros2probe_model::payloads::{Given, News, Topic};
+
+    #[test]
+    fn messages_that_wait_beyond_the_bytes_go_and_are_counted() {
+        const MESSAGES: u64 = 40;
+        let board = Arc::new(Board::new(SourceKind::Wire, Settings::default()));
+        let caps = Caps {
+            subscriptions: 1,
+            bytes: 64 << 20,
+        };
+        let all = Arc::new(Subscriptions::new(board, caps, CancellationToken::new()));
+        let choice = Choice::parse("/points").unwrap();
+        let mut subscription = all.open(request(choice, 0)).unwrap();
+        let topic = Arc::new(Topic {
+            domain_id: 0,
+            name: "/points".into(),
+            dds_name: "rt/points".into(),
+            message_type: "a/msg/B".into(),
+            offered: None,
+        });
+        for number in 1..=MESSAGES {
+            let sample = Sample {
+                topic: Arc::clone(&topic),
+                time: Timestamp(number),
+                writer: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3])),
+                sequence_number: number,
+                source_timestamp: None,
+                header_stamp: None,
+                size: 1 << 20,
+                sampled: false,
+                payload: Some(vec![7; 1 << 20].into()),
+            };
+            let news = News::Sample(Arc::new(sample));
+            let to = [1].into();
+            all.deliver(vec![Given { to, news }], None);
+        }
+        assert!(all.facts().queued_bytes <= QUEUE_BYTES);
+        let (mut missed, mut kept) = (0, Vec::new());
+        while let Some(item) = subscription.try_next() {
+            match item {
+                Item::Missed(news) => missed += news.samples,
+                Item::Sample(sample) => kept.push(sample.sequence_number),
+                Item::Clock(_) | Item::End(_) => {}
+            }
+        }
+        assert_eq!(missed + kept.len() as u64, MESSAGES);
+        assert_eq!(kept.last(), Some(&MESSAGES), "the newest is kept");
+        assert!((14..=16).contains(&kept.len()), "{kept:?}");
+    }
+}

@@ -1,0 +1,195 @@
+//! The control API: REST over a loopback address and a unix socket, described by its OpenAPI
+//! document. It reads snapshots and changes what is watched; it never makes the capture wait.
+//!
+//! A module for each noun gives its routes; what every request has to pass is in `security`.
+
+mod actions;
+mod body;
+mod body_stream;
+mod downloads;
+mod endpoint;
+mod events;
+mod finding;
+mod graph;
+mod health;
+mod history;
+mod index;
+pub mod live;
+mod measured;
+mod messages;
+mod names;
+mod nearest;
+mod nodes;
+mod openapi;
+pub mod page;
+mod parameters;
+mod participants;
+mod party;
+mod pipe;
+pub mod problem;
+mod processes;
+mod recordings;
+pub mod reload;
+mod samples;
+mod scope;
+mod security;
+mod server;
+mod services;
+mod silence;
+mod snapshots;
+mod topics;
+mod watch;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::to_bytes;
+use axum::extract::{Request, State as Extract};
+use axum::http::header::CONTENT_LENGTH;
+use axum::http::{Method, StatusCode};
+use axum::middleware::{self, Next};
+use axum::response::{IntoResponse as _, Response};
+use tokio_util::sync::CancellationToken;
+use utoipa_axum::router::OpenApiRouter;
+
+use super::board::{Board, State};
+use super::large::Answers;
+use crate::config::{Access, Limit};
+use crate::recording::{Recordings, Snapshots};
+use crate::subscriptions::Subscriptions;
+use crate::watches::Watches;
+pub use live::Live;
+pub use openapi::document;
+pub use page::Page;
+pub use pipe::serve as serve_in_process;
+use problem::{Code, Problem};
+use reload::Reloader;
+use ros2probe_message::Library;
+use security::{Door, Needs};
+pub use server::{OpenError, Server};
+
+/// How long a reader waits for a snapshot that knows what was asked for just before.
+const PATIENCE: Duration = Duration::from_millis(600);
+
+/// What the routes work on.
+#[derive(Clone)]
+pub struct Context {
+    /// The latest snapshot.
+    pub board: Arc<Board>,
+    /// What is watched.
+    pub watches: Arc<Watches>,
+    /// Who gets messages one by one.
+    pub subscriptions: Arc<Subscriptions>,
+    /// Bags that the agent writes.
+    pub recordings: Arc<Recordings>,
+    /// The last seconds of some topics.
+    pub snapshots: Arc<Snapshots>,
+    /// What streams of the page have in common.
+    pub live: Arc<Live>,
+    /// Definitions of messages.
+    pub library: Arc<Library>,
+    /// The page for browsers.
+    pub page: Arc<Page>,
+    /// Has the configuration read again.
+    pub reloader: Reloader,
+    /// Ends streams when the agent ends.
+    pub stop: CancellationToken,
+}
+
+impl Context {
+    /// What is known at this moment, or a little earlier where the capture has no time.
+    async fn state(&self) -> Arc<State> {
+        self.board.refresh(PATIENCE).await;
+        self.board.state()
+    }
+}
+
+/// The routes of all nouns and what the document says of them.
+fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
+    let turns = |views: OpenApiRouter<Context>| match context {
+        Some(context) => views.layer(middleware::from_fn_with_state(context.clone(), take_turns)),
+        None => views,
+    };
+    let needs = |read, change, routes: OpenApiRouter<Context>| {
+        let needs = Needs { read, change };
+        routes.layer(middleware::from_fn_with_state(needs, security::within))
+    };
+    OpenApiRouter::with_openapi(openapi::head())
+        .merge(needs(Access::Read, Access::Watch, watch::routes()))
+        .merge(events::routes())
+        .merge(live::routes())
+        .merge(needs(Access::Watch, Access::Watch, samples::routes()))
+        .merge(needs(Access::All, Access::All, recordings::routes()))
+        .merge(needs(Access::All, Access::All, downloads::routes()))
+        .merge(needs(Access::All, Access::All, snapshots::routes()))
+        .merge(turns(views()))
+        .merge(processes::routes())
+        .merge(health::routes())
+        .merge(needs(Access::All, Access::All, reload::routes()))
+        .merge(needs(Access::All, Access::All, page::routes()))
+        .merge(openapi::routes())
+}
+
+/// What tells all there is of something.
+fn views() -> OpenApiRouter<Context> {
+    OpenApiRouter::new()
+        .merge(topics::routes())
+        .merge(nodes::routes())
+        .merge(services::routes())
+        .merge(actions::routes())
+        .merge(participants::routes())
+        .merge(graph::routes())
+        .merge(names::routes())
+}
+
+/// Views that are being made and read.
+static VIEWS: Answers = Answers::new();
+
+/// Marks a response that is a stream: it is passed on as it comes, and takes no turn of a view.
+#[derive(Clone, Copy, Debug)]
+struct Streamed;
+
+/// Few views at a time: see [`super::large`].
+async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
+    let Some(turn) = VIEWS.turn().await else {
+        context.board.limits().reached(Limit::ApiClients, 1);
+        let detail = "memory for responses is used up by slow readers";
+        return Problem::new(Code::TooManyClients, detail).into_response();
+    };
+    let response = next.run(request).await;
+    if response.extensions().get::<Streamed>().is_some() {
+        return response;
+    }
+    let (mut head, body) = response.into_parts();
+    match to_bytes(body, usize::MAX).await {
+        Ok(bytes) => {
+            head.headers.insert(CONTENT_LENGTH, bytes.len().into());
+            Response::from_parts(head, turn.keep(bytes))
+        }
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
+}
+
+/// What answers behind `door`.
+fn router(context: &Context, door: Arc<Door>) -> Router {
+    let (router, _) = nouns(Some(context)).split_for_parts();
+    let files = (door.is_for_browsers() && context.page.is_served()).then(|| {
+        let guard = middleware::from_fn_with_state(Arc::clone(&door), security::guard_files);
+        page::files().layer(guard)
+    });
+    let router = router
+        .fallback(async || Problem::new(Code::NotFound, "the paths are listed in /openapi.json"))
+        .method_not_allowed_fallback(async |method: Method| {
+            Problem::new(
+                Code::MethodNotAllowed,
+                format!("{method} is not possible here"),
+            )
+        })
+        .layer(middleware::from_fn_with_state(door, security::guard));
+    let router = match files {
+        Some(files) => router.merge(files),
+        None => router,
+    };
+    router.with_state(context.clone())
+}

@@ -1,0 +1,299 @@
+//! `/nodes`: ROS nodes with all they publish, subscribe, serve and call, as `ros2 node info` says.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use ros2probe_wire::Guid;
+use serde::Serialize;
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::endpoint::{ProcessView, text};
+use super::finding::FindingView;
+use super::index::{Ends, Index};
+use super::nearest::hint;
+use super::parameters::{Name, Parameters};
+use super::party::{Side, action, action_type, service_type};
+use super::problem::{Code, Problem, ProblemBody};
+use super::scope::{Scope, only};
+use ros2probe_model::diagnosis::Diagnosis;
+use ros2probe_model::snapshot::{NodeFacts, Snapshot};
+
+/// Nodes.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = NodeList)]
+struct NodesView<'a> {
+    /// Unix time of the facts.
+    timestamp_seconds: f64,
+    /// By domain and name.
+    nodes: Vec<NodeView<'a>>,
+}
+
+/// One node name. Several nodes of one name in one domain are a fault, and shown as one.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Node)]
+struct NodeView<'a> {
+    /// Domain.
+    domain_id: u32,
+    /// Fully qualified name.
+    #[schema(example = "/robot1/lidar")]
+    name: &'a str,
+    /// Hidden by ROS convention: those of the command line are.
+    hidden: bool,
+    /// Each node of the name; more than one is a fault.
+    instances: Vec<InstanceView<'a>>,
+    /// Topics it publishes.
+    publishers: Vec<NamedView<'a>>,
+    /// Topics it subscribes to.
+    subscriptions: Vec<NamedView<'a>>,
+    /// Services it serves.
+    services: Vec<NamedView<'a>>,
+    /// Services it calls.
+    clients: Vec<NamedView<'a>>,
+    /// Actions it serves.
+    action_servers: Vec<NamedView<'a>>,
+    /// Actions it calls.
+    action_clients: Vec<NamedView<'a>>,
+    /// What is wrong with it; `/topics` says what is wrong with its topics.
+    diagnoses: Vec<FindingView<'a>>,
+}
+
+/// One node of a name.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = NodeInstance)]
+struct InstanceView<'a> {
+    /// Its participant.
+    #[serde(serialize_with = "text")]
+    #[schema(value_type = String)]
+    participant: Guid,
+    /// Implementation.
+    vendor: Option<&'a str>,
+    /// Where it lives.
+    #[serde(flatten)]
+    process: Option<ProcessView<'a>>,
+}
+
+/// A name with its types.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Named)]
+struct NamedView<'a> {
+    /// ROS name.
+    name: String,
+    /// ROS types.
+    #[schema(value_type = Vec<String>)]
+    types: BTreeSet<&'a str>,
+}
+
+/// Names with their types, sorted.
+#[derive(Debug, Default)]
+struct Names<'a>(BTreeMap<String, BTreeSet<&'a str>>);
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new()
+        .routes(routes!(list))
+        .routes(routes!(show))
+}
+
+/// All nodes
+#[utoipa::path(
+    get,
+    path = "/nodes",
+    tag = "graph",
+    params(Scope),
+    responses((status = 200, description = "Nodes.", body = NodesView<'static>))
+)]
+async fn list(
+    State(context): State<Context>,
+    Parameters(scope): Parameters<Scope>,
+) -> Result<Response, Problem> {
+    let scope = scope.checked()?;
+    let state = context.state().await;
+    let snapshot = state.known();
+    let desk = Desk::new(snapshot, scope);
+    let nodes = nodes(snapshot).filter(|nodes| {
+        let first = nodes.first();
+        first.is_some_and(|node| {
+            scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden(&node.name))
+        })
+    });
+    let answer = NodesView {
+        timestamp_seconds: snapshot.at.seconds(),
+        nodes: nodes.filter_map(|nodes| desk.node(nodes)).collect(),
+    };
+    Ok(Json(answer).into_response())
+}
+
+/// One node
+#[utoipa::path(
+    get,
+    path = "/nodes/{*node}",
+    tag = "graph",
+    params(NodeParameter, Scope),
+    responses(
+        (status = 200, description = "The node.", body = NodeView<'static>),
+        (status = 404, description = "No such node.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 409, description = "It is in several domains.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn show(
+    State(context): State<Context>,
+    Name(name): Name,
+    Parameters(scope): Parameters<Scope>,
+) -> Result<Response, Problem> {
+    let scope = scope.checked()?;
+    let state = context.state().await;
+    let snapshot = state.known();
+    let admitted = || {
+        let all = nodes(snapshot).filter_map(|nodes| Some((nodes.first()?, nodes)));
+        all.filter(|(node, _)| scope.admits(node.domain_id))
+    };
+    let found = admitted().filter(|(node, _)| node.name == name);
+    let found = found.map(|(node, nodes)| (node.domain_id, nodes)).collect();
+    let missing = || {
+        let hint = hint(&name, admitted().map(|(node, _)| node.name.as_str()));
+        Problem::new(Code::NoSuchNode, format!("no node {name}{hint}"))
+    };
+    let nodes = only(found, &name, missing)?;
+    let desk = Desk::new(snapshot, scope);
+    Ok(Json(desk.node(nodes)).into_response())
+}
+
+/// The node in a path, for the document.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "read by the document's generator alone")]
+struct NodeParameter {
+    /// Fully qualified name without its leading slash; slashes within need not be encoded.
+    #[param(min_length = 1, example = "robot1/lidar")]
+    node: String,
+}
+
+/// Nodes of one name in one domain, together.
+fn nodes(snapshot: &Snapshot) -> impl Iterator<Item = &[NodeFacts]> {
+    snapshot.nodes.chunk_by(|one, other| {
+        (one.domain_id, one.name.as_str()) == (other.domain_id, other.name.as_str())
+    })
+}
+
+fn is_hidden(name: &str) -> bool {
+    name.split('/').any(|token| token.starts_with('_'))
+}
+
+/// What answers are made of.
+struct Desk<'a> {
+    snapshot: &'a Snapshot,
+    index: Index<'a>,
+    ends: Ends<'a>,
+    scope: Scope,
+}
+
+impl<'a> Desk<'a> {
+    fn new(snapshot: &'a Snapshot, scope: Scope) -> Self {
+        Self {
+            snapshot,
+            index: Index::new(snapshot),
+            ends: Ends::new(snapshot),
+            scope,
+        }
+    }
+
+    fn node(&self, nodes: &'a [NodeFacts]) -> Option<NodeView<'a>> {
+        let first = nodes.first()?;
+        let [mut publishers, mut subscriptions] = [Names::default(), Names::default()];
+        let [mut services, mut clients] = [Names::default(), Names::default()];
+        let [mut action_servers, mut action_clients] = [Names::default(), Names::default()];
+        let writers = nodes.iter().flat_map(|node| &node.writers);
+        let readers = nodes.iter().flat_map(|node| &node.readers);
+        let ends = writers.map(|guid| (guid, true));
+        for (guid, is_writer) in ends.chain(readers.map(|guid| (guid, false))) {
+            let Some((topic, endpoint)) = self.ends.endpoint(*guid) else {
+                continue;
+            };
+            // Not the topic's types: nodes of another type may be on it.
+            let message_type = endpoint.message_type.as_str();
+            let side = Side::of(topic, is_writer);
+            if let (Some(side), Some((name, _))) = (side, action(topic)) {
+                let names = match side {
+                    Side::Server => &mut action_servers,
+                    Side::Client => &mut action_clients,
+                };
+                names.add(name.as_str(), action_type(message_type));
+            }
+            if topic.hidden && !self.scope.shows_hidden() {
+                continue;
+            }
+            match (topic.kind, side) {
+                ("service_request" | "service_reply", Some(side)) => {
+                    let names = match side {
+                        Side::Server => &mut services,
+                        Side::Client => &mut clients,
+                    };
+                    names.add(&topic.name, Some(service_type(message_type)));
+                }
+                _ if is_writer => publishers.add(&topic.name, Some(message_type)),
+                _ => subscriptions.add(&topic.name, Some(message_type)),
+            }
+        }
+        Some(NodeView {
+            domain_id: first.domain_id,
+            name: &first.name,
+            hidden: is_hidden(&first.name),
+            instances: nodes.iter().map(|node| self.instance(node)).collect(),
+            publishers: publishers.views(),
+            subscriptions: subscriptions.views(),
+            services: services.views(),
+            clients: clients.views(),
+            action_servers: action_servers.views(),
+            action_clients: action_clients.views(),
+            diagnoses: self.findings(first),
+        })
+    }
+
+    fn instance(&self, node: &'a NodeFacts) -> InstanceView<'a> {
+        let participant = self.index.participant(node.participant);
+        InstanceView {
+            participant: node.participant,
+            vendor: participant.map(|participant| participant.vendor.as_str()),
+            process: participant.map(|participant| (&participant.process).into()),
+        }
+    }
+
+    fn findings(&self, own: &NodeFacts) -> Vec<FindingView<'a>> {
+        let found = self.snapshot.diagnoses.list.iter();
+        let about = found.filter(|finding| match finding {
+            Diagnosis::DuplicateNode {
+                domain_id, node, ..
+            } => *domain_id == own.domain_id && **node == own.name,
+            Diagnosis::NodeInSeveralDomains { node, domains, .. } => {
+                domains.contains(&own.domain_id) && **node == own.name
+            }
+            _ => false,
+        });
+        about.map(Into::into).collect()
+    }
+}
+
+impl<'a> Names<'a> {
+    fn add(&mut self, name: &str, message_type: Option<&'a str>) {
+        match self.0.get_mut(name) {
+            Some(known) => known.extend(message_type),
+            None => drop(
+                self.0
+                    .insert(name.to_owned(), message_type.into_iter().collect()),
+            ),
+        }
+    }
+
+    fn views(self) -> Vec<NamedView<'a>> {
+        let views = self.0.into_iter();
+        views
+            .map(|(name, types)| NamedView { name, types })
+            .collect()
+    }
+}

@@ -1,0 +1,382 @@
+//! The page for browsers, at `/` beside the API: files that are part of the program, and the tokens
+//! that grant a page more than its listener does.
+//!
+//! The files hold nothing of the robot and need no token. Their policy lets them load from and ask
+//! this listener only. No foreign page can frame or load them.
+
+mod tokens;
+
+use std::net::SocketAddr;
+use std::sync::{Arc, LazyLock, OnceLock};
+
+use axum::body::{Body, Bytes};
+use axum::extract::{Path, State};
+use axum::http::header::{
+    ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, ETAG,
+    HeaderName, IF_NONE_MATCH, REFERRER_POLICY, VARY, X_CONTENT_TYPE_OPTIONS,
+};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use ros2probe_page::File;
+use serde::Serialize;
+use sha2::{Digest as _, Sha256};
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::problem::{Code, Problem};
+pub(super) use tokens::Tokens;
+
+/// The page may load from and connect to its own origin only.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' \
+    data: blob:; connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; \
+    form-action 'none'; frame-ancestors 'none'";
+/// Sent with every file.
+const HEADERS: [(HeaderName, &str); 7] = [
+    (CONTENT_SECURITY_POLICY, POLICY),
+    (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+    (REFERRER_POLICY, "no-referrer"),
+    (
+        HeaderName::from_static("cross-origin-opener-policy"),
+        "same-origin",
+    ),
+    (
+        HeaderName::from_static("cross-origin-resource-policy"),
+        "same-origin",
+    ),
+    // An upgrade of the agent is seen at once.
+    (CACHE_CONTROL, "no-cache"),
+    (VARY, "accept-encoding"),
+];
+/// Bytes of a file's hash that tell versions apart.
+const TAG: usize = 16;
+
+/// What listeners and routes know of the page.
+#[derive(Debug, Default)]
+pub struct Page {
+    /// Addresses at which it is served.
+    addresses: Vec<SocketAddr>,
+    pub(super) tokens: Tokens,
+}
+
+/// The page's files with what was made of them.
+static FILES: LazyLock<Vec<Served>> = LazyLock::new(|| {
+    let served = |file| Served {
+        file,
+        forms: OnceLock::new(),
+    };
+    ros2probe_page::FILES.iter().map(served).collect()
+});
+
+/// One file of the page.
+struct Served {
+    file: &'static File,
+    forms: OnceLock<Forms>,
+}
+
+/// What is made of a file when it is first asked for.
+struct Forms {
+    tag: String,
+    packed: Bytes,
+}
+
+/// Grants a page all rights.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = PageToken)]
+struct TokenView {
+    /// Sent as `Authorization: Bearer`; valid until the agent ends, or until 16 newer ones are given.
+    token: String,
+    /// Where the page is served on the agent's host; null where it is not.
+    #[schema(example = "http://localhost:17401/")]
+    address: Option<String>,
+}
+
+impl Page {
+    /// Of an agent that serves it at these addresses.
+    #[must_use]
+    pub fn new(addresses: Vec<SocketAddr>) -> Self {
+        Self {
+            addresses,
+            tokens: Tokens::default(),
+        }
+    }
+
+    /// Some listener serves it.
+    pub(super) const fn is_served(&self) -> bool {
+        !self.addresses.is_empty()
+    }
+
+    /// Where a browser of the agent's host finds it.
+    fn address(&self) -> Option<String> {
+        let is_near = |address: &&SocketAddr| address.ip().is_loopback();
+        let near = self.addresses.iter().find(is_near);
+        let address = near.or_else(|| self.addresses.first())?;
+        Some(if address.ip().is_loopback() && address.is_ipv4() {
+            format!("http://localhost:{}/", address.port())
+        } else {
+            format!("http://{address}/")
+        })
+    }
+}
+
+impl Served {
+    fn forms(&self) -> &Forms {
+        self.forms.get_or_init(|| {
+            let hash = Sha256::digest(self.file.bytes);
+            let tag = hash.iter().take(TAG);
+            Forms {
+                tag: tag.map(|byte| format!("{byte:02x}")).collect(),
+                packed: packed(self.file.bytes).into(),
+            }
+        })
+    }
+
+    /// The file, or 304 where the client has it.
+    fn answer(&'static self, headers: &HeaderMap) -> Response {
+        let forms = self.forms();
+        let is_packed = accepts_gzip(headers) && !forms.packed.is_empty();
+        // Another form is another representation (RFC 9110, 8.8.3).
+        let tag = match is_packed {
+            true => format!("\"{}-gzip\"", forms.tag),
+            false => format!("\"{}\"", forms.tag),
+        };
+        let known = headers.get_all(IF_NONE_MATCH).iter();
+        let known = known.filter_map(|list| list.to_str().ok());
+        let mut known = known.flat_map(|list| list.split(','));
+        let is_known = known.any(|known| {
+            let known = known.trim();
+            known == "*" || known.trim_start_matches("W/") == tag
+        });
+        let always = (HEADERS, [(ETAG, tag)]);
+        if is_known {
+            return (StatusCode::NOT_MODIFIED, always).into_response();
+        }
+        let kind = [(CONTENT_TYPE, self.file.media_type)];
+        if is_packed {
+            let encoding = [(CONTENT_ENCODING, "gzip")];
+            let body = Body::from(forms.packed.clone());
+            return (always.0, always.1, kind, encoding, body).into_response();
+        }
+        let body = Body::from(Bytes::from_static(self.file.bytes));
+        (always.0, always.1, kind, body).into_response()
+    }
+}
+
+/// What is not worth compressing stays as it is: empty.
+fn packed(bytes: &[u8]) -> Vec<u8> {
+    let mut packer = GzEncoder::new(Vec::new(), Compression::best());
+    let packed = std::io::Write::write_all(&mut packer, bytes).and_then(|()| packer.finish());
+    let packed = packed.unwrap_or_default();
+    if packed.len() < bytes.len() {
+        packed
+    } else {
+        Vec::new()
+    }
+}
+
+/// Whether the client takes gzip (RFC 9110, 12.5.3).
+fn accepts_gzip(headers: &HeaderMap) -> bool {
+    let lists = headers.get_all(ACCEPT_ENCODING).iter();
+    let lists = lists.filter_map(|list| list.to_str().ok());
+    lists.flat_map(|list| list.split(',')).any(|coding| {
+        let mut words = coding.split(';');
+        let name = words.next().unwrap_or_default().trim();
+        let is_refused = words.any(|word| {
+            let quality = word.trim().strip_prefix("q=");
+            quality.is_some_and(|quality| quality.parse() == Ok(0.0))
+        });
+        (name.eq_ignore_ascii_case("gzip") || name == "*") && !is_refused
+    })
+}
+
+/// The files, for listeners that serve them.
+pub(super) fn files() -> Router<Context> {
+    Router::new()
+        .route("/", get(index))
+        .route("/page/{*file}", get(file))
+}
+
+async fn index(headers: HeaderMap) -> Response {
+    find("index.html", &headers)
+}
+
+async fn file(Path(path): Path<String>, headers: HeaderMap) -> Response {
+    find(&path, &headers)
+}
+
+fn find(path: &str, headers: &HeaderMap) -> Response {
+    let file = FILES.iter().find(|served| served.file.path == path);
+    let missing = || Problem::new(Code::NotFound, "the page has no such file").into_response();
+    file.map_or_else(missing, |file| file.answer(headers))
+}
+
+/// What the API has for it.
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(token))
+}
+
+/// A token for the page
+///
+/// It grants the rights of the unix socket: payloads, recordings, downloads. `rp page` asks for one.
+#[utoipa::path(
+    post,
+    path = "/page/token",
+    tag = "agent",
+    responses((status = 200, description = "A new token.", body = TokenView))
+)]
+async fn token(State(context): State<Context>) -> Result<Json<TokenView>, Problem> {
+    let token = context.page.tokens.mint();
+    let token = token.map_err(|error| Problem::new(Code::StorageRefuses, error.to_string()))?;
+    Ok(Json(TokenView {
+        token,
+        address: context.page.address(),
+    }))
+}
+
+/// Shares a page among listeners and routes.
+pub(super) type Shared = Arc<Page>;
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::fs;
+
+    use super::*;
+
+    /// Compressed bytes of the whole page.
+    const BUDGET: usize = 120_000;
+
+    fn headers(pairs: &[(&HeaderName, &str)]) -> HeaderMap {
+        let pairs = pairs.iter();
+        pairs
+            .map(|(name, value)| ((*name).clone(), value.parse().unwrap()))
+            .collect()
+    }
+
+    /// Files of a folder that are served.
+    fn listed(folder: &std::path::Path, prefix: &str, into: &mut BTreeSet<String>) {
+        for entry in fs::read_dir(folder).unwrap() {
+            let entry = entry.unwrap();
+            let name = entry.file_name().into_string().unwrap();
+            let path = format!("{prefix}{name}");
+            if entry.file_type().unwrap().is_dir() {
+                if path != "test" {
+                    listed(&entry.path(), &format!("{path}/"), into);
+                }
+                continue;
+            }
+            let kinds = [
+                "html",
+                "css",
+                "js",
+                "mjs",
+                "svg",
+                "json",
+                "png",
+                "ico",
+                "webmanifest",
+            ];
+            let end = name.rsplit_once('.').map_or("", |(_, end)| end);
+            if kinds.contains(&end) {
+                into.insert(path);
+            }
+        }
+    }
+
+    #[test]
+    fn every_file_of_the_folder_is_served_and_no_other() {
+        let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../page");
+        let mut expected = BTreeSet::new();
+        listed(&folder, "", &mut expected);
+        let served: BTreeSet<_> = FILES
+            .iter()
+            .map(|served| served.file.path.to_owned())
+            .collect();
+        assert_eq!(served, expected);
+        assert!(served.contains("index.html"));
+        for file in FILES.iter().map(|served| served.file) {
+            let (_, end) = file.path.rsplit_once('.').unwrap();
+            let expected = match end {
+                "html" => "text/html; charset=utf-8",
+                "css" => "text/css; charset=utf-8",
+                "js" | "mjs" => "text/javascript; charset=utf-8",
+                "svg" => "image/svg+xml",
+                other => panic!("no media type for {other}"),
+            };
+            assert_eq!(file.media_type, expected, "{}", file.path);
+            assert_eq!(
+                file.bytes,
+                fs::read(folder.join(file.path)).unwrap(),
+                "{}",
+                file.path
+            );
+        }
+    }
+
+    #[test]
+    fn the_page_is_small() {
+        let sizes = FILES
+            .iter()
+            .map(|served| match served.forms().packed.len() {
+                0 => served.file.bytes.len(),
+                packed => packed,
+            });
+        let all: usize = sizes.sum();
+        println!("{all} bytes");
+        assert!(all <= BUDGET, "{all} bytes");
+    }
+
+    #[test]
+    fn a_file_that_the_client_has_is_not_sent_again() {
+        let file = FILES
+            .iter()
+            .find(|served| served.file.path == "index.html")
+            .unwrap();
+        let first = file.answer(&HeaderMap::new());
+        assert_eq!(first.status(), StatusCode::OK);
+        let tag = first.headers()[ETAG].to_str().unwrap().to_owned();
+        let again = file.answer(&headers(&[(&IF_NONE_MATCH, &format!("\"other\", {tag}"))]));
+        assert_eq!(again.status(), StatusCode::NOT_MODIFIED);
+        assert_eq!(again.headers()[ETAG], tag.as_str());
+        let packed = file.answer(&headers(&[
+            (&IF_NONE_MATCH, &tag),
+            (&ACCEPT_ENCODING, "br, gzip;q=0.8"),
+        ]));
+        assert_eq!(packed.status(), StatusCode::OK);
+        assert_eq!(packed.headers()[CONTENT_ENCODING], "gzip");
+        assert_ne!(packed.headers()[ETAG], tag.as_str());
+    }
+
+    #[test]
+    fn gzip_is_sent_to_who_takes_it() {
+        for (given, expected) in [
+            ("gzip", true),
+            ("deflate, GZIP;q=1", true),
+            ("*", true),
+            ("gzip;q=0", false),
+            ("identity", false),
+            ("", false),
+        ] {
+            let headers = headers(&[(&ACCEPT_ENCODING, given)]);
+            assert_eq!(accepts_gzip(&headers), expected, "{given}");
+        }
+    }
+
+    #[test]
+    fn the_address_is_one_that_the_listener_answers_to() {
+        let page = |addresses: &[&str]| {
+            let addresses = addresses.iter().map(|address| address.parse().unwrap());
+            Page::new(addresses.collect()).address()
+        };
+        assert_eq!(page(&[]), None);
+        let near = page(&["10.0.0.1:17401", "127.0.0.1:1"]);
+        assert_eq!(near.as_deref(), Some("http://localhost:1/"));
+        assert_eq!(page(&["[::1]:5"]).as_deref(), Some("http://[::1]:5/"));
+        assert_eq!(page(&["10.0.0.1:5"]).as_deref(), Some("http://10.0.0.1:5/"));
+    }
+}

@@ -1,0 +1,150 @@
+//! Who serves and who calls: the ends of services and actions, as their topics show them.
+
+use std::collections::BTreeMap;
+
+use ros2probe_wire::names::{ActionPart, RosName};
+use ros2probe_wire::{EntityId, Guid};
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::endpoint::{text, texts};
+use ros2probe_model::snapshot::TopicFacts;
+
+/// A node, or a participant without one, at one end of a service or action.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Party)]
+pub(super) struct PartyView<'a> {
+    /// The node, when `ros_discovery_info` told.
+    node: Option<&'a str>,
+    /// Its participant.
+    #[serde(serialize_with = "text")]
+    #[schema(value_type = String)]
+    participant: Guid,
+    /// Its writers and readers there.
+    #[serde(serialize_with = "texts")]
+    #[schema(value_type = Vec<String>)]
+    endpoints: Vec<Guid>,
+}
+
+/// Which end of a service or action.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Side {
+    /// Serves.
+    Server,
+    /// Calls.
+    Client,
+}
+
+/// Both ends, each party once.
+#[derive(Debug, Default)]
+pub(super) struct Parties<'a> {
+    servers: BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>,
+    clients: BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>,
+}
+
+impl Side {
+    /// Of a writer or reader of this topic: a server reads requests and writes all else.
+    pub(super) fn of(topic: &TopicFacts, is_writer: bool) -> Option<Self> {
+        match (topic.kind, is_writer) {
+            ("service_request", false) | ("service_reply", true) => Some(Self::Server),
+            ("service_request", true) | ("service_reply", false) => Some(Self::Client),
+            // Whoever reads feedback may be a client, or only curious.
+            ("action_feedback" | "action_status", true) => Some(Self::Server),
+            _ => None,
+        }
+    }
+}
+
+impl<'a> Parties<'a> {
+    /// With the ends of one more topic.
+    pub(super) fn add(&mut self, topic: &'a TopicFacts) {
+        for (endpoints, is_writer) in [(&topic.publishers, true), (&topic.subscriptions, false)] {
+            let parties = match Side::of(topic, is_writer) {
+                Some(Side::Server) => &mut self.servers,
+                Some(Side::Client) => &mut self.clients,
+                None => continue,
+            };
+            for endpoint in endpoints {
+                let participant = Guid::new(endpoint.guid.prefix, EntityId::PARTICIPANT);
+                let party = parties.entry((endpoint.node.as_deref(), participant));
+                party.or_default().push(endpoint.guid);
+            }
+        }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.servers.is_empty() && self.clients.is_empty()
+    }
+
+    /// Servers and clients, by node and participant.
+    pub(super) fn views(self) -> [Vec<PartyView<'a>>; 2] {
+        [self.servers, self.clients].map(|parties| {
+            let views = parties
+                .into_iter()
+                .map(|((node, participant), mut endpoints)| {
+                    endpoints.sort_unstable();
+                    PartyView {
+                        node,
+                        participant,
+                        endpoints,
+                    }
+                });
+            views.collect()
+        })
+    }
+}
+
+impl PartyView<'_> {
+    /// Its node, or its participant.
+    pub(super) const fn who(&self) -> (Option<&str>, Guid) {
+        (self.node, self.participant)
+    }
+}
+
+/// The service of a topic's type: `pkg/srv/Add` of `pkg/srv/Add_Request`.
+pub(super) fn service_type(message_type: &str) -> &str {
+    let ends = ["_Request", "_Response"];
+    let mut stems = ends.iter().filter_map(|end| message_type.strip_suffix(end));
+    stems.next().unwrap_or(message_type)
+}
+
+/// The action that a topic or service is a part of.
+pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
+    match topic.kind {
+        "topic" | "service_event" | "discovery" | "dds" => None,
+        _ => RosName::parse(&topic.name).ok()?.action(),
+    }
+}
+
+/// The action's type from that of a part; `None` for parts whose type says nothing of it.
+pub(super) fn action_type(message_type: &str) -> Option<&str> {
+    const ENDS: [&str; 5] = [
+        "_FeedbackMessage",
+        "_SendGoal_Request",
+        "_SendGoal_Response",
+        "_GetResult_Request",
+        "_GetResult_Response",
+    ];
+    ENDS.iter().find_map(|end| message_type.strip_suffix(end))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn types_lose_what_their_topic_adds() {
+        assert_eq!(service_type("a/srv/Add_Request"), "a/srv/Add");
+        assert_eq!(service_type("a/srv/Add_Response"), "a/srv/Add");
+        assert_eq!(service_type("Square"), "Square");
+        assert_eq!(
+            action_type("a/action/Fib_FeedbackMessage"),
+            Some("a/action/Fib")
+        );
+        assert_eq!(
+            action_type("a/action/Fib_SendGoal_Request"),
+            Some("a/action/Fib")
+        );
+        assert_eq!(action_type("action_msgs/msg/GoalStatusArray"), None);
+    }
+}

@@ -1,0 +1,180 @@
+//! `/processes`: CPU time and memory of the processes whose participants are known, read when they
+//! are asked for and at no other time.
+//!
+//! A process id counts only where the kernel has named the process that holds a participant's
+//! socket: an id that a participant announces may belong to another host or namespace.
+
+use std::collections::BTreeMap;
+use std::time::SystemTime;
+
+use axum::Json;
+use axum::extract::State;
+use serde::Serialize;
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::problem::{Code, Problem};
+use crate::surface::process::Usage;
+use ros2probe_model::snapshot::Snapshot;
+
+/// Processes that are read for one answer.
+const MAX_PROCESSES: usize = 512;
+
+/// Processes of participants on this host.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ProcessList)]
+struct ProcessesView {
+    /// Unix time of the reading, by this host's clock.
+    timestamp_seconds: f64,
+    /// By process id.
+    processes: Vec<UsageView>,
+    /// Processes of which the kernel shows the agent nothing: see `ProtectProc=` of its unit.
+    unreadable: usize,
+}
+
+/// What a process has used.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ProcessUsage)]
+struct UsageView {
+    /// Its id, in the agent's process namespace.
+    process_id: u32,
+    /// Its name.
+    process: String,
+    /// CPU time so far; what two readings differ by, over the time between them, is its share.
+    cpu_seconds: f64,
+    /// Resident memory.
+    memory_bytes: u64,
+    /// Threads.
+    threads: u32,
+    /// Unix time of its start.
+    started_timestamp_seconds: Option<f64>,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(list))
+}
+
+/// CPU and memory of the robot's processes
+#[utoipa::path(
+    get,
+    path = "/processes",
+    tag = "graph",
+    responses((status = 200, description = "Processes of this host.", body = ProcessesView))
+)]
+async fn list(State(context): State<Context>) -> Result<Json<ProcessesView>, Problem> {
+    let ids = local(context.board.state().known());
+    let read = tokio::task::spawn_blocking(move || read(ids)).await;
+    read.map(Json)
+        .map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))
+}
+
+/// Processes that hold a participant's socket on this host, and what discovery calls them.
+fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<String>> {
+    let mut ids = BTreeMap::new();
+    for participant in &snapshot.participants {
+        let process = &participant.process;
+        // Only the kernel knows the control group.
+        if let (Some(id), Some(_)) = (process.id, &process.cgroup) {
+            ids.insert(id, process.name.clone());
+        }
+    }
+    ids
+}
+
+fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessesView {
+    let mut unreadable = 0;
+    let mut processes = Vec::new();
+    for (process_id, name) in ids.into_iter().take(MAX_PROCESSES) {
+        let Some(usage) = Usage::read(process_id) else {
+            unreadable += 1;
+            continue;
+        };
+        processes.push(UsageView {
+            process_id,
+            process: name.unwrap_or(usage.name),
+            cpu_seconds: usage.cpu_seconds,
+            memory_bytes: usage.resident_bytes,
+            threads: usage.threads,
+            started_timestamp_seconds: usage.started,
+        });
+    }
+    let now = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
+    ProcessesView {
+        timestamp_seconds: now.as_secs_f64(),
+        processes,
+        unreadable,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
+    use ros2probe_wire::{Guid, Timestamp};
+
+    fn participant(id: u32, cgroup: Option<&str>) -> ParticipantFacts {
+        ParticipantFacts {
+            guid: Guid::default(),
+            domain_id: 0,
+            vendor: String::new(),
+            enclave: None,
+            process: ProcessFacts {
+                host: None,
+                id: Some(id),
+                name: None,
+                cgroup: cgroup.map(str::to_owned),
+            },
+            first_seen: Timestamp(1),
+            last_seen: Timestamp(1),
+            lease_nanoseconds: None,
+            secured: false,
+            restored: false,
+            addresses: Default::default(),
+        }
+    }
+
+    #[test]
+    fn only_processes_whose_sockets_are_here_are_read() {
+        let own = std::process::id();
+        let snapshot = Snapshot {
+            participants: vec![
+                participant(own, Some("/robot.slice")),
+                participant(1, None),
+                participant(u32::MAX - 1, Some("/gone")),
+            ],
+            ..Snapshot::default()
+        };
+        let view = read(local(&snapshot));
+        let ids: Vec<_> = view.processes.iter().map(|each| each.process_id).collect();
+        assert_eq!((ids, view.unreadable), (vec![own], 1));
+        let process = &view.processes[0];
+        assert!(
+            process.memory_bytes > 100_000 && process.threads >= 1,
+            "{process:?}"
+        );
+        let busy = std::time::Instant::now();
+        while busy.elapsed().as_millis() < 60 {
+            std::hint::black_box(busy);
+        }
+        let later = read(local(&snapshot));
+        assert!(later.processes[0].cpu_seconds > process.cpu_seconds);
+        assert!(later.timestamp_seconds > view.timestamp_seconds);
+    }
+
+    #[test]
+    fn so_many_processes_are_read_for_one_answer() {
+        // No process has an id of these.
+        let first = 1 << 30;
+        let participants = (first..).take(MAX_PROCESSES + 9);
+        let snapshot = Snapshot {
+            participants: participants
+                .map(|id| participant(id, Some("/gone")))
+                .collect(),
+            ..Snapshot::default()
+        };
+        let view = read(local(&snapshot));
+        assert_eq!((view.processes.len(), view.unreadable), (0, MAX_PROCESSES));
+    }
+}

@@ -1,0 +1,396 @@
+//! `/recordings`: bags that the agent writes, begun, paused and ended by clients.
+//!
+//! They lie below the directory that the configuration names; a name is a file name and nothing
+//! else. Whoever wants a bag elsewhere records with `rp bag record`.
+
+use std::sync::Arc;
+use std::time::{Duration, UNIX_EPOCH};
+
+use axum::Json;
+use axum::extract::{DefaultBodyLimit, Path, State};
+use axum::http::StatusCode;
+use axum::http::header::LOCATION;
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::body::Body;
+use super::problem::{Code, Problem, ProblemBody};
+use super::security::MAX_BODY;
+use crate::config::RecordingLimits;
+use crate::config::watch::MAX_DOMAIN;
+use crate::recording::{Asked, Order, Recording, Refusal, Report, Stage, Wanted};
+use ros2probe_bag::{Form, Options, Storage};
+
+/// How long an answer waits for a bag to be completed.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// Longest time of one file, a year.
+const MAX_DURATION: u64 = 31_536_000;
+
+/// All recordings.
+#[derive(Debug, Serialize, ToSchema)]
+struct RecordingList {
+    /// Where they lie; null where the agent has no place for them.
+    directory: Option<String>,
+    /// Those under way, and the last ones that ended.
+    recordings: Vec<RecordingView>,
+    /// What they may take of the disk.
+    limits: RecordingLimitsView,
+}
+
+/// What recordings may take of the disk; one ends in order where it meets a limit.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = RecordingLimits)]
+struct RecordingLimitsView {
+    /// Bytes of each; null = any.
+    max_bytes: Option<u64>,
+    /// Bytes of all bags in the directory; null = any.
+    max_total_bytes: Option<u64>,
+    /// Of the file system stays free: the larger one of these percent and those bytes.
+    reserve_percent: u8,
+    /// Likewise.
+    reserve_bytes: u64,
+}
+
+/// One recording.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Recording)]
+struct RecordingView {
+    /// Its name, that of its directory.
+    name: String,
+    /// Where it lies on the robot.
+    directory: String,
+    /// Whose topics.
+    domain_id: u32,
+    /// `recording`, `paused` or `ended`.
+    #[schema(value_type = String)]
+    state: &'static str,
+    /// Unix time of its beginning.
+    began_timestamp_seconds: f64,
+    /// Bytes of its files.
+    file_bytes: u64,
+    /// Files begun.
+    files: usize,
+    /// Why it ended, if that was not asked for.
+    error: Option<String>,
+    /// What was asked for.
+    topics: Asked,
+    /// What it has and has not.
+    report: Report,
+}
+
+/// What is to be recorded. Without any topic, every topic is.
+#[derive(Debug, Default, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, default)]
+struct RecordingRequest {
+    /// Name of the directory; the time when left out.
+    #[schema(max_length = 128, pattern = "^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
+    name: Option<String>,
+    /// Which topics.
+    topics: Asked,
+    /// Of which domain.
+    #[schema(minimum = 0, maximum = 232)]
+    domain_id: u32,
+    /// Split when a file reaches so many bytes; 0 = never.
+    max_bag_size: u64,
+    /// Split when a file reaches so many seconds; 0 = never.
+    #[schema(maximum = 31_536_000)]
+    max_bag_duration_seconds: u64,
+    /// `none`, `fastwrite`, `zstd_fast` or `zstd_small`.
+    #[schema(value_type = String, example = "zstd_fast")]
+    storage_preset_profile: String,
+    /// `zstd` or `lz4`: compress whole files once they are complete.
+    #[schema(value_type = String)]
+    file_compression: String,
+    /// For whom metadata.yaml is written: a distribution; for all of them when left out.
+    #[schema(value_type = String)]
+    distro: String,
+    /// Begin paused.
+    paused: bool,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new()
+        .routes(routes!(list, begin))
+        .routes(routes!(show, end))
+        .routes(routes!(pause))
+        .routes(routes!(resume))
+        .routes(routes!(split))
+        .layer(DefaultBodyLimit::max(MAX_BODY))
+}
+
+/// All recordings
+#[utoipa::path(
+    get,
+    path = "/recordings",
+    tag = "recordings",
+    responses((status = 200, description = "Running recordings, and the last ones that ended.",
+        body = RecordingList))
+)]
+async fn list(State(context): State<Context>) -> Json<RecordingList> {
+    let recordings = context.recordings.all();
+    let directory = context.recordings.directory();
+    Json(RecordingList {
+        directory: directory.map(|directory| directory.display().to_string()),
+        recordings: recordings.iter().map(|each| view(each)).collect(),
+        limits: context.recordings.limits().into(),
+    })
+}
+
+/// Begin a recording
+///
+/// Nothing is subscribed to: messages are copied as they pass. What is sent from the answer on is in the bag.
+#[utoipa::path(
+    post,
+    path = "/recordings",
+    tag = "recordings",
+    request_body = RecordingRequest,
+    responses(
+        (status = 201, description = "It is under way.", body = RecordingView,
+            headers(("location" = String, description = "Path of the recording."))),
+        (status = 409, description = "There is one of that name, or there are too many.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 415, description = "The content type is not JSON.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "The request cannot be satisfied.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 507, description = "The storage does not take it.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn begin(
+    State(context): State<Context>,
+    Body(request): Body<RecordingRequest>,
+) -> Result<Response, Problem> {
+    let wanted = wanted(request)?;
+    // What is known at this moment goes into the bag's list of topics.
+    context.state().await;
+    let recordings = Arc::clone(&context.recordings);
+    let begun = tokio::task::spawn_blocking(move || recordings.begin(wanted)).await;
+    let begun = begun.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
+    let recording = begun.map_err(|refusal| problem(&refusal))?;
+    // From the next snapshot on the kernel's filter knows what is wanted.
+    context.state().await;
+    let location = format!("/recordings/{}", recording.name);
+    let answer = Json(view(&recording));
+    Ok((StatusCode::CREATED, [(LOCATION, location)], answer).into_response())
+}
+
+/// One recording
+#[utoipa::path(
+    get,
+    path = "/recordings/{name}",
+    tag = "recordings",
+    params(("name" = String, Path, description = "Its name.")),
+    responses(
+        (status = 200, description = "How it goes.", body = RecordingView),
+        (status = 404, description = "No such name.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn show(
+    State(context): State<Context>,
+    Path(name): Path<String>,
+) -> Result<Json<RecordingView>, Problem> {
+    let recording = find(&context, &name)?;
+    Ok(Json(view(&recording)))
+}
+
+/// End a recording
+///
+/// The bag is complete when this answers, and stays where it is.
+#[utoipa::path(
+    delete,
+    path = "/recordings/{name}",
+    tag = "recordings",
+    params(("name" = String, Path, description = "Its name.")),
+    responses(
+        (status = 200, description = "It has ended; its report.", body = RecordingView),
+        (status = 202, description = "It is ending; the storage is slow.", body = RecordingView),
+        (status = 404, description = "No such name.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn end(
+    State(context): State<Context>,
+    Path(name): Path<String>,
+) -> Result<Response, Problem> {
+    let recording = find(&context, &name)?;
+    recording.order(Order::Stop);
+    let status = if recording.over(PATIENCE).await {
+        StatusCode::OK
+    } else {
+        StatusCode::ACCEPTED
+    };
+    Ok((status, Json(view(&recording))).into_response())
+}
+
+/// Let messages go by
+#[utoipa::path(
+    post,
+    path = "/recordings/{name}/pause",
+    tag = "recordings",
+    params(("name" = String, Path, description = "Its name.")),
+    responses(
+        (status = 202, description = "It will be paused within a tenth of a second.",
+            body = RecordingView),
+        (status = 404, description = "No such name.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn pause(
+    State(context): State<Context>,
+    Path(name): Path<String>,
+) -> Result<Response, Problem> {
+    order(&context, &name, Order::Pause)
+}
+
+/// Take messages again
+#[utoipa::path(
+    post,
+    path = "/recordings/{name}/resume",
+    tag = "recordings",
+    params(("name" = String, Path, description = "Its name.")),
+    responses(
+        (status = 202, description = "It will go on within a tenth of a second.",
+            body = RecordingView),
+        (status = 404, description = "No such name.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn resume(
+    State(context): State<Context>,
+    Path(name): Path<String>,
+) -> Result<Response, Problem> {
+    order(&context, &name, Order::Resume)
+}
+
+/// Go on in a new file
+#[utoipa::path(
+    post,
+    path = "/recordings/{name}/split",
+    tag = "recordings",
+    params(("name" = String, Path, description = "Its name.")),
+    responses(
+        (status = 202, description = "It will within a tenth of a second.", body = RecordingView),
+        (status = 404, description = "No such name.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn split(
+    State(context): State<Context>,
+    Path(name): Path<String>,
+) -> Result<Response, Problem> {
+    order(&context, &name, Order::Split)
+}
+
+fn order(context: &Context, name: &str, order: Order) -> Result<Response, Problem> {
+    let recording = find(context, name)?;
+    recording.order(order);
+    Ok((StatusCode::ACCEPTED, Json(view(&recording))).into_response())
+}
+
+pub(super) fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Problem> {
+    let found = context.recordings.find(name);
+    found.ok_or_else(|| {
+        let name: String = name.chars().take(128).collect();
+        let detail = format!("no recording `{name}`; GET /recordings lists them");
+        Problem::new(Code::NoSuchRecording, detail)
+    })
+}
+
+fn wanted(request: RecordingRequest) -> Result<Wanted, Problem> {
+    let invalid = |detail: String| Problem::new(Code::InvalidRequest, detail);
+    if request.domain_id > MAX_DOMAIN {
+        let id = request.domain_id;
+        return Err(invalid(format!(
+            "domain_id is {id}, must be at most {MAX_DOMAIN}"
+        )));
+    }
+    if request.max_bag_duration_seconds > MAX_DURATION {
+        let detail = format!("max_bag_duration_seconds must be at most {MAX_DURATION}");
+        return Err(invalid(detail));
+    }
+    let asked = if request.topics == Asked::default() {
+        Asked::everything()
+    } else {
+        request.topics
+    };
+    let options = || {
+        let format = &request.file_compression;
+        let mode = if format.is_empty() { "none" } else { "file" };
+        let seconds = request.max_bag_duration_seconds;
+        Ok::<_, ros2probe_bag::options::OptionsError>(Options {
+            form: match request.distro.as_str() {
+                "" => Form::default(),
+                distro => Form::of(distro),
+            },
+            ros_distro: request.distro.clone(),
+            storage: Storage::preset(&request.storage_preset_profile)?,
+            file_compression: ros2probe_bag::options::file_compression(mode, format)?,
+            max_file_bytes: ros2probe_bag::options::max_file_bytes(request.max_bag_size)?,
+            max_file_duration: (seconds > 0).then(|| Duration::from_secs(seconds)),
+            ..Options::default()
+        })
+    };
+    Ok(Wanted {
+        options: options().map_err(|error| invalid(error.to_string()))?,
+        name: request.name,
+        asked,
+        domain_id: request.domain_id,
+        paused: request.paused,
+    })
+}
+
+fn problem(refusal: &Refusal) -> Problem {
+    let code = match refusal {
+        Refusal::Exists(_) => Code::RecordingExists,
+        Refusal::TooMany(_) => Code::TooManyRecordings,
+        Refusal::NoDirectory => Code::NoPlaceForRecordings,
+        Refusal::Name(_) | Refusal::Filter(_) | Refusal::Choice(_) => Code::InvalidRequest,
+        Refusal::Subscription(_) => Code::TooManySubscriptions,
+        Refusal::Storage { .. } => Code::StorageRefuses,
+    };
+    Problem::new(code, refusal.to_string())
+}
+
+impl From<RecordingLimits> for RecordingLimitsView {
+    fn from(limits: RecordingLimits) -> Self {
+        let RecordingLimits {
+            max_bytes,
+            max_total_bytes,
+            reserve_percent,
+            reserve_bytes,
+        } = limits;
+        Self {
+            max_bytes,
+            max_total_bytes,
+            reserve_percent,
+            reserve_bytes,
+        }
+    }
+}
+
+fn view(recording: &Recording) -> RecordingView {
+    let status = recording.status();
+    let began = recording.began.duration_since(UNIX_EPOCH);
+    RecordingView {
+        name: recording.name.clone(),
+        directory: recording.directory.display().to_string(),
+        domain_id: recording.domain_id,
+        state: match status.stage {
+            Stage::Recording => "recording",
+            Stage::Paused => "paused",
+            Stage::Ended => "ended",
+        },
+        began_timestamp_seconds: began.unwrap_or_default().as_secs_f64(),
+        file_bytes: status.file_bytes,
+        files: status.files,
+        error: status.error,
+        topics: recording.asked.clone(),
+        report: status.report,
+    }
+}

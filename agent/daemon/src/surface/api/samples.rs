@@ -1,0 +1,323 @@
+//! `GET /samples`: the messages of topics as they come, one by one, for as long as the client
+//! stays. The topics are measured meanwhile, whether they are watched or not.
+//!
+//! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
+//! and is told, on a replay it is waited for. It holds nobody else up.
+
+use std::collections::HashSet;
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::extract::{Extension, State};
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use ros2probe_wire::Guid;
+use serde::Deserialize;
+use tokio_util::sync::CancellationToken;
+use utoipa::IntoParams;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::body_stream::{Pieces, stream_of};
+use super::parameters::Parameters;
+use super::problem::{Code, Problem, ProblemBody};
+use super::security::Granted;
+use crate::config::Access;
+use crate::config::watch::MAX_DOMAIN;
+use crate::subscriptions::line::{LINES, Line, OfferedFacts, Open, OpenTopic, SAMPLES};
+use crate::subscriptions::{
+    Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
+};
+use crate::surface::SourceKind;
+use ros2probe_model::snapshot::Snapshot;
+
+/// Names and globs in one request, and how many characters they and a regular expression have.
+const MAX_PATTERNS: usize = 256;
+const MAX_LIST: usize = 16_384;
+const MAX_REGEX: usize = 4_096;
+/// Writers that are introduced to one client.
+const WRITERS: usize = 65_536;
+/// Lines made into one piece of the answer.
+const BATCH_BYTES: usize = 16 * 1024;
+/// Room for arrivals, a few thousand; and for messages with their bytes.
+const ARRIVALS_BYTES: usize = 1 << 20;
+const PAYLOADS_BYTES: usize = 16 << 20;
+const LEAST_BYTES: usize = 64 << 10;
+/// How long a stream waits with its first line for the capture to know what is wanted.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+#[derive(Clone, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+struct Wanted {
+    /// Topics, separated by commas: ROS names, globs as in a watch, or exact DDS names. Also those
+    /// that appear later.
+    #[param(max_length = 16384, example = "/points,/robot1/**")]
+    topic: Option<String>,
+    /// Topics in whose names this regular expression is found.
+    #[param(max_length = 4096)]
+    regex: Option<String>,
+    /// Every topic that `ros2 topic list` shows.
+    all: bool,
+    /// Except these: as `topic`.
+    #[param(max_length = 16384)]
+    exclude: Option<String>,
+    /// Except those in whose names this regular expression is found.
+    #[param(max_length = 4096)]
+    exclude_regex: Option<String>,
+    /// Whether globs, `regex` and `all` find hidden topics, too. A name finds them anyway.
+    hidden: bool,
+    /// Only of this domain.
+    #[param(maximum = 232)]
+    domain_id: Option<u32>,
+    /// Whether the bytes of the messages are wanted.
+    payload: bool,
+    /// Bytes that may wait for this client, as far as `limits.payload_bytes` allows for all streams
+    /// together, 64 KiB at least. Then the oldest message of the topic that holds most of them is
+    /// dropped.
+    queue_bytes: Option<usize>,
+}
+
+/// One client's stream.
+struct Stream {
+    subscription: Subscription,
+    stop: CancellationToken,
+    /// Payload that goes out next, behind its line.
+    payload: Option<Bytes>,
+    first: Option<Line>,
+    /// Writers of which it was told what they announced.
+    introduced: HashSet<Guid>,
+    ended: bool,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(samples))
+}
+
+/// The messages of topics, as they come
+///
+/// Each line is a JSON object with one key: first `open`, with the topics that are known and
+/// wanted; then `sample` for each message, once, however often it is seen; `clock` at least ten times
+/// a second, when everything up to a time has been told; `missed` for messages that will not be told,
+/// with the reason; `end` when nothing will follow. With `payload=true`, as many raw bytes as
+/// `payload_bytes` says follow a sample's line: the serialized message with its encapsulation. The topics are
+/// measured as long as the stream is open, and are not listed as watches.
+#[utoipa::path(
+    get,
+    path = "/samples",
+    tag = "samples",
+    params(Wanted),
+    responses(
+        (status = 200, description = "Lines, until the client disconnects, or the capture or the \
+            agent ends.",
+            content((Line = "application/x-ndjson"), (Line = "application/vnd.ros2probe.samples"))),
+        (status = 422, description = "No topic requested, or an invalid topic name.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 503, description = "There are too many subscriptions already, or patterns of all of them.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn samples(
+    State(context): State<Context>,
+    Extension(granted): Extension<Granted>,
+    Parameters(wanted): Parameters<Wanted>,
+) -> Result<Response, Problem> {
+    if wanted.payload {
+        granted.require(Access::All)?;
+    }
+    let domain_id = wanted.domain_id;
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+        let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    let is_replay = context.board.state().agent.source == SourceKind::Replay;
+    let (depth, queue_bytes, media_type) = if wanted.payload {
+        (Depth::Payloads, PAYLOADS_BYTES, SAMPLES)
+    } else {
+        (Depth::Arrivals, ARRIVALS_BYTES, LINES)
+    };
+    let queue_bytes = wanted.queue_bytes.unwrap_or(queue_bytes).max(LEAST_BYTES);
+    let request = Request {
+        topics: selection(&wanted)?,
+        domain_id,
+        depth,
+        queue_bytes,
+        overflow: if is_replay {
+            Overflow::Wait
+        } else {
+            Overflow::DropOldest
+        },
+        label: "GET /samples".to_owned(),
+    };
+    let opened = context.subscriptions.open(request);
+    let subscription = opened.map_err(|refused: Refused| {
+        Problem::new(Code::TooManySubscriptions, refused.to_string())
+    })?;
+    let known = if is_replay {
+        context.board.state()
+    } else {
+        subscription.in_force(PATIENCE).await;
+        context.state().await
+    };
+    let most = context.board.limits().caps().topics;
+    let first = Line::Open(Open {
+        topics: topics(known.known(), subscription.selection(), domain_id, most),
+    });
+    let stream = Stream {
+        subscription,
+        stop: context.stop.clone(),
+        payload: None,
+        first: Some(first),
+        introduced: HashSet::new(),
+        ended: false,
+    };
+    let headers = [(CACHE_CONTROL, "no-store"), (CONTENT_TYPE, media_type)];
+    Ok((headers, Body::from_stream(stream_of(stream))).into_response())
+}
+
+impl Pieces for Stream {
+    type Piece = Bytes;
+
+    /// The next piece of the answer: some lines, or the payload behind the last one.
+    async fn next(&mut self) -> Option<Bytes> {
+        if let Some(payload) = self.payload.take() {
+            return Some(payload);
+        }
+        let mut lines = Vec::new();
+        if let Some(first) = self.first.take() {
+            write(&mut lines, &first);
+        }
+        while !self.ended && self.payload.is_none() && lines.len() < BATCH_BYTES {
+            let item = match self.subscription.try_next() {
+                Some(item) => item,
+                None if !lines.is_empty() => break,
+                None => self.wait().await,
+            };
+            write(&mut lines, &self.told(&item));
+            match item {
+                Item::Sample(sample) => self.payload.clone_from(&sample.payload),
+                Item::End(_) => self.ended = true,
+                Item::Clock(_) | Item::Missed(_) => {}
+            }
+        }
+        (!lines.is_empty()).then(|| lines.into())
+    }
+}
+
+impl Stream {
+    /// The line for it; with what the writer announced where it is the writer's first.
+    fn told(&mut self, item: &Item) -> Line {
+        let mut line = Line::from(item);
+        if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
+            && sample.payload.is_some()
+            && let Some(offered) = &sample.topic.offered
+            && self.introduced.len() < WRITERS
+            && self.introduced.insert(sample.writer)
+        {
+            facts.offered = Some(Box::new(OfferedFacts::from(&**offered)));
+        }
+        line
+    }
+
+    async fn wait(&mut self) -> Item {
+        let item = tokio::select! {
+            biased;
+            item = self.subscription.next() => item,
+            () = self.stop.cancelled() => None,
+        };
+        item.unwrap_or(Item::End("agent ends"))
+    }
+}
+
+fn write(lines: &mut Vec<u8>, line: &Line) {
+    // Plain numbers and strings into memory: nothing that could fail.
+    let _ = serde_json::to_writer(&mut *lines, line);
+    lines.push(b'\n');
+}
+
+fn selection(wanted: &Wanted) -> Result<Selection, Problem> {
+    let mut include = patterns(wanted.topic.as_deref(), wanted.regex.as_deref())?;
+    if wanted.all {
+        include.push(Choice::All);
+    }
+    if include.is_empty() {
+        let detail = "no topic requested: use `topic`, `regex` or `all=true`";
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    Ok(Selection {
+        include,
+        exclude: patterns(wanted.exclude.as_deref(), wanted.exclude_regex.as_deref())?,
+        hidden: wanted.hidden,
+    })
+}
+
+fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Problem> {
+    for (text, most) in [(names, MAX_LIST), (regex, MAX_REGEX)] {
+        if text.is_some_and(|text| text.chars().count() > most) {
+            let detail = format!("a list or an expression of more than {most} characters");
+            return Err(Problem::new(Code::InvalidRequest, detail));
+        }
+    }
+    let names: Vec<_> = names.into_iter().flat_map(|list| list.split(',')).collect();
+    if names.len() > MAX_PATTERNS {
+        let detail = format!("at most {MAX_PATTERNS} topics can be named, use globs");
+        return Err(Problem::new(Code::InvalidRequest, detail));
+    }
+    let names = names.into_iter().map(|name| Choice::parse(name.trim()));
+    let choices: Result<_, _> = names.chain(regex.map(Choice::regex)).collect();
+    choices.map_err(|error| {
+        let detail = format!("{:#}", anyhow::anyhow!(error));
+        Problem::new(Code::InvalidRequest, detail)
+    })
+}
+
+/// The topics that are wanted and known, no more than can be measured.
+fn topics(
+    snapshot: &Snapshot,
+    selection: &Selection,
+    domain_id: Option<u32>,
+    most: usize,
+) -> Vec<OpenTopic> {
+    let topics = snapshot.topics.iter().filter(|topic| {
+        domain_id.is_none_or(|wanted| wanted == topic.domain_id)
+            && selection.covers(topic.kind, &topic.name, &topic.dds_name, topic.hidden)
+    });
+    topics
+        .take(most)
+        .map(|topic| OpenTopic {
+            topic: topic.name.clone(),
+            domain_id: topic.domain_id,
+            types: topic.message_types.clone(),
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_can_never_be_given_is_refused() {
+        let wanted = |topic: &str, regex: &str| Wanted {
+            topic: (!topic.is_empty()).then(|| topic.to_owned()),
+            regex: (!regex.is_empty()).then(|| regex.to_owned()),
+            ..Wanted::default()
+        };
+        for (topic, regex) in [("/points, /robot1/**,rq/addRequest", ""), ("", "^/cam.*,x")] {
+            assert!(selection(&wanted(topic, regex)).is_ok(), "{topic} {regex}");
+        }
+        let many = vec!["/a"; MAX_PATTERNS + 1].join(",");
+        for (topic, regex) in [
+            ("", ""),
+            ("/a//b", ""),
+            ("/a,,/b", ""),
+            (&many, ""),
+            ("", "("),
+        ] {
+            let refused = selection(&wanted(topic, regex)).unwrap_err();
+            assert_eq!(refused.code(), Code::InvalidRequest, "{topic} {regex}");
+        }
+    }
+}

@@ -1,0 +1,242 @@
+//! Why a topic is silent or cannot be seen: every reason that is known, in words and as a code.
+//!
+//! Reasons come from facts that are told elsewhere too; nothing is guessed from a missing number
+//! alone.
+
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::index::Index;
+use crate::config::Watchlist;
+use crate::surface::agent_facts::SourceKind;
+use ros2probe_model::diagnosis::Diagnosis;
+use ros2probe_model::snapshot::{EndpointFacts, Measurement, Passage, Snapshot, TopicFacts};
+
+/// One reason.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Reason)]
+pub(super) struct ReasonView {
+    /// Which one.
+    code: Cause,
+    /// In words.
+    detail: String,
+}
+
+/// Why nothing, or not everything, is seen of a topic.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+#[schema(as = ReasonCode)]
+enum Cause {
+    /// The agent does not see the robot at the moment.
+    AgentNotReady,
+    /// Nobody publishes it.
+    NoPublisher,
+    /// Nobody subscribes: most writers send nothing then.
+    NoSubscriber,
+    /// There are subscriptions, and none matches a publisher.
+    NoMatchedSubscriber,
+    /// A publisher's participant uses DDS security: messages may be encrypted.
+    Encrypted,
+    /// Nobody asked for it to be measured.
+    NotWatched,
+    /// It is watched, but `limits.topics` are measured already.
+    WatchRejected,
+    /// All its endpoints are on other hosts, and the agent looks at this host's sockets.
+    OutsideView,
+    /// Messages go through Fast DDS's shared memory, and none was seen there.
+    SharedMemory,
+    /// Subscribers read the publisher's history in memory: invisible.
+    DataSharing,
+    /// Publishers and subscribers are in one process: invisible.
+    SameProcess,
+    /// Messages go through Cyclone DDS's iceoryx: invisible.
+    Iceoryx,
+    /// All is as it should be, and no message was seen, or none lately.
+    Quiet,
+}
+
+/// What reasons are looked for in, besides the topic.
+#[derive(Debug)]
+pub(super) struct Circumstances<'a> {
+    pub(super) snapshot: &'a Snapshot,
+    pub(super) index: Index<'a>,
+    pub(super) watchlist: &'a Watchlist,
+    pub(super) source: SourceKind,
+    /// The agent looks at shared memory too.
+    pub(super) looks_at_memory: bool,
+    /// Why the agent sees nothing.
+    pub(super) unready: Option<String>,
+}
+
+impl<'a> Circumstances<'a> {
+    /// Every reason there is; none for a topic whose messages are counted.
+    pub(super) fn reasons(&self, topic: &'a TopicFacts) -> Vec<ReasonView> {
+        let mut reasons = Vec::new();
+        let mut say = |code, detail: String| reasons.push(ReasonView { code, detail });
+        if let Some(reason) = &self.unready {
+            say(Cause::AgentNotReady, reason.clone());
+        }
+        let is_connected = match (topic.publishers.len(), topic.subscriptions.len()) {
+            (0, _) if topic.vanished => {
+                say(Cause::NoPublisher, "its last endpoint is gone".to_owned());
+                false
+            }
+            (0, subscriptions) => {
+                let detail = format!("no publishers, {subscriptions} subscribed");
+                say(Cause::NoPublisher, detail);
+                false
+            }
+            (_, 0) => {
+                let detail = "no subscribers: most writers send nothing".to_owned();
+                say(Cause::NoSubscriber, detail);
+                false
+            }
+            (_, _) => match self.unmatched(topic) {
+                Some(detail) => {
+                    say(Cause::NoMatchedSubscriber, detail);
+                    false
+                }
+                None => true,
+            },
+        };
+        if let Some(secured) = self.secured(topic) {
+            let detail = format!("participant {secured} uses DDS security");
+            say(Cause::Encrypted, detail);
+        }
+        match topic.measurement.as_deref() {
+            None => {
+                let (code, detail) = self.unwatched(topic);
+                say(code, detail);
+            }
+            Some(measured) if is_connected && measured.rate_hz == 0.0 => {
+                if let Some((code, detail)) = self.aside(topic) {
+                    say(code, detail);
+                } else if self.is_elsewhere(topic) {
+                    let detail = "publishers and subscribers are on other hosts; capture.source: \
+                        wire sees traffic that passes this host";
+                    say(Cause::OutsideView, detail.to_owned());
+                } else {
+                    say(Cause::Quiet, self.quiet(measured));
+                }
+            }
+            Some(_) => {}
+        }
+        reasons
+    }
+
+    /// Why no publisher has a subscriber that matches, if so.
+    fn unmatched(&self, topic: &'a TopicFacts) -> Option<String> {
+        let findings = self.index.findings(topic);
+        let is_unheard = |publisher: &EndpointFacts| {
+            findings.iter().any(|finding| {
+                matches!(finding, Diagnosis::UnheardPublisher { writer, .. }
+                    if *writer == publisher.guid)
+            })
+        };
+        if !topic.publishers.iter().all(is_unheard) {
+            return None;
+        }
+        let mut policies: Vec<&str> = Vec::new();
+        let mut reasons: Vec<&str> = Vec::new();
+        for finding in findings {
+            match finding {
+                Diagnosis::QosIncompatible { policies: own, .. } => {
+                    policies.extend(own.iter().map(|policy| policy.label()));
+                }
+                Diagnosis::UnheardPublisher { reason, .. } => reasons.push(reason.label()),
+                _ => {}
+            }
+        }
+        for list in [&mut policies, &mut reasons] {
+            list.sort_unstable();
+            list.dedup();
+        }
+        let mut detail = format!("no subscription matches: {}", reasons.join(", "));
+        if !policies.is_empty() {
+            detail.push_str(" (");
+            detail.push_str(&policies.join(", "));
+            detail.push(')');
+        }
+        Some(detail)
+    }
+
+    fn secured(&self, topic: &'a TopicFacts) -> Option<ros2probe_wire::Guid> {
+        let participants = topic.publishers.iter();
+        let mut participants = participants.filter_map(|each| self.index.participant(each.guid));
+        let secured = participants.find(|participant| participant.secured)?;
+        Some(secured.guid)
+    }
+
+    fn unwatched(&self, topic: &'a TopicFacts) -> (Cause, String) {
+        let name = match topic.kind {
+            "service_request" | "service_reply" => &topic.dds_name,
+            _ => &topic.name,
+        };
+        let is_covered = !self.watchlist.matching(topic.domain_id, name).is_empty();
+        if is_covered && !topic.hidden {
+            let detail = "limits.topics topics are measured already, or it was watched just now";
+            return (Cause::WatchRejected, detail.to_owned());
+        }
+        let detail = match name.strip_prefix('/') {
+            Some(path) => format!("not measured: POST /watch/{path}"),
+            None => "not measured: add it to the configuration".to_owned(),
+        };
+        (Cause::NotWatched, detail)
+    }
+
+    /// How messages pass, if no pair of publisher and subscriber uses the network.
+    fn aside(&self, topic: &TopicFacts) -> Option<(Cause, String)> {
+        let passages = topic.passages.iter();
+        let most = passages.clone().max_by_key(|count| count.pairs)?;
+        if passages
+            .clone()
+            .any(|count| count.passage == Passage::Network)
+        {
+            return None;
+        }
+        let detail = |how: &str| format!("{how}; nothing crosses the network");
+        Some(match most.passage {
+            Passage::Network => return None,
+            Passage::SharedMemory if self.looks_at_memory => {
+                let how = "messages pass through shared memory; none was seen lately";
+                (Cause::SharedMemory, detail(how))
+            }
+            Passage::SharedMemory => {
+                let how = "messages pass through shared memory, which this agent does not read";
+                (Cause::SharedMemory, detail(how))
+            }
+            Passage::DataSharing => {
+                let how = "subscribers read the publisher's history in memory (data sharing)";
+                (Cause::DataSharing, detail(how))
+            }
+            Passage::SameProcess => (
+                Cause::SameProcess,
+                detail(
+                    "publisher and subscriber share \
+                one process",
+                ),
+            ),
+            Passage::Iceoryx => (Cause::Iceoryx, detail("messages pass through iceoryx")),
+        })
+    }
+
+    /// Whether none of its participants has a socket on this host, as far as sockets are seen.
+    fn is_elsewhere(&self, topic: &'a TopicFacts) -> bool {
+        let mut all = topic.publishers.iter().chain(&topic.subscriptions);
+        self.source == SourceKind::Host
+            && all.all(|endpoint| {
+                let participant = self.index.participant(endpoint.guid);
+                participant.is_none_or(|participant| participant.process.cgroup.is_none())
+            })
+    }
+
+    fn quiet(&self, measured: &Measurement) -> String {
+        match measured.last_message {
+            None => "published and subscribed, and no message was seen yet".to_owned(),
+            Some(last) => {
+                let age = self.snapshot.at.seconds() - last.seconds();
+                format!("the last message was seen {age:.1} s ago")
+            }
+        }
+    }
+}

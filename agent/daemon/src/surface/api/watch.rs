@@ -1,0 +1,566 @@
+//! `/watch`: what is measured, listed, added and removed while the agent runs.
+//!
+//! A watch is known by its topic, a name or a glob as in the configuration file, and its domain.
+//! POST adds and never changes what is there; PUT adds or replaces.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::extract::{DefaultBodyLimit, State};
+use axum::http::StatusCode;
+use axum::http::header::LOCATION;
+use axum::response::{IntoResponse, Response};
+use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::body::Body;
+use super::parameters::{Name, Parameters};
+use super::problem::{Code, Problem, ProblemBody};
+use super::security::MAX_BODY;
+use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
+use crate::watches::{Done, Entry, Origin, Refused};
+use ros2probe_model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
+
+/// What is watched.
+#[derive(Debug, Serialize, ToSchema)]
+struct WatchList {
+    /// Those of the configuration, of the command line, and then of clients, as they came.
+    watches: Vec<WatchView>,
+}
+
+/// One watch.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Watch)]
+struct WatchView {
+    /// ROS name or glob.
+    #[schema(example = "/points")]
+    topic: String,
+    /// Only in this domain; every domain when it is null.
+    #[schema(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
+    /// Who asked for it.
+    origin: OriginView,
+    /// What has become of it.
+    state: Stage,
+    /// Series per writer and subscriber.
+    per_subscriber: bool,
+    /// The part of the messages of which spans are exported.
+    #[schema(minimum = 0, maximum = 1)]
+    trace: f64,
+    /// `last`: the last message of each transient-local writer is kept for recordings that begin later.
+    retain: RetainView,
+    #[serde(flatten)]
+    expectations: ExpectationsView,
+    /// The topics it covers now, and a name that does not exist yet.
+    topics: Vec<TopicView>,
+}
+
+/// What is kept of a topic's messages for recordings that begin later.
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize, ToSchema)]
+#[schema(as = Retain)]
+#[serde(rename_all = "lowercase")]
+enum RetainView {
+    /// Nothing.
+    #[default]
+    None,
+    /// The last one of each writer that keeps its own for late joiners (transient local).
+    Last,
+}
+
+impl From<Retain> for RetainView {
+    fn from(retain: Retain) -> Self {
+        match retain {
+            Retain::None => Self::None,
+            Retain::Last => Self::Last,
+        }
+    }
+}
+
+impl From<RetainView> for Retain {
+    fn from(view: RetainView) -> Self {
+        match view {
+            RetainView::None => Self::None,
+            RetainView::Last => Self::Last,
+        }
+    }
+}
+
+/// What should hold for each topic; what is left out is not expected.
+#[derive(Clone, Copy, Debug, Default, Serialize, ToSchema)]
+pub(super) struct ExpectationsView {
+    /// At least this many messages a second.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    min_rate_hz: Option<f64>,
+    /// At most this many messages a second.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    max_rate_hz: Option<f64>,
+    /// At most this part of the messages may be lost, 0 to 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    max_loss_ratio: Option<f64>,
+    /// Longest time from the writer's timestamp to the capture, in milliseconds.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    max_latency_ms: Option<f64>,
+    /// Longest time without a message, in seconds.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    max_silence_s: Option<f64>,
+}
+
+/// Who asked for a watch.
+#[derive(Clone, Copy, Debug, Serialize, ToSchema)]
+#[schema(as = Origin)]
+#[serde(rename_all = "snake_case")]
+enum OriginView {
+    /// The configuration file.
+    Config,
+    /// `--watch`.
+    CommandLine,
+    /// A client of this API.
+    Api,
+}
+
+/// What has become of a watch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum Stage {
+    /// Taken over with the next packets.
+    Starting,
+    /// No such topic yet: it is measured as soon as it appears.
+    Waiting,
+    /// Its topics are measured.
+    Measuring,
+    /// There is such a topic, but `limits.topics` are measured already.
+    Rejected,
+}
+
+/// A watched topic.
+#[derive(Debug, Serialize, ToSchema)]
+struct TopicView {
+    /// Domain.
+    domain_id: u32,
+    /// ROS name.
+    topic: String,
+    /// How it stands with what is expected.
+    state: TopicState,
+    /// Expectations that are broken.
+    #[schema(value_type = Vec<String>)]
+    violations: Vec<&'static str>,
+    /// Messages counted while it was watched.
+    messages: u64,
+    /// Messages a second over the last window.
+    rate_hertz: f64,
+}
+
+/// How a topic stands with what is expected of it.
+#[derive(Clone, Copy, Debug, Serialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+enum TopicState {
+    /// All expectations hold.
+    Ok,
+    /// One is broken.
+    Violated,
+    /// Nothing came for longer than `max_silence_s`.
+    Silent,
+    /// Nobody publishes it.
+    NotPublished,
+    /// Nobody subscribes to it.
+    NoSubscriber,
+}
+
+/// How a topic is to be watched. Every field may be left out, and so may the body.
+#[derive(Clone, Copy, Debug, Default, Deserialize, ToSchema)]
+#[serde(deny_unknown_fields, default)]
+struct WatchRequest {
+    /// Only in this domain; every domain when left out. The same as the query's.
+    #[schema(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
+    /// Series per writer and subscriber of each covered topic, besides those per topic.
+    per_subscriber: bool,
+    /// The part of each covered topic's messages of which spans are exported, 0 to 1.
+    #[schema(minimum = 0, maximum = 1)]
+    trace: f64,
+    /// `last`: keep the last message of each transient-local writer for recordings that begin later.
+    retain: RetainView,
+    /// At least this many messages a second.
+    #[schema(minimum = 0, maximum = 1_000_000)]
+    min_rate_hz: Option<f64>,
+    /// At most this many messages a second.
+    #[schema(minimum = 0, maximum = 1_000_000)]
+    max_rate_hz: Option<f64>,
+    /// At most this part of the messages may be lost, 0 to 1.
+    #[schema(minimum = 0, maximum = 1)]
+    max_loss_ratio: Option<f64>,
+    /// Longest time from the writer's timestamp to the capture, in milliseconds.
+    #[schema(minimum = 0, maximum = 3_600_000)]
+    max_latency_ms: Option<f64>,
+    /// Longest time without a message, in seconds.
+    #[schema(minimum = 0.001, maximum = 604_800)]
+    max_silence_s: Option<f64>,
+}
+
+#[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+struct Domain {
+    /// The watch for this domain; the one for every domain when left out.
+    #[param(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
+}
+
+impl Domain {
+    /// Refuses a domain that cannot be.
+    fn checked(self) -> Result<Self, Problem> {
+        match self.domain_id {
+            Some(domain_id) if domain_id > MAX_DOMAIN => {
+                let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+                Err(Problem::new(Code::MalformedRequest, detail))
+            }
+            _ => Ok(self),
+        }
+    }
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new()
+        .routes(routes!(list))
+        .routes(routes!(show, add, replace, remove))
+        .layer(DefaultBodyLimit::max(MAX_BODY))
+}
+
+/// All watches
+#[utoipa::path(
+    get,
+    path = "/watch",
+    tag = "watch",
+    responses((status = 200, description = "Watches of every origin.", body = WatchList))
+)]
+async fn list(State(context): State<Context>) -> Json<WatchList> {
+    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let snapshot = state.snapshot.as_ref();
+    let watches = in_force.entries().iter().map(|entry| view(entry, snapshot));
+    Json(WatchList {
+        watches: watches.collect(),
+    })
+}
+
+/// One watch
+#[utoipa::path(
+    get,
+    path = "/watch/{*topic}",
+    tag = "watch",
+    params(TopicParameter, Domain),
+    responses(
+        (status = 200, description = "The watch.", body = WatchView),
+        (status = 404, description = "It is not watched.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn show(
+    State(context): State<Context>,
+    Name(topic): Name,
+    Parameters(domain): Parameters<Domain>,
+) -> Result<Json<WatchView>, Problem> {
+    let domain = domain.checked()?;
+    let (state, in_force) = (context.state().await, context.watches.in_force());
+    let entry = in_force.find(&topic, domain.domain_id);
+    let entry = entry.ok_or_else(|| unknown(&topic, domain.domain_id))?;
+    Ok(Json(view(entry, state.snapshot.as_ref())))
+}
+
+/// Watch a topic
+///
+/// The topic need not exist yet. The body may be left out. Asking again for the same is no mistake.
+#[utoipa::path(
+    post,
+    path = "/watch/{*topic}",
+    tag = "watch",
+    params(TopicParameter, Domain),
+    request_body = WatchRequest,
+    responses(
+        (status = 200, description = "It is watched just so already.", body = WatchView),
+        (status = 201, description = "It is watched from now on.", body = WatchView,
+            headers(("location" = String, description = "Path of the watch."))),
+        (status = 409, description = "It is watched with other settings, or the limit of watches \
+            is reached.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 415, description = "The content type is not JSON.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "Invalid topic name or settings.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn add(
+    State(context): State<Context>,
+    Name(topic): Name,
+    Parameters(domain): Parameters<Domain>,
+    Body(settings): Body<WatchRequest>,
+) -> Result<Response, Problem> {
+    let watch = watch(topic, domain, settings)?;
+    let done = context.watches.add(watch.clone());
+    answer(&context, &watch, done)
+}
+
+/// Watch a topic with these settings, whatever they were
+#[utoipa::path(
+    put,
+    path = "/watch/{*topic}",
+    tag = "watch",
+    params(TopicParameter, Domain),
+    request_body = WatchRequest,
+    responses(
+        (status = 200, description = "It is watched just so.", body = WatchView),
+        (status = 201, description = "It is watched from now on.", body = WatchView,
+            headers(("location" = String, description = "Path of the watch."))),
+        (status = 409, description = "The configuration lists it with other settings, or the \
+            limit of watches is reached.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 415, description = "The content type is not JSON.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 422, description = "Invalid topic name or settings.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn replace(
+    State(context): State<Context>,
+    Name(topic): Name,
+    Parameters(domain): Parameters<Domain>,
+    Body(settings): Body<WatchRequest>,
+) -> Result<Response, Problem> {
+    let watch = watch(topic, domain, settings)?;
+    let done = context.watches.replace(watch.clone());
+    answer(&context, &watch, done)
+}
+
+/// Watch a topic no longer
+///
+/// Only what clients have added: what the configuration lists goes with the configuration.
+#[utoipa::path(
+    delete,
+    path = "/watch/{*topic}",
+    tag = "watch",
+    params(TopicParameter, Domain),
+    responses(
+        (status = 204, description = "It is watched no longer."),
+        (status = 404, description = "It was not watched.",
+            body = ProblemBody, content_type = "application/problem+json"),
+        (status = 409, description = "The configuration or the command line lists it.",
+            body = ProblemBody, content_type = "application/problem+json"),
+    )
+)]
+async fn remove(
+    State(context): State<Context>,
+    Name(topic): Name,
+    Parameters(domain): Parameters<Domain>,
+) -> Result<StatusCode, Problem> {
+    let domain = domain.checked()?;
+    let removed = context.watches.remove(&topic, domain.domain_id);
+    removed.map_err(|refused| problem(&refused, &topic, domain.domain_id))?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// The topic in a path, for the document.
+#[derive(IntoParams)]
+#[into_params(parameter_in = Path)]
+#[expect(dead_code, reason = "read by the document's generator alone")]
+struct TopicParameter {
+    /// ROS name or glob without its leading slash; slashes within need not be encoded.
+    #[param(
+        max_length = 254,
+        pattern = r"^(\*\*|\*|(\*?[A-Za-z_]|\*[0-9])(\*?[A-Za-z0-9_])*\*?)(/(\*\*|\*|(\*?[A-Za-z_]|\*[0-9])(\*?[A-Za-z0-9_])*\*?))*$",
+        example = "camera/front/image_raw"
+    )]
+    topic: String,
+}
+
+/// What is asked for, checked.
+fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch, Problem> {
+    let invalid = |detail: String| Err(Problem::new(Code::InvalidRequest, detail));
+    if let Err(error) = check_pattern(&topic) {
+        return invalid(format!("the topic `{topic}` {error}"));
+    }
+    let domain_id = match (domain.domain_id, settings.domain_id) {
+        (Some(one), Some(other)) if one != other => {
+            return invalid(format!(
+                "domain_id is {one} in the query and {other} in the body"
+            ));
+        }
+        (one, other) => one.or(other),
+    };
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+        return invalid(format!(
+            "domain_id is {domain_id}, must be between 0 and {MAX_DOMAIN}"
+        ));
+    }
+    let expectations = Expectations {
+        min_rate_hz: settings.min_rate_hz,
+        max_rate_hz: settings.max_rate_hz,
+        max_loss_ratio: settings.max_loss_ratio,
+        max_latency_ms: settings.max_latency_ms,
+        max_silence_s: settings.max_silence_s,
+    };
+    let trace = settings.trace;
+    match expectations.check().and_then(|()| check_trace(trace)) {
+        Ok(()) => Ok(Watch {
+            pattern: topic,
+            domain_id,
+            expectations,
+            per_subscriber: settings.per_subscriber,
+            trace,
+            retain: settings.retain.into(),
+        }),
+        Err(mistake) => invalid(mistake),
+    }
+}
+
+fn answer(
+    context: &Context,
+    watch: &Watch,
+    done: Result<Done, Refused>,
+) -> Result<Response, Problem> {
+    let done = done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id))?;
+    let in_force = context.watches.in_force();
+    // Gone again already: somebody else removes while this one adds.
+    let entry = in_force.find(&watch.pattern, watch.domain_id).cloned();
+    let entry = entry.unwrap_or_else(|| Entry {
+        watch: Arc::new(watch.clone()),
+        origin: Origin::Api,
+    });
+    let state = context.board.state();
+    // What is on the board of a new one was of another one, if anything.
+    let snapshot = state.snapshot.as_ref().filter(|_| done == Done::Unchanged);
+    let body = Json(view(&entry, snapshot));
+    Ok(match done {
+        Done::Added => {
+            let location = location(watch);
+            (StatusCode::CREATED, [(LOCATION, location)], body).into_response()
+        }
+        Done::Replaced | Done::Unchanged => body.into_response(),
+    })
+}
+
+/// Names and globs have no character that a path would not.
+fn location(watch: &Watch) -> String {
+    match watch.domain_id {
+        None => format!("/watch{}", watch.pattern),
+        Some(domain_id) => format!("/watch{}?domain_id={domain_id}", watch.pattern),
+    }
+}
+
+fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
+    let detail = match refused {
+        Refused::Given { by: Origin::Config } => {
+            format!("{topic} is listed in the configuration file: change it there and reload")
+        }
+        Refused::Given { by } => format!("{topic} is given by {}", by.phrase()),
+        Refused::Different => {
+            format!("{topic} is watched with other settings: PUT replaces them")
+        }
+        Refused::Unknown => return unknown(topic, domain_id),
+        refused => refused.to_string(),
+    };
+    let code = match refused {
+        Refused::Given { .. } => Code::WatchGiven,
+        Refused::Different => Code::WatchDiffers,
+        Refused::Full(_) => Code::TooManyWatches,
+        Refused::Unknown | Refused::Globs(_) => Code::InvalidRequest,
+    };
+    Problem::new(code, detail)
+}
+
+fn unknown(topic: &str, domain_id: Option<u32>) -> Problem {
+    let detail = match domain_id {
+        None => format!("no watch {topic} for all domains"),
+        Some(domain_id) => format!("no watch {topic} for domain {domain_id}"),
+    };
+    Problem::new(Code::NoSuchWatch, detail)
+}
+
+fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
+    let watch = &entry.watch;
+    let facts = snapshot.and_then(|snapshot| {
+        let mut all = snapshot.watches.iter();
+        let same = |facts: &&WatchFacts| {
+            (&facts.pattern, facts.domain_id) == (&watch.pattern, watch.domain_id)
+        };
+        Some((snapshot, all.find(same)?))
+    });
+    let topics = facts.map_or_else(Vec::new, |(snapshot, facts)| topics(snapshot, facts));
+    let stage = match facts {
+        None => Stage::Starting,
+        Some((snapshot, facts)) => stage(watch, snapshot, facts),
+    };
+    WatchView {
+        topic: watch.pattern.clone(),
+        domain_id: watch.domain_id,
+        origin: match entry.origin {
+            Origin::Config => OriginView::Config,
+            Origin::CommandLine => OriginView::CommandLine,
+            Origin::Api => OriginView::Api,
+        },
+        state: stage,
+        per_subscriber: watch.per_subscriber,
+        trace: watch.trace,
+        retain: watch.retain.into(),
+        expectations: (&watch.expectations).into(),
+        topics,
+    }
+}
+
+impl From<&Expectations> for ExpectationsView {
+    fn from(expectations: &Expectations) -> Self {
+        Self {
+            min_rate_hz: expectations.min_rate_hz,
+            max_rate_hz: expectations.max_rate_hz,
+            max_loss_ratio: expectations.max_loss_ratio,
+            max_latency_ms: expectations.max_latency_ms,
+            max_silence_s: expectations.max_silence_s,
+        }
+    }
+}
+
+fn stage(watch: &Watch, snapshot: &Snapshot, facts: &WatchFacts) -> Stage {
+    let measured = |topic: &str, domain_id: u32| {
+        let mut topics = snapshot.topics.iter();
+        topics.any(|facts| facts.domain_id == domain_id && facts.name == topic)
+    };
+    let mut covered = facts.topics.iter();
+    if covered.any(|topic| measured(&topic.topic, topic.domain_id)) {
+        Stage::Measuring
+    } else if watch.is_literal() && facts.topics.is_empty() {
+        Stage::Rejected
+    } else {
+        Stage::Waiting
+    }
+}
+
+fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<TopicView> {
+    let topic = |watched: &WatchedTopicFacts| {
+        let same = |facts: &&TopicFacts| {
+            facts.domain_id == watched.domain_id && facts.name == watched.topic
+        };
+        let mut measurement = snapshot.topics.iter().filter(same);
+        let measurement = measurement.find_map(|facts| facts.measurement.as_deref());
+        TopicView {
+            domain_id: watched.domain_id,
+            topic: watched.topic.clone(),
+            state: match watched.state {
+                WatchState::Ok => TopicState::Ok,
+                WatchState::Violated => TopicState::Violated,
+                WatchState::Silent => TopicState::Silent,
+                WatchState::NotPublished => TopicState::NotPublished,
+                WatchState::NoSubscriber => TopicState::NoSubscriber,
+            },
+            violations: watched.violations.clone(),
+            messages: measurement.map_or(0, |measured| measured.messages),
+            rate_hertz: measurement.map_or(0.0, |measured| measured.rate_hz),
+        }
+    };
+    facts.topics.iter().map(topic).collect()
+}

@@ -1,0 +1,412 @@
+//! The log of events: the last ones, numbered, for any number of readers that come and go.
+//!
+//! Who tells is never held up: it appends under a lock that readers hold only to copy references.
+//! A reader keeps its own place; what was overwritten before it came is counted and told to it,
+//! never passed over in silence. Storms are cut here: so many events of one name in a second, the
+//! rest in one number. The seconds of what happened to the robot are those of the source's clock, so
+//! that a capture gives the same events at any speed.
+//!
+//! A number belongs to one run of the agent. Written out, an id names the run too, so that after a
+//! restart nobody mistakes an old place for a new one.
+
+mod record;
+mod table;
+mod watchman;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use ros2probe_wire::Timestamp;
+use tokio::sync::Notify;
+
+use record::Happened;
+pub use record::{AgentEvent, Record, Value};
+use ros2probe_model::event::{Class, Taken};
+pub use table::{Definition, EVENTS, Severity, markdown};
+pub use watchman::{Drops, Sight};
+
+const SECOND: u64 = 1_000_000_000;
+/// Events kept.
+const KEPT: usize = 4096;
+/// Events of one name in a second.
+const MOST: u32 = 200;
+
+/// The last events.
+#[derive(Debug)]
+pub struct EventLog {
+    run: Run,
+    begun: Instant,
+    log: Mutex<Log>,
+    news: Notify,
+    overtaken: [AtomicU64; Reader::ALL.len()],
+}
+
+/// One run of the agent, by the microsecond in which it began.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Run(u64);
+
+/// Who reads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reader {
+    /// A stream of the API.
+    Stream,
+    /// The sender of log records.
+    Otlp,
+}
+
+/// A place in some run's events.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// Behind the event of this number in this run.
+    Behind(u64),
+    /// In another run, or where this one never was.
+    Elsewhere,
+}
+
+/// What a reader gets.
+#[derive(Debug, Default)]
+pub struct Batch {
+    /// Events that were overwritten before they could be read.
+    pub lagged: u64,
+    /// What follows them.
+    pub records: Vec<Record>,
+    /// The number to go on behind.
+    pub last: u64,
+}
+
+#[derive(Debug, Default)]
+struct Log {
+    kept: VecDeque<Arc<Entry>>,
+    /// Number of the latest event.
+    last: u64,
+    told: BTreeMap<&'static str, u64>,
+    /// Of the robot, in seconds of the source's clock.
+    robot: Storm,
+    /// Of the agent, in seconds of its life.
+    agent: Storm,
+    suppressed: u64,
+}
+
+/// Events of one whole second.
+#[derive(Debug, Default)]
+struct Storm {
+    second: u64,
+    told: BTreeMap<&'static str, u32>,
+    held_back: BTreeMap<&'static str, u64>,
+}
+
+#[derive(Debug)]
+struct Entry {
+    number: u64,
+    at: Timestamp,
+    observed: Timestamp,
+    happened: Happened,
+}
+
+impl Default for EventLog {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl EventLog {
+    /// Empty, of a run that begins now.
+    #[must_use]
+    pub fn new() -> Self {
+        Self {
+            run: Run(wall_clock().0 / 1000),
+            begun: Instant::now(),
+            log: Mutex::default(),
+            news: Notify::new(),
+            overtaken: Default::default(),
+        }
+    }
+
+    /// Tells what the model noticed until `clock`, the source's. Called with nothing too, so that a
+    /// storm's end is told.
+    pub fn add(&self, taken: Taken, clock: Timestamp) {
+        let mut log = self.log();
+        let before = log.last;
+        for event in taken.events {
+            log.turn_robot(event.at.0 / SECOND);
+            log.tell(event.at, Happened::Robot(event.kind));
+        }
+        for (class, count) in taken.overflow {
+            log.hold_back(group(class), count);
+        }
+        // What is settled late happened up to a second ago.
+        log.turn_robot((clock.0 / SECOND).saturating_sub(1));
+        let is_news = log.last > before;
+        drop(log);
+        if is_news {
+            self.news.notify_waiters();
+        }
+    }
+
+    /// Nothing more will come: tells what is still held back.
+    pub fn settle(&self) {
+        let mut log = self.log();
+        log.tell_held_back();
+        drop(log);
+        self.news.notify_waiters();
+    }
+
+    /// Tells what happened to the agent just now.
+    pub fn tell(&self, event: AgentEvent) {
+        self.tell_at(event, Instant::now());
+    }
+
+    /// Events behind this number, oldest first, not more than so many.
+    #[must_use]
+    pub fn read(&self, behind: u64, most: usize) -> Batch {
+        let log = self.log();
+        let before_first = log.last - log.kept.len() as u64;
+        let behind_what_is_kept = behind.clamp(before_first, log.last);
+        let skip = usize::try_from(behind_what_is_kept - before_first).unwrap_or(usize::MAX);
+        let entries: Vec<_> = log
+            .kept
+            .iter()
+            .skip(skip)
+            .take(most)
+            .map(Arc::clone)
+            .collect();
+        drop(log);
+        Batch {
+            lagged: before_first.saturating_sub(behind),
+            last: entries
+                .last()
+                .map_or(behind_what_is_kept, |entry| entry.number),
+            records: entries.iter().map(|entry| entry.record()).collect(),
+        }
+    }
+
+    /// Number of the latest event; 0 = none yet.
+    #[must_use]
+    pub fn last(&self) -> u64 {
+        self.log().last
+    }
+
+    /// Waits until there is an event behind this number.
+    pub async fn wait(&self, behind: u64) {
+        loop {
+            // From here on no news is missed.
+            let news = self.news.notified();
+            if self.last() > behind {
+                return;
+            }
+            news.await;
+        }
+    }
+
+    /// The id of the event of this number.
+    #[must_use]
+    pub fn id(&self, number: u64) -> String {
+        format!("{}-{number}", self.run)
+    }
+
+    /// What tells this run of the agent from others.
+    #[must_use]
+    pub fn run(&self) -> String {
+        self.run.to_string()
+    }
+
+    /// What an id means to this run; `None` = it is no id.
+    #[must_use]
+    pub fn place(&self, id: &str) -> Option<Place> {
+        let (run, number) = id.split_once('-')?;
+        let run = Run(u64::from_str_radix(run, 16).ok()?);
+        let number = number.parse().ok()?;
+        let ours = run == self.run && number <= self.last();
+        Some(if ours {
+            Place::Behind(number)
+        } else {
+            Place::Elsewhere
+        })
+    }
+
+    /// So many events were overwritten before this reader came to them.
+    pub fn overtook(&self, reader: Reader, count: u64) {
+        if let Some(overtaken) = self.overtaken.get(reader as usize) {
+            overtaken.fetch_add(count, Ordering::Relaxed);
+        }
+    }
+
+    /// Events told, by name, also those of which there was none.
+    #[must_use]
+    pub fn told(&self) -> Vec<(&'static str, u64)> {
+        let log = self.log();
+        let told = |name: &str| log.told.get(name).copied().unwrap_or(0);
+        EVENTS
+            .iter()
+            .map(|event| (event.name, told(event.name)))
+            .collect()
+    }
+
+    /// Events that were not told, or not to everybody, by reason.
+    #[must_use]
+    pub fn dropped(&self) -> Vec<(&'static str, u64)> {
+        let mut dropped = vec![("storm", self.log().suppressed)];
+        let readers = Reader::ALL.iter().zip(&self.overtaken);
+        dropped.extend(
+            readers.map(|(reader, count)| (reader.reason(), count.load(Ordering::Relaxed))),
+        );
+        dropped
+    }
+
+    fn tell_at(&self, event: AgentEvent, now: Instant) {
+        let second = now.saturating_duration_since(self.begun).as_secs();
+        let mut log = self.log();
+        if second > log.agent.second {
+            for (event, count) in log.agent.turn(second) {
+                let suppressed = AgentEvent::Suppressed { event, count };
+                log.append(wall_clock(), Happened::Agent(suppressed));
+            }
+        }
+        log.tell(wall_clock(), Happened::Agent(event));
+        drop(log);
+        self.news.notify_waiters();
+    }
+
+    /// As if so many events had come and all that is kept had gone since.
+    #[cfg(test)]
+    pub(super) fn overwrite(&self, count: u64) {
+        let mut log = self.log();
+        log.kept.clear();
+        log.last += count;
+        drop(log);
+        self.news.notify_waiters();
+    }
+
+    /// What was appended before a panic is whole.
+    fn log(&self) -> MutexGuard<'_, Log> {
+        self.log.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Log {
+    /// It is this second of the source's clock now: tells what the last one held back. What belongs
+    /// to the second before is of this one; further back the clock was set.
+    fn turn_robot(&mut self, second: u64) {
+        let current = self.robot.second;
+        if second == current || second.checked_add(1) == Some(current) {
+            return;
+        }
+        self.tell_held_back();
+        self.robot.turn(second);
+    }
+
+    fn tell_held_back(&mut self) {
+        let end = Timestamp(self.robot.second.saturating_add(1).saturating_mul(SECOND));
+        for (event, count) in std::mem::take(&mut self.robot.held_back) {
+            let suppressed = AgentEvent::Suppressed { event, count };
+            self.append(end, Happened::Agent(suppressed));
+        }
+    }
+
+    fn tell(&mut self, at: Timestamp, happened: Happened) {
+        let name = happened.definition().name;
+        let storm = match happened {
+            Happened::Robot(_) => &mut self.robot,
+            Happened::Agent(_) => &mut self.agent,
+        };
+        if storm.admits(name) {
+            self.append(at, happened);
+        } else {
+            self.suppressed += 1;
+        }
+    }
+
+    fn hold_back(&mut self, name: &'static str, count: u64) {
+        *self.robot.held_back.entry(name).or_default() += count;
+        self.suppressed += count;
+    }
+
+    fn append(&mut self, at: Timestamp, happened: Happened) {
+        self.last += 1;
+        *self.told.entry(happened.definition().name).or_default() += 1;
+        if self.kept.len() >= KEPT {
+            self.kept.pop_front();
+        }
+        self.kept.push_back(Arc::new(Entry {
+            number: self.last,
+            at,
+            observed: wall_clock(),
+            happened,
+        }));
+    }
+}
+
+impl Storm {
+    /// Begins this second; what the one before held back, by name.
+    fn turn(&mut self, second: u64) -> BTreeMap<&'static str, u64> {
+        self.second = second;
+        self.told.clear();
+        std::mem::take(&mut self.held_back)
+    }
+
+    /// Whether there is room for an event of this name; held back otherwise.
+    fn admits(&mut self, name: &'static str) -> bool {
+        let told = self.told.entry(name).or_default();
+        if *told >= MOST {
+            *self.held_back.entry(name).or_default() += 1;
+            return false;
+        }
+        *told += 1;
+        true
+    }
+}
+
+impl Entry {
+    fn record(&self) -> Record {
+        Record {
+            number: self.number,
+            at: self.at,
+            observed: self.observed,
+            definition: self.happened.definition(),
+            severity: self.happened.severity(),
+            attributes: self.happened.attributes(self.at),
+        }
+    }
+}
+
+impl Reader {
+    const ALL: [Self; 2] = [Self::Stream, Self::Otlp];
+
+    /// Label value.
+    const fn reason(self) -> &'static str {
+        match self {
+            Self::Stream => "stream_lagged",
+            Self::Otlp => "otlp_lagged",
+        }
+    }
+}
+
+impl fmt::Display for Run {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:x}", self.0)
+    }
+}
+
+/// What the names of a class have in common.
+const fn group(class: Class) -> &'static str {
+    match class {
+        Class::Participant => "ros2.participant.*",
+        Class::Endpoint => "ros2.endpoint.*",
+        Class::Node => "ros2.node.*",
+        Class::Loss => "ros2.message.*",
+        Class::Expectation => "ros2.topic.*",
+        Class::Diagnosis => "ros2.graph.*",
+    }
+}
+
+fn wall_clock() -> Timestamp {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    let nanoseconds = since.unwrap_or(Duration::ZERO).as_nanos();
+    Timestamp(u64::try_from(nanoseconds).unwrap_or(u64::MAX))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,575 @@
+//! One event in words: what streams and log records carry. Made from the facts when somebody reads
+//! it, so that an event nobody reads costs no formatting.
+
+use std::borrow::Cow;
+use std::fmt::{Display, Write as _};
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::names::DdsTopic;
+
+use super::table::{self, Definition, Severity};
+use crate::surface::SourceKind;
+use crate::surface::robot::series_name;
+use ros2probe_model::churn;
+use ros2probe_model::diagnosis::{Diagnosis, Policy};
+use ros2probe_model::event::{EventKind, LossBurst, bounded};
+use ros2probe_model::snapshot::WatchState;
+use ros2probe_model::topic::Naming;
+
+const SECONDS_OF_A_DAY: u64 = 86_400;
+const NANOSECONDS: u64 = 1_000_000_000;
+
+/// What happened to the robot or the agent.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Happened {
+    Robot(EventKind),
+    Agent(AgentEvent),
+}
+
+/// What happened to the agent.
+#[derive(Clone, Debug, PartialEq)]
+pub enum AgentEvent {
+    /// It started.
+    Started {
+        /// Where packets come from.
+        source: SourceKind,
+    },
+    /// It lost what it should have looked at.
+    Dropped {
+        /// `packets`, `records`, `datagrams`, `contended`.
+        what: &'static str,
+        /// How many since the last such event.
+        count: u64,
+    },
+    /// It does not see.
+    Blind {
+        /// Why.
+        reason: String,
+    },
+    /// It sees again.
+    Seeing {
+        /// For how long it did not.
+        blind_seconds: f64,
+    },
+    /// A configuration was taken over.
+    Reloaded {
+        /// Entries of the watchlist that is in force now.
+        watches: usize,
+    },
+    /// A configuration was refused.
+    ReloadFailed {
+        /// Why.
+        error: String,
+    },
+    /// The API was asked to watch.
+    WatchAdded {
+        /// The pattern.
+        watch: String,
+        /// Only in this domain.
+        domain_id: Option<u32>,
+    },
+    /// The API was asked to watch no more.
+    WatchRemoved {
+        /// The pattern.
+        watch: String,
+        /// Only in this domain.
+        domain_id: Option<u32>,
+    },
+    /// A recording began.
+    RecordingStarted {
+        /// Its name.
+        recording: String,
+    },
+    /// It ended.
+    RecordingEnded {
+        /// Its name.
+        recording: String,
+        /// Messages in the bag.
+        messages: u64,
+        /// Messages that were sent and are not in it.
+        missing: u64,
+        /// What ended it, if nobody asked.
+        reason: Option<String>,
+    },
+    /// What came before an incident was written, or could not be.
+    SnapshotTaken {
+        /// Its name in the configuration.
+        snapshot: String,
+        /// The bag.
+        recording: String,
+        /// Messages in it.
+        messages: u64,
+        /// Why it was not written.
+        reason: Option<String>,
+    },
+    /// Too many of one kind.
+    Suppressed {
+        /// Name of the events, or what the names have in common and `*`.
+        event: &'static str,
+        /// How many are only counted.
+        count: u64,
+    },
+}
+
+/// One event as it is told.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Record {
+    /// Its number in this run of the agent.
+    pub number: u64,
+    /// When it happened, in the source's time.
+    pub at: Timestamp,
+    /// When the agent told it, in this host's time.
+    pub observed: Timestamp,
+    /// What it is.
+    pub definition: &'static Definition,
+    /// How bad.
+    pub severity: Severity,
+    /// Attributes of the definition with their values, in its order.
+    pub attributes: Vec<(&'static str, Value)>,
+}
+
+/// Value of an attribute.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Value {
+    /// Text, bounded.
+    Text(String),
+    /// A count, a number of something.
+    Number(u64),
+    /// A quantity.
+    Real(f64),
+    /// Several texts.
+    List(Vec<String>),
+}
+
+impl Record {
+    /// The value of one attribute, if it has one.
+    #[must_use]
+    pub fn attribute(&self, name: &str) -> Option<&Value> {
+        let mut attributes = self.attributes.iter();
+        attributes.find_map(|(key, value)| (*key == name).then_some(value))
+    }
+
+    /// When it happened, as RFC 3339 writes it.
+    #[must_use]
+    pub fn time(&self) -> String {
+        rfc3339(self.at)
+    }
+}
+
+impl Happened {
+    /// Its entry of the table.
+    pub(super) const fn definition(&self) -> &'static Definition {
+        use churn::Event::{Appeared, Cascaded, Changed, Disposed, Expired};
+        match self {
+            Self::Robot(EventKind::Participant { change, .. }) => match change {
+                Appeared => &table::PARTICIPANT_DISCOVERED,
+                Changed => &table::PARTICIPANT_CHANGED,
+                Disposed | Expired | Cascaded => &table::PARTICIPANT_LOST,
+            },
+            Self::Robot(EventKind::Endpoint { change, .. }) => match change {
+                Appeared => &table::ENDPOINT_DISCOVERED,
+                Changed => &table::ENDPOINT_CHANGED,
+                Disposed | Expired | Cascaded => &table::ENDPOINT_LOST,
+            },
+            Self::Robot(EventKind::Node { change, .. }) => match change {
+                Appeared | Changed => &table::NODE_DISCOVERED,
+                Disposed | Expired | Cascaded => &table::NODE_LOST,
+            },
+            Self::Robot(EventKind::Loss(_)) => &table::MESSAGE_LOST,
+            Self::Robot(EventKind::Expectation { .. }) => &table::EXPECTATION_CHANGED,
+            Self::Robot(EventKind::Silence { .. }) => &table::TOPIC_SILENT,
+            Self::Robot(EventKind::Diagnosis { resolved, finding }) => match (finding, resolved) {
+                (Diagnosis::QosIncompatible { .. }, false) => &table::QOS_INCOMPATIBLE,
+                (Diagnosis::QosIncompatible { .. }, true) => &table::QOS_RESOLVED,
+                (_, false) => &table::GRAPH_DIAGNOSED,
+                (_, true) => &table::GRAPH_RESOLVED,
+            },
+            Self::Agent(event) => match event {
+                AgentEvent::Started { .. } => &table::STARTED,
+                AgentEvent::Dropped { .. } => &table::CAPTURE_DROPPED,
+                AgentEvent::Blind { .. } => &table::CAPTURE_BLIND,
+                AgentEvent::Seeing { .. } => &table::CAPTURE_SEEING,
+                AgentEvent::Reloaded { .. } => &table::CONFIG_RELOADED,
+                AgentEvent::ReloadFailed { .. } => &table::CONFIG_REFUSED,
+                AgentEvent::RecordingStarted { .. } => &table::RECORDING_STARTED,
+                AgentEvent::RecordingEnded { .. } => &table::RECORDING_ENDED,
+                AgentEvent::SnapshotTaken { .. } => &table::SNAPSHOT_TAKEN,
+                AgentEvent::WatchAdded { .. } => &table::WATCH_ADDED,
+                AgentEvent::WatchRemoved { .. } => &table::WATCH_REMOVED,
+                AgentEvent::Suppressed { .. } => &table::SUPPRESSED,
+            },
+        }
+    }
+
+    pub(super) fn severity(&self) -> Severity {
+        let definition = self.definition();
+        let relieves = match self {
+            Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
+            Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
+            // Usual while nodes start, and with tools that publish for whoever may come.
+            Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
+                finding,
+                Diagnosis::UnheardPublisher { .. } | Diagnosis::UnfedSubscriber { .. }
+            ),
+            Self::Agent(
+                AgentEvent::RecordingEnded { reason, .. }
+                | AgentEvent::SnapshotTaken { reason, .. },
+            ) => reason.is_none(),
+            _ => false,
+        };
+        if relieves {
+            definition.relief
+        } else {
+            definition.severity
+        }
+    }
+
+    /// Attributes by name, in any order; `None` = not known.
+    fn values(&self, at: Timestamp) -> Vec<(&'static str, Option<Value>)> {
+        match self {
+            Self::Robot(kind) => robot(kind, at),
+            Self::Agent(event) => agent(event),
+        }
+    }
+
+    /// Attributes in the table's order, each that is known.
+    pub(super) fn attributes(&self, at: Timestamp) -> Vec<(&'static str, Value)> {
+        let mut values = self.values(at);
+        let names = self.definition().attributes.iter();
+        let attributes = names.filter_map(|name| {
+            let place = values.iter().position(|(key, _)| key == name)?;
+            Some((*name, values.swap_remove(place).1?))
+        });
+        let attributes = attributes.collect();
+        debug_assert!(
+            values.iter().all(|(_, value)| value.is_none()),
+            "{values:?}"
+        );
+        attributes
+    }
+}
+
+fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> {
+    use churn::Event::{Cascaded, Disposed, Expired};
+    let cause = |change: &churn::Event| {
+        let went = matches!(change, Disposed | Expired | Cascaded);
+        ("cause", went.then(|| text(change.label())))
+    };
+    let domain = |domain_id: &u32| ("domain_id", number(*domain_id));
+    match kind {
+        EventKind::Participant {
+            change,
+            domain_id,
+            guid,
+            vendor,
+            host,
+            process,
+        } => vec![
+            domain(domain_id),
+            ("participant", written(guid)),
+            ("vendor", written(vendor)),
+            ("host", host.as_deref().map(text)),
+            ("process", process.as_deref().map(text)),
+            cause(change),
+        ],
+        EventKind::Endpoint {
+            change,
+            domain_id,
+            guid,
+            role,
+            topic,
+            message_type,
+        } => {
+            let naming = naming(topic);
+            let role = match role {
+                Role::Writer => "writer",
+                Role::Reader => "reader",
+            };
+            vec![
+                domain(domain_id),
+                ("topic", Some(text(&series(naming.as_ref(), topic)))),
+                ("kind", naming.as_ref().map(|naming| text(naming.kind))),
+                ("role", Some(text(role))),
+                ("endpoint", written(guid)),
+                ("message_type", Some(text(message_type))),
+                cause(change),
+            ]
+        }
+        EventKind::Node {
+            change,
+            domain_id,
+            participant,
+            name,
+        } => vec![
+            domain(domain_id),
+            ("ros_node", Some(text(name))),
+            ("participant", written(participant)),
+            cause(change),
+        ],
+        EventKind::Loss(LossBurst {
+            writer,
+            topic,
+            node,
+            count,
+            first,
+            last,
+        }) => {
+            let name = |topic: &str| text(&series(naming(topic).as_ref(), topic));
+            let topic = topic.as_ref();
+            vec![
+                (
+                    "domain_id",
+                    topic.and_then(|(domain_id, _)| number(*domain_id)),
+                ),
+                ("topic", topic.map(|(_, topic)| name(topic))),
+                ("writer", written(writer)),
+                ("ros_node", node.as_deref().map(text)),
+                ("count", number(*count)),
+                ("first_sequence_number", number(*first)),
+                ("last_sequence_number", number(*last)),
+            ]
+        }
+        EventKind::Expectation {
+            domain_id,
+            topic,
+            watch,
+            from,
+            to,
+            violations,
+        } => vec![
+            domain(domain_id),
+            ("topic", Some(text(topic))),
+            ("watch", Some(text(watch))),
+            ("from", from.map(|from| text(from.label()))),
+            ("to", Some(text(to.label()))),
+            ("violations", list(violations)),
+        ],
+        EventKind::Silence {
+            domain_id,
+            topic,
+            watch,
+            last_message,
+        } => {
+            let ago = last_message.map(|last| Value::Real(seconds(at, last)));
+            vec![
+                domain(domain_id),
+                ("topic", Some(text(topic))),
+                ("watch", Some(text(watch))),
+                ("last_message_seconds_ago", ago),
+            ]
+        }
+        EventKind::Diagnosis { finding, .. } => self::finding(finding),
+    }
+}
+
+fn finding(finding: &Diagnosis) -> Vec<(&'static str, Option<Value>)> {
+    let mut values = Vec::new();
+    if !matches!(finding, Diagnosis::QosIncompatible { .. }) {
+        values.push(("diagnosis", Some(text(finding.kind()))));
+    }
+    if let Some(topic) = finding.topic() {
+        let name = series_name(topic.kind, &topic.name, &topic.dds_name);
+        values.push(("domain_id", number(topic.domain_id)));
+        values.push(("topic", Some(text(&name))));
+    }
+    values.extend(match finding {
+        Diagnosis::QosIncompatible {
+            writer,
+            reader,
+            policies,
+            ..
+        } => vec![
+            ("writer", written(writer)),
+            ("reader", written(reader)),
+            ("policies", list(policies.iter().map(Policy::label))),
+        ],
+        Diagnosis::TypeConflict { types, .. } => vec![("message_types", list(types))],
+        Diagnosis::TypeHashConflict {
+            message_type,
+            hashes,
+            ..
+        } => vec![
+            ("message_types", list([message_type])),
+            ("type_hashes", list(hashes)),
+        ],
+        Diagnosis::DuplicateNode {
+            domain_id,
+            node,
+            participants,
+        } => vec![
+            ("domain_id", number(*domain_id)),
+            ("ros_node", Some(text(node))),
+            ("participants", list(participants)),
+        ],
+        Diagnosis::UnheardPublisher { writer, reason, .. } => vec![
+            ("writer", written(writer)),
+            ("reason", Some(text(reason.label()))),
+        ],
+        Diagnosis::UnfedSubscriber { reader, reason, .. } => vec![
+            ("reader", written(reader)),
+            ("reason", Some(text(reason.label()))),
+        ],
+        Diagnosis::NodeInSeveralDomains {
+            node,
+            participant,
+            domains,
+        } => vec![
+            ("ros_node", Some(text(node))),
+            ("participants", list([participant])),
+            ("domains", list(domains)),
+        ],
+    });
+    values
+}
+
+fn agent(event: &AgentEvent) -> Vec<(&'static str, Option<Value>)> {
+    match event {
+        AgentEvent::Started { source } => vec![
+            ("version", Some(text(env!("CARGO_PKG_VERSION")))),
+            ("source", Some(text(source.label()))),
+        ],
+        AgentEvent::Dropped { what, count } => {
+            vec![("what", Some(text(what))), ("count", number(*count))]
+        }
+        AgentEvent::Blind { reason } => vec![("reason", Some(text(reason)))],
+        AgentEvent::Seeing { blind_seconds } => {
+            vec![("blind_seconds", Some(Value::Real(*blind_seconds)))]
+        }
+        AgentEvent::Reloaded { watches } => vec![("watches", number(*watches as u64))],
+        AgentEvent::ReloadFailed { error } => vec![("error", Some(text(error)))],
+        AgentEvent::WatchAdded { watch, domain_id }
+        | AgentEvent::WatchRemoved { watch, domain_id } => vec![
+            ("watch", Some(text(watch))),
+            ("watch_domain_id", domain_id.and_then(number)),
+        ],
+        AgentEvent::RecordingStarted { recording } => vec![("recording", Some(text(recording)))],
+        AgentEvent::RecordingEnded {
+            recording,
+            messages,
+            missing,
+            reason,
+        } => vec![
+            ("recording", Some(text(recording))),
+            ("messages", number(*messages)),
+            ("missing", number(*missing)),
+            ("reason", reason.as_deref().map(text)),
+        ],
+        AgentEvent::SnapshotTaken {
+            snapshot,
+            recording,
+            messages,
+            reason,
+        } => vec![
+            ("snapshot", Some(text(snapshot))),
+            ("recording", Some(text(recording))),
+            ("messages", number(*messages)),
+            ("reason", reason.as_deref().map(text)),
+        ],
+        AgentEvent::Suppressed { event, count } => {
+            vec![("event", Some(text(event))), ("count", number(*count))]
+        }
+    }
+}
+
+fn naming(topic: &str) -> Option<Naming> {
+    DdsTopic::parse(topic).ok().map(|topic| Naming::of(&topic))
+}
+
+/// The topic as the metrics name it.
+fn series<'a>(naming: Option<&'a Naming>, topic: &'a str) -> Cow<'a, str> {
+    naming.map_or(Cow::Borrowed(topic), |naming| {
+        series_name(naming.kind, &naming.name, &naming.dds_name)
+    })
+}
+
+fn list<T: Display>(items: impl IntoIterator<Item = T>) -> Option<Value> {
+    let items = items.into_iter();
+    let texts = items.map(|item| bounded(&item.to_string()).to_owned());
+    Some(Value::List(texts.collect()))
+}
+
+fn text(text: &str) -> Value {
+    Value::Text(bounded(text).to_owned())
+}
+
+fn written(value: &impl Display) -> Option<Value> {
+    Some(Value::Text(value.to_string()))
+}
+
+fn number(number: impl Into<u64>) -> Option<Value> {
+    Some(Value::Number(number.into()))
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "nanoseconds of a silence stay exact to 104 days"
+)]
+fn seconds(at: Timestamp, last: Timestamp) -> f64 {
+    at.nanoseconds_since(last) as f64 / 1e9
+}
+
+/// UTC with nanoseconds (RFC 3339, 5.6). The calendar's arithmetic counts days from 1 March of the
+/// year 0, so that the leap day is a year's last.
+fn rfc3339(at: Timestamp) -> String {
+    let (days, rest) = (
+        at.0 / NANOSECONDS / SECONDS_OF_A_DAY,
+        at.0 / NANOSECONDS % SECONDS_OF_A_DAY,
+    );
+    let days = days + 719_468;
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let day = day - (153 * month + 2) / 5 + 1;
+    let (month, next) = if month < 10 {
+        (month + 3, 0)
+    } else {
+        (month - 9, 1)
+    };
+    let year = era * 400 + year + next;
+    let (hour, minute, second) = (rest / 3600, rest / 60 % 60, rest % 60);
+    let mut time = String::with_capacity(30);
+    let _ = write!(
+        time,
+        "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{:09}Z",
+        at.0 % NANOSECONDS
+    );
+    time
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_utc_with_leap_years() {
+        for (seconds, expected) in [
+            (0, "1970-01-01T00:00:00.000000000Z"),
+            (951_782_399, "2000-02-28T23:59:59.000000000Z"),
+            (951_868_800, "2000-03-01T00:00:00.000000000Z"),
+            (1_709_164_800, "2024-02-29T00:00:00.000000000Z"),
+            (1_795_219_199, "2026-11-20T23:59:59.000000000Z"),
+            (4_107_542_400, "2100-03-01T00:00:00.000000000Z"),
+        ] {
+            assert_eq!(rfc3339(Timestamp(seconds * NANOSECONDS)), expected);
+        }
+        assert!(rfc3339(Timestamp(7)).ends_with("00.000000007Z"));
+    }
+
+    #[test]
+    fn a_goodbye_is_no_warning_and_an_expired_lease_is_one() {
+        let lost = |change| {
+            Happened::Robot(EventKind::Participant {
+                change,
+                domain_id: 0,
+                guid: ros2probe_wire::Guid::from_bytes([1; 16]),
+                vendor: ros2probe_wire::rtps::VendorId([1, 0x0f]),
+                host: None,
+                process: None,
+            })
+        };
+        assert_eq!(lost(churn::Event::Disposed).severity(), Severity::Info);
+        assert_eq!(lost(churn::Event::Expired).severity(), Severity::Warn);
+    }
+}

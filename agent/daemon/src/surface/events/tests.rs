@@ -1,0 +1,213 @@
+//! The log of events under storms, slow readers and restarts.
+
+use ros2probe_wire::Guid;
+
+use super::*;
+use ros2probe_model::churn;
+use ros2probe_model::event::{Event, EventKind};
+
+fn node(at: u64) -> Event {
+    Event {
+        at: Timestamp(at),
+        kind: EventKind::Node {
+            change: churn::Event::Appeared,
+            domain_id: 7,
+            participant: Guid::from_bytes([1; 16]),
+            name: "/lidar".into(),
+        },
+    }
+}
+
+fn taken(events: Vec<Event>) -> Taken {
+    let overflow = Vec::new();
+    Taken { events, overflow }
+}
+
+/// The clock at the beginning of a second.
+const fn second(number: u64) -> Timestamp {
+    Timestamp(number * SECOND)
+}
+
+fn names(batch: &Batch) -> Vec<&'static str> {
+    let records = batch.records.iter();
+    records.map(|record| record.definition.name).collect()
+}
+
+#[test]
+fn numbers_grow_by_one_and_a_reader_goes_on_where_it_was() {
+    let log = EventLog::new();
+    assert_eq!((log.last(), log.read(0, 10).records.len()), (0, 0));
+    log.add(taken((1..=3).map(node).collect()), second(0));
+    let first = log.read(0, 2);
+    let numbers: Vec<_> = first.records.iter().map(|record| record.number).collect();
+    assert_eq!((first.lagged, first.last, numbers), (0, 2, vec![1, 2]));
+    let second = log.read(first.last, 10);
+    let record = &second.records[0];
+    assert_eq!(
+        (second.last, record.number, record.at),
+        (3, 3, Timestamp(3))
+    );
+    assert_eq!(record.definition.name, "ros2.node.discovered");
+    assert_eq!(
+        record.attributes,
+        [
+            ("domain_id", Value::Number(7)),
+            ("ros_node", Value::Text("/lidar".to_owned())),
+            (
+                "participant",
+                Value::Text("010101010101010101010101.01010101".to_owned())
+            ),
+        ]
+    );
+    let nothing = log.read(second.last, 10);
+    assert_eq!((nothing.last, nothing.records.len()), (3, 0));
+}
+
+#[test]
+fn a_storm_is_cut_in_each_second_and_told_in_one_event() {
+    let log = EventLog::new();
+    let storm = u64::from(MOST) + 50;
+    log.add(taken((0..storm).map(node).collect()), second(0));
+    let other = Event {
+        kind: EventKind::Silence {
+            domain_id: 0,
+            topic: "/imu".into(),
+            watch: "/imu".into(),
+            last_message: None,
+        },
+        ..node(1)
+    };
+    let mut more = taken(vec![node(1), other]);
+    more.overflow = vec![(Class::Endpoint, 9)];
+    log.add(more, second(1));
+    let batch = log.read(0, KEPT);
+    assert_eq!(batch.records.len() as u64, u64::from(MOST) + 1);
+    assert_eq!(names(&batch).last(), Some(&"ros2.topic.silent"));
+    log.add(Taken::default(), second(1));
+    assert_eq!(log.last(), batch.last);
+
+    log.add(taken(vec![node(2 * SECOND)]), second(2));
+    let rest = log.read(batch.last, KEPT);
+    let suppressed = "ros2probe.events.suppressed";
+    assert_eq!(
+        names(&rest),
+        [suppressed, suppressed, "ros2.node.discovered"]
+    );
+    let said: Vec<_> = rest.records[..2]
+        .iter()
+        .map(|record| record.attributes.clone())
+        .collect();
+    let text = |text: &str| Value::Text(text.to_owned());
+    assert_eq!(
+        said,
+        [
+            [
+                ("event", text("ros2.endpoint.*")),
+                ("count", Value::Number(9))
+            ],
+            [
+                ("event", text("ros2.node.discovered")),
+                ("count", Value::Number(51))
+            ]
+        ]
+    );
+    assert_eq!(log.dropped()[0], ("storm", 60));
+    let told: BTreeMap<_, _> = log.told().into_iter().collect();
+    assert_eq!(told["ros2.node.discovered"], u64::from(MOST) + 1);
+    assert_eq!((told[suppressed], told["ros2.message.lost"]), (2, 0));
+}
+
+#[test]
+fn a_storm_of_the_agent_is_cut_by_the_seconds_of_its_life() {
+    let log = EventLog::new();
+    let at = |seconds| log.begun + Duration::from_secs(seconds);
+    for _ in 0..MOST + 3 {
+        log.tell_at(AgentEvent::Reloaded { watches: 1 }, at(1));
+    }
+    assert_eq!(log.last(), u64::from(MOST));
+    log.tell_at(AgentEvent::Reloaded { watches: 1 }, at(2));
+    let rest = log.read(MOST.into(), 10);
+    assert_eq!(names(&rest)[0], "ros2probe.events.suppressed");
+    assert_eq!(rest.records.len(), 2);
+}
+
+#[test]
+fn a_replay_at_full_speed_tells_what_one_at_the_capture_s_pace_tells() {
+    let events: Vec<_> = (0..430).map(|number| node(number * SECOND / 100)).collect();
+    let (at_once, paced) = (EventLog::new(), EventLog::new());
+    at_once.add(taken(events.clone()), second(5));
+    for event in events {
+        let clock = event.at;
+        paced.add(taken(vec![event]), clock);
+    }
+    let told = |log: &EventLog| {
+        log.settle();
+        let records = log.read(0, KEPT).records;
+        let told = records
+            .iter()
+            .map(|record| (record.at, record.definition.name));
+        told.collect::<Vec<_>>()
+    };
+    let told_at_once = told(&at_once);
+    assert_eq!(told_at_once.len(), 430);
+    assert_eq!(told_at_once, told(&paced));
+}
+
+#[test]
+fn what_was_overwritten_is_told_to_the_reader_that_missed_it() {
+    let log = EventLog::new();
+    for number in 0..25 {
+        // Every other second, for a late event is of the second that is there.
+        let at = second(2 * number);
+        log.add(taken((0..200).map(|each| node(at.0 + each)).collect()), at);
+    }
+    assert_eq!(log.last(), 5000);
+    let batch = log.read(100, KEPT);
+    let lost = 5000 - KEPT as u64 - 100;
+    assert_eq!((batch.lagged, batch.last), (lost, 5000));
+    assert_eq!(batch.records.len(), KEPT);
+    assert_eq!(log.read(4000, 1).lagged, 0);
+    log.overtook(Reader::Otlp, lost);
+    assert!(log.dropped().contains(&("otlp_lagged", lost)));
+    // A place that never was is no reason to give anything.
+    assert_eq!(log.read(u64::MAX, 1).records.len(), 0);
+}
+
+#[test]
+fn an_id_means_something_to_its_own_run_alone() {
+    let log = EventLog::new();
+    log.add(taken(vec![node(1), node(2)]), second(0));
+    assert_eq!(log.place(&log.id(1)), Some(Place::Behind(1)));
+    let mut before = EventLog::new();
+    before.run = Run(log.run.0 - 1);
+    before.add(taken(vec![node(1), node(2), node(3)]), second(0));
+    assert_eq!(log.place(&before.id(1)), Some(Place::Elsewhere));
+    assert_eq!(log.place(&log.id(3)), Some(Place::Elsewhere));
+    for nonsense in ["", "1", "-", "x-1", "1-x", "1--1", "1-1-1"] {
+        assert_eq!(log.place(nonsense), None, "{nonsense}");
+    }
+}
+
+#[tokio::test]
+async fn who_waits_is_woken_by_the_next_event() {
+    let log = Arc::new(EventLog::new());
+    log.wait(0).await_soon(false).await;
+    log.tell(AgentEvent::Reloaded { watches: 3 });
+    log.wait(0).await_soon(true).await;
+    let waiting = Arc::clone(&log);
+    let woken = tokio::spawn(async move { waiting.wait(1).await });
+    tokio::task::yield_now().await;
+    log.add(taken(vec![node(1)]), second(0));
+    woken.await_soon(true).await;
+}
+
+/// Waits for a future, or not for long.
+trait Soon: Future + Sized {
+    async fn await_soon(self, expected: bool) {
+        let patience = Duration::from_millis(if expected { 10_000 } else { 20 });
+        let came = tokio::time::timeout(patience, self).await.is_ok();
+        assert_eq!(came, expected);
+    }
+}
+
+impl<F: Future> Soon for F {}

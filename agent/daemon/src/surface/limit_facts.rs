@@ -1,0 +1,308 @@
+//! How far the caps of the configuration are used, and what was refused or given up because of each.
+//!
+//! Most of it the model counts in its tables anyway. What surfaces and recordings hand out (places
+//! of connections, bags, watches) is counted here, where it is handed out.
+
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::{Duration, Instant};
+
+use super::board::State;
+use crate::config::{Limit, Limits};
+
+const LIMITS: usize = Limit::ALL.len();
+/// An agent is at a limit for so long after something was refused or given up because of it.
+const LATELY: Duration = Duration::from_secs(60);
+
+/// One cap of the configuration, at one moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LimitFacts {
+    /// Which.
+    pub limit: Limit,
+    /// Entries, connections or bytes that may be.
+    pub cap: u64,
+    /// That are.
+    pub used: u64,
+    /// Refused, or given up to make room, since the start.
+    pub reached: u64,
+    /// There is no room, or there was none within the last minute.
+    pub at_limit: bool,
+}
+
+/// The caps in force, and what is counted where the model does not.
+#[derive(Debug)]
+pub struct LimitFigures {
+    caps: Limits,
+    /// What is not handed out as places.
+    used: [AtomicU64; LIMITS],
+    reached: [AtomicU64; LIMITS],
+    rises: Mutex<[Rise; LIMITS]>,
+    places: Mutex<Vec<(Limit, Weak<Places>)>>,
+}
+
+/// When the count of what was refused or given up rose last.
+#[derive(Clone, Copy, Debug, Default)]
+struct Rise {
+    count: u64,
+    at: Option<Instant>,
+}
+
+/// Places of which only so many can be taken at once.
+#[derive(Debug)]
+pub struct Places {
+    cap: usize,
+    taken: AtomicUsize,
+}
+
+/// One place; free again when this is dropped.
+#[derive(Debug)]
+pub struct Place {
+    of: Arc<Places>,
+}
+
+impl LimitFigures {
+    /// Nothing used yet.
+    #[must_use]
+    pub fn new(caps: Limits) -> Self {
+        Self {
+            caps,
+            used: std::array::from_fn(|_| AtomicU64::new(0)),
+            reached: std::array::from_fn(|_| AtomicU64::new(0)),
+            rises: Mutex::default(),
+            places: Mutex::default(),
+        }
+    }
+
+    /// The caps.
+    #[must_use]
+    pub const fn caps(&self) -> &Limits {
+        &self.caps
+    }
+
+    /// As many places as `limit` allows, to whoever hands them out: a listener of several has its
+    /// own, so that who fills one does not lock the others.
+    #[must_use]
+    pub fn places(&self, limit: Limit) -> Arc<Places> {
+        let places = Arc::new(Places {
+            cap: self.caps.get(limit),
+            taken: AtomicUsize::new(0),
+        });
+        let mut all = self.places.lock().unwrap_or_else(PoisonError::into_inner);
+        all.push((limit, Arc::downgrade(&places)));
+        places
+    }
+
+    /// So many are in use now.
+    pub fn set_used(&self, limit: Limit, used: usize) {
+        if let Some(place) = self.used.get(limit as usize) {
+            place.store(used as u64, Ordering::Relaxed);
+        }
+    }
+
+    /// So many were refused, or given up.
+    pub fn reached(&self, limit: Limit, count: usize) {
+        if let Some(reached) = self.reached.get(limit as usize) {
+            reached.fetch_add(count as u64, Ordering::Relaxed);
+        }
+    }
+
+    /// Notes what was refused or given up until `state`.
+    pub(super) fn note(&self, state: &State) {
+        let mut rises = self.rises.lock().unwrap_or_else(PoisonError::into_inner);
+        for (rise, limit) in rises.iter_mut().zip(Limit::ALL) {
+            let (_, count) = self.usage(limit, state);
+            if count > rise.count {
+                rise.at = Some(state.agent.at);
+            }
+            rise.count = count;
+        }
+    }
+
+    /// All caps as they stand; what the model counts is of `state`.
+    #[must_use]
+    pub fn facts(&self, state: &State) -> [LimitFacts; LIMITS] {
+        let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
+        let is_recent = |at: Instant| state.agent.at.saturating_duration_since(at) < LATELY;
+        Limit::ALL.map(|limit| {
+            let (used, reached) = self.usage(limit, state);
+            let cap = self.caps.get(limit) as u64;
+            let rise = rises.get(limit as usize).and_then(|rise| rise.at);
+            LimitFacts {
+                limit,
+                cap,
+                used,
+                reached,
+                at_limit: used >= cap || rise.is_some_and(is_recent),
+            }
+        })
+    }
+
+    /// Which limits keep part of the robot from being seen, in words.
+    #[must_use]
+    pub fn degraded(&self, state: &State) -> Option<String> {
+        let all = self.facts(state).into_iter();
+        let reached = all.filter(|facts| facts.at_limit && facts.limit.blinds());
+        let reached = reached.map(|facts| {
+            let LimitFacts {
+                limit, cap, used, ..
+            } = facts;
+            let refused = match facts.reached {
+                0 => String::new(),
+                count => format!(", {count} refused or evicted"),
+            };
+            format!("{} ({used} of {cap}{refused})", limit.key())
+        });
+        let reached: Vec<_> = reached.collect();
+        (!reached.is_empty()).then(|| format!("at a limit: {}", reached.join(", ")))
+    }
+
+    fn usage(&self, limit: Limit, state: &State) -> (u64, u64) {
+        let (agent, known) = (&state.agent, state.known());
+        let table = |name: &str| {
+            let table = known.tables.iter().find(|table| table.table == name);
+            table.map_or((0, 0), |table| (table.size, table.evictions))
+        };
+        match limit {
+            Limit::Participants => table("participants"),
+            Limit::Endpoints => table("endpoints"),
+            Limit::Topics => (known.topics_measured, known.topics_rejected),
+            Limit::UnknownWriters => table("unknown_writers"),
+            Limit::Flows => table("deliveries"),
+            Limit::ReassemblyBytes => (agent.reassembly_bytes, agent.reassembly_evicted),
+            Limit::Subscriptions => {
+                let facts = &agent.subscriptions;
+                (facts.open as u64, facts.refused)
+            }
+            Limit::PayloadBytes => {
+                let facts = &agent.subscriptions;
+                let (bytes, given_up) = table("payloads");
+                (
+                    bytes + facts.queued_bytes as u64,
+                    given_up + facts.crowded_out,
+                )
+            }
+            Limit::Watches | Limit::Recordings | Limit::ApiClients | Limit::MetricsClients => {
+                self.own(limit)
+            }
+        }
+    }
+
+    fn own(&self, limit: Limit) -> (u64, u64) {
+        let read = |counts: &[AtomicU64; LIMITS]| {
+            let count = counts.get(limit as usize);
+            count.map_or(0, |count| count.load(Ordering::Relaxed))
+        };
+        let all = self.places.lock().unwrap_or_else(PoisonError::into_inner);
+        let places = all.iter().filter(|(of, _)| *of == limit);
+        let taken = places.filter_map(|(_, places)| Some(places.upgrade()?.taken() as u64));
+        // The fullest of several: there the next one is refused.
+        let taken = taken.max().unwrap_or(0);
+        (taken.max(read(&self.used)), read(&self.reached))
+    }
+}
+
+impl Places {
+    /// A place, if one is free.
+    pub fn take(self: &Arc<Self>) -> Option<Place> {
+        let more = |taken| (taken < self.cap).then_some(taken + 1);
+        let taken = self
+            .taken
+            .fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
+        taken.ok().map(|_| Place {
+            of: Arc::clone(self),
+        })
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub const fn cap(&self) -> usize {
+        self.cap
+    }
+
+    fn taken(&self) -> usize {
+        self.taken.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.of.taken.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::agent_facts::{AgentFacts, SourceKind};
+    use ros2probe_model::snapshot::{Snapshot, TableFacts};
+
+    #[test]
+    fn places_are_as_many_as_the_cap_and_come_back() {
+        let figures = LimitFigures::new(Limits {
+            recordings: 2,
+            ..Limits::default()
+        });
+        let places = figures.places(Limit::Recordings);
+        let taken = [places.take().unwrap(), places.take().unwrap()];
+        assert!(places.take().is_none());
+        figures.reached(Limit::Recordings, 1);
+        assert_eq!(figures.own(Limit::Recordings), (2, 1));
+        drop(taken);
+        assert_eq!(figures.own(Limit::Recordings), (0, 1));
+        assert!(places.take().is_some());
+    }
+
+    #[test]
+    fn a_limit_is_reached_while_there_is_no_room_and_for_a_minute_after_a_refusal() {
+        let figures = LimitFigures::new(Limits {
+            participants: 10,
+            ..Limits::default()
+        });
+        let start = Instant::now();
+        let at = |seconds: u64, size: u64, evictions: u64| {
+            let at = start + Duration::from_secs(seconds);
+            let table = TableFacts {
+                table: "participants",
+                size,
+                limit: 10,
+                evictions,
+            };
+            let snapshot = Snapshot {
+                tables: vec![table],
+                ..Snapshot::default()
+            };
+            let state = State {
+                snapshot: Some(snapshot),
+                agent: AgentFacts::new(SourceKind::Wire, at),
+            };
+            figures.note(&state);
+            figures.degraded(&state)
+        };
+        let full = Some("at a limit: participants (10 of 10)".to_owned());
+        assert_eq!(at(0, 9, 0), None);
+        assert_eq!(at(1, 10, 0), full);
+        assert_eq!(at(2, 9, 0), None);
+        assert!(at(3, 10, 5).is_some());
+        let lately = "at a limit: participants (9 of 10, 5 refused or evicted)";
+        assert_eq!(at(62, 9, 5).as_deref(), Some(lately));
+        assert_eq!(at(63, 9, 5), None);
+        // What clients hand in hides nothing of the robot.
+        figures.set_used(Limit::Watches, 1_000);
+        assert_eq!(at(64, 9, 5), None);
+    }
+
+    #[test]
+    fn of_several_listeners_the_fullest_one_is_shown_and_one_that_is_gone_is_not() {
+        let figures = LimitFigures::new(Limits::default());
+        let (one, other) = (
+            figures.places(Limit::ApiClients),
+            figures.places(Limit::ApiClients),
+        );
+        let _one = one.take().unwrap();
+        let two = [other.take().unwrap(), other.take().unwrap()];
+        assert_eq!(figures.own(Limit::ApiClients).0, 2);
+        drop((two, other));
+        assert_eq!(figures.own(Limit::ApiClients).0, 1);
+        assert_eq!(figures.own(Limit::MetricsClients), (0, 0));
+    }
+}

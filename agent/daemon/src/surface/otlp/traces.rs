@@ -1,0 +1,301 @@
+//! Spans on their way out: a bounded queue that the capture thread fills without waiting, and what
+//! is sent of it.
+//!
+//! A message's trace and the span of its sending have the same ids from whichever agent they come;
+//! ids of what happens at one host depend on that host.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
+use opentelemetry_proto::tonic::common::v1::KeyValue;
+use opentelemetry_proto::tonic::common::v1::any_value::Value;
+use opentelemetry_proto::tonic::resource::v1::Resource;
+use opentelemetry_proto::tonic::trace::v1::span::SpanKind;
+use opentelemetry_proto::tonic::trace::v1::{ResourceSpans, ScopeSpans, Span as Exported};
+use prost::Message as _;
+use tokio::sync::Notify;
+
+use super::client::Request;
+use super::outlet::Outlet;
+use super::points::{attribute, key_value, scope};
+use ros2probe_model::identity::Identity;
+use ros2probe_model::trace::{Span, Stage};
+
+/// Spans that wait here, and in one request.
+const WAITING: usize = 4096;
+const REQUEST: usize = 512;
+/// They are sent together that end within this time.
+const GATHER: Duration = Duration::from_secs(1);
+/// W3C trace flags: sampled, and sampled by chance that all see alike.
+const FLAGS: u32 = 0b11;
+
+/// Spans between the capture thread and the exporter.
+#[derive(Debug, Default)]
+pub struct SpanQueue {
+    waiting: Mutex<VecDeque<Span>>,
+    news: Notify,
+}
+
+impl SpanQueue {
+    /// Appends these; for how many there was no room.
+    pub fn put(&self, spans: Vec<Span>) -> u64 {
+        if spans.is_empty() {
+            return 0;
+        }
+        let mut waiting = self.waiting();
+        let room = WAITING.saturating_sub(waiting.len());
+        let refused = spans.len().saturating_sub(room);
+        waiting.extend(spans.into_iter().take(room));
+        drop(waiting);
+        self.news.notify_one();
+        refused as u64
+    }
+
+    fn take(&self) -> Vec<Span> {
+        let mut waiting = self.waiting();
+        let most = waiting.len().min(REQUEST);
+        waiting.drain(..most).collect()
+    }
+
+    async fn filled(&self) {
+        loop {
+            let news = self.news.notified();
+            if !self.waiting().is_empty() {
+                return;
+            }
+            news.await;
+        }
+    }
+
+    fn waiting(&self) -> MutexGuard<'_, VecDeque<Span>> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Writes requests.
+pub(super) struct Tracing {
+    resource: Resource,
+    /// Of this agent, in ids of what happens at its host.
+    host: u128,
+}
+
+impl Tracing {
+    pub(super) const fn new(resource: Resource, host: u128) -> Self {
+        Self { resource, host }
+    }
+
+    /// Exports what comes into the queue until the end.
+    pub(super) async fn run(self, mut outlet: Outlet, queue: &SpanQueue) {
+        loop {
+            let gathered = async {
+                queue.filled().await;
+                tokio::time::sleep(GATHER).await;
+            };
+            tokio::select! {
+                () = gathered => {}
+                () = outlet.stopped() => break,
+            }
+            while !outlet.is_stopped() {
+                let spans = queue.take();
+                if spans.is_empty() {
+                    break;
+                }
+                outlet.deliver(vec![self.request(&spans)], None).await;
+            }
+        }
+        let mut last = Vec::new();
+        loop {
+            let spans = queue.take();
+            if spans.is_empty() {
+                break;
+            }
+            last.push(self.request(&spans));
+        }
+        outlet.finish(last, false).await;
+    }
+
+    fn request(&self, spans: &[Span]) -> Request {
+        let request = ExportTraceServiceRequest {
+            resource_spans: vec![ResourceSpans {
+                resource: Some(self.resource.clone()),
+                scope_spans: vec![ScopeSpans {
+                    scope: Some(scope()),
+                    spans: spans.iter().map(|span| self.exported(span)).collect(),
+                    schema_url: String::new(),
+                }],
+                schema_url: String::new(),
+            }],
+        };
+        Request {
+            body: request.encode_to_vec().into(),
+            items: spans.len() as u64,
+        }
+    }
+
+    fn exported(&self, span: &Span) -> Exported {
+        let (operation, kind) = match span.stage {
+            Stage::Send => ("send", SpanKind::Producer),
+            Stage::Receive => ("receive", SpanKind::Consumer),
+            Stage::Settle(_) => ("settle", SpanKind::Client),
+        };
+        let message = &span.message;
+        let parent = match span.stage {
+            Stage::Send => Vec::new(),
+            Stage::Receive | Stage::Settle(_) => self.id(span, Stage::Send),
+        };
+        Exported {
+            trace_id: message.trace_id.to_be_bytes().to_vec(),
+            span_id: self.id(span, span.stage),
+            parent_span_id: parent,
+            flags: FLAGS,
+            name: format!("{operation} {}", message.subject.topic),
+            kind: kind.into(),
+            start_time_unix_nano: span.begin.0,
+            end_time_unix_nano: span.end.0,
+            attributes: attributes(span, operation),
+            ..Exported::default()
+        }
+    }
+
+    /// Of the message's span at this stage.
+    fn id(&self, span: &Span, stage: Stage) -> Vec<u8> {
+        let mut identity = Identity::of(match stage {
+            Stage::Send => b"send",
+            Stage::Receive => b"receive",
+            Stage::Settle(_) => b"settle",
+        });
+        identity.add(&span.message.trace_id.to_be_bytes());
+        match stage {
+            Stage::Send => {}
+            // Each host that it comes to receives it.
+            Stage::Receive => identity.add(&self.host.to_be_bytes()),
+            Stage::Settle(reader) => identity.add(&reader.to_bytes()),
+        }
+        let bits = identity.bits() as u64;
+        bits.to_be_bytes().to_vec()
+    }
+}
+
+/// By OpenTelemetry's conventions for messaging, and under the names that the metrics' labels have.
+fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
+    let message = &span.message;
+    let (writer, number) = (message.writer, message.sequence_number);
+    let int = |key: &str, value: u64| {
+        key_value(
+            key,
+            Value::IntValue(i64::try_from(value).unwrap_or(i64::MAX)),
+        )
+    };
+    let client = match span.stage {
+        Stage::Settle(reader) => reader,
+        Stage::Send | Stage::Receive => writer,
+    };
+    let mut attributes = vec![
+        attribute("messaging.system", "dds"),
+        attribute("messaging.operation.name", operation),
+        attribute("messaging.operation.type", operation),
+        attribute("messaging.destination.name", &*message.subject.topic),
+        attribute("messaging.client.id", client.to_string()),
+        attribute("messaging.message.id", format!("{writer}/{number}")),
+        int("messaging.message.body.size", message.size.into()),
+        int("domain_id", message.subject.domain_id.into()),
+        attribute("writer", writer.to_string()),
+        int("sequence_number", number),
+        attribute("message_type", &*message.subject.message_type),
+    ];
+    if let Some(time) = message.source.timestamp() {
+        attributes.push(int("source_timestamp_unix_nano", time.0));
+    }
+    let (address, port) = match span.stage {
+        Stage::Settle(reader) => {
+            attributes.push(attribute("reader", reader.to_string()));
+            return attributes;
+        }
+        Stage::Send => ("network.peer.address", "network.peer.port"),
+        Stage::Receive => ("network.local.address", "network.local.port"),
+    };
+    let to = message.destination.socket_address();
+    attributes.extend([
+        int("fragments", message.fragments.into()),
+        attribute(address, to.ip().to_string()),
+        int(port, to.port().into()),
+    ]);
+    attributes
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, Timestamp};
+
+    use super::*;
+    use ros2probe_model::trace::{Message, Subject};
+    use ros2probe_model::way::Place;
+
+    fn span(stage: Stage) -> Span {
+        let writer = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3]));
+        Span {
+            stage,
+            message: Message {
+                writer,
+                sequence_number: 42,
+                trace_id: Message::identity(writer, 42),
+                subject: Arc::new(Subject {
+                    domain_id: 5,
+                    topic: "/points".into(),
+                    message_type: "sensor_msgs/msg/PointCloud2".into(),
+                    reliable: true,
+                }),
+                source: RtpsTime::default(),
+                size: 7,
+                fragments: 1,
+                destination: Place::default(),
+            },
+            begin: Timestamp(10),
+            end: Timestamp(20),
+        }
+    }
+
+    #[test]
+    fn two_hosts_report_one_trace_in_which_each_has_its_own_part() {
+        let reader = Guid::new(GuidPrefix([2; 12]), EntityId([0, 0, 1, 4]));
+        let (one, two) = (
+            Tracing::new(Resource::default(), 1),
+            Tracing::new(Resource::default(), 2),
+        );
+        let sent = one.exported(&span(Stage::Send));
+        assert_eq!(sent, two.exported(&span(Stage::Send)));
+        assert_eq!((sent.trace_id.len(), sent.span_id.len()), (16, 8));
+        assert_eq!(sent.name, "send /points");
+        assert!(sent.parent_span_id.is_empty());
+        let received = [&one, &two].map(|tracing| tracing.exported(&span(Stage::Receive)));
+        let settled = one.exported(&span(Stage::Settle(reader)));
+        let [first, second] = &received;
+        for child in [first, second, &settled] {
+            assert_eq!(child.trace_id, sent.trace_id);
+            assert_eq!(child.parent_span_id, sent.span_id);
+            assert_ne!(child.span_id, sent.span_id);
+        }
+        assert_ne!(first.span_id, second.span_id);
+        assert_ne!(first.span_id, settled.span_id);
+        assert_eq!(settled, two.exported(&span(Stage::Settle(reader))));
+    }
+
+    #[tokio::test]
+    async fn the_queue_holds_so_many_and_says_how_many_it_refused() {
+        let queue = SpanQueue::default();
+        assert_eq!(queue.put(Vec::new()), 0);
+        assert_eq!(queue.put(vec![span(Stage::Send); WAITING - 1]), 0);
+        assert_eq!(queue.put(vec![span(Stage::Send); 3]), 2);
+        queue.filled().await;
+        let mut taken = 0;
+        while let more @ 1.. = queue.take().len() {
+            assert!(more <= REQUEST);
+            taken += more;
+        }
+        assert_eq!(taken, WAITING);
+    }
+}

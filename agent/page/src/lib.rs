@@ -1,0 +1,132 @@
+//! Files of the page for browsers, as the folder around this crate holds them.
+//!
+//! ```
+//! let index = ros2probe_page::FILES.iter().find(|file| file.path == "index.html");
+//! assert!(index.is_some_and(|file| file.media_type.starts_with("text/html")));
+//! ```
+
+#![forbid(unsafe_code)]
+
+/// One file of the page.
+#[derive(Clone, Copy, Debug)]
+pub struct File {
+    /// Path below `/page/`.
+    pub path: &'static str,
+    /// Value of `Content-Type`.
+    pub media_type: &'static str,
+    /// Content, not compressed.
+    pub bytes: &'static [u8],
+}
+
+impl File {
+    const fn new(path: &'static str, media_type: &'static str, bytes: &'static [u8]) -> Self {
+        Self {
+            path,
+            media_type,
+            bytes,
+        }
+    }
+}
+
+/// Each file, by its path below `/page/`; `index.html` is served at `/`, too.
+pub static FILES: [File; 34] = [
+    File::new("api.js", SCRIPT, include_bytes!("../api.js")),
+    File::new("app.css", CSS, include_bytes!("../app.css")),
+    File::new("app.js", SCRIPT, include_bytes!("../app.js")),
+    File::new("camera.js", SCRIPT, include_bytes!("../camera.js")),
+    File::new("chart.js", SCRIPT, include_bytes!("../chart.js")),
+    File::new("dialogs.js", SCRIPT, include_bytes!("../dialogs.js")),
+    File::new("format.js", SCRIPT, include_bytes!("../format.js")),
+    File::new(
+        "graph-model.js",
+        SCRIPT,
+        include_bytes!("../graph-model.js"),
+    ),
+    File::new("icon.svg", SVG, include_bytes!("../icon.svg")),
+    File::new("index.html", HTML, include_bytes!("../index.html")),
+    File::new(
+        "layout-worker.js",
+        SCRIPT,
+        include_bytes!("../layout-worker.js"),
+    ),
+    File::new("layout.js", SCRIPT, include_bytes!("../layout.js")),
+    File::new("message.js", SCRIPT, include_bytes!("../message.js")),
+    File::new("qos.js", SCRIPT, include_bytes!("../qos.js")),
+    File::new("router.js", SCRIPT, include_bytes!("../router.js")),
+    File::new("state.js", SCRIPT, include_bytes!("../state.js")),
+    File::new("store.js", SCRIPT, include_bytes!("../store.js")),
+    File::new("stream.js", SCRIPT, include_bytes!("../stream.js")),
+    File::new("table.js", SCRIPT, include_bytes!("../table.js")),
+    File::new("timebar.js", SCRIPT, include_bytes!("../timebar.js")),
+    File::new("ui.js", SCRIPT, include_bytes!("../ui.js")),
+    File::new(
+        "vendor/hooks.mjs",
+        SCRIPT,
+        include_bytes!("../vendor/hooks.mjs"),
+    ),
+    File::new(
+        "vendor/htm.mjs",
+        SCRIPT,
+        include_bytes!("../vendor/htm.mjs"),
+    ),
+    File::new(
+        "vendor/preact.mjs",
+        SCRIPT,
+        include_bytes!("../vendor/preact.mjs"),
+    ),
+    File::new(
+        "vendor/uPlot.iife.min.js",
+        SCRIPT,
+        include_bytes!("../vendor/uPlot.iife.min.js"),
+    ),
+    File::new(
+        "vendor/uPlot.min.css",
+        CSS,
+        include_bytes!("../vendor/uPlot.min.css"),
+    ),
+    File::new(
+        "views/agent.js",
+        SCRIPT,
+        include_bytes!("../views/agent.js"),
+    ),
+    File::new(
+        "views/events.js",
+        SCRIPT,
+        include_bytes!("../views/events.js"),
+    ),
+    File::new(
+        "views/graph.js",
+        SCRIPT,
+        include_bytes!("../views/graph.js"),
+    ),
+    File::new(
+        "views/nodes.js",
+        SCRIPT,
+        include_bytes!("../views/nodes.js"),
+    ),
+    File::new(
+        "views/overview.js",
+        SCRIPT,
+        include_bytes!("../views/overview.js"),
+    ),
+    File::new(
+        "views/recordings.js",
+        SCRIPT,
+        include_bytes!("../views/recordings.js"),
+    ),
+    File::new(
+        "views/topic.js",
+        SCRIPT,
+        include_bytes!("../views/topic.js"),
+    ),
+    File::new(
+        "views/topics.js",
+        SCRIPT,
+        include_bytes!("../views/topics.js"),
+    ),
+];
+
+const CSS: &str = "text/css; charset=utf-8";
+const HTML: &str = "text/html; charset=utf-8";
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+const SVG: &str = "image/svg+xml";
