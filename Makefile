@@ -14,7 +14,7 @@ MIRI := MIRIFLAGS="-Zmiri-strict-provenance -Zmiri-disable-isolation $$MIRI_MORE
     CARGO_TARGET_DIR=$(TARGET)/miri cargo "+$$(.ci/prerequisites.sh --nightly)" miri test
 # Floods and what is tried with every change of a byte would take hours there, and queues wake their
 # readers through sockets that it does not have.
-MIRI_WIRE := cursor:: walk:: record:: rtps:: --skip never
+MIRI_WIRE := cursor:: walk:: record:: rtps:: testing:: --skip never
 MIRI_CAPTURE := ring::block ring::turns shm::cell shm::port shm::segment shm::inbox
 MIRI_THREADS := ring::turns
 
