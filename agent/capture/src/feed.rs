@@ -3,6 +3,7 @@
 //! The live source takes its frames from the ring itself. Nothing here waits; whoever replays at
 //! a certain speed does so between packets.
 
+use ros2probe_model::input::Input;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::walk::Envelope;
@@ -40,7 +41,7 @@ impl Feed {
         while let Some(captured) = reader.next_packet()? {
             self.packet(&captured, observer);
         }
-        observer.settle();
+        observer.input(Input::End);
         Ok(())
     }
 
@@ -48,11 +49,14 @@ impl Feed {
     pub fn packet(&mut self, captured: &Captured<'_>, observer: &mut Observer) {
         // Several interfaces of one capture may be a little out of order.
         self.last = self.last.max(captured.time);
-        observer.advance(self.last);
+        observer.input(Input::Time(self.last));
         let parsed = match frame::parse(captured.link, captured.bytes, captured.length) {
             Ok(parsed) => parsed,
             Err(error) => {
-                observer.decode_error("frame", error.reason);
+                observer.input(Input::DecodeError {
+                    stage: "frame",
+                    reason: error.reason,
+                });
                 return;
             }
         };
@@ -107,8 +111,16 @@ impl Feed {
 
 fn give(observer: &mut Observer, envelope: &Envelope, payload: &[u8], length: u32) {
     if payload.len() < usize::try_from(length).unwrap_or(usize::MAX) {
-        observer.cut_datagram(envelope, payload, length);
+        observer.input(Input::CutDatagram {
+            envelope,
+            payload,
+            length,
+        });
     } else {
-        observer.datagram(envelope, payload, None);
+        observer.input(Input::Datagram {
+            envelope,
+            payload,
+            handover: None,
+        });
     }
 }

@@ -3,6 +3,7 @@
 //!
 //! One for each loaded filter. It puts pieces together and everything in order; it decides nothing.
 
+use ros2probe_model::input::Input;
 use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
 
@@ -176,7 +177,10 @@ impl Intake {
                 return u64::MAX;
             };
             let Some((piece, bytes)) = captured.read() else {
-                observer.decode_error("piece", Reason::BadLength);
+                observer.input(Input::DecodeError {
+                    stage: "piece",
+                    reason: Reason::BadLength,
+                });
                 continue;
             };
             self.copied_bytes += (size_of::<Piece>() + bytes.len()) as u64;
@@ -210,7 +214,7 @@ fn deliver(
         let Some(Next::Kernel(record) | Next::Walked(record)) = order.next(clocks, until) else {
             return true;
         };
-        observer.record(&record);
+        observer.input(Input::Record(&record));
     }
     false
 }
@@ -234,11 +238,17 @@ fn take_in_datagram(
         host: piece.flags & flag::HOST != 0,
         ..Envelope::default()
     };
-    observer.announcements(&envelope, bytes, |observer, mut record| {
+    let mut records = Vec::new();
+    observer.input(Input::Announcements {
+        envelope: &envelope,
+        payload: bytes,
+        records: &mut records,
+    });
+    for mut record in records {
         record.datagram = piece.datagram;
         record.flags |= piece.flags & (flag::SHM | flag::EXACT);
         if let Some(record) = order.walked(piece.time, record) {
-            observer.record(&record);
+            observer.input(Input::Record(&record));
         }
-    });
+    }
 }

@@ -4,6 +4,7 @@
 //! for each namespace; also both, for interfaces with traffic that no socket receives. Nothing is
 //! ever sent.
 
+use ros2probe_model::input::Input;
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::os::fd::BorrowedFd;
@@ -252,7 +253,7 @@ impl LiveSource {
                 milliseconds,
                 "the system's clock was set, or the system slept"
             );
-            observer.calendar_set(step);
+            observer.input(Input::ClockSet(step));
         }
         let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= SECOND;
         self.clocks = clocks;
@@ -286,7 +287,9 @@ impl LiveSource {
         }
         if held_up {
             // Its rings may have been too small: nobody went because this process did not look.
-            observer.participants_alive(self.last_seen());
+            for (prefix, at) in self.last_seen() {
+                observer.input(Input::ParticipantAlive(prefix, at));
+            }
         }
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         Ok(())
@@ -480,7 +483,7 @@ impl LiveSource {
             && let Some(mut exact) = self.exact.take()
         {
             exact.drain(clocks, observer);
-            observer.seen_exactly_no_longer();
+            observer.input(Input::ProbesDetached);
             let reason = "the cgroup was made anew: restart to see its messages one by one";
             tracing::warn!(reason, "shared memory is sampled");
             self.without_exact = Some(reason.to_owned());

@@ -4,6 +4,7 @@
 //! Asks seldom: going through all open files of the host costs. Keeps no more sockets than the hook
 //! remembers.
 
+use ros2probe_model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
@@ -82,7 +83,7 @@ impl Sockets {
             let facts = known.facts(*cookie, socket, &self.groups);
             if known.told.as_ref() != Some(&facts) {
                 known.told = Some(facts.clone());
-                observer.socket(facts);
+                observer.input(Input::Socket(facts));
             }
         }
     }
@@ -93,9 +94,9 @@ impl Sockets {
             let stays = met.contains_key(cookie);
             if !stays && known.told.is_some() {
                 if known.may_be_open() {
-                    observer.socket_forgotten(*cookie);
+                    observer.input(Input::SocketForgotten(*cookie));
                 } else {
-                    observer.socket_closed(*cookie);
+                    observer.input(Input::SocketClosed(*cookie));
                 }
             }
             stays
@@ -145,7 +146,7 @@ impl Sockets {
                     questions: MOST_QUESTIONS,
                     ..Known::default()
                 };
-                observer.socket_closed(*cookie);
+                observer.input(Input::SocketClosed(*cookie));
                 continue;
             }
             known.owner = owner.or(known.owner.take());

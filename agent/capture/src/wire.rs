@@ -4,6 +4,7 @@
 //! Frames and records come through two rings, either may be the quicker one; both wait until they
 //! are taken in by time. Nothing is ever sent.
 
+use ros2probe_model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::path::{Path, PathBuf};
@@ -308,11 +309,17 @@ impl WireTap {
             for captured in frames.by_ref() {
                 *self.packets.entry(captured.interface).or_default() += 1;
                 if let Err(error) = self.intake.frame(clocks, &captured, observer) {
-                    observer.decode_error("frame", error.reason);
+                    observer.input(Input::DecodeError {
+                        stage: "frame",
+                        reason: error.reason,
+                    });
                 }
             }
             if frames.damaged() {
-                observer.decode_error("frame", Reason::BadLength);
+                observer.input(Input::DecodeError {
+                    stage: "frame",
+                    reason: Reason::BadLength,
+                });
             }
         }
         Ok(())
@@ -383,7 +390,7 @@ impl Intake {
             let record = match next {
                 Next::Kernel(record) => record,
                 Next::Walked(record) => {
-                    observer.record(&record);
+                    observer.input(Input::Record(&record));
                     continue;
                 }
             };
@@ -472,17 +479,23 @@ fn take_in_frame(
     observer: &mut Observer,
 ) {
     let at = clocks.monotonic_of(Timestamp(envelope.time));
-    observer.announcements(envelope, payload, |observer, record| {
-        if let Some(record) = order.walked(at, record) {
-            observer.record(&record);
-        }
+    let mut records = Vec::new();
+    observer.input(Input::Announcements {
+        envelope,
+        payload,
+        records: &mut records,
     });
+    for record in records {
+        if let Some(record) = order.walked(at, record) {
+            observer.input(Input::Record(&record));
+        }
+    }
 }
 
 /// What has become complete.
 fn take_in(ready: Ready, observer: &mut Observer) {
     match ready {
-        Ready::Record(record) => observer.record(&record),
+        Ready::Record(record) => observer.input(Input::Record(&record)),
         Ready::Rest(rest) => take_in_rest(&rest, observer),
     }
 }
@@ -490,7 +503,11 @@ fn take_in(ready: Ready, observer: &mut Observer) {
 fn take_in_rest(rest: &Reassembled, observer: &mut Observer) {
     let Some(record) = rest.handover else { return };
     let envelope = Envelope::of_handover(&record, rest.last_seen);
-    observer.datagram(&envelope, rest.payload(), Some(&record.handover()));
+    observer.input(Input::Datagram {
+        envelope: &envelope,
+        payload: rest.payload(),
+        handover: Some(&record.handover()),
+    });
 }
 
 #[cfg(test)]

@@ -2,8 +2,10 @@
 //! for a whole capture.
 #![expect(clippy::unwrap_used, reason = "a benchmark may panic on its own input")]
 
+use ros2probe::model::input::Input;
 use std::hint::black_box;
 use std::path::Path;
+use std::sync::Arc;
 
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
 use ros2probe::capture::feed::Feed;
@@ -27,14 +29,24 @@ fn guid(index: u16) -> Guid {
 /// An observer of one participant with this many measured writers.
 fn observer(writers: u16) -> Observer {
     let mut observer = Observer::new(Settings::default());
-    observer.set_watchlist(Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap());
-    observer.advance(Timestamp(START));
+    observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
+    )));
+    observer.input(Input::Time(Timestamp(START)));
     let envelope = forge::multicast(START, 0);
     let spdp = forge::participant(ALICE, 1_000_000, Some(0));
     let spdp = Message::from(ALICE).data(SPDP, 1, &spdp).bytes();
-    observer.datagram(&envelope, &spdp, None);
+    observer.input(Input::Datagram {
+        envelope: &envelope,
+        payload: &spdp,
+        handover: None,
+    });
     for index in 0..writers {
-        observer.datagram(&envelope, &sedp(index), None);
+        observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &sedp(index),
+            handover: None,
+        });
     }
     observer
 }
@@ -64,7 +76,11 @@ fn samples(criterion: &mut Criterion) {
                 low.copy_from_slice(&u32::try_from(number).unwrap().to_le_bytes());
             }
             let envelope = forge::multicast(START + number * 100_000, 0);
-            world.datagram(black_box(&envelope), black_box(&datagram), None);
+            world.input(Input::Datagram {
+                envelope: black_box(&envelope),
+                payload: black_box(&datagram),
+                handover: None,
+            });
         });
     });
     let mut world = observer(100);
@@ -82,7 +98,7 @@ fn samples(criterion: &mut Criterion) {
                 source_timestamp: 1_795_143_000 << 32,
                 ..Record::default()
             };
-            world.record(black_box(&record));
+            world.input(Input::Record(black_box(&record)));
         });
     });
     let mut world = observer(100);
@@ -102,7 +118,7 @@ fn samples(criterion: &mut Criterion) {
                 ..Record::default()
             };
             fragment += 1;
-            world.record(black_box(&record));
+            world.input(Input::Record(black_box(&record)));
         });
     });
     group.finish();
@@ -143,10 +159,10 @@ fn deliveries(criterion: &mut Criterion) {
                 let (number, socket) = (count / 4 + 1, count % 4 + 1);
                 let record = at(number, socket);
                 if (number + socket) % lost != 0 {
-                    world.record(black_box(&record));
+                    world.input(Input::Record(black_box(&record)));
                 }
                 if count % 4000 == 0 {
-                    world.advance(Timestamp(record.time));
+                    world.input(Input::Time(Timestamp(record.time)));
                 }
             });
         });
@@ -161,7 +177,7 @@ fn deliveries(criterion: &mut Criterion) {
             if leaves {
                 record.flags |= flag::OUTGOING;
             }
-            world.record(black_box(&record));
+            world.input(Input::Record(black_box(&record)));
         });
     });
     group.finish();
@@ -176,7 +192,11 @@ fn discovery(criterion: &mut Criterion) {
             || observer(0),
             |mut world| {
                 for announcement in &announcements {
-                    world.datagram(&envelope, announcement, None);
+                    world.input(Input::Datagram {
+                        envelope: &envelope,
+                        payload: announcement,
+                        handover: None,
+                    });
                 }
                 world
             },
@@ -186,7 +206,13 @@ fn discovery(criterion: &mut Criterion) {
     let mut world = observer(1000);
     let again = sedp(500);
     group.bench_function("known endpoint", |bencher| {
-        bencher.iter(|| world.datagram(black_box(&envelope), black_box(&again), None));
+        bencher.iter(|| {
+            world.input(Input::Datagram {
+                envelope: black_box(&envelope),
+                payload: black_box(&again),
+                handover: None,
+            });
+        });
     });
     group.finish();
 }
@@ -198,7 +224,7 @@ fn housekeeping(criterion: &mut Criterion) {
     group.bench_function("one second of ticks", |bencher| {
         bencher.iter(|| {
             now += 1_000_000_000;
-            world.advance(Timestamp(now));
+            world.input(Input::Time(Timestamp(now)));
         });
     });
     group.bench_function("snapshot", |bencher| {

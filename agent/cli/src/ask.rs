@@ -1,5 +1,6 @@
 //! `rp discover` at the terminal: listen, say what will be sent, ask, say what came of it.
 
+use ros2probe_model::input::Input;
 use std::io::{Write, stdout};
 use std::time::{Duration, Instant};
 
@@ -98,8 +99,8 @@ fn listen(mut live: LiveSource, options: &Discover) -> Result<Vec<ParticipantFac
     loop {
         let left = end.saturating_duration_since(Instant::now());
         live.poll(left.min(SLICE), None, &mut observer)?;
-        observer.advance(live.clock());
-        live.apply(&observer.interest_changes());
+        observer.input(Input::Time(live.clock()));
+        live.apply(&observer.drain().interest);
         let mut heard = observer.snapshot(live.clock()).participants;
         heard.retain(is_meant);
         let is_found = options.participant.is_some() && !heard.is_empty();

@@ -1,5 +1,6 @@
 //! The life of an agent in order, and the composition root of live agents and replays.
 
+use ros2probe_model::input::Input;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -222,7 +223,10 @@ pub fn run(options: Options) -> Result<()> {
 
     let mut observer = Observer::new(settings(&config, options.replay.is_none()));
     if let (Some(known), Source::Live(live)) = (known, &source) {
-        observer.restore(&known, live.clock());
+        observer.input(Input::Restored {
+            memory: &known,
+            now: live.clock(),
+        });
         drop(known);
         // Reading it takes several times what stays of it.
         give_back_memory();

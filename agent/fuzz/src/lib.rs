@@ -4,6 +4,7 @@
 //! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic,
 //! nothing delivered that was not there, an end, and an end that stays.
 
+use ros2probe::model::input::Input;
 use std::fs;
 use std::io::{Cursor, Write as _};
 use std::path::Path;
@@ -359,7 +360,7 @@ pub fn model(bytes: &[u8]) {
     let mut observer = small_observer();
     let mut now = START;
     let mut rest = bytes;
-    observer.advance(Timestamp(now));
+    observer.input(Input::Time(Timestamp(now)));
     while let Some(([kind, wait, low, high], behind)) = rest.split_first_chunk::<4>() {
         let length = usize::from(u16::from_le_bytes([*low, *high])).min(behind.len());
         let (content, behind) = behind.split_at(length);
@@ -369,13 +370,12 @@ pub fn model(bytes: &[u8]) {
             0xff => now.saturating_sub(5 * STEP),
             wait => now + u64::from(*wait) * STEP,
         };
-        observer.advance(Timestamp(now));
+        observer.input(Input::Time(Timestamp(now)));
         brought(&mut observer, *kind, now, content);
-        observer.interest_changes();
-        observer.take_given();
+        observer.drain();
     }
     let memory = observer.memory();
-    observer.settle();
+    observer.input(Input::End);
     let snapshot = observer.snapshot(Timestamp(now));
     assert!(snapshot.participants.len() <= SMALL.participants);
     assert!(snapshot.nodes.len() <= SMALL.nodes);
@@ -386,11 +386,13 @@ pub fn model(bytes: &[u8]) {
     let endpoints = snapshot.topics.iter();
     let endpoints = endpoints.map(|topic| topic.publishers.len() + topic.subscriptions.len());
     assert!(endpoints.sum::<usize>() <= SMALL.endpoints);
-    observer.take_events();
-    observer.take_spans();
+    observer.drain();
     // What is remembered can be taken back, as far as it is believed.
     let mut after = small_observer();
-    after.restore(&memory, Timestamp(now));
+    after.input(Input::Restored {
+        memory: &memory,
+        now: Timestamp(now),
+    });
     assert!(after.memory().participants.len() <= memory.participants.len());
 }
 
@@ -414,13 +416,13 @@ fn small_observer() -> Observer {
     let mut observer = Observer::new(SMALL);
     let watches = ["/**", "/a"].map(|pattern| Watch::named(pattern).expect("a pattern"));
     let watchlist = Watchlist::new(watches.to_vec());
-    observer.set_watchlist(watchlist.expect("patterns"));
-    observer.set_wishes(Arc::new(vec![Wish {
+    observer.input(Input::Watchlist(Arc::new(watchlist.expect("patterns"))));
+    observer.input(Input::Wishes(Arc::new(vec![Wish {
         id: 1,
         selection: Arc::new(Selection::all()),
         domain_id: None,
         depth: Depth::Payloads,
-    }]));
+    }])));
     observer
 }
 
@@ -435,19 +437,38 @@ fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
         ..Envelope::default()
     };
     match kind & 7 {
-        0 | 1 => observer.datagram(&envelope, content, None),
-        2 => observer.shared_memory(&envelope, content),
-        3 => observer.cut_datagram(&envelope, content, u32::from(kind) * 8),
-        4 => observer.announcements(&envelope, content, |observer, record| {
-            observer.record(&record);
+        0 | 1 => observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: content,
+            handover: None,
         }),
+        2 => observer.input(Input::SharedMemory {
+            envelope: &envelope,
+            payload: content,
+        }),
+        3 => observer.input(Input::CutDatagram {
+            envelope: &envelope,
+            payload: content,
+            length: u32::from(kind) * 8,
+        }),
+        4 => {
+            let mut records = Vec::new();
+            observer.input(Input::Announcements {
+                envelope: &envelope,
+                payload: content,
+                records: &mut records,
+            });
+            for record in &records {
+                observer.input(Input::Record(record));
+            }
+        }
         // As the kernel's programs write them, of whatever was sent.
         _ => {
             if let Ok((record, _)) = Record::read_from_prefix(content) {
-                observer.record(&Record {
+                observer.input(Input::Record(&Record {
                     time: now,
                     ..record
-                });
+                }));
             }
         }
     }

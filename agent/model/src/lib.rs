@@ -1,6 +1,7 @@
 //! The core: a state machine without clock, thread or I/O. Time and bytes come in, facts go out.
 //!
-//! - [`observer::Observer`] takes datagrams, records and facts about sockets, each with its time.
+//! - [`observer::Observer`] takes one [`input::Input`] after the other, each with its time, and is
+//!   drained of its [`input::Output`].
 //! - [`snapshot::Snapshot`] is all that it knows at a moment: participants, endpoints, topics and
 //!   their figures. [`event`] tells what changed.
 //! - [`interest`] is the verdict for each writer that the kernel programs need.
@@ -9,11 +10,13 @@
 //! The same input gives the same facts, live or replayed at any speed. Every table is bounded.
 //!
 //! ```
+//! use ros2probe_model::input::Input;
 //! use ros2probe_model::observer::{Observer, Settings};
 //! use ros2probe_wire::Timestamp;
 //!
 //! let mut observer = Observer::new(Settings::default());
-//! observer.advance(Timestamp(1_000_000_000));
+//! observer.input(Input::Time(Timestamp(1_000_000_000)));
+//! assert!(observer.drain().events.events.is_empty());
 //! assert!(observer.snapshot(Timestamp(1_000_000_000)).participants.is_empty());
 //! ```
 
@@ -38,6 +41,7 @@ pub mod histogram;
 pub mod history;
 pub mod identity;
 pub mod in_order;
+pub mod input;
 pub mod interest;
 pub mod journal;
 pub mod limits;

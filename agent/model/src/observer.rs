@@ -18,22 +18,23 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, Wire
 use super::calendar::Calendar;
 use super::diagnosis::{self, Examiner};
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin, Worth, endpoints_of};
-use super::event::{EventKind, Taken, bounded, bounded_finding, bounded_shared};
+use super::event::{EventKind, bounded, bounded_finding, bounded_shared};
 use super::expectation::Evidence;
 use super::header::begins_with_header;
+use super::input::{Input, Output};
 use super::interest::Interest;
 use super::journal::Journal;
 use super::passage::{lacks_names, may_share_memory};
-use super::payloads::{self, Given, Offered, Payloads};
+use super::payloads::{self, Offered, Payloads};
 use super::pieces::Pieces;
 use super::profiler::{Measured, Profiler, Sighting, UNDELIVERED};
 use super::rate::Slot;
 use super::receivers::{Around, Receivers};
 use super::selection::Wish;
 use super::size::Size;
-use super::snapshot::{Measurement, Snapshot, SocketFacts, WatchState};
+use super::snapshot::{Measurement, Snapshot, WatchState};
 use super::topic::{Naming, Topic, TopicId, Topics, Watched};
-use super::trace::{Spans, Subject, Tracer};
+use super::trace::{Subject, Tracer};
 use super::way::Place;
 use super::writer::{Counted, Traits};
 use crate::limits::Limits;
@@ -199,11 +200,72 @@ impl Observer {
         }
     }
 
+    /// Takes in one input.
+    pub fn input(&mut self, input: Input<'_>) {
+        match input {
+            Input::Time(now) => self.advance(now),
+            Input::ClockSet(step) => self.calendar.set(step),
+            Input::Datagram {
+                envelope,
+                payload,
+                handover,
+            } => self.walk(envelope, payload, handover, 0, Self::count),
+            Input::CutDatagram {
+                envelope,
+                payload,
+                length,
+            } => self.cut_datagram(envelope, payload, length),
+            Input::Announcements {
+                envelope,
+                payload,
+                records,
+            } => self.walk(envelope, payload, None, 0, |observer, record| {
+                if record.writer().entity.is_builtin() {
+                    observer.count(record);
+                } else {
+                    records.push(*record);
+                }
+            }),
+            Input::SharedMemory { envelope, payload } => {
+                self.walk(envelope, payload, None, flag::SHM, Self::count);
+            }
+            Input::SharedMemoryGap(now) => self.profiler.uncertain(self.calendar.even(now)),
+            Input::ProbesDetached => self.profiler.seen_exactly_no_longer(),
+            Input::Record(record) => self.count(record),
+            Input::ParticipantAlive(prefix, at) => {
+                let at = self.calendar.even(at);
+                self.discovery.seen(prefix, at, Worth::NOTHING);
+            }
+            Input::Socket(facts) => self.receivers.socket(facts),
+            Input::SocketClosed(cookie) => self.receivers.socket_closed(cookie),
+            Input::SocketForgotten(cookie) => self.receivers.socket_forgotten(cookie),
+            Input::DecodeError { stage, reason } => self.decode_error(stage, reason),
+            Input::Watchlist(watchlist) => self.set_watchlist(watchlist),
+            Input::Wishes(wishes) => self.set_wishes(wishes),
+            Input::Restored { memory, now } => self.restore(memory, now),
+            Input::End => self.settle(),
+        }
+    }
+
+    /// Takes out what has come up since the last call.
+    pub fn drain(&mut self) -> Output {
+        let mut output = Output {
+            interest: self.interest.changes(),
+            events: self.journal.events.take(),
+            samples: self.payloads.take(),
+            spans: self.tracer.take(),
+        };
+        self.calendar.show_events(&mut output.events);
+        self.calendar.show_given(&mut output.samples);
+        self.calendar.show_spans(&mut output.spans);
+        output
+    }
+
     /// Watches these from now on, once [`Self::ask_more`] has come to all topics. What was counted of
     /// a topic that is no more watched stays, and so does how a topic stands with an entry that is in
     /// the new list as it was.
-    pub fn set_watchlist(&mut self, watchlist: impl Into<Arc<Watchlist>>) {
-        let before = std::mem::replace(&mut self.watchlist, watchlist.into());
+    fn set_watchlist(&mut self, watchlist: Arc<Watchlist>) {
+        let before = std::mem::replace(&mut self.watchlist, watchlist);
         let moved = |watch: &Arc<Watch>| {
             let place = self.watchlist.position(&watch.pattern, watch.domain_id)?;
             let after = self.watchlist.watches().get(place)?;
@@ -221,19 +283,12 @@ impl Observer {
     /// Gives the samples that these wish for, and no others, once [`Self::ask_more`] has come to all
     /// topics. Their topics are measured
     /// meanwhile, whether they are watched or not; what was counted stays.
-    pub fn set_wishes(&mut self, wishes: Arc<Vec<Wish>>) {
+    fn set_wishes(&mut self, wishes: Arc<Vec<Wish>>) {
         self.wishes = wishes;
         if self.wishes.is_empty() {
             self.payloads.retain_strangers(|_| false);
         }
         self.consult_all();
-    }
-
-    /// What is to be given since the last call.
-    pub fn take_given(&mut self) -> Vec<Given> {
-        let mut given = self.payloads.take();
-        self.calendar.show_given(&mut given);
-        given
     }
 
     /// The time up to which all samples were given, or told as missing, that have come by `now`.
@@ -307,17 +362,6 @@ impl Observer {
         sizes
     }
 
-    /// Takes in a datagram that was captured, replayed or read from shared memory. With `handover`
-    /// the kernel filter has reported what lies before its offset.
-    pub fn datagram(&mut self, envelope: &Envelope, payload: &[u8], handover: Option<&Handover>) {
-        self.walk(envelope, payload, handover, 0, Self::count);
-    }
-
-    /// Takes in a message that was read in shared memory, where others may have been missed.
-    pub fn shared_memory(&mut self, envelope: &Envelope, payload: &[u8]) {
-        self.walk(envelope, payload, None, flag::SHM, Self::count);
-    }
-
     /// What is wanted of shared memory at the moment.
     #[must_use]
     pub fn wanted_of_shared_memory(&self) -> Wanted {
@@ -333,37 +377,9 @@ impl Observer {
         }
     }
 
-    /// So much time passed between two looks at shared memory that nobody can tell what happened.
-    pub fn shared_memory_uncertain(&mut self, now: Timestamp) {
-        self.profiler.uncertain(self.calendar.even(now));
-    }
-
-    /// Messages into shared memory are no longer seen in the processes that send them: what is read
-    /// there counts from now on.
-    pub fn seen_exactly_no_longer(&mut self) {
-        self.profiler.seen_exactly_no_longer();
-    }
-
-    /// Takes in what a datagram announces. What is to be counted is left to `later`, which puts it
-    /// in order with what comes another way and gives it to [`Self::record`].
-    pub fn announcements(
-        &mut self,
-        envelope: &Envelope,
-        payload: &[u8],
-        mut later: impl FnMut(&mut Self, Record),
-    ) {
-        self.walk(envelope, payload, None, 0, |observer, record| {
-            if record.writer().entity.is_builtin() {
-                observer.count(record);
-            } else {
-                later(observer, *record);
-            }
-        });
-    }
-
     /// Takes in a datagram of which a capture kept only the beginning: what it says about its
     /// submessages counts, its payloads are not read.
-    pub fn cut_datagram(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
+    fn cut_datagram(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
         self.datagrams += 1;
         self.decode_error("frame", Reason::Truncated);
         let length = length.min(u16::MAX.into()).try_into().unwrap_or(0);
@@ -372,27 +388,8 @@ impl Observer {
         walk::datagram(&padded, envelope, None, |found| self.count(&found.record));
     }
 
-    /// Takes in one record of a complete datagram, its time in nanoseconds since the Unix epoch.
-    pub fn record(&mut self, record: &Record) {
-        self.count(record);
-    }
-
-    /// These participants were last seen then, as the kernel filter knows without a record.
-    pub fn participants_alive(&mut self, alive: impl IntoIterator<Item = (GuidPrefix, Timestamp)>) {
-        for (prefix, at) in alive {
-            let at = self.calendar.even(at);
-            self.discovery.seen(prefix, at, Worth::NOTHING);
-        }
-    }
-
-    /// The calendar was set forward by so many nanoseconds, or back: all times that come from now on
-    /// are of the new one. No time has passed by that.
-    pub const fn calendar_set(&mut self, step: i64) {
-        self.calendar.set(step);
-    }
-
     /// Says what time it is: ends leases, settles gaps, judges expectations.
-    pub fn advance(&mut self, now: Timestamp) {
+    fn advance(&mut self, now: Timestamp) {
         let now = self.calendar.even(now);
         if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
             self.clock = Timestamp(now.0 - now.0 % TICK);
@@ -405,7 +402,7 @@ impl Observer {
     }
 
     /// Nothing more will come: decides what is still open, without letting time pass.
-    pub fn settle(&mut self) {
+    fn settle(&mut self) {
         let around = around!(self);
         self.profiler.settle(self.clock, &mut self.journal, around);
         self.tell_missing();
@@ -416,23 +413,8 @@ impl Observer {
         self.examine(self.clock);
     }
 
-    /// Says what is known of a socket, again whenever that changes.
-    pub fn socket(&mut self, facts: SocketFacts) {
-        self.receivers.socket(facts);
-    }
-
-    /// This socket was closed.
-    pub fn socket_closed(&mut self, cookie: u64) {
-        self.receivers.socket_closed(cookie);
-    }
-
-    /// This socket may be open, but the kernel remembers others in its place.
-    pub fn socket_forgotten(&mut self, cookie: u64) {
-        self.receivers.socket_forgotten(cookie);
-    }
-
     /// Takes over what was known before the start, until one lease from `now` on at most.
-    pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
+    fn restore(&mut self, memory: &Memory, now: Timestamp) {
         let now = self.calendar.even(now);
         self.discovery.restore(memory, now);
         self.examiner.forget();
@@ -455,29 +437,10 @@ impl Observer {
         self.discovery.revision()
     }
 
-    /// What the kernel filter has to be told since the last call; `None` = remove the entry.
-    pub fn interest_changes(&mut self) -> Vec<(Guid, Option<Verdict>)> {
-        self.interest.changes()
-    }
-
     /// The latest discovery events and losses.
     #[must_use]
     pub const fn journal(&self) -> &Journal {
         &self.journal
-    }
-
-    /// What happened since the last call.
-    pub fn take_events(&mut self) -> Taken {
-        let mut taken = self.journal.events.take();
-        self.calendar.show_events(&mut taken);
-        taken
-    }
-
-    /// Spans of sampled messages that ended since the last call.
-    pub fn take_spans(&mut self) -> Spans {
-        let mut spans = self.tracer.take();
-        self.calendar.show_spans(&mut spans);
-        spans
     }
 
     /// All facts at this moment.
@@ -494,7 +457,7 @@ impl Observer {
     }
 
     /// Counts a parse failure, also of those outside who parse for the core.
-    pub fn decode_error(&mut self, stage: &'static str, reason: Reason) {
+    fn decode_error(&mut self, stage: &'static str, reason: Reason) {
         *self
             .decode_errors
             .entry((stage, reason.label()))

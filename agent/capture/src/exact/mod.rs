@@ -9,6 +9,7 @@ pub mod library;
 pub mod processes;
 pub mod search;
 
+use ros2probe_model::input::Input;
 use std::fs::File;
 use std::io;
 use std::os::fd::BorrowedFd;
@@ -147,7 +148,7 @@ impl Exact {
         self.intake.take_in(clocks, observer);
         if self.was_attached && !is_attached {
             self.intake.drain(clocks, observer);
-            observer.seen_exactly_no_longer();
+            observer.input(Input::ProbesDetached);
         }
         self.was_attached = is_attached;
     }

@@ -20,6 +20,7 @@ pub mod verdict;
 #[cfg(test)]
 mod image;
 
+use ros2probe_model::input::Input;
 use std::collections::BTreeSet;
 use std::io;
 use std::os::fd::BorrowedFd;
@@ -134,7 +135,7 @@ impl SharedMemory {
             match item {
                 Item::Record(record) => {
                     let time = clocks.stamped(Timestamp(record.time)).0;
-                    observer.record(&Record { time, ..record });
+                    observer.input(Input::Record(&Record { time, ..record }));
                 }
                 Item::Message { time, port, bytes } => {
                     let envelope = Envelope {
@@ -142,10 +143,13 @@ impl SharedMemory {
                         destination_port: port,
                         ..Envelope::default()
                     };
-                    observer.shared_memory(&envelope, &bytes);
+                    observer.input(Input::SharedMemory {
+                        envelope: &envelope,
+                        payload: &bytes,
+                    });
                 }
                 Item::Uncertain(time) => {
-                    observer.shared_memory_uncertain(clocks.stamped(Timestamp(time)));
+                    observer.input(Input::SharedMemoryGap(clocks.stamped(Timestamp(time))));
                 }
             }
         }

@@ -7,8 +7,10 @@
 
 mod injection;
 
+use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
@@ -136,7 +138,7 @@ impl Counts {
             .ok()
             .context("the watchlist")?;
         let mut observer = Observer::new(Settings::default());
-        observer.set_watchlist(Watchlist::new(config.watches)?);
+        observer.input(Input::Watchlist(Arc::new(Watchlist::new(config.watches)?)));
         let mut feed = Feed::new(Limits::default());
         feed.run(&mut PcapReader::open(capture)?, &mut observer)?;
         let losses = observer.journal().losses();

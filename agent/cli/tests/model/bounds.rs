@@ -1,5 +1,6 @@
 //! Who forges messages with every field another each time fills every table, and none beyond its
 //! cap.
+use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -172,14 +173,16 @@ fn observer() -> Observer {
     let mut observer = Observer::new(Settings::default());
     let mut watch = Watch::named("/**").unwrap();
     watch.trace = 1.0;
-    observer.set_watchlist(Watchlist::new(vec![watch]).unwrap());
-    observer.set_wishes(Arc::new(vec![Wish {
+    observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
+    observer.input(Input::Wishes(Arc::new(vec![Wish {
         id: 1,
         selection: Arc::new(Selection::all()),
         domain_id: None,
         depth: Depth::Payloads,
-    }]));
-    observer.advance(Timestamp(START));
+    }])));
+    observer.input(Input::Time(Timestamp(START)));
     observer
 }
 
@@ -210,14 +213,11 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
         now += pause;
         step(&mut observer, &mut dice, now);
         if turn % 2_000 == 0 {
-            observer.advance(Timestamp(now));
+            observer.input(Input::Time(Timestamp(now)));
             look(&observer.sizes(), &mut largest);
             history.take(Timestamp(now), observer.measured(Timestamp(now)));
             look(&history.sizes(), &mut largest);
-            observer.take_given();
-            observer.take_events();
-            observer.take_spans();
-            observer.interest_changes();
+            observer.drain();
         }
         if turn == messages / 2 {
             half = allocator::held().saturating_sub(before);
@@ -254,7 +254,11 @@ fn any_datagram(observer: &mut Observer, dice: &mut Dice, now: u64) {
         message[at] ^= 0x55;
     }
     let envelope = somewhere(dice, now);
-    observer.datagram(&envelope, &message, None);
+    observer.input(Input::Datagram {
+        envelope: &envelope,
+        payload: &message,
+        handover: None,
+    });
 }
 
 fn readers_of(number: u64) -> GuidPrefix {
@@ -267,7 +271,11 @@ fn readers_of(number: u64) -> GuidPrefix {
 fn announce_one_writer(observer: &mut Observer) {
     let mut put = |message: Message| {
         let envelope = forge::multicast(START, 0);
-        observer.datagram(&envelope, &message.bytes(), None);
+        observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     };
     let string = "std_msgs::msg::dds_::String_";
     let payload = forge::participant(ALICE, 1_000_000, Some(0));
@@ -352,15 +360,18 @@ fn one_writer(observer: &mut Observer, dice: &mut Dice, now: u64) {
         0 => {
             let message = Message::from(ALICE).data(SAMPLES, newest, &[0, 1, 0, 0, 5, 5, 5, 5]);
             let envelope = forge::multicast(now, 0);
-            observer.shared_memory(&envelope, &message.bytes());
+            observer.input(Input::SharedMemory {
+                envelope: &envelope,
+                payload: &message.bytes(),
+            });
         }
-        1 => observer.socket_closed(1 + dice.pick(5000)),
-        2 | 3 => observer.socket(SocketFacts {
+        1 => observer.input(Input::SocketClosed(1 + dice.pick(5000))),
+        2 | 3 => observer.input(Input::Socket(SocketFacts {
             cookie: 1 + dice.pick(5000),
             process_id: Some(dice.pick(5000) as u32),
             ..SocketFacts::default()
-        }),
-        _ => observer.record(&forged_record(dice, newest, now)),
+        })),
+        _ => observer.input(Input::Record(&forged_record(dice, newest, now))),
     }
 }
 
@@ -373,7 +384,7 @@ fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
         let globs = (0..20).map(|number| format!("/g{number}/**"));
         let names = globs.chain(["/exact".to_owned()]);
         let watches = names.map(|name| Watch::named(&name).unwrap()).collect();
-        observer.set_watchlist(Watchlist::new(watches).unwrap());
+        observer.input(Input::Watchlist(Arc::new(Watchlist::new(watches).unwrap())));
     }
     let is_newcomer = dice.pick(20) == 0;
     let mut prefix = [if is_newcomer { 8 } else { 9 }; 12];
@@ -406,7 +417,11 @@ fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
             message.data(SEDP_WRITERS, number, &payload)
         }
     };
-    observer.datagram(&forge::multicast(now, 0), &message.bytes(), None);
+    observer.input(Input::Datagram {
+        envelope: &forge::multicast(now, 0),
+        payload: &message.bytes(),
+        handover: None,
+    });
 }
 
 /// The names of all tables in these sources.
@@ -489,7 +504,11 @@ fn one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone() {
     let (largest, _, whole) = drive(MESSAGES, 20_000, &mut |observer, dice, now| {
         let payload = forge::participant_at(prefix, 100, None, &dice.locators());
         let message = Message::from(prefix).data(SPDP, 1, &payload).bytes();
-        observer.datagram(&somewhere(dice, now), &message, None);
+        observer.input(Input::Datagram {
+            envelope: &somewhere(dice, now),
+            payload: &message,
+            handover: None,
+        });
     });
     assert_eq!(largest["receivers.places"].0, 16);
     assert!(whole < 2 << 20, "{whole} bytes");

@@ -3,9 +3,11 @@
 
 use crate::allocator;
 use ros2probe::config::{Limits, Watch, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use std::sync::Arc;
 
 const SECOND: u64 = 1_000_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
@@ -24,7 +26,11 @@ struct Robot {
 impl Robot {
     fn put(&mut self, message: Message) {
         let envelope = forge::multicast(self.now, 3);
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     fn prefix(number: u32) -> GuidPrefix {
@@ -72,11 +78,8 @@ impl Robot {
             let prefix = Self::prefix(gone);
             self.put(Message::from(prefix).dispose_by_hash(SPDP, 3, guid));
         }
-        self.observer.advance(Timestamp(self.now));
-        drop((
-            self.observer.take_events(),
-            self.observer.interest_changes(),
-        ));
+        self.observer.input(Input::Time(Timestamp(self.now)));
+        drop((self.observer.drain().events, self.observer.drain().interest));
     }
 
     /// Bytes held after so many more have come.
@@ -99,7 +102,9 @@ fn thousands_that_came_and_went_leave_nothing_behind() {
     };
     let mut observer = Observer::new(Settings::default().with_limits(&limits));
     let watch = Watch::named("/**").unwrap();
-    observer.set_watchlist(Watchlist::new(vec![watch]).unwrap());
+    observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
     let mut robot = Robot {
         observer,
         now: START,

@@ -1,6 +1,7 @@
 //! Deliveries under forged records and virtual time: what each receiver got, what it lost, and where
 //! that died. Every class by construction, and all of them adding up.
 
+use ros2probe::model::input::Input;
 use ros2probe_testing::model::host::{BOB, CAROL, GROUP, Host, READER, Seen};
 use std::net::{Ipv4Addr, SocketAddrV4};
 
@@ -507,7 +508,7 @@ fn what_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
             host.wait(100);
         }
         if is_closed {
-            host.observer.socket_closed(bob.socket);
+            host.observer.input(Input::SocketClosed(bob.socket));
         }
         for _ in 0..40 {
             host.wait(1000);
@@ -772,14 +773,14 @@ fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.data(bob, 1);
-    host.observer.socket(SocketFacts {
+    host.observer.input(Input::Socket(SocketFacts {
         cookie: bob.socket,
         process_id: Some(42),
         own_process_id: Some(42),
         process: Some("planner".to_owned()),
         cgroup: Some("/robot".to_owned()),
         unidentified_drops: 3,
-    });
+    }));
     let delivery = &host.deliveries()[0];
     assert_eq!(delivery.process_id, Some(42));
     assert_eq!(delivery.cgroup.as_deref(), Some("/robot"));
@@ -797,12 +798,12 @@ fn a_container_is_recognised_by_the_number_that_its_process_has_inside() {
     }
     let group = SocketAddrV4::new(Ipv4Addr::new(239, 255, 0, 1), 7401);
     for (process, socket) in [(9_u8, 1001), (7, 1002)] {
-        host.observer.socket(SocketFacts {
+        host.observer.input(Input::Socket(SocketFacts {
             cookie: socket,
             process_id: Some(40_000 + u32::from(process)),
             own_process_id: Some(process.into()),
             ..SocketFacts::default()
-        });
+        }));
         let seen = Seen {
             socket,
             address: group,

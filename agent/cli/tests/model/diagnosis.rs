@@ -1,5 +1,6 @@
 //! What discovery tells of a graph that cannot work, from forged announcements in virtual time.
 
+use ros2probe::model::input::Input;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::Instant;
@@ -36,7 +37,7 @@ struct World {
 impl World {
     fn new() -> Self {
         let mut observer = Observer::new(Settings::default());
-        observer.advance(Timestamp(START));
+        observer.input(Input::Time(Timestamp(START)));
         Self {
             observer,
             now: START,
@@ -56,7 +57,11 @@ impl World {
 
     fn put(&mut self, message: Message) {
         let envelope = forge::multicast(self.now, self.domain_id);
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     fn participant(&mut self, number: u8, addresses: &[SocketAddrV4]) {
@@ -97,7 +102,7 @@ impl World {
 
     fn wait(&mut self, milliseconds: u64) {
         self.now += milliseconds * MILLISECOND;
-        self.observer.advance(Timestamp(self.now));
+        self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
     fn diagnoses(&self) -> Arc<Diagnoses> {

@@ -2,6 +2,7 @@
 //!
 //! Each run is held against the same run without the forgery.
 
+use ros2probe::model::input::Input;
 use std::sync::Arc;
 
 use proptest::prelude::*;
@@ -461,12 +462,12 @@ fn a_restart_fills_no_gaps_of_the_run_before() {
 fn a_doubted_message_is_given_once_and_holds_no_other_up() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
-    host.observer.set_wishes(Arc::new(vec![Wish {
+    host.observer.input(Input::Wishes(Arc::new(vec![Wish {
         id: 1,
         selection: Arc::new(Selection::all()),
         domain_id: None,
         depth: Depth::Arrivals,
-    }]));
+    }])));
     let mut given = Vec::new();
     for number in 1..=100 {
         host.wait(10);
@@ -475,7 +476,7 @@ fn a_doubted_message_is_given_once_and_holds_no_other_up() {
             host.acknack(bob, 50);
         }
         host.data(bob, number);
-        let samples = host.observer.take_given().into_iter();
+        let samples = host.observer.drain().samples.into_iter();
         given.extend(samples.filter_map(|given: Given| match given.news {
             News::Sample(sample) => Some(sample.sequence_number),
             News::Missed(_) => None,

@@ -1,6 +1,7 @@
 //! What deliveries take: resident memory of a process in which nothing else happens, as nextest runs
 //! each test. `cargo test` needs the filter `memory::`.
 
+use ros2probe::model::input::Input;
 use std::fs;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
@@ -63,11 +64,17 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
     let limits = Limits::default();
     let before = resident();
     let mut observer = Observer::new(Settings::default().with_limits(&limits));
-    observer.set_watchlist(Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap());
+    observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
+    )));
     let mut now = host::START;
-    observer.advance(Timestamp(now));
+    observer.input(Input::Time(Timestamp(now)));
     let put = |observer: &mut Observer, now: u64, message: Message| {
-        observer.datagram(&forge::multicast(now, 0), &message.bytes(), None);
+        observer.input(Input::Datagram {
+            envelope: &forge::multicast(now, 0),
+            payload: &message.bytes(),
+            handover: None,
+        });
     };
     let prefix = |number: usize| {
         let [a, b, c, d] = u32::try_from(number).unwrap().to_be_bytes();
@@ -110,7 +117,7 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
     strangers.extend(&writers);
     for number in 1..=100 {
         for (place, writer) in strangers.iter().enumerate() {
-            observer.record(&Record {
+            observer.input(Input::Record(&Record {
                 kind: kind::DATA,
                 submessage_flags: 5,
                 writer: guid_words(*writer),
@@ -124,10 +131,10 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
                 flags: flag::HOST,
                 socket: place as u64 + 1,
                 ..Record::default()
-            });
+            }));
         }
         now += 100 * host::MILLISECOND;
-        observer.advance(Timestamp(now));
+        observer.input(Input::Time(Timestamp(now)));
     }
     let modelled = resident() - before;
     let board = Arc::new(Board::new(

@@ -4,12 +4,14 @@
 use ros2probe::config::{Expectations, Watch, Watchlist};
 use ros2probe::model::churn;
 use ros2probe::model::event::EventKind;
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::{Measurement, Snapshot, SocketFacts, TopicFacts, WatchState};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use std::sync::Arc;
 
 const MILLISECOND: u64 = 1_000_000;
 const SECOND: u64 = 1000 * MILLISECOND;
@@ -37,8 +39,8 @@ impl World {
 
     fn with(patterns: &[&str], settings: Settings) -> Self {
         let mut observer = Observer::new(settings);
-        observer.set_watchlist(watchlist(patterns));
-        observer.advance(Timestamp(START));
+        observer.input(Input::Watchlist(Arc::new(watchlist(patterns))));
+        observer.input(Input::Time(Timestamp(START)));
         Self {
             observer,
             now: START,
@@ -48,12 +50,16 @@ impl World {
 
     fn put(&mut self, message: Message) {
         let envelope = forge::multicast(self.now, self.domain_id);
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     fn wait(&mut self, milliseconds: u64) {
         self.now += milliseconds * MILLISECOND;
-        self.observer.advance(Timestamp(self.now));
+        self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
     fn spdp(&mut self, prefix: GuidPrefix, lease_seconds: u32) {
@@ -114,7 +120,7 @@ impl World {
 
     /// What was noticed since the last call, and when, counted from the start.
     fn events(&mut self) -> Vec<(u64, EventKind)> {
-        let events = self.observer.take_events().events.into_iter();
+        let events = self.observer.drain().events.events.into_iter();
         let told = events.map(|event| ((event.at.0 - START) / MILLISECOND, event.kind));
         told.collect()
     }
@@ -183,11 +189,11 @@ fn a_domain_told_by_a_better_port_moves_everything_along() {
         destination: [0; 16],
         ..unicast
     };
-    world.observer.datagram(
-        &unicast,
-        &Message::from(ALICE).data(SPDP, 1, &payload).bytes(),
-        None,
-    );
+    world.observer.input(Input::Datagram {
+        envelope: &unicast,
+        payload: &Message::from(ALICE).data(SPDP, 1, &payload).bytes(),
+        handover: None,
+    });
     world.sedp(alice(WRITER), "rt/chatter");
     assert!(
         world
@@ -391,7 +397,7 @@ fn a_changed_expectation_is_told_once_and_another_watch_changes_nothing() {
     let mut world = World::new(&[]);
     let watch = |world: &mut World, watches: Vec<Watch>| {
         let watchlist = Watchlist::new(watches).unwrap();
-        world.observer.set_watchlist(watchlist);
+        world.observer.input(Input::Watchlist(Arc::new(watchlist)));
     };
     watch(&mut world, vec![chatter.clone()]);
     world.spdp(ALICE, 100);
@@ -446,9 +452,11 @@ fn the_kernel_can_vouch_for_a_participant() {
     world.spdp(ALICE, 10);
     for _ in 0..5 {
         world.wait(8000);
-        world
-            .observer
-            .participants_alive([(ALICE, Timestamp(world.now)), (BOB, Timestamp(world.now))]);
+        for prefix in [ALICE, BOB] {
+            world
+                .observer
+                .input(Input::ParticipantAlive(prefix, Timestamp(world.now)));
+        }
     }
     assert_eq!(world.snapshot().participants.len(), 1);
 }
@@ -633,13 +641,21 @@ fn one_malformed_datagram_costs_one_counter() {
     for good in &good {
         let envelope = forge::multicast(world.now, 0);
         for len in 0..good.len() {
-            world.observer.datagram(&envelope, &good[..len], None);
+            world.observer.input(Input::Datagram {
+                envelope: &envelope,
+                payload: &good[..len],
+                handover: None,
+            });
         }
         for place in 20..good.len() {
             for value in [0x00, 0x7f, 0xff] {
                 let mut bad = good.clone();
                 bad[place] = value;
-                world.observer.datagram(&envelope, &bad, None);
+                world.observer.input(Input::Datagram {
+                    envelope: &envelope,
+                    payload: &bad,
+                    handover: None,
+                });
             }
         }
     }
@@ -676,7 +692,7 @@ fn interest_follows_discovery() {
     world.sedp(alice(NODES), "ros_discovery_info");
     world.spdp(BOB, 10);
     world.sedp(bob(READER), "rt/chatter");
-    let changes = world.observer.interest_changes();
+    let changes = world.observer.drain().interest;
     let mut expected = vec![
         (alice(NODES), Some(Verdict::Capture)),
         (alice(WRITER), Some(Verdict::Meter)),
@@ -686,8 +702,10 @@ fn interest_follows_discovery() {
     expected.sort_unstable();
     assert_eq!(changes, expected);
 
-    world.observer.set_watchlist(watchlist(&["/other"]));
-    let changes = world.observer.interest_changes();
+    world
+        .observer
+        .input(Input::Watchlist(Arc::new(watchlist(&["/other"]))));
+    let changes = world.observer.drain().interest;
     let mut expected = vec![
         (alice(WRITER), Some(Verdict::Ignore)),
         (alice(OTHER), Some(Verdict::Meter)),
@@ -697,7 +715,7 @@ fn interest_follows_discovery() {
     assert_eq!(changes, expected);
 
     world.wait(11_000);
-    let gone = world.observer.interest_changes();
+    let gone = world.observer.drain().interest;
     assert_eq!(gone.len(), 3);
     assert!(gone.iter().all(|(_, verdict)| verdict.is_none()));
 }
@@ -720,7 +738,8 @@ fn the_cap_on_watched_topics_rejects_and_counts() {
     assert!(
         world
             .observer
-            .interest_changes()
+            .drain()
+            .interest
             .contains(&(rejected, Some(Verdict::Ignore)))
     );
     assert_eq!(world.snapshot().topics_rejected, 1);
@@ -731,11 +750,14 @@ fn the_cap_on_watched_topics_rejects_and_counts() {
         alice(EntityId([0, 0, 0x20, 3])),
     ));
     world.spdp(ALICE, 10);
-    world.observer.set_watchlist(watchlist(&["/**"]));
+    world
+        .observer
+        .input(Input::Watchlist(Arc::new(watchlist(&["/**"]))));
     assert!(
         world
             .observer
-            .interest_changes()
+            .drain()
+            .interest
             .contains(&(rejected, Some(Verdict::Meter)))
     );
 }
@@ -755,7 +777,9 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
     let mut patterns: Vec<_> = globs.collect();
     patterns.push("/topic_*".to_owned());
     let patterns: Vec<&str> = patterns.iter().map(String::as_str).collect();
-    world.observer.set_watchlist(watchlist(&patterns));
+    world
+        .observer
+        .input(Input::Watchlist(Arc::new(watchlist(&patterns))));
     assert!(!world.observer.has_asked_all());
     let is_measured = |topic: &TopicFacts| topic.measurement.is_some();
     let some = world
@@ -789,9 +813,13 @@ fn what_was_counted_survives_writers_and_watchlists() {
     world.spdp(ALICE, 100);
     world.sedp(alice(WRITER), "rt/chatter");
     world.stream(alice(WRITER), 1..=50);
-    world.observer.set_watchlist(watchlist(&[]));
+    world
+        .observer
+        .input(Input::Watchlist(Arc::new(watchlist(&[]))));
     world.stream(alice(WRITER), 51..=70);
-    world.observer.set_watchlist(watchlist(&["/chatter"]));
+    world
+        .observer
+        .input(Input::Watchlist(Arc::new(watchlist(&["/chatter"]))));
     world.stream(alice(WRITER), 71..=100);
     world.wait(15_000);
     let facts = world.measurement("/chatter");
@@ -817,14 +845,14 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
         (alice(WRITER), 400)
     );
     assert!((unknown.measurement.rate_hz - 100.0).abs() < 1.0);
-    let changes = world.observer.interest_changes();
+    let changes = world.observer.drain().interest;
     assert_eq!(changes, [(alice(WRITER), Some(Verdict::Meter))]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");
     assert!(world.snapshot().unknown_writers.is_empty());
     world.stream(alice(WRITER), 401..=500);
     assert_eq!(world.measurement("/chatter").messages, 500);
-    assert!(world.observer.interest_changes().is_empty());
+    assert!(world.observer.drain().interest.is_empty());
 }
 
 #[test]
@@ -838,7 +866,7 @@ fn an_unknown_writer_is_told_by_the_holder_of_its_socket_by_its_guid_and_by_its_
         cgroup: Some("/robot.slice".to_owned()),
         ..SocketFacts::default()
     };
-    world.observer.socket(holder);
+    world.observer.input(Input::Socket(holder));
     let send = |world: &mut World, number| {
         for (prefix, socket) in [(FAST, 77), (ALICE, 78), (BOB, 77)] {
             let envelope = Envelope {
@@ -848,7 +876,11 @@ fn an_unknown_writer_is_told_by_the_holder_of_its_socket_by_its_guid_and_by_its_
                 ..forge::multicast(world.now, 0)
             };
             let sample = Message::from(prefix).data(WRITER, number, &[0, 1, 0, 0]);
-            world.observer.datagram(&envelope, &sample.bytes(), None);
+            world.observer.input(Input::Datagram {
+                envelope: &envelope,
+                payload: &sample.bytes(),
+                handover: None,
+            });
         }
         world.wait(10);
     };
@@ -918,9 +950,9 @@ fn expectations_are_judged_in_the_sources_time() {
         trace: 0.0,
         retain: ros2probe::config::Retain::None,
     };
-    world
-        .observer
-        .set_watchlist(Watchlist::new(vec![watch]).unwrap());
+    world.observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
     let state = |world: &World| {
         let facts = world.snapshot().watches.remove(0);
         (facts.topics[0].topic.clone(), facts.topics[0].state)
@@ -1104,12 +1136,12 @@ fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
         world.sedp(alice(WRITER), "rt/chatter");
         world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
         world.stream(alice(WRITER), 1..=500);
-        world.observer.take_events();
+        world.observer.drain();
         let before = world.now;
 
         // The writer's clock is the same one.
         world.now = world.now.saturating_add_signed(step);
-        world.observer.calendar_set(step);
+        world.observer.input(Input::ClockSet(step));
         world.stream(alice(WRITER), 501..=700);
         // A gap that is settled ten seconds later, as without the step.
         world.stream(alice(WRITER), 702..=1000);
@@ -1128,7 +1160,7 @@ fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
         assert!(chatter.interarrival.sum() < 10.0, "{forward}");
         assert_eq!(world.churn("participant", "expired"), 0);
         assert_eq!(world.node_names(), ["/talker"]);
-        for event in world.observer.take_events().events {
+        for event in world.observer.drain().events.events {
             assert!(world.now.abs_diff(event.at.0) < 10 * SECOND, "{event:?}");
         }
 
@@ -1139,7 +1171,7 @@ fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
         assert_eq!(world.measurement("/chatter").lost, 1, "{forward}");
         world.wait(200);
         assert_eq!(world.snapshot().participants.len(), 0, "{forward}");
-        let events = world.observer.take_events().events;
+        let events = world.observer.drain().events.events;
         let expired = events.iter().find(|event| {
             let EventKind::Participant { change, .. } = &event.kind else {
                 return false;
@@ -1157,8 +1189,8 @@ fn a_clock_that_jumps_is_followed() {
     world.spdp(ALICE, 10);
     world.wait(1000 * 3600 * 24 * 365);
     assert!(world.snapshot().participants.is_empty());
-    world.observer.advance(Timestamp(START));
-    world.observer.advance(Timestamp(u64::MAX));
+    world.observer.input(Input::Time(Timestamp(START)));
+    world.observer.input(Input::Time(Timestamp(u64::MAX)));
 }
 
 #[test]
@@ -1179,7 +1211,7 @@ fn the_same_input_gives_the_same_facts() {
         format!(
             "{:?} {:?}",
             world.snapshot(),
-            world.observer.interest_changes()
+            world.observer.drain().interest
         )
     };
     assert_eq!(replay(), replay());

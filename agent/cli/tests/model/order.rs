@@ -1,6 +1,7 @@
 //! Samples one by one in the order of a reliable subscriber: what waits for a repair, for how long,
 //! and what never waits. Virtual time and forged records.
 
+use ros2probe::model::input::Input;
 use std::sync::Arc;
 
 use proptest::prelude::*;
@@ -24,7 +25,8 @@ fn wishes(host: &mut Host, ids: &[u64], depth: Depth) {
         domain_id: None,
         depth,
     });
-    host.observer.set_wishes(Arc::new(wishes.collect()));
+    host.observer
+        .input(Input::Wishes(Arc::new(wishes.collect())));
 }
 
 /// A host with a reader of Bob's that acknowledges.
@@ -38,7 +40,7 @@ fn listening() -> (Host, Seen) {
 
 /// Numbers and milliseconds since the start of the samples that were given, in their order.
 fn given(host: &mut Host) -> Vec<(u64, u64)> {
-    let given = host.observer.take_given().into_iter();
+    let given = host.observer.drain().samples.into_iter();
     given
         .filter_map(|given| match given.news {
             News::Sample(sample) => {
@@ -56,7 +58,7 @@ fn numbers(host: &mut Host) -> Vec<u64> {
 
 /// Reason, first and last number of what is missed.
 fn missed(host: &mut Host) -> Vec<(MissedReason, u64, u64)> {
-    let given = host.observer.take_given().into_iter();
+    let given = host.observer.drain().samples.into_iter();
     given
         .filter_map(|given| match given.news {
             News::Missed(missed) => Some((missed.reason, missed.first, missed.last)),
@@ -181,7 +183,7 @@ fn the_end_gives_what_waits() {
         host.data(bob, number);
     }
     assert_eq!(numbers(&mut host), [1]);
-    host.observer.settle();
+    host.observer.input(Input::End);
     assert_eq!(numbers(&mut host), [3, 5]);
     let (mut host, bob) = listening();
     for number in [1, 3, 5] {
@@ -257,7 +259,7 @@ proptest! {
         let mut times = Vec::new();
         let mut numbers = Vec::new();
         let mut told = Vec::new();
-        for given in host.observer.take_given() {
+        for given in host.observer.drain().samples {
             match given.news {
                 News::Sample(sample) => {
                     numbers.push(sample.sequence_number);
@@ -320,7 +322,7 @@ impl Unannounced {
     /// Numbers of the samples that are given, each with its bytes if those are wanted.
     fn given(&mut self, depth: Depth) -> Vec<u64> {
         let mut numbers = Vec::new();
-        for given in self.host.observer.take_given() {
+        for given in self.host.observer.drain().samples {
             let News::Sample(sample) = given.news else {
                 panic!("{given:?}")
             };
@@ -368,7 +370,7 @@ fn a_subscription_is_told_of_what_came_before_the_announcement_since_it_began() 
     dora.data(4);
     dora.announce(false);
     dora.data(5);
-    let given = dora.host.observer.take_given().into_iter();
+    let given = dora.host.observer.drain().samples.into_iter();
     let mut told: Vec<_> = given
         .filter_map(|given| match given.news {
             News::Missed(missed) => Some((given.to.to_vec(), missed.first, missed.last)),

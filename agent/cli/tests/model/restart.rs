@@ -1,7 +1,9 @@
 //! An agent that is started anew on a running robot: what it knew comes along, and stays only if
 //! it is still true.
 
+use ros2probe::model::input::Input;
 use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
 
 use proptest::prelude::*;
 use ros2probe::config::{Watch, Watchlist};
@@ -24,13 +26,19 @@ const LEASE: u32 = 10;
 fn agent(settings: Settings) -> Observer {
     let mut observer = Observer::new(settings);
     let watch = Watch::named("/**").unwrap();
-    observer.set_watchlist(Watchlist::new(vec![watch]).unwrap());
+    observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
     observer
 }
 
 fn put(observer: &mut Observer, at: u64, message: Message) {
     let envelope = forge::multicast(at, 3);
-    observer.datagram(&envelope, &message.bytes(), None);
+    observer.input(Input::Datagram {
+        envelope: &envelope,
+        payload: &message.bytes(),
+        handover: None,
+    });
 }
 
 fn spdp(prefix: GuidPrefix) -> Message {
@@ -70,7 +78,7 @@ fn robot_at(observer: &mut Observer, start: u64) {
             Message::from(prefix).data(NODES, 4, &payload),
         );
     }
-    observer.advance(Timestamp(start + SECOND));
+    observer.input(Input::Time(Timestamp(start + SECOND)));
 }
 
 /// What is shown of the robot, without when it was seen and without the mark.
@@ -118,7 +126,10 @@ fn unconfirmed(observer: &Observer) -> usize {
 
 fn restarted(memory: &Memory, at: u64) -> Observer {
     let mut observer = agent(Settings::default());
-    observer.restore(memory, Timestamp(at));
+    observer.input(Input::Restored {
+        memory,
+        now: Timestamp(at),
+    });
     observer
 }
 
@@ -138,7 +149,7 @@ fn everything_that_was_shown_is_shown_again_and_the_filter_told() {
         Guid { entity: NODES, .. } => Verdict::Capture,
         _ => Verdict::Meter,
     };
-    let mut told = after.interest_changes();
+    let mut told = after.drain().interest;
     told.sort_unstable_by_key(|(guid, _)| *guid);
     let all = [ALICE, BOB].map(|prefix| [NODES, WRITER, READER].map(|it| Guid::new(prefix, it)));
     let all: Vec<_> = all
@@ -157,11 +168,11 @@ fn who_is_heard_within_a_lease_stays_and_who_is_not_goes() {
     robot(&mut before);
     let at = START + 60 * SECOND;
     let mut after = restarted(&before.memory(), at);
-    after.advance(Timestamp(at + 9 * SECOND));
+    after.input(Input::Time(Timestamp(at + 9 * SECOND)));
     assert_eq!(after.snapshot(Timestamp(at)).participants.len(), 2);
     put(&mut after, at + 9 * SECOND, spdp(BOB));
     assert_eq!(unconfirmed(&after), 1);
-    after.advance(Timestamp(at + 11 * SECOND));
+    after.input(Input::Time(Timestamp(at + 11 * SECOND)));
     let snapshot = after.snapshot(Timestamp(at + 11 * SECOND));
     assert_eq!((snapshot.participants.len(), unconfirmed(&after)), (1, 0));
     assert_eq!(snapshot.participants[0].guid.prefix, BOB);
@@ -182,15 +193,15 @@ fn a_robot_whose_clock_begins_in_1970_is_seen_and_forgotten_like_any_other() {
         };
         assert_eq!(count(&observer, start + SECOND), (2, 2), "{start}");
         let memory = observer.memory();
-        observer.advance(Timestamp(start + 9 * SECOND));
+        observer.input(Input::Time(Timestamp(start + 9 * SECOND)));
         assert_eq!(count(&observer, start + 9 * SECOND), (2, 2), "{start}");
-        observer.advance(Timestamp(start + 11 * SECOND));
+        observer.input(Input::Time(Timestamp(start + 11 * SECOND)));
         assert_eq!(count(&observer, start + 11 * SECOND), (0, 0), "{start}");
         // Started again before the clock was set.
         let mut after = restarted(&memory, start);
-        after.advance(Timestamp(start + 9 * SECOND));
+        after.input(Input::Time(Timestamp(start + 9 * SECOND)));
         assert_eq!(count(&after, start + 9 * SECOND), (2, 2), "{start}");
-        after.advance(Timestamp(start + 11 * SECOND));
+        after.input(Input::Time(Timestamp(start + 11 * SECOND)));
         assert_eq!(count(&after, start + 11 * SECOND), (0, 0), "{start}");
     }
 }
@@ -201,9 +212,9 @@ fn any_message_confirms_but_not_one_from_before_the_start() {
     robot(&mut before);
     let at = START + 60 * SECOND;
     let mut after = restarted(&before.memory(), at);
-    after.participants_alive([(ALICE, Timestamp(at - SECOND))]);
+    after.input(Input::ParticipantAlive(ALICE, Timestamp(at - SECOND)));
     assert_eq!(unconfirmed(&after), 2);
-    after.participants_alive([(ALICE, Timestamp(at + SECOND))]);
+    after.input(Input::ParticipantAlive(ALICE, Timestamp(at + SECOND)));
     assert_eq!(unconfirmed(&after), 1);
     let sample = Message::from(BOB).data(WRITER, 9, &[0, 1, 0, 0]);
     put(&mut after, at + SECOND, sample);
@@ -241,7 +252,10 @@ fn caps_hold_for_what_comes_from_before_too() {
         nodes: 0,
         ..Settings::default()
     });
-    after.restore(&before.memory(), Timestamp(START));
+    after.input(Input::Restored {
+        memory: &before.memory(),
+        now: Timestamp(START),
+    });
     let snapshot = after.snapshot(Timestamp(START));
     let evictions = |table| {
         let tables = snapshot.tables.iter();
@@ -286,7 +300,7 @@ proptest! {
             let shown = shown(&after, START);
             let is_hostile = shown.contains('\u{202e}');
             prop_assert!(!is_hostile);
-            after.advance(Timestamp(START + 200 * SECOND));
+            after.input(Input::Time(Timestamp(START + 200 * SECOND)));
         }
     }
 }

@@ -1,6 +1,8 @@
 //! Tables that forgeries have filled: a real newcomer that is worth more finds room, what was there
 //! before stays, and no flood makes a packet expensive.
 
+use ros2probe::model::input::Input;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ros2probe::config::{Limits, Watch, Watchlist};
@@ -29,8 +31,8 @@ struct World {
 impl World {
     fn new(patterns: &[&str], limits: &Limits) -> Self {
         let mut observer = Observer::new(Settings::default().with_limits(limits));
-        observer.set_watchlist(watchlist(patterns));
-        observer.advance(Timestamp(START));
+        observer.input(Input::Watchlist(Arc::new(watchlist(patterns))));
+        observer.input(Input::Time(Timestamp(START)));
         Self {
             observer,
             now: START,
@@ -39,12 +41,16 @@ impl World {
 
     fn put(&mut self, message: Message) {
         let envelope = forge::multicast(self.now, 0);
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     fn wait(&mut self, milliseconds: u64) {
         self.now += milliseconds * MILLISECOND;
-        self.observer.advance(Timestamp(self.now));
+        self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
     fn spdp(&mut self, prefix: GuidPrefix) {
@@ -78,11 +84,11 @@ impl World {
 
     /// A packet that this participant's socket on this host sends.
     fn leaves(&mut self, prefix: GuidPrefix, socket: u64) {
-        self.observer.socket(SocketFacts {
+        self.observer.input(Input::Socket(SocketFacts {
             cookie: socket,
             process_id: Some(4711),
             ..SocketFacts::default()
-        });
+        }));
         let record = Record {
             kind: kind::HEARTBEAT,
             writer: guid_words(Guid::new(prefix, SEDP_WRITERS)),
@@ -92,7 +98,7 @@ impl World {
             time: self.now,
             ..Record::default()
         };
-        self.observer.record(&record);
+        self.observer.input(Input::Record(&record));
     }
 
     /// Forged participants that repeat themselves until each is as good as a real one.
@@ -330,9 +336,9 @@ fn a_topic_watched_by_name_is_measured_among_as_many_as_may_be() {
     assert_eq!(measured(&world), [true, true, true, false, false]);
     assert_eq!(world.snapshot().topics_measured, 4);
     // So it is for a topic that is watched by name later on, and no topic takes it away.
-    world
-        .observer
-        .set_watchlist(watchlist(&["/**", "/points", "/crowd_8"]));
+    world.observer.input(Input::Watchlist(Arc::new(watchlist(&[
+        "/**", "/points", "/crowd_8",
+    ]))));
     world.sample(Guid::new(BOB, entity(8, 3)), 1);
     assert_eq!(world.messages("/crowd_8"), Some(1));
     world.sedp(Guid::new(BOB, entity(20, 3)), "rt/late");
@@ -446,7 +452,7 @@ fn forgeries_that_fall_silent_make_room_for_silent_newcomers_as_before() {
     world.wait(100_000);
     world.spdp(ALICE);
     assert!(world.knows(BOB));
-    world.observer.socket_closed(77);
+    world.observer.input(Input::SocketClosed(77));
     world.wait(2000);
     world.spdp(ALICE);
     assert!(world.knows(ALICE));
@@ -459,7 +465,9 @@ fn a_watch_that_is_added_lets_in_what_a_full_table_had_kept_out() {
     world.spdp(ALICE);
     world.sedp(writer(ALICE), "rt/points");
     assert!(!world.knows(ALICE));
-    world.observer.set_watchlist(watchlist(&["/points"]));
+    world
+        .observer
+        .input(Input::Watchlist(Arc::new(watchlist(&["/points"]))));
     world.spdp(ALICE);
     world.sample(writer(ALICE), 1);
     assert_eq!(world.messages("/points"), Some(1));

@@ -19,7 +19,8 @@ const COLLECTIONS: [&str; 9] = [
 
 /// Files whose structs are made for one answer and not kept by the model, and the watchlist, which the
 /// model is given and `limits.watches` bounds.
-const ANSWERS: [&str; 8] = [
+const ANSWERS: [&str; 9] = [
+    "input.rs",
     "snapshot.rs",
     "snapshot/delivery.rs",
     "discovery/memory.rs",

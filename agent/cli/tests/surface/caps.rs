@@ -1,5 +1,6 @@
 //! Fixed caps of docs/limits.md, driven over from outside; others have a test beside the constant.
 
+use ros2probe::model::input::Input;
 use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -45,8 +46,10 @@ struct World {
 impl World {
     fn new() -> Self {
         let mut observer = Observer::new(Settings::default());
-        observer.set_watchlist(Watchlist::new(vec![watch()]).unwrap());
-        observer.advance(Timestamp(START));
+        observer.input(Input::Watchlist(Arc::new(
+            Watchlist::new(vec![watch()]).unwrap(),
+        )));
+        observer.input(Input::Time(Timestamp(START)));
         Self {
             observer,
             now: START,
@@ -56,7 +59,11 @@ impl World {
     fn put(&mut self, message: Message) {
         self.now += 1000;
         let envelope = forge::multicast(self.now, 0);
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     fn participant(&mut self, prefix: GuidPrefix) {
@@ -87,7 +94,7 @@ impl World {
 
     fn wait(&mut self, milliseconds: u64) {
         self.now += milliseconds * 1_000_000;
-        self.observer.advance(Timestamp(self.now));
+        self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
     /// Entries and what was refused or given up of a table.
@@ -172,7 +179,7 @@ fn acknowledging_readers_beyond_the_page_s_cap_are_counted_as_not_shown() {
         let reader = Guid::new(prefix(1 + number), entity(1, 4));
         world.endpoint(reader, 1, "rt/known", STRING);
         for writer in writers {
-            world.observer.record(&Record {
+            world.observer.input(Input::Record(&Record {
                 kind: kind::ACKNACK,
                 reader: guid_words(reader),
                 writer: guid_words(writer),
@@ -181,7 +188,7 @@ fn acknowledging_readers_beyond_the_page_s_cap_are_counted_as_not_shown() {
                 sequence_number: 2,
                 time: world.now,
                 ..Record::default()
-            });
+            }));
         }
     }
     world.wait(1000);

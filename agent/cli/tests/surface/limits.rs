@@ -3,6 +3,7 @@
 
 mod driven;
 
+use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
@@ -56,8 +57,10 @@ struct World {
 impl World {
     fn new(limits: Limits) -> Self {
         let mut observer = Observer::new(Settings::default().with_limits(&limits));
-        observer.set_watchlist(Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap());
-        observer.advance(Timestamp(host::START));
+        observer.input(Input::Watchlist(Arc::new(
+            Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
+        )));
+        observer.input(Input::Time(Timestamp(host::START)));
         Self {
             limits,
             observer,
@@ -67,12 +70,16 @@ impl World {
 
     fn put(&mut self, message: Message) {
         let envelope = forge::multicast(self.now, 0);
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     fn wait(&mut self, milliseconds: u64) {
         self.now += milliseconds * MILLISECOND;
-        self.observer.advance(Timestamp(self.now));
+        self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
     fn participant(&mut self, prefix: GuidPrefix) {

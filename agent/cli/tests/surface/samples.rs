@@ -1,6 +1,7 @@
 //! Samples one by one: from the model over replayed captures, and from the real binary by
 //! `GET /samples`.
 
+use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -67,15 +68,17 @@ fn wish(id: u64, depth: Depth) -> Wish {
 fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
     let mut observer = Observer::new(Settings::default());
     let everything = vec![Watch::named("/**").unwrap()];
-    observer.set_watchlist(Watchlist::new(everything).unwrap());
+    observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(everything).unwrap(),
+    )));
     if let Some(depth) = depth {
-        observer.set_wishes(Arc::new(vec![wish(1, depth)]));
+        observer.input(Input::Wishes(Arc::new(vec![wish(1, depth)])));
     }
     let mut reader = PcapReader::open(capture).unwrap();
     let mut feed = Feed::new(Limits::default());
     let mut news = Vec::new();
     let mut take = |observer: &mut Observer| {
-        for given in observer.take_given() {
+        for given in observer.drain().samples {
             assert_eq!(*given.to, [1]);
             news.push(given.news);
         }
@@ -84,7 +87,7 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
         feed.packet(&captured, &mut observer);
         take(&mut observer);
     }
-    observer.settle();
+    observer.input(Input::End);
     take(&mut observer);
     let mut snapshot = observer.snapshot(feed.last());
     snapshot.tables.retain(|table| table.table != "payloads");
@@ -251,7 +254,7 @@ impl Robot {
             observer: Observer::new(settings),
             at: START,
         };
-        robot.observer.advance(Timestamp(START));
+        robot.observer.input(Input::Time(Timestamp(START)));
         for (prefix, topic) in [(ALICE, "rt/points"), (BOB, "rt/add/_service_event")] {
             let payload = forge::participant(prefix, 100, None);
             robot.put(Message::from(prefix).data(SPDP, 1, &payload));
@@ -265,14 +268,21 @@ impl Robot {
     fn put(&mut self, message: Message) {
         self.at += 1_000_000;
         let envelope = forge::multicast(self.at, 0);
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     /// Read in shared memory, where others may have been missed.
     fn look(&mut self, message: Message) {
         self.at += 1_000_000;
         let envelope = forge::multicast(self.at, 0);
-        self.observer.shared_memory(&envelope, &message.bytes());
+        self.observer.input(Input::SharedMemory {
+            envelope: &envelope,
+            payload: &message.bytes(),
+        });
     }
 
     fn fragment(&mut self, prefix: GuidPrefix, number: u64, start: u32, payload: &[u8]) {
@@ -285,12 +295,12 @@ impl Robot {
             selection: Arc::new(selection),
             ..wish(3, depth)
         }];
-        self.observer.set_wishes(Arc::new(wishes));
+        self.observer.input(Input::Wishes(Arc::new(wishes)));
     }
 
     /// Writer, number and payload, or the reason why not, of what is given.
     fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
-        let given = self.observer.take_given().into_iter();
+        let given = self.observer.drain().samples.into_iter();
         given
             .map(|given| match given.news {
                 News::Sample(sample) => {
@@ -377,19 +387,19 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
     assert_eq!(robot.given(), [given(1), given(2), given(5)]);
     let sent = robot.at;
     let now = Timestamp(sent + SECOND / 20);
-    robot.observer.advance(now);
+    robot.observer.input(Input::Time(now));
     assert!(robot.observer.given_until(now).0 < sent);
     // One of them comes late.
     look(&mut robot, 3);
     assert_eq!(robot.given(), [given(3)]);
     let now = Timestamp(sent + SECOND);
-    robot.observer.advance(now);
+    robot.observer.input(Input::Time(now));
     assert_eq!(robot.observer.given_until(now), now);
     let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
     assert_eq!(robot.given(), [not_captured]);
     // The end of a capture waits for nothing.
     look(&mut robot, 8);
-    robot.observer.settle();
+    robot.observer.input(Input::End);
     assert_eq!(
         robot.given(),
         [given(8), (ALICE, 6, Err(MissedReason::NotCaptured))]
@@ -411,12 +421,12 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
         times.insert(number, robot.at);
     }
     let now = Timestamp(robot.at + SECOND / 20);
-    robot.observer.advance(now);
+    robot.observer.input(Input::Time(now));
     let end = Timestamp(robot.at + SECOND);
     let mut given = Vec::new();
     for now in [now, end] {
-        robot.observer.advance(now);
-        for each in robot.observer.take_given() {
+        robot.observer.input(Input::Time(now));
+        for each in robot.observer.drain().samples {
             match each.news {
                 News::Sample(sample) => given.push((sample.sequence_number, Some(sample.time.0))),
                 News::Missed(missed) => given.push((missed.first, None)),
@@ -452,10 +462,14 @@ fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_r
     ];
     let acknowledgement = Message::from(BOB).submessage(0x0e, 0x01, &ALICE.0);
     robot.look(acknowledgement.submessage(0x06, 0x03, &body.concat()));
-    robot.observer.advance(Timestamp(robot.at + SECOND / 20));
-    robot.observer.advance(Timestamp(robot.at + SECOND));
+    robot
+        .observer
+        .input(Input::Time(Timestamp(robot.at + SECOND / 20)));
+    robot
+        .observer
+        .input(Input::Time(Timestamp(robot.at + SECOND)));
     let mut missed = 0;
-    for each in robot.observer.take_given() {
+    for each in robot.observer.drain().samples {
         if let News::Missed(each) = each.news {
             assert_eq!(each.reason, MissedReason::NotCaptured);
             missed += each.samples;
@@ -473,7 +487,9 @@ fn a_sample_that_stays_incomplete_is_told_and_not_given() {
     robot.fragment(ALICE, 2, 1, &payload(3000));
     robot.fragment(ALICE, 2, 3, &payload(3000));
     robot.put(Message::from(ALICE).data(WRITER, 3, &payload(24)));
-    robot.observer.advance(Timestamp(robot.at + 30 * SECOND));
+    robot
+        .observer
+        .input(Input::Time(Timestamp(robot.at + 30 * SECOND)));
     let given: Vec<_> = robot.given();
     let expected = [
         (ALICE, 1, Ok(payload(20))),
@@ -491,7 +507,9 @@ fn each_subscription_is_told_of_the_losses_since_it_began() {
     };
     let wishes = |robot: &mut Robot, ids: &[u64]| {
         let wishes = ids.iter().map(|id| wish(*id, Depth::Arrivals));
-        robot.observer.set_wishes(Arc::new(wishes.collect()));
+        robot
+            .observer
+            .input(Input::Wishes(Arc::new(wishes.collect())));
     };
     wishes(&mut robot, &[3]);
     data(&mut robot, 1);
@@ -499,8 +517,8 @@ fn each_subscription_is_told_of_the_losses_since_it_began() {
     wishes(&mut robot, &[3, 5]);
     data(&mut robot, 8);
     robot.at += 12 * SECOND;
-    robot.observer.advance(Timestamp(robot.at));
-    let given = robot.observer.take_given().into_iter();
+    robot.observer.input(Input::Time(Timestamp(robot.at)));
+    let given = robot.observer.drain().samples.into_iter();
     let mut missed: Vec<_> = given
         .filter_map(|given| match given.news {
             News::Missed(missed) => {
@@ -520,7 +538,7 @@ fn interest_measures_what_nobody_watches_and_ends_with_the_last_wish() {
     let mut robot = Robot::new(Settings::default());
     let guid = Guid::new(ALICE, WRITER);
     let verdict = |robot: &mut Robot| {
-        let changes = robot.observer.interest_changes().into_iter();
+        let changes = robot.observer.drain().interest.into_iter();
         let mut of_it = changes.filter(|(endpoint, _)| *endpoint == guid);
         of_it.next().and_then(|(_, verdict)| verdict)
     };
@@ -534,7 +552,7 @@ fn interest_measures_what_nobody_watches_and_ends_with_the_last_wish() {
     assert_eq!(verdict(&mut robot), Some(Verdict::Capture));
     robot.put(Message::from(ALICE).data(WRITER, 3, &payload(20)));
     assert_eq!(robot.given(), [(ALICE, 3, Ok(payload(20)))]);
-    robot.observer.set_wishes(Arc::default());
+    robot.observer.input(Input::Wishes(Arc::default()));
     assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
     robot.put(Message::from(ALICE).data(WRITER, 4, &payload(20)));
     assert!(robot.given().is_empty());

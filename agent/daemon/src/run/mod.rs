@@ -5,6 +5,7 @@ mod moment;
 pub mod replay;
 mod source;
 
+use ros2probe_model::input::Input;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -148,14 +149,13 @@ impl Run {
             let finished = self.source.is_finished();
             if finished {
                 if let Some(end) = self.source.cut() {
-                    self.observer.advance(end);
+                    self.observer.input(Input::Time(end));
                 }
-                self.observer.settle();
+                self.observer.input(Input::End);
             } else {
-                self.observer.advance(self.source.clock());
+                self.observer.input(Input::Time(self.source.clock()));
             }
             self.remember();
-            self.tell_interest();
             self.hand_over();
             let age = published.elapsed();
             let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
@@ -206,19 +206,22 @@ impl Run {
         self.board.remember(history.past());
     }
 
-    /// Gives away what happened since the last time; nobody makes this wait.
+    /// Gives away what has come up since the last time. No reader makes this wait.
     fn hand_over(&mut self) {
         let now = self.source.clock();
-        self.board.events().add(self.observer.take_events(), now);
-        self.board.add_spans(self.observer.take_spans());
-        let given = self.observer.take_given();
+        let output = self.observer.drain();
+        if let Source::Live(live) = &mut self.source {
+            live.apply(&output.interest);
+        }
+        self.board.events().add(output.events, now);
+        self.board.add_spans(output.spans);
         let clock = self.observer.given_until(now);
         if clock.0.saturating_add(SET_BACK) < self.told.0 {
             self.told = clock;
         }
         let news = (clock > self.told).then_some(clock);
         self.told = self.told.max(clock);
-        self.subscriptions.deliver(given, news);
+        self.subscriptions.deliver(output.samples, news);
     }
 
     /// Watches and gives what is asked for since the last look. The kernel knows it before the next
@@ -228,15 +231,15 @@ impl Run {
         if self.ask() {
             if let Some(watchlist) = self.watches.take_news() {
                 self.subscriptions.retain(watchlist.watches());
-                self.observer.set_watchlist(watchlist);
+                self.observer.input(Input::Watchlist(watchlist));
             }
             if let Some(wishes) = self.subscriptions.take_news() {
-                self.observer.set_wishes(Arc::clone(&wishes));
+                self.observer.input(Input::Wishes(Arc::clone(&wishes)));
                 self.wishes = Some(wishes);
             }
         }
         let has_asked_all = self.ask();
-        self.tell_interest();
+        self.hand_over();
         if has_asked_all && let Some(wishes) = self.wishes.take() {
             self.subscriptions.in_force(&wishes);
             if wishes.is_empty() {
@@ -256,15 +259,11 @@ impl Run {
         true
     }
 
-    fn tell_interest(&mut self) {
-        if let Source::Live(live) = &mut self.source {
-            live.apply(&self.observer.interest_changes());
-        }
-    }
-
     fn publish(&mut self) {
         if let Source::Live(live) = &mut self.source {
-            self.observer.participants_alive(live.last_seen());
+            for (prefix, at) in live.last_seen() {
+                self.observer.input(Input::ParticipantAlive(prefix, at));
+            }
         }
         let mut snapshot = self.observer.snapshot(self.source.clock());
         if let Some(history) = &self.history {

@@ -2,6 +2,7 @@
 //! sums only. It works as the agent does, and looks at sockets of the whole machine: give it a
 //! control group.
 
+use ros2probe::model::input::Input;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -151,7 +152,9 @@ fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Tes
     };
     source.start(ros2probe::privilege::spawn_source);
     let mut observer = Observer::new(observer::Settings::default());
-    observer.set_watchlist(Watchlist::new(config.watches.clone())?);
+    observer.input(Input::Watchlist(Arc::new(Watchlist::new(
+        config.watches.clone(),
+    )?)));
     let publish = |snapshot: Snapshot| {
         let mut latest = shared.latest.lock().unwrap_or_else(PoisonError::into_inner);
         *latest = Some(Arc::new(snapshot));
@@ -159,15 +162,15 @@ fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Tes
     while !shared.stop.load(Ordering::Relaxed) {
         publish(observer.snapshot(source.clock()));
         source.poll(SLICE, None, &mut observer)?;
-        observer.advance(source.clock());
-        source.apply(&observer.interest_changes());
+        observer.input(Input::Time(source.clock()));
+        source.apply(&observer.drain().interest);
     }
     source.drain(&mut observer);
     let counters = source.counters()?;
     let skipped_runs = bpf::skipped_runs()?;
     let end = Timestamp(source.clock().0.saturating_add(UNTIL_ALL_IS_SETTLED));
-    observer.advance(end);
-    observer.settle();
+    observer.input(Input::Time(end));
+    observer.input(Input::End);
     Ok(Testimony {
         end: observer.snapshot(end),
         losses: observer.journal().losses().copied().collect(),

@@ -1,6 +1,8 @@
 //! A host in virtual time: a writer elsewhere or on it, and receivers at its sockets.
 
+use ros2probe::model::input::Input;
 use std::net::{Ipv4Addr, SocketAddrV4};
+use std::sync::Arc;
 
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::cause::LossCause;
@@ -91,8 +93,10 @@ impl Host {
     /// With a reliable writer of Alice's on `/chatter`.
     pub fn with(settings: Settings) -> Self {
         let mut observer = Observer::new(settings);
-        observer.set_watchlist(Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap());
-        observer.advance(Timestamp(START));
+        observer.input(Input::Watchlist(Arc::new(
+            Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
+        )));
+        observer.input(Input::Time(Timestamp(START)));
         let mut host = Self {
             observer,
             now: START,
@@ -162,12 +166,12 @@ impl Host {
         let process_id = u32::from(prefix.0[2]);
         let sending = 1000 + u64::from(process_id);
         for cookie in [sending, seen.socket] {
-            self.observer.socket(SocketFacts {
+            self.observer.input(Input::Socket(SocketFacts {
                 cookie,
                 process_id: Some(process_id),
                 process: Some("listener".to_owned()),
                 ..SocketFacts::default()
-            });
+            }));
         }
         let out = Record {
             kind: kind::ACKNACK,
@@ -179,19 +183,23 @@ impl Host {
             time: self.now,
             ..Record::default()
         };
-        self.observer.record(&out);
+        self.observer.input(Input::Record(&out));
     }
 
     pub fn announce(&mut self, message: Message) {
         let envelope = Envelope {
             ..forge::multicast(self.now, 0)
         };
-        self.observer.datagram(&envelope, &message.bytes(), None);
+        self.observer.input(Input::Datagram {
+            envelope: &envelope,
+            payload: &message.bytes(),
+            handover: None,
+        });
     }
 
     pub fn wait(&mut self, milliseconds: u64) {
         self.now += milliseconds * MILLISECOND;
-        self.observer.advance(Timestamp(self.now));
+        self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
     /// A record of Alice's writer.
@@ -226,7 +234,7 @@ impl Host {
     }
 
     pub fn put(&mut self, record: Record) {
-        self.observer.record(&record);
+        self.observer.input(Input::Record(&record));
     }
 
     pub fn data(&mut self, seen: Seen, number: u64) {
