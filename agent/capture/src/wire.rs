@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use ros2probe_wire::frame::{self, PacketType, Payload};
-use ros2probe_wire::record::kind;
+use ros2probe_wire::record::Body;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record, Timestamp, WireError};
 
@@ -394,7 +394,7 @@ impl Intake {
                     continue;
                 }
             };
-            if record.kind == kind::HANDOVER {
+            if matches!(record.body(), Body::Handover) {
                 let (at, key) = (
                     Timestamp(record.time),
                     FlowKey::of_handover(self.number, &record),

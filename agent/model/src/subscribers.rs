@@ -213,7 +213,7 @@ impl Subscribers {
         }
         let came_again = match body {
             Body::Sample(sample) if way.is_sent() => self.leave(index, sample, stage),
-            _ => self.arrive(index, record, stage),
+            _ => self.arrive(index, record, body, stage),
         };
         if came_again { Sight::Again } else { Sight::New }
     }
@@ -265,16 +265,23 @@ impl Subscribers {
         again && !way.place.is_multicast()
     }
 
-    fn arrive(&mut self, index: usize, record: &Record, stage: &mut Stage<'_>) -> bool {
+    fn arrive(
+        &mut self,
+        index: usize,
+        record: &Record,
+        body: Body<'_>,
+        stage: &mut Stage<'_>,
+    ) -> bool {
         self.totals.seen[0] = true;
         let Some((receiver, matched)) = self.receiver(index, record, stage) else {
             return false;
         };
         if matched == Matched::No {
-            let is_missed = |sample: Sample<'_>| {
-                sample.is_message() && sample.is_end() && record.flags & flag::NO_ROOM == 0
-            };
-            if record.sample().is_some_and(is_missed) {
+            if let Body::Sample(sample) = body
+                && sample.is_message()
+                && sample.is_end()
+                && record.flags & flag::NO_ROOM == 0
+            {
                 let place = self.find(receiver);
                 match place.and_then(|place| self.deliveries.get_mut(place)) {
                     Some(delivery) => delivery.ignore(&mut self.totals),
@@ -283,7 +290,7 @@ impl Subscribers {
             }
             return false;
         }
-        match record.body() {
+        match body {
             Body::Sample(sample) => return self.sample(index, receiver, sample, stage),
             Body::Heartbeat(heartbeat) => {
                 self.heartbeat(index, (receiver, matched), heartbeat, stage);

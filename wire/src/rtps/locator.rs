@@ -42,7 +42,7 @@ impl Locator {
     pub const LEN: usize = 24;
 
     /// # Errors
-    /// [`Reason::Truncated`].
+    /// [`Truncated`](crate::cursor::Reason::Truncated).
     pub fn read(cursor: &mut Cursor<'_>) -> Result<Self, WireError> {
         Ok(Self {
             kind: LocatorKind(cursor.i32("locator kind")?),
