@@ -1,14 +1,13 @@
 //! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
 
 pub mod bell;
-pub mod control_groups;
-pub mod exact;
-pub mod feed;
+pub mod cgroup;
+pub mod cgroup_paths;
+pub mod clock_step;
 pub mod filter;
-pub mod hierarchy;
-pub mod host;
-pub mod inside;
-pub mod intake;
+pub mod filter_reader;
+pub mod frame_decoder;
+pub mod host_tap;
 pub mod interfaces;
 pub mod kernel_types;
 pub mod live;
@@ -16,13 +15,14 @@ pub mod netns;
 pub mod order;
 pub mod owners;
 pub mod pcap;
+pub mod piece_assembler;
 pub mod reattach;
 pub mod ring;
-pub mod set_clock;
 pub mod settings;
 pub mod shm;
 pub mod sockets;
 pub mod system;
 pub mod threads;
-pub mod whole;
-pub mod wire;
+pub mod tracepoints;
+pub mod uprobe;
+pub mod wire_tap;

@@ -6,7 +6,7 @@ use std::hint::black_box;
 use std::path::Path;
 
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
-use ros2probe::capture::feed::Feed;
+use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
@@ -220,7 +220,7 @@ fn captures(criterion: &mut Criterion) {
             bencher.iter(|| {
                 let mut world = observer(0);
                 let mut reader = PcapReader::open(&path).unwrap();
-                Feed::new(Limits::default())
+                FrameDecoder::new(Limits::default())
                     .run(&mut reader, &mut world)
                     .unwrap();
                 world

@@ -11,13 +11,13 @@ use std::sync::{Arc, LazyLock};
 
 use ros2probe::bag::info::Bag;
 use ros2probe::bag::reindex::{Found, reindex};
-use ros2probe::capture::exact::library;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::ring::block::Frames;
 use ros2probe::capture::shm::cell::Cell;
+use ros2probe::capture::shm::classifier::MessageClassifier;
 use ros2probe::capture::shm::port::Port;
 use ros2probe::capture::shm::segment::{Buffer, Message};
-use ros2probe::capture::shm::verdict::Judge;
+use ros2probe::capture::uprobe::library;
 use ros2probe::config::{Config, Watch, Watchlist};
 use ros2probe::message::filter::{Filter, Subject};
 use ros2probe::message::{Decoded, Definition, MessageType, Shown, csv, decode, yaml};
@@ -104,13 +104,13 @@ pub fn shared_memory(bytes: &[u8]) {
     for (round, file) in [after, before, after].into_iter().enumerate() {
         let known = announced.len();
         let now = MOMENT * (round as u64 + 1);
-        let Some(look) = port.look(file, now, &mut announced) else {
+        let Some(look) = port.poll(file, now, &mut announced) else {
             break;
         };
         assert!((announced.len() - known) as u64 <= look.pushed);
         assert!((announced.len() - known) * Cell::LEN <= file.len());
     }
-    let mut judge = Judge::default();
+    let mut judge = MessageClassifier::default();
     for descriptor in &announced {
         let Ok(buffer) = Buffer::find(segment, descriptor) else {
             continue;
@@ -118,7 +118,7 @@ pub fn shared_memory(bytes: &[u8]) {
         assert!(buffer.is_valid(segment));
         let mut records = Vec::new();
         let message = Message::new(segment, buffer);
-        judge.judge(&message, buffer.length, Record::default(), &mut records);
+        judge.classify(&message, buffer.length, Record::default(), &mut records);
         assert!(records.len() <= buffer.length as usize);
         let mut whole = Vec::new();
         if buffer.read(segment, &mut whole) {

@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::{Agent, ClientError, Lines, Next};
@@ -13,7 +14,6 @@ use ros2probe_daemon::subscriptions::{Got, Item, Missed, MissedReason, Topic};
 use ros2probe_model::discovery::hexadecimal;
 use ros2probe_model::payloads::Sample;
 
-const SECOND: i64 = 1_000_000_000;
 /// Writers that are remembered; of further ones each message makes its own description.
 const WRITERS: usize = 65_536;
 
@@ -170,8 +170,8 @@ fn time(nanoseconds: i64) -> Timestamp {
 }
 
 fn stamp(nanoseconds: i64) -> Option<(i32, u32)> {
-    let seconds = i32::try_from(nanoseconds.div_euclid(SECOND)).ok()?;
-    let rest = u32::try_from(nanoseconds.rem_euclid(SECOND)).ok()?;
+    let seconds = i32::try_from(nanoseconds.div_euclid(SECOND.cast_signed())).ok()?;
+    let rest = u32::try_from(nanoseconds.rem_euclid(SECOND.cast_signed())).ok()?;
     Some((seconds, rest))
 }
 

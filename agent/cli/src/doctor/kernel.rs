@@ -3,7 +3,7 @@
 
 use super::finding::{Area, Finding, Verdict};
 use super::host::{Host, Unread};
-use ros2probe_capture::hierarchy::{Cgroup, HierarchyError, topmost};
+use ros2probe_capture::cgroup::{Cgroup, CgroupError, topmost};
 
 const AREA: Area = Area::Kernel;
 const RELEASE: &str = "/proc/sys/kernel/osrelease";
@@ -167,7 +167,7 @@ fn control_groups(host: &Host) -> Finding {
                 containers are not visible"),
         )
         .elsewhere("--cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro    # docker run; hostPath in Kubernetes"),
-        Err(HierarchyError::Open { source, .. }) => say(
+        Err(CgroupError::Open { source, .. }) => say(
             Verdict::Unknown,
             format!("the cgroup hierarchy at {point} cannot be opened: {source}"),
         ),

@@ -110,7 +110,7 @@ fn probes(host: &Host, settings: &CaptureSettings) -> Option<Finding> {
     if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
         return None;
     }
-    let missing = ros2probe_capture::exact::lacking(&host.capabilities);
+    let missing = ros2probe_capture::uprobe::lacking(&host.capabilities);
     if missing.is_empty() {
         return None;
     }

@@ -10,7 +10,7 @@ use super::answers::Participants;
 use super::finding::{Area, Finding, Verdict};
 use super::host::{Host, Unread, base_name};
 use super::variables::{Range, Variables};
-use ros2probe_capture::exact::processes::is_library;
+use ros2probe_capture::uprobe::processes::is_library;
 
 const AREA: Area = Area::Processes;
 /// Text of a process's map that is read.

@@ -44,12 +44,12 @@ impl Observed {
         let cgroup = Cgroup::create(&name).unwrap();
         let mut filter = Filter::load_host(settings).unwrap();
         filter.attach(&File::open(cgroup.path()).unwrap()).unwrap();
-        filter.look_inside(false);
+        filter.attach_tracepoints(false);
         Observed { filter, cgroup }
     }
 
     fn owners(&self, socket: u64) -> BTreeMap<u64, Owner> {
-        let owners = self.filter.inside().unwrap().owners().expect("owners");
+        let owners = self.filter.tracepoints().unwrap().owners().expect("owners");
         owners.refresh(&BTreeSet::from([socket])).unwrap()
     }
 
@@ -160,7 +160,7 @@ fn cookie(socket: &UdpSocket) -> u64 {
 #[test]
 fn a_socket_is_known_by_process_name_inode_and_drops() {
     let observed = Observed::new();
-    let abilities = observed.filter.inside().unwrap().abilities();
+    let abilities = observed.filter.tracepoints().unwrap().abilities();
     assert!(abilities.owners.is_ok(), "{abilities:?}");
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     let cookie = cookie(&socket);
@@ -508,7 +508,7 @@ const SETTLED: Duration = Duration::from_millis(200);
 
 fn observed_link(number: u32, verdict: Verdict) -> (Observed, Link, Talker, Guid) {
     let mut observed = Observed::new();
-    let abilities = observed.filter.inside().unwrap().abilities();
+    let abilities = observed.filter.tracepoints().unwrap().abilities();
     assert!(abilities.socket_losses.is_ok(), "{abilities:?}");
     let link = Link::new().unwrap();
     for (host, address) in [(&link.robot, "fd99::1"), (&link.monitor, "fd99::2")] {
@@ -588,7 +588,7 @@ fn without_the_kernels_types_full_sockets_are_told_as_long_as_every_socket_is_se
         ..FilterSettings::default()
     };
     let one_cgroup = Observed::with(&settings);
-    let abilities = one_cgroup.filter.inside().unwrap().abilities();
+    let abilities = one_cgroup.filter.tracepoints().unwrap().abilities();
     let reason = abilities.socket_losses.clone().unwrap_err();
     assert!(reason.contains("limited to one cgroup"), "{reason}");
     assert!(abilities.owners.is_err() && abilities.reassembly_losses.is_err());
@@ -596,7 +596,7 @@ fn without_the_kernels_types_full_sockets_are_told_as_long_as_every_socket_is_se
     let mut filter = Filter::load_host(&settings).unwrap();
     let all = File::open(cgroup::hierarchy().unwrap()).unwrap();
     filter.attach(&all).unwrap();
-    filter.look_inside(true);
+    filter.attach_tracepoints(true);
     let (mut talker, writer) = talker(9);
     filter.set_interest(writer, Some(Verdict::Meter)).unwrap();
     let host = Namespace::alone().unwrap();

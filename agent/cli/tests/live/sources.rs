@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
 use injection::Injection;
-use ros2probe::capture::feed::Feed;
+use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::config::{Config, Watchlist};
 use ros2probe::model::journal::Loss;
@@ -137,7 +137,7 @@ impl Counts {
             .context("the watchlist")?;
         let mut observer = Observer::new(Settings::default());
         observer.set_watchlist(Watchlist::new(config.watches)?);
-        let mut feed = Feed::new(Limits::default());
+        let mut feed = FrameDecoder::new(Limits::default());
         feed.run(&mut PcapReader::open(capture)?, &mut observer)?;
         let losses = observer.journal().losses();
         Ok(Counts::of(&observer.snapshot(feed.last()), losses))

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use crate::rp;
 use bytes::Bytes;
-use ros2probe::capture::feed::Feed;
+use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::observer::{Observer, Settings};
@@ -20,9 +20,9 @@ use ros2probe_testing::local_agent;
 use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
-const SECOND: u64 = 1_000_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
@@ -72,7 +72,7 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
         observer.set_wishes(Arc::new(vec![wish(1, depth)]));
     }
     let mut reader = PcapReader::open(capture).unwrap();
-    let mut feed = Feed::new(Limits::default());
+    let mut feed = FrameDecoder::new(Limits::default());
     let mut news = Vec::new();
     let mut take = |observer: &mut Observer| {
         for given in observer.take_given() {

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use ros2probe_wire::qos::Qos;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::announced::{Announced, SeenTopic, Sight};
@@ -21,7 +22,6 @@ use ros2probe_bag::{
 };
 use ros2probe_model::payloads::{Offered, Sample};
 
-const SECOND: u64 = 1_000_000_000;
 /// How often what was taken is handed to the system, by the time of the samples: so much is lost
 /// when the process is killed.
 const FLUSH: u64 = SECOND;

@@ -12,7 +12,7 @@ use ros2probe_wire::frame::Link;
 use tokio::sync::watch;
 
 use super::Moment;
-use ros2probe_capture::feed::Feed;
+use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
 use ros2probe_model::observer::Observer;
 use ros2probe_model::reassembly::{Limits, Reassembly};
@@ -65,7 +65,7 @@ impl Waiter {
 /// A capture being replayed.
 pub struct Replay {
     reader: PcapReader,
-    feed: Feed,
+    decoder: FrameDecoder,
     pacer: Pacer,
     speed: Speed,
     /// Read but not due yet.
@@ -105,7 +105,7 @@ impl Replay {
         }
         Ok(Self {
             reader,
-            feed: Feed::new(limits),
+            decoder: FrameDecoder::new(limits),
             pacer: Pacer::new(speed),
             speed,
             waiting: None,
@@ -220,7 +220,7 @@ impl Replay {
                     bytes,
                     length,
                 };
-                self.feed.packet(&captured, observer);
+                self.decoder.packet(&captured, observer);
             }
             self.next()?;
         }
@@ -369,7 +369,7 @@ impl Replay {
     /// What puts its fragments together, for its counters.
     #[must_use]
     pub const fn reassembly(&self) -> &Reassembly {
-        self.feed.reassembly()
+        self.decoder.reassembly()
     }
 
     fn show_progress(&mut self) {

@@ -15,7 +15,7 @@ use crate::config::CaptureSettings;
 use crate::surface::{
     Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
-use ros2probe_capture::host::HostTap;
+use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::shm;
 use ros2probe_model::observer::Observer;
@@ -188,7 +188,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     }));
     interfaces.extend(live.host().map(|host| InterfaceFacts {
         name: "sockets".to_owned(),
-        packets: Some(host.intake().datagrams()),
+        packets: Some(host.reader().datagrams()),
         dropped: None,
     }));
     interfaces.extend(live.messages_of_processes().map(|messages| InterfaceFacts {
@@ -259,7 +259,7 @@ fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
         open: vec![
             ("port", counters.ports),
             ("segment", counters.segments),
-            ("directory", counters.places),
+            ("directory", counters.directories),
         ],
         events: vec![
             ("announced", counters.announced),

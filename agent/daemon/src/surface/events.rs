@@ -20,6 +20,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 use tokio::sync::Notify;
 
 use record::Happened;
@@ -28,7 +29,6 @@ use ros2probe_model::event::{Class, Taken};
 pub use table::{Definition, EVENTS, Severity, markdown};
 pub use watchman::{Drops, Sight};
 
-const SECOND: u64 = 1_000_000_000;
 /// Events kept.
 const KEPT: usize = 4096;
 /// Events of one name in a second.

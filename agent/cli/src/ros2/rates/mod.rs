@@ -21,7 +21,7 @@ use self::table::table;
 use super::{Dialect, Refused};
 use ros2probe_model::header::begins_with_header;
 
-const SECOND: i64 = 1_000_000_000;
+const SECOND: i64 = ros2probe_wire::time::SECOND.cast_signed();
 /// Of a nanosecond, in seconds.
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.

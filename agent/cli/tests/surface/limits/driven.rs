@@ -58,8 +58,8 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_OPEN",
-        "agent/capture/src/whole.rs",
-        "agent/capture/src/whole.rs",
+        "agent/capture/src/piece_assembler.rs",
+        "agent/capture/src/piece_assembler.rs",
         "more_than_there_is_room_for_push_out_the_oldest",
     ],
     [
@@ -418,14 +418,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_FILES",
-        "agent/capture/src/shm/scan.rs",
-        "agent/capture/src/shm/scan.rs",
+        "agent/capture/src/shm/directories.rs",
+        "agent/capture/src/shm/directories.rs",
         "files_of_living_processes_are_found_among_more_forged_ones_than_are_kept",
     ],
     [
         "SHARE",
-        "agent/capture/src/shm/listing.rs",
-        "agent/capture/src/shm/listing.rs",
+        "agent/capture/src/shm/cpu_allowance.rs",
+        "agent/capture/src/shm/cpu_allowance.rs",
         "listings_that_are_always_wanted_cost_no_more_than_their_share",
     ],
     [
@@ -496,20 +496,20 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_WAITING",
-        "agent/capture/src/intake.rs",
+        "agent/capture/src/filter_reader.rs",
         "agent/cli/tests/kernel/caps.rs",
         "records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted",
     ],
     [
         "MAX_LIBRARIES",
-        "agent/capture/src/exact/search.rs",
-        "agent/capture/src/exact/search.rs",
+        "agent/capture/src/uprobe/search.rs",
+        "agent/capture/src/uprobe/search.rs",
         "a_library_beyond_the_cap_is_said_to_be_uncovered_until_another_is_no_longer_used",
     ],
     [
         "MAX_LISTED",
-        "agent/capture/src/shm/scan.rs",
-        "agent/capture/src/shm/scan.rs",
+        "agent/capture/src/shm/directories.rs",
+        "agent/capture/src/shm/directories.rs",
         "of_more_entries_than_are_looked_through_those_of_files_that_were_known_stay",
     ],
 ];

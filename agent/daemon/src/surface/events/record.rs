@@ -7,6 +7,7 @@ use std::fmt::{Display, Write as _};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
+use ros2probe_wire::time::SECOND;
 
 use super::table::{self, Definition, Severity};
 use crate::surface::SourceKind;
@@ -18,7 +19,6 @@ use ros2probe_model::snapshot::WatchState;
 use ros2probe_model::topic::Naming;
 
 const SECONDS_OF_A_DAY: u64 = 86_400;
-const NANOSECONDS: u64 = 1_000_000_000;
 
 /// What happened to the robot or the agent.
 #[derive(Clone, Debug, PartialEq)]
@@ -513,8 +513,8 @@ fn seconds(at: Timestamp, last: Timestamp) -> f64 {
 /// year 0, so that the leap day is a year's last.
 fn rfc3339(at: Timestamp) -> String {
     let (days, rest) = (
-        at.0 / NANOSECONDS / SECONDS_OF_A_DAY,
-        at.0 / NANOSECONDS % SECONDS_OF_A_DAY,
+        at.0 / SECOND / SECONDS_OF_A_DAY,
+        at.0 / SECOND % SECONDS_OF_A_DAY,
     );
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
@@ -533,7 +533,7 @@ fn rfc3339(at: Timestamp) -> String {
     let _ = write!(
         time,
         "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{:09}Z",
-        at.0 % NANOSECONDS
+        at.0 % SECOND
     );
     time
 }
@@ -552,7 +552,7 @@ mod tests {
             (1_795_219_199, "2026-11-20T23:59:59.000000000Z"),
             (4_107_542_400, "2100-03-01T00:00:00.000000000Z"),
         ] {
-            assert_eq!(rfc3339(Timestamp(seconds * NANOSECONDS)), expected);
+            assert_eq!(rfc3339(Timestamp(seconds * SECOND)), expected);
         }
         assert!(rfc3339(Timestamp(7)).ends_with("00.000000007Z"));
     }

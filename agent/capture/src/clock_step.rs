@@ -10,14 +10,14 @@ const LATE_NANOSECONDS: u64 = 1_000_000_000;
 
 /// How the calendar's clock stands against the even one.
 #[derive(Clone, Copy, Debug)]
-pub struct SetClock {
+pub struct ClockStep {
     /// Nanoseconds that it was ahead at the last look.
     ahead: i64,
     /// When a step was noticed last, and all steps of that moment.
     noticed: Option<(u64, i64)>,
 }
 
-impl SetClock {
+impl ClockStep {
     /// As it stands.
     #[must_use]
     pub const fn new(clocks: &Clocks) -> Self {
@@ -29,7 +29,7 @@ impl SetClock {
 
     /// By how many nanoseconds the clock was set forward since the last look; 0 = it was not. Notes in
     /// the clocks that it was, for as long as that matters.
-    pub const fn look(&mut self, clocks: &mut Clocks) -> i64 {
+    pub const fn update(&mut self, clocks: &mut Clocks) -> i64 {
         let before = match self.noticed {
             Some((at, steps)) if clocks.monotonic.saturating_sub(at) < LATE_NANOSECONDS => steps,
             _ => 0,
@@ -57,7 +57,7 @@ mod tests {
 
     use super::*;
 
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
     const HOUR: i64 = 3600 * SECOND.cast_signed();
     const STARTED: u64 = 1_700_000_000 * SECOND;
 
@@ -73,26 +73,26 @@ mod tests {
     #[test]
     fn a_step_is_noticed_once_and_remembered_for_a_second_and_slewing_is_none() {
         for step in [HOUR, -HOUR] {
-            let mut set = SetClock::new(&clocks(0, 0));
+            let mut set = ClockStep::new(&clocks(0, 0));
             // 500 parts in a million, as fast as a time server goes.
             let mut now = clocks(SECOND, 500_000);
-            assert_eq!((set.look(&mut now), now.step), (0, 0));
+            assert_eq!((set.update(&mut now), now.step), (0, 0));
             let mut now = clocks(SECOND + SECOND / 4, step);
-            assert_eq!(set.look(&mut now), step - 500_000);
+            assert_eq!(set.update(&mut now), step - 500_000);
             assert_eq!(now.step, step - 500_000);
             let mut now = clocks(2 * SECOND, step);
-            assert_eq!((set.look(&mut now), now.step), (0, step - 500_000));
+            assert_eq!((set.update(&mut now), now.step), (0, step - 500_000));
             let mut now = clocks(3 * SECOND, step);
-            assert_eq!((set.look(&mut now), now.step), (0, 0));
+            assert_eq!((set.update(&mut now), now.step), (0, 0));
         }
     }
 
     #[test]
     fn what_came_before_the_step_is_taken_for_what_it_is() {
         for step in [HOUR, -HOUR] {
-            let mut set = SetClock::new(&clocks(0, 0));
+            let mut set = ClockStep::new(&clocks(0, 0));
             let mut now = clocks(5 * SECOND, step);
-            set.look(&mut now);
+            set.update(&mut now);
             let half = Timestamp(now.now.0 - SECOND / 2);
             let before = clocks(4 * SECOND + SECOND / 2, 0).now;
             assert_eq!(now.stamped(before), half, "before the step");

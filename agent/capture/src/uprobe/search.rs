@@ -18,7 +18,7 @@ use super::library::{self, LibraryError};
 use super::processes::{LibraryId, Mapped, Processes, is_library};
 use crate::filter::{FilterError, Probe, Probes};
 use crate::live::in_words;
-use crate::shm::scan::{Name, Places, Scope};
+use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::DirectoryWatch;
 use crate::threads::{Spawn, Task};
 
@@ -49,7 +49,7 @@ const INSTALLED: [&str; 5] = [
 const DISTRIBUTIONS: &str = "/opt/ros";
 
 /// The thread, from the outside.
-pub struct Search {
+pub struct LibrarySearch {
     shared: Arc<Shared>,
     /// What the thread is given when it begins.
     waiting: Option<(Attachments, Scope)>,
@@ -138,7 +138,7 @@ impl Default for Facts {
     }
 }
 
-impl Search {
+impl LibrarySearch {
     /// Attaches to what is installed, and to nothing else before it is started; `on_demand` to nothing
     /// before it is wanted.
     #[must_use]
@@ -218,7 +218,7 @@ impl Search {
     }
 }
 
-impl Drop for Search {
+impl Drop for LibrarySearch {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
@@ -232,7 +232,7 @@ impl Drop for Search {
 /// The thread.
 fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
     let mut processes = Processes::new(scope.clone());
-    let mut places = Places::new(scope);
+    let mut shared_memory = ShmDirectories::new(scope);
     // Without it, a participant that starts is noticed within a second.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched = BTreeSet::new();
@@ -241,7 +241,7 @@ fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
         if !shared.wanted.load(Ordering::Acquire) {
             if shared.attached.load(Ordering::Acquire) {
                 // Shared memory is looked at again before nothing is seen here any more.
-                shared.tell(Facts::resting());
+                shared.report(Facts::resting());
                 std::thread::sleep(OVERLAP);
                 attachments.libraries.clear();
                 shared.attached.store(false, Ordering::Release);
@@ -265,13 +265,16 @@ fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
             processes.find(true);
             attachments.follow(&processes, now);
         }
-        shared.tell(attachments.facts(&processes));
+        shared.report(attachments.facts(&processes));
         let Some(watch) = &mut watch else {
             std::thread::park_timeout(EVERY);
             continue;
         };
-        places.find();
-        let directories = places.places.values().map(|place| place.path.clone());
+        shared_memory.find();
+        let directories = shared_memory
+            .directories
+            .values()
+            .map(|directory| directory.path.clone());
         let directories: BTreeSet<_> = directories.collect();
         for new in directories.difference(&watched) {
             watch.add(new);
@@ -283,7 +286,7 @@ fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
 }
 
 impl Shared {
-    fn tell(&self, facts: Facts) {
+    fn report(&self, facts: Facts) {
         self.covers_all
             .store(facts.uncovered.is_none(), Ordering::Release);
         let mut known = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
@@ -491,7 +494,7 @@ mod tests {
         assert_eq!(used.libraries.len(), MAX_LIBRARIES + 1);
         let process = std::process::id();
         let all = Processes::of(process, used.clone());
-        let (_filter, probes) = Filter::load_handed(&FilterSettings::default(), None)
+        let (_filter, probes) = Filter::load_uprobe(&FilterSettings::default(), None)
             .expect("loading the kernel filter needs root: run the tests with sudo");
         let mut attachments = Attachments {
             probes,

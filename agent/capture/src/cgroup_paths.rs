@@ -19,13 +19,13 @@ const CONTAINER_ID_SHOWN: usize = 12;
 
 /// The control groups below a directory.
 #[derive(Debug)]
-pub struct ControlGroups {
+pub struct CgroupPaths {
     root: PathBuf,
     /// `None`: it is not there.
     known: BTreeMap<u64, Option<String>>,
 }
 
-impl ControlGroups {
+impl CgroupPaths {
     /// Those below the place where the version 2 hierarchy is mounted.
     #[must_use]
     pub const fn new(root: PathBuf) -> Self {
@@ -123,7 +123,7 @@ mod tests {
         let inode = |path: &Path| fs::metadata(path).unwrap().ino();
         let (top, below) = (inode(root.path()), inode(&service));
         let gone = 1;
-        let mut groups = ControlGroups::new(root.path().to_path_buf());
+        let mut groups = CgroupPaths::new(root.path().to_path_buf());
         assert_eq!(groups.path(below), None);
         groups.refresh(&BTreeSet::from([top, below, gone]));
         assert_eq!(groups.path(top), Some("/"));
@@ -141,7 +141,7 @@ mod tests {
 
     #[test]
     fn a_hierarchy_that_is_not_there_has_nothing() {
-        let mut groups = ControlGroups::new(PathBuf::from("/nonexistent"));
+        let mut groups = CgroupPaths::new(PathBuf::from("/nonexistent"));
         groups.refresh(&BTreeSet::from([1]));
         assert_eq!(groups.path(1), None);
     }

@@ -7,22 +7,22 @@
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 
+use super::cgroup::{self, Cgroup, CgroupError};
 use super::filter::{Filter, FilterError, FilterSettings};
-use super::hierarchy::{self, Cgroup, HierarchyError};
-use super::inside::Abilities;
-use super::intake::Intake;
+use super::filter_reader::FilterReader;
 use super::reattach::{self, Reattach};
 use super::sockets::Sockets;
 use super::system::Clocks;
+use super::tracepoints::Abilities;
 use crate::threads::Spawn;
 use ros2probe_model::observer::Observer;
 
 /// Why the host hook is not in place.
 #[derive(Debug, thiserror::Error)]
-pub enum HostError {
+pub enum HostTapError {
     /// The control group.
     #[error(transparent)]
-    Hierarchy(#[from] HierarchyError),
+    Hierarchy(#[from] CgroupError),
     /// The kernel programs.
     #[error(transparent)]
     Filter(#[from] FilterError),
@@ -41,7 +41,7 @@ pub enum FollowError {
 
 /// Which sockets are looked at, and with how much memory.
 #[derive(Clone, Debug)]
-pub struct HostSettings {
+pub struct HostTapSettings {
     /// Only those of this control group and below; `None` = all.
     pub cgroup: Option<PathBuf>,
     /// Bytes of the ring for captured datagrams.
@@ -53,7 +53,7 @@ pub struct HostSettings {
 /// The host hook and what it found on its way to the model.
 pub struct HostTap {
     cgroup: Cgroup,
-    intake: Intake,
+    reader: FilterReader,
     sockets: Sockets,
     /// For a control group that can be removed.
     reattach: Option<Reattach>,
@@ -64,7 +64,7 @@ impl HostTap {
     ///
     /// # Errors
     /// A capability is missing, or the kernel or the machine does not have what it takes.
-    pub fn open(settings: &HostSettings) -> Result<Self, HostError> {
+    pub fn open(settings: &HostTapSettings) -> Result<Self, HostTapError> {
         let cgroup = match &settings.cgroup {
             Some(path) => Cgroup::open(path)?,
             None => Cgroup::topmost()?,
@@ -76,17 +76,17 @@ impl HostTap {
             ..FilterSettings::default()
         })?;
         // First, so that nothing dies unseen behind the hook.
-        filter.look_inside(cgroup.is_whole_host());
+        filter.attach_tracepoints(cgroup.is_whole_host());
         filter.attach(cgroup.directory())?;
         filter.settle();
         let hierarchy = match &settings.cgroup {
-            Some(path) => hierarchy::mount_point().unwrap_or_else(|_| path.clone()),
+            Some(path) => cgroup::mount_point().unwrap_or_else(|_| path.clone()),
             None => cgroup.path().to_path_buf(),
         };
         Ok(Self {
             sockets: Sockets::new(hierarchy),
             cgroup,
-            intake: Intake::new(filter),
+            reader: FilterReader::new(filter),
             reattach: None,
         })
     }
@@ -134,40 +134,40 @@ impl HostTap {
     /// What can be told of what happens behind the hook.
     #[must_use]
     pub fn abilities(&self) -> Option<&Abilities> {
-        Some(self.filter().inside()?.abilities())
+        Some(self.filter().tracepoints()?.abilities())
     }
 
     /// Readable when a ring is half full.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.intake.descriptors()
+        self.reader.descriptors()
     }
 
-    /// Takes in all there is; see [`Intake::take_in`].
-    pub fn take_in(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        self.intake.take_in(clocks, observer);
+    /// Takes in all there is; see [`FilterReader::poll`].
+    pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
+        self.reader.poll(clocks, observer);
         self.sockets
-            .follow(self.intake.filter(), clocks.monotonic, observer);
+            .follow(self.reader.filter(), clocks.monotonic, observer);
     }
 
     /// Gives the model what still waits, at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        self.intake.drain(clocks, observer);
+        self.reader.drain(clocks, observer);
     }
 
     /// The kernel programs' maps.
     #[must_use]
     pub const fn filter(&self) -> &Filter {
-        self.intake.filter()
+        self.reader.filter()
     }
 
     /// The kernel programs' maps, to tell them what is of interest.
     pub const fn filter_mut(&mut self) -> &mut Filter {
-        self.intake.filter_mut()
+        self.reader.filter_mut()
     }
 
     /// What was taken in so far.
     #[must_use]
-    pub const fn intake(&self) -> &Intake {
-        &self.intake
+    pub const fn reader(&self) -> &FilterReader {
+        &self.reader
     }
 }

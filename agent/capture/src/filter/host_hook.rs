@@ -16,7 +16,7 @@ use aya::programs::ProgramFd;
 use ros2probe_wire::host::{Piece, Socket};
 use zerocopy::FromBytes;
 
-use super::super::inside::{Inside, Places};
+use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
     Filter, FilterError, FilterSettings, UNUSED, failed, load_program, open, ring_size, take,
 };
@@ -27,11 +27,11 @@ const INGRESS: u32 = 0;
 const EGRESS: u32 = 1;
 
 /// What the host hook has besides what both hooks have.
-pub(super) struct Hook {
+pub(super) struct HostHook {
     /// Until they are attached: it holds the object's instructions and types, half a megabyte.
     programs: Option<Ebpf>,
-    places: Places,
-    inside: Option<Inside>,
+    layout: KernelLayout,
+    tracepoints: Option<Tracepoints>,
     egress: ProgramFd,
     links: Vec<OwnedFd>,
     /// Values are [`Socket`]s.
@@ -66,21 +66,21 @@ impl Filter {
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses them.
     pub fn load_host(settings: &FilterSettings) -> Result<Self, FilterError> {
         let pieces = ring_size(settings.piece_ring_bytes);
-        let places = if settings.kernel_types {
-            Places::look_up()
+        let layout = if settings.kernel_types {
+            KernelLayout::read()
         } else {
-            Places::unknown("kernel types were not read".to_owned())
+            KernelLayout::unknown("kernel types were not read".to_owned())
         };
         let sizes = [("PIECES", pieces), ("FLOWS", UNUSED)];
-        let mut ebpf = open(settings, true, &sizes, Some(&places), 0)?;
+        let mut ebpf = open(settings, true, &sizes, Some(&layout), 0)?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
         let mut filter = Self::with_maps(&mut ebpf, ingress, None)?;
-        filter.host = Some(Hook {
+        filter.host = Some(HostHook {
             programs: Some(ebpf),
-            places,
-            inside: None,
+            layout,
+            tracepoints: None,
             egress,
             links: Vec::new(),
             sockets,
@@ -120,12 +120,12 @@ impl Filter {
 
     /// Attaches the programs that look further inside the kernel, as many as it allows. `whole_host`:
     /// the hook is attached to the topmost cgroup, so it sees every socket. Nothing on the wire hook.
-    pub fn look_inside(&mut self, whole_host: bool) {
+    pub fn attach_tracepoints(&mut self, whole_host: bool) {
         if let Some(host) = &mut self.host
             && let Some(programs) = &mut host.programs
         {
-            let inside = Inside::attach(programs, &host.places, whole_host);
-            host.inside = Some(inside);
+            let tracepoints = Tracepoints::attach(programs, &host.layout, whole_host);
+            host.tracepoints = Some(tracepoints);
         }
     }
 
@@ -136,10 +136,10 @@ impl Filter {
         }
     }
 
-    /// What [`Filter::look_inside`] has put in place.
+    /// What [`Filter::attach_tracepoints`] has put in place.
     #[must_use]
-    pub fn inside(&self) -> Option<&Inside> {
-        self.host.as_ref()?.inside.as_ref()
+    pub fn tracepoints(&self) -> Option<&Tracepoints> {
+        self.host.as_ref()?.tracepoints.as_ref()
     }
 
     /// The program for datagrams on their way out, `None` on the wire hook.

@@ -119,7 +119,7 @@ pub fn find(file: &File) -> Result<Entry, LibraryError> {
                 continue;
             };
             if let Some((address, form)) = search(file, symbols, names)? {
-                let offset = place(file, &header, address)?;
+                let offset = directory(file, &header, address)?;
                 return Ok(Entry { offset, form });
             }
         }
@@ -203,7 +203,7 @@ fn search(
 }
 
 /// Where in the file lies what is loaded at this address, behind a landing pad.
-fn place(file: &File, header: &Header, address: u64) -> Result<u64, LibraryError> {
+fn directory(file: &File, header: &Header, address: u64) -> Result<u64, LibraryError> {
     let segments = table(file, header.segments, header.segment_count, SEGMENT)?;
     let (segments, _) = segments.as_chunks::<SEGMENT>();
     for bytes in segments {

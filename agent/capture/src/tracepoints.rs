@@ -28,7 +28,7 @@ pub struct Abilities {
 
 /// The running kernel's types, as far as the programs read them.
 #[derive(Debug)]
-pub struct Places {
+pub struct KernelLayout {
     array: [u32; Layout::COUNT],
     /// Why there are none at all.
     unknown: Option<String>,
@@ -38,7 +38,7 @@ pub struct Places {
 const REASONS: &str = "skb_drop_reason";
 
 /// From this release on the kernel tells of datagrams over IPv6 that a socket had no room for.
-const TELLS_IPV6: (u32, u32) = (6, 6);
+const REPORTS_IPV6: (u32, u32) = (6, 6);
 
 /// What each place is called: a structure's member, its size where there is none, or an enumerator.
 const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
@@ -90,16 +90,16 @@ const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
 ];
 
 /// The programs in place; they go with this value.
-pub struct Inside {
+pub struct Tracepoints {
     abilities: Abilities,
     owners: Option<Owners>,
     _links: Vec<RawTracePointLink>,
 }
 
-impl Places {
+impl KernelLayout {
     /// Of the running kernel.
     #[must_use]
-    pub fn look_up() -> Self {
+    pub fn read() -> Self {
         match KernelTypes::read() {
             Ok(types) => Self::of(&types),
             Err(error) => Self::unknown(chain(&error)),
@@ -134,17 +134,17 @@ impl Places {
     }
 
     /// Tells the programs of an object that is about to be loaded.
-    pub fn tell<'a>(&'a self, loader: &mut EbpfLoader<'a>) {
+    pub fn set_globals<'a>(&'a self, loader: &mut EbpfLoader<'a>) {
         loader.override_global("LAYOUT", &self.array, true);
     }
 
     /// Nothing, if all of these are known; otherwise the reason why a program cannot do without.
-    fn need(&self, places: &[Layout]) -> Result<(), String> {
+    fn need(&self, layout: &[Layout]) -> Result<(), String> {
         if let Some(unknown) = &self.unknown {
             return Err(unknown.clone());
         }
         let absent = TABLE.iter().find(|(place, _, _)| {
-            places.contains(place) && self.array.get(*place as usize) == Some(&Layout::ABSENT)
+            layout.contains(place) && self.array.get(*place as usize) == Some(&Layout::ABSENT)
         });
         match absent {
             Some((_, structure, member)) => Err(format!("this kernel has no {structure} {member}")),
@@ -153,16 +153,16 @@ impl Places {
     }
 }
 
-impl Inside {
-    /// Loads and attaches what this kernel has of them, from an object that [`Places::tell`] was
+impl Tracepoints {
+    /// Loads and attaches what this kernel has of them, from an object that [`KernelLayout::set_globals`] was
     /// told about. `whole_host`: the host hook sees every socket.
     #[must_use]
-    pub fn attach(ebpf: &mut Ebpf, places: &Places, whole_host: bool) -> Self {
+    pub fn attach(ebpf: &mut Ebpf, layout: &KernelLayout, whole_host: bool) -> Self {
         let mut links = Vec::new();
         let socket_losses =
-            socket_losses(ebpf, places, whole_host).map(|mut more| links.append(&mut more));
-        let reassembly_losses = reassembly_losses(ebpf, places).map(|link| links.push(link));
-        let owners = owners(ebpf, places);
+            socket_losses(ebpf, layout, whole_host).map(|mut more| links.append(&mut more));
+        let reassembly_losses = reassembly_losses(ebpf, layout).map(|link| links.push(link));
+        let owners = owners(ebpf, layout);
         Self {
             abilities: Abilities {
                 socket_losses,
@@ -189,17 +189,17 @@ impl Inside {
 
 fn socket_losses(
     ebpf: &mut Ebpf,
-    places: &Places,
+    layout: &KernelLayout,
     whole_host: bool,
 ) -> Result<Vec<RawTracePointLink>, String> {
-    if !whole_host && let Err(reason) = places.need(&[Layout::SocketCookie]) {
+    if !whole_host && let Err(reason) = layout.need(&[Layout::SocketCookie]) {
         // A socket that the hook does not see could be taken for one that it does.
         return Err(format!("limited to one cgroup, and {reason}"));
     }
     let mut links = vec![tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")?];
-    if release().is_none_or(|release| release < TELLS_IPV6) {
+    if release().is_none_or(|release| release < REPORTS_IPV6) {
         let reasons = [Layout::ReasonBufferFull, Layout::ReasonMemory];
-        let program = if places.need(&reasons).is_ok() {
+        let program = if layout.need(&reasons).is_ok() {
             "no_room_freed"
         } else {
             "no_room_unexplained"
@@ -216,14 +216,14 @@ fn release() -> Option<(u32, u32)> {
     Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))
 }
 
-fn reassembly_losses(ebpf: &mut Ebpf, places: &Places) -> Result<RawTracePointLink, String> {
-    places.need(&[
+fn reassembly_losses(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<RawTracePointLink, String> {
+    layout.need(&[
         Layout::BufferHead,
         Layout::BufferTail,
         Layout::BufferNetworkHeader,
         Layout::BufferInterface,
     ])?;
-    let program = if places.need(&[Layout::ReasonNone]).is_ok() {
+    let program = if layout.need(&[Layout::ReasonNone]).is_ok() {
         "not_reassembled"
     } else {
         "not_reassembled_unexplained"
@@ -231,8 +231,8 @@ fn reassembly_losses(ebpf: &mut Ebpf, places: &Places) -> Result<RawTracePointLi
     tracepoint(ebpf, program, "kfree_skb")
 }
 
-fn owners(ebpf: &mut Ebpf, places: &Places) -> Result<Owners, String> {
-    places.need(&[
+fn owners(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<Owners, String> {
+    layout.need(&[
         Layout::SocketCookie,
         Layout::FileInode,
         Layout::FilePrivate,
@@ -300,20 +300,20 @@ mod tests {
 
     #[test]
     fn a_reason_names_what_the_kernel_does_not_have() {
-        let mut places = Places {
+        let mut layout = KernelLayout {
             array: [7; Layout::COUNT],
             unknown: None,
         };
         let needed = [Layout::BufferHead, Layout::ReasonTimeout];
-        assert_eq!(places.need(&needed), Ok(()));
-        places.array[Layout::ReasonTimeout as usize] = Layout::ABSENT;
-        let reason = places.need(&needed).unwrap_err();
+        assert_eq!(layout.need(&needed), Ok(()));
+        layout.array[Layout::ReasonTimeout as usize] = Layout::ABSENT;
+        let reason = layout.need(&needed).unwrap_err();
         assert_eq!(
             reason,
             "this kernel has no skb_drop_reason SKB_DROP_REASON_FRAG_REASM_TIMEOUT"
         );
-        assert_eq!(places.need(&[Layout::BufferHead]), Ok(()));
-        let unknown = Places::unknown("no types".to_owned());
+        assert_eq!(layout.need(&[Layout::BufferHead]), Ok(()));
+        let unknown = KernelLayout::unknown("no types".to_owned());
         assert_eq!(unknown.need(&needed), Err("no types".to_owned()));
     }
 }

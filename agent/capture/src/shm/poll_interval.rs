@@ -70,7 +70,7 @@ pub struct Budget {
 
 /// The sleeps.
 #[derive(Debug)]
-pub struct Pace {
+pub struct PollInterval {
     budget: Budget,
     need: Need,
     sleep: f64,
@@ -90,7 +90,7 @@ pub struct Pace {
     spent: (f64, f64),
 }
 
-impl Pace {
+impl PollInterval {
     /// Within these shares of a CPU.
     #[must_use]
     pub const fn new(budget: Budget) -> Self {
@@ -122,17 +122,17 @@ impl Pace {
 
     /// Somebody comes: for a moment it looks as closely as it can, while there is credit for that.
     pub fn newcomer(&mut self, now: f64) {
-        self.meet(now + NEWCOMER);
+        self.watch_closely(now + NEWCOMER);
     }
 
     /// Something was announced, and more of it may follow.
     pub fn news(&mut self, now: f64) {
-        self.meet(now + NEWS);
+        self.watch_closely(now + NEWS);
     }
 
     /// Whether it looks closely because somebody comes.
     #[must_use]
-    pub fn is_meeting(&self, now: f64) -> bool {
+    pub fn is_watching_closely(&self, now: f64) -> bool {
         now < self.meeting_until
     }
 
@@ -146,7 +146,7 @@ impl Pace {
             let (_, used) = std::mem::replace(&mut self.accounted, (now, cpu));
             self.credit -= cpu - used;
         }
-        self.was_close = self.is_meeting(now) && self.credit > 0.0;
+        self.was_close = self.is_watching_closely(now) && self.credit > 0.0;
         if self.was_close {
             self.sleep = MEETING;
             if found > 0 && self.has_company {
@@ -208,7 +208,7 @@ impl Pace {
         Duration::from_secs_f64(if now < self.awake_until { SOON } else { EVERY })
     }
 
-    fn meet(&mut self, until: f64) {
+    fn watch_closely(&mut self, until: f64) {
         if self.credit > 0.0 {
             self.meeting_until = self.meeting_until.max(until);
         }
@@ -246,7 +246,7 @@ mod tests {
     /// Runs for `seconds` with a look costing `cost`; the share of CPU over the second half, and
     /// the looks in it.
     fn run(
-        pace: &mut Pace,
+        interval: &mut PollInterval,
         seconds: f64,
         cost: f64,
         need: Need,
@@ -254,7 +254,7 @@ mod tests {
     ) -> (f64, f64) {
         let (mut now, mut cpu, mut looks, mut half) = (0.0, 0.0, 0_u32, (0.0, 0.0));
         while now < seconds {
-            let slept = pace.sleep(now, cpu, found(now), need);
+            let slept = interval.sleep(now, cpu, found(now), need);
             now += slept.as_secs_f64() + cost;
             cpu += cost;
             if now >= seconds / 2.0 {
@@ -273,11 +273,11 @@ mod tests {
         for budget in [0.005, 0.015, 0.1] {
             for cost in [5e-6, 25e-6, 200e-6] {
                 for burst in [0, 1, 40] {
-                    let mut pace = Pace::new(Budget {
+                    let mut interval = PollInterval::new(Budget {
                         watching: budget,
                         every: 1.0,
                     });
-                    let (share, _) = run(&mut pace, 20.0, cost, Need::Watching, |_| burst);
+                    let (share, _) = run(&mut interval, 20.0, cost, Need::Watching, |_| burst);
                     // A look that costs 200 us at every 50 ms is 0.4 %: less is not to be had.
                     assert!(share <= budget * 1.1, "{budget} {cost} {burst}: {share}");
                 }
@@ -287,36 +287,38 @@ mod tests {
 
     #[test]
     fn it_looks_a_thousand_times_a_second_while_it_may() {
-        let mut pace = Pace::new(BUDGET);
+        let mut interval = PollInterval::new(BUDGET);
         let busy = |now: f64| usize::from(now % 1.0 < 0.01);
-        let (_, looks) = run(&mut pace, 10.0, 5e-6, Need::Watching, busy);
+        let (_, looks) = run(&mut interval, 10.0, 5e-6, Need::Watching, busy);
         assert!(looks > 900.0, "{looks}");
     }
 
     #[test]
     fn where_little_is_needed_it_looks_seldom() {
-        let looks = |need| {
-            let mut pace = Pace::new(BUDGET);
-            run(&mut pace, 20.0, 5e-6, need, |_| 0).1
+        let polls = |need| {
+            let mut interval = PollInterval::new(BUDGET);
+            run(&mut interval, 20.0, 5e-6, need, |_| 0).1
         };
-        assert!((9.0..11.0).contains(&looks(Need::Nothing)));
-        assert!((90.0..110.0).contains(&looks(Need::Watching)));
-        assert!((90.0..110.0).contains(&looks(Need::Names)));
+        assert!((9.0..11.0).contains(&polls(Need::Nothing)));
+        assert!((90.0..110.0).contains(&polls(Need::Watching)));
+        assert!((90.0..110.0).contains(&polls(Need::Names)));
     }
 
     #[test]
     fn when_somebody_comes_it_looks_closely_but_not_for_ever() {
-        let mut pace = Pace::new(BUDGET);
-        pace.newcomer(100.0);
-        let look = |pace: &mut Pace, now, cpu| pace.sleep(now, cpu, 0, Need::Nothing).as_micros();
-        assert_eq!(look(&mut pace, 100.01, 0.0), 10);
-        assert_eq!(look(&mut pace, 100.2, 0.0), 10);
-        assert!(look(&mut pace, 100.6, 0.0) > 10);
+        let mut interval = PollInterval::new(BUDGET);
+        interval.newcomer(100.0);
+        let microseconds = |interval: &mut PollInterval, now, cpu| {
+            interval.sleep(now, cpu, 0, Need::Nothing).as_micros()
+        };
+        assert_eq!(microseconds(&mut interval, 100.01, 0.0), 10);
+        assert_eq!(microseconds(&mut interval, 100.2, 0.0), 10);
+        assert!(microseconds(&mut interval, 100.6, 0.0) > 10);
         // Somebody comes all the time, and close looks take a third of a CPU.
         let (mut now, mut cpu) = (101.0, 0.0);
         while now < 201.0 {
-            pace.newcomer(now);
-            let close = look(&mut pace, now, cpu) == 10;
+            interval.newcomer(now);
+            let close = microseconds(&mut interval, now, cpu) == 10;
             now += 0.01;
             cpu += if close { 0.003 } else { 0.0 };
         }
@@ -327,56 +329,61 @@ mod tests {
     #[test]
     fn after_each_message_of_a_newcomer_it_stays_awake_where_others_have_a_cpu() {
         for cpus in [1, 2] {
-            let mut pace = Pace::new(BUDGET).on(cpus);
-            pace.newcomer(100.0);
-            let mut look = |now, found| pace.sleep(now, 0.0, found, Need::Names).as_micros();
+            let mut interval = PollInterval::new(BUDGET).on(cpus);
+            interval.newcomer(100.0);
+            let mut microseconds =
+                |now, found| interval.sleep(now, 0.0, found, Need::Names).as_micros();
             let awake = if cpus > 1 { 0 } else { 10 };
-            assert_eq!(look(100.0, 0), 10);
-            assert_eq!(look(100.001, 1), awake);
-            assert_eq!(look(100.001_1, 0), awake);
-            assert_eq!(look(100.001_3, 0), 10);
+            assert_eq!(microseconds(100.0, 0), 10);
+            assert_eq!(microseconds(100.001, 1), awake);
+            assert_eq!(microseconds(100.001_1, 0), awake);
+            assert_eq!(microseconds(100.001_3, 0), 10);
         }
     }
 
     #[test]
     fn while_every_message_is_wanted_it_looks_every_50_us_within_a_budget_of_its_own() {
         let idle = |_: f64| 0;
-        let mut pace = Pace::new(BUDGET).on(2);
-        let (share, looks) = run(&mut pace, 10.0, 8e-6, Need::Every, idle);
+        let mut interval = PollInterval::new(BUDGET).on(2);
+        let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);
         assert!(looks > 15_000.0 && share < 0.16, "{looks} {share}");
         // A hundred thousand messages a second, and looks that cost much.
         for cost in [8e-6, 60e-6] {
-            let mut pace = Pace::new(BUDGET).on(2);
-            (pace.need, pace.savings) = (Need::Every, 0.0);
-            let (share, looks) = run(&mut pace, 20.0, cost, Need::Every, |_| 10);
+            let mut interval = PollInterval::new(BUDGET).on(2);
+            (interval.need, interval.savings) = (Need::Every, 0.0);
+            let (share, looks) = run(&mut interval, 20.0, cost, Need::Every, |_| 10);
             assert!(share <= 0.27 && looks > 2000.0, "{cost} {share} {looks}");
             // Nobody wants them any more: what was learnt of the cost does not carry over.
-            let first = pace.sleep(30.0, 9.0, 1, Need::Watching);
+            let first = interval.sleep(30.0, 9.0, 1, Need::Watching);
             assert!(first <= Duration::from_micros(500), "{first:?}");
         }
     }
 
     #[test]
     fn after_a_message_that_is_wanted_it_looks_again_soon_while_the_budget_allows_it() {
-        let mut pace = Pace::new(BUDGET).on(2);
-        let mut look = |now, cpu, found| pace.sleep(now, cpu, found, Need::Every).as_micros();
-        assert_eq!(look(1.0, 0.0, 0), 50);
-        assert_eq!(look(1.001, 0.0, 1), 20);
-        assert_eq!(look(1.001_1, 0.0, 0), 20);
-        assert_eq!(look(1.001_3, 0.0, 0), 50);
+        let mut interval = PollInterval::new(BUDGET).on(2);
+        let mut microseconds =
+            |now, cpu, found| interval.sleep(now, cpu, found, Need::Every).as_micros();
+        assert_eq!(microseconds(1.0, 0.0, 0), 50);
+        assert_eq!(microseconds(1.001, 0.0, 1), 20);
+        assert_eq!(microseconds(1.001_1, 0.0, 0), 20);
+        assert_eq!(microseconds(1.001_3, 0.0, 0), 50);
         // What was saved is spent, and saved again.
-        assert_eq!(look(1.5, 7.0, 1), 75);
-        assert_eq!(look(4.5, 7.0, 1), 20);
+        assert_eq!(microseconds(1.5, 7.0, 1), 75);
+        assert_eq!(microseconds(4.5, 7.0, 1), 20);
     }
 
     #[test]
     fn a_burst_is_followed_closely_and_then_left_alone() {
-        let mut pace = Pace::new(BUDGET);
-        assert_eq!(pace.sleep(0.01, 0.0, 5, Need::Watching).as_micros(), 100);
+        let mut interval = PollInterval::new(BUDGET);
+        assert_eq!(
+            interval.sleep(0.01, 0.0, 5, Need::Watching).as_micros(),
+            100
+        );
         let mut last = Duration::ZERO;
         for step in 0..10 {
             let now = 0.01 + f64::from(step) * 1e-3;
-            let slept = pace.sleep(now, 0.0, 0, Need::Watching);
+            let slept = interval.sleep(now, 0.0, 0, Need::Watching);
             assert!(slept >= last);
             last = slept;
         }

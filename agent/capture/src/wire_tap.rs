@@ -34,7 +34,7 @@ const RECORDS_PER_ROUND: usize = 32_768;
 
 /// Why an interface cannot be looked at, or no longer.
 #[derive(Debug, thiserror::Error)]
-pub enum TapError {
+pub enum WireTapError {
     /// The kernel filter.
     #[error(transparent)]
     Filter(#[from] FilterError),
@@ -48,7 +48,7 @@ pub enum TapError {
 
 /// Which interfaces of a namespace are looked at, and with how much memory.
 #[derive(Clone, Debug)]
-pub struct WireSettings {
+pub struct WireTapSettings {
     /// Which interfaces.
     pub selection: Selection,
     /// Bytes of the packet ring.
@@ -73,9 +73,9 @@ pub struct WireTap {
     selection: Selection,
     /// Frames captured by interface index.
     packets: BTreeMap<u32, u64>,
-    intake: Intake,
+    frames: FrameAssembly,
     refused_interfaces: u64,
-    named: Named,
+    included: IncludedInterfaces,
 }
 
 impl WireTap {
@@ -86,10 +86,10 @@ impl WireTap {
     /// # Errors
     /// A capability is missing, or the kernel refuses.
     pub fn open(
-        settings: &WireSettings,
+        settings: &WireTapSettings,
         number: u32,
         path: Option<PathBuf>,
-    ) -> Result<Self, TapError> {
+    ) -> Result<Self, WireTapError> {
         let selection = settings.selection.clone();
         let mut filter = Filter::load(&FilterSettings {
             record_ring_bytes: u32::try_from(settings.record_ring_bytes).unwrap_or(u32::MAX >> 1),
@@ -100,8 +100,8 @@ impl WireTap {
         for interface in interfaces.iter() {
             filter.accept_interface(interface.index, selection.accepts(&interface.name))?;
         }
-        let mut named = Named::default();
-        named.look(&selection, &interfaces);
+        let mut included = IncludedInterfaces::default();
+        included.update(&selection, &interfaces);
         let ring = Ring::open(
             ring::Settings::with_memory(settings.ring_bytes),
             Some(filter.program()),
@@ -115,7 +115,7 @@ impl WireTap {
             interfaces,
             selection,
             packets: BTreeMap::new(),
-            intake: Intake {
+            frames: FrameAssembly {
                 number,
                 reassembly: Reassembly::new(settings.reassembly),
                 ahead: Ahead::default(),
@@ -123,7 +123,7 @@ impl WireTap {
                 copied_bytes: 0,
             },
             refused_interfaces: 0,
-            named,
+            included,
         })
     }
 
@@ -135,7 +135,7 @@ impl WireTap {
 
     /// Logs when another namespace is at the path by now, or none: its frames are not seen, and
     /// entering it would take privileges that were given up. Logs when the first one is there again.
-    pub fn look_for_namespace(&mut self) {
+    pub fn check_namespace(&mut self) {
         let Some(path) = &self.path else { return };
         let is_gone = identity(path) != self.identity;
         if is_gone == self.is_gone {
@@ -163,7 +163,7 @@ impl WireTap {
                  current one"
             ));
         }
-        let interface = self.named.missing()?;
+        let interface = self.included.missing()?;
         Some(match &self.path {
             Some(path) => format!(
                 "the interface {interface} of the network namespace {} is gone",
@@ -187,23 +187,23 @@ impl WireTap {
     ///
     /// # Errors
     /// The kernel refuses to go on.
-    pub fn take_in(&mut self, clocks: &Clocks, observer: &mut Observer) -> Result<(), TapError> {
+    pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) -> Result<(), WireTapError> {
         self.follow_interfaces();
         self.take_frames(clocks, observer)?;
-        self.intake.take_records(&mut self.filter);
+        self.frames.take_records(&mut self.filter);
         let stalled = clocks.monotonic.saturating_sub(STALLED_NANOSECONDS);
-        self.intake.take_stalled(&mut self.filter, stalled);
+        self.frames.take_stalled(&mut self.filter, stalled);
         let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
-        self.intake.deliver(clocks, settled, observer);
-        self.intake.advance(clocks);
+        self.frames.deliver(clocks, settled, observer);
+        self.frames.advance(clocks);
         Ok(())
     }
 
     /// Gives the model what still waits, at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        self.intake.take_records(&mut self.filter);
-        self.intake.take_stalled(&mut self.filter, clocks.monotonic);
-        self.intake.deliver(clocks, u64::MAX, observer);
+        self.frames.take_records(&mut self.filter);
+        self.frames.take_stalled(&mut self.filter, clocks.monotonic);
+        self.frames.deliver(clocks, u64::MAX, observer);
     }
 
     /// The kernel filter.
@@ -233,34 +233,34 @@ impl WireTap {
     ///
     /// # Errors
     /// The kernel does not tell.
-    pub fn drops(&mut self) -> Result<u64, TapError> {
+    pub fn drops(&mut self) -> Result<u64, WireTapError> {
         Ok(self.ring.statistics()?.drops)
     }
 
     /// Bytes that came from the kernel: frames and records.
     #[must_use]
     pub const fn copied_bytes(&self) -> u64 {
-        self.intake.copied_bytes
+        self.frames.copied_bytes
     }
 
     /// Fragmented datagrams that were begun and never became complete: the kernel filter's and
     /// those reassembled here.
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
-        let reassembly = self.intake.reassembly.counters();
-        self.intake.ahead.given_up() + reassembly.evicted + reassembly.timed_out
+        let reassembly = self.frames.reassembly.counters();
+        self.frames.ahead.given_up() + reassembly.evicted + reassembly.timed_out
     }
 
     /// Bytes held for reassembly.
     #[must_use]
     pub const fn reassembly_bytes(&self) -> usize {
-        self.intake.reassembly.bytes()
+        self.frames.reassembly.bytes()
     }
 
     /// Datagrams given up for want of room.
     #[must_use]
     pub const fn reassembly_evicted(&self) -> u64 {
-        self.intake.reassembly.counters().evicted
+        self.frames.reassembly.counters().evicted
     }
 
     /// Interfaces that the kernel filter could not be told of.
@@ -274,7 +274,7 @@ impl WireTap {
     fn follow_interfaces(&mut self) {
         let changes = self.interfaces.changes().unwrap_or_default();
         if !changes.is_empty() {
-            self.named.look(&self.selection, &self.interfaces);
+            self.included.update(&self.selection, &self.interfaces);
         }
         for change in changes {
             let told = match change {
@@ -295,7 +295,11 @@ impl WireTap {
 
     /// What frames announce the model gets at once, what they count for in its turn. Before each
     /// frame it gets what is older: a writer's last samples count before its farewell is read.
-    fn take_frames(&mut self, clocks: &Clocks, observer: &mut Observer) -> Result<(), TapError> {
+    fn take_frames(
+        &mut self,
+        clocks: &Clocks,
+        observer: &mut Observer,
+    ) -> Result<(), WireTapError> {
         // Clears what the socket reports when a link goes down; without, waiting would never wait.
         self.ring.wait(Duration::ZERO)?;
         // No more than the ring holds: a flood must not keep us from everything else.
@@ -303,11 +307,11 @@ impl WireTap {
             let Some(block) = self.ring.block() else {
                 break;
             };
-            self.intake.take_records(&mut self.filter);
+            self.frames.take_records(&mut self.filter);
             let mut frames = block.frames();
             for captured in frames.by_ref() {
                 *self.packets.entry(captured.interface).or_default() += 1;
-                if let Err(error) = self.intake.frame(clocks, &captured, observer) {
+                if let Err(error) = self.frames.frame(clocks, &captured, observer) {
                     observer.decode_error("frame", error.reason);
                 }
             }
@@ -321,10 +325,10 @@ impl WireTap {
 
 /// Interfaces that the configuration names and that were there, with whether they are now.
 #[derive(Debug, Default)]
-struct Named(BTreeMap<String, bool>);
+struct IncludedInterfaces(BTreeMap<String, bool>);
 
-impl Named {
-    fn look(&mut self, selection: &Selection, interfaces: &Interfaces) {
+impl IncludedInterfaces {
+    fn update(&mut self, selection: &Selection, interfaces: &Interfaces) {
         let there: BTreeSet<_> = interfaces.iter().map(|it| it.name.as_str()).collect();
         for (name, was_there) in &mut self.0 {
             let is_there = there.contains(name.as_str());
@@ -347,7 +351,7 @@ impl Named {
 }
 
 /// One tap's frames and records on their way to the model.
-struct Intake {
+struct FrameAssembly {
     number: u32,
     reassembly: Reassembly,
     ahead: Ahead,
@@ -356,7 +360,7 @@ struct Intake {
     copied_bytes: u64,
 }
 
-impl Intake {
+impl FrameAssembly {
     /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
     /// A flood may fill it as fast as it is emptied: what is left is taken the next time.
     fn take_records(&mut self, filter: &mut Filter) {
@@ -393,11 +397,11 @@ impl Intake {
                     FlowKey::of_handover(self.number, &record),
                 );
                 if let Some(rest) = self.reassembly.hand_over(at, key, &record) {
-                    let ready = |each| take_in(each, observer);
+                    let ready = |each| poll(each, observer);
                     self.ahead.rest(self.number, rest, ready);
                 }
             }
-            let ready = |each| take_in(each, observer);
+            let ready = |each| poll(each, observer);
             self.ahead.record(self.number, record, ready);
         }
     }
@@ -438,7 +442,7 @@ impl Intake {
             Payload::Datagram(udp) => {
                 (envelope.source_port, envelope.destination_port) =
                     (udp.source_port, udp.destination_port);
-                take_in_frame(&envelope, udp.payload, clocks, &mut self.order, observer);
+                decode_frame(&envelope, udp.payload, clocks, &mut self.order, observer);
             }
             Payload::Fragment(fragment) => {
                 let key =
@@ -447,14 +451,14 @@ impl Intake {
                     return Ok(());
                 };
                 if whole.handover.is_some() {
-                    let ready = |each| take_in(each, observer);
+                    let ready = |each| poll(each, observer);
                     self.ahead.rest(self.number, whole, ready);
                 } else {
                     (envelope.source_port, envelope.destination_port) =
                         (whole.source_port, whole.destination_port);
                     envelope.fragmented = true;
                     let payload = whole.payload();
-                    take_in_frame(&envelope, payload, clocks, &mut self.order, observer);
+                    decode_frame(&envelope, payload, clocks, &mut self.order, observer);
                 }
             }
             _ => {}
@@ -464,7 +468,7 @@ impl Intake {
 }
 
 /// A captured datagram.
-fn take_in_frame(
+fn decode_frame(
     envelope: &Envelope,
     payload: &[u8],
     clocks: &Clocks,
@@ -480,14 +484,14 @@ fn take_in_frame(
 }
 
 /// What has become complete.
-fn take_in(ready: Ready, observer: &mut Observer) {
+fn poll(ready: Ready, observer: &mut Observer) {
     match ready {
         Ready::Record(record) => observer.record(&record),
-        Ready::Rest(rest) => take_in_rest(&rest, observer),
+        Ready::Rest(rest) => decode_rest(&rest, observer),
     }
 }
 
-fn take_in_rest(rest: &Reassembled, observer: &mut Observer) {
+fn decode_rest(rest: &Reassembled, observer: &mut Observer) {
     let Some(record) = rest.handover else { return };
     let envelope = Envelope::of_handover(&record, rest.last_seen);
     observer.datagram(&envelope, rest.payload(), Some(&record.handover()));
@@ -504,20 +508,20 @@ mod tests {
             let names = ["one", "never", "patt*"].map(str::to_owned);
             let selection = Selection::new(&names, &[]).unwrap();
             let mut interfaces = Interfaces::open().unwrap();
-            let mut named = Named::default();
-            let mut look = |command: &str| {
+            let mut included = IncludedInterfaces::default();
+            let mut update = |command: &str| {
                 ip(command);
                 interfaces.changes().unwrap();
-                named.look(&selection, &interfaces);
-                named.missing().map(str::to_owned)
+                included.update(&selection, &interfaces);
+                included.missing().map(str::to_owned)
             };
-            assert_eq!(look("link add one type veth peer name pattern"), None);
+            assert_eq!(update("link add one type veth peer name pattern"), None);
             let missing = Some("one".to_owned());
-            assert_eq!(look("link set one name other"), missing);
-            assert_eq!(look("link set other name one"), None);
+            assert_eq!(update("link set one name other"), missing);
+            assert_eq!(update("link set other name one"), None);
             // The other end goes with it: a pattern names no interface.
-            assert_eq!(look("link delete one"), missing);
-            assert_eq!(look("link add one type veth peer name far"), None);
+            assert_eq!(update("link delete one"), missing);
+            assert_eq!(update("link add one type veth peer name far"), None);
         });
     }
 }

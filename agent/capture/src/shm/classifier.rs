@@ -8,6 +8,7 @@ use std::collections::HashMap;
 
 use ros2probe_wire::filter::{UNKNOWN_CAPACITY, UNKNOWN_CAPTURE_BYTES};
 use ros2probe_wire::record::{Record, Verdict, guid_words, kind};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Bytes, Fate, MAGIC, Step, Walk};
 use ros2probe_wire::{EntityId, Guid};
 
@@ -16,11 +17,10 @@ const SUBMESSAGES: usize = 64;
 /// What unclassified writers may cost each second, all together: bytes captured, and records.
 const CAPTURE_PER_SECOND: i64 = 4 << 20;
 const RECORDS_PER_SECOND: i64 = 4096;
-const SECOND: u64 = 1_000_000_000;
 
 /// What is to be done with a message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Judgement {
+pub enum MessageVerdict {
     /// Nothing: none of its submessages is of interest.
     Ignored,
     /// The records that were appended count.
@@ -33,7 +33,7 @@ pub enum Judgement {
 
 /// The rules, and what is wanted.
 #[derive(Debug)]
-pub struct Judge {
+pub struct MessageClassifier {
     interest: HashMap<[u32; 4], Verdict>,
     /// Bytes captured of unclassified writers.
     unknown: HashMap<[u32; 4], u32>,
@@ -47,7 +47,7 @@ pub struct Judge {
 }
 
 /// Nothing classified.
-impl Default for Judge {
+impl Default for MessageClassifier {
     fn default() -> Self {
         Self {
             interest: HashMap::new(),
@@ -61,7 +61,7 @@ impl Default for Judge {
     }
 }
 
-impl Judge {
+impl MessageClassifier {
     /// What is wanted of this writer or reader from now on; `None` = it is not classified.
     pub fn set(&mut self, guid: Guid, verdict: Option<Verdict>) {
         let key = guid_words(guid);
@@ -82,18 +82,18 @@ impl Judge {
 
     /// Judges a message of `length` bytes. Records are appended with what `template` says of the
     /// whole message; they count when the message is metered.
-    pub fn judge<B: Bytes>(
+    pub fn classify<B: Bytes>(
         &mut self,
         message: &B,
         length: u32,
         template: Record,
         records: &mut Vec<Record>,
-    ) -> Judgement {
+    ) -> MessageVerdict {
         let Some([magic, _version, source @ ..]) = message.words::<5>(0) else {
-            return Judgement::Foreign;
+            return MessageVerdict::Foreign;
         };
         if magic != MAGIC {
-            return Judgement::Foreign;
+            return MessageVerdict::Foreign;
         }
         let mut walk = Walk {
             record: template,
@@ -109,9 +109,9 @@ impl Judge {
                 Step::Endpoint | Step::LongGap => self.wanted(&walk.record, length),
                 Step::End | Step::Later | Step::Split | Step::Malformed => {
                     return if records.len() > first {
-                        Judgement::Metered
+                        MessageVerdict::Metered
                     } else {
-                        Judgement::Ignored
+                        MessageVerdict::Ignored
                     };
                 }
             };
@@ -127,12 +127,12 @@ impl Judge {
                     self.announces = is_sample && writer != EntityId::SPDP_WRITER;
                     self.is_wanted = self.interest.contains_key(&walk.record.writer);
                     records.truncate(first);
-                    return Judgement::Captured;
+                    return MessageVerdict::Captured;
                 }
             }
         }
         records.truncate(first);
-        Judgement::Captured
+        MessageVerdict::Captured
     }
 
     fn wanted(&mut self, record: &Record, length: u32) -> Verdict {
@@ -199,25 +199,25 @@ mod tests {
         bytes
     }
 
-    fn judge(judge: &mut Judge, message: &[u8]) -> (Judgement, Vec<Record>) {
+    fn classify(judge: &mut MessageClassifier, message: &[u8]) -> (MessageVerdict, Vec<Record>) {
         let mut records = Vec::new();
         let template = Record {
             flags: flag::SHM,
             ..Record::default()
         };
         let length = u32::try_from(message.len()).unwrap();
-        let judgement = judge.judge(&message, length, template, &mut records);
+        let judgement = judge.classify(&message, length, template, &mut records);
         (judgement, records)
     }
 
     #[test]
     fn every_sample_of_a_measured_writer_becomes_a_record() {
-        let mut rules = Judge::default();
+        let mut rules = MessageClassifier::default();
         rules.set(guid(WRITER), Some(Verdict::Meter));
         rules.set(guid([0, 0, 2, 3]), Some(Verdict::Ignore));
         let message = message(&[(WRITER, 7), ([0, 0, 2, 3], 1), (WRITER, 8)]);
-        let (judgement, records) = judge(&mut rules, &message);
-        assert_eq!(judgement, Judgement::Metered);
+        let (judgement, records) = classify(&mut rules, &message);
+        assert_eq!(judgement, MessageVerdict::Metered);
         let numbers: Vec<_> = records.iter().map(|one| one.sequence_number).collect();
         assert_eq!(numbers, [7, 8]);
         assert!(records.iter().all(|record| {
@@ -230,45 +230,48 @@ mod tests {
 
     #[test]
     fn discovery_is_captured_whatever_else_there_is() {
-        let mut rules = Judge::default();
+        let mut rules = MessageClassifier::default();
         rules.set(guid(WRITER), Some(Verdict::Meter));
         let participant = message(&[(WRITER, 1), ([0, 1, 0, 0xc2], 1)]);
         assert_eq!(
-            judge(&mut rules, &participant),
-            (Judgement::Captured, vec![])
+            classify(&mut rules, &participant),
+            (MessageVerdict::Captured, vec![])
         );
         assert!(!rules.announces);
         let endpoint = message(&[(WRITER, 1), ([0, 0, 3, 0xc2], 1)]);
-        assert_eq!(judge(&mut rules, &endpoint).0, Judgement::Captured);
+        assert_eq!(classify(&mut rules, &endpoint).0, MessageVerdict::Captured);
         assert!(rules.announces && !rules.is_wanted);
         rules.set(guid(WRITER), Some(Verdict::Capture));
         let read = message(&[(WRITER, 2)]);
-        assert_eq!(judge(&mut rules, &read).0, Judgement::Captured);
+        assert_eq!(classify(&mut rules, &read).0, MessageVerdict::Captured);
         assert!(rules.announces && rules.is_wanted);
     }
 
     #[test]
     fn what_is_of_no_interest_or_no_rtps_is_left_alone() {
-        let mut rules = Judge::default();
+        let mut rules = MessageClassifier::default();
         rules.set(guid(WRITER), Some(Verdict::Ignore));
         assert_eq!(
-            judge(&mut rules, &message(&[(WRITER, 1)])).0,
-            Judgement::Ignored
+            classify(&mut rules, &message(&[(WRITER, 1)])).0,
+            MessageVerdict::Ignored
         );
-        assert_eq!(judge(&mut rules, b"RTPX").0, Judgement::Foreign);
-        assert_eq!(judge(&mut rules, &[0; 100]).0, Judgement::Foreign);
-        assert_eq!(judge(&mut rules, &message(&[])).0, Judgement::Ignored);
+        assert_eq!(classify(&mut rules, b"RTPX").0, MessageVerdict::Foreign);
+        assert_eq!(classify(&mut rules, &[0; 100]).0, MessageVerdict::Foreign);
+        assert_eq!(
+            classify(&mut rules, &message(&[])).0,
+            MessageVerdict::Ignored
+        );
     }
 
     #[test]
     fn an_unknown_writer_is_captured_then_metered_then_nothing() {
-        let mut rules = Judge::default();
+        let mut rules = MessageClassifier::default();
         let message = message(&[(WRITER, 1)]);
         let mut counts = [0; 3];
         for _ in 0..UNKNOWN_CAPTURE_BYTES {
-            counts[match judge(&mut rules, &message).0 {
-                Judgement::Captured => 0,
-                Judgement::Metered => 1,
+            counts[match classify(&mut rules, &message).0 {
+                MessageVerdict::Captured => 0,
+                MessageVerdict::Metered => 1,
                 _ => 2,
             }] += 1;
         }
@@ -280,19 +283,19 @@ mod tests {
         assert_eq!(i64::from(metered), RECORDS_PER_SECOND);
         assert!(ignored > 0);
         rules.refill(SECOND);
-        assert_eq!(judge(&mut rules, &message).0, Judgement::Metered);
+        assert_eq!(classify(&mut rules, &message).0, MessageVerdict::Metered);
         rules.set(guid(WRITER), Some(Verdict::Ignore));
-        assert_eq!(judge(&mut rules, &message).0, Judgement::Ignored);
+        assert_eq!(classify(&mut rules, &message).0, MessageVerdict::Ignored);
     }
 
     #[test]
     fn a_flood_of_invented_writers_stays_within_the_budget() {
-        let mut rules = Judge::default();
+        let mut rules = MessageClassifier::default();
         let mut captured = 0;
         for writer in 0..200_000_u32 {
             let [_, a, b, c] = writer.to_be_bytes();
             let message = message(&[([a, b, c, 3], 1)]);
-            if judge(&mut rules, &message).0 == Judgement::Captured {
+            if classify(&mut rules, &message).0 == MessageVerdict::Captured {
                 captured += message.len();
             }
         }

@@ -17,7 +17,7 @@ const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
 
 /// Datagrams of which not all pieces have come, the oldest first.
 #[derive(Debug, Default)]
-pub struct Wholes {
+pub struct PieceAssembler {
     open: VecDeque<Open>,
     given_up: u64,
 }
@@ -28,7 +28,7 @@ struct Open {
     bytes: Vec<u8>,
 }
 
-impl Wholes {
+impl PieceAssembler {
     /// Takes in a piece and the bytes that follow it; gives the datagram when it is whole, with its
     /// first piece.
     pub fn piece<'a>(&mut self, piece: &Piece, bytes: &'a [u8]) -> Option<(Piece, Cow<'a, [u8]>)> {
@@ -150,7 +150,7 @@ mod tests {
 
     #[test]
     fn a_datagram_in_one_piece_is_not_copied() {
-        let mut wholes = Wholes::default();
+        let mut wholes = PieceAssembler::default();
         let (piece, bytes) = pieces(1, 1472).remove(0);
         let whole = wholes.piece(&piece, &bytes).unwrap();
         assert!(matches!(whole.1, Cow::Borrowed(same) if same == bytes));
@@ -158,7 +158,7 @@ mod tests {
 
     #[test]
     fn the_largest_datagrams_of_two_cpus_come_whole_when_their_pieces_mingle() {
-        let mut wholes = Wholes::default();
+        let mut wholes = PieceAssembler::default();
         let (one, two) = (pieces(1, 65_507), pieces(2, 65_507));
         assert_eq!(one.len(), 4);
         let mut complete = Vec::new();
@@ -176,7 +176,7 @@ mod tests {
 
     #[test]
     fn one_whose_rest_never_comes_is_given_up_once() {
-        let mut wholes = Wholes::default();
+        let mut wholes = PieceAssembler::default();
         let all = pieces(1, 40_000);
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         // The second had no room.
@@ -194,7 +194,7 @@ mod tests {
 
     #[test]
     fn a_token_that_comes_again_begins_anew() {
-        let mut wholes = Wholes::default();
+        let mut wholes = PieceAssembler::default();
         let (old, new) = (pieces(1, 40_000), pieces(1, 20_000));
         assert!(wholes.piece(&old[0].0, &old[0].1).is_none());
         assert!(wholes.piece(&new[0].0, &new[0].1).is_none());
@@ -205,7 +205,7 @@ mod tests {
 
     #[test]
     fn more_than_there_is_room_for_push_out_the_oldest() {
-        let mut wholes = Wholes::default();
+        let mut wholes = PieceAssembler::default();
         for token in 0..1000 {
             let all = pieces(token, 65_507);
             assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
@@ -223,7 +223,7 @@ mod tests {
             ),
         ) {
             let lens: [u32; 3] = [20_000, 40_000, 65_507];
-            let mut wholes = Wholes::default();
+            let mut wholes = PieceAssembler::default();
             for (token, step, damage, len) in sequence {
                 let datagram_len = lens[len as usize];
                 let offset = step * PIECE_BYTES;

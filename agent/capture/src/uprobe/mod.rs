@@ -15,10 +15,10 @@ use std::os::fd::BorrowedFd;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-use self::search::{Facts, Search};
+use self::search::{Facts, LibrarySearch};
 use super::filter::{Filter, FilterError, FilterSettings};
-use super::intake::Intake;
-use super::shm::scan::Scope;
+use super::filter_reader::FilterReader;
+use super::shm::directories::Scope;
 use super::system::Clocks;
 use crate::threads::Spawn;
 use caps::{CapSet, Capability, CapsHashSet};
@@ -30,7 +30,7 @@ const RECORD_RINGS: usize = 4;
 
 /// Why messages are not seen in the processes that send them.
 #[derive(Debug, thiserror::Error)]
-pub enum ExactError {
+pub enum UprobeError {
     /// Breakpoints in other processes, and looking which processes there are.
     #[error("it needs {0}")]
     Missing(String),
@@ -78,13 +78,13 @@ fn missing() -> Vec<&'static str> {
 }
 
 /// The kernel programs and the thread that attaches them.
-pub struct Exact {
-    intake: Intake,
-    search: Search,
+pub struct Uprobe {
+    reader: FilterReader,
+    search: LibrarySearch,
     was_attached: bool,
 }
 
-impl Exact {
+impl Uprobe {
     /// Loads the programs. Attaches them to installed libraries, or with `on_demand` to none before
     /// [`Self::want`]. `cgroup`: only for processes of this control group.
     ///
@@ -95,10 +95,10 @@ impl Exact {
         ring_bytes: usize,
         record_ring_bytes: usize,
         on_demand: bool,
-    ) -> Result<Self, ExactError> {
+    ) -> Result<Self, UprobeError> {
         let missing = missing();
         if !missing.is_empty() {
-            return Err(ExactError::Missing(missing.join(" and ")));
+            return Err(UprobeError::Missing(missing.join(" and ")));
         }
         let within = cgroup.map(inode).transpose()?;
         let size = |bytes| u32::try_from(bytes).unwrap_or(u32::MAX >> 1);
@@ -107,15 +107,17 @@ impl Exact {
             piece_ring_bytes: size(ring_bytes),
             ..FilterSettings::default()
         };
-        let loaded = Filter::load_handed(&settings, within);
+        let loaded = Filter::load_uprobe(&settings, within);
         let (filter, probes) = loaded.map_err(|error| match error {
-            FilterError::Program(_) if within.is_some() => ExactError::Scope(error),
+            FilterError::Program(_) if within.is_some() => UprobeError::Scope(error),
             error => error.into(),
         })?;
-        let scope = cgroup.map_or(Scope::Everybody, |path| Scope::Cgroup(path.to_path_buf()));
+        let scope = cgroup.map_or(Scope::AllProcesses, |path| {
+            Scope::Cgroup(path.to_path_buf())
+        });
         Ok(Self {
-            intake: Intake::new(filter),
-            search: Search::new(probes, scope, on_demand),
+            reader: FilterReader::new(filter),
+            search: LibrarySearch::new(probes, scope, on_demand),
             was_attached: false,
         })
     }
@@ -131,7 +133,7 @@ impl Exact {
 
     /// Readable when a ring is half full.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
-        self.intake.descriptors()
+        self.reader.descriptors()
     }
 
     /// Whether every sample is wanted of a writer that may send into shared memory. Matters where
@@ -142,11 +144,11 @@ impl Exact {
 
     /// Gives the model what was found, and once the programs are no longer attached, that nothing
     /// more is found.
-    pub fn take_in(&mut self, clocks: &Clocks, observer: &mut Observer) {
+    pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         let is_attached = self.search.is_attached();
-        self.intake.take_in(clocks, observer);
+        self.reader.poll(clocks, observer);
         if self.was_attached && !is_attached {
-            self.intake.drain(clocks, observer);
+            self.reader.drain(clocks, observer);
             observer.seen_exactly_no_longer();
         }
         self.was_attached = is_attached;
@@ -154,24 +156,24 @@ impl Exact {
 
     /// Gives the model what still waits, at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
-        self.intake.drain(clocks, observer);
+        self.reader.drain(clocks, observer);
     }
 
     /// The kernel programs' maps.
     #[must_use]
     pub const fn filter(&self) -> &Filter {
-        self.intake.filter()
+        self.reader.filter()
     }
 
     /// The kernel programs' maps, to tell them what is of interest.
     pub const fn filter_mut(&mut self) -> &mut Filter {
-        self.intake.filter_mut()
+        self.reader.filter_mut()
     }
 
     /// What was taken in so far.
     #[must_use]
-    pub const fn intake(&self) -> &Intake {
-        &self.intake
+    pub const fn reader(&self) -> &FilterReader {
+        &self.reader
     }
 
     /// What is attached, and what is not covered.
@@ -188,9 +190,9 @@ impl Exact {
 }
 
 /// A control group's number: the inode of its directory.
-fn inode(path: &Path) -> Result<u64, ExactError> {
+fn inode(path: &Path) -> Result<u64, UprobeError> {
     let metadata = File::open(path).and_then(|directory| directory.metadata());
-    let metadata = metadata.map_err(|source| ExactError::Cgroup {
+    let metadata = metadata.map_err(|source| UprobeError::Cgroup {
         path: path.to_path_buf(),
         source,
     })?;

@@ -11,14 +11,14 @@ pub const SHARE: u64 = 100;
 
 /// CPU time for listings that is left.
 #[derive(Debug)]
-pub struct Allowance {
+pub struct CpuAllowance {
     /// Nanoseconds; below zero what was spent too much.
     left: i64,
     /// When that was so, on the monotonic clock.
     at: u64,
 }
 
-impl Default for Allowance {
+impl Default for CpuAllowance {
     fn default() -> Self {
         Self {
             left: SAVINGS.cast_signed(),
@@ -27,7 +27,7 @@ impl Default for Allowance {
     }
 }
 
-impl Allowance {
+impl CpuAllowance {
     /// Whether anything is left at `now`, in nanoseconds of the monotonic clock.
     pub fn is_left(&mut self, now: u64) -> bool {
         let gained = now.saturating_sub(self.at) / SHARE;
@@ -49,12 +49,12 @@ impl Allowance {
 mod tests {
     use super::*;
 
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
 
     #[test]
     fn listings_that_are_always_wanted_cost_no_more_than_their_share() {
         for cost in [1_000, 3_000_000, 700_000_000] {
-            let (mut allowance, mut now, mut spent) = (Allowance::default(), SECOND, 0);
+            let (mut allowance, mut now, mut spent) = (CpuAllowance::default(), SECOND, 0);
             while now < 101 * SECOND {
                 if allowance.is_left(now) {
                     allowance.spend(cost);

@@ -8,7 +8,7 @@ use std::fs::{self, File};
 use std::io::{self, Read as _};
 use std::path::PathBuf;
 
-use crate::shm::scan::Scope;
+use crate::shm::directories::Scope;
 
 /// Names of the library: Fast DDS 2.x, 3.x. A version may follow.
 const LIBRARIES: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];
@@ -285,7 +285,7 @@ mod tests {
 
     #[test]
     fn this_process_is_met_and_uses_none_of_it() {
-        let mut processes = Processes::new(Scope::Everybody);
+        let mut processes = Processes::new(Scope::AllProcesses);
         processes.find(true);
         let own = std::process::id();
         assert!(processes.known.contains_key(&own));

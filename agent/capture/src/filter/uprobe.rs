@@ -41,7 +41,7 @@ impl Filter {
     ///
     /// # Errors
     /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses them.
-    pub fn load_handed(
+    pub fn load_uprobe(
         settings: &FilterSettings,
         within: Option<u64>,
     ) -> Result<(Self, Probes), FilterError> {

@@ -15,7 +15,7 @@ const ROOT_INODE: u64 = 1;
 
 /// Why there is no control group to attach to.
 #[derive(Debug, thiserror::Error)]
-pub enum HierarchyError {
+pub enum CgroupError {
     /// The list of mounts.
     #[error("cannot read {MOUNTS}")]
     Mounts(#[source] io::Error),
@@ -51,7 +51,7 @@ impl Cgroup {
     ///
     /// # Errors
     /// None is mounted.
-    pub fn topmost() -> Result<Self, HierarchyError> {
+    pub fn topmost() -> Result<Self, CgroupError> {
         Self::open(&mount_point()?)
     }
 
@@ -59,8 +59,8 @@ impl Cgroup {
     ///
     /// # Errors
     /// It does not exist or is none.
-    pub fn open(path: &Path) -> Result<Self, HierarchyError> {
-        let failed = |source| HierarchyError::Open {
+    pub fn open(path: &Path) -> Result<Self, CgroupError> {
+        let failed = |source| CgroupError::Open {
             path: path.to_path_buf(),
             source,
         };
@@ -70,7 +70,7 @@ impl Cgroup {
         // no more than "bad file descriptor".
         if !path.join("cgroup.controllers").exists() {
             let path = path.to_path_buf();
-            return Err(HierarchyError::Other { path });
+            return Err(CgroupError::Other { path });
         }
         Ok(Self {
             path: path.to_path_buf(),
@@ -103,9 +103,9 @@ impl Cgroup {
 ///
 /// # Errors
 /// Nowhere.
-pub fn mount_point() -> Result<PathBuf, HierarchyError> {
-    let mounts = fs::read(MOUNTS).map_err(HierarchyError::Mounts)?;
-    topmost(&mounts).ok_or(HierarchyError::NotMounted)
+pub fn mount_point() -> Result<PathBuf, CgroupError> {
+    let mounts = fs::read(MOUNTS).map_err(CgroupError::Mounts)?;
+    topmost(&mounts).ok_or(CgroupError::NotMounted)
 }
 
 /// Of several mounts one that shows all, that is `/` of the hierarchy.

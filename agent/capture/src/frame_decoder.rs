@@ -13,12 +13,12 @@ use ros2probe_model::reassembly::{FlowKey, Limits, Reassembly};
 
 /// One capture on its way into the core.
 #[derive(Debug)]
-pub struct Feed {
+pub struct FrameDecoder {
     reassembly: Reassembly,
     last: Timestamp,
 }
 
-impl Feed {
+impl FrameDecoder {
     /// At the beginning.
     #[must_use]
     pub fn new(limits: Limits) -> Self {

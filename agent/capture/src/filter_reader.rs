@@ -13,8 +13,8 @@ use ros2probe_wire::{Reason, Record};
 
 use super::filter::Filter;
 use super::order::{Next, Order};
+use super::piece_assembler::PieceAssembler;
 use super::system::Clocks;
-use super::whole::Wholes;
 use ros2probe_model::observer::Observer;
 
 /// Records younger than this wait for those that a run of fragments keeps back.
@@ -36,10 +36,10 @@ const RECORDS_BETWEEN: usize = 1024;
 pub const MAX_WAITING: usize = 131_072;
 
 /// One filter's maps and what they held.
-pub struct Intake {
+pub struct FilterReader {
     filter: Filter,
     order: Order,
-    wholes: Wholes,
+    pieces: PieceAssembler,
     /// Captured datagrams that wait.
     fresh: VecDeque<(Piece, Vec<u8>)>,
     datagrams: u64,
@@ -48,14 +48,14 @@ pub struct Intake {
     recorded: u64,
 }
 
-impl Intake {
+impl FilterReader {
     /// Nothing taken in yet.
     #[must_use]
     pub fn new(filter: Filter) -> Self {
         Self {
             filter,
             order: Order::default(),
-            wholes: Wholes::default(),
+            pieces: PieceAssembler::default(),
             fresh: VecDeque::new(),
             datagrams: 0,
             copied_bytes: 0,
@@ -76,7 +76,7 @@ impl Intake {
     /// is older: a writer's last samples count before its farewell is read. Where a flood leaves
     /// one ring behind, the other waits for it: what a writer's records and its captured datagrams
     /// say would otherwise come out of order, as losses that are none.
-    pub fn take_in(&mut self, clocks: &Clocks, observer: &mut Observer) {
+    pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         let recorded = self.take_records();
         let fresh = clocks.monotonic.saturating_sub(FRESH_NANOSECONDS);
         let captured = self.take_datagrams(clocks, fresh.min(recorded), observer);
@@ -87,7 +87,7 @@ impl Intake {
         while !deliver(&mut self.order, clocks, settled, observer, RECORDS_BETWEEN) {
             self.take_records();
         }
-        self.wholes.advance(clocks.monotonic);
+        self.pieces.advance(clocks.monotonic);
     }
 
     /// Gives the model what still waits, at the end.
@@ -124,14 +124,14 @@ impl Intake {
     /// Captured datagrams that never became whole.
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
-        self.wholes.given_up()
+        self.pieces.given_up()
     }
 
     /// Bytes held for them.
     #[must_use]
     pub fn waiting_bytes(&self) -> usize {
         let fresh: usize = self.fresh.iter().map(|(_, bytes)| bytes.len()).sum();
-        fresh + self.wholes.bytes()
+        fresh + self.pieces.bytes()
     }
 
     /// A flood may fill the ring as fast as it is emptied: what is left is taken the next time.
@@ -164,7 +164,7 @@ impl Intake {
     fn take_datagrams(&mut self, clocks: &Clocks, before: u64, observer: &mut Observer) -> u64 {
         while let Some((piece, bytes)) = self.fresh.pop_front_if(|(piece, _)| piece.time <= before)
         {
-            take_in_datagram(&piece, &bytes, clocks, &mut self.order, observer);
+            decode_datagram(&piece, &bytes, clocks, &mut self.order, observer);
         }
         let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
@@ -181,12 +181,12 @@ impl Intake {
             };
             self.copied_bytes += (size_of::<Piece>() + bytes.len()) as u64;
             newest = piece.time;
-            let Some((piece, bytes)) = self.wholes.piece(&piece, bytes) else {
+            let Some((piece, bytes)) = self.pieces.piece(&piece, bytes) else {
                 continue;
             };
             self.datagrams += 1;
             if piece.time <= before && self.fresh.is_empty() {
-                take_in_datagram(&piece, &bytes, clocks, &mut self.order, observer);
+                decode_datagram(&piece, &bytes, clocks, &mut self.order, observer);
                 continue;
             }
             // Behind those that wait: one that overtook them would let a sample count by the copies
@@ -215,7 +215,7 @@ fn deliver(
     false
 }
 
-fn take_in_datagram(
+fn decode_datagram(
     piece: &Piece,
     bytes: &[u8],
     clocks: &Clocks,

@@ -18,7 +18,7 @@ const SHARED_MEMORY: &str = "/dev/shm";
 /// File names begin with one of these: Fast DDS 2.x, 3.x.
 const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
 /// Mount namespaces with a `/dev/shm` of their own that are looked at.
-const MAX_PLACES: usize = 64;
+const MAX_DIRECTORIES: usize = 64;
 /// Files of one of them.
 const MAX_FILES: usize = 2048;
 /// Entries of one of them that are looked through for those.
@@ -35,7 +35,7 @@ const MAX_PROCESSES: usize = 8192;
 
 /// A directory of shared memory, by the device and inode it has.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
-pub struct PlaceId {
+pub struct ShmDirectoryId {
     device: u64,
     inode: u64,
 }
@@ -55,7 +55,7 @@ pub enum Name {
 
 /// One directory of shared memory.
 #[derive(Debug)]
-pub struct Place {
+pub struct ShmDirectory {
     /// Where it can be reached now.
     pub path: PathBuf,
     /// Files by name, with their inodes.
@@ -68,7 +68,7 @@ pub struct Place {
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Scope {
     /// The agent's own, and that of every process.
-    Everybody,
+    AllProcesses,
     /// That of the processes of this cgroup and those below it.
     Cgroup(PathBuf),
     /// The agent's own, and that of processes in these network namespaces.
@@ -79,14 +79,14 @@ pub enum Scope {
 
 /// All of them.
 #[derive(Debug)]
-pub struct Places {
+pub struct ShmDirectories {
     scope: Scope,
     /// Inodes of the network namespaces, where those are the scope.
     networks: Vec<u64>,
     /// By identity.
-    pub places: HashMap<PlaceId, Place>,
+    pub directories: HashMap<ShmDirectoryId, ShmDirectory>,
     /// Processes gone through, with the place they have and how often they were met.
-    processes: HashMap<u32, (Option<PlaceId>, u32)>,
+    processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
     /// Places and files left out because of a cap.
     pub left_out: u64,
 }
@@ -96,7 +96,7 @@ impl Scope {
     #[must_use]
     pub fn processes(&self) -> Vec<u32> {
         match self {
-            Self::Everybody | Self::Networks(_) => all_processes(),
+            Self::AllProcesses | Self::Networks(_) => all_processes(),
             Self::Cgroup(cgroup) => {
                 let mut processes = Vec::new();
                 processes_of(cgroup, DEPTH, &mut processes);
@@ -151,7 +151,7 @@ impl Name {
     }
 }
 
-impl Places {
+impl ShmDirectories {
     /// None found yet.
     #[must_use]
     pub fn new(scope: Scope) -> Self {
@@ -162,7 +162,7 @@ impl Places {
         Self {
             scope,
             networks,
-            places: HashMap::new(),
+            directories: HashMap::new(),
             processes: HashMap::new(),
             left_out: 0,
         }
@@ -170,8 +170,8 @@ impl Places {
 
     /// Looks which places there are. What no living process reaches any more is forgotten.
     pub fn find(&mut self) {
-        for place in self.places.values_mut() {
-            place.seen = false;
+        for directory in self.directories.values_mut() {
+            directory.seen = false;
         }
         match self.scope.clone() {
             Scope::Directories(directories) => {
@@ -186,19 +186,19 @@ impl Places {
                 processes.retain(|pid| *pid != std::process::id());
                 self.go_through(processes);
             }
-            Scope::Everybody | Scope::Networks(_) => {
+            Scope::AllProcesses | Scope::Networks(_) => {
                 self.reach(Path::new(SHARED_MEMORY));
                 self.go_through(all_processes());
             }
         }
-        self.places.retain(|_, place| place.seen);
+        self.directories.retain(|_, directory| directory.seen);
     }
 
     /// Lists what changed since the last time; whether anything did.
     pub fn list(&mut self) -> bool {
         let mut any = false;
-        for place in self.places.values_mut() {
-            any |= place.list(&mut self.left_out);
+        for directory in self.directories.values_mut() {
+            any |= directory.list(&mut self.left_out);
         }
         any
     }
@@ -208,20 +208,21 @@ impl Places {
         for pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
             let is_settled = met > YOUNG && met % ROUNDS != pid % ROUNDS;
-            let place = match known.and_then(|id| self.places.get_mut(&id)) {
+            let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
                 // Its path may lead through another process, which need not live any more.
-                Some(place) if is_settled && (place.seen || place.path.exists()) => {
-                    place.seen = true;
+                Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {
+                    directory.seen = true;
                     known
                 }
                 None if is_settled => None,
-                _ => self.place_of(pid),
+                _ => self.directory_of(pid),
             };
-            self.processes.insert(pid, (place, met.saturating_add(1)));
+            self.processes
+                .insert(pid, (directory, met.saturating_add(1)));
         }
     }
 
-    fn place_of(&mut self, pid: u32) -> Option<PlaceId> {
+    fn directory_of(&mut self, pid: u32) -> Option<ShmDirectoryId> {
         if matches!(self.scope, Scope::Networks(_)) {
             let network = inode(Path::new(&format!("/proc/{pid}/ns/net")))?;
             if !self.networks.contains(&network) {
@@ -236,26 +237,26 @@ impl Places {
         is_plain.then(|| self.reach(&within)).flatten()
     }
 
-    fn reach(&mut self, path: &Path) -> Option<PlaceId> {
+    fn reach(&mut self, path: &Path) -> Option<ShmDirectoryId> {
         let metadata = fs::metadata(path).ok().filter(Metadata::is_dir)?;
-        let id = PlaceId {
+        let id = ShmDirectoryId {
             device: metadata.dev(),
             inode: metadata.ino(),
         };
-        if let Some(place) = self.places.get_mut(&id) {
-            if !place.seen && place.path != path && !place.path.exists() {
-                place.path = path.to_path_buf();
+        if let Some(directory) = self.directories.get_mut(&id) {
+            if !directory.seen && directory.path != path && !directory.path.exists() {
+                directory.path = path.to_path_buf();
             }
-            place.seen = true;
+            directory.seen = true;
             return Some(id);
         }
-        if self.places.len() >= MAX_PLACES {
+        if self.directories.len() >= MAX_DIRECTORIES {
             self.left_out += 1;
             return None;
         }
-        self.places.insert(
+        self.directories.insert(
             id,
-            Place {
+            ShmDirectory {
                 path: path.to_path_buf(),
                 files: HashMap::new(),
                 changed: None,
@@ -266,7 +267,7 @@ impl Places {
     }
 }
 
-impl Place {
+impl ShmDirectory {
     fn list(&mut self, left_out: &mut u64) -> bool {
         let changed = fs::metadata(&self.path).and_then(|metadata| metadata.modified());
         let changed = changed.ok();
@@ -420,29 +421,36 @@ mod tests {
     #[test]
     fn files_that_come_and_go_are_noticed_also_within_one_tick_of_the_clock() {
         let directory = tempfile::tempdir().unwrap();
-        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
-        places.find();
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
         let port = Name::parse("fastrtps_port7411").unwrap();
         let path = directory.path().join(port.file_name());
-        let count = |places: &Places| {
-            let files = places.places.values().map(|place| place.files.len());
+        let count = |directories: &ShmDirectories| {
+            let files = directories
+                .directories
+                .values()
+                .map(|directory| directory.files.len());
             files.sum::<usize>()
         };
         for _ in 0..20 {
             fs::write(&path, "x").unwrap();
-            places.list();
-            assert_eq!(count(&places), 1);
+            directories.list();
+            assert_eq!(count(&directories), 1);
             fs::remove_file(&path).unwrap();
-            places.list();
-            assert_eq!(count(&places), 0);
+            directories.list();
+            assert_eq!(count(&directories), 0);
         }
         drop(directory);
-        places.find();
-        assert!(places.places.is_empty());
+        directories.find();
+        assert!(directories.directories.is_empty());
     }
 
-    fn files(places: &Places) -> HashSet<Name> {
-        let files = places.places.values().flat_map(|place| place.files.keys());
+    fn files(directories: &ShmDirectories) -> HashSet<Name> {
+        let files = directories
+            .directories
+            .values()
+            .flat_map(|directory| directory.files.keys());
         files.copied().collect()
     }
 
@@ -463,15 +471,16 @@ mod tests {
         for number in 0..MAX_FILES + 500 {
             file(&format!("fastrtps_port{}", 20_000 + number));
         }
-        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
-        places.find();
-        places.list();
-        let found = files(&places);
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
+        directories.list();
+        let found = files(&directories);
         assert_eq!(found.len(), MAX_FILES);
         for name in real {
             assert!(found.contains(&Name::parse(name).unwrap()), "{name}");
         }
-        assert!(places.left_out > 0);
+        assert!(directories.left_out > 0);
         drop(locks);
     }
 
@@ -489,31 +498,32 @@ mod tests {
             fs::File::create(path(name)).unwrap();
             std::os::unix::fs::chown(path(name), Some(64_123), None).unwrap();
         };
-        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
-        places.find();
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
         // Whichever end of the directory the file system lists first.
         make(real[0]);
         flood(0..MAX_LISTED - real.len());
         make(real[1]);
-        places.list();
-        assert_eq!(places.left_out, (MAX_LISTED - MAX_FILES) as u64);
-        let has_real = |places: &Places| {
-            let found = files(places);
+        directories.list();
+        assert_eq!(directories.left_out, (MAX_LISTED - MAX_FILES) as u64);
+        let has_real = |directories: &ShmDirectories| {
+            let found = files(directories);
             assert_eq!(found.len(), MAX_FILES);
             real.map(|name| found.contains(&Name::parse(name).unwrap()))
         };
-        assert_eq!(has_real(&places), [true; 2]);
+        assert_eq!(has_real(&directories), [true; 2]);
         flood(MAX_LISTED..MAX_LISTED + 2 * MAX_FILES);
-        places.left_out = 0;
-        places.list();
+        directories.left_out = 0;
+        directories.list();
         // One for all entries that were not looked at, and the files beyond those that are kept.
-        let left_out = usize::try_from(places.left_out).unwrap();
+        let left_out = usize::try_from(directories.left_out).unwrap();
         let bound = 1 + MAX_LISTED - MAX_FILES..=1 + MAX_LISTED;
         assert!(bound.contains(&left_out), "{left_out}");
-        assert_eq!(has_real(&places), [true; 2]);
+        assert_eq!(has_real(&directories), [true; 2]);
         fs::remove_file(path(real[0])).unwrap();
-        places.list();
-        assert_eq!(has_real(&places), [false, true]);
+        directories.list();
+        assert_eq!(has_real(&directories), [false, true]);
     }
 
     #[test]
@@ -526,10 +536,11 @@ mod tests {
         let real = Name::parse("fastrtps_port7411").unwrap();
         fs::write(file("fastrtps_port7411"), "").unwrap();
         std::os::unix::fs::chown(file("fastrtps_port7411"), Some(64_123), None).unwrap();
-        let mut places = Places::new(Scope::Directories(vec![directory.path().to_path_buf()]));
-        places.find();
-        places.list();
-        let found = files(&places);
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
+        directories.list();
+        let found = files(&directories);
         assert!(found.len() == MAX_FILES && found.contains(&real));
     }
 
@@ -539,37 +550,40 @@ mod tests {
         let path = above.path().join("shm");
         fs::create_dir(&path).unwrap();
         fs::write(path.join("fastrtps_port7411"), "").unwrap();
-        let mut places = Places::new(Scope::Directories(vec![path.clone()]));
-        let mut look = |name: &str| {
-            places.find();
-            places.list();
-            assert_eq!(files(&places), HashSet::from([Name::parse(name).unwrap()]));
+        let mut directories = ShmDirectories::new(Scope::Directories(vec![path.clone()]));
+        let mut assert_only = |name: &str| {
+            directories.find();
+            directories.list();
+            assert_eq!(
+                files(&directories),
+                HashSet::from([Name::parse(name).unwrap()])
+            );
         };
-        look("fastrtps_port7411");
+        assert_only("fastrtps_port7411");
         // Another directory with the same path, as after a mount.
         fs::rename(&path, above.path().join("below")).unwrap();
         fs::create_dir(&path).unwrap();
         fs::write(path.join("fastrtps_port7413"), "").unwrap();
-        look("fastrtps_port7413");
+        assert_only("fastrtps_port7413");
     }
 
     #[test]
     fn this_hosts_shared_memory_is_found_once_however_many_processes_have_it() {
-        let mut places = Places::new(Scope::Everybody);
-        places.find();
-        let own = places
-            .places
+        let mut directories = ShmDirectories::new(Scope::AllProcesses);
+        directories.find();
+        let own = directories
+            .directories
             .values()
-            .filter(|place| place.path == Path::new(SHARED_MEMORY));
+            .filter(|directory| directory.path == Path::new(SHARED_MEMORY));
         assert_eq!(own.count(), 1);
         // Of this process's network there is that one too, of a cgroup without processes nothing.
         let network = PathBuf::from("/proc/self/ns/net");
-        let mut places = Places::new(Scope::Networks(vec![network]));
-        places.find();
-        let mut own = places.places.values();
-        assert!(own.any(|place| place.path == Path::new(SHARED_MEMORY)));
-        let mut places = Places::new(Scope::Cgroup(PathBuf::from("/nowhere")));
-        places.find();
-        assert!(places.places.is_empty());
+        let mut directories = ShmDirectories::new(Scope::Networks(vec![network]));
+        directories.find();
+        let mut own = directories.directories.values();
+        assert!(own.any(|directory| directory.path == Path::new(SHARED_MEMORY)));
+        let mut directories = ShmDirectories::new(Scope::Cgroup(PathBuf::from("/nowhere")));
+        directories.find();
+        assert!(directories.directories.is_empty());
     }
 }
