@@ -12,8 +12,8 @@ use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record};
 
 use super::filter::Filter;
-use super::order::{Next, Order};
 use super::piece_assembler::PieceAssembler;
+use super::reorder_buffer::{Next, ReorderBuffer};
 use super::system::Clocks;
 use ros2probe_model::observer::Observer;
 
@@ -38,7 +38,7 @@ pub const MAX_WAITING: usize = 131_072;
 /// One filter's maps and what they held.
 pub struct FilterReader {
     filter: Filter,
-    order: Order,
+    order: ReorderBuffer,
     pieces: PieceAssembler,
     /// Captured datagrams that wait.
     fresh: VecDeque<(Piece, Vec<u8>)>,
@@ -54,7 +54,7 @@ impl FilterReader {
     pub fn new(filter: Filter) -> Self {
         Self {
             filter,
-            order: Order::default(),
+            order: ReorderBuffer::default(),
             pieces: PieceAssembler::default(),
             fresh: VecDeque::new(),
             datagrams: 0,
@@ -200,7 +200,7 @@ impl FilterReader {
 /// Gives the model what is not younger than `until`, but not more than so many; whether that was
 /// all.
 fn deliver(
-    order: &mut Order,
+    order: &mut ReorderBuffer,
     clocks: &Clocks,
     until: u64,
     observer: &mut Observer,
@@ -219,7 +219,7 @@ fn decode_datagram(
     piece: &Piece,
     bytes: &[u8],
     clocks: &Clocks,
-    order: &mut Order,
+    order: &mut ReorderBuffer,
     observer: &mut Observer,
 ) {
     deliver(order, clocks, piece.time, observer, usize::MAX);

@@ -16,8 +16,8 @@ use ros2probe_wire::{Reason, Record, Timestamp, WireError};
 
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
-use super::order::{Next, Order};
 use super::reattach::{Identity, identity};
+use super::reorder_buffer::{Next, ReorderBuffer};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::Clocks;
 use ros2probe_model::ahead::{Ahead, Ready};
@@ -119,7 +119,7 @@ impl WireTap {
                 number,
                 reassembly: Reassembly::new(settings.reassembly),
                 ahead: Ahead::default(),
-                order: Order::default(),
+                order: ReorderBuffer::default(),
                 copied_bytes: 0,
             },
             refused_interfaces: 0,
@@ -356,7 +356,7 @@ struct FrameAssembly {
     reassembly: Reassembly,
     ahead: Ahead,
     /// What is to be counted, waiting for its turn.
-    order: Order,
+    order: ReorderBuffer,
     copied_bytes: u64,
 }
 
@@ -472,7 +472,7 @@ fn decode_frame(
     envelope: &Envelope,
     payload: &[u8],
     clocks: &Clocks,
-    order: &mut Order,
+    order: &mut ReorderBuffer,
     observer: &mut Observer,
 ) {
     let at = clocks.monotonic_of(Timestamp(envelope.time));

@@ -17,11 +17,11 @@ use tokio_util::sync::CancellationToken;
 
 use crate::config::{Access, Config, ConfigError, PageChoice, Watch};
 use crate::logging::Log;
-use crate::privilege::{self, Identity, Powerless, Role, Sandbox};
+use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
 use crate::recording::{Recordings, Refusal, Snapshots};
 use crate::run::replay::Replay;
 use crate::run::{Run, Source};
-use crate::state::{Keeper, StateDirectory};
+use crate::state::{StateDirectory, StateWriter};
 use crate::subscriptions::{Caps, Subscriptions};
 use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
 use crate::surface::api::reload::Reloads;
@@ -73,7 +73,7 @@ pub struct Blueprint<'a> {
     /// What is watched.
     pub watches: Arc<Watches>,
     /// Writes down what discovery knows.
-    pub keeper: Option<Keeper>,
+    pub keeper: Option<StateWriter>,
     /// Directory of recordings; `None` = recordings are refused.
     pub recordings: Option<PathBuf>,
     /// Finds definitions of messages.
@@ -231,7 +231,9 @@ pub fn run(options: Options) -> Result<()> {
         if keeps_watches {
             watches.keep_in(Arc::clone(&directory))?;
         }
-        keeps_known.then(|| Keeper::start(directory)).transpose()
+        keeps_known
+            .then(|| StateWriter::start(directory))
+            .transpose()
     };
     let keeper = state.map_or(Ok(None), keep);
     let stop = CancellationToken::new();
@@ -322,9 +324,9 @@ fn listeners(config: &Config, board: &Arc<Board>) -> Result<(Option<Server>, api
 }
 
 /// Gives up the privileges of this thread, and reads back that none is left.
-fn give_up() -> Result<Powerless> {
+fn give_up() -> Result<Unprivileged> {
     privilege::confine(Role::Service)?;
-    let powerless = Powerless::verify()?;
+    let powerless = Unprivileged::verify()?;
     if let Sandbox::Unfiltered(reason) = privilege::sandbox() {
         tracing::warn!(reason, "system calls are not filtered");
     }

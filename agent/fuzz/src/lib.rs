@@ -20,7 +20,7 @@ use ros2probe::capture::shm::segment::{Buffer, Message};
 use ros2probe::capture::uprobe::library;
 use ros2probe::config::{Config, Watch, Watchlist};
 use ros2probe::message::filter::{Filter, Subject};
-use ros2probe::message::{Decoded, Definition, MessageType, Shown, csv, decode, yaml};
+use ros2probe::message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe::model::selection::{Depth, Selection, Wish};
@@ -234,14 +234,14 @@ pub fn message(bytes: &[u8]) {
     let Ok(Decoded { message, .. }) = &whole else {
         return;
     };
-    let all = Shown::default();
+    let all = Truncation::default();
     let line = csv::line(message, &all);
     assert!(line.len() <= (payload.len() + 64) * LONGEST);
     for style in [yaml::Style::Block, yaml::Style::Flow] {
         let document = yaml::document(message, &all, style);
         assert!(document.ends_with('\n') && document.len() <= (payload.len() + 64) * LONGEST);
     }
-    let few = Shown {
+    let few = Truncation {
         truncate: Some(2),
         ..all
     };

@@ -26,22 +26,22 @@
 pub mod csv;
 pub mod decode;
 pub mod definition;
+mod definition_source;
 mod dialect;
 mod digits;
 mod embedded;
 pub mod filter;
 mod hash;
 mod idl;
-mod implied;
+mod implicit_types;
 pub mod library;
 mod name;
 mod numpy;
 mod parse;
-mod place;
 pub mod python;
 mod schema;
 mod search;
-pub mod shown;
+pub mod truncation;
 pub mod value;
 pub mod yaml;
 
@@ -52,5 +52,5 @@ pub use definition::{
 pub use dialect::Dialect;
 pub use library::{Library, NotFound, Sources};
 pub use parse::{ParseError, Problem};
-pub use shown::Shown;
+pub use truncation::Truncation;
 pub use value::{Array, Items, Message, Scalar, Value};

@@ -6,7 +6,7 @@ use std::io::{self, Write as _};
 /// A line for stderr as it is, as the original prints its errors; the exit code is 1.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub(crate) struct Said(pub(crate) String);
+pub(crate) struct UserError(pub(crate) String);
 
 /// Standard output.
 #[derive(Debug)]

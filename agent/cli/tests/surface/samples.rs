@@ -269,7 +269,7 @@ impl Robot {
     }
 
     /// Read in shared memory, where others may have been missed.
-    fn look(&mut self, message: Message) {
+    fn receive(&mut self, message: Message) {
         self.at += 1_000_000;
         let envelope = forge::multicast(self.at, 0);
         self.observer.shared_memory(&envelope, &message.bytes());
@@ -338,11 +338,11 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
     robot.at += SECOND;
     let large = payload(3000);
     for start in [1, 2, 3] {
-        robot.look(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
+        robot.receive(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
     }
     // Looks at two ports may find them in another order, and twice.
     for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
-        robot.look(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
+        robot.receive(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
     }
     let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
     let given = robot.given();
@@ -350,10 +350,10 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
     // The last fragment of 2 was seen while one was missing: it was given up then.
     assert_eq!(whole, [expected[0].clone(), expected[2].clone()]);
     assert_eq!(missed, [(ALICE, 2, Err(MissedReason::NotCaptured))]);
-    robot.look(Message::from(ALICE).data(WRITER, 4, &payload(24)));
+    robot.receive(Message::from(ALICE).data(WRITER, 4, &payload(24)));
     // A fragment was overwritten before it was read.
     for start in [1, 3] {
-        robot.look(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
+        robot.receive(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
     }
     let expected = [
         (ALICE, 4, Ok(payload(24))),
@@ -368,7 +368,7 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
     robot.subscribe(&["/points"], Depth::Payloads);
     let small = payload(24);
     let look = |robot: &mut Robot, number| {
-        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
     };
     for number in [1, 2, 5] {
         look(&mut robot, number);
@@ -407,7 +407,7 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
     let mut times = BTreeMap::new();
     // 3 is sent again, 5 was not seen.
     for number in [1, 2, 4, 6, 3, 7] {
-        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
         times.insert(number, robot.at);
     }
     let now = Timestamp(robot.at + SECOND / 20);
@@ -442,7 +442,7 @@ fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_r
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);
     let small = payload(24);
-    robot.look(Message::from(ALICE).data(WRITER, 1, &small));
+    robot.receive(Message::from(ALICE).data(WRITER, 1, &small));
     // INFO_DST and ACKNACK: all below 4.
     let body = [
         &[0, 0, 0x12, 0x04][..],
@@ -451,7 +451,7 @@ fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_r
         &[0; 8],
     ];
     let acknowledgement = Message::from(BOB).submessage(0x0e, 0x01, &ALICE.0);
-    robot.look(acknowledgement.submessage(0x06, 0x03, &body.concat()));
+    robot.receive(acknowledgement.submessage(0x06, 0x03, &body.concat()));
     robot.observer.advance(Timestamp(robot.at + SECOND / 20));
     robot.observer.advance(Timestamp(robot.at + SECOND));
     let mut missed = 0;

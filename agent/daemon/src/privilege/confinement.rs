@@ -196,16 +196,16 @@ pub fn spawn(
     thread: Builder,
     work: impl FnOnce() + Send + 'static,
 ) -> Result<JoinHandle<()>, SpawnError> {
-    let (tell, told) = mpsc::channel();
+    let (report, confined) = mpsc::channel();
     let thread = thread.spawn(move || {
         let confined = confine(role);
         let may_begin = confined.is_ok();
-        let _ = tell.send(confined);
+        let _ = report.send(confined);
         if may_begin {
             work();
         }
     })?;
-    told.recv().map_err(|_| SpawnError::Died)??;
+    confined.recv().map_err(|_| SpawnError::Died)??;
     Ok(thread)
 }
 

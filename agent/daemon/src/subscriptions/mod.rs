@@ -238,7 +238,7 @@ impl Subscriptions {
 
     /// For the capture thread: all wishes, when they have changed since the last call.
     #[must_use]
-    pub fn take_news(&self) -> Option<Arc<Vec<Wish>>> {
+    pub fn take_changed(&self) -> Option<Arc<Vec<Wish>>> {
         self.news.swap(None)
     }
 

@@ -52,8 +52,8 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_WALKED",
-        "agent/capture/src/order.rs",
-        "agent/capture/src/order.rs",
+        "agent/capture/src/reorder_buffer.rs",
+        "agent/capture/src/reorder_buffer.rs",
         "no_more_wait_than_there_is_room_for",
     ],
     [
@@ -232,14 +232,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "AT_ONCE",
-        "agent/daemon/src/surface/large.rs",
-        "agent/daemon/src/surface/large.rs",
+        "agent/daemon/src/surface/large_responses.rs",
+        "agent/daemon/src/surface/large_responses.rs",
         "a_third_answer_waits_until_one_of_two_is_made",
     ],
     [
         "KEPT",
-        "agent/daemon/src/surface/large.rs",
-        "agent/daemon/src/surface/large.rs",
+        "agent/daemon/src/surface/large_responses.rs",
+        "agent/daemon/src/surface/large_responses.rs",
         "slow_readers_of_large_answers_never_keep_others_from_theirs",
     ],
     [
@@ -250,14 +250,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "UNFINISHED",
-        "agent/daemon/src/surface/pace.rs",
-        "agent/daemon/src/surface/pace.rs",
+        "agent/daemon/src/surface/connection.rs",
+        "agent/daemon/src/surface/connection.rs",
         "unfinished_requests_of_all_connections_share_a_budget_and_small_ones_need_none",
     ],
     [
         "LEAST",
-        "agent/daemon/src/surface/pace.rs",
-        "agent/daemon/src/surface/pace.rs",
+        "agent/daemon/src/surface/connection.rs",
+        "agent/daemon/src/surface/connection.rs",
         "a_whole_answer_that_is_read_too_slowly_ends_and_a_stream_may_stall_for_longer",
     ],
     [
@@ -274,13 +274,13 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_SHOWN",
-        "agent/daemon/src/surface/deliveries.rs",
+        "agent/daemon/src/surface/delivery_metrics.rs",
         "agent/cli/tests/surface/caps.rs",
         "acknowledging_readers_beyond_the_page_s_cap_are_counted_as_not_shown",
     ],
     [
         "MAX_UNKNOWN_WRITERS",
-        "agent/daemon/src/surface/robot.rs",
+        "agent/daemon/src/surface/ros2_metrics.rs",
         "agent/cli/tests/surface/caps.rs",
         "unknown_writers_beyond_the_page_s_cap_are_in_the_sum_alone",
     ],

@@ -11,7 +11,7 @@ use ros2probe_wire::time::SECOND;
 
 use super::table::{self, Definition, Severity};
 use crate::surface::SourceKind;
-use crate::surface::robot::series_name;
+use crate::surface::ros2_metrics::series_name;
 use ros2probe_model::churn;
 use ros2probe_model::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::event::{EventKind, LossBurst, bounded};
@@ -22,7 +22,7 @@ const SECONDS_OF_A_DAY: u64 = 86_400;
 
 /// What happened to the robot or the agent.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Happened {
+pub(super) enum Occurrence {
     Robot(EventKind),
     Agent(AgentEvent),
 }
@@ -157,7 +157,7 @@ impl Record {
     }
 }
 
-impl Happened {
+impl Occurrence {
     /// Its entry of the table.
     pub(super) const fn definition(&self) -> &'static Definition {
         use churn::Event::{Appeared, Cascaded, Changed, Disposed, Expired};
@@ -560,7 +560,7 @@ mod tests {
     #[test]
     fn a_goodbye_is_no_warning_and_an_expired_lease_is_one() {
         let lost = |change| {
-            Happened::Robot(EventKind::Participant {
+            Occurrence::Robot(EventKind::Participant {
                 change,
                 domain_id: 0,
                 guid: ros2probe_wire::Guid::from_bytes([1; 16]),

@@ -19,7 +19,7 @@ const STEP: u64 = 8 << 20;
 
 /// The room of one recording.
 #[derive(Clone, Debug)]
-pub struct Room {
+pub struct DiskQuota {
     /// In which all bags lie.
     directory: PathBuf,
     limits: RecordingLimits,
@@ -29,7 +29,7 @@ pub struct Room {
 
 /// A limit that is reached.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-enum Full {
+enum QuotaExceeded {
     #[error("the recording would be larger than {0} bytes (recordings.max_bytes)")]
     Bag(u64),
     #[error("all recordings take {used} bytes, of {limit} they may (recordings.max_total_bytes)")]
@@ -41,7 +41,7 @@ enum Full {
     Reserve { free: u64, reserve: u64 },
 }
 
-impl Room {
+impl DiskQuota {
     /// Below this directory, which may not exist yet.
     #[must_use]
     pub fn new(directory: &Path, limits: RecordingLimits) -> Self {
@@ -60,7 +60,7 @@ impl Room {
         if let Some(limit) = self.limits.max_bytes
             && bag.saturating_add(more) > limit
         {
-            return Err(Full::Bag(limit).into());
+            return Err(QuotaExceeded::Bag(limit).into());
         }
         self.unseen = self.unseen.saturating_add(more);
         if self.unseen >= STEP {
@@ -78,7 +78,7 @@ impl Room {
         if let Some(limit) = self.limits.max_total_bytes {
             let used = used(&self.directory);
             if used >= limit {
-                return Err(Full::Total { used, limit }.into());
+                return Err(QuotaExceeded::Total { used, limit }.into());
             }
         }
         // What cannot be asked shows itself in writing.
@@ -90,14 +90,14 @@ impl Room {
         // Without a reserve the storage itself refuses what it has no room for.
         if reserve > 0 && space.free <= reserve {
             let free = space.free;
-            return Err(Full::Reserve { free, reserve }.into());
+            return Err(QuotaExceeded::Reserve { free, reserve }.into());
         }
         Ok(())
     }
 }
 
-impl From<Full> for Error {
-    fn from(full: Full) -> Self {
+impl From<QuotaExceeded> for Error {
+    fn from(full: QuotaExceeded) -> Self {
         Self::Limit(full.to_string())
     }
 }
@@ -112,28 +112,28 @@ fn used(directory: &Path) -> u64 {
 }
 
 /// Bytes of a file system.
-struct Space {
+struct FilesystemSpace {
     size: u64,
     /// To users without privileges.
     free: u64,
 }
 
 /// Of the file system in which a directory is, or would be.
-fn space(directory: &Path) -> io::Result<Space> {
+fn space(directory: &Path) -> io::Result<FilesystemSpace> {
     let existing = directory.ancestors().find(|path| path.exists());
     let path = existing.unwrap_or(directory);
     let path = CString::new(path.as_os_str().as_bytes())?;
-    let mut told = MaybeUninit::<libc::statvfs>::uninit();
+    let mut statistics = MaybeUninit::<libc::statvfs>::uninit();
     // SAFETY: the path ends in a zero, and both outlive the call.
-    if unsafe { libc::statvfs(path.as_ptr(), told.as_mut_ptr()) } != 0 {
+    if unsafe { libc::statvfs(path.as_ptr(), statistics.as_mut_ptr()) } != 0 {
         return Err(io::Error::last_os_error());
     }
     // SAFETY: the call has filled it.
-    let told = unsafe { told.assume_init() };
-    let bytes = |blocks: libc::fsblkcnt_t| blocks.saturating_mul(told.f_frsize);
-    Ok(Space {
-        size: bytes(told.f_blocks),
-        free: bytes(told.f_bavail),
+    let statistics = unsafe { statistics.assume_init() };
+    let bytes = |blocks: libc::fsblkcnt_t| blocks.saturating_mul(statistics.f_frsize);
+    Ok(FilesystemSpace {
+        size: bytes(statistics.f_blocks),
+        free: bytes(statistics.f_bavail),
     })
 }
 
@@ -141,8 +141,8 @@ fn space(directory: &Path) -> io::Result<Space> {
 mod tests {
     use super::*;
 
-    fn room(directory: &Path, limits: RecordingLimits) -> Room {
-        Room::new(directory, limits)
+    fn quota(directory: &Path, limits: RecordingLimits) -> DiskQuota {
+        DiskQuota::new(directory, limits)
     }
 
     fn refused(result: Result<(), Error>) -> String {
@@ -158,7 +158,7 @@ mod tests {
             reserve_bytes: 0,
             ..RecordingLimits::default()
         };
-        let mut each = room(
+        let mut each = quota(
             &bags,
             RecordingLimits {
                 max_bytes: Some(1000),
@@ -172,11 +172,11 @@ mod tests {
             max_total_bytes: Some(100),
             ..none
         };
-        room(&bags, all).check().unwrap();
+        quota(&bags, all).check().unwrap();
         std::fs::create_dir_all(bags.join("before")).unwrap();
         std::fs::write(bags.join("before/before_0.mcap"), [0; 100]).unwrap();
-        assert!(refused(room(&bags, all).check()).contains("recordings.max_total_bytes"));
-        let mut stepping = room(&bags, all);
+        assert!(refused(quota(&bags, all).check()).contains("recordings.max_total_bytes"));
+        let mut stepping = quota(&bags, all);
         stepping.take(0, STEP - 1).unwrap();
         assert!(stepping.take(0, 1).is_err(), "after every few megabytes");
 
@@ -185,12 +185,12 @@ mod tests {
             reserve_bytes: free * 2,
             ..none
         };
-        assert!(refused(room(&bags, reserve).check()).contains("recordings.reserve_bytes"));
+        assert!(refused(quota(&bags, reserve).check()).contains("recordings.reserve_bytes"));
         let percent = RecordingLimits {
             reserve_percent: 100,
             ..none
         };
-        assert!(refused(room(&bags, percent).check()).contains("recordings.reserve_percent"));
-        room(&bags, none).check().unwrap();
+        assert!(refused(quota(&bags, percent).check()).contains("recordings.reserve_percent"));
+        quota(&bags, none).check().unwrap();
     }
 }

@@ -26,7 +26,7 @@ const LATE_NANOSECONDS: u64 = 1_000_000_000;
 
 /// The records of one tap.
 #[derive(Debug, Default)]
-pub struct Order {
+pub struct ReorderBuffer {
     /// In the kernel's clock.
     kernel: VecDeque<Record>,
     /// Those with [`flag::NO_ROOM`], in the kernel's clock and sorted by it.
@@ -57,7 +57,7 @@ pub enum Next {
     Walked(Record),
 }
 
-impl Order {
+impl ReorderBuffer {
     /// Takes in a record of the kernel's ring, its time in the kernel's clock.
     pub fn kernel(&mut self, record: Record) {
         if record.kind == kind::UNDELIVERED {
@@ -204,12 +204,12 @@ mod tests {
         (clocks.monotonic, record)
     }
 
-    fn walked(order: &mut Order, (at, record): (u64, Record)) {
+    fn walked(order: &mut ReorderBuffer, (at, record): (u64, Record)) {
         assert!(order.walked(at, record).is_none());
     }
 
     /// Sequence numbers, negative where the record says that there was no room.
-    fn numbers(order: &mut Order, clocks: &Clocks) -> Vec<i64> {
+    fn numbers(order: &mut ReorderBuffer, clocks: &Clocks) -> Vec<i64> {
         std::iter::from_fn(|| order.next(clocks, clocks.monotonic.saturating_sub(SETTLE)))
             .map(|next| {
                 let (Next::Kernel(record) | Next::Walked(record)) = next;
@@ -224,7 +224,7 @@ mod tests {
 
     #[test]
     fn a_retransmission_in_a_captured_frame_does_not_overtake_the_gap_it_fills() {
-        let mut order = Order::default();
+        let mut order = ReorderBuffer::default();
         // 10 was lost; it comes again in a frame that user space gets before the record of 11.
         walked(&mut order, captured(10, 30));
         order.kernel(of_the_kernel(9, 1));
@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn no_room_is_said_before_everything_of_its_time_or_later() {
-        let mut order = Order::default();
+        let mut order = ReorderBuffer::default();
         order.kernel(of_the_kernel(1, 5));
         order.kernel(of_the_kernel(2, 10));
         // Another CPU's, and two that are out of order.
@@ -257,7 +257,7 @@ mod tests {
     #[test]
     fn what_a_captured_datagram_holds_is_said_as_not_delivered_first() {
         for pieces_first in [true, false] {
-            let mut order = Order::default();
+            let mut order = ReorderBuffer::default();
             let heartbeat = |(at, record)| {
                 let record = Record {
                     kind: kind::HEARTBEAT,
@@ -297,7 +297,7 @@ mod tests {
 
     #[test]
     fn a_clock_that_was_set_holds_nothing_up() {
-        let mut order = Order::default();
+        let mut order = ReorderBuffer::default();
         let (_, back) = captured(1, 3_600_000);
         let at = clocks(10).monotonic_of(Timestamp(back.time));
         assert!(order.walked(at, back).is_none());
@@ -307,7 +307,7 @@ mod tests {
 
     #[test]
     fn what_a_burst_took_is_given_back_when_it_is_over() {
-        let mut order = Order::default();
+        let mut order = ReorderBuffer::default();
         for number in 0..20_000 {
             order.kernel(of_the_kernel(number, 1));
             let (at, record) = captured(number, 1);
@@ -321,7 +321,7 @@ mod tests {
 
     #[test]
     fn no_more_wait_than_there_is_room_for() {
-        let mut order = Order::default();
+        let mut order = ReorderBuffer::default();
         let refused = (0..20_000).filter(|number| {
             let (at, record) = captured(*number, 1);
             order.walked(at, record).is_some()

@@ -31,7 +31,7 @@ const AGAIN: Duration = Duration::from_secs(30);
 
 /// What was found at the start.
 #[derive(Debug, PartialEq)]
-pub enum Kept {
+pub enum LoadedWatches {
     /// No file.
     Nothing,
     /// These watches.
@@ -72,20 +72,20 @@ struct Line {
 
 /// The thread that writes.
 #[derive(Debug)]
-pub(super) struct Keeper {
-    desk: Arc<Desk>,
+pub(super) struct WatchWriter {
+    mailbox: Arc<Mailbox>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
 /// Where the thread finds its work.
 #[derive(Debug, Default)]
-struct Desk {
-    papers: Mutex<Papers>,
+struct Mailbox {
+    pending: Mutex<Pending>,
     changed: Condvar,
 }
 
 #[derive(Debug, Default)]
-struct Papers {
+struct Pending {
     /// Not written yet.
     latest: Option<Vec<Arc<Watch>>>,
     is_failing: bool,
@@ -94,11 +94,11 @@ struct Papers {
 
 /// What clients of the last agent had added. What is no such file is moved aside.
 #[must_use]
-pub fn load(directory: &StateDirectory) -> Kept {
+pub fn load(directory: &StateDirectory) -> LoadedWatches {
     let document = match directory.read(&FORM) {
-        Found::Nothing => return Kept::Nothing,
-        Found::Newer(newer) => return Kept::Newer(newer),
-        Found::Unusable { reason, aside } => return Kept::Unusable { reason, aside },
+        Found::Nothing => return LoadedWatches::Nothing,
+        Found::Newer(newer) => return LoadedWatches::Newer(newer),
+        Found::Unusable { reason, aside } => return LoadedWatches::Unusable { reason, aside },
         Found::This(document) => document,
     };
     let watches = if document.watches.len() > Limit::Watches.row().range.1 {
@@ -112,10 +112,10 @@ pub fn load(directory: &StateDirectory) -> Kept {
         Ok(watches)
     });
     match watches {
-        Ok(watches) => Kept::These(watches),
+        Ok(watches) => LoadedWatches::These(watches),
         Err(reason) => match directory.set_aside::<Document>(FILE, reason) {
-            Found::Unusable { reason, aside } => Kept::Unusable { reason, aside },
-            Found::Nothing | Found::This(_) | Found::Newer(_) => Kept::Nothing,
+            Found::Unusable { reason, aside } => LoadedWatches::Unusable { reason, aside },
+            Found::Nothing | Found::This(_) | Found::Newer(_) => LoadedWatches::Nothing,
         },
     }
 }
@@ -172,35 +172,35 @@ impl From<&Watch> for Line {
     }
 }
 
-impl Keeper {
+impl WatchWriter {
     /// Starts the thread.
     pub(super) fn start(directory: Arc<StateDirectory>) -> io::Result<Self> {
-        let desk = Arc::<Desk>::default();
-        let own = Arc::clone(&desk);
+        let mailbox = Arc::<Mailbox>::default();
+        let own = Arc::clone(&mailbox);
         let thread = std::thread::Builder::new()
             .name("watches".to_owned())
             .spawn(move || own.write_until_closed(&directory))?;
         Ok(Self {
-            desk,
+            mailbox,
             thread: Mutex::new(Some(thread)),
         })
     }
 
     /// Hands over what is to be on disk; returns at once.
     pub(super) fn keep(&self, watches: Vec<Arc<Watch>>) {
-        self.desk.papers().latest = Some(watches);
-        self.desk.changed.notify_one();
+        self.mailbox.pending().latest = Some(watches);
+        self.mailbox.changed.notify_one();
     }
 
     /// The last write did not fail.
     pub(super) fn works(&self) -> bool {
-        !self.desk.papers().is_failing
+        !self.mailbox.pending().is_failing
     }
 
     /// Waits until the latest list is written, or cannot be.
     pub(super) fn finish(&self) {
-        self.desk.papers().is_closed = true;
-        self.desk.changed.notify_one();
+        self.mailbox.pending().is_closed = true;
+        self.mailbox.changed.notify_one();
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(thread) = thread.take() {
             // If it has panicked, that is in the log.
@@ -209,9 +209,9 @@ impl Keeper {
     }
 }
 
-impl Desk {
-    fn papers(&self) -> MutexGuard<'_, Papers> {
-        self.papers.lock().unwrap_or_else(PoisonError::into_inner)
+impl Mailbox {
+    fn pending(&self) -> MutexGuard<'_, Pending> {
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn write_until_closed(&self, directory: &StateDirectory) {
@@ -221,13 +221,13 @@ impl Desk {
                 watches: watches.iter().map(|watch| Line::from(&**watch)).collect(),
             };
             let written = directory.replace(FILE, &document);
-            let mut papers = self.papers();
-            let failed_before = mem::replace(&mut papers.is_failing, written.is_err());
+            let mut pending = self.pending();
+            let failed_before = mem::replace(&mut pending.is_failing, written.is_err());
             // At the end a disk that fails is not tried for ever.
-            if papers.is_failing && !papers.is_closed {
-                papers.latest.get_or_insert(watches);
+            if pending.is_failing && !pending.is_closed {
+                pending.latest.get_or_insert(watches);
             }
-            drop(papers);
+            drop(pending);
             let path = directory.path().display();
             match written {
                 Ok(()) if failed_before => {
@@ -243,19 +243,19 @@ impl Desk {
 
     /// The next list to write; `None` when there will be none.
     fn next(&self) -> Option<Vec<Arc<Watch>>> {
-        let mut papers = self.papers();
-        if papers.is_failing && !papers.is_closed {
-            let again = self.changed.wait_timeout(papers, AGAIN);
-            papers = again.unwrap_or_else(PoisonError::into_inner).0;
+        let mut pending = self.pending();
+        if pending.is_failing && !pending.is_closed {
+            let again = self.changed.wait_timeout(pending, AGAIN);
+            pending = again.unwrap_or_else(PoisonError::into_inner).0;
         }
-        let idle = |papers: &mut Papers| papers.latest.is_none() && !papers.is_closed;
-        let papers = self.changed.wait_while(papers, idle);
-        let papers = papers.unwrap_or_else(PoisonError::into_inner);
+        let idle = |pending: &mut Pending| pending.latest.is_none() && !pending.is_closed;
+        let pending = self.changed.wait_while(pending, idle);
+        let pending = pending.unwrap_or_else(PoisonError::into_inner);
         // More may follow at once.
-        let open = |papers: &mut Papers| !papers.is_closed;
-        let waited = self.changed.wait_timeout_while(papers, TOGETHER, open);
-        let mut papers = waited.unwrap_or_else(PoisonError::into_inner).0;
-        papers.latest.take()
+        let open = |pending: &mut Pending| !pending.is_closed;
+        let waited = self.changed.wait_timeout_while(pending, TOGETHER, open);
+        let mut pending = waited.unwrap_or_else(PoisonError::into_inner).0;
+        pending.latest.take()
     }
 }
 
@@ -295,12 +295,12 @@ mod tests {
     #[test]
     fn what_is_added_is_read_again_as_it_was() {
         let (_place, directory) = directory();
-        assert_eq!(load(&directory), Kept::Nothing);
-        let keeper = Keeper::start(Arc::clone(&directory)).unwrap();
+        assert_eq!(load(&directory), LoadedWatches::Nothing);
+        let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
         keeper.keep(Vec::new());
         keeper.keep(shared());
         keeper.finish();
-        assert_eq!(load(&directory), Kept::These(watches()));
+        assert_eq!(load(&directory), LoadedWatches::These(watches()));
     }
 
     #[test]
@@ -326,10 +326,13 @@ mod tests {
         for text in broken {
             fs::write(&file, &text).unwrap();
             let found = load(&directory);
-            assert!(matches!(&found, Kept::Unusable { .. }), "{text}: {found:?}");
+            assert!(
+                matches!(&found, LoadedWatches::Unusable { .. }),
+                "{text}: {found:?}"
+            );
             let aside = place.path().join("watches.json.corrupt");
             assert_eq!(fs::read_to_string(aside).unwrap(), text);
-            assert_eq!(load(&directory), Kept::Nothing);
+            assert_eq!(load(&directory), LoadedWatches::Nothing);
         }
     }
 
@@ -343,12 +346,12 @@ mod tests {
             watches: globs.map(|watch| Line::from(&watch)).collect(),
         };
         directory.replace(FILE, &document).unwrap();
-        let Kept::Unusable { reason, aside } = load(&directory) else {
+        let LoadedWatches::Unusable { reason, aside } = load(&directory) else {
             panic!("it was read");
         };
         assert!(reason.contains("it has 1000 globs of"), "{reason}");
         assert_eq!(aside, Some(place.path().join("watches.json.corrupt")));
-        assert_eq!(load(&directory), Kept::Nothing);
+        assert_eq!(load(&directory), LoadedWatches::Nothing);
     }
 
     #[test]
@@ -362,7 +365,7 @@ mod tests {
             version: 2,
             known: VERSION,
         };
-        assert_eq!(load(&directory), Kept::Newer(found));
+        assert_eq!(load(&directory), LoadedWatches::Newer(found));
         assert_eq!(fs::read_to_string(&file).unwrap(), newer);
 
         fs::write(
@@ -377,7 +380,7 @@ mod tests {
             retain: Retain::None,
             ..watches().remove(0)
         };
-        assert_eq!(load(&directory), Kept::These(vec![first]));
+        assert_eq!(load(&directory), LoadedWatches::These(vec![first]));
     }
 
     #[test]
@@ -386,7 +389,7 @@ mod tests {
         // Nobody can write a file where a directory is.
         let obstacle = place.path().join("watches.json.new");
         fs::create_dir(&obstacle).unwrap();
-        let keeper = Keeper::start(Arc::clone(&directory)).unwrap();
+        let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
         keeper.keep(shared());
         let start = Instant::now();
         while keeper.works() {
@@ -395,6 +398,6 @@ mod tests {
         }
         fs::remove_dir(obstacle).unwrap();
         keeper.finish();
-        assert_eq!(load(&directory), Kept::These(watches()));
+        assert_eq!(load(&directory), LoadedWatches::These(watches()));
     }
 }

@@ -12,8 +12,8 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::board::Board;
-use super::limit_facts::{Place, Places};
-use super::pace::{Connection, Crowd};
+use super::connection::{Connection, Connections};
+use super::limit_facts::{Slot, Slots};
 use crate::config::Limit;
 
 /// How long a client that is turned away may take to read why, and how many may do so at once.
@@ -26,10 +26,10 @@ const ROOM: Duration = Duration::from_millis(100);
 
 /// A listener with a limited number of connections; a further one is told so and closed.
 #[derive(Debug)]
-pub(super) struct Bounded<L> {
+pub(super) struct LimitedListener<L> {
     listener: L,
-    places: Arc<Places>,
-    crowd: Arc<Crowd>,
+    slots: Arc<Slots>,
+    connections: Arc<Connections>,
     board: Arc<Board>,
     limit: Limit,
     refusal: Option<Refusal>,
@@ -40,7 +40,7 @@ pub(super) struct Bounded<L> {
 #[derive(Clone, Debug)]
 pub(super) struct Refusal(Arc<str>);
 
-impl<L> Bounded<L> {
+impl<L> LimitedListener<L> {
     /// At most as many connections at a time as `limit` says, which is counted on `board`. Without
     /// a refusal a further one is closed without a word.
     pub(super) fn new(
@@ -51,8 +51,8 @@ impl<L> Bounded<L> {
     ) -> Self {
         Self {
             listener,
-            places: board.limits().places(limit),
-            crowd: Arc::default(),
+            slots: board.limits().slots(limit),
+            connections: Arc::default(),
             board,
             limit,
             refusal,
@@ -61,19 +61,19 @@ impl<L> Bounded<L> {
     }
 
     /// A place, if need be that of a connection on which nothing is being answered.
-    async fn place(&self) -> Option<Place> {
-        if let Some(place) = self.places.take() {
-            return Some(place);
+    async fn slot(&self) -> Option<Slot> {
+        if let Some(slot) = self.slots.take() {
+            return Some(slot);
         }
         self.board.limits().reached(self.limit, 1);
-        if !self.crowd.make_room() {
+        if !self.connections.make_room() {
             return None;
         }
         let freed = async {
             loop {
-                self.crowd.left().await;
-                if let Some(place) = self.places.take() {
-                    return place;
+                self.connections.left().await;
+                if let Some(slot) = self.slots.take() {
+                    return slot;
                 }
             }
         };
@@ -81,26 +81,26 @@ impl<L> Bounded<L> {
     }
 
     /// No place for this one. It is not waited for, nor are many kept that take their time.
-    fn turn_away(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
+    fn reject(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
         while self.leaving.try_join_next().is_some() {}
         if let Some(refusal) = self.refusal.clone()
             && self.leaving.len() < FAREWELLS
         {
             self.leaving.spawn(async move {
-                let _ = timeout(FAREWELL, refusal.tell(stream)).await;
+                let _ = timeout(FAREWELL, refusal.send(stream)).await;
             });
         }
     }
 }
 
-impl<L: Listener> Bounded<L> {
+impl<L: Listener> LimitedListener<L> {
     /// The next connection that has a place.
     pub(super) async fn accept(&mut self) -> Connection<L::Io> {
         loop {
             let (stream, _) = self.listener.accept().await;
-            match self.place().await {
-                Some(place) => return self.crowd.join(stream, place),
-                None => self.turn_away(stream),
+            match self.slot().await {
+                Some(slot) => return self.connections.join(stream, slot),
+                None => self.reject(stream),
             }
         }
     }
@@ -119,7 +119,7 @@ impl Refusal {
         )
     }
 
-    async fn tell(self, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
+    async fn send(self, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
         stream.write_all(self.0.as_bytes()).await?;
         stream.shutdown().await?;
         // Closed with something unread, the connection would be reset and the answer perhaps lost.

@@ -13,7 +13,7 @@ pub(super) const TRIED: &str = "test load of the BPF programs";
 
 /// What a source can see.
 #[derive(Clone, Debug, Default)]
-pub struct Sight {
+pub struct Visibility {
     /// `host` or `wire`.
     pub source: String,
     /// Why it is not the one that sees more.
@@ -26,7 +26,7 @@ pub struct Sight {
     pub from: &'static str,
 }
 
-impl Sight {
+impl Visibility {
     /// As a running agent says.
     #[must_use]
     pub fn of_agent(health: &Health) -> Self {
@@ -84,27 +84,27 @@ pub fn failed(error: &str) -> Vec<Finding> {
 
 /// What it sees, and each thing that it does not.
 #[must_use]
-pub fn check(sight: &Sight) -> Vec<Finding> {
-    let mut findings = vec![source(sight)];
-    let able = |ability: &Ability| sight.able.contains(ability);
+pub fn check(visibility: &Visibility) -> Vec<Finding> {
+    let mut findings = vec![source(visibility)];
+    let able = |ability: &Ability| visibility.able.contains(ability);
     let (seen, blind): (Vec<_>, Vec<_>) = Ability::ALL.into_iter().partition(able);
     let seen: Vec<_> = seen.into_iter().map(words).collect();
     if !seen.is_empty() {
         let sentence = format!("it sees {}", seen.join("; "));
         let finding = Finding::new(AREA, "abilities", Verdict::Ok, sentence);
-        findings.push(finding.seen("1", format!("{} abilities", sight.from)));
+        findings.push(finding.seen("1", format!("{} abilities", visibility.from)));
     }
     findings.extend(
         blind
             .into_iter()
-            .filter_map(|ability| lacking(sight, ability)),
+            .filter_map(|ability| lacking(visibility, ability)),
     );
     findings
 }
 
-fn source(sight: &Sight) -> Finding {
+fn source(visibility: &Visibility) -> Finding {
     let say = |verdict, sentence: String| Finding::new(AREA, "source", verdict, sentence);
-    let finding = match (sight.source.as_str(), &sight.source_reason) {
+    let finding = match (visibility.source.as_str(), &visibility.source_reason) {
         ("host", _) => say(
             Verdict::Ok,
             "the agent observes the sockets of this host: whole messages, per subscriber"
@@ -127,7 +127,7 @@ fn source(sight: &Sight) -> Finding {
         .configure("capture: {source: auto}"),
         (source, _) => say(Verdict::Note, format!("packets come from a {source}")),
     };
-    finding.seen(&sight.source, sight.from)
+    finding.seen(&visibility.source, visibility.from)
 }
 
 /// What is seen.
@@ -146,10 +146,13 @@ const fn words(ability: Ability) -> &'static str {
 }
 
 /// What is not seen, unless the source's own line says it.
-fn lacking(sight: &Sight, ability: Ability) -> Option<Finding> {
-    let reason = sight.reasons.iter().find(|(blind, _)| *blind == ability);
+fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
+    let reason = visibility
+        .reasons
+        .iter()
+        .find(|(blind, _)| *blind == ability);
     let reason = reason.map(|(_, reason)| reason.as_str());
-    let is_host = sight.source == "host";
+    let is_host = visibility.source == "host";
     let (verdict, mut sentence, remedy) = match ability {
         Ability::Subscribers if is_host => {
             (Verdict::Warning, format!("not {}", words(ability)), None)
@@ -196,7 +199,7 @@ fn lacking(sight: &Sight, ability: Ability) -> Option<Finding> {
         sentence = format!("{sentence}: {reason}");
     }
     let finding = Finding::new(AREA, ability.label(), verdict, sentence);
-    let finding = finding.seen(reason.unwrap_or("0"), sight.from);
+    let finding = finding.seen(reason.unwrap_or("0"), visibility.from);
     Some(match remedy {
         Some(remedy) => finding.configure(remedy),
         None => finding,
@@ -205,15 +208,15 @@ fn lacking(sight: &Sight, ability: Ability) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::finding::Place;
+    use super::super::finding::RemedyTarget;
     use super::*;
     use ros2probe_daemon::config::Config;
 
-    fn host(able: &[Ability]) -> Sight {
-        Sight {
+    fn host(able: &[Ability]) -> Visibility {
+        Visibility {
             source: "host".to_owned(),
             able: able.to_vec(),
-            ..Sight::default()
+            ..Visibility::default()
         }
     }
 
@@ -232,10 +235,10 @@ mod tests {
     fn what_the_kernel_does_not_allow_is_said_with_its_reason() {
         let mut able = Ability::ALL.to_vec();
         able.retain(|each| *each != Ability::ReassemblyLosses);
-        let mut sight = host(&able);
+        let mut visibility = host(&able);
         let reason = "the kernel does not tell".to_owned();
-        sight.reasons = vec![(Ability::ReassemblyLosses, reason)];
-        let findings = check(&sight);
+        visibility.reasons = vec![(Ability::ReassemblyLosses, reason)];
+        let findings = check(&visibility);
         let found = find(&findings, "reassembly_losses").unwrap();
         assert_eq!(found.verdict, Verdict::Warning);
         assert_eq!(
@@ -246,15 +249,15 @@ mod tests {
 
     #[test]
     fn the_wire_is_a_choice_or_a_warning_and_lists_no_consequence_twice() {
-        let mut sight = Sight {
+        let mut visibility = Visibility {
             source: "wire".to_owned(),
             able: vec![Ability::Sent, Ability::Forwarded],
-            ..Sight::default()
+            ..Visibility::default()
         };
-        let chosen = check(&sight);
+        let chosen = check(&visibility);
         assert_eq!(find(&chosen, "source").unwrap().verdict, Verdict::Note);
-        sight.source_reason = Some("no cgroup v2 hierarchy is mounted".to_owned());
-        let forced = check(&sight);
+        visibility.source_reason = Some("no cgroup v2 hierarchy is mounted".to_owned());
+        let forced = check(&visibility);
         let source = find(&forced, "source").unwrap();
         assert_eq!(source.verdict, Verdict::Warning);
         assert!(
@@ -273,13 +276,13 @@ mod tests {
     fn what_is_to_be_configured_can_be() {
         let mut configured = 0;
         for source in ["host", "wire"] {
-            let sight = Sight {
+            let visibility = Visibility {
                 source: source.to_owned(),
-                ..Sight::default()
+                ..Visibility::default()
             };
-            for finding in check(&sight) {
+            for finding in check(&visibility) {
                 for remedy in finding.remedies {
-                    assert_eq!(remedy.kind, Place::Configuration, "{remedy:?}");
+                    assert_eq!(remedy.kind, RemedyTarget::Configuration, "{remedy:?}");
                     let parsed = Config::parse(remedy.line.as_bytes());
                     assert!(parsed.is_ok(), "{}: {parsed:?}", remedy.line);
                     configured += 1;
@@ -296,9 +299,12 @@ mod tests {
             {"ability":"owners","able":true},{"ability":"socket_losses","able":false,"reason":"no"}]}"#,
         )
         .unwrap();
-        let sight = Sight::of_agent(&health);
-        assert_eq!(sight.able, [Ability::Owners]);
-        assert_eq!(sight.reasons, [(Ability::SocketLosses, "no".to_owned())]);
+        let visibility = Visibility::of_agent(&health);
+        assert_eq!(visibility.able, [Ability::Owners]);
+        assert_eq!(
+            visibility.reasons,
+            [(Ability::SocketLosses, "no".to_owned())]
+        );
     }
 
     #[test]

@@ -16,14 +16,14 @@ use super::exports::Reason;
 const LAST: Duration = Duration::from_millis(1_400);
 
 /// A client that knows when to stop.
-pub(super) struct Outlet {
+pub(super) struct SignalSender {
     client: Client,
     stop: CancellationToken,
     /// What was under way when the end was asked for.
     left: VecDeque<Request>,
 }
 
-impl Outlet {
+impl SignalSender {
     pub(super) const fn new(client: Client, stop: CancellationToken) -> Self {
         Self {
             client,

@@ -14,7 +14,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, Sleep, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use super::limit_facts::Place;
+use super::limit_facts::Slot;
 
 /// A connection without a request is closed after so long; a stream on which nothing can be written
 /// for so long, too.
@@ -31,15 +31,15 @@ const FREE: usize = 4 << 10;
 
 /// The connections of one listener.
 #[derive(Debug, Default)]
-pub(super) struct Crowd {
-    connections: Mutex<Vec<Arc<Pace>>>,
+pub(super) struct Connections {
+    connections: Mutex<Vec<Arc<ConnectionState>>>,
     unfinished: AtomicUsize,
     left: Notify,
 }
 
 /// How far one connection is; shared by its stream and by what answers its requests.
 #[derive(Debug)]
-pub(super) struct Pace {
+pub(super) struct ConnectionState {
     progress: Mutex<Progress>,
     /// Closes the connection.
     end: CancellationToken,
@@ -51,7 +51,7 @@ struct Progress {
     since: Instant,
     /// Bytes of the request that were read.
     read: usize,
-    /// Counted in [`Crowd::unfinished`].
+    /// Counted in [`Connections::unfinished`].
     counted: usize,
     /// Since when the client takes nothing, and what it took since then.
     stalled: Option<(Instant, usize)>,
@@ -75,38 +75,38 @@ enum Phase {
 #[derive(Debug)]
 pub(super) struct Connection<S> {
     stream: S,
-    pace: Arc<Pace>,
-    crowd: Arc<Crowd>,
+    state: Arc<ConnectionState>,
+    connections: Arc<Connections>,
     deadline: Pin<Box<Sleep>>,
-    _place: Place,
+    _place: Slot,
 }
 
-impl Crowd {
+impl Connections {
     /// Takes a connection in, which leaves with its value.
-    pub(super) fn join<S>(self: &Arc<Self>, stream: S, place: Place) -> Connection<S> {
-        let pace = Arc::new(Pace::new());
-        self.lock().push(Arc::clone(&pace));
+    pub(super) fn join<S>(self: &Arc<Self>, stream: S, slot: Slot) -> Connection<S> {
+        let state = Arc::new(ConnectionState::new());
+        self.lock().push(Arc::clone(&state));
         Connection {
             stream,
-            pace,
-            crowd: Arc::clone(self),
+            state,
+            connections: Arc::clone(self),
             deadline: Box::pin(sleep_until(Instant::now() + IDLE)),
-            _place: place,
+            _place: slot,
         }
     }
 
     /// Closes the connection that has been without a whole request for longest, if there is one.
     pub(super) fn make_room(&self) -> bool {
         let connections = self.lock();
-        let waiting = connections.iter().filter_map(|pace| {
-            let progress = pace.lock();
+        let waiting = connections.iter().filter_map(|state| {
+            let progress = state.lock();
             let is_waiting = matches!(progress.phase, Phase::Waiting | Phase::Receiving)
                 // The end of an answer is still on its way.
                 && progress.stalled.is_none();
-            (is_waiting && !pace.end.is_cancelled()).then_some((progress.since, pace))
+            (is_waiting && !state.end.is_cancelled()).then_some((progress.since, state))
         });
         let longest = waiting.min_by_key(|(since, _)| *since);
-        longest.map(|(_, pace)| pace.end.cancel()).is_some()
+        longest.map(|(_, state)| state.end.cancel()).is_some()
     }
 
     /// Returns when a connection has gone.
@@ -126,14 +126,14 @@ impl Crowd {
         self.unfinished.fetch_sub(bytes, Ordering::Relaxed);
     }
 
-    fn lock(&self) -> MutexGuard<'_, Vec<Arc<Pace>>> {
+    fn lock(&self) -> MutexGuard<'_, Vec<Arc<ConnectionState>>> {
         self.connections
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Pace {
+impl ConnectionState {
     fn new() -> Self {
         Self {
             progress: Mutex::new(Progress {
@@ -222,8 +222,8 @@ impl Progress {
 }
 
 impl<S> Connection<S> {
-    pub(super) const fn pace(&self) -> &Arc<Pace> {
-        &self.pace
+    pub(super) const fn state(&self) -> &Arc<ConnectionState> {
+        &self.state
     }
 
     pub(super) const fn stream(&self) -> &S {
@@ -232,7 +232,7 @@ impl<S> Connection<S> {
 
     /// Pending, unless the time is over.
     fn overdue<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
-        let deadline = self.pace.lock().deadline();
+        let deadline = self.state.lock().deadline();
         if self.deadline.deadline() != deadline {
             self.deadline.as_mut().reset(deadline);
         }
@@ -244,7 +244,7 @@ impl<S> Connection<S> {
 
     /// Counts what was read of a request.
     fn has_read(&self, bytes: usize) -> io::Result<()> {
-        let mut progress = self.pace.lock();
+        let mut progress = self.state.lock();
         if !matches!(progress.phase, Phase::Waiting | Phase::Receiving) {
             return Ok(());
         }
@@ -255,7 +255,7 @@ impl<S> Connection<S> {
         progress.read += bytes;
         let beyond = progress.read.saturating_sub(FREE);
         let fresh = beyond.saturating_sub(progress.counted);
-        if !self.crowd.hold(fresh) {
+        if !self.connections.hold(fresh) {
             return Err(io::Error::other("too many bytes of unfinished requests"));
         }
         progress.counted += fresh;
@@ -266,9 +266,10 @@ impl<S> Connection<S> {
     /// long.
     fn has_written(&self, bytes: usize) -> io::Result<()> {
         let now = Instant::now();
-        let mut progress = self.pace.lock();
+        let mut progress = self.state.lock();
         // The request is behind it.
-        self.crowd.release(std::mem::take(&mut progress.counted));
+        self.connections
+            .release(std::mem::take(&mut progress.counted));
         if matches!(progress.phase, Phase::Answering | Phase::Streaming) {
             progress.since = now;
         }
@@ -286,7 +287,7 @@ impl<S> Connection<S> {
     }
 
     fn stalls(&self) {
-        let mut progress = self.pace.lock();
+        let mut progress = self.state.lock();
         if progress.stalled.is_none() {
             progress.stalled = Some((Instant::now(), 0));
         }
@@ -295,11 +296,11 @@ impl<S> Connection<S> {
 
 impl<S> Drop for Connection<S> {
     fn drop(&mut self) {
-        self.crowd.release(self.pace.lock().counted);
-        let mut connections = self.crowd.lock();
-        connections.retain(|pace| !Arc::ptr_eq(pace, &self.pace));
+        self.connections.release(self.state.lock().counted);
+        let mut connections = self.connections.lock();
+        connections.retain(|state| !Arc::ptr_eq(state, &self.state));
         drop(connections);
-        self.crowd.left.notify_one();
+        self.connections.left.notify_one();
     }
 }
 
@@ -339,7 +340,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         // All that there was has been taken.
-        self.pace.lock().stalled = None;
+        self.state.lock().stalled = None;
         Pin::new(&mut self.stream).poll_flush(context)
     }
 
@@ -357,18 +358,18 @@ mod tests {
     use crate::surface::limit_facts::LimitFigures;
 
     /// A crowd, and a way to add a connection to it.
-    fn crowd() -> (
-        Arc<Crowd>,
+    fn connections() -> (
+        Arc<Connections>,
         impl Fn() -> (Connection<DuplexStream>, DuplexStream),
     ) {
-        let crowd = Arc::new(Crowd::default());
-        let places = LimitFigures::new(Limits::default()).places(Limit::ApiClients);
-        let joined = Arc::clone(&crowd);
+        let connections = Arc::new(Connections::default());
+        let places = LimitFigures::new(Limits::default()).slots(Limit::ApiClients);
+        let joined = Arc::clone(&connections);
         let join = move || {
             let (ours, theirs) = duplex(1 << 10);
             (joined.join(ours, places.take().unwrap()), theirs)
         };
-        (crowd, join)
+        (connections, join)
     }
 
     /// Reads until the connection fails or ends; for how long, and why.
@@ -386,7 +387,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_request_that_trickles_in_has_ten_seconds_and_a_pause_seventy_five() {
-        let (_crowd, join) = crowd();
+        let (_crowd, join) = connections();
         let (mut idle, _client) = join();
         let (lasted, why) = read(&mut idle).await;
         assert_eq!((lasted.as_secs(), why), (75, io::ErrorKind::TimedOut));
@@ -410,10 +411,10 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn a_whole_answer_that_is_read_too_slowly_ends_and_a_stream_may_stall_for_longer() {
         for (is_whole, seconds) in [(true, 10..=20), (false, 75..=75)] {
-            let (_crowd, join) = crowd();
+            let (_crowd, join) = connections();
             let (mut connection, mut client) = join();
-            connection.pace().requested(true);
-            connection.pace().answers(is_whole);
+            connection.state().requested(true);
+            connection.state().answers(is_whole);
             let start = Instant::now();
             let sent = connection.write_all(&[7; 1 << 20]);
             // 5 KB a second of a whole answer; nothing of a stream.
@@ -438,10 +439,10 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn an_answer_that_is_read_at_twenty_kilobytes_a_second_is_sent_whole() {
-        let (_crowd, join) = crowd();
+        let (_crowd, join) = connections();
         let (mut connection, mut client) = join();
-        connection.pace().requested(true);
-        connection.pace().answers(true);
+        connection.state().requested(true);
+        connection.state().answers(true);
         let reading = tokio::spawn(async move {
             let mut bytes = [0; 2 << 10];
             let mut read = 0;
@@ -458,7 +459,7 @@ mod tests {
 
     #[tokio::test]
     async fn unfinished_requests_of_all_connections_share_a_budget_and_small_ones_need_none() {
-        let (crowd, join) = crowd();
+        let (connections, join) = connections();
         let mut large = Vec::new();
         let mut refused = 0;
         for _ in 0..20 {
@@ -471,26 +472,26 @@ mod tests {
             refused += u32::from(connection.read_exact(&mut bytes).await.is_err());
             large.push((connection, sending));
         }
-        assert!(crowd.unfinished.load(Ordering::Relaxed) <= UNFINISHED);
+        assert!(connections.unfinished.load(Ordering::Relaxed) <= UNFINISHED);
         assert_eq!(refused, 13, "36 KiB each of 256");
         let (mut small, mut client) = join();
         client.write_all(b"GET /metrics").await.unwrap();
         assert!(small.read(&mut [0; 64]).await.is_ok());
         drop((large, small));
-        assert_eq!(crowd.unfinished.load(Ordering::Relaxed), 0);
+        assert_eq!(connections.unfinished.load(Ordering::Relaxed), 0);
     }
 
     #[tokio::test(start_paused = true)]
     async fn the_connection_that_waits_longest_makes_room_and_one_that_is_answered_does_not() {
-        let (crowd, join) = crowd();
+        let (connections, join) = connections();
         let (answered, _one) = join();
-        answered.pace().requested(true);
+        answered.state().requested(true);
         let (oldest, _two) = join();
         tokio::time::advance(Duration::from_secs(1)).await;
         let (newest, _three) = join();
-        let is_closed = |connection: &Connection<DuplexStream>| connection.pace.end.is_cancelled();
-        assert!(crowd.make_room() && is_closed(&oldest) && !is_closed(&newest));
-        assert!(crowd.make_room() && is_closed(&newest) && !is_closed(&answered));
-        assert!(!crowd.make_room());
+        let is_closed = |connection: &Connection<DuplexStream>| connection.state.end.is_cancelled();
+        assert!(connections.make_room() && is_closed(&oldest) && !is_closed(&newest));
+        assert!(connections.make_room() && is_closed(&newest) && !is_closed(&answered));
+        assert!(!connections.make_room());
     }
 }

@@ -5,8 +5,8 @@ use std::collections::BTreeMap;
 use std::fmt;
 
 use super::catalogue::{self as metric, Metric};
-use super::page::{Label, Page};
-use super::robot::series_name;
+use super::metric_sink::{Label, MetricSink};
+use super::ros2_metrics::series_name;
 use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::snapshot::Snapshot;
 
@@ -16,15 +16,15 @@ type Count = fn(&Diagnosis) -> usize;
 type PerTopic<'a> = BTreeMap<(u32, Cow<'a, str>), usize>;
 
 /// One family of each kind of finding.
-pub(super) fn diagnoses(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
+pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     let found = &*snapshot.diagnoses;
-    page.family(&metric::DIAGNOSES, |family| {
+    sink.family(&metric::DIAGNOSES, |family| {
         Diagnosis::KINDS.iter().try_for_each(|kind| {
             let own = found.list.iter().filter(|each| each.kind() == *kind);
             family.sample(&[Label::Text(kind)], own.count())
         })
     })?;
-    page.family(&metric::QOS_INCOMPATIBLE_PAIRS, |family| {
+    sink.family(&metric::QOS_INCOMPATIBLE_PAIRS, |family| {
         let mut pairs = BTreeMap::new();
         for each in &found.qos_pairs {
             let (domain_id, topic) = series(&each.topic);
@@ -63,14 +63,14 @@ pub(super) fn diagnoses(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result
                 *counts.entry(series(topic)).or_default() += count;
             }
         }
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             counts.iter().try_for_each(|((domain_id, topic), count)| {
                 let labels = [Label::Number((*domain_id).into()), Label::Text(topic)];
                 family.sample(&labels, *count)
             })
         })?;
     }
-    page.family(&metric::DUPLICATE_NODES, |family| {
+    sink.family(&metric::DUPLICATE_NODES, |family| {
         found.list.iter().try_for_each(|each| match each {
             Diagnosis::DuplicateNode {
                 domain_id,
@@ -83,7 +83,7 @@ pub(super) fn diagnoses(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result
             _ => Ok(()),
         })
     })?;
-    page.family(&metric::NODE_DOMAINS, |family| {
+    sink.family(&metric::NODE_DOMAINS, |family| {
         found.list.iter().try_for_each(|each| match each {
             Diagnosis::NodeInSeveralDomains {
                 node,

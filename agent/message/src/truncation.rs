@@ -6,7 +6,7 @@ use super::value::Array;
 
 /// What is shown of arrays and strings.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Shown {
+pub struct Truncation {
     /// Elements and characters at most, `...` standing for the others.
     pub truncate: Option<usize>,
     /// Arrays only by type and length.
@@ -15,7 +15,7 @@ pub struct Shown {
     pub no_strings: bool,
 }
 
-impl Shown {
+impl Truncation {
     /// A string, as far as it is shown.
     pub fn text(&self, text: &str) -> Option<String> {
         if self.no_strings {

@@ -4,13 +4,13 @@ use super::FilterError;
 
 /// One word.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Word {
+pub(super) struct Token {
     pub column: usize,
-    pub kind: WordKind,
+    pub kind: TokenKind,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum WordKind {
+pub(super) enum TokenKind {
     Name(String),
     Int(i128),
     Float(f64),
@@ -26,22 +26,22 @@ const SIGNS: [&str; 22] = [
 ];
 
 /// All words, the end being the last.
-pub(super) fn words(text: &str) -> Result<Vec<Word>, FilterError> {
+pub(super) fn tokens(text: &str) -> Result<Vec<Token>, FilterError> {
     let mut reader = Reader {
         rest: text,
         column: 1,
     };
-    let mut words = Vec::new();
+    let mut tokens = Vec::new();
     loop {
         let blank = reader.rest.len() - reader.rest.trim_start().len();
         reader.take(blank);
         let column = reader.column;
         let Some(first) = reader.rest.chars().next() else {
-            words.push(Word {
+            tokens.push(Token {
                 column,
-                kind: WordKind::End,
+                kind: TokenKind::End,
             });
-            return Ok(words);
+            return Ok(tokens);
         };
         let fraction = reader
             .rest
@@ -52,20 +52,20 @@ pub(super) fn words(text: &str) -> Result<Vec<Word>, FilterError> {
             let end = reader
                 .rest
                 .find(|next: char| !next.is_ascii_alphanumeric() && next != '_');
-            WordKind::Name(reader.take(end.unwrap_or(reader.rest.len())).to_owned())
+            TokenKind::Name(reader.take(end.unwrap_or(reader.rest.len())).to_owned())
         } else if first.is_ascii_digit() || (first == '.' && fraction) {
             reader.number()?
         } else if first == '\'' || first == '"' {
-            WordKind::Text(reader.string(first)?)
+            TokenKind::Text(reader.string(first)?)
         } else {
             let sign = SIGNS.iter().find(|sign| reader.rest.starts_with(**sign));
             let sign = *sign.ok_or_else(|| {
                 FilterError::new(column, format!("`{first}` is not part of an expression"))
             })?;
             reader.take(sign.len());
-            WordKind::Sign(sign)
+            TokenKind::Sign(sign)
         };
-        words.push(Word { column, kind });
+        tokens.push(Token { column, kind });
     }
 }
 
@@ -85,7 +85,7 @@ impl<'a> Reader<'a> {
         taken
     }
 
-    fn number(&mut self) -> Result<WordKind, FilterError> {
+    fn number(&mut self) -> Result<TokenKind, FilterError> {
         let column = self.column;
         let wrong = || FilterError::new(column, "not a number");
         for (prefix, radix) in [("0x", 16), ("0b", 2), ("0o", 8)] {
@@ -100,7 +100,7 @@ impl<'a> Reader<'a> {
                     .find(|next: char| !next.is_ascii_alphanumeric() && next != '_');
                 let digits = self.take(end.unwrap_or(self.rest.len())).replace('_', "");
                 return i128::from_str_radix(&digits, radix)
-                    .map(WordKind::Int)
+                    .map(TokenKind::Int)
                     .map_err(|_| wrong());
             }
         }
@@ -112,13 +112,13 @@ impl<'a> Reader<'a> {
         });
         let digits = self.take(end.unwrap_or(self.rest.len())).replace('_', "");
         if digits.bytes().all(|byte| byte.is_ascii_digit()) {
-            return digits.parse().map(WordKind::Int).map_err(|_| wrong());
+            return digits.parse().map(TokenKind::Int).map_err(|_| wrong());
         }
         let plain = digits
             .bytes()
             .all(|byte| b"0123456789.eE+-".contains(&byte));
         let number = digits.parse().ok().filter(|_| plain);
-        number.map(WordKind::Float).ok_or_else(wrong)
+        number.map(TokenKind::Float).ok_or_else(wrong)
     }
 
     fn string(&mut self, quote: char) -> Result<String, FilterError> {

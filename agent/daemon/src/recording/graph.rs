@@ -28,7 +28,7 @@ pub struct GraphTopic {
     #[serde(default)]
     measurement: Option<Counted>,
     #[serde(flatten)]
-    announced: Announced,
+    announced: DiscoveredTopic,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -44,28 +44,28 @@ struct Counted {
 
 /// The API's `/participants`: who sends without having been announced.
 #[derive(Clone, Debug, Default, Deserialize)]
-pub struct Strangers {
-    unknown_writers: Vec<Stranger>,
+pub struct UnknownWriterList {
+    unknown_writers: Vec<UnknownWriter>,
 }
 
 #[derive(Clone, Debug, Deserialize)]
-struct Stranger {
+struct UnknownWriter {
     guid: String,
     measurement: Counted,
 }
 
 /// The graph at one moment, as far as a report compares two of them.
 #[derive(Clone, Debug, Default)]
-pub struct Sight {
+pub struct GraphSnapshot {
     /// ROS topics that somebody publishes.
-    pub topics: Vec<SeenTopic>,
+    pub topics: Vec<PublishedTopic>,
     /// Messages of each writer that was never announced, by its GUID.
     pub unknown_writers: HashMap<String, u64>,
 }
 
 /// A published topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct SeenTopic {
+pub struct PublishedTopic {
     /// Its domain.
     pub domain_id: u32,
     /// ROS name.
@@ -75,9 +75,9 @@ pub struct SeenTopic {
     /// Somebody subscribes to it.
     pub subscribed: bool,
     /// How messages pass between most pairs, where none of them uses the network.
-    pub aside: Option<String>,
+    pub other_transport: Option<String>,
     /// Publishers that late joiners are given samples of.
-    pub keepers: Vec<String>,
+    pub durable_publishers: Vec<String>,
     /// Messages counted so far; `None` where it is not measured.
     pub messages: Option<u64>,
 }
@@ -92,7 +92,7 @@ impl From<GraphTopic> for Graph {
 impl Graph {
     /// Of one domain, by the names that messages bear: ROS names of topics, else DDS names.
     #[must_use]
-    pub fn by_name(self, domain_id: u32) -> HashMap<String, Announced> {
+    pub fn by_name(self, domain_id: u32) -> HashMap<String, DiscoveredTopic> {
         let topics = self.topics.into_iter();
         let topics = topics.filter(|topic| topic.domain_id == domain_id);
         let topics = topics.map(|topic| {
@@ -108,7 +108,7 @@ impl Graph {
 
     /// With those who send unannounced.
     #[must_use]
-    pub fn sight(self, strangers: Strangers) -> Sight {
+    pub fn into_snapshot(self, unknown_writers: UnknownWriterList) -> GraphSnapshot {
         let topics = self.topics.into_iter();
         let topics = topics
             .filter(|topic| is_topic(&topic.kind) && !topic.announced.publishers.is_empty())
@@ -116,54 +116,56 @@ impl Graph {
                 let passages = topic.passages.iter();
                 let passages = passages.map(|each| (each.passage.as_str(), each.pairs));
                 let publishers = topic.announced.publishers.iter();
-                let keepers = publishers.filter(|publisher| publisher.keeps_samples());
-                SeenTopic {
+                let durable_publishers = publishers.filter(|publisher| publisher.is_durable());
+                PublishedTopic {
                     domain_id: topic.domain_id,
-                    aside: aside(passages).map(str::to_owned),
-                    keepers: keepers.map(|publisher| publisher.guid.clone()).collect(),
+                    other_transport: other_transport(passages).map(str::to_owned),
+                    durable_publishers: durable_publishers
+                        .map(|publisher| publisher.guid.clone())
+                        .collect(),
                     name: topic.name,
                     message_types: topic.announced.message_types,
                     subscribed: !topic.announced.subscriptions.is_empty(),
                     messages: topic.measurement.map(|counted| counted.messages),
                 }
             });
-        let strangers = strangers.unknown_writers.into_iter();
-        Sight {
+        let unknown_writers = unknown_writers.unknown_writers.into_iter();
+        GraphSnapshot {
             topics: topics.collect(),
-            unknown_writers: strangers
+            unknown_writers: unknown_writers
                 .map(|stranger| (stranger.guid, stranger.measurement.messages))
                 .collect(),
         }
     }
 }
 
-impl From<&Snapshot> for Sight {
+impl From<&Snapshot> for GraphSnapshot {
     fn from(snapshot: &Snapshot) -> Self {
         let topics = snapshot.topics.iter();
         let topics = topics.filter(|topic| is_topic(topic.kind) && !topic.publishers.is_empty());
-        let strangers = snapshot.unknown_writers.iter();
+        let unknown_writers = snapshot.unknown_writers.iter();
         Self {
-            topics: topics.map(SeenTopic::from).collect(),
-            unknown_writers: strangers
+            topics: topics.map(PublishedTopic::from).collect(),
+            unknown_writers: unknown_writers
                 .map(|stranger| (stranger.guid.to_string(), stranger.measurement.messages))
                 .collect(),
         }
     }
 }
 
-impl From<&TopicFacts> for SeenTopic {
+impl From<&TopicFacts> for PublishedTopic {
     fn from(facts: &TopicFacts) -> Self {
         let passages = facts.passages.iter();
         let passages = passages.map(|count| (count.passage.label(), count.pairs));
         let publishers = facts.publishers.iter();
-        let keepers = publishers.filter(|publisher| publisher.durability != VOLATILE);
+        let durable_publishers = publishers.filter(|publisher| publisher.durability != VOLATILE);
         Self {
             domain_id: facts.domain_id,
             name: facts.name.clone(),
             message_types: facts.message_types.clone(),
             subscribed: !facts.subscriptions.is_empty(),
-            aside: aside(passages).map(str::to_owned),
-            keepers: keepers
+            other_transport: other_transport(passages).map(str::to_owned),
+            durable_publishers: durable_publishers
                 .map(|publisher| publisher.guid.to_string())
                 .collect(),
             messages: facts.measurement.as_ref().map(|measured| measured.messages),
@@ -179,7 +181,9 @@ fn is_topic(kind: &str) -> bool {
     )
 }
 
-fn aside<'a>(passages: impl Iterator<Item = (&'a str, usize)> + Clone) -> Option<&'a str> {
+fn other_transport<'a>(
+    passages: impl Iterator<Item = (&'a str, usize)> + Clone,
+) -> Option<&'a str> {
     let network = Passage::Network.label();
     if passages.clone().any(|(passage, _)| passage == network) {
         return None;
@@ -190,7 +194,7 @@ fn aside<'a>(passages: impl Iterator<Item = (&'a str, usize)> + Clone) -> Option
 
 /// A topic at the moment in which it is taken into a bag.
 #[derive(Clone, Debug, Default, Deserialize)]
-pub struct Announced {
+pub struct DiscoveredTopic {
     /// ROS types announced on it.
     pub message_types: Vec<String>,
     /// RIHS01 hashes announced on it.
@@ -217,12 +221,12 @@ pub struct Subscriber {}
 impl Publisher {
     /// Late joiners are given its last samples, which were sent before and are sent to them alone.
     #[must_use]
-    pub fn keeps_samples(&self) -> bool {
+    pub fn is_durable(&self) -> bool {
         self.qos.durability != VOLATILE
     }
 }
 
-impl From<&TopicFacts> for Announced {
+impl From<&TopicFacts> for DiscoveredTopic {
     fn from(facts: &TopicFacts) -> Self {
         Self {
             message_types: facts.message_types.clone(),
@@ -262,9 +266,9 @@ mod tests {
                 "durability": "TRANSIENT_LOCAL", "history": "KEEP_LAST (5)",
                 "deadline_seconds": 0.1, "lifespan_seconds": null, "liveliness": "AUTOMATIC",
                 "liveliness_lease_seconds": null, "ownership": "SHARED", "partitions": []}}]}"#;
-        let announced: Announced = serde_json::from_str(json).unwrap();
+        let announced: DiscoveredTopic = serde_json::from_str(json).unwrap();
         let publisher = &announced.publishers[0];
-        assert!(publisher.keeps_samples() && announced.subscriptions.len() == 1);
+        assert!(publisher.is_durable() && announced.subscriptions.len() == 1);
         assert_eq!(publisher.qos.history, "KEEP_LAST (5)");
     }
 }

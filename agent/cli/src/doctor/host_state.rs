@@ -18,7 +18,7 @@ const MAX_NAMES: usize = 1 << 16;
 
 /// What checks look at.
 #[derive(Debug)]
-pub struct Host {
+pub struct HostState {
     /// `/proc`, `/sys`, `/etc` and `/run`.
     pub files: Files,
     /// Bytes of a page; 0 = not known.
@@ -66,7 +66,7 @@ pub enum Unread {
     Other(String),
 }
 
-impl Host {
+impl HostState {
     /// This one.
     #[must_use]
     pub fn read() -> Self {
@@ -214,12 +214,12 @@ fn clock() -> Result<ClockState, String> {
     // SAFETY: a `timex` is plain numbers, for which zero is a value; zero modes change nothing.
     let mut state: libc::timex = unsafe { std::mem::zeroed() };
     // SAFETY: `state` is ours and outlives the call.
-    let told = unsafe { libc::adjtimex(&raw mut state) };
-    if told < 0 {
+    let result = unsafe { libc::adjtimex(&raw mut state) };
+    if result < 0 {
         return Err(io::Error::last_os_error().to_string());
     }
     Ok(ClockState {
-        synchronised: told != libc::TIME_ERROR && state.status & libc::STA_UNSYNC == 0,
+        synchronised: result != libc::TIME_ERROR && state.status & libc::STA_UNSYNC == 0,
         estimated_error: state.esterror,
         maximum_error: state.maxerror,
     })
@@ -230,14 +230,14 @@ pub(super) mod tests {
     use super::*;
 
     /// A host of these files alone, with no variables and no privileges.
-    pub(in crate::doctor) fn host(files: &[(&str, &str)]) -> (tempfile::TempDir, Host) {
+    pub(in crate::doctor) fn host(files: &[(&str, &str)]) -> (tempfile::TempDir, HostState) {
         let directory = tempfile::tempdir().unwrap();
         for (path, text) in files {
             let path = directory.path().join(path.trim_start_matches('/'));
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, text).unwrap();
         }
-        let host = Host {
+        let host = HostState {
             files: Files::below(directory.path()),
             page_bytes: 4096,
             capabilities: CapsHashSet::new(),
@@ -266,7 +266,7 @@ pub(super) mod tests {
 
     #[test]
     fn this_host_can_be_read() {
-        let host = Host::read();
+        let host = HostState::read();
         assert!(host.files.processes().contains(&std::process::id()));
         assert!(host.page_bytes >= 4096);
         assert!(!host.environment.is_empty());

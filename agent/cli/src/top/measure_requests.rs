@@ -10,47 +10,47 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use super::app::Hold;
-use super::feed::Ask;
+use super::app::MeasuredBy;
+use super::poller::Request;
 use super::row::Key;
 use crate::client::{Agent, ClientError, Next};
 use ros2probe_api::path::encoded;
 
 /// How often a connection looks whether it is still wanted.
-const LOOK: Duration = Duration::from_millis(200);
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
 /// Looks between two attempts to open it again.
 const PAUSE: u32 = 10;
 
 /// All of them.
 #[derive(Debug)]
-pub(super) struct Holds {
+pub(super) struct MeasureRequests {
     agent: Arc<Agent>,
-    asks: Sender<Ask>,
-    all: BTreeMap<Key, Held>,
+    requests: Sender<Request>,
+    all: BTreeMap<Key, MeasureRequest>,
 }
 
 #[derive(Debug)]
-enum Held {
+enum MeasureRequest {
     /// By a connection, until this is set.
     Stream(Arc<AtomicBool>),
     /// By a watch of this name.
     Watch(String),
 }
 
-impl Holds {
-    pub(super) const fn new(agent: Arc<Agent>, asks: Sender<Ask>) -> Self {
+impl MeasureRequests {
+    pub(super) const fn new(agent: Arc<Agent>, requests: Sender<Request>) -> Self {
         Self {
             agent,
-            asks,
+            requests,
             all: BTreeMap::new(),
         }
     }
 
     /// As the table marks them.
-    pub(super) fn shown(&self) -> BTreeMap<Key, Hold> {
-        let hold = |held: &Held| match held {
-            Held::Stream(_) => Hold::Here,
-            Held::Watch(_) => Hold::Kept,
+    pub(super) fn shown(&self) -> BTreeMap<Key, MeasuredBy> {
+        let hold = |held: &MeasureRequest| match held {
+            MeasureRequest::Stream(_) => MeasuredBy::Session,
+            MeasureRequest::Watch(_) => MeasuredBy::Watch,
         };
         let all = self.all.iter();
         all.map(|(key, held)| (key.clone(), hold(held))).collect()
@@ -59,19 +59,19 @@ impl Holds {
     /// Has a topic measured while this program runs, or no longer.
     pub(super) fn toggle(&mut self, key: &Key, name: &str) -> String {
         match self.all.remove(key) {
-            Some(Held::Stream(stop)) => {
+            Some(MeasureRequest::Stream(stop)) => {
                 stop.store(true, Ordering::Relaxed);
                 format!("{name}: no longer measured for rp top")
             }
-            Some(Held::Watch(path)) => match self.agent.delete(&path) {
+            Some(MeasureRequest::Watch(path)) => match self.agent.delete(&path) {
                 Ok(()) => format!("{name}: the watch is removed"),
                 Err(error) => {
-                    let said = format!("{name}: {error}");
+                    let status = format!("{name}: {error}");
                     // Somebody else may have removed it; else it is still there.
                     if !error.is("no-such-watch") {
-                        self.all.insert(key.clone(), Held::Watch(path));
+                        self.all.insert(key.clone(), MeasureRequest::Watch(path));
                     }
-                    said
+                    status
                 }
             },
             None => match self.open(key) {
@@ -83,7 +83,7 @@ impl Holds {
 
     /// Has a topic measured also after the end.
     pub(super) fn keep(&mut self, key: &Key, name: &str) -> String {
-        if let Some(Held::Watch(_)) = self.all.get(key) {
+        if let Some(MeasureRequest::Watch(_)) = self.all.get(key) {
             return format!("{name}: is kept already; w removes the watch");
         }
         let path = format!("/watch{}?domain_id={}", encoded(name), key.domain_id);
@@ -92,8 +92,8 @@ impl Holds {
         }
         match self.agent.post::<_, Value>(&path, &json!({})) {
             Ok(_) => {
-                let before = self.all.insert(key.clone(), Held::Watch(path));
-                if let Some(Held::Stream(stop)) = before {
+                let before = self.all.insert(key.clone(), MeasureRequest::Watch(path));
+                if let Some(MeasureRequest::Stream(stop)) = before {
                     stop.store(true, Ordering::Relaxed);
                 }
                 format!("{name}: stays watched after rp top ends; w removes it")
@@ -119,11 +119,11 @@ impl Holds {
             ),
             key: key.clone(),
             stop: Arc::clone(&stop),
-            asks: self.asks.clone(),
+            requests: self.requests.clone(),
         };
         let thread = thread::Builder::new().name("interest".to_owned());
         thread.spawn(move || stream.run())?;
-        self.all.insert(key.clone(), Held::Stream(stop));
+        self.all.insert(key.clone(), MeasureRequest::Stream(stop));
         Ok(())
     }
 }
@@ -135,7 +135,7 @@ struct Stream {
     path: String,
     key: Key,
     stop: Arc<AtomicBool>,
-    asks: Sender<Ask>,
+    requests: Sender<Request>,
 }
 
 impl Stream {
@@ -145,14 +145,16 @@ impl Stream {
             match self.agent.stream(&self.path) {
                 Ok(mut lines) => {
                     while !self.is_over() {
-                        match lines.line_within(LOOK) {
+                        match lines.line_within(POLL_INTERVAL) {
                             Ok(Next::Line(_) | Next::Nothing) => {}
                             Ok(Next::End) | Err(_) => break,
                         }
                     }
                 }
                 Err(error @ (ClientError::Refused(_) | ClientError::Older { .. })) => {
-                    let _ = self.asks.send(Ask::Lost(self.key, error.to_string()));
+                    let _ = self
+                        .requests
+                        .send(Request::Lost(self.key, error.to_string()));
                     return;
                 }
                 Err(_) => {}
@@ -161,7 +163,7 @@ impl Stream {
                 if self.is_over() {
                     return;
                 }
-                thread::sleep(LOOK);
+                thread::sleep(POLL_INTERVAL);
             }
         }
     }

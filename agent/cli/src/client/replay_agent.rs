@@ -14,7 +14,7 @@ use super::{ClientError, Target};
 use ros2probe_capture::pcap::{PcapError, Speed, link_name};
 use ros2probe_daemon::agent::{Blueprint, Parts};
 use ros2probe_daemon::config::{Config, Watch};
-use ros2probe_daemon::run::replay::{Replay, Waiter, rest};
+use ros2probe_daemon::run::replay::{Replay, ReplayControl, pause_at};
 use ros2probe_daemon::run::{RunError, Source};
 use ros2probe_daemon::surface::api;
 use ros2probe_daemon::surface::{Board, Settings};
@@ -47,10 +47,10 @@ pub(super) enum Stop {
 
 /// A capture with an agent of its own.
 #[derive(Debug)]
-pub(super) struct Replayed {
+pub(super) struct ReplayAgent {
     capture: PathBuf,
     pipes: mpsc::UnboundedSender<DuplexStream>,
-    waiter: Option<Waiter>,
+    waiter: Option<ReplayControl>,
     stop: CancellationToken,
     outcome: Arc<OnceLock<Outcome>>,
 }
@@ -64,7 +64,7 @@ pub struct Outcome {
     pub unsupported_packets: u64,
 }
 
-impl Replayed {
+impl ReplayAgent {
     /// Replays `capture` as far as is asked for. What cannot be read of it is said on stderr; what
     /// came before counts.
     pub(super) async fn start(
@@ -94,8 +94,8 @@ impl Replayed {
             replay = replay.quiet();
         }
         if matches!(stop, Stop::AtBeginning | Stop::AtBeginningMeasured) {
-            let (rest, other) = rest(target.from);
-            replay = replay.resting(rest);
+            let (rest, other) = pause_at(target.from);
+            replay = replay.pausing_at(rest);
             waiter = Some(other);
         }
         let source = Source::Replay(Box::new(replay));
@@ -170,7 +170,7 @@ impl Replayed {
                     return Err(failed(error));
                 }
             }
-            Some(waiter) => waiter.rests().await,
+            Some(waiter) => waiter.paused().await,
         }
         Ok(Self {
             capture: capture.to_path_buf(),
@@ -199,9 +199,9 @@ impl Replayed {
     }
 
     /// Replays the rest.
-    pub(super) fn go_on(&self) {
+    pub(super) fn resume(&self) {
         if let Some(waiter) = &self.waiter {
-            waiter.go_on();
+            waiter.resume();
         }
     }
 
@@ -211,7 +211,7 @@ impl Replayed {
     }
 }
 
-impl Drop for Replayed {
+impl Drop for ReplayAgent {
     fn drop(&mut self) {
         self.stop.cancel();
     }

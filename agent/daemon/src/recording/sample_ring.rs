@@ -13,7 +13,7 @@ const OVERHEAD: usize = 256;
 
 /// The last samples, oldest first.
 #[derive(Debug)]
-pub struct Ring {
+pub struct SampleRing {
     samples: VecDeque<Arc<Sample>>,
     bytes: usize,
     limit: usize,
@@ -22,7 +22,7 @@ pub struct Ring {
     crowded_out: u64,
 }
 
-impl Ring {
+impl SampleRing {
     /// Keeps at most `limit` bytes, and nothing older than `span`.
     #[must_use]
     pub const fn new(limit: usize, span: Option<Duration>) -> Self {
@@ -137,13 +137,13 @@ mod tests {
         })
     }
 
-    fn numbers(ring: &mut Ring) -> Vec<u64> {
+    fn numbers(ring: &mut SampleRing) -> Vec<u64> {
         ring.drain().map(|sample| sample.sequence_number).collect()
     }
 
     #[test]
     fn what_is_older_than_the_span_goes() {
-        let mut ring = Ring::new(1 << 20, Some(Duration::from_secs(3)));
+        let mut ring = SampleRing::new(1 << 20, Some(Duration::from_secs(3)));
         for second in 0..6 {
             ring.push(sample(second, 10));
         }
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn the_bytes_stay_below_the_limit_and_what_had_to_go_is_counted() {
-        let mut ring = Ring::new(3000, None);
+        let mut ring = SampleRing::new(3000, None);
         for second in 0..5 {
             ring.push(sample(second, 1000));
             assert!(ring.bytes() <= 3000);

@@ -10,7 +10,7 @@ use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
-use super::packed::{Encoding, Packed, Packer};
+use super::compressed_text::{CompressedText, Encoding, TextCompressor};
 
 /// Large answers of one surface that are made at once.
 const AT_ONCE: usize = 2;
@@ -23,15 +23,15 @@ const PATIENCE: Duration = Duration::from_secs(2);
 
 /// Large answers of one surface.
 #[derive(Debug)]
-pub(super) struct Answers {
+pub(super) struct LargeResponses {
     making: Semaphore,
     patience: Duration,
-    kept: Mutex<Vec<Kept>>,
+    kept: Mutex<Vec<Pending>>,
 }
 
 /// An answer that is being read, by age.
 #[derive(Debug)]
-struct Kept {
+struct Pending {
     bytes: usize,
     /// Its reader gets no more.
     given_up: CancellationToken,
@@ -39,19 +39,19 @@ struct Kept {
 
 /// The turn of one answer, while it is made.
 #[derive(Debug)]
-pub(super) struct Turn {
-    of: &'static Answers,
+pub(super) struct RenderPermit {
+    of: &'static LargeResponses,
     _making: SemaphorePermit<'static>,
 }
 
 /// The room of one answer, until it is read.
 #[derive(Debug)]
-pub(super) struct Room {
-    of: &'static Answers,
+pub(super) struct Reservation {
+    of: &'static LargeResponses,
     given_up: CancellationToken,
 }
 
-impl Answers {
+impl LargeResponses {
     /// Nothing made or kept.
     pub(super) const fn new() -> Self {
         Self {
@@ -62,17 +62,17 @@ impl Answers {
     }
 
     /// A turn, within a moment.
-    pub(super) async fn turn(&'static self) -> Option<Turn> {
+    pub(super) async fn turn(&'static self) -> Option<RenderPermit> {
         let making = timeout(self.patience, self.making.acquire()).await;
         let making = making.ok()?.ok()?;
-        Some(Turn {
+        Some(RenderPermit {
             of: self,
             _making: making,
         })
     }
 
     /// Room for an answer of so many bytes, that of the oldest ones where need be.
-    fn room(&'static self, bytes: usize) -> Room {
+    fn room(&'static self, bytes: usize) -> Reservation {
         let given_up = CancellationToken::new();
         let mut kept = self.lock();
         let mut sum: usize = kept.iter().map(|each| each.bytes).sum();
@@ -84,21 +84,21 @@ impl Answers {
             }
             stays
         });
-        kept.push(Kept {
+        kept.push(Pending {
             bytes,
             given_up: given_up.clone(),
         });
-        Room { of: self, given_up }
+        Reservation { of: self, given_up }
     }
 
-    fn lock(&self) -> MutexGuard<'_, Vec<Kept>> {
+    fn lock(&self) -> MutexGuard<'_, Vec<Pending>> {
         self.kept.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Turn {
+impl RenderPermit {
     /// The text as an answer.
-    pub(super) fn keep_packed(self, text: Packed) -> Body {
+    pub(super) fn keep_packed(self, text: CompressedText) -> Body {
         if text.len() < LARGE {
             return text.into_body(None);
         }
@@ -111,7 +111,7 @@ impl Turn {
         if bytes.len() < LARGE {
             return bytes.into();
         }
-        let mut packer = Packer::new(Encoding::Identity);
+        let mut packer = TextCompressor::new(Encoding::Identity);
         let packed = packer.write(&bytes).and_then(|()| packer.finish());
         match packed {
             Ok(packed) => self.keep_packed(packed),
@@ -121,14 +121,14 @@ impl Turn {
     }
 }
 
-impl Room {
+impl Reservation {
     /// Whether another answer has it.
     pub(super) fn is_given_up(&self) -> bool {
         self.given_up.is_cancelled()
     }
 }
 
-impl Drop for Room {
+impl Drop for Reservation {
     fn drop(&mut self) {
         self.given_up.cancel();
         self.of.lock().retain(|each| !each.given_up.is_cancelled());
@@ -155,7 +155,7 @@ mod tests {
 
     #[tokio::test]
     async fn slow_readers_of_large_answers_never_keep_others_from_theirs() {
-        static ANSWERS: Answers = Answers {
+        static ANSWERS: LargeResponses = LargeResponses {
             making: Semaphore::const_new(AT_ONCE),
             patience: Duration::ZERO,
             kept: Mutex::new(Vec::new()),
@@ -185,7 +185,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_third_answer_waits_until_one_of_two_is_made() {
-        static ANSWERS: Answers = Answers {
+        static ANSWERS: LargeResponses = LargeResponses {
             making: Semaphore::const_new(AT_ONCE),
             patience: Duration::ZERO,
             kept: Mutex::new(Vec::new()),

@@ -7,8 +7,8 @@ use std::net::SocketAddr;
 
 use super::board::Settings;
 use super::catalogue::{self as metric, Metric};
-use super::page::{Family, Label, Number, Page};
-use super::robot::Row;
+use super::metric_sink::{Family, Label, MetricSink, Number};
+use super::ros2_metrics::TopicRow;
 use ros2probe_model::cause::LossCause;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{
@@ -33,20 +33,20 @@ type Values = fn(&Breakdown) -> &Histogram;
 pub(super) struct Deliveries<'a> {
     sent: Vec<Delivery<'a>>,
     received: Vec<Delivery<'a>>,
-    readers: Vec<(&'a Row<'a>, &'a AcknowledgementFacts)>,
+    readers: Vec<(&'a TopicRow<'a>, &'a AcknowledgementFacts)>,
     /// How many have none.
     pub(super) hidden: usize,
 }
 
 /// One series: what no label tells apart is added up.
 struct Delivery<'a> {
-    row: &'a Row<'a>,
+    row: &'a TopicRow<'a>,
     facts: &'a DeliveryFacts,
     delivered: Delivered,
 }
 
 impl<'a> Deliveries<'a> {
-    pub(super) fn new(rows: &'a [Row<'a>]) -> Self {
+    pub(super) fn new(rows: &'a [TopicRow<'a>]) -> Self {
         let mut all = Self {
             sent: Vec::new(),
             received: Vec::new(),
@@ -70,7 +70,7 @@ impl<'a> Deliveries<'a> {
     }
 
     /// The snapshot's lists are sorted by what the labels show, so twins follow one another.
-    fn add(&mut self, row: &'a Row<'a>, facts: &'a DeliveryFacts) {
+    fn add(&mut self, row: &'a TopicRow<'a>, facts: &'a DeliveryFacts) {
         let shown = self.sent.len() + self.received.len();
         let list = match facts.direction {
             Direction::Sent => &mut self.sent,
@@ -94,13 +94,13 @@ impl<'a> Deliveries<'a> {
         }
     }
 
-    pub(super) fn write(&self, page: &mut Page<'_>) -> fmt::Result {
+    pub(super) fn write(&self, sink: &mut MetricSink<'_>) -> fmt::Result {
         let sent: [(&Metric, Count); 2] = [
             (&metric::WRITER_SENT, |sent| sent.messages),
             (&metric::WRITER_SENT_BYTES, |sent| sent.bytes),
         ];
         for (metric, value) in sent {
-            page.family(metric, |family| {
+            sink.family(metric, |family| {
                 self.sent.iter().try_for_each(|delivery| {
                     let [domain_id, topic, writer, destination, _] = delivery.labels();
                     let labels = [domain_id, topic, writer, destination];
@@ -108,14 +108,14 @@ impl<'a> Deliveries<'a> {
                 })
             })?;
         }
-        page.family(&metric::SUBSCRIBER_INFO, |family| self.subscribers(family))?;
-        self.each_received(page, &metric::SUBSCRIBER_RECEIVED, |got| {
+        sink.family(&metric::SUBSCRIBER_INFO, |family| self.subscribers(family))?;
+        self.each_received(sink, &metric::SUBSCRIBER_RECEIVED, |got| {
             got.messages.into()
         })?;
-        self.each_received(page, &metric::SUBSCRIBER_RECEIVED_BYTES, |got| {
+        self.each_received(sink, &metric::SUBSCRIBER_RECEIVED_BYTES, |got| {
             got.bytes.into()
         })?;
-        page.family(&metric::SUBSCRIBER_LOST, |family| {
+        sink.family(&metric::SUBSCRIBER_LOST, |family| {
             self.received.iter().try_for_each(|delivery| {
                 let [domain_id, topic, writer, destination, subscriber] = delivery.labels();
                 LossCause::ALL.into_iter().try_for_each(|cause| {
@@ -132,29 +132,29 @@ impl<'a> Deliveries<'a> {
                 })
             })
         })?;
-        self.each_received(page, &metric::SUBSCRIBER_PENDING, |got| got.pending.into())?;
-        self.each_received(page, &metric::SUBSCRIBER_RECOVERED, |got| {
+        self.each_received(sink, &metric::SUBSCRIBER_PENDING, |got| got.pending.into())?;
+        self.each_received(sink, &metric::SUBSCRIBER_RECOVERED, |got| {
             got.recovered.into()
         })?;
-        self.each_received(page, &metric::SUBSCRIBER_RECOVERY_SECONDS, |got| {
+        self.each_received(sink, &metric::SUBSCRIBER_RECOVERY_SECONDS, |got| {
             got.recovery_seconds.into()
         })?;
-        self.each_received(page, &metric::SUBSCRIBER_IRRELEVANT, |got| {
+        self.each_received(sink, &metric::SUBSCRIBER_IRRELEVANT, |got| {
             got.irrelevant.into()
         })?;
-        self.each_received(page, &metric::SUBSCRIBER_UNMATCHED, |got| {
+        self.each_received(sink, &metric::SUBSCRIBER_UNMATCHED, |got| {
             got.unmatched.into()
         })?;
-        self.acknowledgements(page)
+        self.acknowledgements(sink)
     }
 
     fn each_received(
         &self,
-        page: &mut Page<'_>,
+        sink: &mut MetricSink<'_>,
         metric: &'static Metric,
         value: fn(&Delivered) -> Number,
     ) -> fmt::Result {
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             self.received.iter().try_for_each(|delivery| {
                 family.sample(&delivery.labels(), value(&delivery.delivered))
             })
@@ -190,7 +190,7 @@ impl<'a> Deliveries<'a> {
         Ok(())
     }
 
-    fn acknowledgements(&self, page: &mut Page<'_>) -> fmt::Result {
+    fn acknowledgements(&self, sink: &mut MetricSink<'_>) -> fmt::Result {
         let values: [(&Metric, Acknowledged); 4] = [
             (&metric::READER_LAG, |facts| facts.lag_samples.into()),
             (&metric::READER_LAG_SECONDS, |facts| {
@@ -200,7 +200,7 @@ impl<'a> Deliveries<'a> {
             (&metric::READER_REQUESTED, |facts| facts.requested.into()),
         ];
         for (metric, value) in values {
-            page.family(metric, |family| {
+            sink.family(metric, |family| {
                 self.readers.iter().try_for_each(|(row, facts)| {
                     let [domain_id, topic] = row.labels();
                     let labels = [
@@ -220,7 +220,7 @@ impl<'a> Deliveries<'a> {
 
 impl<'a> Delivery<'a> {
     /// What tells receivers apart in the labels that describe them.
-    fn receiver(&self) -> (*const Row<'a>, SocketAddr, &'a str) {
+    fn receiver(&self) -> (*const TopicRow<'a>, SocketAddr, &'a str) {
         let row = std::ptr::from_ref(self.row);
         (row, self.facts.destination, &self.facts.subscriber)
     }
@@ -238,13 +238,17 @@ impl<'a> Delivery<'a> {
 }
 
 /// Sums over a topic's deliveries, for the topics of which any was seen.
-pub(super) fn sums(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -> fmt::Result {
+pub(super) fn sums(
+    sink: &mut MetricSink<'_>,
+    rows: &[TopicRow<'_>],
+    settings: &Settings,
+) -> fmt::Result {
     let sent: [(&Metric, Count); 2] = [
         (&metric::TOPIC_SENT, |sent| sent.messages),
         (&metric::TOPIC_SENT_BYTES, |sent| sent.bytes),
     ];
     for (metric, value) in sent {
-        each(page, metric, rows, |topic| {
+        each(sink, metric, rows, |topic| {
             Some(value(topic.sent.as_deref()?))
         })?;
     }
@@ -253,11 +257,11 @@ pub(super) fn sums(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -
         (&metric::TOPIC_DELIVERED_BYTES, |got| got.bytes),
     ];
     for (metric, value) in delivered {
-        each(page, metric, rows, |topic| {
+        each(sink, metric, rows, |topic| {
             Some(value(topic.received.as_deref()?))
         })?;
     }
-    page.family(&metric::TOPIC_DELIVERY_LOST, |family| {
+    sink.family(&metric::TOPIC_DELIVERY_LOST, |family| {
         let received = rows
             .iter()
             .filter_map(|row| Some((row, row.facts?.received.as_deref()?)));
@@ -277,18 +281,18 @@ pub(super) fn sums(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -
         (&metric::TOPIC_DELIVERY_UNMATCHED, |got| got.unmatched),
     ];
     for (metric, value) in rest {
-        each(page, metric, rows, |topic| {
+        each(sink, metric, rows, |topic| {
             Some(value(topic.received.as_deref()?))
         })?;
     }
-    each(page, &metric::TOPIC_LAG, rows, |topic| {
+    each(sink, &metric::TOPIC_LAG, rows, |topic| {
         topic
             .acknowledgements
             .iter()
             .map(|each| each.lag_samples)
             .max()
     })?;
-    each(page, &metric::TOPIC_LAG_SECONDS, rows, |topic| {
+    each(sink, &metric::TOPIC_LAG_SECONDS, rows, |topic| {
         topic
             .acknowledgements
             .iter()
@@ -302,7 +306,7 @@ pub(super) fn sums(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -
         (&metric::TOPIC_RETRANSMISSION, |spent| &spent.retransmission),
     ];
     for (metric, values) in breakdown {
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             for row in rows.iter().filter(|_| settings.histograms) {
                 let spent = row.facts.and_then(|topic| topic.breakdown.as_deref());
                 if let Some(values) = spent.map(values).filter(|values| values.count() > 0) {
@@ -317,12 +321,12 @@ pub(super) fn sums(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -
 
 /// One sample for each topic that has a value.
 fn each<N: Into<Number>>(
-    page: &mut Page<'_>,
+    sink: &mut MetricSink<'_>,
     metric: &'static Metric,
-    rows: &[Row<'_>],
+    rows: &[TopicRow<'_>],
     value: impl Fn(&TopicFacts) -> Option<N>,
 ) -> fmt::Result {
-    page.family(metric, |family| {
+    sink.family(metric, |family| {
         rows.iter()
             .try_for_each(|row| match row.facts.and_then(&value) {
                 Some(value) => family.sample(&row.labels(), value),
@@ -332,8 +336,8 @@ fn each<N: Into<Number>>(
 }
 
 /// Sockets of which it is not known what they dropped.
-pub(super) fn sockets(page: &mut Page<'_>, sockets: &[SocketFacts]) -> fmt::Result {
-    page.family(&metric::SOCKET_DROPS, |family| {
+pub(super) fn sockets(sink: &mut MetricSink<'_>, sockets: &[SocketFacts]) -> fmt::Result {
+    sink.family(&metric::SOCKET_DROPS, |family| {
         let dropping = sockets
             .iter()
             .filter(|socket| socket.unidentified_drops > 0);

@@ -17,7 +17,7 @@ const IDL: &str = "idl";
 
 /// Where to look.
 #[derive(Debug)]
-pub(super) enum Place {
+pub(super) enum DefinitionSource {
     /// Named by the user.
     Directory(PathBuf),
     /// An installed ROS.
@@ -26,7 +26,7 @@ pub(super) enum Place {
     Embedded(Dialect),
 }
 
-impl Place {
+impl DefinitionSource {
     pub(super) fn describe(&self) -> String {
         match self {
             Self::Directory(path) | Self::Prefix(path) => format!("in {}", path.display()),

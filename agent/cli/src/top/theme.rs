@@ -5,7 +5,7 @@ use ratatui::style::{Color, Modifier, Style};
 
 /// What the terminal can show.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Look {
+pub struct Theme {
     /// Characters beyond ASCII.
     pub unicode: bool,
     /// Colours.
@@ -28,7 +28,7 @@ pub enum Kind {
     Selected,
 }
 
-impl Look {
+impl Theme {
     /// By the environment, given as a function: locale as libc finds it, and <https://no-color.org>.
     #[must_use]
     pub fn of(variable: impl Fn(&str) -> Option<String>) -> Self {
@@ -102,8 +102,8 @@ impl Look {
 mod tests {
     use super::*;
 
-    fn look(variables: &[(&str, &str)]) -> Look {
-        Look::of(|name| {
+    fn theme(variables: &[(&str, &str)]) -> Theme {
+        Theme::of(|name| {
             let mut all = variables.iter();
             let (_, value) = all.find(|(key, _)| *key == name)?;
             Some((*value).to_owned())
@@ -113,24 +113,24 @@ mod tests {
     #[test]
     fn the_locale_decides_about_characters_and_no_color_about_colours() {
         let xterm = ("TERM", "xterm-256color");
-        let utf = look(&[xterm, ("LANG", "en_US.UTF-8")]);
+        let utf = theme(&[xterm, ("LANG", "en_US.UTF-8")]);
         assert_eq!((utf.unicode, utf.colours), (true, true));
-        assert!(look(&[xterm, ("LC_ALL", "C.utf8"), ("LANG", "C")]).unicode);
-        assert!(!look(&[xterm, ("LC_ALL", "C"), ("LANG", "en_US.UTF-8")]).unicode);
-        assert!(!look(&[xterm]).unicode);
-        assert!(!look(&[xterm, ("NO_COLOR", "1")]).colours);
-        assert!(look(&[xterm, ("NO_COLOR", "")]).colours);
-        assert!(!look(&[("TERM", "dumb")]).colours);
-        let plain = look(&[xterm, ("NO_COLOR", "1")]).style(Kind::Problem);
+        assert!(theme(&[xterm, ("LC_ALL", "C.utf8"), ("LANG", "C")]).unicode);
+        assert!(!theme(&[xterm, ("LC_ALL", "C"), ("LANG", "en_US.UTF-8")]).unicode);
+        assert!(!theme(&[xterm]).unicode);
+        assert!(!theme(&[xterm, ("NO_COLOR", "1")]).colours);
+        assert!(theme(&[xterm, ("NO_COLOR", "")]).colours);
+        assert!(!theme(&[("TERM", "dumb")]).colours);
+        let plain = theme(&[xterm, ("NO_COLOR", "1")]).style(Kind::Problem);
         assert_eq!((plain.fg, plain.bg), (None, None));
     }
 
     #[test]
     fn a_bar_shows_that_there_is_something() {
-        let ascii = Look::default();
+        let ascii = Theme::default();
         let bars = [0.0, 1e-9, 0.5, 1.0].map(|part| ascii.bar(part, 4));
         assert_eq!(bars, ["", "#", "##", "####"]);
-        let unicode = Look {
+        let unicode = Theme {
             unicode: true,
             ..ascii
         };

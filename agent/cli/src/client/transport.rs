@@ -16,7 +16,7 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::time::timeout;
 
-use super::replayed::{Outcome, Replayed, Stop};
+use super::replay_agent::{Outcome, ReplayAgent, Stop};
 use super::{ClientError, Target};
 
 /// Where the package and the service manager put the agent's socket.
@@ -30,21 +30,21 @@ const PATIENCE: Duration = Duration::from_secs(5);
 
 /// How an agent is reached.
 #[derive(Debug)]
-pub(super) enum Way {
+pub(super) enum Transport {
     /// By its socket.
     Socket(PathBuf),
     /// By host name or address, and port.
     Address(String),
     /// Within this process.
-    Replayed(Box<Replayed>),
+    ReplayAgent(Box<ReplayAgent>),
 }
 
-impl Way {
+impl Transport {
     /// As `target` says; else by what there is on this host.
     pub(super) async fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
         if let Some(capture) = &target.replay {
-            let replayed = Replayed::start(capture, target, stop).await?;
-            return Ok(Self::Replayed(Box::new(replayed)));
+            let replayed = ReplayAgent::start(capture, target, stop).await?;
+            return Ok(Self::ReplayAgent(Box::new(replayed)));
         }
         if let Some(host) = &target.host {
             return Ok(Self::Address(with_port(host)));
@@ -70,7 +70,7 @@ impl Way {
     /// What requests call the agent.
     pub(super) fn host(&self) -> &str {
         match self {
-            Self::Socket(_) | Self::Replayed(_) => "localhost",
+            Self::Socket(_) | Self::ReplayAgent(_) => "localhost",
             Self::Address(address) => address,
         }
     }
@@ -90,26 +90,26 @@ impl Way {
                 let _ = stream.set_nodelay(true);
                 self.ask(stream, request).await
             }
-            Self::Replayed(replayed) => self.ask(replayed.connect(), request).await,
+            Self::ReplayAgent(replayed) => self.ask(replayed.connect(), request).await,
         }
     }
 
     /// Whether it is within this process.
     pub(super) const fn is_replayed(&self) -> bool {
-        matches!(self, Self::Replayed(_))
+        matches!(self, Self::ReplayAgent(_))
     }
 
     /// What a replay waited for has begun.
-    pub(super) fn go_on(&self) {
-        if let Self::Replayed(replayed) = self {
-            replayed.go_on();
+    pub(super) fn resume(&self) {
+        if let Self::ReplayAgent(replayed) = self {
+            replayed.resume();
         }
     }
 
     /// How a replay ended, if this is one that did.
     pub(super) fn outcome(&self) -> Option<Outcome> {
         match self {
-            Self::Replayed(replayed) => replayed.outcome(),
+            Self::ReplayAgent(replayed) => replayed.outcome(),
             Self::Socket(_) | Self::Address(_) => None,
         }
     }
@@ -195,12 +195,12 @@ impl Way {
     }
 }
 
-impl fmt::Display for Way {
+impl fmt::Display for Transport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Socket(path) => write!(f, "{}", path.display()),
             Self::Address(address) => f.write_str(address),
-            Self::Replayed(replayed) => write!(f, "{}", replayed.capture().display()),
+            Self::ReplayAgent(replayed) => write!(f, "{}", replayed.capture().display()),
         }
     }
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use super::board::Settings;
 use super::catalogue::{self as metric, Metric};
-use super::page::{Family, Label, Number, Page};
+use super::metric_sink::{Family, Label, MetricSink, Number};
 use crate::config::Watch;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{
@@ -28,7 +28,7 @@ type SampledCount = fn(&SampledFacts) -> u64;
 type Values = fn(&Measurement) -> &Histogram;
 
 /// A topic with series of its own.
-pub(super) struct Row<'a> {
+pub(super) struct TopicRow<'a> {
     domain_id: u32,
     name: Cow<'a, str>,
     /// `None`: watched by name, but nobody has announced it.
@@ -39,16 +39,16 @@ pub(super) struct Row<'a> {
 }
 
 /// The topics to show, sorted, and how many are left out.
-pub(super) struct Rows<'a> {
-    pub(super) shown: Vec<Row<'a>>,
+pub(super) struct TopicRows<'a> {
+    pub(super) shown: Vec<TopicRow<'a>>,
     pub(super) hidden: usize,
 }
 
-impl<'a> Rows<'a> {
+impl<'a> TopicRows<'a> {
     /// Topics that are measured come first; services and other plumbing are shown when measured.
     pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
         let max_topics = settings.limits.topics;
-        let mut rows: BTreeMap<(u32, Cow<'a, str>), Row<'a>> = BTreeMap::new();
+        let mut rows: BTreeMap<(u32, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
         let mut hidden = 0;
         let shown = |facts: &&TopicFacts| {
             facts.measurement.is_some() || matches!(facts.kind, "topic" | "dds")
@@ -67,7 +67,7 @@ impl<'a> Rows<'a> {
             } else {
                 rows.insert(
                     key,
-                    Row {
+                    TopicRow {
                         domain_id,
                         name,
                         facts: Some(facts),
@@ -95,7 +95,7 @@ impl<'a> Rows<'a> {
             } else if rows.len() < max_topics {
                 rows.insert(
                     key,
-                    Row {
+                    TopicRow {
                         domain_id,
                         name,
                         facts: None,
@@ -112,7 +112,7 @@ impl<'a> Rows<'a> {
     }
 }
 
-impl<'a> Row<'a> {
+impl<'a> TopicRow<'a> {
     pub(super) fn labels(&self) -> [Label<'_>; 2] {
         [
             Label::Number(self.domain_id.into()),
@@ -136,7 +136,7 @@ pub(super) fn series_name<'a>(kind: &str, name: &'a str, dds_name: &'a str) -> C
 }
 
 /// The graph.
-pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
+pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     let mut domains: BTreeMap<u32, (usize, usize, usize)> = BTreeMap::new();
     for participant in &snapshot.participants {
         let counts = domains.entry(participant.domain_id).or_default();
@@ -149,17 +149,17 @@ pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
     if domains.is_empty() {
         domains.insert(0, (0, 0, 0));
     }
-    page.family(&metric::PARTICIPANTS, |family| {
+    sink.family(&metric::PARTICIPANTS, |family| {
         per_domain(family, &domains, |counts| counts.0)
     })?;
-    page.family(&metric::SECURED_PARTICIPANTS, |family| {
+    sink.family(&metric::SECURED_PARTICIPANTS, |family| {
         per_domain(family, &domains, |counts| counts.1)
     })?;
-    page.family(&metric::NODES, |family| {
+    sink.family(&metric::NODES, |family| {
         per_domain(family, &domains, |counts| counts.2)
     })?;
-    page.family(&metric::NODE_INFO, |family| nodes(family, snapshot))?;
-    page.family(&metric::PARTICIPANT_INFO, |family| {
+    sink.family(&metric::NODE_INFO, |family| nodes(family, snapshot))?;
+    sink.family(&metric::PARTICIPANT_INFO, |family| {
         snapshot.participants.iter().try_for_each(|participant| {
             let [host, process, pid, cgroup] = place(&participant.process);
             family.info(&[
@@ -173,7 +173,7 @@ pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
             ])
         })
     })?;
-    page.family(&metric::TOPICS, |family| {
+    sink.family(&metric::TOPICS, |family| {
         let mut kinds: BTreeMap<(u32, &str), usize> = BTreeMap::new();
         for topic in snapshot.topics.iter().filter(|topic| !topic.vanished) {
             *kinds.entry((topic.domain_id, topic.kind)).or_default() += 1;
@@ -185,7 +185,7 @@ pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
             )
         })
     })?;
-    page.family(&metric::DISCOVERY_EVENTS, |family| {
+    sink.family(&metric::DISCOVERY_EVENTS, |family| {
         snapshot.churn.iter().try_for_each(|churn| {
             let labels = [
                 Label::Number(churn.domain_id.into()),
@@ -195,21 +195,21 @@ pub(super) fn graph(page: &mut Page<'_>, snapshot: &Snapshot) -> fmt::Result {
             family.sample(&labels, churn.count)
         })
     })?;
-    page.single(&metric::UNKNOWN_WRITERS, snapshot.unknown_writers.len())?;
+    sink.single(&metric::UNKNOWN_WRITERS, snapshot.unknown_writers.len())?;
     let unknown = || snapshot.unknown_writers.iter().take(MAX_UNKNOWN_WRITERS);
-    page.family(&metric::UNKNOWN_WRITER_MESSAGES, |family| {
+    sink.family(&metric::UNKNOWN_WRITER_MESSAGES, |family| {
         unknown().try_for_each(|writer| {
             let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
             family.sample(&labels, writer.measurement.messages)
         })
     })?;
-    page.family(&metric::UNKNOWN_WRITER_RATE, |family| {
+    sink.family(&metric::UNKNOWN_WRITER_RATE, |family| {
         unknown().try_for_each(|writer| {
             let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
             family.sample(&labels, writer.measurement.rate_hz)
         })
     })?;
-    page.family(&metric::UNKNOWN_WRITER_INFO, |family| {
+    sink.family(&metric::UNKNOWN_WRITER_INFO, |family| {
         unknown().try_for_each(|writer| {
             let [host, process, pid, cgroup] = place(&writer.process);
             let (guid, vendor) = (Label::Guid(writer.guid), Label::Text(&writer.vendor));
@@ -267,11 +267,15 @@ fn nodes(family: &mut Family<'_, '_>, snapshot: &Snapshot) -> fmt::Result {
 }
 
 /// Topics.
-pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -> fmt::Result {
-    page.family(&metric::TOPIC_INFO, |family| {
+pub(super) fn topics(
+    sink: &mut MetricSink<'_>,
+    rows: &[TopicRow<'_>],
+    settings: &Settings,
+) -> fmt::Result {
+    sink.family(&metric::TOPIC_INFO, |family| {
         rows.iter().try_for_each(|row| topic_info(family, row))
     })?;
-    page.family(&metric::TOPIC_PUBLISHERS, |family| {
+    sink.family(&metric::TOPIC_PUBLISHERS, |family| {
         rows.iter().try_for_each(|row| {
             family.sample(
                 &row.labels(),
@@ -279,7 +283,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
             )
         })
     })?;
-    page.family(&metric::TOPIC_SUBSCRIPTIONS, |family| {
+    sink.family(&metric::TOPIC_SUBSCRIPTIONS, |family| {
         rows.iter().try_for_each(|row| {
             family.sample(
                 &row.labels(),
@@ -296,11 +300,11 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
         (&metric::TOPIC_INCOMPLETE, |measured| measured.incomplete),
     ];
     for (metric, value) in counters {
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             measured(family, rows, |facts| Some(value(facts).into()))
         })?;
     }
-    page.family(&metric::TOPIC_LAST_MESSAGE, |family| {
+    sink.family(&metric::TOPIC_LAST_MESSAGE, |family| {
         rows.iter().try_for_each(|row| {
             match row.measurement().and_then(|measured| measured.last_message) {
                 Some(time) => family.sample(&row.labels(), time.seconds()),
@@ -308,10 +312,10 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
             }
         })
     })?;
-    page.family(&metric::TOPIC_RATE, |family| {
+    sink.family(&metric::TOPIC_RATE, |family| {
         measured(family, rows, |facts| Some(facts.rate_hz.into()))
     })?;
-    page.family(&metric::TOPIC_BANDWIDTH, |family| {
+    sink.family(&metric::TOPIC_BANDWIDTH, |family| {
         measured(family, rows, |facts| Some(facts.bandwidth.into()))
     })?;
     let doubts: [(&Metric, Count); 3] = [
@@ -326,11 +330,11 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
         }),
     ];
     for (metric, value) in doubts {
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             measured(family, rows, |facts| Some(value(facts).into()))
         })?;
     }
-    sampled(page, rows)?;
+    sampled(sink, rows)?;
     let histograms: [(&Metric, Values); 3] = [
         (&metric::TOPIC_INTERARRIVAL, |measured| {
             &measured.interarrival
@@ -341,7 +345,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
         }),
     ];
     for (metric, values) in histograms {
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             let measured = rows
                 .iter()
                 .filter_map(|row| Some((row, row.measurement()?)));
@@ -358,7 +362,7 @@ pub(super) fn topics(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings)
 }
 
 /// Topics of which a part was seen in shared memory, and how messages pass.
-fn sampled(page: &mut Page<'_>, rows: &[Row<'_>]) -> fmt::Result {
+fn sampled(sink: &mut MetricSink<'_>, rows: &[TopicRow<'_>]) -> fmt::Result {
     let counters: [(&Metric, SampledCount); 3] = [
         (&metric::TOPIC_SAMPLED, |sampled| sampled.span),
         (&metric::TOPIC_SAMPLED_SEEN, |sampled| sampled.seen),
@@ -367,21 +371,22 @@ fn sampled(page: &mut Page<'_>, rows: &[Row<'_>]) -> fmt::Result {
         }),
     ];
     let of_rows = || {
-        let sampled = |row: &'_ Row<'_>| row.measurement().and_then(|measured| measured.sampled);
+        let sampled =
+            |row: &'_ TopicRow<'_>| row.measurement().and_then(|measured| measured.sampled);
         rows.iter()
             .filter_map(move |row| Some((row, sampled(row)?)))
     };
     for (metric, value) in counters {
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             of_rows().try_for_each(|(row, sampled)| family.sample(&row.labels(), value(&sampled)))
         })?;
     }
-    page.family(&metric::TOPIC_COVERAGE, |family| {
+    sink.family(&metric::TOPIC_COVERAGE, |family| {
         let with_any = of_rows().filter_map(|(row, sampled)| Some((row, sampled.coverage()?)));
         let mut with_any = with_any;
         with_any.try_for_each(|(row, coverage)| family.sample(&row.labels(), coverage))
     })?;
-    page.family(&metric::TOPIC_PAIRS, |family| {
+    sink.family(&metric::TOPIC_PAIRS, |family| {
         for row in rows {
             for count in row.facts.iter().flat_map(|facts| &facts.passages) {
                 let [domain_id, topic] = row.labels();
@@ -394,14 +399,18 @@ fn sampled(page: &mut Page<'_>, rows: &[Row<'_>]) -> fmt::Result {
 }
 
 /// Writers, when `settings` ask for them.
-pub(super) fn writers(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings) -> fmt::Result {
+pub(super) fn writers(
+    sink: &mut MetricSink<'_>,
+    rows: &[TopicRow<'_>],
+    settings: &Settings,
+) -> fmt::Result {
     let per_writer: [(&Metric, Count); 3] = [
         (&metric::WRITER_MESSAGES, |measured| measured.messages),
         (&metric::WRITER_BYTES, |measured| measured.bytes),
         (&metric::WRITER_LOST, |measured| measured.lost),
     ];
     for (metric, value) in per_writer {
-        page.family(metric, |family| {
+        sink.family(metric, |family| {
             rows.iter()
                 .filter(|_| settings.per_writer)
                 .try_for_each(|row| each_writer(family, row, value))
@@ -413,7 +422,7 @@ pub(super) fn writers(page: &mut Page<'_>, rows: &[Row<'_>], settings: &Settings
 /// One sample for each topic that is measured or will be: watched ones begin with 0.
 fn measured(
     family: &mut Family<'_, '_>,
-    rows: &[Row<'_>],
+    rows: &[TopicRow<'_>],
     value: impl Fn(&Measurement) -> Option<Number>,
 ) -> fmt::Result {
     let nothing = Measurement::default();
@@ -428,7 +437,7 @@ fn measured(
     Ok(())
 }
 
-fn topic_info(family: &mut Family<'_, '_>, row: &Row<'_>) -> fmt::Result {
+fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
     let Some(facts) = row.facts else {
         return Ok(());
     };
@@ -469,7 +478,7 @@ fn joined<'a>(values: impl Iterator<Item = &'a String>) -> String {
     text
 }
 
-fn each_writer(family: &mut Family<'_, '_>, row: &Row<'_>, value: Count) -> fmt::Result {
+fn each_writer(family: &mut Family<'_, '_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
     let mut seen = BTreeSet::new();
     for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
         let Some(measured) = &writer.measurement else {
@@ -493,11 +502,11 @@ fn each_writer(family: &mut Family<'_, '_>, row: &Row<'_>, value: Count) -> fmt:
 
 /// The watchlist's states and broken expectations.
 pub(super) fn watches(
-    page: &mut Page<'_>,
+    sink: &mut MetricSink<'_>,
     snapshot: &Snapshot,
     configured: &[Arc<Watch>],
 ) -> fmt::Result {
-    page.family(&metric::WATCH_STATE, |family| {
+    sink.family(&metric::WATCH_STATE, |family| {
         for watch in &snapshot.watches {
             let name = watch_name(watch);
             for topic in &watch.topics {
@@ -514,7 +523,7 @@ pub(super) fn watches(
         }
         Ok(())
     })?;
-    page.family(&metric::WATCH_VIOLATED, |family| {
+    sink.family(&metric::WATCH_VIOLATED, |family| {
         for (place, watch) in snapshot.watches.iter().enumerate() {
             let Some(configured) = self::configured(place, watch, configured) else {
                 continue;

@@ -6,14 +6,14 @@ use ros2probe_wire::Timestamp;
 
 /// A time in a capture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Moment {
+pub enum CaptureTime {
     /// Since the epoch.
     At(Timestamp),
     /// Nanoseconds since the capture's first packet.
     After(u64),
 }
 
-impl Moment {
+impl CaptureTime {
     /// The time in a capture that begins at `beginning`.
     #[must_use]
     pub const fn in_capture(self, beginning: Timestamp) -> Timestamp {
@@ -24,7 +24,7 @@ impl Moment {
     }
 }
 
-impl FromStr for Moment {
+impl FromStr for CaptureTime {
     type Err = &'static str;
 
     /// Unix seconds, or `+` and seconds from the capture's beginning; nanoseconds are kept.
@@ -59,11 +59,11 @@ mod tests {
 
     #[test]
     fn moments_keep_their_nanoseconds() {
-        let at = |text: &str| text.parse::<Moment>();
+        let at = |text: &str| text.parse::<CaptureTime>();
         let exact = Timestamp(1_795_142_407_300_015_394);
-        assert_eq!(at("1795142407.300015394"), Ok(Moment::At(exact)));
-        assert_eq!(at("+2.5"), Ok(Moment::After(2_500_000_000)));
-        assert_eq!(at("+3"), Ok(Moment::After(3_000_000_000)));
+        assert_eq!(at("1795142407.300015394"), Ok(CaptureTime::At(exact)));
+        assert_eq!(at("+2.5"), Ok(CaptureTime::After(2_500_000_000)));
+        assert_eq!(at("+3"), Ok(CaptureTime::After(3_000_000_000)));
         for wrong in [
             "",
             "+",

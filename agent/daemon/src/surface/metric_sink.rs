@@ -35,7 +35,7 @@ pub(super) enum Number {
 }
 
 /// One scrape or one export being written.
-pub(super) enum Page<'a> {
+pub(super) enum MetricSink<'a> {
     Text(Text<'a>),
     Points(&'a mut Points),
 }
@@ -43,10 +43,10 @@ pub(super) enum Page<'a> {
 /// One family being written; its samples follow one another.
 pub(super) struct Family<'a, 'b> {
     metric: &'static Metric,
-    page: &'a mut Page<'b>,
+    sink: &'a mut MetricSink<'b>,
 }
 
-impl<'b> Page<'b> {
+impl<'b> MetricSink<'b> {
     /// Begins a family; `samples` writes what it holds.
     pub(super) fn family(
         &mut self,
@@ -57,7 +57,7 @@ impl<'b> Page<'b> {
             Self::Text(text) => text.begin(metric)?,
             Self::Points(points) => points.open(metric),
         }
-        samples(&mut Family { metric, page: self })
+        samples(&mut Family { metric, sink: self })
     }
 
     /// A family with one sample and no labels.
@@ -73,9 +73,9 @@ impl<'b> Page<'b> {
 impl Family<'_, '_> {
     /// One counter, gauge or info sample; an info's value is ignored.
     pub(super) fn sample(&mut self, labels: &[Label<'_>], value: impl Into<Number>) -> fmt::Result {
-        match self.page {
-            Page::Text(text) => text.sample(self.metric, labels, value.into()),
-            Page::Points(points) => {
+        match self.sink {
+            MetricSink::Text(text) => text.sample(self.metric, labels, value.into()),
+            MetricSink::Points(points) => {
                 points.number(labels, value.into());
                 Ok(())
             }
@@ -89,9 +89,9 @@ impl Family<'_, '_> {
 
     /// One histogram.
     pub(super) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
-        match self.page {
-            Page::Text(text) => text.histogram(self.metric, labels, values),
-            Page::Points(points) => {
+        match self.sink {
+            MetricSink::Text(text) => text.histogram(self.metric, labels, values),
+            MetricSink::Points(points) => {
                 points.histogram(labels, values);
                 Ok(())
             }

@@ -9,9 +9,9 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::app::{Fact, Wish};
+use super::app::{Command, Fact};
 use super::facts::{Event, Health, Lagged, Topic, Topics};
-use super::holds::Holds;
+use super::measure_requests::MeasureRequests;
 use super::row::Key;
 use super::server_sent::Messages;
 use super::text::safe;
@@ -36,16 +36,16 @@ pub enum Input {
 
 /// What the polling thread is told.
 #[derive(Debug)]
-pub(super) enum Ask {
-    Wish(Wish),
+pub(super) enum Request {
+    Command(Command),
     /// A topic is measured no longer, and why.
     Lost(Key, String),
 }
 
 /// The threads that read.
 #[derive(Debug)]
-pub struct Feed {
-    asks: Sender<Ask>,
+pub struct Poller {
+    requests: Sender<Request>,
 }
 
 /// What is asked for again and again.
@@ -56,11 +56,11 @@ struct Poll {
     interval: Duration,
     hidden: bool,
     selected: Option<Key>,
-    holds: Holds,
+    holds: MeasureRequests,
     inputs: SyncSender<Input>,
 }
 
-impl Feed {
+impl Poller {
     /// Begins to ask, every `interval`, about one domain or all of them.
     ///
     /// # Errors
@@ -72,14 +72,14 @@ impl Feed {
         inputs: &SyncSender<Input>,
     ) -> io::Result<Self> {
         let agent = Arc::new(agent);
-        let (asks, asked) = std::sync::mpsc::channel();
+        let (requests, asked) = std::sync::mpsc::channel();
         let poll = Poll {
             agent: Arc::clone(&agent),
             domain_id,
             interval,
             hidden: false,
             selected: None,
-            holds: Holds::new(Arc::clone(&agent), asks.clone()),
+            holds: MeasureRequests::new(Arc::clone(&agent), requests.clone()),
             inputs: inputs.clone(),
         };
         let thread = thread::Builder::new().name("poll".to_owned());
@@ -87,13 +87,13 @@ impl Feed {
         let inputs = inputs.clone();
         let thread = thread::Builder::new().name("events".to_owned());
         thread.spawn(move || follow_events(&agent, &inputs))?;
-        Ok(Self { asks })
+        Ok(Self { requests })
     }
 
     /// Has a wish fulfilled.
-    pub fn wish(&self, wish: Wish) {
+    pub fn command(&self, command: Command) {
         // The thread lives as long as the program: a panic of it ends both.
-        let _ = self.asks.send(Ask::Wish(wish));
+        let _ = self.requests.send(Request::Command(command));
     }
 }
 
@@ -115,17 +115,17 @@ pub fn ask(
 }
 
 impl Poll {
-    fn run(mut self, asked: &Receiver<Ask>) {
+    fn run(mut self, asked: &Receiver<Request>) {
         loop {
             let begun = Instant::now();
             self.all();
             loop {
                 let left = self.interval.saturating_sub(begun.elapsed());
                 match asked.recv_timeout(left) {
-                    Ok(Ask::Wish(wish)) => self.fulfil(wish),
-                    Ok(Ask::Lost(key, why)) => {
-                        let said = self.holds.lost(&key, why);
-                        self.tell_holds(said);
+                    Ok(Request::Command(command)) => self.execute(command),
+                    Ok(Request::Lost(key, why)) => {
+                        let status = self.holds.lost(&key, why);
+                        self.send_measured(status);
                     }
                     Err(RecvTimeoutError::Timeout) => break,
                     Err(RecvTimeoutError::Disconnected) => return,
@@ -137,11 +137,11 @@ impl Poll {
     fn all(&mut self) {
         match ask(&self.agent, self.domain_id, self.hidden) {
             Ok((health, topics)) => {
-                self.tell(Fact::Health(Box::new(health)));
-                self.tell(Fact::Topics(Box::new(topics)));
+                self.send(Fact::Health(Box::new(health)));
+                self.send(Fact::Topics(Box::new(topics)));
                 self.details();
             }
-            Err(error) => self.tell(Fact::Gone(error.to_string())),
+            Err(error) => self.send(Fact::Gone(error.to_string())),
         }
     }
 
@@ -155,41 +155,41 @@ impl Poll {
             key.domain_id
         );
         match self.agent.get::<Topic>(&path) {
-            Ok(topic) => self.tell(Fact::Details(key, Some(Box::new(topic)))),
-            Err(ClientError::Refused(_)) => self.tell(Fact::Details(key, None)),
+            Ok(topic) => self.send(Fact::Details(key, Some(Box::new(topic)))),
+            Err(ClientError::Refused(_)) => self.send(Fact::Details(key, None)),
             // The next round tells that the agent is gone.
             Err(_) => {}
         }
     }
 
-    fn fulfil(&mut self, wish: Wish) {
-        match wish {
-            Wish::Quit => {}
-            Wish::Select(key) => {
+    fn execute(&mut self, command: Command) {
+        match command {
+            Command::Quit => {}
+            Command::Select(key) => {
                 self.selected = key;
                 self.details();
             }
-            Wish::Hidden(hidden) => {
+            Command::Hidden(hidden) => {
                 self.hidden = hidden;
                 self.all();
             }
-            Wish::Toggle(key, name) => {
-                let said = self.holds.toggle(&key, &name);
-                self.tell_holds(said);
+            Command::Toggle(key, name) => {
+                let status = self.holds.toggle(&key, &name);
+                self.send_measured(status);
             }
-            Wish::Keep(key, name) => {
-                let said = self.holds.keep(&key, &name);
-                self.tell_holds(said);
+            Command::Keep(key, name) => {
+                let status = self.holds.keep(&key, &name);
+                self.send_measured(status);
             }
         }
     }
 
-    fn tell_holds(&self, said: String) {
-        self.tell(Fact::Measured(self.holds.shown()));
-        self.tell(Fact::Said(said));
+    fn send_measured(&self, status: String) {
+        self.send(Fact::Measured(self.holds.shown()));
+        self.send(Fact::Status(status));
     }
 
-    fn tell(&self, fact: Fact) {
+    fn send(&self, fact: Fact) {
         // Whoever reads it ends the process when it ends.
         let _ = self.inputs.send(Input::Fact(fact));
     }
@@ -215,8 +215,8 @@ fn follow_events(agent: &Agent, inputs: &SyncSender<Input>) {
                 is_refused = false;
             }
             Err(ClientError::Refused(refusal)) if !is_refused => {
-                let said = Fact::Said(format!("no events: {refusal}"));
-                let _ = inputs.send(Input::Fact(said));
+                let status = Fact::Status(format!("no events: {refusal}"));
+                let _ = inputs.send(Input::Fact(status));
                 is_refused = true;
             }
             Err(_) => {}

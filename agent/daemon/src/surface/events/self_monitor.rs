@@ -11,8 +11,8 @@ const PAUSE: Duration = Duration::from_secs(1);
 
 /// What was lost on the way to the model.
 #[derive(Debug, Default)]
-pub struct Drops {
-    told: Losses,
+pub struct DropMonitor {
+    reported: Losses,
     at: Option<Instant>,
 }
 
@@ -20,22 +20,22 @@ type Losses = [(&'static str, u64); 4];
 
 /// Whether the agent sees.
 #[derive(Debug, Default)]
-pub struct Sight {
+pub struct SourceMonitor {
     blind_since: Option<Instant>,
     /// When it was last looked at and saw. Until then it is starting, not blind.
     saw: Option<Instant>,
     attached_anew: u64,
 }
 
-impl Drops {
+impl DropMonitor {
     /// What was lost since it was last told.
-    pub fn look(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
+    pub fn check(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
         let early = |at: Instant| now.saturating_duration_since(at) < PAUSE;
         if self.at.is_some_and(early) {
             return Vec::new();
         }
         let lost = losses(facts);
-        let before = self.told.iter().map(|(_, count)| *count);
+        let before = self.reported.iter().map(|(_, count)| *count);
         let new = lost
             .iter()
             .zip(before)
@@ -45,7 +45,7 @@ impl Drops {
             });
         let new: Vec<_> = new.collect();
         if !new.is_empty() {
-            (self.told, self.at) = (lost, Some(now));
+            (self.reported, self.at) = (lost, Some(now));
         }
         new
     }
@@ -62,11 +62,11 @@ fn losses(facts: &AgentFacts) -> Losses {
     ]
 }
 
-impl Sight {
+impl SourceMonitor {
     /// Whether it sees at `now`, or why not, and how often the hook was attached anew; the events if
     /// that is news. A control group that went and came between two looks makes both events, with the
     /// time between the looks.
-    pub fn look(
+    pub fn check(
         &mut self,
         ready: &Result<(), String>,
         attached_anew: u64,
@@ -116,49 +116,52 @@ mod tests {
             ..AgentFacts::new(SourceKind::Wire, start)
         };
         let drop = |what, count| AgentEvent::Dropped { what, count };
-        let mut drops = Drops::default();
+        let mut drops = DropMonitor::default();
         let second = |number| start + Duration::from_secs(number);
         let nothing = AgentFacts::new(SourceKind::Wire, start);
-        assert_eq!(drops.look(&nothing, start), []);
-        let new = drops.look(&facts(4, 2), start);
+        assert_eq!(drops.check(&nothing, start), []);
+        let new = drops.check(&facts(4, 2), start);
         assert_eq!(new, [drop("packets", 5), drop("records", 2)]);
-        assert_eq!(drops.look(&facts(5, 2), start), []);
-        assert_eq!(drops.look(&facts(9, 2), second(1)), [drop("packets", 5)]);
-        assert_eq!(drops.look(&facts(9, 2), second(3)), []);
+        assert_eq!(drops.check(&facts(5, 2), start), []);
+        assert_eq!(drops.check(&facts(9, 2), second(1)), [drop("packets", 5)]);
+        assert_eq!(drops.check(&facts(9, 2), second(3)), []);
     }
 
     #[test]
     fn blindness_is_told_once_and_not_of_an_agent_that_starts() {
         let start = Instant::now();
-        let mut sight = Sight::default();
+        let mut sight = SourceMonitor::default();
         let blind = Err("stuck".to_owned());
-        assert_eq!(sight.look(&blind, 0, start), []);
-        assert_eq!(sight.look(&Ok(()), 0, start), []);
+        assert_eq!(sight.check(&blind, 0, start), []);
+        assert_eq!(sight.check(&Ok(()), 0, start), []);
         let reason = "stuck".to_owned();
-        assert_eq!(sight.look(&blind, 0, start), [AgentEvent::Blind { reason }]);
-        assert_eq!(sight.look(&blind, 0, start), []);
+        assert_eq!(
+            sight.check(&blind, 0, start),
+            [AgentEvent::Blind { reason }]
+        );
+        assert_eq!(sight.check(&blind, 0, start), []);
         let later = start + Duration::from_secs(3);
         let seeing = AgentEvent::Seeing { blind_seconds: 3.0 };
-        assert_eq!(sight.look(&Ok(()), 0, later), [seeing]);
-        assert_eq!(sight.look(&Ok(()), 0, later), []);
+        assert_eq!(sight.check(&Ok(()), 0, later), [seeing]);
+        assert_eq!(sight.check(&Ok(()), 0, later), []);
     }
 
     #[test]
     fn a_cgroup_that_is_made_anew_between_two_looks_is_told_once() {
         let start = Instant::now();
         let second = |number| start + Duration::from_secs(number);
-        let mut sight = Sight::default();
-        assert_eq!(sight.look(&Ok(()), 0, start), []);
-        let events = sight.look(&Ok(()), 1, second(2));
+        let mut sight = SourceMonitor::default();
+        assert_eq!(sight.check(&Ok(()), 0, start), []);
+        let events = sight.check(&Ok(()), 1, second(2));
         let reason = "the cgroup was removed and made anew".to_owned();
         let seeing = |blind_seconds| AgentEvent::Seeing { blind_seconds };
         assert_eq!(events, [AgentEvent::Blind { reason }, seeing(2.0)]);
-        assert_eq!(sight.look(&Ok(()), 1, second(4)), []);
+        assert_eq!(sight.check(&Ok(()), 1, second(4)), []);
 
         // Noticed while it was gone: that is told already.
         let gone = Err("the cgroup /robot was removed".to_owned());
-        assert_eq!(sight.look(&gone, 1, second(6)).len(), 1);
-        assert_eq!(sight.look(&Ok(()), 2, second(9)), [seeing(3.0)]);
-        assert_eq!(sight.look(&Ok(()), 2, second(10)), []);
+        assert_eq!(sight.check(&gone, 1, second(6)).len(), 1);
+        assert_eq!(sight.check(&Ok(()), 2, second(9)), [seeing(3.0)]);
+        assert_eq!(sight.check(&Ok(()), 2, second(10)), []);
     }
 }

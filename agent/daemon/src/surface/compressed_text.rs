@@ -11,7 +11,7 @@ use flate2::write::GzEncoder;
 use futures_util::stream;
 use lz4_flex::block::{compress_prepend_size, decompress_size_prepended};
 
-use super::large::Room;
+use super::large_responses::Reservation;
 
 /// Bytes in a piece as it is sent, or a little more.
 const PIECE: usize = 64 << 10;
@@ -26,7 +26,7 @@ pub(super) enum Encoding {
 }
 
 /// Takes text and keeps it compressed.
-pub(super) struct Packer {
+pub(super) struct TextCompressor {
     pieces: VecDeque<Box<[u8]>>,
     length: usize,
     form: Form,
@@ -40,13 +40,13 @@ enum Form {
 
 /// The text, whole.
 #[derive(Debug)]
-pub(super) struct Packed {
+pub(super) struct CompressedText {
     encoding: Encoding,
     pieces: VecDeque<Box<[u8]>>,
     length: usize,
 }
 
-impl Packer {
+impl TextCompressor {
     /// Nothing yet.
     pub(super) fn new(encoding: Encoding) -> Self {
         Self {
@@ -78,7 +78,7 @@ impl Packer {
     ///
     /// # Errors
     /// Never: it is in memory.
-    pub(super) fn finish(mut self) -> io::Result<Packed> {
+    pub(super) fn finish(mut self) -> io::Result<CompressedText> {
         let encoding = match &mut self.form {
             Form::Plain(_) => Encoding::Identity,
             Form::Gzip(encoder) => {
@@ -87,7 +87,7 @@ impl Packer {
             }
         };
         self.pack(1);
-        Ok(Packed {
+        Ok(CompressedText {
             encoding,
             pieces: self.pieces,
             length: self.length,
@@ -116,13 +116,13 @@ impl Packer {
     }
 }
 
-impl fmt::Write for Packer {
+impl fmt::Write for TextCompressor {
     fn write_str(&mut self, text: &str) -> fmt::Result {
         self.write(text.as_bytes()).map_err(|_| fmt::Error)
     }
 }
 
-impl Packed {
+impl CompressedText {
     /// Bytes that the client gets.
     pub(super) const fn len(&self) -> usize {
         self.length
@@ -134,10 +134,10 @@ impl Packed {
     }
 
     /// The answer, which ends with an error when its `room` is given up.
-    pub(super) fn into_body(self, room: Option<Room>) -> Body {
+    pub(super) fn into_body(self, reservation: Option<Reservation>) -> Body {
         let encoding = self.encoding;
         let pieces = self.pieces.into_iter().map(move |piece| {
-            if room.as_ref().is_some_and(Room::is_given_up) {
+            if reservation.as_ref().is_some_and(Reservation::is_given_up) {
                 return Err(io::Error::other("read too slowly while others waited"));
             }
             match encoding {
@@ -163,7 +163,7 @@ mod tests {
     #[tokio::test]
     async fn a_page_takes_a_tenth_of_its_length_and_comes_back_as_it_was() {
         for encoding in [Encoding::Identity, Encoding::Gzip] {
-            let mut packer = Packer::new(encoding);
+            let mut packer = TextCompressor::new(encoding);
             let mut page = String::new();
             for topic in 0..2_000_u32 {
                 let line = format!(
@@ -191,7 +191,7 @@ mod tests {
                 }
             };
             assert_eq!(text, page);
-            let nothing = Packer::new(encoding).finish().unwrap();
+            let nothing = TextCompressor::new(encoding).finish().unwrap();
             assert!(nothing.len() < 32);
         }
     }

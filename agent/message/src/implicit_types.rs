@@ -3,7 +3,7 @@
 use super::definition::{Element, Field, Kind, Shape, Structure, TypeName};
 
 /// As `rosidl_parser` composes them.
-pub(super) fn implied(name: &TypeName) -> Vec<Structure> {
+pub(super) fn implicit_types(name: &TypeName) -> Vec<Structure> {
     let mut structures = Vec::new();
     match name.kind() {
         Kind::Message => {}

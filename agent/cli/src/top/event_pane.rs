@@ -21,13 +21,13 @@ pub struct Line {
 
 /// The latest events.
 #[derive(Clone, Debug, Default)]
-pub struct News {
+pub struct EventPane {
     lines: VecDeque<Line>,
     /// Only warnings are shown.
     pub only_warnings: bool,
 }
 
-impl News {
+impl EventPane {
     /// Takes in one event, unless it is of another domain than this.
     pub fn add(&mut self, event: &Event, domain_id: Option<u32>) {
         let own = event.attributes.get("domain_id").and_then(Value::as_u64);
@@ -134,7 +134,7 @@ mod tests {
 
     #[test]
     fn an_event_begins_with_what_it_is_about() {
-        let mut news = News::default();
+        let mut news = EventPane::default();
         let lost = event(json!({
             "time": "2026-11-20T14:02:11.123Z", "name": "ros2.message.lost", "severity": "WARN",
             "attributes": {"domain_id": 0, "count": 3, "topic": "/po\u{1b}[31mints", "writer": "01.02"},
@@ -150,7 +150,7 @@ mod tests {
 
     #[test]
     fn it_remembers_only_the_latest_and_what_is_missing() {
-        let mut news = News::default();
+        let mut news = EventPane::default();
         for number in 0..KEPT + 5 {
             news.add(
                 &event(json!({"severity": "INFO", "attributes": {"count": number}})),
