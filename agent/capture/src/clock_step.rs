@@ -1,4 +1,4 @@
-//! Notices that somebody has set the calendar's clock, or that the machine was suspended, by the clock
+//! Notices a step of the calendar's clock, or a suspended machine, by the clock
 //! that goes on evenly. It reads no clock.
 
 use super::system::Clocks;
@@ -11,7 +11,7 @@ const LATE_NANOSECONDS: u64 = 1_000_000_000;
 /// How the calendar's clock stands against the even one.
 #[derive(Clone, Copy, Debug)]
 pub struct ClockStep {
-    /// Nanoseconds that it was ahead at the last look.
+    /// Nanoseconds that it was ahead at the last update.
     ahead: i64,
     /// When a step was noticed last, and all steps of that moment.
     noticed: Option<(u64, i64)>,
@@ -27,7 +27,7 @@ impl ClockStep {
         }
     }
 
-    /// By how many nanoseconds the clock was set forward since the last look; 0 = it was not. Notes in
+    /// By how many nanoseconds the clock was set forward since the last update; 0 = it was not. Notes in
     /// the clocks that it was, for as long as that matters.
     pub const fn update(&mut self, clocks: &mut Clocks) -> i64 {
         let before = match self.noticed {

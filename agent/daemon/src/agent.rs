@@ -61,7 +61,7 @@ pub struct Options {
 pub struct Listen(pub Option<SocketAddr>);
 
 /// What an agent is made of.
-pub struct Blueprint<'a> {
+pub struct Components<'a> {
     /// Limits, recordings and whether the page is served.
     pub config: &'a Config,
     /// Where datagrams come from.
@@ -87,7 +87,7 @@ pub struct Blueprint<'a> {
 }
 
 /// An agent that is ready to run.
-pub struct Parts {
+pub struct AssembledAgent {
     /// The loop of the working thread.
     pub run: Run,
     /// What the API answers from.
@@ -96,12 +96,12 @@ pub struct Parts {
     pub reloads: Reloads,
 }
 
-impl Blueprint<'_> {
+impl Components<'_> {
     /// Connects the parts. Starts the threads of configured snapshots, and no other.
     ///
     /// # Errors
     /// Returns [`Refusal`] if a snapshot cannot be kept.
-    pub fn assemble(self) -> Result<Parts, Refusal> {
+    pub fn assemble(self) -> Result<AssembledAgent, Refusal> {
         let Self { config, board, .. } = self;
         let caps = Caps {
             subscriptions: config.limits.subscriptions,
@@ -152,7 +152,7 @@ impl Blueprint<'_> {
             reloader,
             stop: self.stop,
         };
-        Ok(Parts {
+        Ok(AssembledAgent {
             run: run.keeping(self.keeper).remembering(history),
             context,
             reloads,
@@ -237,7 +237,7 @@ pub fn run(options: Options) -> Result<()> {
     };
     let keeper = state.map_or(Ok(None), keep);
     let stop = CancellationToken::new();
-    let blueprint = Blueprint {
+    let components = Components {
         config: &config,
         source,
         observer,
@@ -257,7 +257,7 @@ pub fn run(options: Options) -> Result<()> {
         },
         stop: stop.clone(),
     };
-    let parts = blueprint.assemble().context("recordings.snapshots")?;
+    let parts = components.assemble().context("recordings.snapshots")?;
     if options.report && server.is_none() && control.is_empty() {
         let ended = worker.finish(parts.run);
         print!("{}", Exposition::new(board).render(Format::Classic)?);

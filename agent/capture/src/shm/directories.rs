@@ -64,7 +64,7 @@ pub struct ShmDirectory {
     seen: bool,
 }
 
-/// Whose shared memory is looked at.
+/// Whose shared memory is read.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Scope {
     /// The agent's own, and that of every process.
@@ -85,9 +85,9 @@ pub struct ShmDirectories {
     networks: Vec<u64>,
     /// By identity.
     pub directories: HashMap<ShmDirectoryId, ShmDirectory>,
-    /// Processes gone through, with the place they have and how often they were met.
+    /// Processes gone through, with the directory they have and how often they were met.
     processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
-    /// Places and files left out because of a cap.
+    /// Directories and files left out because of a cap.
     pub left_out: u64,
 }
 
@@ -168,7 +168,7 @@ impl ShmDirectories {
         }
     }
 
-    /// Looks which places there are. What no living process reaches any more is forgotten.
+    /// Finds the directories of shared memory. What no living process reaches any more is forgotten.
     pub fn find(&mut self) {
         for directory in self.directories.values_mut() {
             directory.seen = false;

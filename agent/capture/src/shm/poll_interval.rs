@@ -1,4 +1,4 @@
-//! How long the tap sleeps between two looks.
+//! How long the tap sleeps between two polls.
 //!
 //! Waking up is what a look costs. So it looks again soon where there was much, slower and slower
 //! where there was nothing, and whatever it would like to do is stretched until it stays within its

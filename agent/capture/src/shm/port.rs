@@ -24,7 +24,7 @@ const MAX_CAPACITY: u32 = 1 << 11;
 const UNFILLED_NANOSECONDS: u64 = 100_000_000;
 /// Attempts to read a ring that nobody moves meanwhile.
 const ATTEMPTS: usize = 3;
-/// The pace of a port is measured over this long, and forgotten by an eighth each time.
+/// The rate of a port is measured over this long, and forgotten by an eighth each time.
 const PACE_NANOSECONDS: u64 = 100_000_000;
 
 /// Where things lie in a port's file.
@@ -48,7 +48,7 @@ pub struct Port {
     bytes: Vec<u8>,
 }
 
-/// What a look at a port found besides messages.
+/// What one poll of a port found besides messages.
 #[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
 pub struct PortPoll {
     /// Messages announced since the last one.
@@ -109,7 +109,7 @@ impl Port {
         Some((port, filled.collect()))
     }
 
-    /// Appends what was announced since the last look. `None` when the file is no port any more.
+    /// Appends what was announced since the last poll. `None` when the file is no port any more.
     pub fn poll<S: Source + ?Sized>(
         &mut self,
         source: &S,
@@ -238,7 +238,7 @@ impl Layout {
 }
 
 impl PeakRate {
-    /// Whether two rounds, which look like none, may have passed at the pace of late.
+    /// Whether two rounds, which look like none, may have passed at the rate of late.
     fn may_lap(&self, elapsed: u64, capacity: u32) -> bool {
         let pushed = u128::from(self.peak) * u128::from(elapsed) / 1_000_000_000;
         pushed >= 2 * u128::from(capacity)

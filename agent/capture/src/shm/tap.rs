@@ -103,7 +103,7 @@ pub struct Counters {
     pub abandoned: u64,
     /// Looks that came so late that a ring may have gone round unnoticed.
     pub uncertain: u64,
-    /// Files and places left out because of a cap.
+    /// Files and directories left out because of a cap.
     pub left_out: u64,
 }
 

@@ -86,11 +86,11 @@ pub(crate) fn library(target: &Target, directories: Vec<PathBuf>) -> Library {
     ))
 }
 
-/// What comes by a stream.
+/// One item of a stream.
 pub(crate) enum StreamItem<'a> {
     Message(&'a SampleFacts, Bytes),
     Missed(&'a MissedFacts),
-    /// Everything up to here was told.
+    /// Everything up to here was delivered.
     Clock,
 }
 
@@ -104,11 +104,11 @@ pub(crate) fn for_stdout(text: String) -> String {
     }
 }
 
-/// How a stream went on.
+/// The state of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum StreamStatus {
     Open,
-    /// Who reads it wants no more.
+    /// The reader wants no more.
     Stopped,
     /// The capture has ended.
     CaptureEnded,

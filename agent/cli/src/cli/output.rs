@@ -40,7 +40,7 @@ impl Output {
     }
 }
 
-/// The reader of standard output has gone: nothing is left to be said.
+/// The reader of standard output has gone: there is no output left to write.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         let cause = cause.downcast_ref::<io::Error>();

@@ -12,7 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{ClientError, Target};
 use ros2probe_capture::pcap::{PcapError, Speed, link_name};
-use ros2probe_daemon::agent::{Blueprint, Parts};
+use ros2probe_daemon::agent::{AssembledAgent, Components};
 use ros2probe_daemon::config::{Config, Watch};
 use ros2probe_daemon::run::replay::{Replay, ReplayControl, pause_at};
 use ros2probe_daemon::run::{RunError, Source};
@@ -117,7 +117,7 @@ impl ReplayAgent {
             ..observer::Settings::default().with_limits(&config.limits)
         };
         let token = CancellationToken::new();
-        let parts = Blueprint {
+        let parts = Components {
             config: &config,
             source,
             observer: Observer::new(settings),
@@ -134,7 +134,7 @@ impl ReplayAgent {
         let parts = parts.assemble().map_err(|error| ClientError::Runtime {
             source: std::io::Error::other(error),
         })?;
-        let Parts { run, context, .. } = parts;
+        let AssembledAgent { run, context, .. } = parts;
         let (tell, ended) = oneshot::channel();
         let outcome = Arc::new(OnceLock::new());
         let (how, seen, file) = (

@@ -1,4 +1,4 @@
-//! The way to an agent: one connection for each request, for connections on a host are cheap and
+//! The transport to an agent: one connection for each request, for connections on a host are cheap and
 //! what is kept open would have to be minded.
 
 use std::fmt;

@@ -1,5 +1,5 @@
 //! What the kernel has of what the agent can use: its version, its types, its compiler, control
-//! groups. What of the hooks really works is tried or asked for in `sight`.
+//! groups. What of the hooks really works is tried or asked for in `visibility`.
 
 use super::finding::{Area, Finding, Verdict};
 use super::host_state::{HostState, Unread};

@@ -75,7 +75,7 @@ pub struct Echo {
     unreadable: HashMap<String, u64>,
 }
 
-/// What there is to say about one message.
+/// The text for one message.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct MessageText {
     /// For stdout; `None` where the message did not pass the filter or cannot be read.

@@ -38,7 +38,7 @@ pub enum Fact {
     Measured(BTreeMap<Key, MeasuredBy>),
 }
 
-/// How this program has a topic measured.
+/// What keeps a topic measured for this program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MeasuredBy {
     /// Until it ends.
@@ -47,7 +47,7 @@ pub enum MeasuredBy {
     Watch,
 }
 
-/// What the program should do.
+/// A command for the program.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Command {
     /// End.

@@ -24,7 +24,7 @@ const RETRY: Duration = Duration::from_secs(2);
 /// What the program waits for.
 #[derive(Debug)]
 pub enum Input {
-    /// The agent said something.
+    /// The agent answered.
     Fact(Fact),
     /// A key was pressed.
     Key(ratatui::crossterm::event::KeyEvent),
@@ -34,7 +34,7 @@ pub enum Input {
     End(u8),
 }
 
-/// What the polling thread is told.
+/// A request to the polling thread.
 #[derive(Debug)]
 pub(super) enum Request {
     Command(Command),
@@ -90,7 +90,7 @@ impl Poller {
         Ok(Self { requests })
     }
 
-    /// Has a wish fulfilled.
+    /// Executes a command.
     pub fn command(&self, command: Command) {
         // The thread lives as long as the program: a panic of it ends both.
         let _ = self.requests.send(Request::Command(command));

@@ -114,7 +114,7 @@ fn hand(sender: &mut Process, message: &[u8], lengths: &[usize]) -> Result<()> {
     for byte in message {
         write!(line, "{byte:02x}")?;
     }
-    sender.say(&line)?;
+    sender.write_line(&line)?;
     sender.wait_for("handed", PATIENCE)
 }
 
@@ -235,7 +235,7 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
             .map(|record| (record.sequence_number, record.payload_len))
             .collect();
         assert_eq!(found, [(5, 140_000)]);
-        handing.sender.say("nowhere")?;
+        handing.sender.write_line("nowhere")?;
         handing.sender.wait_for("handed", PATIENCE)?;
         handing.hand(b"none of RTPS, and yet a message", &[31])?;
         handing.hand(b"short", &[5])?;

@@ -6,7 +6,6 @@
 mod entry;
 
 use std::fs;
-use std::path::Path;
 
 /// Seeds longer than this are cut and changed only up to here.
 const LENGTH: usize = 2_000;

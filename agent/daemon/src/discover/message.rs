@@ -39,7 +39,7 @@ const PL_CDR_LE: [u8; 4] = [0x00, 0x03, 0x00, 0x00];
 /// Disposed and unregistered; STATUS_INFO is big-endian always (RTPS 2.5, 9.6.4.9).
 const GONE: [u8; 4] = [0, 0, 0, 3];
 
-/// Who speaks: a participant of a moment.
+/// The participant that sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LocalParticipant {
     /// Its GUID prefix.
@@ -55,7 +55,7 @@ pub struct LocalParticipant {
 pub struct Message(Vec<u8>);
 
 impl Message {
-    /// From the speaker to this participant alone.
+    /// From the local participant to this participant alone.
     #[must_use]
     pub fn new(local: LocalParticipant, target: GuidPrefix) -> Self {
         let header = [&b"RTPS\x02\x03"[..], &VENDOR.0, &local.prefix.0];

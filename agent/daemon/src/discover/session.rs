@@ -172,7 +172,7 @@ impl Session {
         plan
     }
 
-    /// Takes in a datagram that came to the speaker's socket.
+    /// Takes in a datagram that came to the local participant's socket.
     pub fn datagram(&mut self, now: Timestamp, bytes: &[u8]) {
         self.received.add(bytes.len());
         let vendor = bytes.get(6..8).and_then(|vendor| vendor.try_into().ok());

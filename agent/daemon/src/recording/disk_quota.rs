@@ -14,16 +14,16 @@ use std::path::{Path, PathBuf};
 use crate::config::RecordingLimits;
 use ros2probe_bag::Error;
 
-/// Bytes of messages between two looks at the file system.
+/// Bytes of messages between two checks of the file system.
 const STEP: u64 = 8 << 20;
 
-/// The room of one recording.
+/// The quota of one recording.
 #[derive(Clone, Debug)]
 pub struct DiskQuota {
     /// In which all bags lie.
     directory: PathBuf,
     limits: RecordingLimits,
-    /// Bytes taken since the last look.
+    /// Bytes taken since the last check.
     unseen: u64,
 }
 
@@ -52,7 +52,7 @@ impl DiskQuota {
         }
     }
 
-    /// Takes room for `more` bytes in a bag of `bag` bytes.
+    /// Takes quota for `more` bytes in a bag of `bag` bytes.
     ///
     /// # Errors
     /// A limit would be exceeded.

@@ -20,7 +20,8 @@ use super::report::Report;
 use super::session::{self, Activity, Command};
 use crate::config::{Limit, RecordingLimits};
 use crate::subscriptions::{
-    ChoiceError, Depth, Got, Overflow, Refused, Request, Selection, Subscription, Subscriptions,
+    ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
+    Subscriptions,
 };
 use crate::surface::{AgentEvent, Board, Slot, Slots};
 use ros2probe_bag::{Options, Schema, Writer};
@@ -410,7 +411,7 @@ impl Recording {
     ) {
         let next = |patience| {
             let item = subscription.next_blocking(patience);
-            Ok::<_, std::convert::Infallible>(item.map_or(Got::Nothing, Got::Item))
+            Ok::<_, std::convert::Infallible>(item.map_or(NextItem::Pending, NextItem::Item))
         };
         let figures = board.recordings();
         figures.active.fetch_add(1, Ordering::Relaxed);

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use ros2probe_wire::Timestamp;
 
 use super::recorder::{Finished, Recorder};
-use crate::subscriptions::{Got, Item};
+use crate::subscriptions::{Item, NextItem};
 use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 
 /// How long orders wait at most.
@@ -84,7 +84,7 @@ struct Completion<'a, T> {
 /// recording now and then, and whenever an order was carried out.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
-    mut next: impl FnMut(Duration) -> Result<Got, E>,
+    mut next: impl FnMut(Duration) -> Result<NextItem, E>,
     commands: &Receiver<Command>,
     mut report_activity: impl FnMut(Activity<'_>),
 ) -> (Finished, Option<E>) {
@@ -124,9 +124,9 @@ pub fn record<E>(
             break (None, None);
         }
         let item = match got {
-            Got::Item(item) => item,
-            Got::Nothing => continue,
-            Got::Gone => break (None, None),
+            NextItem::Item(item) => item,
+            NextItem::Pending => continue,
+            NextItem::Closed => break (None, None),
         };
         if let Err(error) = recorder.take(&item) {
             break (Some(error), None);

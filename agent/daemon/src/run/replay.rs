@@ -22,10 +22,10 @@ const PROGRESS: Duration = Duration::from_secs(1);
 /// A packet this far from the last one is gone to at once, not step by step.
 const FAR: u64 = 3600 * 1_000_000_000;
 
-/// While it rests, what the agent is asked is answered so often.
+/// The polling period of requests while a replay is paused.
 const PAUSE_POLL: Duration = Duration::from_millis(5);
 
-/// Both ends of a rest that a replay takes at some moment, until it is told to go on.
+/// Both ends of a pause of a replay, which lasts until it is resumed.
 #[must_use]
 pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
     let (resume, resumed) = mpsc::channel();
@@ -47,7 +47,7 @@ pub struct PausePoint {
     pausing: watch::Sender<bool>,
 }
 
-/// Who waits for the replay's rest, and ends it.
+/// Waits for the pause of a replay, and ends it.
 #[derive(Debug)]
 pub struct ReplayControl {
     resume: mpsc::Sender<()>,
@@ -55,7 +55,7 @@ pub struct ReplayControl {
 }
 
 impl ReplayControl {
-    /// Returns when the replay rests, or when it has ended before.
+    /// Returns when the replay pauses, or when it has ended before.
     pub async fn paused(&mut self) {
         let _ = self.paused.wait_for(|pausing| *pausing).await;
     }
@@ -318,7 +318,7 @@ impl Replay {
         })
     }
 
-    /// Tells who waits for the rest.
+    /// Reports the pause to its waiter.
     pub fn report_pause(&mut self) {
         if let Some(pause) = &self.pause {
             pause.pausing.send_replace(true);

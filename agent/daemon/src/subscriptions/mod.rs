@@ -96,13 +96,13 @@ pub enum Item {
 
 /// What came within a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Got {
+pub enum NextItem {
     /// Something.
     Item(Item),
     /// Nothing yet.
-    Nothing,
+    Pending,
     /// The agent hung up.
-    Gone,
+    Closed,
 }
 
 /// All subscriptions.
@@ -340,8 +340,8 @@ impl Subscriptions {
                 _ => sample,
             };
             if let Some(payload) = &sample.payload {
-                let charge =
-                    charge.get_or_insert_with(|| channel::Charge::new(&self.queued, payload.len()));
+                let charge = charge
+                    .get_or_insert_with(|| channel::QueuedBytes::new(&self.queued, payload.len()));
                 channel.sample(sample, Some(charge), &self.stop);
             } else {
                 channel.sample(sample, None, &self.stop);

@@ -1,5 +1,5 @@
-//! The one walk over what is pinned to the board, family by family in the catalogue's order. Scrapes
-//! and exports both take it, so they show the same.
+//! The one collection of what is pinned to the board, family by family in the catalogue's order. Scrapes
+//! and exports both use it, so they show the same.
 
 use std::fmt;
 use std::time::{Duration, Instant};
@@ -12,7 +12,7 @@ use super::metric_sink::MetricSink;
 use super::ros2_metrics::{self, TopicRows};
 use ros2probe_model::snapshot::Snapshot;
 
-/// Writes everything to `page`; `previous` is how long that took the last time.
+/// Writes everything to `sink`; `previous` is how long that took the last time.
 pub(super) fn collect(sink: &mut MetricSink<'_>, board: &Board, previous: Duration) -> fmt::Result {
     let (state, settings) = (board.state(), board.settings());
     let nothing = Snapshot::default();

@@ -133,7 +133,7 @@ impl CompressedText {
         self.pieces.iter().map(|piece| piece.len()).sum()
     }
 
-    /// The answer, which ends with an error when its `room` is given up.
+    /// The answer, which ends with an error when its `reservation` is given up.
     pub(super) fn into_body(self, reservation: Option<Reservation>) -> Body {
         let encoding = self.encoding;
         let pieces = self.pieces.into_iter().map(move |piece| {

@@ -1,13 +1,13 @@
 //! The log of events: the last ones, numbered, for any number of readers that come and go.
 //!
-//! Who tells is never held up: it appends under a lock that readers hold only to copy references.
-//! A reader keeps its own place; what was overwritten before it came is counted and told to it,
+//! A writer is never held up: it appends under a lock that readers hold only to copy references.
+//! A reader keeps its own position; what was overwritten before it came is counted and told to it,
 //! never passed over in silence. Storms are cut here: so many events of one name in a second, the
 //! rest in one number. The seconds of what happened to the robot are those of the source's clock, so
 //! that a capture gives the same events at any speed.
 //!
 //! A number belongs to one run of the agent. Written out, an id names the run too, so that after a
-//! restart nobody mistakes an old place for a new one.
+//! restart nobody mistakes an old position for a new one.
 
 mod record;
 mod self_monitor;
@@ -57,7 +57,7 @@ pub enum Reader {
     Otlp,
 }
 
-/// A place in some run's events.
+/// A position in some run's events.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Position {
     /// Behind the event of this number in this run.
@@ -125,7 +125,7 @@ impl EventLog {
         }
     }
 
-    /// Tells what the model noticed until `clock`, the source's. Called with nothing too, so that a
+    /// Records what the model noticed until `clock`, the source's. Called with nothing too, so that a
     /// storm's end is told.
     pub fn add(&self, taken: Taken, clock: Timestamp) {
         let mut log = self.log();
@@ -146,7 +146,7 @@ impl EventLog {
         }
     }
 
-    /// Nothing more will come: tells what is still held back.
+    /// Nothing more will come: records what is still held back.
     pub fn settle(&self) {
         let mut log = self.log();
         log.record_suppressed();
@@ -154,7 +154,7 @@ impl EventLog {
         self.news.notify_waiters();
     }
 
-    /// Tells what happened to the agent just now.
+    /// Records what happened to the agent just now.
     pub fn record(&self, event: AgentEvent) {
         self.record_at(event, Instant::now());
     }
@@ -234,7 +234,7 @@ impl EventLog {
         }
     }
 
-    /// Events told, by name, also those of which there was none.
+    /// Events recorded, by name, also those of which there was none.
     #[must_use]
     pub fn recorded(&self) -> Vec<(&'static str, u64)> {
         let log = self.log();

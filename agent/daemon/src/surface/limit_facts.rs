@@ -1,6 +1,6 @@
 //! How far the caps of the configuration are used, and what was refused or given up because of each.
 //!
-//! Most of it the model counts in its tables anyway. What surfaces and recordings hand out (places
+//! Most of it the model counts in its tables anyway. What surfaces and recordings hand out (slots
 //! of connections, bags, watches) is counted here, where it is handed out.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -33,7 +33,7 @@ pub struct LimitFacts {
 #[derive(Debug)]
 pub struct LimitFigures {
     caps: Limits,
-    /// What is not handed out as places.
+    /// What is not handed out as slots.
     used: [AtomicU64; LIMITS],
     reached: [AtomicU64; LIMITS],
     rises: Mutex<[Rise; LIMITS]>,
@@ -47,14 +47,14 @@ struct Rise {
     at: Option<Instant>,
 }
 
-/// Places of which only so many can be taken at once.
+/// Slots of which only so many can be taken at once.
 #[derive(Debug)]
 pub struct Slots {
     cap: usize,
     taken: AtomicUsize,
 }
 
-/// One place; free again when this is dropped.
+/// One slot; free again when this is dropped.
 #[derive(Debug)]
 pub struct Slot {
     of: Arc<Slots>,
@@ -79,7 +79,7 @@ impl LimitFigures {
         &self.caps
     }
 
-    /// As many places as `limit` allows, to whoever hands them out: a listener of several has its
+    /// As many slots as `limit` allows, to whoever hands them out: a listener of several has its
     /// own, so that who fills one does not lock the others.
     #[must_use]
     pub fn slots(&self, limit: Limit) -> Arc<Slots> {
@@ -202,7 +202,7 @@ impl LimitFigures {
 }
 
 impl Slots {
-    /// A place, if one is free.
+    /// A slot, if one is free.
     pub fn take(self: &Arc<Self>) -> Option<Slot> {
         let more = |taken| (taken < self.cap).then_some(taken + 1);
         let taken = self

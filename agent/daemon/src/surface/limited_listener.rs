@@ -1,4 +1,4 @@
-//! A listener that cannot be used up: a limited number of connections. Where all places are taken,
+//! A listener that cannot be used up: a limited number of connections. Where all slots are taken,
 //! the connection that waits longest for its client makes room; where none waits, a further client
 //! is answered 503 at once.
 
@@ -24,7 +24,7 @@ const REQUEST: u64 = 64 << 10;
 /// How long the connection that makes room may take to go.
 const ROOM: Duration = Duration::from_millis(100);
 
-/// A listener with a limited number of connections; a further one is told so and closed.
+/// A listener with a limited number of connections; a further one is refused and closed.
 #[derive(Debug)]
 pub(super) struct LimitedListener<L> {
     listener: L,
@@ -36,7 +36,7 @@ pub(super) struct LimitedListener<L> {
     leaving: JoinSet<()>,
 }
 
-/// What is answered to who is one too many, whatever was asked.
+/// The answer to each connection beyond the limit.
 #[derive(Clone, Debug)]
 pub(super) struct Refusal(Arc<str>);
 
@@ -60,7 +60,7 @@ impl<L> LimitedListener<L> {
         }
     }
 
-    /// A place, if need be that of a connection on which nothing is being answered.
+    /// A slot, if need be that of a connection on which nothing is being answered.
     async fn slot(&self) -> Option<Slot> {
         if let Some(slot) = self.slots.take() {
             return Some(slot);
@@ -80,7 +80,7 @@ impl<L> LimitedListener<L> {
         timeout(ROOM, freed).await.ok()
     }
 
-    /// No place for this one. It is not waited for, nor are many kept that take their time.
+    /// No slot for this one. It is not waited for, nor are many kept that take their time.
     fn reject(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
         while self.leaving.try_join_next().is_some() {}
         if let Some(refusal) = self.refusal.clone()
@@ -94,7 +94,7 @@ impl<L> LimitedListener<L> {
 }
 
 impl<L: Listener> LimitedListener<L> {
-    /// The next connection that has a place.
+    /// The next connection that has a slot.
     pub(super) async fn accept(&mut self) -> Connection<L::Io> {
         loop {
             let (stream, _) = self.listener.accept().await;

@@ -77,7 +77,7 @@ pub(super) struct WatchWriter {
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
-/// Where the thread finds its work.
+/// The mailbox of the thread.
 #[derive(Debug, Default)]
 struct Mailbox {
     pending: Mutex<Pending>,

@@ -1,4 +1,4 @@
-//! Looks at what the agent knows of itself and says when that becomes an event: it lost something,
+//! Watches what the agent knows of itself and makes events of it: it lost something,
 //! it does not see any more, it sees again. Each says a thing once.
 
 use std::time::{Duration, Instant};
@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::AgentEvent;
 use crate::surface::AgentFacts;
 
-/// Losses are told at most this often.
+/// Losses are reported at most this often.
 const PAUSE: Duration = Duration::from_secs(1);
 
 /// What was lost on the way to the model.
@@ -28,7 +28,7 @@ pub struct SourceMonitor {
 }
 
 impl DropMonitor {
-    /// What was lost since it was last told.
+    /// What was lost since the last report.
     pub fn check(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
         let early = |at: Instant| now.saturating_duration_since(at) < PAUSE;
         if self.at.is_some_and(early) {
