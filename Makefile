@@ -14,7 +14,7 @@ MIRI := MIRIFLAGS="-Zmiri-strict-provenance -Zmiri-disable-isolation $$MIRI_MORE
     CARGO_TARGET_DIR=$(TARGET)/miri cargo "+$$(.ci/prerequisites.sh --nightly)" miri test
 # Floods and what is tried with every change of a byte would take hours there, and queues wake their
 # readers through sockets that it does not have.
-MIRI_WIRE := cursor:: walk:: record:: rtps:: --skip never
+MIRI_WIRE := cursor:: walk:: record:: rtps:: testing:: --skip never
 MIRI_CAPTURE := ring::block ring::turns shm::cell shm::port shm::segment shm::inbox
 MIRI_THREADS := ring::turns
 
@@ -119,9 +119,9 @@ soak: ## an hour of a changing graph, and faults, on what is shipped; SOAK_SECON
 
 fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	@.ci/prerequisites.sh fuzz
-	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list); do \
+	for crate in wire agent; do (cd $$crate && for target in $$(cargo fuzz list --fuzz-dir fuzz); do \
 	    mkdir -p "fuzz/corpus/$$target"; \
-	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run "$$target" "fuzz/corpus/$$target" \
+	    cargo "+$$(../.ci/prerequisites.sh --nightly)" fuzz run --fuzz-dir fuzz "$$target" "fuzz/corpus/$$target" \
 	        $$(ls -d "fuzz/seeds/$$target" "tests/data/$${target}s" 2>/dev/null) -- \
 	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
 	done) || exit 1; done

@@ -90,7 +90,7 @@ libraries() {
 libraries | gzip -9n >"$parts/libraries.gz"
 
 package=$directory/ros2probe_${version}_$architecture.deb
-cd "$root/agent"
+cd "$root/agent/cli"
 CARGO_TARGET_DIR=$stage cargo deb --quiet --locked --no-build --no-strip --no-dbgsym --compress-system \
     --target "$target" --deb-version "$version" --output "$package" "$@" >/dev/null
 printf '%s\n' "$package"

@@ -1,7 +1,11 @@
-//! How long the parsers take over real datagrams: all submessages of one, a participant's and an
+//! How long the parsers take over real datagrams: the walk over all submessages of one, a participant's and an
 //! endpoint's announcement, and a `ros_discovery_info` sample.
 
-#![expect(clippy::unwrap_used, reason = "a benchmark may panic on its own input")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    reason = "a benchmark may panic on its own input"
+)]
 
 use std::hint::black_box;
 
@@ -9,7 +13,9 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ros2probe_wire::discovery::{self, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::rtps::{Body, Data, InlineQos, Message, VendorId};
+use ros2probe_wire::record::Sample;
+use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
+use ros2probe_wire::walk::{self, Envelope};
 
 macro_rules! captured {
     ($file:literal) => {
@@ -17,17 +23,16 @@ macro_rules! captured {
     };
 }
 
-fn first_data(datagram: &[u8]) -> (VendorId, Data<'_>) {
-    Message::parse(datagram)
-        .unwrap()
-        .find_map(|submessage| {
-            let submessage = submessage.unwrap();
-            match submessage.body {
-                Body::Data(data) => Some((submessage.receiver.vendor, data)),
-                _ => None,
-            }
-        })
-        .unwrap()
+/// Payload of a datagram's first DATA, and whose it is.
+fn first_data(datagram: &[u8]) -> (VendorId, Payload<'_>) {
+    let vendor = VendorId([datagram[6], datagram[7]]);
+    let mut payload = None;
+    walk::datagram(datagram, &Envelope::default(), None, |found| {
+        if matches!(found.record.sample(), Some(Sample::Data(_))) {
+            payload.get_or_insert(found.payload());
+        }
+    });
+    (vendor, payload.unwrap())
 }
 
 fn messages(criterion: &mut Criterion) {
@@ -40,10 +45,12 @@ fn messages(criterion: &mut Criterion) {
         group.throughput(Throughput::Elements(1));
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
-                Message::parse(black_box(datagram))
-                    .unwrap()
-                    .flatten()
-                    .count()
+                let mut count = 0;
+                walk::datagram(black_box(datagram), &Envelope::default(), None, |found| {
+                    black_box(found);
+                    count += 1;
+                });
+                count
             });
         });
     }
@@ -56,9 +63,9 @@ fn announcements(criterion: &mut Criterion) {
         ("fast", captured!("fast-spdp")),
         ("cyclone", captured!("jazzy-spdp")),
     ] {
-        let (vendor, data) = first_data(datagram);
+        let (vendor, payload) = first_data(datagram);
         group.bench_function(format!("participant {name}"), |bencher| {
-            let payload = black_box(data.payload);
+            let payload = black_box(payload);
             bencher.iter(|| discovery::participant(vendor, payload, &InlineQos::default()));
         });
     }
@@ -66,16 +73,16 @@ fn announcements(criterion: &mut Criterion) {
         ("fast", captured!("fast-sedp-writer")),
         ("cyclone", captured!("jazzy-sedp")),
     ] {
-        let (vendor, data) = first_data(datagram);
+        let (vendor, payload) = first_data(datagram);
         group.bench_function(format!("endpoint {name}"), |bencher| {
-            let payload = black_box(data.payload);
+            let payload = black_box(payload);
             bencher
                 .iter(|| discovery::endpoint(Role::Writer, vendor, payload, &InlineQos::default()));
         });
     }
-    let (_, data) = first_data(captured!("cyclone-entities"));
+    let (_, payload) = first_data(captured!("cyclone-entities"));
     group.bench_function("node of fifteen endpoints", |bencher| {
-        bencher.iter(|| ParticipantEntities::parse(black_box(data.payload.bytes())));
+        bencher.iter(|| ParticipantEntities::parse(black_box(payload.bytes())));
     });
     let topic = DdsTopic::parse("rq/robot1/fibonacci/_action/send_goalRequest").unwrap();
     group.bench_function("kind of a topic", |bencher| {

@@ -11,6 +11,9 @@
 extern crate alloc;
 #[cfg(test)]
 extern crate std;
+// The oracle is included by tests here and elsewhere: it names this crate from outside.
+#[cfg(test)]
+extern crate self as ros2probe_wire;
 
 pub mod cursor;
 #[cfg(feature = "alloc")]

@@ -143,18 +143,6 @@ impl<'a> ParameterList<'a> {
         })
     }
 
-    /// The list at the cursor, which moves behind the sentinel: only the sentinel tells where a
-    /// payload begins.
-    pub(crate) fn take(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
-        let list = Self::inline(*cursor);
-        let mut walk = list;
-        for parameter in walk.by_ref() {
-            parameter?;
-        }
-        *cursor = walk.rest;
-        Ok(list)
-    }
-
     /// Value of the first parameter of this identifier.
     ///
     /// # Errors

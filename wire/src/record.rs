@@ -3,24 +3,33 @@
 //! The same [`Record`]s come out of the kernel's ring buffer and out of the user-space walk over
 //! captured, replayed or shared-memory datagrams; the model cannot tell the difference. Words are
 //! in the host's byte order except where they hold wire bytes (GUIDs, addresses).
+//!
+//! The kinds share the words of a record. [`Record::body`] reads them as the kind has it; only the
+//! walk and the kernel program, which write them, use the fields themselves.
+
+mod body;
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
 use crate::guid::{Guid, GuidPrefix};
-use crate::time::RtpsTime;
+use crate::time::{RtpsTime, Timestamp};
+
+pub use body::{AckNack, Body, Data, DataFrag, Gap, Heartbeat, Sample, SequenceNumberSet};
 
 /// Submessage kinds (RTPS 2.5, 9.4.5.1.1) and the two that only this ABI knows.
 pub mod kind {
+    use crate::rtps::SubmessageId;
+
     /// ACKNACK: reader acknowledges and asks again.
-    pub const ACKNACK: u8 = 0x06;
+    pub const ACKNACK: u8 = SubmessageId::ACKNACK.0;
     /// HEARTBEAT: writer says what it has.
-    pub const HEARTBEAT: u8 = 0x07;
+    pub const HEARTBEAT: u8 = SubmessageId::HEARTBEAT.0;
     /// GAP: writer says what will never come.
-    pub const GAP: u8 = 0x08;
+    pub const GAP: u8 = SubmessageId::GAP.0;
     /// DATA: one sample.
-    pub const DATA: u8 = 0x15;
+    pub const DATA: u8 = SubmessageId::DATA.0;
     /// DATA_FRAG: some fragments of one sample.
-    pub const DATA_FRAG: u8 = 0x16;
+    pub const DATA_FRAG: u8 = SubmessageId::DATA_FRAG.0;
     /// Not a submessage: the fragmented datagram [`super::Record::datagram`] is complete, all
     /// records that were sent ahead for it now count.
     pub const COMPLETE: u8 = 0xf0;
@@ -68,6 +77,9 @@ pub mod flag {
 }
 
 /// One submessage of one writer or reader. 136 bytes.
+///
+/// The fields from `payload_len` to `status_info`, and `sequence_number`, are named for DATA and
+/// DATA_FRAG. Other kinds keep other numbers there: [`Record::body`] names them.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
@@ -138,6 +150,26 @@ impl Record {
     /// make the walk ask for the whole datagram instead.
     pub const BITMAP_BITS: u32 = 160;
 
+    /// The participant that sent it: the writer's, of an ACKNACK the reader's.
+    #[must_use]
+    pub fn sender(&self) -> GuidPrefix {
+        if self.is_acknack() {
+            self.reader().prefix
+        } else {
+            self.writer().prefix
+        }
+    }
+
+    /// The participant that it is for; unknown for all matched readers.
+    #[must_use]
+    pub fn addressee(&self) -> GuidPrefix {
+        if self.is_acknack() {
+            self.writer().prefix
+        } else {
+            self.reader().prefix
+        }
+    }
+
     /// The writer.
     #[must_use]
     pub fn writer(&self) -> Guid {
@@ -148,6 +180,12 @@ impl Record {
     #[must_use]
     pub fn reader(&self) -> Guid {
         zerocopy::transmute!(self.reader)
+    }
+
+    /// When the first datagram that it reports came, where it reports fragments of several.
+    #[must_use]
+    pub const fn began(&self) -> Timestamp {
+        Timestamp(self.time.saturating_sub(self.elapsed as u64))
     }
 
     /// INFO_TS in force.
@@ -227,35 +265,8 @@ impl Record {
     }
 
     /// HEARTBEAT's lastSN, GAP's gapList base.
-    #[must_use]
-    pub const fn second_sequence_number(&self) -> u64 {
+    const fn long(&self) -> u64 {
         (self.payload_len as u64) << 32 | self.encapsulation as u64
-    }
-
-    /// GAP's and ACKNACK's set: bit `i` set means `base + i` is meant (RTPS 2.5, 9.4.2.6).
-    pub fn bitmap(&self) -> impl Iterator<Item = u32> + use<> {
-        let words = [
-            self.stamp_nanoseconds,
-            self.fragment_start,
-            self.fragments,
-            self.sample_size,
-            self.status_info,
-        ];
-        let bits = self.stamp_seconds.min(Self::BITMAP_BITS);
-        (0..bits).filter(move |bit| {
-            let word = words.get((bit / 32) as usize).copied().unwrap_or(0);
-            word >> (31 - bit % 32) & 1 == 1
-        })
-    }
-
-    /// `std_msgs/Header.stamp` if the payload begins with one: seconds and nanoseconds. `None` when
-    /// the payload's first bytes were not seen or cannot be a stamp.
-    #[must_use]
-    pub const fn header_stamp(&self) -> Option<(i32, u32)> {
-        if self.flags & flag::STAMP == 0 || self.stamp_nanoseconds >= 1_000_000_000 {
-            return None;
-        }
-        Some((self.stamp_seconds.cast_signed(), self.stamp_nanoseconds))
     }
 
     /// [`kind::HANDOVER`]'s context.

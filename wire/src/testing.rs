@@ -4,7 +4,13 @@ use std::string::ToString;
 use std::vec::Vec;
 
 use crate::cursor::Endianness;
-use crate::rtps::{Body, Data, InlineQos, Message, VendorId};
+use crate::rtps::{InlineQos, VendorId};
+use oracle::submessage::Data;
+use oracle::{Body, Message};
+
+#[path = "../tests/oracle/mod.rs"]
+pub(crate) mod oracle;
+mod oracle_tests;
 
 macro_rules! captured {
     ($($name:ident = $file:literal;)+) => {

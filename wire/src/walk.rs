@@ -10,8 +10,11 @@
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
+use crate::cursor::{Cursor, Reason, WireError};
 use crate::guid::EntityId;
+use crate::parameters::{ParameterId, ParameterList};
 use crate::record::{Handover, Record, flag, kind};
+use crate::rtps::{InlineQos, Payload, SubmessageFlags, SubmessageId, VendorId};
 use crate::time::Timestamp;
 
 /// Where a walk reads from: a slice, or a socket buffer in the kernel.
@@ -41,13 +44,19 @@ pub const MAGIC: u32 = u32::from_ne_bytes(*b"RTPS");
 
 /// Parameters of one inline QoS that the walk reads before it gives up on its length.
 const INLINE_QOS_PARAMETERS: u32 = 12;
-const PID_SENTINEL: u32 = 0x0001;
-const PID_STATUS_INFO: u32 = 0x0071;
+const PID_SENTINEL: u32 = ParameterId::SENTINEL.0 as u32;
+const PID_STATUS_INFO: u32 = ParameterId::STATUS_INFO.0 as u32;
 
-const INFO_TS: u32 = 0x09;
-const INFO_SRC: u32 = 0x0c;
-const INFO_DST: u32 = 0x0e;
-const PAD: u32 = 0x01;
+const INFO_TS: u32 = SubmessageId::INFO_TS.0 as u32;
+const INFO_SRC: u32 = SubmessageId::INFO_SRC.0 as u32;
+const INFO_DST: u32 = SubmessageId::INFO_DST.0 as u32;
+const PAD: u32 = SubmessageId::PAD.0 as u32;
+
+/// [`SubmessageFlags`] as the walk holds them.
+const ENDIANNESS: u32 = SubmessageFlags::ENDIANNESS.0 as u32;
+const INVALIDATE: u32 = SubmessageFlags::INVALIDATE.0 as u32;
+const INLINE_QOS: u32 = SubmessageFlags::INLINE_QOS.0 as u32;
+const DATA_OR_KEY: u32 = SubmessageFlags::DATA.with(SubmessageFlags::KEY).0 as u32;
 
 /// One datagram on its way through [`step`].
 #[derive(Clone, Copy, Default, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
@@ -95,7 +104,7 @@ impl Order {
     /// From a submessage's flags: E set means little-endian.
     #[inline(always)]
     const fn of(flags: u32) -> Self {
-        Self((flags & 1).wrapping_neg())
+        Self((flags & ENDIANNESS).wrapping_neg())
     }
 
     #[inline(always)]
@@ -239,7 +248,7 @@ fn receiver_state<B: Bytes>(
     end: u32,
 ) -> Step {
     if id == INFO_TS {
-        if flags & 0x02 != 0 {
+        if flags & INVALIDATE != 0 {
             walk.timestamp = [zero(); 2];
             return Step::Passed;
         }
@@ -293,7 +302,19 @@ fn zero() -> u32 {
     core::hint::black_box(0)
 }
 
-/// DATA and DATA_FRAG (RTPS 2.5, 9.4.5.3 and 9.4.5.4).
+/// Length of extraFlags and octetsToInlineQos, which begin a DATA or DATA_FRAG.
+const EXTRA_LEN: u32 = 4;
+
+/// octetsToInlineQos of a DATA or DATA_FRAG whose first word is `extra`. It counts from behind
+/// itself to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions may put fields
+/// behind those of this one, so the offset is followed, not assumed.
+#[inline(always)]
+const fn octets_to_inline_qos(order: Order, extra: u32) -> u32 {
+    let (_extra_flags, octets) = order.halves(extra);
+    octets
+}
+
+/// DATA and DATA_FRAG (RTPS 2.5, 9.4.5.4 and 9.4.5.5).
 #[inline(always)]
 #[expect(
     clippy::too_many_arguments,
@@ -325,13 +346,11 @@ fn data<B: Bytes>(
         walk.record.fragments = in_submessage << 16 | fragment_size;
         walk.record.sample_size = order.word(size);
     }
-    // octetsToInlineQos counts from behind itself (RTPS 2.5, 9.4.5.3.3).
-    let (_, to_inline_qos) = order.halves(extra);
-    let mut at = body + 4 + to_inline_qos;
+    let mut at = body + EXTRA_LEN + octets_to_inline_qos(order, extra);
     if at < body + fixed || at > end {
         return Step::Malformed;
     }
-    if flags & 0x02 != 0 {
+    if flags & INLINE_QOS != 0 {
         let mut seen = 0;
         loop {
             if seen == INLINE_QOS_PARAMETERS {
@@ -349,7 +368,7 @@ fn data<B: Bytes>(
                     return Step::Malformed;
                 }
                 let [status] = read!(walk, bytes, present, at + 4, 1);
-                // Big-endian whatever E says (RTPS 2.5, 9.6.3.9).
+                // Big-endian whatever E says (RTPS 2.5, 9.6.4.9).
                 walk.record.status_info = u32::from_be(status);
             }
             at += 4;
@@ -364,7 +383,7 @@ fn data<B: Bytes>(
         }
     }
     // Neither Data nor Key: a disposal that says everything inline (Fast DDS).
-    if !fragment && flags & 0x0c == 0 {
+    if !fragment && flags & DATA_OR_KEY == 0 {
         return Step::Endpoint;
     }
     walk.record.payload_len = end - at;
@@ -382,7 +401,7 @@ fn data<B: Bytes>(
     Step::Endpoint
 }
 
-/// HEARTBEAT (RTPS 2.5, 9.4.5.6).
+/// HEARTBEAT (RTPS 2.5, 9.4.5.7).
 #[inline(always)]
 fn heartbeat<B: Bytes>(
     walk: &mut Walk,
@@ -413,7 +432,7 @@ fn heartbeat<B: Bytes>(
     Step::Endpoint
 }
 
-/// GAP and ACKNACK (RTPS 2.5, 9.4.5.5 and 9.4.5.2): both end in a SequenceNumberSet (9.4.2.6).
+/// GAP and ACKNACK (RTPS 2.5, 9.4.5.6 and 9.4.5.3): both end in a SequenceNumberSet (9.4.2.6).
 #[inline(always)]
 #[expect(
     clippy::too_many_arguments,
@@ -622,6 +641,46 @@ pub struct Found<'a> {
     pub payload: &'a [u8],
 }
 
+impl<'a> Found<'a> {
+    /// The flags octet of the submessage's header.
+    #[must_use]
+    pub const fn flags(&self) -> SubmessageFlags {
+        SubmessageFlags(self.record.submessage_flags)
+    }
+
+    /// Payload of a DATA, as its flags D and K say what it is (RTPS 2.5, 9.4.5.4).
+    #[must_use]
+    pub const fn payload(&self) -> Payload<'a> {
+        let flags = self.flags();
+        if flags.contains(SubmessageFlags::DATA) {
+            Payload::Data(self.payload)
+        } else if flags.contains(SubmessageFlags::KEY) {
+            Payload::Key(self.payload)
+        } else {
+            Payload::None
+        }
+    }
+
+    /// Inline QoS of a DATA or DATA_FRAG, none if flag Q is not set; `vendor` decides what the
+    /// vendor-specific parameters mean.
+    ///
+    /// # Errors
+    /// The parameter list is malformed, also behind those parameters that the walk followed.
+    pub fn inline_qos(&self, vendor: VendorId) -> Result<InlineQos, WireError> {
+        let flags = self.flags();
+        if !flags.contains(SubmessageFlags::INLINE_QOS) {
+            return Ok(InlineQos::default());
+        }
+        let mut cursor = Cursor::new(self.body, flags.endianness());
+        let error = cursor.error("octetsToInlineQos", Reason::Truncated);
+        let [extra] = self.body.words::<1>(0).ok_or(error)?;
+        let octets = octets_to_inline_qos(Order::of(flags.0.into()), extra);
+        let offset = usize::try_from(EXTRA_LEN + octets).map_err(|_| error)?;
+        cursor.take("octetsToInlineQos", offset)?;
+        InlineQos::parse(ParameterList::inline(cursor), vendor)
+    }
+}
+
 /// How a walk in user space ended.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Outcome {
@@ -674,8 +733,11 @@ pub fn datagram<'a>(
             Step::Passed => {}
             Step::Endpoint | Step::LongGap => {
                 let body = slice(payload, start + 4, walk.offset);
-                let is_data = matches!(walk.record.kind, kind::DATA | kind::DATA_FRAG);
-                let payload_len = if is_data { walk.record.payload_len } else { 0 };
+                let payload_len = if walk.record.is_sample() {
+                    walk.record.payload_len
+                } else {
+                    0
+                };
                 let data = slice(payload, walk.offset - payload_len, walk.offset);
                 show(Found {
                     record: walk.record,
@@ -699,9 +761,8 @@ pub fn datagram<'a>(
 /// from there on, with an empty range before it.
 fn long_gap_tail(record: &Record, body: &[u8]) -> Record {
     let order = Order::of(record.submessage_flags.into());
-    let base = record
-        .second_sequence_number()
-        .wrapping_add(Record::BITMAP_BITS.into());
+    let gap_list_base = u64::from(record.payload_len) << 32 | u64::from(record.encapsulation);
+    let base = gap_list_base.wrapping_add(Record::BITMAP_BITS.into());
     // reader, writer, gapStart, base, numBits, then five words that the first record holds
     let map = |index: u32| {
         body.words::<1>(28 + 20 + 4 * index)

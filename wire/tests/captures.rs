@@ -24,9 +24,11 @@ use ros2probe_wire::discovery::{
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::frame::{self, Link};
 use ros2probe_wire::names::TopicKind;
-use ros2probe_wire::rtps::{Body, InlineQos, Locator, LocatorKind, Message, Payload};
+use ros2probe_wire::rtps::{InlineQos, Locator, LocatorKind, Payload};
 use ros2probe_wire::{Duration, EntityId, Guid};
 use serde_json::{Value, json};
+
+use entry::oracle::{Body, Message};
 
 /// What this crate finds in one capture.
 #[derive(Default)]

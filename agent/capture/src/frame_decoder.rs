@@ -8,8 +8,8 @@ use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::walk::Envelope;
 
 use super::pcap::{Captured, PcapError, PcapReader};
+use crate::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_model::observer::Observer;
-use ros2probe_model::reassembly::{FlowKey, Limits, Reassembly};
 
 /// One capture on its way into the core.
 #[derive(Debug)]

@@ -1,5 +1,28 @@
-//! Where datagrams come from: live interfaces and captures. All the I/O of observing is here.
+//! Sources of the model: datagrams, records of the kernel programs, facts about sockets.
+//!
+//! - [`live::LiveSource`] observes this host: at the sockets of a control group ([`host_tap`]), on
+//!   interfaces ([`wire_tap`]), in shared memory of Fast DDS ([`shm`], or with uprobes [`uprobe`]).
+//! - [`pcap::PcapReader`] reads a capture, and [`frame_decoder::FrameDecoder`] brings its packets to the model.
+//!
+//! All `unsafe` code of user space is here: rings, maps, `ptrace`-like reads of other processes. A
+//! source changes, delays and drops nothing of what it observes, and sends nothing. It is given how
+//! to start threads ([`threads::Spawn`]), so that it knows nothing of privileges.
+//!
+//! ```no_run
+//! use std::path::Path;
+//!
+//! use ros2probe_capture::frame_decoder::FrameDecoder;
+//! use ros2probe_capture::pcap::PcapReader;
+//! use ros2probe_capture::reassembly::Limits;
+//! use ros2probe_model::observer::{Observer, Settings};
+//!
+//! let mut reader = PcapReader::open(Path::new("robot.pcap.gz"))?;
+//! let mut observer = Observer::new(Settings::default());
+//! FrameDecoder::new(Limits::default()).run(&mut reader, &mut observer)?;
+//! # Ok::<_, ros2probe_capture::pcap::PcapError>(())
+//! ```
 
+pub mod ahead;
 pub mod bell;
 pub mod cgroup;
 pub mod cgroup_paths;
@@ -15,6 +38,7 @@ pub mod netns;
 pub mod owners;
 pub mod pcap;
 pub mod piece_assembler;
+pub mod reassembly;
 pub mod reattach;
 pub mod reorder_buffer;
 pub mod ring;

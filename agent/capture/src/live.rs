@@ -29,9 +29,9 @@ use super::threads::Spawn;
 use super::uprobe::Uprobe;
 use super::uprobe::search::Facts as UprobeFacts;
 use super::wire_tap::{self, WireTap, WireTapError, WireTapSettings};
+use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
 use ros2probe_model::observer::{Observer, Wanted};
-use ros2probe_model::reassembly::Limits;
 
 /// What unclassified writers may cost each second, all together: a dozen nodes that start at once
 /// stay far below, a storm of forged ones stays bounded.

@@ -12,7 +12,7 @@
 use std::collections::{HashSet, VecDeque};
 
 use ros2probe_wire::Record;
-use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::record::{Body, flag};
 
 use super::system::Clocks;
 
@@ -60,7 +60,7 @@ pub enum Next {
 impl ReorderBuffer {
     /// Takes in a record of the kernel's ring, its time in the kernel's clock.
     pub fn kernel(&mut self, record: Record) {
-        if record.kind == kind::UNDELIVERED {
+        if matches!(record.body(), Body::Undelivered) {
             self.undelivered.push_back((record.time, record.datagram));
             self.undelivered_tokens.insert(record.datagram);
         } else if record.flags & flag::NO_ROOM != 0 {
@@ -120,7 +120,7 @@ impl ReorderBuffer {
         let record = walked.record;
         if !walked.no_room_said && self.undelivered_tokens.contains(&record.datagram) {
             walked.no_room_said = true;
-            if matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
+            if record.is_sample() {
                 let flags = record.flags | flag::NO_ROOM;
                 return Some(Next::Walked(Record { flags, ..record }));
             }
@@ -156,6 +156,7 @@ impl ReorderBuffer {
 #[cfg(test)]
 mod tests {
     use ros2probe_wire::Timestamp;
+    use ros2probe_wire::record::kind;
 
     use super::*;
 

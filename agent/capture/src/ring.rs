@@ -5,7 +5,7 @@
 //! it is bound to no interface, so that interfaces which appear later are seen as well. It never
 //! sends. Which frames are kept, and how much of each, is the filter's verdict and not decided here.
 //!
-//! Kernel memory is touched here and in [`turns`] only: a [`Block`] is lent to its reader and goes
+//! Kernel memory is touched here and in `turns` only: a [`Block`] is lent to its reader and goes
 //! back to the kernel when it is dropped. What is in a block is read by [`block`] as plain bytes.
 
 pub mod block;

@@ -20,9 +20,9 @@ use super::reattach::{Identity, identity};
 use super::reorder_buffer::{Next, ReorderBuffer};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::Clocks;
-use ros2probe_model::ahead::{Ahead, Ready};
+use crate::ahead::{Ahead, Ready};
+use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 use ros2probe_model::observer::Observer;
-use ros2probe_model::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 
 /// Records younger than this wait, so that frames captured before them are taken in first: a frame
 /// waits up to 100 ms for its block to fill.

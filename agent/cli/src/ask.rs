@@ -5,13 +5,13 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail};
 use ros2probe_capture::live::LiveSource;
+use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::agent::configuration;
 use ros2probe_daemon::config::{CaptureSettings, ShmMode, SourceChoice};
 use ros2probe_daemon::discover::session::{MOST_PACKETS, Session, Target};
 use ros2probe_daemon::discover::{converse, local_participant};
 use ros2probe_daemon::privilege;
 use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::reassembly::Limits;
 use ros2probe_model::snapshot::ParticipantFacts;
 use ros2probe_model::topic::Naming;
 use ros2probe_wire::discovery::Role;

@@ -1,4 +1,17 @@
 //! `rp`: asks an agent, and prints what it answers as `ros2` does.
+//!
+//! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
+//! - [`ros2`] makes the text of `ros2 topic`, `ros2 node`, `ros2 bag info` and others from answers.
+//! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
+//!
+//! The commands themselves are in the program (`src/cli/`). The crates below are exported here for
+//! tests and fuzz targets.
+//!
+//! ```
+//! use ros2probe::ros2::Dialect;
+//!
+//! assert_eq!(Dialect::of_distro("humble"), Some(Dialect::Humble));
+//! ```
 
 pub use ros2probe_bag as bag;
 pub use ros2probe_capture as capture;

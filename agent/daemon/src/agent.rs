@@ -8,11 +8,11 @@ use std::time::Duration;
 use anyhow::{Context as _, Result};
 use ros2probe_capture::live::LiveSource;
 use ros2probe_capture::pcap::Speed;
+use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::{Dialect, Library, Sources};
 use ros2probe_model::history::History;
 use ros2probe_model::observer::{self, Observer};
-use ros2probe_model::reassembly::Limits;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Access, Config, ConfigError, PageChoice, Watch};

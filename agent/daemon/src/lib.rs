@@ -1,4 +1,18 @@
-//! The agent: feeds the model from its sources and serves what the model knows.
+//! The agent: brings what its sources capture to the model, and serves what the model knows.
+//!
+//! - [`agent::run`] is the life of an agent. [`agent::Blueprint`] composes one, live or replayed.
+//! - [`config`] reads the configuration, [`watches`] merges what is watched.
+//! - [`run`] is the loop of the working thread, the only one that touches the model.
+//! - [`surface`] serves snapshots: Prometheus, OTLP, the API and the page.
+//! - [`subscriptions`] and [`recording`] take single messages, into streams and bags.
+//!
+//! ```
+//! use ros2probe_daemon::config::Config;
+//!
+//! let config = Config::parse(b"watch: [/points]\n")?;
+//! assert_eq!(config.watches[0].pattern, "/points");
+//! # Ok::<_, ros2probe_daemon::config::Mistakes>(())
+//! ```
 
 pub mod agent;
 pub mod config;

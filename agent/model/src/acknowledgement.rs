@@ -6,8 +6,8 @@
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::record::flag;
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::record::{AckNack, SequenceNumberSet, flag};
+use ros2probe_wire::{Guid, Timestamp};
 
 use super::size::Size;
 use super::snapshot::AcknowledgementFacts;
@@ -38,7 +38,7 @@ struct Reader {
     acknacks: u64,
     last_seen: Timestamp,
     /// The last one seen leaving, not arriving yet.
-    leaving: Option<[u32; 6]>,
+    leaving: Option<SequenceNumberSet>,
 }
 
 impl Acknowledgements {
@@ -64,8 +64,8 @@ impl Acknowledgements {
     }
 
     /// Takes in an ACKNACK.
-    pub fn record(&mut self, record: &Record) {
-        let guid = record.reader();
+    pub fn acknack(&mut self, acknack: AckNack<'_>) {
+        let guid = acknack.record().reader();
         let place = self.readers.binary_search_by_key(&guid, |each| each.guid);
         let index = match place {
             Ok(index) => index,
@@ -79,7 +79,7 @@ impl Acknowledgements {
             }
         };
         if let Some(reader) = self.readers.get_mut(index) {
-            reader.record(record);
+            reader.acknack(acknack);
         }
         self.trim();
     }
@@ -187,18 +187,12 @@ impl Reader {
         }
     }
 
-    fn record(&mut self, record: &Record) {
+    fn acknack(&mut self, acknack: AckNack<'_>) {
+        let record = acknack.record();
+        let content = acknack.missing();
         self.last_seen = self.last_seen.max(Timestamp(record.time));
-        self.base = record.sequence_number;
-        self.missing = record.bitmap().count() as u64;
-        let content = [
-            record.sequence_number as u32,
-            record.stamp_seconds,
-            record.stamp_nanoseconds,
-            record.fragment_start,
-            record.fragments,
-            record.sample_size,
-        ];
+        self.base = acknack.base();
+        self.missing = content.iter().count() as u64;
         // Where both ends are local it is seen leaving, then arriving.
         let is_leaving = record.flags & flag::OUTGOING != 0;
         if !is_leaving && self.leaving.take() == Some(content) {
@@ -212,13 +206,21 @@ impl Reader {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_wire::record::{guid_words, kind};
-    use ros2probe_wire::{EntityId, GuidPrefix};
+    use ros2probe_wire::record::{Body, guid_words, kind};
+    use ros2probe_wire::{EntityId, GuidPrefix, Record};
 
     use super::*;
 
     fn guid(number: u8) -> Guid {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, number, 4]))
+    }
+
+    /// [`Acknowledgements::acknack`] of the ACKNACK that a record reports.
+    fn put(all: &mut Acknowledgements, record: &Record) {
+        let Body::AckNack(acknack) = record.body() else {
+            panic!("{record:?}")
+        };
+        all.acknack(acknack);
     }
 
     fn acknack(reader: u8, base: u64, bits: u32, bitmap: u32) -> Record {
@@ -241,13 +243,13 @@ mod tests {
     #[test]
     fn a_reader_that_hangs_falls_behind_in_samples_and_in_time() {
         let mut all = Acknowledgements::default();
-        all.record(&acknack(1, 1, 0, 0));
-        all.record(&acknack(2, 1, 0, 0));
+        put(&mut all, &acknack(1, 1, 0, 0));
+        put(&mut all, &acknack(2, 1, 0, 0));
         for number in 1..=100 {
             all.wrote(number, Timestamp(number * 1_000_000_000));
         }
-        all.record(&acknack(2, 101, 0, 0));
-        all.record(&acknack(1, 41, 3, 0b101 << 29));
+        put(&mut all, &acknack(2, 101, 0, 0));
+        put(&mut all, &acknack(1, 41, 3, 0b101 << 29));
         let [hangs, keeps_up] = &facts(&all, 101, 110)[..] else {
             panic!("two readers")
         };
@@ -260,12 +262,12 @@ mod tests {
     #[test]
     fn an_hour_of_silence_is_told_in_bounded_memory() {
         let mut all = Acknowledgements::default();
-        all.record(&acknack(1, 1, 0, 0));
+        put(&mut all, &acknack(1, 1, 0, 0));
         for number in 1..=360_000 {
             all.wrote(number, Timestamp(number * 10_000_000));
         }
         assert!(all.times.len() <= TIMES);
-        all.record(&acknack(1, 180_001, 0, 0));
+        put(&mut all, &acknack(1, 180_001, 0, 0));
         let lag = facts(&all, 360_001, 3600)
             .first()
             .and_then(|each| each.lag_seconds);
@@ -282,8 +284,8 @@ mod tests {
             flags: flag::OUTGOING,
             ..acknack(1, 5, 1, 1 << 31)
         };
-        all.record(&leaving);
-        all.record(&acknack(1, 5, 1, 1 << 31));
+        put(&mut all, &leaving);
+        put(&mut all, &acknack(1, 5, 1, 1 << 31));
         let [reader] = &facts(&all, 6, 1)[..] else {
             panic!("one reader")
         };

@@ -8,10 +8,9 @@
 use std::collections::{BTreeMap, HashMap};
 
 use bytes::Bytes;
-use ros2probe_wire::record::{flag, kind};
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::record::{Sample, flag};
+use ros2probe_wire::{Guid, Timestamp};
 
-use super::reception::is_message;
 use super::size::Size;
 
 /// What keeping one sample or one fragment that came too early costs besides its bytes.
@@ -22,7 +21,6 @@ const SAMPLES: usize = 16_384;
 const FORGET: u64 = 30_000_000_000;
 /// Least memory that is asked for at once.
 const LEAST: usize = 4096;
-const FRAGMENT_KEY_FLAG: u8 = 0x04;
 
 /// The samples under way.
 #[derive(Debug)]
@@ -106,12 +104,12 @@ impl Assembly {
     }
 
     /// Keeps what a DATA or DATA_FRAG brings; `beside` bytes are spent elsewhere.
-    pub fn put(&mut self, record: &Record, payload: &[u8], beside: usize) {
-        let Some((size, fragment_size)) = sizes(record, payload) else {
+    pub fn put(&mut self, sample: Sample<'_>, payload: &[u8], beside: usize) {
+        let Some((size, fragment_size)) = sizes(sample, payload) else {
             return;
         };
-        let key = (record.writer(), record.sequence_number);
-        let now = Timestamp(record.time);
+        let key = (sample.record().writer(), sample.sequence_number());
+        let now = Timestamp(sample.record().time);
         if !self.parts.contains_key(&key) {
             self.begun += 1;
             self.ages.insert(self.begun, key);
@@ -128,9 +126,9 @@ impl Assembly {
         }
         let before = part.bytes();
         part.touched = now;
-        let start = match record.kind {
-            kind::DATA => 1,
-            _ => record.fragment_start,
+        let start = match sample {
+            Sample::Data(_) => 1,
+            Sample::DataFrag(fragments) => fragments.starting(),
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
@@ -259,35 +257,38 @@ impl Part {
 }
 
 /// Size of the sample and of its fragments; `None` where the bytes are of no use.
-fn sizes(record: &Record, payload: &[u8]) -> Option<(usize, usize)> {
-    if record.flags & flag::INLINE_QOS_UNREAD != 0 {
-        // Where the payload begins is not known.
+fn sizes(sample: Sample<'_>, payload: &[u8]) -> Option<(usize, usize)> {
+    if sample.record().flags & flag::INLINE_QOS_UNREAD != 0 || !sample.is_message() {
+        // Where the payload begins is not known, or it is a disposal.
         return None;
     }
-    match record.kind {
-        kind::DATA if is_message(record) && !payload.is_empty() => {
-            Some((payload.len(), payload.len()))
+    match sample {
+        Sample::Data(_) => (!payload.is_empty()).then_some((payload.len(), payload.len())),
+        Sample::DataFrag(fragments) => {
+            let size = usize::try_from(fragments.sample_size()).ok()?;
+            let fragment_size = usize::try_from(fragments.fragment_size()).ok()?;
+            let is_possible = size > 0 && fragment_size > 0 && fragments.starting() > 0;
+            is_possible.then_some((size, fragment_size))
         }
-        kind::DATA_FRAG => {
-            let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
-            let size = usize::try_from(record.sample_size).ok()?;
-            let fragment_size = usize::try_from(record.fragment_size()).ok()?;
-            let is_possible = size > 0 && fragment_size > 0 && record.fragment_start > 0;
-            (is_possible && !is_key && record.status_info == 0).then_some((size, fragment_size))
-        }
-        _ => None,
     }
 }
 
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use ros2probe_wire::{EntityId, GuidPrefix};
+    use ros2probe_wire::record::kind;
+    use ros2probe_wire::rtps::SubmessageFlags;
+    use ros2probe_wire::{EntityId, GuidPrefix, Record};
 
     use super::*;
 
     fn writer(number: u8) -> Guid {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 3]))
+    }
+
+    /// [`Assembly::put`] of the sample that a record reports.
+    fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], beside: usize) {
+        assembly.put(record.sample().unwrap(), payload, beside);
     }
 
     fn fragment(of: Guid, number: u64, start: u32, count: u32, size: u32, of_size: u32) -> Record {
@@ -331,7 +332,7 @@ mod tests {
                 let first = u32::try_from(start + 1).unwrap();
                 let (count, sample) = (count as u32, size as u32);
                 let record = fragment(writer(1), 5, first, count, sample, fragment_size as u32);
-                assembly.put(&record, &bytes, 0);
+                put(&mut assembly, &record, &bytes, 0);
             }
             prop_assert_eq!(assembly.take(writer(1), 5).map(|bytes| bytes.to_vec()), Some(whole));
             prop_assert_eq!((assembly.bytes, assembly.ages.len()), (0, 0));
@@ -346,10 +347,10 @@ mod tests {
             let from = (start as usize - 1) * 1000;
             let to = |len: usize| len.min(from + 1000);
             let record = fragment(writer(1), 9, start, 1, 2500, 1000);
-            assembly.put(&record, &one[from..to(2500)], 0);
+            put(&mut assembly, &record, &one[from..to(2500)], 0);
             if from < 2000 {
                 let record = fragment(writer(2), 9, start, 1, 2000, 1000);
-                assembly.put(&record, &two[from..to(2000)], 0);
+                put(&mut assembly, &record, &two[from..to(2000)], 0);
             }
         }
         assert_eq!(assembly.take(writer(1), 9).unwrap(), one);
@@ -360,13 +361,33 @@ mod tests {
     #[test]
     fn an_incomplete_sample_is_never_given_and_keeps_nothing() {
         let mut assembly = Assembly::new(1 << 20);
-        assembly.put(&fragment(writer(1), 1, 1, 1, 2500, 1000), &[0; 1000], 0);
-        assembly.put(&fragment(writer(1), 1, 3, 1, 2500, 1000), &[0; 500], 0);
+        put(
+            &mut assembly,
+            &fragment(writer(1), 1, 1, 1, 2500, 1000),
+            &[0; 1000],
+            0,
+        );
+        put(
+            &mut assembly,
+            &fragment(writer(1), 1, 3, 1, 2500, 1000),
+            &[0; 500],
+            0,
+        );
         // A datagram that claims more fragments than it has bytes for.
-        assembly.put(&fragment(writer(1), 1, 2, 2, 2500, 1000), &[0; 999], 0);
+        put(
+            &mut assembly,
+            &fragment(writer(1), 1, 2, 2, 2500, 1000),
+            &[0; 999],
+            0,
+        );
         assert_eq!(assembly.take(writer(1), 1), None);
         assert_eq!(assembly.bytes, 0);
-        assembly.put(&fragment(writer(1), 2, 1, 1, 2500, 1000), &[0; 1000], 0);
+        put(
+            &mut assembly,
+            &fragment(writer(1), 2, 1, 1, 2500, 1000),
+            &[0; 1000],
+            0,
+        );
         assembly.expire(Timestamp(FORGET + 2));
         assert_eq!((assembly.bytes, assembly.parts.len()), (0, 0));
     }
@@ -381,7 +402,7 @@ mod tests {
                 ..whole
             },
             Record {
-                submessage_flags: FRAGMENT_KEY_FLAG,
+                submessage_flags: SubmessageFlags::FRAGMENT_KEY.0,
                 ..whole
             },
             Record {
@@ -398,11 +419,21 @@ mod tests {
             fragment(writer(1), 1, 1, 1, 100, 0),
         ];
         for record in strange {
-            assembly.put(&record, &[1; 100], 0);
+            put(&mut assembly, &record, &[1; 100], 0);
             assert_eq!(assembly.bytes, 0, "{record:?}");
         }
-        assembly.put(&fragment(writer(1), 1, 1, 1, 3000, 1000), &[1; 1000], 0);
-        assembly.put(&fragment(writer(1), 1, 1, 3, 2999, 1000), &[1; 2999], 0);
+        put(
+            &mut assembly,
+            &fragment(writer(1), 1, 1, 1, 3000, 1000),
+            &[1; 1000],
+            0,
+        );
+        put(
+            &mut assembly,
+            &fragment(writer(1), 1, 1, 3, 2999, 1000),
+            &[1; 2999],
+            0,
+        );
         assert_eq!(assembly.take(writer(1), 1), None);
     }
 
@@ -410,9 +441,9 @@ mod tests {
     fn a_claimed_size_allocates_in_proportion_to_what_came() {
         let mut assembly = Assembly::new(1 << 20);
         let hostile = fragment(writer(1), 1, 1, 1, u32::MAX, 65_535);
-        assembly.put(&hostile, &[0; 100], 0);
+        put(&mut assembly, &hostile, &[0; 100], 0);
         let far = fragment(writer(1), 1, 60_000, 1, u32::MAX, 65_535);
-        assembly.put(&far, &[0; 100], 0);
+        put(&mut assembly, &far, &[0; 100], 0);
         assert!(assembly.bytes < LEAST + 1000, "{}", assembly.bytes);
     }
 
@@ -421,7 +452,7 @@ mod tests {
         let mut assembly = Assembly::new(1 << 20);
         for number in 0..50_000 {
             let record = fragment(writer(1), number, 1, 1, 2_000_000, 1000);
-            assembly.put(&record, &[0; 1000], 1 << 19);
+            put(&mut assembly, &record, &[0; 1000], 1 << 19);
             assert!(assembly.bytes <= 1 << 19);
         }
         assert!(assembly.evictions > 49_000);
@@ -430,7 +461,7 @@ mod tests {
         // One that is larger than the budget is given up as it grows.
         for start in 1..3000 {
             let record = fragment(writer(2), 1, start, 1, 3_000_000, 1000);
-            assembly.put(&record, &[0; 1000], 0);
+            put(&mut assembly, &record, &[0; 1000], 0);
             assert!(assembly.bytes <= 1 << 20);
         }
         assert_eq!(assembly.take(writer(2), 1), None);
@@ -441,7 +472,7 @@ mod tests {
         let mut assembly = Assembly::new(1 << 30);
         for number in 0..SAMPLES as u64 + 100 {
             let record = fragment(writer(1), number, 1, 1, 2_000, 1000);
-            assembly.put(&record, &[0; 1000], 0);
+            put(&mut assembly, &record, &[0; 1000], 0);
         }
         assert_eq!((assembly.parts.len(), assembly.evictions), (SAMPLES, 100));
     }

@@ -9,7 +9,7 @@
 use std::collections::VecDeque;
 
 use ros2probe_wire::Record;
-use ros2probe_wire::record::kind;
+use ros2probe_wire::record::Sample;
 
 use super::size::Size;
 
@@ -53,14 +53,15 @@ impl Cancelled {
     }
 
     /// Takes in that this DATA or DATA_FRAG was not delivered; whether an older one had to go.
-    pub fn note(&mut self, record: &Record) -> bool {
-        let (start, end) = range(record);
+    pub fn note(&mut self, sample: Sample<'_>) -> bool {
+        let record = sample.record();
+        let (start, end) = range(sample);
         let (first, last) = span(record);
         if let Some(back) = self.waiting.back_mut()
             && back.socket == record.socket
-            && back.number == record.sequence_number
+            && back.number == sample.sequence_number()
             && back.end == start
-            && record.kind == kind::DATA_FRAG
+            && matches!(sample, Sample::DataFrag(_))
         {
             (back.end, back.last) = (end, last);
             return false;
@@ -71,7 +72,7 @@ impl Cancelled {
         }
         self.waiting.push_back(Cancellation {
             socket: record.socket,
-            number: record.sequence_number,
+            number: sample.sequence_number(),
             start,
             end,
             first,
@@ -81,19 +82,20 @@ impl Cancelled {
     }
 
     /// The parts of an arrival that were delivered, in order; counts older ones that had to go.
-    pub fn delivered(&mut self, record: &Record, evictions: &mut u64) -> Vec<Record> {
-        let mut parts = vec![range(record)];
+    pub fn delivered(&mut self, sample: Sample<'_>, evictions: &mut u64) -> Vec<Record> {
+        let record = sample.record();
+        let mut parts = vec![range(sample)];
         let (begin, end) = span(record);
         let mut left = Vec::new();
         self.waiting.retain_mut(|each| {
             let is_meant = each.socket == record.socket
-                && each.number == record.sequence_number
+                && each.number == sample.sequence_number()
                 && each.last.saturating_add(SLACK) >= begin
                 && each.first <= end.saturating_add(SLACK);
             if !is_meant {
                 return true;
             }
-            let (start, end) = range(record);
+            let (start, end) = range(sample);
             let (from, to) = (each.start.max(start), each.end.min(end));
             if from >= to {
                 return true;
@@ -116,18 +118,14 @@ impl Cancelled {
             self.waiting.pop_front();
             *evictions += 1;
         }
-        if record.kind != kind::DATA_FRAG {
+        let Sample::DataFrag(fragments) = sample else {
             return if parts.is_empty() {
                 Vec::new()
             } else {
                 vec![*record]
             };
-        }
-        let part = |(start, end): (u32, u32)| Record {
-            fragment_start: start,
-            fragments: (end - start) << 16 | record.fragment_size(),
-            ..*record
         };
+        let part = |(start, end): (u32, u32)| fragments.part(start, end);
         parts.into_iter().map(part).collect()
     }
 
@@ -144,16 +142,14 @@ impl Cancelled {
     }
 }
 
-/// The fragments a record speaks for.
-fn range(record: &Record) -> (u32, u32) {
-    if record.kind == kind::DATA_FRAG {
-        let start = record.fragment_start;
-        (
-            start,
-            start.saturating_add(record.fragments_in_submessage()),
-        )
-    } else {
-        (0, 1)
+/// The fragments that came, to before the second number.
+const fn range(sample: Sample<'_>) -> (u32, u32) {
+    match sample {
+        Sample::Data(_) => (0, 1),
+        Sample::DataFrag(fragments) => {
+            let start = fragments.starting();
+            (start, start.saturating_add(fragments.count()))
+        }
     }
 }
 
@@ -177,6 +173,8 @@ fn take_out(parts: &[(u32, u32)], from: u32, to: u32) -> Vec<(u32, u32)> {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::record::kind;
+
     use super::*;
 
     fn fragments(start: u32, count: u32, time: u64, elapsed: u32) -> Record {
@@ -192,8 +190,17 @@ mod tests {
         }
     }
 
+    fn note(cancelled: &mut Cancelled, record: &Record) -> bool {
+        cancelled.note(record.sample().unwrap())
+    }
+
+    fn delivered(cancelled: &mut Cancelled, record: &Record, evictions: &mut u64) -> Vec<Record> {
+        cancelled.delivered(record.sample().unwrap(), evictions)
+    }
+
     fn ranges(parts: &[Record]) -> Vec<(u32, u32)> {
-        parts.iter().map(range).collect()
+        let samples = parts.iter().filter_map(Record::sample);
+        samples.map(range).collect()
     }
 
     const MILLISECOND: u64 = 1_000_000;
@@ -201,25 +208,25 @@ mod tests {
     #[test]
     fn what_had_no_room_is_taken_out_of_the_run_that_covers_it_once() {
         let mut cancelled = Cancelled::default();
-        cancelled.note(&fragments(3, 1, 12 * MILLISECOND, 0));
-        cancelled.note(&fragments(4, 1, 13 * MILLISECOND, 0));
-        cancelled.note(&fragments(8, 2, 17 * MILLISECOND, 0));
+        note(&mut cancelled, &fragments(3, 1, 12 * MILLISECOND, 0));
+        note(&mut cancelled, &fragments(4, 1, 13 * MILLISECOND, 0));
+        note(&mut cancelled, &fragments(8, 2, 17 * MILLISECOND, 0));
         let run = fragments(1, 10, 20 * MILLISECOND, 10_000_000);
         assert_eq!(
-            ranges(&cancelled.delivered(&run, &mut 0)),
+            ranges(&delivered(&mut cancelled, &run, &mut 0)),
             [(1, 3), (5, 8), (10, 11)]
         );
         assert!(cancelled.is_empty());
         let again = fragments(3, 2, 40 * MILLISECOND, 0);
-        assert_eq!(ranges(&cancelled.delivered(&again, &mut 0)), [(3, 5)]);
+        assert_eq!(ranges(&delivered(&mut cancelled, &again, &mut 0)), [(3, 5)]);
     }
 
     #[test]
     fn a_retransmission_is_not_taken_for_the_arrival_that_got_lost_on_its_way_here() {
         let mut cancelled = Cancelled::default();
-        cancelled.note(&fragments(3, 1, 12 * MILLISECOND, 0));
+        note(&mut cancelled, &fragments(3, 1, 12 * MILLISECOND, 0));
         let later = fragments(3, 1, 40 * MILLISECOND, 0);
-        assert_eq!(ranges(&cancelled.delivered(&later, &mut 0)), [(3, 4)]);
+        assert_eq!(ranges(&delivered(&mut cancelled, &later, &mut 0)), [(3, 4)]);
         cancelled.expire(13 * MILLISECOND + LIFETIME);
         assert!(cancelled.is_empty());
     }
@@ -229,12 +236,15 @@ mod tests {
         let mut cancelled = Cancelled::default();
         for fragment in 4..8 {
             let time = u64::from(10 + fragment) * MILLISECOND;
-            cancelled.note(&fragments(fragment, 1, time, 0));
+            note(&mut cancelled, &fragments(fragment, 1, time, 0));
         }
         let first = fragments(1, 5, 15 * MILLISECOND, 4_000_000);
-        assert_eq!(ranges(&cancelled.delivered(&first, &mut 0)), [(1, 4)]);
+        assert_eq!(ranges(&delivered(&mut cancelled, &first, &mut 0)), [(1, 4)]);
         let second = fragments(6, 5, 20 * MILLISECOND, 4_000_000);
-        assert_eq!(ranges(&cancelled.delivered(&second, &mut 0)), [(8, 11)]);
+        assert_eq!(
+            ranges(&delivered(&mut cancelled, &second, &mut 0)),
+            [(8, 11)]
+        );
         assert!(cancelled.is_empty());
     }
 
@@ -245,11 +255,11 @@ mod tests {
             kind: kind::DATA,
             ..fragments(0, 0, MILLISECOND, 0)
         };
-        cancelled.note(&data);
+        note(&mut cancelled, &data);
         let elsewhere = Record { socket: 2, ..data };
-        assert_eq!(cancelled.delivered(&elsewhere, &mut 0).len(), 1);
-        assert!(cancelled.delivered(&data, &mut 0).is_empty());
-        assert_eq!(cancelled.delivered(&data, &mut 0).len(), 1);
+        assert_eq!(delivered(&mut cancelled, &elsewhere, &mut 0).len(), 1);
+        assert!(delivered(&mut cancelled, &data, &mut 0).is_empty());
+        assert_eq!(delivered(&mut cancelled, &data, &mut 0).len(), 1);
     }
 
     #[test]
@@ -261,7 +271,7 @@ mod tests {
                 sequence_number: number,
                 ..Record::default()
             };
-            cancelled.note(&data);
+            note(&mut cancelled, &data);
         }
         assert!(cancelled.waiting.len() <= LIMIT);
     }
@@ -271,9 +281,13 @@ mod tests {
         let mut cancelled = Cancelled::default();
         let mut evictions = 0;
         let time = 20 * MILLISECOND;
-        cancelled.note(&fragments(1, 60_000, time, 0));
+        note(&mut cancelled, &fragments(1, 60_000, time, 0));
         for fragment in 1..20_000 {
-            cancelled.delivered(&fragments(3 * fragment, 1, time, 0), &mut evictions);
+            delivered(
+                &mut cancelled,
+                &fragments(3 * fragment, 1, time, 0),
+                &mut evictions,
+            );
         }
         let [waiting] = cancelled.sizes();
         assert_eq!(waiting.entries, waiting.cap);

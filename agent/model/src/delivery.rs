@@ -9,7 +9,7 @@ mod deciding;
 
 use std::collections::BTreeSet;
 
-use ros2probe_wire::record::kind;
+use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
 use deciding::Deciding;
@@ -234,18 +234,18 @@ impl Delivery {
     }
 
     /// Takes in a DATA or DATA_FRAG; whether it brought nothing new, and what it completed.
-    pub fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
-        self.touch(record);
+    pub fn sample(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+        self.touch(sample.record());
         (self.waiting, self.told, self.proven) = (None, false, true);
         if self.cancelled.is_empty() {
-            return self.take(record, scene);
+            return self.take(sample, scene);
         }
         let (mut again, mut whole) = (false, None);
         let parts = self
             .cancelled
-            .delivered(record, &mut scene.budget.evictions);
-        for part in parts {
-            let (came_again, completed) = self.take(&part, scene);
+            .delivered(sample, &mut scene.budget.evictions);
+        for part in parts.iter().filter_map(Record::sample) {
+            let (came_again, completed) = self.take(part, scene);
             again |= came_again;
             whole = completed.or(whole);
         }
@@ -253,17 +253,17 @@ impl Delivery {
     }
 
     /// Takes in that the socket had no room for this DATA or DATA_FRAG.
-    pub fn no_room(&mut self, record: &Record, scene: &mut Scene<'_>) {
-        self.touch(record);
+    pub fn no_room(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) {
+        self.touch(sample.record());
         (self.waiting, self.told, self.proven) = (None, false, true);
-        if self.cancelled.note(record) {
+        if self.cancelled.note(sample) {
             scene.budget.evictions += 1;
         }
-        let number = record.sequence_number;
-        let is_tail = record.kind == kind::DATA_FRAG && record.fragment_start != 1 && number > 1;
+        let number = sample.sequence_number();
+        let is_tail = !sample.is_start() && number > 1;
         let (reception, budget, mut deciding) = self.split(scene);
         let is_believed =
-            reception.recognise(record, budget, &mut |decision| deciding.take(decision));
+            reception.recognise(sample, budget, &mut |decision| deciding.take(decision));
         if !is_believed {
             // Its cause, should its number be believed later.
             let is_full = self.deaths.note(number, LossCause::SocketBuffer, scene.now);
@@ -295,35 +295,34 @@ impl Delivery {
 
     /// Takes in a HEARTBEAT for this receiver. What it has begins here, if nothing came before; but
     /// as long as nothing comes and nothing is asked for, its samples may go by shared memory.
-    pub fn heartbeat(&mut self, record: &Record, scene: &mut Scene<'_>) {
-        self.touch(record);
-        let last = record.second_sequence_number();
-        self.reception.sequence_mut().begin(last.saturating_add(1));
+    pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, scene: &mut Scene<'_>) {
+        self.touch(heartbeat.record());
+        let end = heartbeat.last().saturating_add(1);
+        self.reception.sequence_mut().begin(end);
         if !self.proven {
             return;
         }
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
         let (reception, budget, mut deciding) = self.split(scene);
-        reception.heartbeat(record, budget, &mut |decision| deciding.take(decision));
+        reception.heartbeat(heartbeat, budget, &mut |decision| deciding.take(decision));
         self.excuse_unheard(before);
     }
 
     /// Takes in a GAP for this receiver.
-    pub fn gap(&mut self, record: &Record, scene: &mut Scene<'_>) {
-        self.touch(record);
+    pub fn gap(&mut self, gap: Gap<'_>, scene: &mut Scene<'_>) {
+        self.touch(gap.record());
         let (reception, budget, mut deciding) = self.split(scene);
-        reception.gap(record, budget, &mut |decision| deciding.take(decision));
+        reception.gap(gap, budget, &mut |decision| deciding.take(decision));
     }
 
     /// Takes in an ACKNACK: a reader asks for samples again.
-    pub fn requested(&mut self, record: &Record) {
-        let base = record.sequence_number;
-        let set = || record.bitmap().map(|bit| base.saturating_add(bit.into()));
+    pub fn requested(&mut self, acknack: AckNack<'_>) {
+        let missing = acknack.missing();
         let sequence = self.reception.sequence_mut();
         let first = sequence.first();
-        self.proven |= sequence.started() && set().any(|number| number >= first);
-        sequence.requested(set());
+        self.proven |= sequence.started() && missing.iter().any(|number| number >= first);
+        sequence.requested(missing.iter());
     }
 
     /// Its readers have all below `base`.
@@ -431,19 +430,19 @@ impl Delivery {
         self.last_seen = self.last_seen.max(Timestamp(record.time));
     }
 
-    fn take(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
-        let (number, reliable) = (record.sequence_number, self.is_reliable(scene));
+    fn take(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+        let (number, reliable) = (sample.sequence_number(), self.is_reliable(scene));
         self.begin_anew(number, scene);
         let sequence = self.reception.sequence();
         let is_sent = self.direction() == Direction::Sent;
-        let source = record.source_timestamp().timestamp();
+        let source = sample.source_timestamp().timestamp();
         let is_late = self.misses(number) && number < sequence.settled();
         if !is_sent && is_late && !sequence.doubts(number, source, REACH) {
-            return self.late(record, scene);
+            return self.late(sample, scene);
         }
         let before = (sequence.next(), sequence.last_advance());
         let (reception, budget, mut deciding) = self.split(scene);
-        let outcome = reception.sample(record, reliable, budget, &mut |decision| {
+        let outcome = reception.sample(sample, reliable, budget, &mut |decision| {
             deciding.take(decision);
         });
         self.excuse_unheard(before);
@@ -502,19 +501,20 @@ impl Delivery {
 
     /// A sample that comes after it was settled as lost: too late for the counters, unless its cause
     /// was still awaited.
-    fn late(&mut self, record: &Record, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
-        let number = record.sequence_number;
-        if record.kind == kind::DATA && self.deaths.resolve(number) {
+    fn late(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+        let number = sample.sequence_number();
+        let is_whole = matches!(sample, Sample::Data(_));
+        if is_whole && self.deaths.resolve(number) {
             self.count(scene, |tally| {
                 tally.pending = tally.pending.saturating_sub(1);
                 tally.messages += 1;
-                tally.bytes += u64::from(record.payload_len);
+                tally.bytes += u64::from(sample.size());
                 tally.recovered += 1;
             });
             self.reception.sequence_mut().know(number);
             return (false, None);
         }
-        if record.kind == kind::DATA {
+        if is_whole {
             self.reception.sequence_mut().know(number);
         }
         self.count(scene, |tally| tally.duplicates += 1);

@@ -1,7 +1,7 @@
 //! Whether a watched topic does what its watchlist entry expects.
 //!
 //! Judged once a second of the source's clock. One bad second is no violation and one good second
-//! no recovery: it takes [`BAD`] and [`GOOD`] in a row. Rates are judged over a window that holds
+//! no recovery: it takes `BAD` and `GOOD` in a row. Rates are judged over a window that holds
 //! at least three expected messages (1 to 10 s), one message of tolerance at its edges, so that a
 //! healthy periodic topic never wavers. Silence has its own time and needs no further patience.
 

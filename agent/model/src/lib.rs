@@ -1,9 +1,25 @@
-//! The core: a plain state machine. Time and bytes in, facts out; no I/O, no clock, no thread.
+//! The core: a state machine without clock, thread or I/O. Time and bytes come in, facts go out.
+//!
+//! - [`observer::Observer`] takes datagrams, records and facts about sockets, each with its time.
+//! - [`snapshot::Snapshot`] is all that it knows at a moment: participants, endpoints, topics and
+//!   their figures. [`event`] tells what changed.
+//! - [`interest`] is the verdict for each writer that the kernel programs need.
+//! - [`watch`] and [`limits`] are what an operator wants measured, and how much it may take.
+//!
+//! The same input gives the same facts, live or replayed at any speed. Every table is bounded.
+//!
+//! ```
+//! use ros2probe_model::observer::{Observer, Settings};
+//! use ros2probe_wire::Timestamp;
+//!
+//! let mut observer = Observer::new(Settings::default());
+//! observer.advance(Timestamp(1_000_000_000));
+//! assert!(observer.snapshot(Timestamp(1_000_000_000)).participants.is_empty());
+//! ```
 
 #![forbid(unsafe_code)]
 
 pub mod acknowledgement;
-pub mod ahead;
 pub mod assembly;
 pub mod calendar;
 pub mod cancelled;
@@ -31,7 +47,6 @@ pub mod payloads;
 pub mod pieces;
 pub mod profiler;
 pub mod rate;
-pub mod reassembly;
 pub mod receivers;
 pub mod reception;
 mod report;

@@ -9,14 +9,11 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::{self, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::parameters::ParameterList;
 use ros2probe_wire::qos::{Durability, Reliability};
-use ros2probe_wire::record::{Handover, Verdict, flag, kind};
+use ros2probe_wire::record::{Body, Handover, Sample, Verdict, flag};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{
-    Cursor, Endianness, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError,
-};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 
 use super::calendar::Calendar;
 use super::diagnosis::{self, Examiner};
@@ -509,19 +506,15 @@ impl Observer {
         let moved = self.calendar.even_record(record);
         let record = moved.as_ref().unwrap_or(record);
         let (writer, at) = (record.writer(), Timestamp(record.time));
-        let sender = if record.kind == kind::ACKNACK {
-            record.reader().prefix
-        } else {
-            writer.prefix
-        };
-        if record.kind == kind::HANDOVER || record.kind == kind::UNDELIVERED {
+        let sender = record.sender();
+        if matches!(record.body(), Body::Handover | Body::Undelivered) {
             self.discovery.seen(sender, at, Worth::NOTHING);
             return;
         }
         let evidence = Worth {
             watched: false,
             local: self.receivers.learn(record),
-            sends: matches!(record.kind, kind::DATA | kind::DATA_FRAG)
+            sends: record.is_sample()
                 && record.flags & UNDELIVERED == 0
                 && !writer.entity.is_builtin(),
         };
@@ -597,11 +590,13 @@ impl Observer {
 
     /// Gives a sample that was counted while its writer was a stranger, now that it comes again.
     fn came_again(&mut self, writer: Guid, record: &Record) {
-        let (number, at) = (record.sequence_number, Timestamp(record.time));
-        let (bytes, stamp, is_last) = match record.kind {
-            kind::DATA => (record.payload_len, record.header_stamp(), true),
-            kind::DATA_FRAG => (record.sample_size, None, record.ends_sample()),
-            _ => return,
+        let Some(sample) = record.sample() else {
+            return;
+        };
+        let (number, at) = (sample.sequence_number(), Timestamp(record.time));
+        let stamp = match sample {
+            Sample::Data(_) => sample.header_stamp(),
+            Sample::DataFrag(_) => None,
         };
         if record.flags & UNDELIVERED != 0 || !self.payloads.lacks(writer, number) {
             return;
@@ -609,7 +604,7 @@ impl Observer {
         let has_header = |known: &Measured| known.writer.traits().has_header;
         let counted = Counted {
             number,
-            bytes: bytes.into(),
+            bytes: sample.size().into(),
             source: record.source_timestamp(),
             stamp: stamp.filter(|_| self.profiler.get(writer).is_some_and(has_header)),
             at,
@@ -618,7 +613,9 @@ impl Observer {
             doubted: false,
         };
         let progress = self.profiler.progress(writer, at, around!(self));
-        if let Some(progress) = progress.filter(|_| is_last || self.payloads.wants_bytes(writer)) {
+        if let Some(progress) =
+            progress.filter(|_| sample.is_end() || self.payloads.wants_bytes(writer))
+        {
             let skip = self.payloads.came_again(writer, &counted, &progress);
             self.skip(writer, skip);
         }
@@ -689,18 +686,18 @@ impl Observer {
 
     fn announced(&mut self, found: &Found<'_>, vendor: Option<VendorId>, envelope: &Envelope) {
         let record = &found.record;
-        if matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
+        if let Some(sample) = record.sample() {
             let prefix = record.writer().prefix;
             let [first, second, ..] = prefix.0;
             let vendor = vendor.unwrap_or(VendorId([first, second]));
             let origin = Origin {
                 at: self.calendar.even(Timestamp(envelope.time)),
                 sender: prefix,
-                sequence_number: record.sequence_number,
+                sequence_number: sample.sequence_number(),
                 destination: envelope.destination,
                 port: envelope.destination_port,
             };
-            self.read(found, vendor, &origin);
+            self.read(found, sample, vendor, &origin);
             self.follow_up(origin.at);
             self.keep(found);
         }
@@ -713,9 +710,12 @@ impl Observer {
             let moved = self.calendar.even_record(&found.record);
             let record = moved.as_ref().unwrap_or(&found.record);
             let known = self.profiler.get(writer);
-            let lacks = self.payloads.lacks(writer, record.sequence_number);
-            if lacks || known.is_some_and(|known| !known.writer.has(record)) {
-                self.payloads.keep(record, found.payload);
+            let Some(sample) = record.sample() else {
+                return;
+            };
+            let lacks = self.payloads.lacks(writer, sample.sequence_number());
+            if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
+                self.payloads.keep(sample, found.payload);
             }
         }
     }
@@ -728,25 +728,24 @@ impl Observer {
     }
 
     /// Reads what is of use to discovery.
-    fn read(&mut self, found: &Found<'_>, vendor: VendorId, origin: &Origin) {
-        let record = &found.record;
-        let writer = record.writer();
+    fn read(&mut self, found: &Found<'_>, sample: Sample<'_>, vendor: VendorId, origin: &Origin) {
+        let writer = found.record.writer();
         let stage = match writer.entity {
             EntityId::SPDP_WRITER | EntityId::SPDP_SECURE_WRITER => "spdp",
             EntityId::SEDP_PUBLICATIONS_WRITER
             | EntityId::SEDP_SUBSCRIPTIONS_WRITER
             | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER
             | EntityId::SEDP_SUBSCRIPTIONS_SECURE_WRITER => "sedp",
-            entity if !entity.is_builtin() && self.may_tell_entities(found) => "entities",
+            entity if !entity.is_builtin() && self.may_tell_entities(found, sample) => "entities",
             _ => return,
         };
         let whole;
-        let (payload, inline_qos) = if record.kind == kind::DATA_FRAG {
-            let Some(bytes) = self.pieces.put(record, found.payload) else {
+        let (payload, inline_qos) = if let Sample::DataFrag(fragments) = sample {
+            let Some(bytes) = self.pieces.put(fragments, found.payload) else {
                 return;
             };
             whole = bytes;
-            let status_info = StatusInfo(record.status_info);
+            let status_info = sample.status_info();
             (
                 Payload::Data(&whole),
                 Ok(InlineQos {
@@ -755,7 +754,7 @@ impl Observer {
                 }),
             )
         } else {
-            (data_payload(found), inline_qos(found, vendor))
+            (found.payload(), found.inline_qos(vendor))
         };
         let told = inline_qos.and_then(|inline_qos| match stage {
             "spdp" => self.participant(vendor, payload, &inline_qos, origin),
@@ -769,10 +768,9 @@ impl Observer {
 
     /// Announced on `ros_discovery_info`, or not announced yet and of its form: the sample is sent
     /// once, perhaps before the announcement is understood.
-    fn may_tell_entities(&self, found: &Found<'_>) -> bool {
-        let record = &found.record;
-        let writer = record.writer();
-        if record.status_info != 0 {
+    fn may_tell_entities(&self, found: &Found<'_>, sample: Sample<'_>) -> bool {
+        let writer = found.record.writer();
+        if sample.status_info() != StatusInfo::ALIVE {
             return false;
         }
         if let Some(endpoint) = self.discovery.endpoints().get(&writer) {
@@ -780,9 +778,11 @@ impl Observer {
         }
         let own = Guid::new(writer.prefix, EntityId::PARTICIPANT).to_bytes();
         let begins = found.payload.get(4..20).is_some_and(|gid| *gid == own);
-        match record.kind {
-            kind::DATA => begins,
-            _ => record.fragment_start == 1 && begins || self.pieces.holds(record),
+        match sample {
+            Sample::Data(_) => begins,
+            Sample::DataFrag(fragments) => {
+                sample.is_start() && begins || self.pieces.holds(fragments)
+            }
         }
     }
 
@@ -1242,36 +1242,4 @@ fn traits(endpoint: &Endpoint) -> Traits {
         keeps_history: endpoint.qos.durability != Durability::VOLATILE,
         has_header: begins_with_header(&endpoint.message_type),
     }
-}
-
-/// Flags of DATA besides E (RTPS 2.5, 9.4.5.4).
-const INLINE_QOS_FLAG: u8 = 0x02;
-const DATA_FLAG: u8 = 0x04;
-const KEY_FLAG: u8 = 0x08;
-
-/// What a DATA submessage carries.
-pub fn data_payload<'a>(found: &Found<'a>) -> Payload<'a> {
-    match found.record.submessage_flags & (DATA_FLAG | KEY_FLAG) {
-        0 => Payload::None,
-        KEY_FLAG => Payload::Key(found.payload),
-        _ => Payload::Data(found.payload),
-    }
-}
-
-/// Inline QoS of a DATA submessage: behind `octetsToInlineQos`, which counts from its own end.
-pub fn inline_qos(found: &Found<'_>, vendor: VendorId) -> Result<InlineQos, WireError> {
-    let flags = found.record.submessage_flags;
-    if flags & INLINE_QOS_FLAG == 0 {
-        return Ok(InlineQos::default());
-    }
-    let endianness = if flags & 1 == 1 {
-        Endianness::Little
-    } else {
-        Endianness::Big
-    };
-    let mut cursor = Cursor::new(found.body, endianness);
-    cursor.u16("extraFlags")?;
-    let octets = cursor.u16("octetsToInlineQos")?;
-    cursor.take("octetsToInlineQos", octets.into())?;
-    InlineQos::parse(ParameterList::inline(cursor), vendor)
 }

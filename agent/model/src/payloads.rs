@@ -11,7 +11,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::{Guid, Timestamp, record};
 
 use super::assembly::Assembly;
 use super::in_order::{Due, InOrder, Progress};
@@ -347,9 +347,9 @@ impl Payloads {
     }
 
     /// Keeps what a DATA or DATA_FRAG brings of a sample that has not been counted yet.
-    pub fn keep(&mut self, record: &Record, payload: &[u8]) {
+    pub fn keep(&mut self, sample: record::Sample<'_>, payload: &[u8]) {
         let beside = self.given_bytes + self.waiting_bytes;
-        self.assembly.put(record, payload, beside);
+        self.assembly.put(sample, payload, beside);
     }
 
     /// Whether samples of this writer are given.

@@ -6,7 +6,8 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use ros2probe_wire::{Guid, Record};
+use ros2probe_wire::Guid;
+use ros2probe_wire::record::DataFrag;
 
 use super::size::Size;
 
@@ -67,8 +68,8 @@ impl Pieces {
 
     /// Whether fragments of this sample were kept.
     #[must_use]
-    pub fn holds(&self, record: &Record) -> bool {
-        self.place(record).is_some()
+    pub fn holds(&self, fragments: DataFrag<'_>) -> bool {
+        self.place(fragments).is_some()
     }
 
     /// Which fragments of this sample have not come, if some have; fragments count from 1.
@@ -88,15 +89,15 @@ impl Pieces {
     }
 
     /// Keeps the fragments of one DATA_FRAG; gives the payload when all have come.
-    pub fn put(&mut self, record: &Record, bytes: &[u8]) -> Option<Vec<u8>> {
-        let (size, fragment_size) = (record.sample_size, record.fragment_size());
-        if size > MAX_SAMPLE || size == 0 || fragment_size == 0 || record.fragment_start == 0 {
+    pub fn put(&mut self, fragments: DataFrag<'_>, bytes: &[u8]) -> Option<Vec<u8>> {
+        let (size, fragment_size) = (fragments.sample_size(), fragments.fragment_size());
+        if size > MAX_SAMPLE || size == 0 || fragment_size == 0 || fragments.starting() == 0 {
             return None;
         }
-        let index = self.place(record).unwrap_or_else(|| {
+        let index = self.place(fragments).unwrap_or_else(|| {
             self.samples.push_back(Sample {
-                writer: record.writer(),
-                number: record.sequence_number,
+                writer: fragments.record().writer(),
+                number: fragments.sequence_number(),
                 size,
                 fragment_size,
                 fragments: BTreeMap::new(),
@@ -106,10 +107,10 @@ impl Pieces {
             self.samples.len() - 1
         });
         let sample = self.samples.get_mut(index)?;
-        let total = size.div_ceil(fragment_size);
+        let total = fragments.total();
         if sample.size == size && sample.fragment_size == fragment_size {
             let chunks = bytes.chunks(usize::try_from(fragment_size).ok()?);
-            for (number, chunk) in (record.fragment_start..=total).zip(chunks) {
+            for (number, chunk) in (fragments.starting()..=total).zip(chunks) {
                 let last = if number == total {
                     size - (total - 1) * fragment_size
                 } else {
@@ -139,20 +140,36 @@ impl Pieces {
         None
     }
 
-    fn place(&self, record: &Record) -> Option<usize> {
-        let writer = record.writer();
+    fn place(&self, fragments: DataFrag<'_>) -> Option<usize> {
+        let writer = fragments.record().writer();
+        let number = fragments.sequence_number();
         self.samples
             .iter()
-            .position(|each| each.writer == writer && each.number == record.sequence_number)
+            .position(|each| each.writer == writer && each.number == number)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::Record;
+    use ros2probe_wire::record::{Sample, kind};
+
     use super::*;
+
+    fn data_frag(record: &Record) -> DataFrag<'_> {
+        let Some(Sample::DataFrag(fragments)) = record.sample() else {
+            panic!("{record:?}")
+        };
+        fragments
+    }
+
+    fn put(pieces: &mut Pieces, record: &Record, bytes: &[u8]) -> Option<Vec<u8>> {
+        pieces.put(data_frag(record), bytes)
+    }
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
         Record {
+            kind: kind::DATA_FRAG,
             sequence_number: number,
             fragment_start: start,
             fragments: count << 16 | 100,
@@ -165,10 +182,13 @@ mod tests {
     fn fragments_in_any_order_and_several_at_once_make_the_payload() {
         let payload: Vec<u8> = (0..=249).collect();
         let mut pieces = Pieces::default();
-        assert_eq!(pieces.put(&fragment(1, 3, 1, 250), &payload[200..]), None);
-        assert!(pieces.holds(&fragment(1, 1, 1, 250)));
         assert_eq!(
-            pieces.put(&fragment(1, 1, 2, 250), &payload[..200]),
+            put(&mut pieces, &fragment(1, 3, 1, 250), &payload[200..]),
+            None
+        );
+        assert!(pieces.holds(data_frag(&fragment(1, 1, 1, 250))));
+        assert_eq!(
+            put(&mut pieces, &fragment(1, 1, 2, 250), &payload[..200]),
             Some(payload)
         );
         assert_eq!((pieces.bytes, pieces.samples.len()), (0, 0));
@@ -177,9 +197,12 @@ mod tests {
     #[test]
     fn a_claimed_size_allocates_nothing_and_a_storm_stays_in_the_budget() {
         let mut pieces = Pieces::default();
-        assert_eq!(pieces.put(&fragment(1, 1, 1, u32::MAX), &[0; 100]), None);
+        assert_eq!(
+            put(&mut pieces, &fragment(1, 1, 1, u32::MAX), &[0; 100]),
+            None
+        );
         for number in 0..100_000 {
-            pieces.put(&fragment(number, 1, 1, 200_000), &[0; 100]);
+            put(&mut pieces, &fragment(number, 1, 1, 200_000), &[0; 100]);
         }
         assert!(pieces.bytes <= BUDGET && pieces.evictions > 0);
     }
@@ -188,7 +211,11 @@ mod tests {
     fn large_samples_that_never_end_keep_within_the_bytes() {
         let mut pieces = Pieces::default();
         for number in 0..1000 {
-            pieces.put(&fragment(number, 1, 500, 200_000), &[0; 50_000]);
+            put(
+                &mut pieces,
+                &fragment(number, 1, 500, 200_000),
+                &[0; 50_000],
+            );
         }
         let [_, bytes] = pieces.sizes().try_into().unwrap();
         assert!(

@@ -8,7 +8,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::ops::RangeInclusive;
 
 use ros2probe_wire::qos::Reliability;
-use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::record::{Body, flag};
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::calendar::Calendar;
@@ -284,7 +284,9 @@ impl Profiler {
         if measured.topic.is_none() && record.flags & LEFT == LEFT {
             measured.sent_from = record.socket;
         }
-        if record.kind == kind::ACKNACK && measured.writer.refuses(record) {
+        if let Body::AckNack(acknack) = record.body()
+            && measured.writer.refuses(acknack)
+        {
             return Sighting::Measured;
         }
         let subject = measured.subject(guid);
@@ -296,7 +298,7 @@ impl Profiler {
                 .subscribers
                 .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
             sight = subscribers.record(record, &mut stage);
-            if record.kind == kind::ACKNACK
+            if record.is_acknack()
                 && let Some(below) = subscribers.acknowledged_below()
             {
                 measured.writer.acknowledged(below);
@@ -350,8 +352,7 @@ impl Profiler {
         journal: &mut Journal,
         around: Around<'_>,
     ) -> Sighting {
-        let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
-        if !is_sample || record.flags & UNDELIVERED != 0 {
+        if !record.is_sample() || record.flags & UNDELIVERED != 0 {
             return Sighting::Unmeasured;
         }
         let now = Timestamp(record.time);

@@ -13,7 +13,7 @@ mod places;
 
 use std::collections::{HashMap, HashSet, VecDeque};
 
-use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::record::flag;
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
 use places::Places;
@@ -201,11 +201,7 @@ impl Receivers {
         if !self.closed.is_empty() {
             self.closed.remove(&record.socket);
         }
-        let (sender, directed) = if record.kind == kind::ACKNACK {
-            (record.reader().prefix, record.writer().prefix)
-        } else {
-            (record.writer().prefix, record.reader().prefix)
-        };
+        let (sender, directed) = (record.sender(), record.addressee());
         let is_sent = record.flags & flag::OUTGOING != 0;
         if !is_sent && (directed == GuidPrefix::UNKNOWN || Place::of(record).is_multicast()) {
             return false;

@@ -4,8 +4,8 @@
 //! are, a late fragment does not reopen it, and what stays away is decided once. It counts nothing;
 //! what it finds is for the caller to count.
 
-use ros2probe_wire::record::kind;
-use ros2probe_wire::{Record, RtpsTime, Timestamp};
+use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
+use ros2probe_wire::{RtpsTime, Timestamp};
 
 use super::samples::{Budget, Facts, Progress, Samples};
 use super::sequence::{Arrival, Belief, Manner, REACH, Sequence, Settled};
@@ -15,8 +15,6 @@ use super::size::Size;
 const REPAIR: i64 = 5_000_000;
 /// Numbers below the newest whose fragments a sampled view still waits for.
 const UNDER_WAY: u64 = 8;
-const DATA_FLAG: u8 = 0x04;
-const FRAGMENT_KEY_FLAG: u8 = 0x04;
 
 /// State of one writer's samples at one place.
 #[derive(Debug, Default)]
@@ -104,14 +102,18 @@ impl Reception {
 
     /// Takes in a DATA_FRAG of a view in which samples may be missing: whether it completes its
     /// sample. Samples far below it are waited for no longer, unless it is `doubted`.
-    pub fn assemble(&mut self, record: &Record, doubted: bool, budget: &mut Budget) -> bool {
+    pub fn assemble(
+        &mut self,
+        fragments: DataFrag<'_>,
+        doubted: bool,
+        budget: &mut Budget,
+    ) -> bool {
         if !doubted {
-            let oldest = record.sequence_number.saturating_sub(UNDER_WAY);
+            let oldest = fragments.sequence_number().saturating_sub(UNDER_WAY);
             self.samples.forget_below(oldest, budget);
         }
-        let progress = self
-            .samples
-            .fragment(record, Timestamp(record.time), budget);
+        let now = Timestamp(fragments.record().time);
+        let progress = self.samples.fragment(fragments, now, budget);
         matches!(progress, Progress::Complete(_))
     }
 
@@ -129,30 +131,32 @@ impl Reception {
     /// Takes in a DATA or DATA_FRAG of a writer that retransmits, or does not.
     pub fn sample(
         &mut self,
-        record: &Record,
+        sample: record::Sample<'_>,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        if !self.recognise(record, budget, decide) {
-            return self.doubted(record, budget);
+        if !self.recognise(sample, budget, decide) {
+            return self.doubted(sample, budget);
         }
-        if record.kind == kind::DATA_FRAG {
-            self.fragment(record, reliable, budget, decide)
-        } else {
-            self.data(record, reliable, budget, decide)
+        match sample {
+            record::Sample::Data(_) => self.data(sample, reliable, budget, decide),
+            record::Sample::DataFrag(fragments) => {
+                self.fragment(fragments, reliable, budget, decide)
+            }
         }
     }
 
     /// Whether the number of this DATA or DATA_FRAG is believed to be the writer's.
     pub fn recognise(
         &mut self,
-        record: &Record,
+        sample: record::Sample<'_>,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> bool {
-        let (number, now) = (record.sequence_number, Timestamp(record.time));
-        let source = record.source_timestamp().timestamp();
+        let number = sample.sequence_number();
+        let now = Timestamp(sample.record().time);
+        let source = sample.source_timestamp().timestamp();
         let Self { sequence, samples } = self;
         match sequence.recognise(number, source, REACH, now) {
             Belief::Live => true,
@@ -169,23 +173,24 @@ impl Reception {
     /// Takes in a HEARTBEAT.
     pub fn heartbeat(
         &mut self,
-        record: &Record,
+        heartbeat: Heartbeat<'_>,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {
-        let (first, last) = (record.sequence_number, record.second_sequence_number());
+        let (first, last) = (heartbeat.first(), heartbeat.last());
+        let now = Timestamp(heartbeat.record().time);
         let Self { sequence, samples } = self;
-        sequence.heartbeat(first, last, Timestamp(record.time), &mut |settled| {
+        sequence.heartbeat(first, last, now, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
     }
 
     /// Takes in a GAP.
-    pub fn gap(&mut self, record: &Record, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
-        let (start, base) = (record.sequence_number, record.second_sequence_number());
-        let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
+    pub fn gap(&mut self, gap: Gap<'_>, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
+        let (start, list) = (gap.start(), gap.list());
+        let now = Timestamp(gap.record().time);
         let Self { sequence, samples } = self;
-        sequence.gap(start, base, set, Timestamp(record.time), &mut |settled| {
+        sequence.gap(start, list.base, list.iter(), now, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
     }
@@ -269,18 +274,18 @@ impl Reception {
 
     fn data(
         &mut self,
-        record: &Record,
+        sample: record::Sample<'_>,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        let number = record.sequence_number;
+        let number = sample.sequence_number();
         let manner = if reliable {
             Manner::Reliable
         } else {
             Manner::BestEffort
         };
-        let now = Timestamp(record.time);
+        let now = Timestamp(sample.record().time);
         let Self { sequence, samples } = self;
         let arrival = sequence.receive(number, manner, now, &mut |settled| {
             decide(decision(settled, samples, budget));
@@ -292,23 +297,26 @@ impl Reception {
         Outcome::Whole(Whole {
             recovered,
             newest,
-            ..whole_data(record)
+            ..whole_data(sample)
         })
     }
 
     /// Takes in a DATA or DATA_FRAG whose number is not believed.
-    fn doubted(&mut self, record: &Record, budget: &mut Budget) -> Outcome {
-        let (number, now) = (record.sequence_number, Timestamp(record.time));
+    fn doubted(&mut self, sample: record::Sample<'_>, budget: &mut Budget) -> Outcome {
+        let number = sample.sequence_number();
+        let now = Timestamp(sample.record().time);
         if self.sequence.has_doubted(number) {
             return Outcome::Again;
         }
-        let whole = match record.kind {
-            kind::DATA_FRAG => match self.samples.fragment(record, now, budget) {
-                Progress::Complete(facts) => whole_fragments(record, &facts),
-                Progress::Duplicate => return Outcome::Again,
-                _ => return Outcome::Open,
-            },
-            _ => whole_data(record),
+        let whole = match sample {
+            record::Sample::DataFrag(fragments) => {
+                match self.samples.fragment(fragments, now, budget) {
+                    Progress::Complete(facts) => whole_fragments(sample, &facts),
+                    Progress::Duplicate => return Outcome::Again,
+                    _ => return Outcome::Open,
+                }
+            }
+            record::Sample::Data(_) => whole_data(sample),
         };
         self.sequence.complete_doubted(number);
         Outcome::Whole(Whole {
@@ -320,18 +328,18 @@ impl Reception {
 
     fn fragment(
         &mut self,
-        record: &Record,
+        fragments: DataFrag<'_>,
         reliable: bool,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
-        let number = record.sequence_number;
-        let now = Timestamp(record.time);
+        let number = fragments.sequence_number();
+        let now = Timestamp(fragments.record().time);
         // Sequence numbers are signed (RTPS 2.5, 9.3.2): beyond is none.
         if self.sequence.has(number) || number > u64::MAX >> 1 {
             return Outcome::Again;
         }
-        let progress = self.samples.fragment(record, now, budget);
+        let progress = self.samples.fragment(fragments, now, budget);
         match progress {
             Progress::Rejected => return Outcome::Open,
             Progress::Duplicate => return Outcome::Again,
@@ -345,7 +353,7 @@ impl Reception {
         }
         // A sample that is joined in the middle does not count as one that was sent; the writer's
         // first one cannot be.
-        let joined = u64::from(record.fragment_start != 1 && number > 1);
+        let joined = u64::from(fragments.starting() != 1 && number > 1);
         self.sequence.begin(number.saturating_add(joined));
         self.exists(number, now, budget, decide);
         let Progress::Complete(facts) = progress else {
@@ -366,45 +374,35 @@ impl Reception {
         let repaired = reliable && facts.repaired_after >= REPAIR;
         Outcome::Whole(Whole {
             recovered: recovered || repaired,
-            ..whole_fragments(record, &facts)
+            ..whole_fragments(record::Sample::DataFrag(fragments), &facts)
         })
     }
 }
 
-const fn whole_data(record: &Record) -> Whole {
+const fn whole_data(sample: record::Sample<'_>) -> Whole {
     Whole {
-        number: record.sequence_number,
-        bytes: record.payload_len as u64,
-        is_message: is_message(record),
+        number: sample.sequence_number(),
+        bytes: sample.size() as u64,
+        is_message: sample.is_message(),
         recovered: false,
         newest: true,
         doubted: false,
-        source: record.source_timestamp(),
-        stamp: record.header_stamp(),
-        began: Timestamp(record.time),
+        source: sample.source_timestamp(),
+        stamp: sample.header_stamp(),
+        began: Timestamp(sample.record().time),
         repaired_after: 0,
     }
 }
 
-const fn whole_fragments(record: &Record, facts: &Facts) -> Whole {
-    let is_key = record.submessage_flags & FRAGMENT_KEY_FLAG != 0;
+const fn whole_fragments(sample: record::Sample<'_>, facts: &Facts) -> Whole {
     Whole {
-        number: record.sequence_number,
         bytes: facts.size as u64,
-        is_message: !is_key && record.status_info == 0,
-        recovered: false,
-        newest: true,
-        doubted: false,
         source: facts.source,
         stamp: facts.stamp,
         began: facts.began,
         repaired_after: facts.repaired_after,
+        ..whole_data(sample)
     }
-}
-
-/// Whether a DATA is no disposal: a key alone is one.
-pub const fn is_message(record: &Record) -> bool {
-    record.submessage_flags & DATA_FLAG != 0 && record.status_info == 0
 }
 
 fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Decision {

@@ -5,7 +5,8 @@
 //! by all writers. Whether a finished sample's number was seen before is the business of
 //! [`super::sequence`]; the caller asks there first.
 
-use ros2probe_wire::{Record, RtpsTime, Timestamp};
+use ros2probe_wire::record::DataFrag;
+use ros2probe_wire::{RtpsTime, Timestamp};
 
 use super::size::Size;
 
@@ -132,14 +133,15 @@ impl Samples {
     }
 
     /// Takes in one DATA_FRAG.
-    pub fn fragment(&mut self, record: &Record, now: Timestamp, budget: &mut Budget) -> Progress {
-        let (start, count) = (record.fragment_start, record.fragments_in_submessage());
-        let (size, fragment_size) = (record.sample_size, record.fragment_size());
-        let total = if fragment_size == 0 {
-            0
-        } else {
-            size.div_ceil(fragment_size)
-        };
+    pub fn fragment(
+        &mut self,
+        fragments: DataFrag<'_>,
+        now: Timestamp,
+        budget: &mut Budget,
+    ) -> Progress {
+        let (start, count) = (fragments.starting(), fragments.count());
+        let (size, fragment_size) = (fragments.sample_size(), fragments.fragment_size());
+        let total = fragments.total();
         let end = start.saturating_add(count);
         if total == 0 || start == 0 || count == 0 || end - 1 > total {
             budget.rejected += 1;
@@ -149,9 +151,9 @@ impl Samples {
             budget.rejected += 1;
             return Progress::TooMany;
         }
-        let index = match self.place(record.sequence_number) {
+        let index = match self.place(fragments.sequence_number()) {
             Some(index) => index,
-            None => self.open(record, now, budget),
+            None => self.open(fragments, now, budget),
         };
         let Some(partial) = self.partial.get_mut(index) else {
             return Progress::Rejected;
@@ -172,10 +174,10 @@ impl Samples {
             partial.tail = Some(now);
         }
         if partial.facts.source == RtpsTime(0) {
-            partial.facts.source = record.source_timestamp();
+            partial.facts.source = fragments.source_timestamp();
         }
         if start == 1 {
-            partial.facts.stamp = record.header_stamp();
+            partial.facts.stamp = fragments.header_stamp();
         }
         if partial.seen == total {
             let mut facts = partial.facts;
@@ -184,7 +186,7 @@ impl Samples {
             return Progress::Complete(facts);
         }
         if budget.bytes > budget.limit {
-            self.evict(record.sequence_number, budget);
+            self.evict(fragments.sequence_number(), budget);
         }
         Progress::Partial
     }
@@ -267,25 +269,27 @@ impl Samples {
         self.partial.iter().position(|each| each.number == number)
     }
 
-    fn open(&mut self, record: &Record, now: Timestamp, budget: &mut Budget) -> usize {
+    fn open(&mut self, fragments: DataFrag<'_>, now: Timestamp, budget: &mut Budget) -> usize {
+        let number = fragments.sequence_number();
         if self.partial.len() >= MAX_PER_WRITER {
-            self.evict(record.sequence_number, budget);
+            self.evict(number, budget);
         }
         budget.samples += 1;
-        let began = Timestamp(now.0.saturating_sub(record.elapsed.into()));
+        let elapsed = fragments.record().elapsed;
+        let began = Timestamp(now.0.saturating_sub(elapsed.into()));
         if began < self.sure_from {
-            self.last_doubtful = self.last_doubtful.max(record.sequence_number);
+            self.last_doubtful = self.last_doubtful.max(number);
         }
         self.partial.push(Partial {
-            number: record.sequence_number,
-            size: record.sample_size,
-            fragment_size: record.fragment_size(),
+            number,
+            size: fragments.sample_size(),
+            fragment_size: fragments.fragment_size(),
             seen: 0,
             bitmap: Vec::new(),
             tail: None,
             latest: now,
             facts: Facts {
-                size: record.sample_size,
+                size: fragments.sample_size(),
                 began,
                 ..Facts::default()
             },
@@ -335,6 +339,9 @@ impl Partial {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::Record;
+    use ros2probe_wire::record::{Sample, kind};
+
     use super::*;
 
     #[test]
@@ -373,8 +380,17 @@ mod tests {
         }
     }
 
+    /// [`Samples::fragment`] of the DATA_FRAG that a record reports.
+    fn put(samples: &mut Samples, record: &Record, at: u64, budget: &mut Budget) -> Progress {
+        let Some(Sample::DataFrag(fragments)) = record.sample() else {
+            panic!("{record:?}")
+        };
+        samples.fragment(fragments, Timestamp(at), budget)
+    }
+
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
         Record {
+            kind: kind::DATA_FRAG,
             sequence_number: number,
             fragment_start: start,
             fragments: count << 16 | 1344,
@@ -391,9 +407,10 @@ mod tests {
     fn repeated_fragments_do_not_complete_a_sample() {
         let (mut samples, mut budget) = (Samples::default(), budget());
         let mut put = |start, count| {
-            samples.fragment(
+            put(
+                &mut samples,
                 &fragment(1, start, count, 13_440),
-                Timestamp(1),
+                1,
                 &mut budget,
             )
         };
@@ -413,14 +430,11 @@ mod tests {
         let (mut samples, mut budget) = (Samples::default(), budget());
         let hostile = fragment(1, 1, 1, u32::MAX);
         assert_eq!(
-            samples.fragment(&hostile, Timestamp(1), &mut budget),
+            put(&mut samples, &hostile, 1, &mut budget),
             Progress::TooMany
         );
         let large = fragment(1, 1, 1, 88_000_000);
-        assert_eq!(
-            samples.fragment(&large, Timestamp(1), &mut budget),
-            Progress::Partial
-        );
+        assert_eq!(put(&mut samples, &large, 1, &mut budget), Progress::Partial);
         assert_eq!(budget.bytes, 8);
     }
 
@@ -436,14 +450,14 @@ mod tests {
         ] {
             let record = fragment(1, start, count, size);
             assert_eq!(
-                samples.fragment(&record, Timestamp(1), &mut budget),
+                put(&mut samples, &record, 1, &mut budget),
                 Progress::Rejected
             );
         }
-        samples.fragment(&fragment(1, 1, 1, 9000), Timestamp(1), &mut budget);
+        put(&mut samples, &fragment(1, 1, 1, 9000), 1, &mut budget);
         let other_size = fragment(1, 2, 1, 9001);
         assert_eq!(
-            samples.fragment(&other_size, Timestamp(1), &mut budget),
+            put(&mut samples, &other_size, 1, &mut budget),
             Progress::Rejected
         );
         assert_eq!(budget.rejected, 6);
@@ -454,7 +468,7 @@ mod tests {
         let (mut samples, mut budget) = (Samples::default(), budget());
         for number in 0..10_000 {
             let last = fragment(number, 65_000, 1, 65_000 * 1344);
-            samples.fragment(&last, Timestamp(number), &mut budget);
+            put(&mut samples, &last, number, &mut budget);
         }
         assert!(budget.bytes <= budget.limit && samples.partial.len() <= MAX_PER_WRITER);
         assert!(budget.evictions > 9000);
@@ -467,15 +481,15 @@ mod tests {
             source_timestamp: 77 << 32,
             ..fragment(1, 1, 1, 2000)
         };
-        samples.fragment(&first, Timestamp(1), &mut budget);
-        let done = samples.fragment(&fragment(1, 2, 1, 2000), Timestamp(9), &mut budget);
+        put(&mut samples, &first, 1, &mut budget);
+        let done = put(&mut samples, &fragment(1, 2, 1, 2000), 9, &mut budget);
         assert!(matches!(done, Progress::Complete(facts) if facts.source == RtpsTime(77 << 32)));
     }
 
     #[test]
     fn stalled_samples_expire() {
         let (mut samples, mut budget) = (Samples::default(), budget());
-        samples.fragment(&fragment(4, 1, 1, 9000), Timestamp(100), &mut budget);
+        put(&mut samples, &fragment(4, 1, 1, 9000), 100, &mut budget);
         assert_eq!(samples.growing(Timestamp(150), 100, 0), Some(4));
         assert_eq!(samples.growing(Timestamp(250), 100, 0), None);
         assert_eq!(samples.expire(Timestamp(250), 100, &mut budget), 1);

@@ -15,7 +15,7 @@
 mod said;
 mod upkeep;
 
-use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::record::{Body, Sample, flag};
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
 use super::acknowledgement::Acknowledgements;
@@ -38,7 +38,6 @@ const LOOK_BACK: u64 = 4096;
 /// Largest UDP payload that fits one Ethernet frame over IPv4: a larger datagram may die in IP
 /// reassembly.
 const ONE_FRAME: u16 = 1472;
-const DATA_FLAG: u8 = 0x04;
 
 /// All receivers and destinations of one writer.
 #[derive(Debug, Default)]
@@ -175,26 +174,28 @@ impl Subscribers {
     /// Takes in a record of the writer, or an ACKNACK for it.
     pub fn record(&mut self, record: &Record, stage: &mut Stage<'_>) -> Sight {
         self.refresh(stage);
-        let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
-        if record.kind == kind::ACKNACK {
-            self.requested(record);
+        let body = record.body();
+        if let Body::AckNack(acknack) = body {
+            self.requested(acknack);
             let is_reader = |topic: &Topic| is_reader(topic, record.reader());
             if stage.topic().is_some_and(is_reader) {
-                self.acknowledgements.record(record);
-                self.acknowledged(record);
+                self.acknowledgements.acknack(acknack);
+                self.acknowledged(acknack);
             }
             return Sight::New;
         }
         if record.flags & flag::NOT_REASSEMBLED != 0 {
-            if is_sample {
-                self.not_reassembled(record, stage);
+            if let Body::Sample(sample) = body {
+                self.not_reassembled(sample, stage);
             }
             return Sight::New;
         }
         self.reassembled |= record.flags & flag::HOST != 0 && record.datagram_len > ONE_FRAME;
         let way = Way::of(record);
-        if !is_sample && (!matches!(record.kind, kind::HEARTBEAT | kind::GAP) || way.is_sent()) {
-            return Sight::New;
+        match body {
+            Body::Sample(_) => {}
+            Body::Heartbeat(_) | Body::Gap(_) if !way.is_sent() => {}
+            _ => return Sight::New,
         }
         let is_host = record.flags & flag::HOST != 0;
         if !is_host && self.at_socket && self.ways.is_at_socket(way.place) {
@@ -210,10 +211,9 @@ impl Subscribers {
                 index = self.ways.find(&way).unwrap_or(index);
             }
         }
-        let came_again = if way.is_sent() {
-            self.leave(index, record, stage)
-        } else {
-            self.arrive(index, record, stage)
+        let came_again = match body {
+            Body::Sample(sample) if way.is_sent() => self.leave(index, sample, stage),
+            _ => self.arrive(index, record, stage),
         };
         if came_again { Sight::Again } else { Sight::New }
     }
@@ -230,17 +230,15 @@ impl Subscribers {
     }
 
     /// A sample on its way out.
-    fn leave(&mut self, index: usize, record: &Record, stage: &mut Stage<'_>) -> bool {
+    fn leave(&mut self, index: usize, sample: Sample<'_>, stage: &mut Stage<'_>) -> bool {
         let Some(way) = self.ways.get(index).map(|known| known.way) else {
             return false;
         };
         self.totals.seen[1] = true;
-        let source = record.source_timestamp().timestamp();
-        let begins = record.kind == kind::DATA || record.fragment_start == 1;
-        let began = record.time.saturating_sub(record.elapsed.into());
-        let began = stage.around.calendar.shown(Timestamp(began));
+        let source = sample.source_timestamp().timestamp();
+        let began = stage.around.calendar.shown(sample.record().began());
         // One clock: what leaves before its timestamp, or hours after, is no matter of sending.
-        if let Some(source) = source.filter(|_| begins)
+        if let Some(source) = source.filter(|_| sample.is_start())
             && let Ok(delay) = u64::try_from(began.nanoseconds_since(source))
             && delay <= PLAUSIBLE
             && self.departures.is_first(source)
@@ -255,7 +253,7 @@ impl Subscribers {
             return false;
         };
         let (again, whole) = delivery.sample(
-            record,
+            sample,
             &mut scene(&mut self.totals, self.reassembled, stage),
         );
         if let Some(whole) = whole {
@@ -272,11 +270,11 @@ impl Subscribers {
         let Some((receiver, matched)) = self.receiver(index, record, stage) else {
             return false;
         };
-        let is_sample = matches!(record.kind, kind::DATA | kind::DATA_FRAG);
         if matched == Matched::No {
-            let is_whole = record.kind == kind::DATA && record.submessage_flags & DATA_FLAG != 0
-                || record.kind == kind::DATA_FRAG && record.ends_sample();
-            if is_whole && record.flags & flag::NO_ROOM == 0 && record.status_info == 0 {
+            let is_missed = |sample: Sample<'_>| {
+                sample.is_message() && sample.is_end() && record.flags & flag::NO_ROOM == 0
+            };
+            if record.sample().is_some_and(is_missed) {
                 let place = self.find(receiver);
                 match place.and_then(|place| self.deliveries.get_mut(place)) {
                     Some(delivery) => delivery.ignore(&mut self.totals),
@@ -285,12 +283,15 @@ impl Subscribers {
             }
             return false;
         }
-        if is_sample {
-            self.sample(index, receiver, record, stage)
-        } else {
-            self.told(index, (receiver, matched), record, stage);
-            false
+        match record.body() {
+            Body::Sample(sample) => return self.sample(index, receiver, sample, stage),
+            Body::Heartbeat(heartbeat) => {
+                self.heartbeat(index, (receiver, matched), heartbeat, stage);
+            }
+            Body::Gap(gap) => self.gap(index, receiver, gap, stage),
+            _ => {}
         }
+        false
     }
 
     /// Who gets what came this way, and whether it reads the topic.
@@ -324,8 +325,8 @@ impl Subscribers {
             }
             (None, None) => Some((Receiver::Way(known.way), Matched::Unknown)),
             (None, Some(_)) => {
-                if matches!(record.kind, kind::DATA | kind::DATA_FRAG) {
-                    self.repair(record, stage);
+                if let Some(sample) = record.sample() {
+                    self.repair(sample, stage);
                 }
                 None
             }
@@ -336,17 +337,17 @@ impl Subscribers {
         &mut self,
         index: usize,
         receiver: Receiver,
-        record: &Record,
+        sample: Sample<'_>,
         stage: &mut Stage<'_>,
     ) -> bool {
-        let no_room = record.flags & flag::NO_ROOM != 0;
+        let no_room = sample.record().flags & flag::NO_ROOM != 0;
         let way = self.ways.get(index).map(|known| known.way);
-        if way.is_some_and(|way| self.is_repair_elsewhere(way, receiver, record)) {
+        if way.is_some_and(|way| self.is_repair_elsewhere(way, receiver, sample)) {
             return false;
         }
         let is_open = |receiver| matches!(receiver, Receiver::Way(way) if way.is_open());
         if self.open > 0 && !is_open(receiver) {
-            let is_known = !no_room && self.repair(record, stage);
+            let is_known = !no_room && self.repair(sample, stage);
             if (is_known || no_room) && self.find(receiver).is_none() {
                 return false;
             }
@@ -360,13 +361,13 @@ impl Subscribers {
         let next = delivery.next();
         if no_room {
             delivery.no_room(
-                record,
+                sample,
                 &mut scene(&mut self.totals, self.reassembled, stage),
             );
             return false;
         }
         let (again, whole) = delivery.sample(
-            record,
+            sample,
             &mut scene(&mut self.totals, self.reassembled, stage),
         );
         if self.open > 0 {
@@ -409,14 +410,14 @@ impl Subscribers {
     }
 
     /// Fills gaps of those that may be the receiver; whether any of them knows of the sample.
-    fn repair(&mut self, record: &Record, stage: &mut Stage<'_>) -> bool {
-        let number = record.sequence_number;
+    fn repair(&mut self, sample: Sample<'_>, stage: &mut Stage<'_>) -> bool {
+        let number = sample.sequence_number();
         let mut is_known = false;
         for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
             is_known |= delivery.next() > number;
             if delivery.misses(number) {
                 delivery.sample(
-                    record,
+                    sample,
                     &mut scene(&mut self.totals, self.reassembled, stage),
                 );
             }
@@ -426,14 +427,14 @@ impl Subscribers {
 
     /// On a wire, by unicast, to somebody of whom nothing else is known, of a sample that has come to
     /// a socket of this host as multicast: a repair for another host that got the multicast too.
-    fn is_repair_elsewhere(&self, way: Way, receiver: Receiver, record: &Record) -> bool {
+    fn is_repair_elsewhere(&self, way: Way, receiver: Receiver, sample: Sample<'_>) -> bool {
         let is_at_socket = |way: Way| way.is_open() && way.socket != 0;
         way.socket == 0
             && self.at_socket
             && !way.place.is_multicast()
             && self.find(receiver).is_none()
             && self.deliveries.iter().any(|delivery| {
-                is_at_socket(delivery.main()) && delivery.next() > record.sequence_number
+                is_at_socket(delivery.main()) && delivery.next() > sample.sequence_number()
             })
     }
 

@@ -9,7 +9,8 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
-use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::record::{AckNack, Body, Sample, flag};
+use ros2probe_wire::rtps::StatusInfo;
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::identity::Identity;
@@ -212,12 +213,12 @@ impl Tracer {
         let Some(Some(traced)) = self.writers.get_mut(&writer) else {
             return;
         };
-        match record.kind {
-            kind::ACKNACK => traced.acknowledged(record, &mut self.ledger),
-            kind::DATA | kind::DATA_FRAG
-                if record.flags & UNDELIVERED == 0 && record.status_info == 0 =>
+        match record.body() {
+            Body::AckNack(acknack) => traced.acknowledged(acknack, &mut self.ledger),
+            Body::Sample(sample)
+                if record.flags & UNDELIVERED == 0 && sample.status_info() == StatusInfo::ALIVE =>
             {
-                traced.sample(record, self.directed, &mut self.ledger);
+                traced.sample(sample, self.directed, &mut self.ledger);
             }
             _ => {}
         }
@@ -355,8 +356,8 @@ impl Traced {
         })
     }
 
-    fn sample(&mut self, record: &Record, directed: bool, ledger: &mut Ledger) {
-        let number = record.sequence_number;
+    fn sample(&mut self, sample: Sample<'_>, directed: bool, ledger: &mut Ledger) {
+        let (record, number) = (sample.record(), sample.sequence_number());
         let trace_id = numbered(self.identity, number);
         if (trace_id as u64 & RANDOM) < self.threshold {
             return;
@@ -375,24 +376,25 @@ impl Traced {
         let known = |message: &Message| message.sequence_number == number;
         let index = match self.under_way.iter().position(known) {
             Some(index) => index,
-            None => match self.begin(self.message(record, trace_id), ledger) {
+            None => match self.begin(self.message(sample, trace_id), ledger) {
                 Some(index) => index,
                 None => return,
             },
         };
-        let (at, first) = (Timestamp(record.time), first_datagram(record));
-        let (begin, source) = if record.kind == kind::DATA_FRAG {
-            match self.samples.fragment(record, at, &mut ledger.budget) {
-                Progress::Partial | Progress::Duplicate => return,
-                Progress::Complete(facts) => (facts.began, facts.source),
-                Progress::Rejected | Progress::TooMany => {
-                    self.under_way.remove(index);
-                    ledger.give_up();
-                    return;
+        let at = Timestamp(record.time);
+        let (begin, source) = match sample {
+            Sample::Data(_) => (record.began(), sample.source_timestamp()),
+            Sample::DataFrag(fragments) => {
+                match self.samples.fragment(fragments, at, &mut ledger.budget) {
+                    Progress::Partial | Progress::Duplicate => return,
+                    Progress::Complete(facts) => (facts.began, facts.source),
+                    Progress::Rejected | Progress::TooMany => {
+                        self.under_way.remove(index);
+                        ledger.give_up();
+                        return;
+                    }
                 }
             }
-        } else {
-            (first, record.source_timestamp())
         };
         let Some(mut message) = self.under_way.remove(index) else {
             return;
@@ -477,33 +479,28 @@ impl Traced {
         self.under_way.len().checked_sub(1)
     }
 
-    fn message(&self, record: &Record, trace_id: u128) -> Message {
-        let is_whole = record.kind == kind::DATA;
-        let size = record.fragment_size().max(1);
+    fn message(&self, sample: Sample<'_>, trace_id: u128) -> Message {
+        let record = sample.record();
         Message {
             writer: record.writer(),
-            sequence_number: record.sequence_number,
+            sequence_number: sample.sequence_number(),
             trace_id,
             subject: Arc::clone(&self.subject),
-            source: record.source_timestamp(),
-            size: if is_whole {
-                record.payload_len
-            } else {
-                record.sample_size
-            },
-            fragments: if is_whole {
-                1
-            } else {
-                record.sample_size.div_ceil(size)
+            source: sample.source_timestamp(),
+            size: sample.size(),
+            fragments: match sample {
+                Sample::Data(_) => 1,
+                Sample::DataFrag(fragments) => fragments.total(),
             },
             destination: Place::of(record),
         }
     }
 
-    fn acknowledged(&mut self, record: &Record, ledger: &mut Ledger) {
+    fn acknowledged(&mut self, acknack: AckNack<'_>, ledger: &mut Ledger) {
+        let record = acknack.record();
         let (reader, at) = (record.reader(), Timestamp(record.time));
         let covered = |waiting: &&mut Waiting| {
-            waiting.message.sequence_number < record.sequence_number
+            waiting.message.sequence_number < acknack.base()
                 && !waiting.readers.contains(&reader)
                 && waiting.readers.len() < MAX_READERS
         };
@@ -541,14 +538,9 @@ impl Ledger {
     }
 }
 
-/// A record of several datagrams bears the time of the last one.
-fn first_datagram(record: &Record) -> Timestamp {
-    Timestamp(record.time.saturating_sub(record.elapsed.into()))
-}
-
 #[cfg(test)]
 mod tests {
-    use ros2probe_wire::record::guid_words;
+    use ros2probe_wire::record::{guid_words, kind};
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;

@@ -4,7 +4,7 @@
 //! it. An idle writer takes under 2 KiB; what grows with traffic (bitmaps) is bounded in
 //! [`super::sequence`] and [`super::samples`].
 
-use ros2probe_wire::record::{flag, kind};
+use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::calendar::Calendar;
@@ -14,7 +14,7 @@ use super::in_order::Progress;
 use super::journal::{Journal, Loss, Missing};
 use super::payloads::MissedReason;
 use super::rate::{SECONDS, Slot, Window};
-use super::reception::{Decision, Outcome, Reception, is_message};
+use super::reception::{Decision, Outcome, Reception};
 use super::sampled::{News, Sampled, Seen};
 use super::samples::Budget;
 use super::sequence::{FAR, REACH};
@@ -182,18 +182,19 @@ impl Writer {
         self.tally.duplicates += 1;
     }
 
-    /// Whether the sample that this record is of needs nothing more: it was counted, or is settled.
+    /// Whether this sample needs nothing more: it was counted, or is settled.
     #[must_use]
-    pub fn has(&self, record: &Record) -> bool {
-        let (number, at) = (record.sequence_number, record_time(record));
+    pub fn has(&self, sample: Sample<'_>) -> bool {
+        let record = sample.record();
+        let (number, at) = (sample.sequence_number(), record_time(record));
         let sequence = self.reception.sequence();
-        if self.is_under_way(record) {
+        if self.is_under_way(sample) {
             return false;
         }
         if is_looked_at(record) && self.is_exact(at) {
             return true;
         }
-        if self.doubts(record) {
+        if self.doubts(sample) {
             return sequence.has_doubted(number);
         }
         match &self.sampled {
@@ -203,9 +204,9 @@ impl Writer {
     }
 
     /// Whether this ACKNACK acknowledges samples that are not known to exist.
-    pub const fn refuses(&mut self, acknack: &Record) -> bool {
+    pub const fn refuses(&mut self, acknack: AckNack<'_>) -> bool {
         let sequence = self.reception.sequence_mut();
-        sequence.refuses(acknack.sequence_number)
+        sequence.refuses(acknack.base())
     }
 
     /// Messages counted.
@@ -246,20 +247,20 @@ impl Writer {
         if is_exact {
             self.exact = self.exact.max(Some(at));
         }
-        if self.is_under_way(record) {
-            return self.catch_up(record, scene);
+        let body = record.body();
+        if let Body::Sample(sample) = body
+            && self.is_under_way(sample)
+        {
+            return self.catch_up(sample, scene);
         }
         if is_sampled && self.is_exact(at) {
             // It has been seen already, or is on its way.
             return None;
         }
-        let takes = self
-            .sampled
-            .as_mut()
-            .is_some_and(|sampled| match record.kind {
-                kind::DATA | kind::DATA_FRAG | kind::HEARTBEAT => sampled.takes(at),
-                _ => sampled.is_current(at),
-            });
+        let takes = self.sampled.as_mut().is_some_and(|sampled| match body {
+            Body::Sample(_) | Body::Heartbeat(_) => sampled.takes(at),
+            _ => sampled.is_current(at),
+        });
         if is_sampled || takes {
             let counted = self.sampled_record(record, is_sampled, scene);
             self.leave_unseen(scene.journal);
@@ -272,27 +273,26 @@ impl Writer {
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
         let mut counted = None;
-        match record.kind {
-            kind::DATA | kind::DATA_FRAG => counted = self.sample(record, scene),
-            kind::HEARTBEAT => {
+        match body {
+            Body::Sample(sample) => counted = self.sample(sample, scene),
+            Body::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
                 let (reception, mut settling) = self.parts(scene.journal, scene.now);
-                reception.heartbeat(record, scene.budget, &mut |decision| {
+                reception.heartbeat(heartbeat, scene.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
-            kind::GAP => {
+            Body::Gap(gap) => {
                 let (reception, mut settling) = self.parts(scene.journal, scene.now);
-                reception.gap(record, scene.budget, &mut |decision| {
+                reception.gap(gap, scene.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
-            kind::ACKNACK => {
-                let base = record.sequence_number;
-                let set = record.bitmap().map(|bit| base.saturating_add(bit.into()));
-                self.reception.sequence_mut().requested(set);
+            Body::AckNack(acknack) => {
+                let sequence = self.reception.sequence_mut();
+                sequence.requested(acknack.missing().iter());
             }
-            _ => {}
+            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => {}
         }
         let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
@@ -420,11 +420,12 @@ impl Writer {
         (&mut self.reception, settling)
     }
 
-    fn sample(&mut self, record: &Record, scene: &mut Scene<'_>) -> Option<Counted> {
+    fn sample(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> Option<Counted> {
+        let record = sample.record();
         let now = record_time(record);
         let reliable = self.traits.reliable;
         let (reception, mut settling) = self.parts(scene.journal, scene.now);
-        let outcome = reception.sample(record, reliable, scene.budget, &mut |decision| {
+        let outcome = reception.sample(sample, reliable, scene.budget, &mut |decision| {
             settling.take(decision);
         });
         match outcome {
@@ -470,18 +471,18 @@ impl Writer {
     }
 
     /// Whether it is of a sample that was under way when the sampled view ended.
-    fn is_under_way(&self, record: &Record) -> bool {
-        matches!(record.kind, kind::DATA | kind::DATA_FRAG)
-            && self.sampled.as_ref().is_some_and(|sampled| {
-                !sampled.is_current(record_time(record)) && sampled.awaits(record.sequence_number)
-            })
+    fn is_under_way(&self, sample: Sample<'_>) -> bool {
+        let (number, at) = (sample.sequence_number(), record_time(sample.record()));
+        self.sampled
+            .as_ref()
+            .is_some_and(|sampled| !sampled.is_current(at) && sampled.awaits(number))
     }
 
     /// Whether the number of this DATA or DATA_FRAG is away from those that the writer uses.
-    fn doubts(&self, record: &Record) -> bool {
-        let source = record.source_timestamp().timestamp();
+    fn doubts(&self, sample: Sample<'_>) -> bool {
+        let source = sample.source_timestamp().timestamp();
         let sequence = self.reception.sequence();
-        sequence.doubts(record.sequence_number, source, reach(record))
+        sequence.doubts(sample.sequence_number(), source, reach(sample.record()))
     }
 
     fn is_exact(&self, now: Timestamp) -> bool {
@@ -514,74 +515,84 @@ impl Writer {
         if is_sampled {
             sampled.touch(now);
         }
-        let number = record.sequence_number;
-        let sequence = self.reception.sequence();
-        let source = record.source_timestamp().timestamp();
         let reach = reach(record);
-        let doubted = sequence.doubts(number, source, reach);
-        let has = !doubted && sampled.has(number, sequence.next());
-        let is_whole = match record.kind {
-            kind::DATA_FRAG => !has && self.reception.assemble(record, doubted, scene.budget),
-            _ => true,
-        };
         let sequence = self.reception.sequence_mut();
-        let told = match record.kind {
-            kind::DATA | kind::DATA_FRAG => {
-                let seen = match is_whole {
-                    true => Seen::Whole,
-                    // What is read in shared memory may come after what is seen in the process.
-                    false if record.ends_sample() && record.flags & flag::EXACT == 0 => Seen::Tail,
-                    false => Seen::Part,
-                };
-                let what = (number, seen, source);
-                let news = sampled.sample(what, reach, now, sequence);
-                return self.sampled_sample(record, &news, (now, scene.calendar.shown(now)));
+        let told = match record.body() {
+            Body::Sample(sample) => {
+                let news = self.sampled_news(sample, reach, scene.budget)?;
+                return self.sampled_sample(sample, &news, (now, scene.calendar.shown(now)));
             }
-            kind::HEARTBEAT => {
+            Body::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
-                sampled.exist(record.second_sequence_number(), reach, now, sequence)
+                sampled.exist(heartbeat.last(), reach, now, sequence)
             }
-            kind::GAP => {
-                let end = record.second_sequence_number();
-                sampled.skip((number, end), reach, now, sequence)
-            }
+            Body::Gap(gap) => sampled.skip((gap.start(), gap.list().base), reach, now, sequence),
             // The reader has all below.
-            kind::ACKNACK => sampled.exist(number.saturating_sub(1), reach, now, sequence),
-            _ => 0,
+            Body::AckNack(acknack) => {
+                sampled.exist(acknack.base().saturating_sub(1), reach, now, sequence)
+            }
+            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
         };
         self.tally.messages += told;
         self.tally.window.current(now).messages += told;
         None
     }
 
+    /// What a sample, or a part of one, changes in the sampled view.
+    fn sampled_news(
+        &mut self,
+        sample: Sample<'_>,
+        reach: u64,
+        budget: &mut Budget,
+    ) -> Option<News> {
+        let sampled = self.sampled.as_mut()?;
+        let (number, now) = (sample.sequence_number(), record_time(sample.record()));
+        let source = sample.source_timestamp().timestamp();
+        let sequence = self.reception.sequence();
+        let doubted = sequence.doubts(number, source, reach);
+        let has = !doubted && sampled.has(number, sequence.next());
+        let is_whole = match sample {
+            Sample::DataFrag(fragments) => {
+                !has && self.reception.assemble(fragments, doubted, budget)
+            }
+            Sample::Data(_) => true,
+        };
+        let is_exact = sample.record().flags & flag::EXACT != 0;
+        let seen = match is_whole {
+            true => Seen::Whole,
+            // What is read in shared memory may come after what is seen in the process.
+            false if sample.is_end() && !is_exact => Seen::Tail,
+            false => Seen::Part,
+        };
+        let sequence = self.reception.sequence_mut();
+        Some(sampled.sample((number, seen, source), reach, now, sequence))
+    }
+
     /// Takes in a part of a sample that was under way when the sampled view ended, by whatever way
     /// it comes.
-    fn catch_up(&mut self, record: &Record, scene: &mut Scene<'_>) -> Option<Counted> {
-        let is_whole =
-            record.kind == kind::DATA || self.reception.assemble(record, false, scene.budget);
+    fn catch_up(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> Option<Counted> {
+        let is_whole = match sample {
+            Sample::Data(_) => true,
+            Sample::DataFrag(fragments) => self.reception.assemble(fragments, false, scene.budget),
+        };
         let seen = if is_whole { Seen::Whole } else { Seen::Part };
-        let news = self
-            .sampled
-            .as_mut()?
-            .catch_up(record.sequence_number, seen);
-        let now = record_time(record);
-        self.sampled_sample(record, &news, (now, scene.calendar.shown(now)))
+        let number = sample.sequence_number();
+        let news = self.sampled.as_mut()?.catch_up(number, seen);
+        let now = record_time(sample.record());
+        self.sampled_sample(sample, &news, (now, scene.calendar.shown(now)))
     }
 
     fn sampled_sample(
         &mut self,
-        record: &Record,
+        sample: Sample<'_>,
         news: &News,
         (now, calendar): (Timestamp, Timestamp),
     ) -> Option<Counted> {
-        let (bytes, is_message) = match record.kind {
-            kind::DATA => (record.payload_len, is_message(record)),
-            _ => (record.sample_size, record.status_info == 0),
-        };
+        let (number, is_message) = (sample.sequence_number(), sample.is_message());
         // Those that were not seen are taken for as large as the next one that was.
         let disposals = u64::from(!is_message && news.samples > 0);
         let messages = news.samples - disposals;
-        let bytes = u64::from(bytes);
+        let bytes = u64::from(sample.size());
         let told = (news.alike - disposals).saturating_mul(bytes);
         self.tally.messages += messages;
         self.tally.bytes = self.tally.bytes.saturating_add(told);
@@ -592,18 +603,17 @@ impl Writer {
             self.last_message = self.last_message.max(Some(now));
         }
         let sampled = self.sampled.as_mut()?;
-        let stamp = sampled.stamp(record.sequence_number, record.header_stamp());
+        let stamp = sampled.stamp(number, sample.header_stamp());
         if let Some(interval) = news.interval {
             self.interarrival.observe(seconds(interval));
         }
-        let source = record.source_timestamp();
+        let source = sample.source_timestamp();
         if news.arrived && is_message {
-            let number = record.sequence_number;
             self.delays(number, true, (source, stamp), (now, calendar));
         }
         if news.finished && is_message {
             return Some(Counted {
-                number: record.sequence_number,
+                number,
                 bytes,
                 source,
                 stamp: stamp.filter(|_| self.traits.has_header),

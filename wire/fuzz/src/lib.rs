@@ -5,15 +5,21 @@
 //!
 //! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic, no
 //! list beyond its bound, nothing kept that was not shown to exist, and the kernel filter's walk
-//! agreeing with the full parser.
+//! agreeing with the oracle (`wire/tests/oracle`).
 
 use ros2probe_wire::discovery::{self, Discovery, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::{MAX_LEN, TopicKind};
-use ros2probe_wire::record::{Record, kind};
-use ros2probe_wire::rtps::{Body, InlineQos, Message, Payload, StatusInfo, Submessage, VendorId};
-use ros2probe_wire::walk::{self, Step, Walk};
+use ros2probe_wire::record::{self, Record, Sample, flag, kind};
+use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
+use ros2probe_wire::walk::{self, Envelope, Step, Walk};
 use ros2probe_wire::{EntityId, Guid};
+
+#[path = "../../tests/oracle/mod.rs"]
+pub mod oracle;
+
+use oracle::sets::SequenceNumberSet;
+use oracle::{Body, Message, Submessage};
 
 /// A UDP payload, through everything that looks into it.
 pub fn datagram(bytes: &[u8]) {
@@ -21,6 +27,7 @@ pub fn datagram(bytes: &[u8]) {
         return;
     };
     let records = walk(bytes, message.header().prefix.0);
+    samples_agree(bytes, message.clone());
     for submessage in message.map_while(Result::ok) {
         let record = records
             .iter()
@@ -181,8 +188,8 @@ fn walk(bytes: &[u8], prefix: [u8; 12]) -> Vec<(usize, Record)> {
     }
 }
 
-/// Whether the walk saw what the full parser saw. The other direction need not hold: the walk lets
-/// numbers pass that the parser refuses.
+/// Whether the walk saw what the oracle saw. The other direction need not hold: the walk lets
+/// numbers pass that the oracle refuses.
 fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
     let (kind, writer, reader, number) = match submessage.body {
         Body::Data(data) => (kind::DATA, data.writer, data.reader, data.sequence_number),
@@ -210,7 +217,7 @@ fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
     assert!(record.is_some(), "the walk missed {submessage:?}");
     let Some(record) = record else { return };
     assert_eq!(record.kind, kind, "{submessage:?}");
-    assert_eq!(record.submessage_flags, submessage.flags);
+    assert_eq!(record.submessage_flags, submessage.flags.0);
     assert_eq!(record.sequence_number, number.0.cast_unsigned());
     if kind == kind::DATA || kind == kind::DATA_FRAG {
         assert_eq!(record.source_timestamp, submessage.receiver.timestamp.0);
@@ -220,6 +227,92 @@ fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
         (writer, reader),
         "{submessage:?}"
     );
+    bodies_agree(submessage, record);
+}
+
+/// Whether the record's body, read as its kind, says what the oracle read.
+fn bodies_agree(submessage: &Submessage<'_>, record: &Record) {
+    match (submessage.body, record.body()) {
+        (Body::Data(data), record::Body::Sample(Sample::Data(ours))) => {
+            let length = data.payload.bytes().len();
+            let is_read = record.flags & flag::INLINE_QOS_UNREAD == 0;
+            assert!(!is_read || ours.payload_len() as usize == length);
+        }
+        (Body::DataFrag(theirs), record::Body::Sample(Sample::DataFrag(ours))) => {
+            assert_eq!(
+                (ours.starting(), ours.count(), ours.fragment_size()),
+                (
+                    theirs.starting,
+                    theirs.count.into(),
+                    theirs.fragment_size.into()
+                )
+            );
+            assert_eq!(
+                (ours.sample_size(), ours.total(), ours.is_key()),
+                (theirs.sample_size, theirs.total(), theirs.is_key)
+            );
+        }
+        (Body::Heartbeat(theirs), record::Body::Heartbeat(ours)) => assert_eq!(
+            (ours.first(), ours.last(), ours.count()),
+            (
+                theirs.first.0.cast_unsigned(),
+                theirs.last.0.cast_unsigned(),
+                theirs.count
+            )
+        ),
+        (Body::Gap(theirs), record::Body::Gap(ours)) => {
+            assert_eq!(ours.start(), theirs.start.0.cast_unsigned());
+            sets_agree(&ours.list(), &theirs.list);
+        }
+        (Body::AckNack(theirs), record::Body::AckNack(ours)) => {
+            sets_agree(&ours.missing(), &theirs.missing);
+        }
+        (theirs, ours) => unreachable!("{theirs:?} has the kind of {ours:?}"),
+    }
+}
+
+/// A record has the first numbers of a long set only.
+fn sets_agree(ours: &record::SequenceNumberSet, theirs: &SequenceNumberSet<'_>) {
+    assert_eq!(ours.base, theirs.base.0.cast_unsigned());
+    assert_eq!(ours.num_bits, theirs.num_bits());
+    let end = ours.base.saturating_add(Record::BITMAP_BITS.into());
+    let numbers = theirs.iter().map(|number| number.0.cast_unsigned());
+    // Beyond the largest sequence number the oracle has none.
+    let largest = i64::MAX.cast_unsigned();
+    assert!(
+        ours.iter()
+            .take_while(|number| *number <= largest)
+            .eq(numbers.take_while(|number| *number < end))
+    );
+}
+
+/// Whether payload and inline QoS of each DATA are where the oracle finds them.
+fn samples_agree(bytes: &[u8], message: Message<'_>) {
+    let mut found = Vec::new();
+    walk::datagram(bytes, &Envelope::default(), None, |each| {
+        if each.record.kind == kind::DATA {
+            found.push(each);
+        }
+    });
+    let theirs = message
+        .map_while(Result::ok)
+        .filter_map(|each| match each.body {
+            Body::Data(data) => Some((each.receiver.vendor, data)),
+            _ => None,
+        });
+    for (index, (vendor, data)) in theirs.enumerate() {
+        let ours = &found[index];
+        let list = data.inline_qos.map(|list| InlineQos::parse(list, vendor));
+        let inline_qos = list.unwrap_or(Ok(InlineQos::default()));
+        // Offsets are those in the datagram there, and in the submessage here.
+        assert_eq!(
+            ours.inline_qos(vendor).map_err(|error| error.reason),
+            inline_qos.map_err(|error| error.reason)
+        );
+        if ours.record.flags & flag::INLINE_QOS_UNREAD == 0 {
+            assert_eq!(ours.payload(), data.payload);
+        }
+    }
 }
 
 fn guid(words: [u32; 4]) -> Guid {

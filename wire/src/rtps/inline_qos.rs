@@ -10,6 +10,9 @@ use crate::parameters::{ParameterId, ParameterList};
 pub struct StatusInfo(pub u32);
 
 impl StatusInfo {
+    /// Neither disposed nor unregistered: what a change without status is.
+    pub const ALIVE: Self = Self(0);
+
     /// The instance was deleted.
     #[must_use]
     pub const fn is_disposed(self) -> bool {

@@ -3,7 +3,7 @@
 use core::fmt;
 use core::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
-use crate::cursor::{Cursor, Reason, WireError};
+use crate::cursor::{Cursor, WireError};
 
 /// Kind of transport; the vendors add their own.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -91,31 +91,5 @@ impl fmt::Display for Locator {
 impl fmt::Debug for Locator {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(self, f)
-    }
-}
-
-/// A counted list of locators, shown to be there but not copied.
-#[derive(Clone, Copy, Debug)]
-pub struct LocatorList<'a> {
-    rest: Cursor<'a>,
-}
-
-impl<'a> LocatorList<'a> {
-    /// `u32` count, then that many locators.
-    pub(crate) fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
-        let error = cursor.error("locator list", Reason::BadLength);
-        let count = usize::try_from(cursor.u32("locator count")?).map_err(|_| error)?;
-        let length = count.checked_mul(Locator::LEN).ok_or(error)?;
-        Ok(Self {
-            rest: cursor.sub("locator list", length)?,
-        })
-    }
-}
-
-impl Iterator for LocatorList<'_> {
-    type Item = Locator;
-
-    fn next(&mut self) -> Option<Locator> {
-        Locator::read(&mut self.rest).ok()
     }
 }

@@ -1,26 +1,23 @@
-//! RTPS messages: the header, every submessage, and the receiver state that gives them meaning.
+//! The vocabulary of RTPS messages: vendors, versions, submessage kinds and flags, locators, inline
+//! QoS (RTPS 2.5, 8.3 and 9.4).
 //!
-//! RTPS 2.5, 8.3 and 9.4. Parsing borrows the datagram and keeps nothing. Unknown submessages are
-//! stepped over by their length; a malformed one ends the message (8.3.4.1), what came before it
-//! stands. Nothing here decides what is worth keeping: that is `walk`'s and the model's matter.
+//! [`crate::walk`] reads messages with it, `rp discover` writes some. Nothing here reads a whole
+//! message. The tests have a second, complete reader, which the walk has to agree with:
+//! `tests/oracle`.
 
+mod flags;
 mod inline_qos;
 mod locator;
-mod sets;
-mod submessage;
+mod payload;
 
 use core::fmt;
 
-use crate::cursor::{Cursor, Endianness, Reason, WireError};
-use crate::guid::GuidPrefix;
-use crate::time::RtpsTime;
+use crate::cursor::{Cursor, WireError};
 
+pub use flags::SubmessageFlags;
 pub use inline_qos::{InlineQos, SampleIdentity, StatusInfo};
-pub use locator::{Locator, LocatorKind, LocatorList};
-pub use sets::{FragmentNumberSet, SequenceNumberSet};
-pub use submessage::{
-    AckNack, Body, Data, DataFrag, Gap, Heartbeat, HeartbeatFrag, InfoReply, NackFrag, Payload,
-};
+pub use locator::{Locator, LocatorKind};
+pub use payload::Payload;
 
 /// Who made the implementation (RTPS 2.5, 9.3.2; numbers assigned by the OMG).
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -106,68 +103,11 @@ impl SequenceNumber {
         let low = cursor.u32(what)?;
         Ok(Self(i64::from(high) << 32 | i64::from(low)))
     }
-
-    /// [`Self::read`] where the specification allows only numbers from `least` on.
-    pub(crate) fn read_from(
-        cursor: &mut Cursor<'_>,
-        what: &'static str,
-        least: i64,
-    ) -> Result<Self, WireError> {
-        let error = cursor.error(what, Reason::BadValue);
-        let number = Self::read(cursor, what)?;
-        if number.0 < least {
-            Err(error)
-        } else {
-            Ok(number)
-        }
-    }
 }
 
 impl fmt::Display for SequenceNumber {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(&self.0, f)
-    }
-}
-
-/// The 20 bytes every RTPS message begins with (RTPS 2.5, 9.4.4).
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Header {
-    /// The sender's protocol version.
-    pub version: ProtocolVersion,
-    /// The sender's implementation.
-    pub vendor: VendorId,
-    /// The sending participant; not necessarily the origin of what it sends.
-    pub prefix: GuidPrefix,
-}
-
-impl Header {
-    /// Length on the wire.
-    pub const LEN: usize = 20;
-
-    /// From the first bytes of a datagram.
-    ///
-    /// # Errors
-    /// [`Reason::Truncated`]; [`Reason::BadMarker`] when it does not begin with `RTPS` or has
-    /// another major version than 2.
-    pub fn parse(bytes: &[u8]) -> Result<Self, WireError> {
-        Self::read(&mut Cursor::new(bytes, Endianness::Big))
-    }
-
-    fn read(cursor: &mut Cursor<'_>) -> Result<Self, WireError> {
-        let error = cursor.error("RTPS magic", Reason::BadMarker);
-        if cursor.array::<4>("RTPS magic")? != *b"RTPS" {
-            return Err(error);
-        }
-        let error = cursor.error("protocol version", Reason::BadMarker);
-        let [major, minor] = cursor.array("protocol version")?;
-        if major != 2 {
-            return Err(error);
-        }
-        Ok(Self {
-            version: ProtocolVersion { major, minor },
-            vendor: VendorId(cursor.array("vendor id")?),
-            prefix: GuidPrefix(cursor.array("guid prefix")?),
-        })
     }
 }
 
@@ -251,126 +191,3 @@ impl fmt::Debug for SubmessageId {
         }
     }
 }
-
-/// What a receiver knows while it reads a message (RTPS 2.5, 8.3.4): whose, for whom, when.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Receiver {
-    /// Whose the submessages are: the header's prefix until an INFO_SRC.
-    pub source: GuidPrefix,
-    /// The source's protocol version.
-    pub version: ProtocolVersion,
-    /// The source's implementation.
-    pub vendor: VendorId,
-    /// For whom they are; [`GuidPrefix::UNKNOWN`] is any participant that receives them.
-    pub destination: GuidPrefix,
-    /// INFO_TS in force; zero when none is.
-    pub timestamp: RtpsTime,
-}
-
-/// One submessage with the receiver state it is to be read under.
-#[derive(Clone, Copy, Debug)]
-pub struct Submessage<'a> {
-    /// State after this submessage when it is an INFO_*, otherwise the state it stands under.
-    pub receiver: Receiver,
-    /// Its kind.
-    pub id: SubmessageId,
-    /// The flags octet.
-    pub flags: u8,
-    /// Where its header begins in the message.
-    pub offset: usize,
-    /// Its content.
-    pub body: Body<'a>,
-}
-
-/// One RTPS message; iterates over its submessages and ends after the first malformed one.
-#[derive(Clone, Debug)]
-pub struct Message<'a> {
-    header: Header,
-    receiver: Receiver,
-    rest: Cursor<'a>,
-}
-
-impl<'a> Message<'a> {
-    /// Over a whole datagram.
-    ///
-    /// # Errors
-    /// Those of [`Header::parse`].
-    pub fn parse(datagram: &'a [u8]) -> Result<Self, WireError> {
-        let mut rest = Cursor::new(datagram, Endianness::Big);
-        let header = Header::read(&mut rest)?;
-        let receiver = Receiver {
-            source: header.prefix,
-            version: header.version,
-            vendor: header.vendor,
-            destination: GuidPrefix::UNKNOWN,
-            timestamp: RtpsTime::default(),
-        };
-        Ok(Self {
-            header,
-            receiver,
-            rest,
-        })
-    }
-
-    /// The message's header.
-    #[must_use]
-    pub const fn header(&self) -> Header {
-        self.header
-    }
-
-    fn submessage(&mut self) -> Result<Submessage<'a>, WireError> {
-        let offset = self.rest.offset();
-        let id = SubmessageId(self.rest.u8("submessage id")?);
-        let flags = self.rest.u8("submessage flags")?;
-        let endianness = if flags & 1 == 0 {
-            Endianness::Big
-        } else {
-            Endianness::Little
-        };
-        let length: [u8; 2] = self.rest.array("octetsToNextHeader")?;
-        let length = match endianness {
-            Endianness::Big => u16::from_be_bytes(length),
-            Endianness::Little => u16::from_le_bytes(length),
-        };
-        // RTPS 2.5, 9.4.5.1.3: zero reaches to the end of the message, except where an empty body
-        // is a body. Fast DDS writes zero for submessages that do not fit the field.
-        let to_the_end = length == 0 && !matches!(id, SubmessageId::PAD | SubmessageId::INFO_TS);
-        let length = if to_the_end {
-            self.rest.remaining()
-        } else {
-            usize::from(length)
-        };
-        let body = self
-            .rest
-            .sub("submessage body", length)?
-            .with_endianness(endianness);
-        let body = submessage::read(id, flags, body, &mut self.receiver)?;
-        Ok(Submessage {
-            receiver: self.receiver,
-            id,
-            flags,
-            offset,
-            body,
-        })
-    }
-}
-
-impl<'a> Iterator for Message<'a> {
-    type Item = Result<Submessage<'a>, WireError>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        // A tail shorter than a submessage header is padding.
-        if self.rest.remaining() < 4 {
-            return None;
-        }
-        let result = self.submessage();
-        if result.is_err() {
-            // Nothing after a malformed submessage can be trusted to be where it seems to be.
-            self.rest = Cursor::new(&[], Endianness::Big);
-        }
-        Some(result)
-    }
-}
-
-#[cfg(test)]
-mod tests;

@@ -4,6 +4,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::guid::{Guid, GuidPrefix};
+use crate::record::{Body, Sample};
 
 const SOURCE: [u8; 12] = *b"\x01\x0fsourcepref";
 const OTHER: [u8; 12] = *b"\x01\x10otherprefi";
@@ -57,6 +58,10 @@ fn walk_all(bytes: &[u8]) -> (Outcome, Vec<(Record, Vec<u8>)>) {
     (outcome, found)
 }
 
+fn header_stamp(record: &Record) -> Option<(i32, u32)> {
+    record.sample().and_then(Sample::header_stamp)
+}
+
 fn guid(prefix: [u8; 12], entity: [u8; 4]) -> Guid {
     Guid::new(GuidPrefix(prefix), EntityId(entity))
 }
@@ -76,7 +81,7 @@ fn data_in_either_byte_order_reads_the_same() {
         assert_eq!(record.reader(), guid([0; 12], READER));
         assert_eq!(record.sequence_number, 7);
         assert_eq!(record.payload_len, 14);
-        assert_eq!(record.header_stamp(), Some((1, 2)));
+        assert_eq!(header_stamp(record), Some((1, 2)));
         assert_eq!(seen, &payload);
     }
 }
@@ -132,6 +137,76 @@ fn status_info_is_big_endian_and_inline_qos_is_not_payload() {
     assert_eq!(walk_all(&bytes).1[0].0.payload_len, 8);
 }
 
+/// The one DATA of a message, its body behind `octets` octets of fixed fields.
+fn inline_qos_of(little: bool, octets: u8, tail: &[u8]) -> Result<InlineQos, WireError> {
+    let mut body = data_body(little, 9, tail);
+    body[if little { 2 } else { 3 }] = octets;
+    let bytes = message(&[submessage(0x15, 0x02 | u8::from(little), &body)]);
+    let mut found = Vec::new();
+    datagram(&bytes, &Envelope::default(), None, |each| {
+        found.push(each.inline_qos(VendorId::CYCLONE));
+    });
+    found.pop().expect("one DATA")
+}
+
+#[test]
+fn inline_qos_are_read_in_the_submessages_byte_order_behind_octets_to_inline_qos() {
+    let list = |little: bool| {
+        let [key, hash, status, four, end] =
+            [0x70_u16, 16, 0x71, 4, 1].map(|number| match little {
+                true => number.to_le_bytes(),
+                false => number.to_be_bytes(),
+            });
+        [
+            &[key, hash].concat()[..],
+            &[7; 16],
+            &[status, four].concat(),
+            &[0, 0, 0, 3],
+            &end,
+            &[0; 2],
+        ]
+        .concat()
+    };
+    for little in [true, false] {
+        let inline_qos = inline_qos_of(little, 16, &list(little)).unwrap();
+        assert_eq!(inline_qos.key_hash, Some([7; 16]));
+        assert_eq!(inline_qos.status_info.0, 3);
+        // A later version's field stands before them.
+        let behind = [&b"new!"[..], &list(little)].concat();
+        assert_eq!(inline_qos_of(little, 20, &behind), Ok(inline_qos));
+    }
+}
+
+#[test]
+fn inline_qos_behind_those_that_the_walk_follows_are_read_and_have_to_be_well_formed() {
+    let unknown = [0x00, 0x7a, 0, 0].repeat(INLINE_QOS_PARAMETERS as usize);
+    let status = [0x71, 0, 4, 0, 0, 0, 0, 1, 1, 0, 0, 0];
+    let inline_qos = inline_qos_of(true, 16, &[&unknown[..], &status].concat()).unwrap();
+    assert!(inline_qos.status_info.is_disposed());
+    let cut = inline_qos_of(true, 16, &[&unknown[..], &status[..8]].concat());
+    assert_eq!(cut.unwrap_err().reason, Reason::Truncated);
+}
+
+#[test]
+fn flags_say_whether_a_payload_is_a_value_or_a_key() {
+    let bytes = [0, 1, 0, 0, 5, 5, 5, 5];
+    for (flags, expected) in [
+        (0x05, Payload::Data(&bytes)),
+        (0x09, Payload::Key(&bytes)),
+        (0x01, Payload::None),
+        // The specification knows no such submessage; the value is the more telling.
+        (0x0d, Payload::Data(&bytes)),
+    ] {
+        let message = message(&[submessage(0x15, flags, &data_body(true, 1, &bytes))]);
+        let mut found = Vec::new();
+        datagram(&message, &Envelope::default(), None, |each| {
+            assert_eq!(each.inline_qos(VendorId::UNKNOWN), Ok(InlineQos::default()));
+            found.push(each.payload() == expected);
+        });
+        assert_eq!(found, [true], "{flags:#04x}");
+    }
+}
+
 #[test]
 fn data_frag_gives_fragment_numbers_and_sizes() {
     let head = [
@@ -155,7 +230,7 @@ fn data_frag_gives_fragment_numbers_and_sizes() {
         (10, 1344)
     );
     assert_eq!(record.sample_size, 644_260);
-    assert_eq!((record.payload_len, record.header_stamp()), (40, None));
+    assert_eq!((record.payload_len, header_stamp(&record)), (40, None));
 }
 
 #[test]
@@ -202,9 +277,12 @@ fn a_gap_of_256_becomes_two_records() {
     let (_, found) = walk_all(&message(&[submessage(0x08, 1, &body)]));
     assert_eq!(found.len(), 2);
     let irrelevant = |record: &Record| {
-        let base = record.second_sequence_number();
-        (record.sequence_number..base)
-            .chain(record.bitmap().map(|bit| base + u64::from(bit)))
+        let Body::Gap(gap) = record.body() else {
+            panic!("{record:?}")
+        };
+        let list = gap.list();
+        (gap.start()..list.base)
+            .chain(list.iter())
             .collect::<Vec<_>>()
     };
     let all: Vec<_> = found

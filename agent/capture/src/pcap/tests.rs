@@ -5,7 +5,7 @@ use flate2::write::GzEncoder;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use super::*;
-use ros2probe_model::reassembly::{self, FlowKey, Limits, Reassembly};
+use crate::reassembly::{self, FlowKey, Limits, Reassembly};
 
 const PACKETS: [(u32, u32, &[u8]); 3] = [
     (1_700_000_000, 123_456, b"first"),

@@ -9,7 +9,7 @@ use ros2probe_wire::frame::{self, PacketType, Payload};
 use super::*;
 use crate::filter::{Filter, FilterSettings};
 use crate::netns::tests::{in_new_namespace, ip};
-use ros2probe_model::reassembly::{FlowKey, Limits, Reassembly};
+use crate::reassembly::{FlowKey, Limits, Reassembly};
 
 const SMALL: Settings = Settings {
     block_size: 16 << 10,

@@ -7,7 +7,7 @@
 use std::collections::HashMap;
 
 use ros2probe_wire::filter::{UNKNOWN_CAPACITY, UNKNOWN_CAPTURE_BYTES};
-use ros2probe_wire::record::{Record, Verdict, guid_words, kind};
+use ros2probe_wire::record::{Record, Verdict, guid_words};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Bytes, Fate, MAGIC, Step, Walk};
 use ros2probe_wire::{EntityId, Guid};
@@ -122,7 +122,7 @@ impl MessageClassifier {
                     ..walk.record
                 }),
                 Verdict::Meter | Verdict::Capture => {
-                    let is_sample = matches!(walk.record.kind, kind::DATA | kind::DATA_FRAG);
+                    let is_sample = walk.record.is_sample();
                     let writer = walk.record.writer().entity;
                     self.announces = is_sample && writer != EntityId::SPDP_WRITER;
                     self.is_wanted = self.interest.contains_key(&walk.record.writer);
@@ -173,7 +173,7 @@ impl MessageClassifier {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_wire::record::flag;
+    use ros2probe_wire::record::{flag, kind};
 
     use super::*;
 

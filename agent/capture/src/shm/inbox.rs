@@ -3,7 +3,7 @@
 use std::os::fd::BorrowedFd;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use ros2probe_wire::record::{Record, kind};
+use ros2probe_wire::record::{Record, Sample};
 
 use crate::bell::Bell;
 
@@ -109,7 +109,7 @@ impl Waiting {
         match &item {
             Item::Record(record) => {
                 if let Some(Item::Record(last)) = self.items.last_mut()
-                    && record.kind == kind::DATA_FRAG
+                    && matches!(record.sample(), Some(Sample::DataFrag(_)))
                     && (last.kind, last.writer) == (record.kind, record.writer)
                     && last.extend(record)
                 {
@@ -134,6 +134,8 @@ impl Waiting {
 #[cfg(test)]
 mod tests {
     use std::time::Duration;
+
+    use ros2probe_wire::record::kind;
 
     use super::*;
     use crate::system::wait;

@@ -42,8 +42,11 @@ pub(crate) struct Echo {
     message_type: Option<String>,
     #[command(flatten)]
     printing: Printing,
-    /// Print only this field of messages, as pose.pose.position or ranges.[0]; may be repeated
-    #[arg(long, value_name = "FIELD")]
+    #[arg(
+        long,
+        value_name = "FIELD",
+        help = "Print only this field of messages, as pose.pose.position or ranges.[0]; may be repeated"
+    )]
     field: Vec<String>,
     /// Print the serialized message
     #[arg(long)]

@@ -12,6 +12,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::{ClientError, Target};
 use ros2probe_capture::pcap::{PcapError, Speed, link_name};
+use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::agent::{AssembledAgent, Components};
 use ros2probe_daemon::config::{Config, Watch};
 use ros2probe_daemon::run::replay::{Replay, ReplayControl, pause_at};
@@ -21,7 +22,6 @@ use ros2probe_daemon::surface::{Board, Settings};
 use ros2probe_daemon::watches::Watches;
 use ros2probe_message::{Library, Sources};
 use ros2probe_model::observer::{self, Observer};
-use ros2probe_model::reassembly::Limits;
 
 /// What a pipe holds: more than most answers.
 const PIPE: usize = 1 << 20;

@@ -446,7 +446,7 @@ fn documents(file: &str) -> Result<Vec<Value>> {
 
 /// What the unit's process may have.
 fn bounding_set() -> Result<BTreeSet<String>> {
-    let unit = std::fs::read_to_string(deploy().join("../../systemd/ros2probe.service"))?;
+    let unit = std::fs::read_to_string(deploy().join("../systemd/ros2probe.service"))?;
     let set = unit
         .lines()
         .find_map(|line| line.strip_prefix("CapabilityBoundingSet="));

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use ros2probe::capture::pcap::PcapReader;
-use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe::capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_testing::program_run::{self, Hook, Kernel, Seen};
 use ros2probe_wire::filter::Counter;
 use ros2probe_wire::frame::{self, Link, PacketType, Payload};

@@ -103,7 +103,7 @@ fn what_a_robot_measured_out_of_reach_arrives_when_the_link_is_back() -> Result<
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &configuration)?;
     // The shipped configurations, at other addresses and scraping faster.
     let server = std::fs::read_to_string(deploy().join("prometheus/prometheus.yaml"))?;
-    let rules = deploy().join("../../dashboards/rules");
+    let rules = deploy().join("../dashboards/rules");
     let server = server.replace("/etc/ros2probe/rules", &rules.display().to_string());
     let server = Prometheus::run(&link.monitor, Kind::Server, &server)?;
     let token = directory.path().join("token");

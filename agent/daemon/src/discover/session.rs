@@ -11,16 +11,15 @@ use std::ops::RangeInclusive;
 
 use ros2probe_wire::discovery::{self, Discovery, EndpointAnnouncement, Role};
 use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
-use ros2probe_wire::record::kind;
-use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
+use ros2probe_wire::record::{Body, Gap, Sample};
+use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Found};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::message::{
     LocalParticipant, MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
     SUBSCRIPTIONS_READER,
 };
-use ros2probe_model::observer::{data_payload, inline_qos};
 use ros2probe_model::pieces::Pieces;
 
 /// Packets sent to one participant, goodbye included.
@@ -282,9 +281,9 @@ impl Session {
         let entity = record.writer().entity;
         let announcers = [&mut self.publications, &mut self.subscriptions];
         let announcer = announcers.into_iter().find(|it| it.writer == entity);
-        match record.kind {
-            kind::HEARTBEAT => {
-                let range = record.sequence_number..=record.second_sequence_number();
+        match record.body() {
+            Body::Heartbeat(heartbeat) => {
+                let range = heartbeat.first()..=heartbeat.last();
                 if let Some(announcer) = announcer {
                     announcer.there = Some(range);
                     self.heard.get_or_insert(now);
@@ -295,25 +294,26 @@ impl Session {
                     self.user_writers.insert(entity, range);
                 }
             }
-            kind::GAP => {
+            Body::Gap(gap) => {
                 if let Some(announcer) = announcer {
-                    announcer.skip(record);
+                    announcer.skip(gap);
                 } else if Some(entity) == self.nodes_writer() {
                     self.nodes = Nodes::Missing;
                 }
             }
-            kind::DATA | kind::DATA_FRAG => {
+            Body::Sample(sample) => {
+                let number = sample.sequence_number();
                 let came = match &announcer {
-                    Some(announcer) => announcer.came.contains(&record.sequence_number),
+                    Some(announcer) => announcer.came.contains(&number),
                     None => matches!(self.nodes, Nodes::Told(_)),
                 };
                 if came || announcer.is_none() && Some(entity) != self.nodes_writer() {
                     return;
                 }
-                let Some((payload, qos)) = self.complete_payload(now, found, vendor) else {
+                let Some((payload, qos)) = self.complete_payload(now, found, sample, vendor) else {
                     return;
                 };
-                let (payload, number) = (payload.borrow(), record.sequence_number);
+                let payload = payload.borrow();
                 if Some(entity) == self.nodes_writer() {
                     self.nodes_announced(payload);
                 } else {
@@ -329,23 +329,23 @@ impl Session {
         &mut self,
         now: Timestamp,
         found: &Found<'a>,
+        sample: Sample<'_>,
         vendor: VendorId,
     ) -> Option<(SamplePayload<'a>, InlineQos)> {
-        if found.record.kind == kind::DATA {
-            let qos = inline_qos(found, vendor).ok()?;
-            return Some((SamplePayload::Borrowed(data_payload(found)), qos));
-        }
-        let record = &found.record;
-        let sample = (record.writer().entity, record.sequence_number);
-        let Some(bytes) = self.pieces.put(record, found.payload) else {
-            if self.partial.len() < MOST_PARTIAL || self.partial.contains_key(&sample) {
-                self.partial.insert(sample, now);
+        let Sample::DataFrag(fragments) = sample else {
+            let qos = found.inline_qos(vendor).ok()?;
+            return Some((SamplePayload::Borrowed(found.payload()), qos));
+        };
+        let key = (found.record.writer().entity, sample.sequence_number());
+        let Some(bytes) = self.pieces.put(fragments, found.payload) else {
+            if self.partial.len() < MOST_PARTIAL || self.partial.contains_key(&key) {
+                self.partial.insert(key, now);
             }
             return None;
         };
-        self.partial.remove(&sample);
+        self.partial.remove(&key);
         let qos = InlineQos {
-            status_info: StatusInfo(found.record.status_info),
+            status_info: sample.status_info(),
             ..InlineQos::default()
         };
         Some((SamplePayload::Joined(bytes), qos))
@@ -621,17 +621,12 @@ impl Announcer {
     }
 
     /// A GAP: these will never come.
-    fn skip(&mut self, record: &Record) {
-        let base = record.second_sequence_number();
-        let listed: BTreeSet<u64> = record
-            .bitmap()
-            .map(|bit| base.saturating_add(bit.into()))
-            .collect();
+    fn skip(&mut self, gap: Gap<'_>) {
+        let (irrelevant, list) = (gap.start()..gap.list().base, gap.list());
+        let listed: BTreeSet<u64> = list.iter().collect();
         let skipped: Vec<u64> = self
             .missing()
-            .filter(|number| {
-                (record.sequence_number..base).contains(number) || listed.contains(number)
-            })
+            .filter(|number| irrelevant.contains(number) || listed.contains(number))
             .collect();
         self.came.extend(skipped);
     }

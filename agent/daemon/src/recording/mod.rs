@@ -2,7 +2,7 @@
 //!
 //! A recording takes samples from a subscription, as a stream of the API does: nothing on the
 //! network tells that there is one. The agent writes some itself (`service`), and the last seconds
-//! before an incident (`snapshot`). How a bag looks on disk is the business of [`crate::bag`].
+//! before an incident (`snapshot`). How a bag looks on disk is the business of `ros2probe_bag`.
 
 mod disk_quota;
 mod filter;

@@ -14,8 +14,8 @@ use tokio::sync::watch;
 use super::CaptureTime;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
+use ros2probe_capture::reassembly::{Limits, Reassembly};
 use ros2probe_model::observer::Observer;
-use ros2probe_model::reassembly::{Limits, Reassembly};
 
 /// How often a terminal is told how far it is.
 const PROGRESS: Duration = Duration::from_secs(1);

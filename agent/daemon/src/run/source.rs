@@ -17,9 +17,9 @@ use crate::surface::{
 };
 use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource};
+use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
 use ros2probe_model::observer::Observer;
-use ros2probe_model::reassembly::Limits;
 
 /// Where packets come from.
 pub enum Source {

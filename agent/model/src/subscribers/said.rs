@@ -1,7 +1,7 @@
 //! What is said of samples without bringing any: HEARTBEAT, GAP, ACKNACK, and what the kernel gave up.
 
-use ros2probe_wire::record::kind;
-use ros2probe_wire::{GuidPrefix, Record};
+use ros2probe_wire::GuidPrefix;
+use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
 
 use super::{Stage, Subscribers, is_open, scene};
 use crate::delivery::Receiver;
@@ -10,32 +10,21 @@ use crate::way::Place;
 use crate::ways::Known;
 
 impl Subscribers {
-    /// A HEARTBEAT or GAP came this way.
-    pub(super) fn told(
+    /// A HEARTBEAT came this way.
+    pub(super) fn heartbeat(
         &mut self,
         index: usize,
         (receiver, matched): (Receiver, Matched),
-        record: &Record,
+        heartbeat: Heartbeat<'_>,
         stage: &mut Stage<'_>,
     ) {
         let Some(known) = self.ways.get(index) else {
             return;
         };
-        let is_heartbeat = record.kind == kind::HEARTBEAT;
         // It goes where data goes, unless a reader is known to be there.
         let holds = known.has_data || matched == Matched::Yes;
-        let is_meant = record.reader().prefix != GuidPrefix::UNKNOWN;
-        let opens = is_heartbeat
-            && matched == Matched::Yes
-            && (is_meant || !known.way.place.is_multicast());
-        if !is_heartbeat && !known.way.place.is_multicast() && self.open > 0 {
-            for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
-                delivery.gap(
-                    record,
-                    &mut scene(&mut self.totals, self.reassembled, stage),
-                );
-            }
-        }
+        let is_meant = heartbeat.record().reader().prefix != GuidPrefix::UNKNOWN;
+        let opens = matched == Matched::Yes && (is_meant || !known.way.place.is_multicast());
         let place = match self.find(receiver) {
             None if opens => self.delivery(index, receiver, stage),
             found => found,
@@ -43,28 +32,50 @@ impl Subscribers {
         let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) else {
             return;
         };
-        let mut scene = scene(&mut self.totals, self.reassembled, stage);
-        if !is_heartbeat {
-            delivery.gap(record, &mut scene);
-        } else if is_meant || holds {
-            delivery.heartbeat(record, &mut scene);
+        if is_meant || holds {
+            let mut scene = scene(&mut self.totals, self.reassembled, stage);
+            delivery.heartbeat(heartbeat, &mut scene);
+        }
+    }
+
+    /// A GAP came this way.
+    pub(super) fn gap(
+        &mut self,
+        index: usize,
+        receiver: Receiver,
+        gap: Gap<'_>,
+        stage: &mut Stage<'_>,
+    ) {
+        let Some(known) = self.ways.get(index) else {
+            return;
+        };
+        if !known.way.place.is_multicast() && self.open > 0 {
+            for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
+                let mut scene = scene(&mut self.totals, self.reassembled, stage);
+                delivery.gap(gap, &mut scene);
+            }
+        }
+        let place = self.find(receiver);
+        if let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) {
+            let mut scene = scene(&mut self.totals, self.reassembled, stage);
+            delivery.gap(gap, &mut scene);
         }
     }
 
     /// A reader asks for samples again: what fills its gaps from now on is a retransmission.
-    pub(super) fn requested(&mut self, record: &Record) {
-        let reader = record.reader().prefix;
+    pub(super) fn requested(&mut self, acknack: AckNack<'_>) {
+        let reader = acknack.record().reader().prefix;
         for delivery in &mut self.deliveries {
             if is_open(delivery) || delivery.receiver() == Receiver::Participant(reader) {
-                delivery.requested(record);
+                delivery.requested(acknack);
             }
         }
     }
 
     /// A reader has all below the base of this ACKNACK. A delivery is its participant's: what all of
     /// its readers have came there, whether it was seen or not.
-    pub(super) fn acknowledged(&mut self, record: &Record) {
-        let prefix = record.reader().prefix;
+    pub(super) fn acknowledged(&mut self, acknack: AckNack<'_>) {
+        let prefix = acknack.record().reader().prefix;
         let below = self.acknowledgements.floor(|guid| guid.prefix == prefix);
         for delivery in &mut self.deliveries {
             let below = match delivery.receiver() {
@@ -78,8 +89,10 @@ impl Subscribers {
         }
     }
 
-    pub(super) fn not_reassembled(&mut self, record: &Record, stage: &mut Stage<'_>) {
+    /// The kernel gave up on some IP fragments of a datagram with this.
+    pub(super) fn not_reassembled(&mut self, sample: Sample<'_>, stage: &mut Stage<'_>) {
         self.reassembled = true;
+        let record = sample.record();
         let place = Place::of(record);
         let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
         for delivery in &mut self.deliveries {
@@ -94,7 +107,7 @@ impl Subscribers {
                     }
             };
             if self.ways.iter().any(leads_there) {
-                let number = record.sequence_number;
+                let number = sample.sequence_number();
                 delivery.not_reassembled(
                     number,
                     &mut scene(&mut self.totals, self.reassembled, stage),

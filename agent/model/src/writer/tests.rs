@@ -1,3 +1,5 @@
+use ros2probe_wire::record::kind;
+
 use super::*;
 
 const MILLISECOND: u64 = 1_000_000;
@@ -509,7 +511,9 @@ fn every_sample_is_given_or_missed(
                     bench.now += MILLISECOND;
                     // A record of which the bytes are not kept cannot complete a sample.
                     let time = bench.now;
-                    let has = bench.writer.has(&Record { time, ..*record });
+                    let has = bench
+                        .writer
+                        .has(Record { time, ..*record }.sample().unwrap());
                     if let Some(counted) = bench.take(*record) {
                         assert!(!has, "{record:?}");
                         given[usize::try_from(counted.number).unwrap() - 1] += 1;

@@ -8,7 +8,7 @@ use std::rc::Rc;
 
 use proptest::prelude::*;
 use ros2probe_wire::Guid;
-use ros2probe_wire::record::{Verdict, kind};
+use ros2probe_wire::record::{Sample, Verdict, kind};
 use ros2probe_wire::time::SECOND;
 use tempfile::TempDir;
 
@@ -221,7 +221,7 @@ fn what_stood_in_the_ring_before_is_found_without_a_time_of_its_own() {
         panic!("{found:?}");
     };
     assert_eq!((record.sequence_number, record.source_timestamp), (2, 0));
-    assert_eq!(record.header_stamp(), None);
+    assert_eq!(record.sample().and_then(Sample::header_stamp), None);
     assert_eq!(host.tap.counters().missed, 1);
 }
 

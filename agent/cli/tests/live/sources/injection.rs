@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe::capture::netns;
 use ros2probe::capture::pcap::PcapReader;
-use ros2probe::model::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe::capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use ros2probe_testing::harness::cgroup::Cgroup;

@@ -64,8 +64,8 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "flows",
-        "agent/model/src/reassembly.rs",
-        "agent/model/src/reassembly/tests.rs",
+        "agent/capture/src/reassembly.rs",
+        "agent/capture/src/reassembly/tests.rs",
         "the_oldest_goes_first_when_there_are_too_many",
     ],
     [
@@ -388,14 +388,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "BYTES",
-        "agent/model/src/ahead.rs",
-        "agent/model/src/ahead.rs",
+        "agent/capture/src/ahead.rs",
+        "agent/capture/src/ahead.rs",
         "a_storm_of_long_datagrams_that_never_end_stays_within_its_bytes",
     ],
     [
         "DATAGRAMS",
-        "agent/model/src/ahead.rs",
-        "agent/model/src/ahead.rs",
+        "agent/capture/src/ahead.rs",
+        "agent/capture/src/ahead.rs",
         "a_storm_of_datagrams_that_never_end_stays_bounded",
     ],
     [

@@ -7,10 +7,10 @@
 use std::collections::{HashMap, VecDeque};
 
 use ros2probe_wire::Timestamp;
-use ros2probe_wire::record::{Record, flag, kind};
+use ros2probe_wire::record::{Body, Record, flag};
 
 use super::reassembly::Reassembled;
-use super::size::Size;
+use ros2probe_model::size::Size;
 
 /// Datagrams waited for; more push out the oldest.
 const DATAGRAMS: usize = 1024;
@@ -80,15 +80,15 @@ impl Ahead {
         let token = (namespace, record.datagram);
         if record.flags & flag::AHEAD == 0 && !self.waiting.contains_key(&token) {
             // The usual case: one record, written when the datagram was complete.
-            if record.kind != kind::COMPLETE {
+            if !matches!(record.body(), Body::Complete) {
                 ready(Ready::Record(record));
             }
             return;
         }
         self.change(token, Timestamp(record.time), |waiting| {
-            match record.kind {
-                kind::HANDOVER => waiting.handed_over = true,
-                kind::COMPLETE => {}
+            match record.body() {
+                Body::Handover => waiting.handed_over = true,
+                Body::Complete => {}
                 _ if waiting.records.len() < RECORDS_PER_DATAGRAM => waiting.records.push(record),
                 _ => {}
             }
@@ -198,6 +198,8 @@ impl Waiting {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::record::kind;
+
     use super::*;
 
     fn record(datagram: u32, kind: u8, flags: u16, time: u64) -> Record {

@@ -1,8 +1,25 @@
 //! Sequence number and fragment number sets (RTPS 2.5, 9.4.2.6 and 9.4.2.8): a base and a window
 //! of at most 256 bits.
 
-use super::SequenceNumber;
-use crate::cursor::{Cursor, Reason, WireError};
+use ros2probe_wire::rtps::SequenceNumber;
+use ros2probe_wire::{Cursor, Reason, WireError};
+
+/// A sequence number, `i32` high and `u32` low, of those from `least` on (RTPS 2.5, 9.4.2.5).
+pub fn sequence_number(
+    cursor: &mut Cursor<'_>,
+    what: &'static str,
+    least: i64,
+) -> Result<SequenceNumber, WireError> {
+    let error = cursor.error(what, Reason::BadValue);
+    let high = cursor.i32(what)?;
+    let low = cursor.u32(what)?;
+    let number = SequenceNumber(i64::from(high) << 32 | i64::from(low));
+    if number.0 < least {
+        Err(error)
+    } else {
+        Ok(number)
+    }
+}
 
 /// Bits, most significant first within each 32-bit word, words in the submessage's byte order.
 #[derive(Clone, Copy, Debug)]
@@ -51,9 +68,9 @@ pub struct SequenceNumberSet<'a> {
 }
 
 impl<'a> SequenceNumberSet<'a> {
-    pub(crate) fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
+    pub fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
         // Fast DDS asks for everything with base 0, so that one is let through.
-        let base = SequenceNumber::read_from(cursor, "set base", 0)?;
+        let base = sequence_number(cursor, "set base", 0)?;
         Ok(Self {
             base,
             bitmap: Bitmap::read(cursor)?,
@@ -84,7 +101,7 @@ pub struct FragmentNumberSet<'a> {
 }
 
 impl<'a> FragmentNumberSet<'a> {
-    pub(crate) fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
+    pub fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
         Ok(Self {
             base: cursor.u32("set base")?,
             bitmap: Bitmap::read(cursor)?,
@@ -97,100 +114,5 @@ impl<'a> FragmentNumberSet<'a> {
         self.bitmap
             .ones()
             .filter_map(move |bit| base.checked_add(bit))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use std::vec::Vec;
-
-    use super::*;
-    use crate::cursor::Endianness;
-
-    fn sequence_numbers(bytes: &[u8], endianness: Endianness) -> Result<Vec<i64>, WireError> {
-        let mut cursor = Cursor::new(bytes, endianness);
-        Ok(SequenceNumberSet::read(&mut cursor)?
-            .iter()
-            .map(|number| number.0)
-            .collect())
-    }
-
-    /// RTPS 2.5, 9.4.2.6: `1234:/12:00110` is 1236 and 1237; here with the example's 30 bits.
-    const EXAMPLE: [u8; 16] = [
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
-        0x04,
-        0xd2,
-        0,
-        0,
-        0,
-        30,
-        0b0011_0000,
-        0,
-        0,
-        0,
-    ];
-
-    #[test]
-    fn bits_count_from_the_most_significant() {
-        assert_eq!(
-            sequence_numbers(&EXAMPLE, Endianness::Big),
-            Ok([1236, 1237].into())
-        );
-        let mut little = EXAMPLE;
-        for word in little.chunks_exact_mut(4) {
-            word.reverse();
-        }
-        assert_eq!(
-            sequence_numbers(&little, Endianness::Little),
-            Ok([1236, 1237].into())
-        );
-    }
-
-    #[test]
-    fn bits_behind_num_bits_do_not_count() {
-        let mut bytes = EXAMPLE;
-        bytes[11] = 3;
-        assert_eq!(sequence_numbers(&bytes, Endianness::Big), Ok([1236].into()));
-        bytes[11] = 0;
-        assert_eq!(sequence_numbers(&bytes, Endianness::Big), Ok([].into()));
-    }
-
-    #[test]
-    fn a_window_of_more_than_256_is_refused() {
-        let mut bytes = [0xff; 12 + 36];
-        bytes[..12].copy_from_slice(&[0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 1, 0]);
-        let all = sequence_numbers(&bytes, Endianness::Big).unwrap();
-        assert_eq!((all.len(), all[0], all[255]), (256, 1, 256));
-        bytes[11] = 1;
-        assert_eq!(
-            sequence_numbers(&bytes, Endianness::Big).map_err(|error| error.reason),
-            Err(Reason::BadValue)
-        );
-    }
-
-    #[test]
-    fn members_beyond_the_last_number_are_left_out() {
-        let mut bytes = EXAMPLE;
-        bytes[..8].copy_from_slice(&i64::MAX.to_be_bytes());
-        bytes[12] = 0xff;
-        assert_eq!(
-            sequence_numbers(&bytes, Endianness::Big),
-            Ok([i64::MAX].into())
-        );
-    }
-
-    #[test]
-    fn cut_off_anywhere_is_an_error() {
-        for length in 0..EXAMPLE.len() {
-            assert!(
-                sequence_numbers(&EXAMPLE[..length], Endianness::Big).is_err(),
-                "{length}"
-            );
-        }
     }
 }

@@ -1,13 +1,14 @@
 //! The submessages' bodies (RTPS 2.5, 9.4.5), with GUIDs made whole from the receiver state.
 
-use super::{
-    FragmentNumberSet, Locator, LocatorKind, LocatorList, ProtocolVersion, Receiver,
-    SequenceNumber, SequenceNumberSet, SubmessageId, VendorId,
+use ros2probe_wire::parameters::{ParameterId, ParameterList};
+use ros2probe_wire::rtps::{
+    Locator, LocatorKind, Payload, ProtocolVersion, SequenceNumber, SubmessageFlags, SubmessageId,
+    VendorId,
 };
-use crate::cursor::{Cursor, Reason, WireError};
-use crate::guid::{EntityId, Guid, GuidPrefix};
-use crate::parameters::ParameterList;
-use crate::time::RtpsTime;
+use ros2probe_wire::{Cursor, EntityId, Guid, GuidPrefix, Reason, RtpsTime, WireError};
+
+use super::Receiver;
+use super::sets::{FragmentNumberSet, SequenceNumberSet, sequence_number};
 
 /// What a submessage holds.
 #[derive(Clone, Copy, Debug)]
@@ -144,28 +145,6 @@ pub struct Data<'a> {
     pub payload: Payload<'a>,
 }
 
-/// What a change carries, encapsulation header included; up to three bytes of it may be padding.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Payload<'a> {
-    /// The whole value.
-    Data(&'a [u8]),
-    /// Its key only: the instance is disposed or unregistered.
-    Key(&'a [u8]),
-    /// Nothing; what there is to know stands in the inline QoS.
-    None,
-}
-
-impl<'a> Payload<'a> {
-    /// The bytes, whatever they are; empty for none.
-    #[must_use]
-    pub const fn bytes(self) -> &'a [u8] {
-        match self {
-            Self::Data(bytes) | Self::Key(bytes) => bytes,
-            Self::None => &[],
-        }
-    }
-}
-
 /// Consecutive fragments of one change.
 #[derive(Clone, Copy, Debug)]
 pub struct DataFrag<'a> {
@@ -210,29 +189,17 @@ impl<'a> DataFrag<'a> {
     }
 }
 
-/// Flag bits besides E.
-const FINAL: u8 = 0x02;
-const LIVELINESS: u8 = 0x04;
-const INVALIDATE: u8 = 0x02;
-const MULTICAST: u8 = 0x02;
-const INLINE_QOS: u8 = 0x02;
-const DATA: u8 = 0x04;
-const KEY: u8 = 0x08;
-/// In DATA_FRAG the key flag stands where DATA has its data flag (RTPS 2.5, 9.4.5.5).
-const FRAGMENT_KEY: u8 = 0x04;
-
 /// Reads one body and applies it to the receiver state.
 pub(super) fn read<'a>(
     id: SubmessageId,
-    flags: u8,
+    flags: SubmessageFlags,
     mut body: Cursor<'a>,
     receiver: &mut Receiver,
 ) -> Result<Body<'a>, WireError> {
-    let has = |flag: u8| flags & flag != 0;
     Ok(match id {
         SubmessageId::PAD => Body::Pad,
         SubmessageId::INFO_TS => {
-            receiver.timestamp = if has(INVALIDATE) {
+            receiver.timestamp = if flags.contains(SubmessageFlags::INVALIDATE) {
                 RtpsTime::default()
             } else {
                 let seconds = body.u32("INFO_TS seconds")?;
@@ -260,14 +227,18 @@ pub(super) fn read<'a>(
         }
         SubmessageId::INFO_REPLY => {
             let unicast = LocatorList::read(&mut body)?;
-            let multicast = has(MULTICAST)
+            let multicast = flags
+                .contains(SubmessageFlags::MULTICAST)
                 .then(|| LocatorList::read(&mut body))
                 .transpose()?;
             Body::InfoReply(InfoReply::Lists(unicast, multicast))
         }
         SubmessageId::INFO_REPLY_IP4 => {
             let unicast = locator_ip4(&mut body)?;
-            let multicast = has(MULTICAST).then(|| locator_ip4(&mut body)).transpose()?;
+            let multicast = flags
+                .contains(SubmessageFlags::MULTICAST)
+                .then(|| locator_ip4(&mut body))
+                .transpose()?;
             Body::InfoReply(InfoReply::Ip4(unicast, multicast))
         }
         SubmessageId::ACKNACK => {
@@ -277,7 +248,7 @@ pub(super) fn read<'a>(
                 writer,
                 missing: SequenceNumberSet::read(&mut body)?,
                 count: body.u32("ACKNACK count")?,
-                is_final: has(FINAL),
+                is_final: flags.contains(SubmessageFlags::FINAL),
             })
         }
         SubmessageId::NACK_FRAG => {
@@ -285,23 +256,23 @@ pub(super) fn read<'a>(
             Body::NackFrag(NackFrag {
                 reader,
                 writer,
-                sequence_number: SequenceNumber::read_from(&mut body, "NACK_FRAG writerSN", 1)?,
+                sequence_number: sequence_number(&mut body, "NACK_FRAG writerSN", 1)?,
                 missing: FragmentNumberSet::read(&mut body)?,
                 count: body.u32("NACK_FRAG count")?,
             })
         }
         SubmessageId::HEARTBEAT => {
             let (reader, writer) = from_writer(&mut body, receiver)?;
-            let first = SequenceNumber::read_from(&mut body, "HEARTBEAT firstSN", 1)?;
-            let last = SequenceNumber::read_from(&mut body, "HEARTBEAT lastSN", first.0 - 1)?;
+            let first = sequence_number(&mut body, "HEARTBEAT firstSN", 1)?;
+            let last = sequence_number(&mut body, "HEARTBEAT lastSN", first.0 - 1)?;
             Body::Heartbeat(Heartbeat {
                 reader,
                 writer,
                 first,
                 last,
                 count: body.u32("HEARTBEAT count")?,
-                is_final: has(FINAL),
-                is_liveliness: has(LIVELINESS),
+                is_final: flags.contains(SubmessageFlags::FINAL),
+                is_liveliness: flags.contains(SubmessageFlags::LIVELINESS),
             })
         }
         SubmessageId::HEARTBEAT_FRAG => {
@@ -309,11 +280,7 @@ pub(super) fn read<'a>(
             Body::HeartbeatFrag(HeartbeatFrag {
                 reader,
                 writer,
-                sequence_number: SequenceNumber::read_from(
-                    &mut body,
-                    "HEARTBEAT_FRAG writerSN",
-                    1,
-                )?,
+                sequence_number: sequence_number(&mut body, "HEARTBEAT_FRAG writerSN", 1)?,
                 last_fragment: body.u32("HEARTBEAT_FRAG lastFragmentNum")?,
                 count: body.u32("HEARTBEAT_FRAG count")?,
             })
@@ -323,7 +290,7 @@ pub(super) fn read<'a>(
             Body::Gap(Gap {
                 reader,
                 writer,
-                start: SequenceNumber::read_from(&mut body, "GAP gapStart", 1)?,
+                start: sequence_number(&mut body, "GAP gapStart", 1)?,
                 list: SequenceNumberSet::read(&mut body)?,
             })
         }
@@ -358,18 +325,26 @@ fn from_reader(body: &mut Cursor<'_>, receiver: &Receiver) -> Result<(Guid, Guid
     ))
 }
 
-fn data<'a>(flags: u8, mut body: Cursor<'a>, receiver: &Receiver) -> Result<Data<'a>, WireError> {
-    let has = |flag: u8| flags & flag != 0;
-    if has(DATA) && has(KEY) {
+fn data<'a>(
+    flags: SubmessageFlags,
+    mut body: Cursor<'a>,
+    receiver: &Receiver,
+) -> Result<Data<'a>, WireError> {
+    let (has_data, has_key) = (
+        flags.contains(SubmessageFlags::DATA),
+        flags.contains(SubmessageFlags::KEY),
+    );
+    if has_data && has_key {
         return Err(body.error("DATA flags", Reason::BadValue));
     }
     let mut rest = after_octets_to_inline_qos(&mut body, 16)?;
     let (reader, writer) = from_writer(&mut body, receiver)?;
-    let sequence_number = SequenceNumber::read_from(&mut body, "DATA writerSN", 1)?;
-    let inline_qos = has(INLINE_QOS)
-        .then(|| ParameterList::take(&mut rest))
+    let sequence_number = sequence_number(&mut body, "DATA writerSN", 1)?;
+    let inline_qos = flags
+        .contains(SubmessageFlags::INLINE_QOS)
+        .then(|| parameter_list(&mut rest))
         .transpose()?;
-    let payload = match (has(DATA), has(KEY)) {
+    let payload = match (has_data, has_key) {
         (true, _) => Payload::Data(rest.rest()),
         (_, true) => Payload::Key(rest.rest()),
         _ => Payload::None,
@@ -384,20 +359,21 @@ fn data<'a>(flags: u8, mut body: Cursor<'a>, receiver: &Receiver) -> Result<Data
 }
 
 fn data_frag<'a>(
-    flags: u8,
+    flags: SubmessageFlags,
     mut body: Cursor<'a>,
     receiver: &Receiver,
 ) -> Result<DataFrag<'a>, WireError> {
     let mut rest = after_octets_to_inline_qos(&mut body, 28)?;
     let (reader, writer) = from_writer(&mut body, receiver)?;
-    let sequence_number = SequenceNumber::read_from(&mut body, "DATA_FRAG writerSN", 1)?;
+    let sequence_number = sequence_number(&mut body, "DATA_FRAG writerSN", 1)?;
     let numbers = body.error("DATA_FRAG fragment numbers", Reason::BadValue);
     let starting = body.u32("DATA_FRAG fragmentStartingNum")?;
     let count = body.u16("DATA_FRAG fragmentsInSubmessage")?;
     let fragment_size = body.u16("DATA_FRAG fragmentSize")?;
     let sample_size = body.u32("DATA_FRAG sampleSize")?;
-    let inline_qos = (flags & INLINE_QOS != 0)
-        .then(|| ParameterList::take(&mut rest))
+    let inline_qos = flags
+        .contains(SubmessageFlags::INLINE_QOS)
+        .then(|| parameter_list(&mut rest))
         .transpose()?;
 
     // The fragments in here span [begin, end) of the payload; the last one may be shorter.
@@ -418,7 +394,7 @@ fn data_frag<'a>(
         fragment_size,
         sample_size,
         inline_qos,
-        is_key: flags & FRAGMENT_KEY != 0,
+        is_key: flags.contains(SubmessageFlags::FRAGMENT_KEY),
         bytes: rest.take("DATA_FRAG fragments", length)?,
     })
 }
@@ -441,6 +417,20 @@ fn after_octets_to_inline_qos<'a>(
     Ok(rest)
 }
 
+/// The list at the cursor, which moves behind the sentinel: only the sentinel shows where a payload
+/// begins.
+fn parameter_list<'a>(cursor: &mut Cursor<'a>) -> Result<ParameterList<'a>, WireError> {
+    let list = ParameterList::inline(*cursor);
+    loop {
+        let id = ParameterId(cursor.u16("parameter id")?);
+        let length = usize::from(cursor.u16("parameter length")?);
+        if id == ParameterId::SENTINEL {
+            return Ok(list);
+        }
+        cursor.take("parameter", length.next_multiple_of(4))?;
+    }
+}
+
 /// `LocatorUDPv4_t` (RTPS 2.5, 9.4.2.10): address and port as numbers.
 fn locator_ip4(body: &mut Cursor<'_>) -> Result<Locator, WireError> {
     let [a, b, c, d] = body.u32("INFO_REPLY_IP4 address")?.to_be_bytes();
@@ -451,4 +441,30 @@ fn locator_ip4(body: &mut Cursor<'_>) -> Result<Locator, WireError> {
         port,
         address,
     })
+}
+
+/// A counted list of locators, shown to be there but not copied.
+#[derive(Clone, Copy, Debug)]
+pub struct LocatorList<'a> {
+    rest: Cursor<'a>,
+}
+
+impl<'a> LocatorList<'a> {
+    /// `u32` count, then that many locators.
+    fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
+        let error = cursor.error("locator list", Reason::BadLength);
+        let count = usize::try_from(cursor.u32("locator count")?).map_err(|_| error)?;
+        let length = count.checked_mul(Locator::LEN).ok_or(error)?;
+        Ok(Self {
+            rest: cursor.sub("locator list", length)?,
+        })
+    }
+}
+
+impl Iterator for LocatorList<'_> {
+    type Item = Locator;
+
+    fn next(&mut self) -> Option<Locator> {
+        Locator::read(&mut self.rest).ok()
+    }
 }

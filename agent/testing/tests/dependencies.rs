@@ -1,0 +1,187 @@
+//! Which crate may depend on which. An arrow upwards fails here with one line that names it.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::Command;
+
+use serde_json::Value;
+
+/// Each crate with the crates of this workspace that it may depend on, lowest first. A crate may
+/// depend on those above it in this list alone, so no cycle can be allowed by mistake.
+const ALLOWED: &[(&str, &[&str])] = &[
+    ("wire", &[]),
+    ("model", &["wire"]),
+    ("capture", &["wire", "model"]),
+    // Both read payloads and times with the one bounded cursor.
+    ("message", &["wire"]),
+    ("bag", &["wire"]),
+    ("api", &[]),
+    ("page", &[]),
+    (
+        "daemon",
+        &["wire", "model", "capture", "message", "bag", "api", "page"],
+    ),
+    // The package is called ros2probe. `rp discover`, `rp doctor` and `rp top` use parts of the
+    // model and the capture beside the daemon.
+    (
+        "cli",
+        &[
+            "wire", "model", "capture", "message", "bag", "api", "daemon",
+        ],
+    ),
+];
+
+/// Libraries that must not be in the model's tree: it has no I/O, no clock, no configuration.
+const NOT_IN_MODEL: &[&str] = &[
+    "anyhow",
+    "axum",
+    "aya",
+    "caps",
+    "clap",
+    "hyper",
+    "libc",
+    "rustix",
+    "schemars",
+    "serde_json",
+    "socket2",
+    "tokio",
+    "tracing",
+    "utoipa",
+];
+
+/// Libraries that must not be in the tree of any of these crates.
+const NO_RUNTIME: &[&str] = &["axum", "hyper", "tokio", "tonic"];
+
+struct Workspace {
+    /// Package id by name.
+    ids: BTreeMap<String, String>,
+    /// Name by package id.
+    names: BTreeMap<String, String>,
+    /// Ids of normal dependencies by package id.
+    dependencies: BTreeMap<String, Vec<String>>,
+}
+
+impl Workspace {
+    fn read() -> Self {
+        let manifest = ros2probe_testing::repository("Cargo.toml");
+        let output = Command::new(env!("CARGO"))
+            .args(["metadata", "--format-version=1", "--locked", "--offline"])
+            .arg("--manifest-path")
+            .arg(manifest)
+            .output()
+            .unwrap();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "cargo metadata: {errors}");
+        let metadata: Value = serde_json::from_slice(&output.stdout).unwrap();
+        let text = |value: &Value| value.as_str().unwrap().to_owned();
+        let packages = metadata["packages"].as_array().unwrap().iter();
+        let names: BTreeMap<_, _> = packages
+            .map(|package| (text(&package["id"]), text(&package["name"])))
+            .collect();
+        let members = metadata["workspace_members"].as_array().unwrap().iter();
+        let ids = members
+            .map(|id| (names[&text(id)].clone(), text(id)))
+            .collect();
+        let nodes = metadata["resolve"]["nodes"].as_array().unwrap().iter();
+        let is_normal = |dependency: &&Value| {
+            let kinds = dependency["dep_kinds"].as_array().unwrap();
+            kinds.iter().any(|kind| kind["kind"].is_null())
+        };
+        let dependencies = nodes
+            .map(|node| {
+                let all = node["deps"].as_array().unwrap().iter();
+                let normal = all.filter(is_normal).map(|each| text(&each["pkg"]));
+                (text(&node["id"]), normal.collect())
+            })
+            .collect();
+        Self {
+            ids,
+            names,
+            dependencies,
+        }
+    }
+
+    /// Names of what a crate depends on, directly.
+    fn direct(&self, name: &str) -> BTreeSet<&str> {
+        let dependencies = self.dependencies[&self.ids[name]].iter();
+        dependencies.map(|id| self.names[id].as_str()).collect()
+    }
+
+    /// Names of all that a crate is built from, without itself.
+    fn tree(&self, name: &str) -> BTreeSet<&str> {
+        let mut waiting = vec![&self.ids[name]];
+        let mut seen = BTreeSet::new();
+        while let Some(id) = waiting.pop() {
+            for dependency in &self.dependencies[id] {
+                if seen.insert(dependency) {
+                    waiting.push(dependency);
+                }
+            }
+        }
+        seen.into_iter().map(|id| self.names[id].as_str()).collect()
+    }
+}
+
+fn package(room: &str) -> String {
+    match room {
+        "cli" => "ros2probe".to_owned(),
+        room => format!("ros2probe-{room}"),
+    }
+}
+
+#[test]
+fn no_crate_depends_on_one_above_it() {
+    let workspace = Workspace::read();
+    let mut listed = BTreeSet::from(["ros2probe-testing".to_owned()]);
+    for (place, (room, allowed)) in ALLOWED.iter().enumerate() {
+        let lower = ALLOWED[..place].iter().map(|(lower, _)| lower);
+        let lower: Vec<_> = lower.collect();
+        let name = package(room);
+        for allowed in *allowed {
+            assert!(
+                lower.contains(&allowed),
+                "{room} may not be allowed {allowed}"
+            );
+        }
+        for other in workspace.direct(&name) {
+            if !workspace.ids.contains_key(other) {
+                continue;
+            }
+            let is_allowed = allowed.iter().any(|allowed| package(allowed) == other);
+            assert!(is_allowed, "{name} must not depend on {other}");
+        }
+        listed.insert(name);
+    }
+    let members: BTreeSet<_> = workspace.ids.keys().cloned().collect();
+    assert_eq!(listed, members, "each crate needs a row in ALLOWED");
+}
+
+#[test]
+fn the_model_is_built_without_input_output_or_configuration() {
+    let workspace = Workspace::read();
+    let tree = workspace.tree("ros2probe-model");
+    for library in NOT_IN_MODEL {
+        assert!(
+            !tree.contains(library),
+            "ros2probe-model must not need {library}"
+        );
+    }
+}
+
+#[test]
+fn what_is_below_the_daemon_needs_no_runtime() {
+    let workspace = Workspace::read();
+    for room in ["wire", "model", "capture", "message", "bag", "api", "page"] {
+        let name = package(room);
+        let tree = workspace.tree(&name);
+        for library in NO_RUNTIME {
+            assert!(!tree.contains(library), "{name} must not need {library}");
+        }
+    }
+}
