@@ -1,4 +1,4 @@
-//! Serving connections: HTTP/1.1 with bounded heads, each request watched by the [`Pace`] of its
+//! Serving connections: HTTP/1.1 with bounded heads, each request watched by the [`ConnectionState`] of its
 //! connection, and an orderly end.
 
 use std::convert::Infallible;
