@@ -1,5 +1,8 @@
 //! Points in time and spans, as RTPS writes them and as the agent keeps them.
 
+/// One second in nanoseconds, the unit of [`Timestamp`].
+pub const SECOND: u64 = 1_000_000_000;
+
 /// Nanoseconds since the Unix epoch. The agent's only clock reading; always passed in.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct Timestamp(pub u64);

@@ -114,7 +114,7 @@ impl Compression {
     pub fn compress_file(self, source: &File, into: &File, progress: &Progress) -> io::Result<()> {
         let size = source.metadata()?.len();
         let source = BufReader::with_capacity(1 << 17, source);
-        let mut source = Watched::new(source, progress);
+        let mut source = ProgressReader::new(source, progress);
         match self {
             Self::None => {
                 io::copy(&mut source, &mut &*into)?;
@@ -141,14 +141,14 @@ impl Compression {
 }
 
 /// Remembers an error and ends, for `ruzstd` takes none.
-struct Watched<'a, R> {
+struct ProgressReader<'a, R> {
     inner: R,
     progress: &'a Progress,
     read: u64,
     failed: Option<io::Error>,
 }
 
-impl<'a, R: Read> Watched<'a, R> {
+impl<'a, R: Read> ProgressReader<'a, R> {
     fn new(inner: R, progress: &'a Progress) -> Self {
         Self {
             inner,
@@ -159,7 +159,7 @@ impl<'a, R: Read> Watched<'a, R> {
     }
 }
 
-impl<R: Read> Read for Watched<'_, R> {
+impl<R: Read> Read for ProgressReader<'_, R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         if self.failed.is_some() {
             return Ok(0);

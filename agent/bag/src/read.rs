@@ -198,10 +198,10 @@ fn read_at(file: &mut File, offset: u64, length: u64) -> io::Result<Vec<u8>> {
 }
 
 /// What is called for every message, with what is known of its channel by then.
-pub type Each<'a> = dyn FnMut(&Message<'_>, &Contents) + 'a;
+pub type Visitor<'a> = dyn FnMut(&Message<'_>, &Contents) + 'a;
 
 /// Reads a file record by record, `.zstd` and `.lz4` decompressed.
-pub fn scan(path: &Path, each: &mut Each<'_>) -> Result<Scan, ReadError> {
+pub fn scan(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
     let wrong = |source| ReadError::Io {
         path: path.to_owned(),
         source,
@@ -236,13 +236,13 @@ pub(super) fn compression(path: &Path) -> Compression {
     suffix.and_then(Compression::named).unwrap_or_default()
 }
 
-fn scan_records(records: &mut Records<'_>, each: &mut Each<'_>) -> io::Result<Scan> {
+fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result<Scan> {
     let mut scan = Scan {
         end: records.position,
         ..Scan::default()
     };
     // Indexes of the last chunk, until the next record of another kind.
-    let mut indexed: Option<Indexed> = None;
+    let mut indexed: Option<IndexedChunk> = None;
     let mut content = Vec::new();
     loop {
         let start = records.position;
@@ -276,8 +276,8 @@ fn scan_records(records: &mut Records<'_>, each: &mut Each<'_>) -> io::Result<Sc
                 let Some(chunk) = Chunk::read(&content) else {
                     return Ok(scan);
                 };
-                let index = look_into(&chunk, &mut records.expands, &mut scan, each)?;
-                indexed = Some(Indexed {
+                let index = read_chunk(&chunk, &mut records.expands, &mut scan, each)?;
+                indexed = Some(IndexedChunk {
                     chunk: ChunkIndex {
                         start: chunk.start,
                         end: chunk.end,
@@ -319,7 +319,7 @@ fn scan_records(records: &mut Records<'_>, each: &mut Each<'_>) -> io::Result<Sc
 }
 
 /// A chunk whose message indexes are being read.
-struct Indexed {
+struct IndexedChunk {
     chunk: ChunkIndex,
     offsets: BTreeMap<u16, u64>,
     length: u64,
@@ -328,7 +328,7 @@ struct Indexed {
 }
 
 /// `at_end`: the file ends here, and indexes that are missing can still be written.
-fn finish_chunk(indexed: Option<Indexed>, scan: &mut Scan, at_end: bool) {
+fn finish_chunk(indexed: Option<IndexedChunk>, scan: &mut Scan, at_end: bool) {
     let Some(mut indexed) = indexed else {
         return;
     };
@@ -344,11 +344,11 @@ fn finish_chunk(indexed: Option<Indexed>, scan: &mut Scan, at_end: bool) {
 }
 
 /// Of what may still be expanded, `left` goes down; a chunk beyond that ends the reading.
-fn look_into(
+fn read_chunk(
     chunk: &Chunk<'_>,
     left: &mut u64,
     scan: &mut Scan,
-    each: &mut Each<'_>,
+    each: &mut Visitor<'_>,
 ) -> io::Result<BTreeMap<u16, Vec<(u64, u64)>>> {
     let records = match Compression::named(chunk.compression) {
         Some(Compression::None) => return Ok(take_chunk(chunk.records, scan, each)),
@@ -386,7 +386,7 @@ fn expands_too_far() -> io::Error {
 fn take_chunk(
     records: &[u8],
     scan: &mut Scan,
-    each: &mut Each<'_>,
+    each: &mut Visitor<'_>,
 ) -> BTreeMap<u16, Vec<(u64, u64)>> {
     let mut index: BTreeMap<u16, Vec<(u64, u64)>> = BTreeMap::new();
     let mut rest = records;
@@ -407,7 +407,7 @@ fn take_chunk(
     index
 }
 
-fn take_message(message: &Message<'_>, scan: &mut Scan, each: &mut Each<'_>) {
+fn take_message(message: &Message<'_>, scan: &mut Scan, each: &mut Visitor<'_>) {
     scan.contents.count(message);
     *scan.sizes.entry(message.channel_id).or_default() += message.data.len() as u64;
     each(message, &scan.contents);

@@ -4,8 +4,8 @@
 //! Needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8); attaching the host hook to a
 //! cgroup needs CAP_NET_ADMIN besides.
 
-mod handed;
-mod host;
+mod host_hook;
+mod uprobe;
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
@@ -18,10 +18,10 @@ use ros2probe_wire::record::{Verdict, guid_words};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 use zerocopy::FromBytes;
 
-use super::inside::Places;
+use super::tracepoints::KernelLayout;
 
-pub use handed::{Form, Probe, Probes};
-pub use host::{CapturedPiece, Links};
+pub use host_hook::{CapturedPiece, Links};
+pub use uprobe::{Form, Probe, Probes};
 
 /// The object `agent-ebpf/build.sh` made. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
@@ -107,7 +107,7 @@ pub struct Filter {
     /// The wire hook's program, which its entry goes on with; the kernel empties it when this is
     /// closed.
     _wire: Option<ProgramArray<MapData>>,
-    host: Option<host::Hook>,
+    host: Option<host_hook::HostHook>,
     /// Captured datagrams, but not on the wire hook.
     pieces: Option<RingBuf<MapData>>,
     interest: HashMap<MapData, [u32; 4], u32>,
@@ -143,7 +143,7 @@ impl Filter {
     fn with_maps(
         ebpf: &mut Ebpf,
         program: ProgramFd,
-        host: Option<host::Hook>,
+        host: Option<host_hook::HostHook>,
     ) -> Result<Self, FilterError> {
         let mut budget: Array<_, i64> = take(ebpf, "BUDGET")?;
         for index in [Budget::CaptureBytes, Budget::Records] {
@@ -339,13 +339,13 @@ fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<i
 const UNUSED: u32 = 64;
 
 /// Opens the object and creates its maps, of which those named have another size.
-/// `host`: for the host hook. `places`: for programs that read the kernel's structures. `within`: the
+/// `host`: for the host hook. `layout`: for programs that read the kernel's structures. `within`: the
 /// control group of the processes whose messages into shared memory are looked at; 0 = all.
 fn open(
     settings: &FilterSettings,
     host: bool,
     sizes: &[(&'static str, u32)],
-    places: Option<&Places>,
+    layout: Option<&KernelLayout>,
     within: u64,
 ) -> Result<Ebpf, FilterError> {
     let in_place = u32::from(host);
@@ -370,8 +370,8 @@ fn open(
     for (map, size) in sizes {
         loader.map_max_entries(map, *size);
     }
-    if let Some(places) = places {
-        places.tell(&mut loader);
+    if let Some(layout) = layout {
+        layout.set_globals(&mut loader);
     }
     loader.load(&OBJECT.0).map_err(FilterError::load)
 }

@@ -13,22 +13,23 @@ use std::time::{Duration, Instant};
 
 use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
-use super::exact::Exact;
-use super::exact::search::Facts as ExactFacts;
+use super::clock_step::ClockStep;
 use super::filter::{Filter, FilterError};
-use super::host::{HostError, HostSettings, HostTap};
-use super::intake::{self, Intake};
+use super::filter_reader::{self, FilterReader};
+use super::host_tap::{HostTap, HostTapError, HostTapSettings};
 use super::interfaces::Selection;
 use super::netns::{self, NetnsError};
-use super::set_clock::SetClock;
-use super::shm::pace::Budget as Shares;
-use super::shm::scan::{Places, Scope};
+use super::shm::directories::{Scope, ShmDirectories};
+use super::shm::poll_interval::Budget as Shares;
 use super::shm::{self, SharedMemory};
 use super::system::{Clocks, give_back_memory, wait};
 use super::threads::Spawn;
-use super::wire::{self, TapError, WireSettings, WireTap};
+use super::uprobe::Uprobe;
+use super::uprobe::search::Facts as UprobeFacts;
+use super::wire_tap::{self, WireTap, WireTapError, WireTapSettings};
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
 use ros2probe_model::observer::{Observer, Wanted};
@@ -47,7 +48,6 @@ const GATHER: Duration = Duration::from_millis(10);
 /// Likewise while whole samples are captured: they fill the ring, a point cloud in a few
 /// milliseconds.
 const GATHER_PAYLOADS: Duration = Duration::from_millis(2);
-const SECOND: u64 = 1_000_000_000;
 const TENTH: u64 = SECOND / 10;
 
 /// Why capturing could not begin or go on.
@@ -55,10 +55,10 @@ const TENTH: u64 = SECOND / 10;
 pub enum CaptureError {
     /// The host hook was asked for and is not to be had.
     #[error("the host hook cannot be used")]
-    Host(#[from] HostError),
+    Host(#[from] HostTapError),
     /// An interface cannot be looked at.
     #[error(transparent)]
-    Tap(#[from] TapError),
+    Tap(#[from] WireTapError),
     /// Another network namespace.
     #[error(transparent)]
     Namespace(#[from] NetnsError),
@@ -80,7 +80,7 @@ pub struct LiveSource {
     /// Why the host hook is not used although it would show more.
     without_host: Option<String>,
     shared_memory: Shm,
-    exact: Option<Exact>,
+    exact: Option<Uprobe>,
     /// Why messages into shared memory are not seen in their senders although that was asked for.
     without_exact: Option<String>,
     /// When unclassified writers last got bytes and records to spend.
@@ -91,7 +91,7 @@ pub struct LiveSource {
     refused_updates: u64,
     clock: Timestamp,
     clocks: Clocks,
-    set_clock: SetClock,
+    clock_step: ClockStep,
 }
 
 /// What looks at shared memory. Its thread begins when the source is started.
@@ -167,7 +167,7 @@ impl LiveSource {
             refused_updates: 0,
             clock: clocks.now,
             clocks,
-            set_clock: SetClock::new(&clocks),
+            clock_step: ClockStep::new(&clocks),
         };
         source.refill(clocks.monotonic);
         Ok(source)
@@ -221,12 +221,12 @@ impl LiveSource {
         observer: &mut Observer,
     ) -> Result<(), CaptureError> {
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            let covers_all = self.exact.as_ref().is_some_and(Exact::covers_all);
+            let covers_all = self.exact.as_ref().is_some_and(Uprobe::covers_all);
             shared_memory.pause(covers_all);
         }
         let sockets = self.host.iter().flat_map(HostTap::descriptors);
         let interfaces = self.wires.iter().flat_map(WireTap::descriptors);
-        let processes = self.exact.iter().flat_map(Exact::descriptors);
+        let processes = self.exact.iter().flat_map(Uprobe::descriptors);
         let rings = bell.is_some().into();
         let looks = match &self.shared_memory {
             Shm::Running(shared_memory) => shared_memory.descriptor(),
@@ -246,7 +246,7 @@ impl LiveSource {
             });
         }
         let mut clocks = Clocks::read();
-        let step = self.set_clock.look(&mut clocks);
+        let step = self.clock_step.update(&mut clocks);
         if step != 0 {
             let milliseconds = step / 1_000_000;
             tracing::info!(
@@ -260,20 +260,20 @@ impl LiveSource {
         self.refill(clocks.monotonic);
         let mut settle = 0;
         if let Some(host) = &mut self.host {
-            host.take_in(&clocks, observer);
-            settle = intake::SETTLE_NANOSECONDS;
+            host.poll(&clocks, observer);
+            settle = filter_reader::SETTLE_NANOSECONDS;
         }
         self.leave_exact_mode(&clocks, observer);
         if let Some(exact) = &mut self.exact {
-            exact.take_in(&clocks, observer);
-            settle = intake::SETTLE_NANOSECONDS;
+            exact.poll(&clocks, observer);
+            settle = filter_reader::SETTLE_NANOSECONDS;
         }
         for wire in &mut self.wires {
-            wire.take_in(&clocks, observer)?;
-            settle = settle.max(wire::SETTLE_NANOSECONDS);
+            wire.poll(&clocks, observer)?;
+            settle = settle.max(wire_tap::SETTLE_NANOSECONDS);
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.take_in(&clocks, observer);
+            shared_memory.poll(&clocks, observer);
         }
         if clocks.monotonic.wrapping_sub(self.wanted_asked) >= TENTH {
             self.wanted_asked = clocks.monotonic;
@@ -308,7 +308,7 @@ impl LiveSource {
             wire.drain(&clocks, observer);
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.take_in(&clocks, observer);
+            shared_memory.poll(&clocks, observer);
         }
     }
 
@@ -316,7 +316,7 @@ impl LiveSource {
     /// unknown to them, and is counted.
     pub fn apply(&mut self, changes: &[(Guid, Option<Verdict>)]) {
         for (endpoint, verdict) in changes {
-            self.tell(|filter| filter.set_interest(*endpoint, *verdict));
+            self.each_filter(|filter| filter.set_interest(*endpoint, *verdict));
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
             shared_memory.apply(changes);
@@ -325,7 +325,7 @@ impl LiveSource {
 
     /// Notes from now on, or no longer, when a participant last sent anything.
     pub fn follow(&mut self, participant: GuidPrefix, follow: bool) {
-        self.tell(|filter| filter.follow_participant(participant, follow));
+        self.each_filter(|filter| filter.follow_participant(participant, follow));
     }
 
     /// Updates that a kernel map had no room for, or that the kernel refused.
@@ -372,7 +372,7 @@ impl LiveSource {
         self.wires
             .iter_mut()
             .map(|wire| {
-                wire.look_for_namespace();
+                wire.check_namespace();
                 Ok(DropCount {
                     dropped: wire.drops()?,
                     namespace: wire.namespace().map(Path::to_path_buf),
@@ -398,7 +398,7 @@ impl LiveSource {
     /// Bytes that came from the kernel: frames, datagrams and records.
     #[must_use]
     pub fn copied_bytes(&self) -> u64 {
-        let host: u64 = self.intakes().map(Intake::copied_bytes).sum();
+        let host: u64 = self.readers().map(FilterReader::copied_bytes).sum();
         host + self.wires.iter().map(WireTap::copied_bytes).sum::<u64>()
     }
 
@@ -406,7 +406,7 @@ impl LiveSource {
     /// together here.
     #[must_use]
     pub fn incomplete_datagrams(&self) -> u64 {
-        let host: u64 = self.intakes().map(Intake::incomplete_datagrams).sum();
+        let host: u64 = self.readers().map(FilterReader::incomplete_datagrams).sum();
         let wires = self.wires.iter().map(WireTap::incomplete_datagrams);
         host + wires.sum::<u64>()
     }
@@ -420,7 +420,7 @@ impl LiveSource {
     /// Bytes held to put captured datagrams together that come in pieces.
     #[must_use]
     pub fn waiting_bytes(&self) -> usize {
-        self.intakes().map(Intake::waiting_bytes).sum()
+        self.readers().map(FilterReader::waiting_bytes).sum()
     }
 
     /// Datagrams given up because there were too many fragments.
@@ -447,14 +447,14 @@ impl LiveSource {
     /// What is attached to processes that send into shared memory, if that was asked for and can be
     /// had.
     #[must_use]
-    pub fn exact(&self) -> Option<ExactFacts> {
-        self.exact.as_ref().map(Exact::facts)
+    pub fn exact(&self) -> Option<UprobeFacts> {
+        self.exact.as_ref().map(Uprobe::facts)
     }
 
     /// Messages that were captured whole in the processes that sent them.
     #[must_use]
     pub fn messages_of_processes(&self) -> Option<u64> {
-        Some(self.exact.as_ref()?.intake().datagrams())
+        Some(self.exact.as_ref()?.reader().datagrams())
     }
 
     /// Why they are not looked at there although that was asked for, in plain words.
@@ -490,16 +490,16 @@ impl LiveSource {
         }
     }
 
-    fn intakes(&self) -> impl Iterator<Item = &Intake> {
-        let host = self.host.iter().map(HostTap::intake);
-        host.chain(self.exact.iter().map(Exact::intake))
+    fn readers(&self) -> impl Iterator<Item = &FilterReader> {
+        let host = self.host.iter().map(HostTap::reader);
+        host.chain(self.exact.iter().map(Uprobe::reader))
     }
 
     fn start_shared_memory(&mut self, spawn: Spawn) {
         let Shm::Later(scope, budget) = &self.shared_memory else {
             return;
         };
-        let started = SharedMemory::start(Places::new(scope.clone()), *budget, spawn);
+        let started = SharedMemory::start(ShmDirectories::new(scope.clone()), *budget, spawn);
         self.shared_memory = match started {
             Ok(running) => Shm::Running(running),
             Err(error) => {
@@ -511,13 +511,13 @@ impl LiveSource {
     }
 
     fn filters(&self) -> impl Iterator<Item = &Filter> {
-        let intakes = self.intakes().map(Intake::filter);
-        intakes.chain(self.wires.iter().map(WireTap::filter))
+        let readers = self.readers().map(FilterReader::filter);
+        readers.chain(self.wires.iter().map(WireTap::filter))
     }
 
-    fn tell(&mut self, mut what: impl FnMut(&mut Filter) -> Result<(), FilterError>) {
+    fn each_filter(&mut self, mut what: impl FnMut(&mut Filter) -> Result<(), FilterError>) {
         let host = self.host.iter_mut().map(HostTap::filter_mut);
-        let exact = self.exact.iter_mut().map(Exact::filter_mut);
+        let exact = self.exact.iter_mut().map(Uprobe::filter_mut);
         for filter in host
             .chain(exact)
             .chain(self.wires.iter_mut().map(WireTap::filter_mut))
@@ -530,12 +530,12 @@ impl LiveSource {
         if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND {
             self.bytes_refilled = monotonic;
             let (budget, amount) = (Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND);
-            self.tell(|filter| filter.set_unknown_budget(budget, amount));
+            self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
         if monotonic.wrapping_sub(self.records_refilled) >= TENTH {
             self.records_refilled = monotonic;
             let (budget, amount) = (Budget::Records, UNKNOWN_RECORDS_PER_TENTH);
-            self.tell(|filter| filter.set_unknown_budget(budget, amount));
+            self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
     }
 }
@@ -544,7 +544,7 @@ impl LiveSource {
 fn scope(settings: &CaptureSettings, host: bool) -> Scope {
     match &settings.cgroup {
         Some(cgroup) if host => Scope::Cgroup(cgroup.clone()),
-        _ if host => Scope::Everybody,
+        _ if host => Scope::AllProcesses,
         _ => {
             let own = PathBuf::from("/proc/self/ns/net");
             let networks = std::iter::once(own).chain(settings.network_namespaces.clone());
@@ -566,7 +566,7 @@ fn open_host(
         }
         SourceChoice::Host | SourceChoice::Auto => {}
     }
-    let opened = HostTap::open(&HostSettings {
+    let opened = HostTap::open(&HostTapSettings {
         cgroup: settings.cgroup.clone(),
         ring_bytes: settings.ring_bytes,
         record_ring_bytes: settings.record_ring_bytes,
@@ -580,7 +580,7 @@ fn open_host(
 
 /// The programs for messages into shared memory, or why there are none. Without them shared memory
 /// is looked at as usual.
-fn open_exact(settings: &CaptureSettings, host: bool) -> (Option<Exact>, Option<String>) {
+fn open_exact(settings: &CaptureSettings, host: bool) -> (Option<Uprobe>, Option<String>) {
     if settings.shm.exact == ExactChoice::Off {
         return (None, None);
     }
@@ -589,7 +589,7 @@ fn open_exact(settings: &CaptureSettings, host: bool) -> (Option<Exact>, Option<
         let reason = "it goes with looking at the host's sockets (capture.source)";
         return (None, Some(reason.to_owned()));
     }
-    let opened = Exact::open(
+    let opened = Uprobe::open(
         settings.cgroup.as_deref(),
         settings.ring_bytes,
         settings.record_ring_bytes,
@@ -613,7 +613,7 @@ fn open_wires(
         bytes: share.max(LEAST_REASSEMBLY),
         ..limits
     };
-    let wire = WireSettings {
+    let wire = WireTapSettings {
         selection,
         ring_bytes: settings.ring_bytes,
         record_ring_bytes: settings.record_ring_bytes,

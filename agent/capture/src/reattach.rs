@@ -14,8 +14,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{Builder, JoinHandle};
 use std::time::Duration;
 
+use super::cgroup::{Cgroup, CgroupError};
 use super::filter::{FilterError, Links};
-use super::hierarchy::{Cgroup, HierarchyError};
 use super::live::in_words;
 use super::system::{DirectoryWatch, wait};
 use crate::threads::{Spawn, Task};
@@ -57,7 +57,7 @@ struct Follow {
 #[derive(Debug, thiserror::Error)]
 enum ReattachError {
     #[error(transparent)]
-    Hierarchy(#[from] HierarchyError),
+    Hierarchy(#[from] CgroupError),
     #[error(transparent)]
     Filter(#[from] FilterError),
 }
@@ -120,7 +120,7 @@ impl Follow {
             if let (Some(watch), Some(above)) = (&mut watch, self.path.parent()) {
                 watch.add(above);
             }
-            self.look();
+            self.check();
             let ended = ended.as_fd();
             let is_over = match &watch {
                 Some(watch) => wait(&[ended, watch.as_fd()], EVERY),
@@ -135,7 +135,7 @@ impl Follow {
         }
     }
 
-    fn look(&mut self) {
+    fn check(&mut self) {
         let there = identity(&self.path);
         if self.attached.is_some() && there == self.attached {
             return;

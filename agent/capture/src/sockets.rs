@@ -9,15 +9,15 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use ros2probe_wire::host::Socket;
+use ros2probe_wire::time::SECOND;
 
-use super::control_groups::ControlGroups;
+use super::cgroup_paths::CgroupPaths;
 use super::filter::Filter;
-use super::inside::Inside;
 use super::owners::Owner;
+use super::tracepoints::Tracepoints;
 use ros2probe_model::observer::Observer;
 use ros2probe_model::snapshot::SocketFacts;
 
-const SECOND: u64 = 1_000_000_000;
 /// How often new sockets are looked for.
 const PERIOD: u64 = 2 * SECOND;
 /// How often all owners are asked for anew: sockets are closed, and count what they drop.
@@ -28,7 +28,7 @@ const MOST_QUESTIONS: u8 = 3;
 /// What is known of all of them.
 #[derive(Debug)]
 pub struct Sockets {
-    groups: ControlGroups,
+    groups: CgroupPaths,
     known: BTreeMap<u64, Known>,
     looked: u64,
     asked: u64,
@@ -51,7 +51,7 @@ impl Sockets {
     #[must_use]
     pub const fn new(hierarchy: PathBuf) -> Self {
         Self {
-            groups: ControlGroups::new(hierarchy),
+            groups: CgroupPaths::new(hierarchy),
             known: BTreeMap::new(),
             looked: 0,
             asked: 0,
@@ -67,10 +67,10 @@ impl Sockets {
         self.looked = now;
         let met: BTreeMap<u64, Socket> = filter.sockets().collect();
         self.forget(&met, observer);
-        let owners = self.owners(filter.inside(), &met, now);
+        let owners = self.owners(filter.tracepoints(), &met, now);
         let asked = owners.is_some();
         if let Some(owners) = owners {
-            self.take_in(owners, &met, observer);
+            self.poll(owners, &met, observer);
         }
         let groups: BTreeSet<u64> = met.values().map(|socket| socket.cgroup).collect();
         self.groups.refresh(&groups);
@@ -106,7 +106,7 @@ impl Sockets {
     /// All owners, when it is worth asking.
     fn owners(
         &mut self,
-        inside: Option<&Inside>,
+        inside: Option<&Tracepoints>,
         met: &BTreeMap<u64, Socket>,
         now: u64,
     ) -> Option<BTreeMap<u64, Owner>> {
@@ -130,7 +130,7 @@ impl Sockets {
         found.ok()
     }
 
-    fn take_in(
+    fn poll(
         &mut self,
         mut owners: BTreeMap<u64, Owner>,
         met: &BTreeMap<u64, Socket>,
@@ -169,7 +169,7 @@ impl Known {
         Some(dropped.saturating_sub(socket.no_room))
     }
 
-    fn facts(&self, cookie: u64, socket: &Socket, groups: &ControlGroups) -> SocketFacts {
+    fn facts(&self, cookie: u64, socket: &Socket, groups: &CgroupPaths) -> SocketFacts {
         let owner = self.owner.as_ref();
         let unnamed = self.unnamed(socket).zip(self.dropped_before);
         SocketFacts {
@@ -214,7 +214,7 @@ mod tests {
         };
         let mut look = |all: &mut Sockets, dropped, no_room| {
             let owners = BTreeMap::from([(1, owner(dropped))]);
-            all.take_in(owners, &sockets(&[1], no_room), &mut observer);
+            all.poll(owners, &sockets(&[1], no_room), &mut observer);
             drops(all, no_room)
         };
         assert_eq!(look(&mut all, 100, 0), 0);
@@ -231,8 +231,8 @@ mod tests {
         let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
         let met = sockets(&[1, 2], 0);
         let owners = BTreeMap::from([(1, owner(0)), (2, owner(0))]);
-        all.take_in(owners, &met, &mut observer);
-        all.take_in(BTreeMap::from([(2, owner(0))]), &met, &mut observer);
+        all.poll(owners, &met, &mut observer);
+        all.poll(BTreeMap::from([(2, owner(0))]), &met, &mut observer);
         let questions = |all: &Sockets, cookie| all.known.get(&cookie).unwrap().questions;
         assert_eq!(questions(&all, 1), MOST_QUESTIONS);
         assert!(all.known.get(&1).unwrap().owner.is_none());

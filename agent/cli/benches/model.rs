@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
-use ros2probe::capture::feed::Feed;
+use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Watch, Watchlist};
@@ -246,7 +246,7 @@ fn captures(criterion: &mut Criterion) {
             bencher.iter(|| {
                 let mut world = observer(0);
                 let mut reader = PcapReader::open(&path).unwrap();
-                Feed::new(Limits::default())
+                FrameDecoder::new(Limits::default())
                     .run(&mut reader, &mut world)
                     .unwrap();
                 world

@@ -10,7 +10,7 @@ use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::agent::configuration;
 use ros2probe_daemon::config::{CaptureSettings, ShmMode, SourceChoice};
 use ros2probe_daemon::discover::session::{MOST_PACKETS, Session, Target};
-use ros2probe_daemon::discover::{converse, speaker};
+use ros2probe_daemon::discover::{converse, local_participant};
 use ros2probe_daemon::privilege;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::ParticipantFacts;
@@ -130,13 +130,13 @@ fn describe(participant: &ParticipantFacts) -> String {
 
 /// Asks one; whether it told everything.
 fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
-    let (speaker, socket) = speaker(target, domain_id)?;
-    let mut session = Session::new(speaker, *target, !options.no_nodes);
+    let (local_participant, socket) = local_participant(target, domain_id)?;
+    let mut session = Session::new(local_participant, *target, !options.no_nodes);
     let will = if options.dry_run { "would" } else { "will" };
     writeln!(
         out,
         "\n{}: {will} send at most {MOST_PACKETS} packets, from {}, normally these:",
-        target.prefix, speaker.address
+        target.prefix, local_participant.address
     )?;
     for packet in session.plan() {
         let (what, bytes) = (packet.what, packet.bytes.len());

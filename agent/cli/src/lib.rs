@@ -16,7 +16,7 @@
 pub use ros2probe_bag as bag;
 pub use ros2probe_capture as capture;
 pub use ros2probe_daemon::{
-    config, discover, file, privilege, recording, run, state, subscriptions, surface, visible,
+    config, discover, escape, file, privilege, recording, run, state, subscriptions, surface,
     watches,
 };
 pub use ros2probe_message as message;

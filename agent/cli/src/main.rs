@@ -11,11 +11,11 @@ use anyhow::Result;
 use clap::Parser as _;
 use ros2probe_daemon::agent;
 use ros2probe_daemon::config::{Config, ConfigError};
-use ros2probe_daemon::privilege::{ConfineError, Missing, StillPowerful};
+use ros2probe_daemon::escape::visible_lines;
+use ros2probe_daemon::privilege::{CapabilitiesRemain, ConfineError, Missing};
 use ros2probe_daemon::surface::otlp::SettingsError;
-use ros2probe_daemon::visible::visible_lines;
 
-use cli::{Arguments, Command, Said};
+use cli::{Arguments, Command, UserError};
 
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
@@ -59,13 +59,13 @@ fn check_config(file: &Path) -> Result<()> {
 fn message(error: &anyhow::Error) -> String {
     match error.downcast_ref::<ConfigError>() {
         Some(mistakes @ ConfigError::Invalid { .. }) => mistakes.to_string(),
-        _ if error.is::<Said>() => error.to_string(),
+        _ if error.is::<UserError>() => error.to_string(),
         _ => format!("rp: {error:#}"),
     }
 }
 
 fn exit_code(error: &anyhow::Error) -> ExitCode {
-    if error.is::<Missing>() || error.is::<StillPowerful>() || error.is::<ConfineError>() {
+    if error.is::<Missing>() || error.is::<CapabilitiesRemain>() || error.is::<ConfineError>() {
         ExitCode::from(NO_PERMISSION)
     } else if error.is::<ConfigError>() || error.is::<SettingsError>() {
         ExitCode::from(BAD_CONFIG)

@@ -18,11 +18,11 @@ use tokio_util::sync::CancellationToken;
 
 use crate::config::{Access, Config, ConfigError, PageChoice, Watch};
 use crate::logging::Log;
-use crate::privilege::{self, Identity, Powerless, Role, Sandbox};
+use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
 use crate::recording::{Recordings, Refusal, Snapshots};
 use crate::run::replay::Replay;
 use crate::run::{Run, Source};
-use crate::state::{Keeper, StateDirectory};
+use crate::state::{StateDirectory, StateWriter};
 use crate::subscriptions::{Caps, Subscriptions};
 use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
 use crate::surface::api::reload::Reloads;
@@ -62,7 +62,7 @@ pub struct Options {
 pub struct Listen(pub Option<SocketAddr>);
 
 /// What an agent is made of.
-pub struct Blueprint<'a> {
+pub struct Components<'a> {
     /// Limits, recordings and whether the page is served.
     pub config: &'a Config,
     /// Where datagrams come from.
@@ -74,7 +74,7 @@ pub struct Blueprint<'a> {
     /// What is watched.
     pub watches: Arc<Watches>,
     /// Writes down what discovery knows.
-    pub keeper: Option<Keeper>,
+    pub keeper: Option<StateWriter>,
     /// Directory of recordings; `None` = recordings are refused.
     pub recordings: Option<PathBuf>,
     /// Finds definitions of messages.
@@ -88,7 +88,7 @@ pub struct Blueprint<'a> {
 }
 
 /// An agent that is ready to run.
-pub struct Parts {
+pub struct AssembledAgent {
     /// The loop of the working thread.
     pub run: Run,
     /// What the API answers from.
@@ -97,12 +97,12 @@ pub struct Parts {
     pub reloads: Reloads,
 }
 
-impl Blueprint<'_> {
+impl Components<'_> {
     /// Connects the parts. Starts the threads of configured snapshots, and no other.
     ///
     /// # Errors
     /// Returns [`Refusal`] if a snapshot cannot be kept.
-    pub fn assemble(self) -> Result<Parts, Refusal> {
+    pub fn assemble(self) -> Result<AssembledAgent, Refusal> {
         let Self { config, board, .. } = self;
         let caps = Caps {
             subscriptions: config.limits.subscriptions,
@@ -153,7 +153,7 @@ impl Blueprint<'_> {
             reloader,
             stop: self.stop,
         };
-        Ok(Parts {
+        Ok(AssembledAgent {
             run: run.keeping(self.keeper).remembering(history),
             context,
             reloads,
@@ -235,11 +235,13 @@ pub fn run(options: Options) -> Result<()> {
         if keeps_watches {
             watches.keep_in(Arc::clone(&directory))?;
         }
-        keeps_known.then(|| Keeper::start(directory)).transpose()
+        keeps_known
+            .then(|| StateWriter::start(directory))
+            .transpose()
     };
     let keeper = state.map_or(Ok(None), keep);
     let stop = CancellationToken::new();
-    let blueprint = Blueprint {
+    let components = Components {
         config: &config,
         source,
         observer,
@@ -259,7 +261,7 @@ pub fn run(options: Options) -> Result<()> {
         },
         stop: stop.clone(),
     };
-    let parts = blueprint.assemble().context("recordings.snapshots")?;
+    let parts = components.assemble().context("recordings.snapshots")?;
     if options.report && server.is_none() && control.is_empty() {
         let ended = worker.finish(parts.run);
         print!("{}", Exposition::new(board).render(Format::Classic)?);
@@ -326,9 +328,9 @@ fn listeners(config: &Config, board: &Arc<Board>) -> Result<(Option<Server>, api
 }
 
 /// Gives up the privileges of this thread, and reads back that none is left.
-fn give_up() -> Result<Powerless> {
+fn give_up() -> Result<Unprivileged> {
     privilege::confine(Role::Service)?;
-    let powerless = Powerless::verify()?;
+    let powerless = Unprivileged::verify()?;
     if let Sandbox::Unfiltered(reason) = privilege::sandbox() {
         tracing::warn!(reason, "system calls are not filtered");
     }

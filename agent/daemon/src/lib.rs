@@ -1,6 +1,6 @@
 //! The agent: brings what its sources capture to the model, and serves what the model knows.
 //!
-//! - [`agent::run`] is the life of an agent. [`agent::Blueprint`] composes one, live or replayed.
+//! - [`agent::run`] is the life of an agent. [`agent::Components`] composes one, live or replayed.
 //! - [`config`] reads the configuration, [`watches`] merges what is watched.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
 //! - [`surface`] serves snapshots: Prometheus, OTLP, the API and the page.
@@ -18,6 +18,7 @@ pub mod agent;
 pub mod config;
 mod control;
 pub mod discover;
+pub mod escape;
 pub mod file;
 mod logging;
 mod memory;
@@ -28,5 +29,4 @@ pub mod state;
 pub mod subscriptions;
 mod supervise;
 pub mod surface;
-pub mod visible;
 pub mod watches;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use crate::config::{StateChoice, Watch};
 use crate::state::{Loaded, Newer, StateDirectory};
-use crate::watches::{self, Kept, Watches};
+use crate::watches::{self, LoadedWatches, Watches};
 use anyhow::anyhow;
 use ros2probe_model::discovery::Memory;
 
@@ -113,17 +113,17 @@ pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> 
 fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
     let path = directory.path().display();
     Some(match watches::load(directory) {
-        Kept::Nothing => Vec::new(),
-        Kept::Newer(newer) => {
+        LoadedWatches::Nothing => Vec::new(),
+        LoadedWatches::Newer(newer) => {
             left_alone(&newer);
             return None;
         }
-        Kept::These(watches) => {
+        LoadedWatches::These(watches) => {
             tracing::info!(%path, watches = watches.len(), "restored the watches that clients \
                 added");
             watches
         }
-        Kept::Unusable { reason, aside } => {
+        LoadedWatches::Unusable { reason, aside } => {
             let aside = aside.map(|aside| aside.display().to_string());
             tracing::warn!(%path, reason, aside, "the watches that were added cannot be used");
             Vec::new()

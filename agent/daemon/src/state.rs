@@ -146,7 +146,7 @@ struct Document {
 
 /// The thread that writes, and what it has done.
 #[derive(Debug)]
-pub struct Keeper {
+pub struct StateWriter {
     inbox: SyncSender<Memory>,
     thread: JoinHandle<()>,
     done: Arc<Done>,
@@ -333,7 +333,7 @@ fn boot() -> String {
     boot.trim().to_owned()
 }
 
-impl Keeper {
+impl StateWriter {
     /// Starts the thread.
     ///
     /// # Errors
@@ -635,7 +635,7 @@ mod tests {
         // Nobody can write a file where a directory is.
         let obstacle = place.path().join(NEW_FILE);
         fs::create_dir(&obstacle).unwrap();
-        let mut keeper = Keeper::start(Arc::new(directory)).unwrap();
+        let mut keeper = StateWriter::start(Arc::new(directory)).unwrap();
         let start = Instant::now();
         assert!(keeper.wants(0, start));
         keeper.keep(Memory::default(), 0, start);

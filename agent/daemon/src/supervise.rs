@@ -7,11 +7,11 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::config::{Config, ConfigError};
-use crate::privilege::{self, Powerless, Role, SpawnError};
+use crate::privilege::{self, Role, SpawnError, Unprivileged};
 use crate::run::{Run, RunError};
 use crate::surface::api;
 use crate::surface::api::reload::{NotReloaded, Reloaded, Reloads};
-use crate::surface::events::Sight;
+use crate::surface::events::SourceMonitor;
 use crate::surface::http::Server;
 use crate::surface::otlp::Exporter;
 use crate::surface::{Board, Settings};
@@ -53,7 +53,7 @@ pub(crate) struct Surfaces {
     pub(crate) control: api::Server,
     pub(crate) context: api::Context,
     /// Nothing is served by a thread that has any privilege.
-    pub(crate) powerless: Powerless,
+    pub(crate) powerless: Unprivileged,
 }
 
 /// Signals that are listened to from before the working thread starts.
@@ -135,7 +135,7 @@ impl Supervisor {
                     }
                 }
                 _ = tick.tick() => {
-                    if watchdog.look(&self.board) {
+                    if watchdog.check(&self.board) {
                         tick = ticks(watchdog.period.map_or(TICK, |period| period.min(TICK)));
                     }
                 }
@@ -247,12 +247,12 @@ impl Responder {
     /// Starts the thread, confined to its role already.
     pub(crate) fn start() -> Result<Self, SpawnError> {
         let (begin, begins) = oneshot::channel::<Surfaces>();
-        let (tell, ended) = oneshot::channel();
+        let (report, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("http".to_owned());
         privilege::spawn(Role::Serve, thread, move || {
             // An agent that fails to start, or a report, has nothing to answer.
             if let Ok(surfaces) = begins.blocking_recv() {
-                let _ = tell.send(surfaces.answer());
+                let _ = report.send(surfaces.answer());
             }
         })?;
         Ok(Self { begin, ended })
@@ -269,7 +269,7 @@ impl Surfaces {
     /// Answers requests until the agent stops.
     fn answer(self) -> Result<()> {
         // Capabilities belong to threads: those of this one are read back, too.
-        let _: (Powerless, Powerless) = (self.powerless, Powerless::verify()?);
+        let _: (Unprivileged, Unprivileged) = (self.powerless, Unprivileged::verify()?);
         // Threads that block make bags for clients; the unit allows 32 threads in all.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .max_blocking_threads(4)
@@ -304,12 +304,12 @@ impl Worker {
     /// Starts the thread, confined to its role already: the caller need not keep what it needs.
     pub(crate) fn start(role: Role) -> Result<Self, SpawnError> {
         let (begin, begins) = oneshot::channel::<Run>();
-        let (tell, ended) = oneshot::channel();
+        let (report, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("capture".to_owned());
         let thread = privilege::spawn(role, thread, move || {
             // An agent that fails to start has nothing to do.
             if let Ok(run) = begins.blocking_recv() {
-                let _ = tell.send(run.run());
+                let _ = report.send(run.run());
             }
         })?;
         Ok(Self {
@@ -340,7 +340,7 @@ struct Watchdog {
     period: Option<Duration>,
     fed: Option<Instant>,
     ready: bool,
-    sight: Sight,
+    sight: SourceMonitor,
 }
 
 impl Watchdog {
@@ -351,18 +351,18 @@ impl Watchdog {
             period,
             fed: None,
             ready: false,
-            sight: Sight::default(),
+            sight: SourceMonitor::default(),
         }
     }
 
     /// Not a timer: what feeds the watchdog is the capture's progress. Whether the agent has just
     /// become ready.
-    fn look(&mut self, board: &Board) -> bool {
+    fn check(&mut self, board: &Board) -> bool {
         let now = Instant::now();
         let state = board.state();
         let ready = state.ready(now);
-        for event in self.sight.look(&ready, state.agent.attached_anew, now) {
-            board.events().tell(event);
+        for event in self.sight.check(&ready, state.agent.attached_anew, now) {
+            board.events().record(event);
         }
         // A restart does not bring back what is gone.
         if state.progresses(now).is_err() || (ready.is_err() && !self.ready) {

@@ -4,7 +4,7 @@
 //! One entry for each pattern and domain; the configuration's comes first. The capture thread is
 //! handed the merged list in a slot that holds the latest one and is woken; nobody waits for it.
 
-mod kept;
+mod persistence;
 
 use std::collections::HashSet;
 use std::io;
@@ -15,8 +15,8 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 use crate::config::{Limit, ManyGlobs, Watch, Watchlist, check_globs};
 use crate::state::StateDirectory;
 use crate::surface::{AgentEvent, Board};
-use kept::Keeper;
-pub use kept::{Kept, load};
+use persistence::WatchWriter;
+pub use persistence::{LoadedWatches, load};
 
 /// Who asked for a watch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,7 +89,7 @@ pub struct Watches {
     /// For the capture thread: the latest list it has not taken yet.
     news: ArcSwapOption<Watchlist>,
     board: Arc<Board>,
-    keeper: OnceLock<Keeper>,
+    keeper: OnceLock<WatchWriter>,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -217,7 +217,7 @@ impl Watches {
     /// # Errors
     /// No thread is to be had for it.
     pub fn keep_in(&self, directory: Arc<StateDirectory>) -> io::Result<()> {
-        let keeper = Keeper::start(directory)?;
+        let keeper = WatchWriter::start(directory)?;
         // Only the first one would ever be asked for.
         let _ = self.keeper.set(keeper);
         Ok(())
@@ -226,7 +226,7 @@ impl Watches {
     /// Whether what clients add outlives the agent: kept somewhere, and the last write worked.
     #[must_use]
     pub fn is_kept(&self) -> bool {
-        self.keeper.get().is_some_and(Keeper::works)
+        self.keeper.get().is_some_and(WatchWriter::works)
     }
 
     /// Waits until what clients have added is on disk, when the agent ends.
@@ -283,7 +283,7 @@ impl Watches {
                 .retain(|watch| !is_for(watch, pattern, domain_id));
             Ok(Done::Replaced)
         })?;
-        self.board.events().tell(AgentEvent::WatchRemoved {
+        self.board.events().record(AgentEvent::WatchRemoved {
             watch: pattern.to_owned(),
             domain_id,
         });
@@ -298,7 +298,7 @@ impl Watches {
 
     /// For the capture thread: what to watch from now on, when that has changed since the last call.
     #[must_use]
-    pub fn take_news(&self) -> Option<Arc<Watchlist>> {
+    pub fn take_changed(&self) -> Option<Arc<Watchlist>> {
         self.news.swap(None)
     }
 
@@ -327,7 +327,7 @@ impl Watches {
             Ok(done)
         })?;
         if done != Done::Unchanged {
-            self.board.events().tell(AgentEvent::WatchAdded {
+            self.board.events().record(AgentEvent::WatchAdded {
                 watch: watch.pattern.clone(),
                 domain_id: watch.domain_id,
             });

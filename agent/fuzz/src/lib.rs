@@ -12,17 +12,17 @@ use std::sync::{Arc, LazyLock};
 
 use ros2probe::bag::info::Bag;
 use ros2probe::bag::reindex::{Found, reindex};
-use ros2probe::capture::exact::library;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe::capture::ring::block::Frames;
 use ros2probe::capture::shm::cell::Cell;
+use ros2probe::capture::shm::classifier::MessageClassifier;
 use ros2probe::capture::shm::port::Port;
 use ros2probe::capture::shm::segment::{Buffer, Message};
-use ros2probe::capture::shm::verdict::Judge;
+use ros2probe::capture::uprobe::library;
 use ros2probe::config::{Config, Watch, Watchlist};
 use ros2probe::message::filter::{Filter, Subject};
-use ros2probe::message::{Decoded, Definition, MessageType, Shown, csv, decode, yaml};
+use ros2probe::message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::selection::{Depth, Selection, Wish};
 use ros2probe::ros2::Dialect;
@@ -105,13 +105,13 @@ pub fn shared_memory(bytes: &[u8]) {
     for (round, file) in [after, before, after].into_iter().enumerate() {
         let known = announced.len();
         let now = MOMENT * (round as u64 + 1);
-        let Some(look) = port.look(file, now, &mut announced) else {
+        let Some(look) = port.poll(file, now, &mut announced) else {
             break;
         };
         assert!((announced.len() - known) as u64 <= look.pushed);
         assert!((announced.len() - known) * Cell::LEN <= file.len());
     }
-    let mut judge = Judge::default();
+    let mut judge = MessageClassifier::default();
     for descriptor in &announced {
         let Ok(buffer) = Buffer::find(segment, descriptor) else {
             continue;
@@ -119,7 +119,7 @@ pub fn shared_memory(bytes: &[u8]) {
         assert!(buffer.is_valid(segment));
         let mut records = Vec::new();
         let message = Message::new(segment, buffer);
-        judge.judge(&message, buffer.length, Record::default(), &mut records);
+        judge.classify(&message, buffer.length, Record::default(), &mut records);
         assert!(records.len() <= buffer.length as usize);
         let mut whole = Vec::new();
         if buffer.read(segment, &mut whole) {
@@ -235,14 +235,14 @@ pub fn message(bytes: &[u8]) {
     let Ok(Decoded { message, .. }) = &whole else {
         return;
     };
-    let all = Shown::default();
+    let all = Truncation::default();
     let line = csv::line(message, &all);
     assert!(line.len() <= (payload.len() + 64) * LONGEST);
     for style in [yaml::Style::Block, yaml::Style::Flow] {
         let document = yaml::document(message, &all, style);
         assert!(document.ends_with('\n') && document.len() <= (payload.len() + 64) * LONGEST);
     }
-    let few = Shown {
+    let few = Truncation {
         truncate: Some(2),
         ..all
     };

@@ -5,7 +5,7 @@ use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ros2probe_message::yaml::{self, Style};
-use ros2probe_message::{Library, Limits, Shown, Sources, decode};
+use ros2probe_message::{Library, Limits, Sources, Truncation, decode};
 
 const IMU: usize = 324;
 const CLOUD: usize = 644_000;
@@ -33,9 +33,9 @@ fn cloud() -> Vec<u8> {
 
 fn message(criterion: &mut Criterion) {
     let library = Library::new(Sources::default());
-    let echo = Shown {
+    let echo = Truncation {
         truncate: Some(128),
-        ..Shown::default()
+        ..Truncation::default()
     };
     let kept = Limits {
         kept: 128,
@@ -56,7 +56,7 @@ fn message(criterion: &mut Criterion) {
         let Ok(decoded) = decode(&message_type, &payload, &kept) else {
             continue;
         };
-        for (shown_name, shown) in [("echo", echo), ("full", Shown::default())] {
+        for (shown_name, shown) in [("echo", echo), ("full", Truncation::default())] {
             group.bench_function(format!("{shown_name}_{name}"), |bencher| {
                 bencher.iter(|| yaml::document(&decoded.message, &shown, Style::Block).len());
             });

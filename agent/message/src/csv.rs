@@ -4,11 +4,11 @@
 //! leave no trace, which is the original's form and what its users parse.
 
 use super::python;
-use super::shown::Shown;
+use super::truncation::Truncation;
 use super::value::{Array, Items, Message, Scalar, Value};
 
 /// The line, without its end.
-pub fn line(message: &Message<'_>, shown: &Shown) -> String {
+pub fn line(message: &Message<'_>, shown: &Truncation) -> String {
     let mut line = String::new();
     for (_, value) in message.fields() {
         if !line.is_empty() {
@@ -29,7 +29,7 @@ pub fn line(message: &Message<'_>, shown: &Shown) -> String {
     line
 }
 
-fn elements(array: &Array<'_>, shown: &Shown) -> String {
+fn elements(array: &Array<'_>, shown: &Truncation) -> String {
     let (count, cut) = shown.elements(array.length);
     let mut line = String::new();
     let separate = |line: &mut String| {
@@ -70,7 +70,7 @@ fn elements(array: &Array<'_>, shown: &Shown) -> String {
     line
 }
 
-fn scalar(line: &mut String, value: Scalar, shown: &Shown) {
+fn scalar(line: &mut String, value: Scalar, shown: &Truncation) {
     match (value, shown.truncate) {
         (Scalar::Byte(_), Some(0)) => line.push_str("b'...'"),
         _ => line.push_str(&python::scalar(value)),

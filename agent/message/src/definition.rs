@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use super::idl;
-use super::implied::implied;
+use super::implicit_types::implicit_types;
 pub use super::name::{Kind, NotATypeName, TypeName};
 use super::parse::{self, ParseError};
 
@@ -128,7 +128,7 @@ impl Definition {
                 _ => None,
             })
             .collect();
-        let implied = implied(&name);
+        let implied = implicit_types(&name);
         let structures = written.into_iter().chain(implied).map(Arc::new).collect();
         Self {
             name,
@@ -207,7 +207,7 @@ impl MessageType {
             if found.structures.len() == MAX_TYPES {
                 return Err(NotClosed::TooMany.into());
             }
-            let structure = found.look_up(&name, &mut find)?;
+            let structure = found.resolve(&name, &mut find)?;
             for field in &structure.fields {
                 if let Element::Nested(nested) = &field.element {
                     wanted.push(nested.clone());
@@ -219,7 +219,7 @@ impl MessageType {
         Ok(found)
     }
 
-    fn look_up<E: From<NotClosed>>(
+    fn resolve<E: From<NotClosed>>(
         &mut self,
         name: &TypeName,
         find: &mut impl FnMut(&TypeName) -> Result<Option<Arc<Definition>>, E>,

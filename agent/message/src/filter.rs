@@ -7,7 +7,7 @@
 
 mod evaluate;
 mod parse;
-mod words;
+mod tokens;
 
 use std::fmt;
 
@@ -64,14 +64,14 @@ impl Filter {
                 format!("longer than {MAX_LENGTH} bytes"),
             ));
         }
-        let words = words::words(text)?;
-        if let Some(word) = words.get(MAX_WORDS) {
+        let tokens = tokens::tokens(text)?;
+        if let Some(word) = tokens.get(MAX_WORDS) {
             return Err(FilterError::new(
                 word.column,
                 format!("more than {MAX_WORDS} words"),
             ));
         }
-        parse::expression(&words).map(Self)
+        parse::expression(&tokens).map(Self)
     }
 
     /// Whether a message passes.

@@ -4,21 +4,21 @@
 //! - [`Library`] finds the definition of a type in directories, in an installed ROS or among those
 //!   embedded here, by name and announced hash, and returns a [`MessageType`].
 //! - [`decode()`] reads a CDR payload of that type into a [`Value`] tree that borrows from it.
-//! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them, [`Shown`] says
-//!   how much of them. [`filter`] evaluates an expression over a message.
+//! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them,
+//!   [`Truncation`] says how much of them. [`filter`] evaluates an expression over a message.
 //!
 //! Definitions are read from files as rosidl reads them; nothing is generated, loaded or executed.
 //! Files, names and payloads are untrusted: every size, number and depth is bounded.
 //!
 //! ```
 //! use ros2probe_message::yaml::{self, Style};
-//! use ros2probe_message::{Library, Limits, Shown, Sources, decode};
+//! use ros2probe_message::{Library, Limits, Sources, Truncation, decode};
 //!
 //! let library = Library::new(Sources::default());
 //! let message_type = library.find("std_msgs/msg/String", None)?;
 //! let payload = b"\0\x01\0\0\x06\0\0\0hello\0";
 //! let decoded = decode(&message_type, payload, &Limits::default())?;
-//! let text = yaml::document(&decoded.message, &Shown::default(), Style::Block);
+//! let text = yaml::document(&decoded.message, &Truncation::default(), Style::Block);
 //! assert_eq!(text, "data: hello\n");
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -26,22 +26,22 @@
 pub mod csv;
 pub mod decode;
 pub mod definition;
+mod definition_source;
 mod dialect;
 mod digits;
 mod embedded;
 pub mod filter;
 mod hash;
 mod idl;
-mod implied;
+mod implicit_types;
 pub mod library;
 mod name;
 mod numpy;
 mod parse;
-mod place;
 pub mod python;
 mod schema;
 mod search;
-pub mod shown;
+pub mod truncation;
 pub mod value;
 pub mod yaml;
 
@@ -52,5 +52,5 @@ pub use definition::{
 pub use dialect::Dialect;
 pub use library::{Library, NotFound, Sources};
 pub use parse::{ParseError, Problem};
-pub use shown::Shown;
+pub use truncation::Truncation;
 pub use value::{Array, Items, Message, Scalar, Value};

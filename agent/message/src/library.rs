@@ -11,15 +11,15 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::definition::{MessageType, NotClosed, TypeName};
+use super::definition_source::DefinitionSource;
 use super::dialect::Dialect;
 use super::parse::ParseError;
-use super::place::Place;
 use super::search::Search;
 
 /// Where ROS is installed, one directory for each distribution.
 const INSTALLED: &str = "/opt/ros";
 /// How many places are looked at: a workspace that is installed package by package has hundreds.
-pub(super) const MAX_PLACES: usize = 1024;
+pub(super) const MAX_SOURCES: usize = 1024;
 /// How many types are kept, and how much text.
 const MAX_KEPT: usize = 1024;
 const MAX_KEPT_TEXT: usize = 32 << 20;
@@ -73,7 +73,7 @@ fn installed(directory: &Path, dialect: Dialect) -> Vec<PathBuf> {
     let of = |path: &PathBuf| path.file_name()?.to_str().and_then(Dialect::of_distro);
     let mut found: Vec<PathBuf> = entries
         .filter_map(|entry| Some(entry.ok()?.path()))
-        .take(MAX_PLACES)
+        .take(MAX_SOURCES)
         .collect();
     found.sort_by(|a, b| b.cmp(a));
     found.sort_by_key(|path| of(path) != Some(dialect));
@@ -83,12 +83,12 @@ fn installed(directory: &Path, dialect: Dialect) -> Vec<PathBuf> {
 /// Finds definitions and keeps the types that were found.
 #[derive(Debug)]
 pub struct Library {
-    places: Vec<Place>,
-    kept: Mutex<Kept>,
+    definition_sources: Vec<DefinitionSource>,
+    kept: Mutex<CachedDefinition>,
 }
 
 #[derive(Debug, Default)]
-struct Kept {
+struct CachedDefinition {
     types: HashMap<(TypeName, Option<String>), Arc<MessageType>>,
     text: usize,
 }
@@ -115,7 +115,7 @@ pub enum NotFound {
     },
     /// Definitions, but none that the nodes use.
     #[error(
-        "the definition of {name} {place} is another one than the nodes use: its hash is {found}, \
+        "the definition of {name} {location} is another one than the nodes use: its hash is {found}, \
          theirs {announced}; install their version of {}, or name a directory that has it with \
          --definitions",
         name.package()
@@ -124,7 +124,7 @@ pub enum NotFound {
         /// The type.
         name: TypeName,
         /// Where the first one found is from.
-        place: String,
+        location: String,
         /// Its hash.
         found: String,
         /// The hash that discovery announces.
@@ -178,13 +178,13 @@ impl Library {
             prefixes,
             dialect,
         } = sources;
-        let mut places: Vec<_> = directories
+        let mut definition_sources: Vec<_> = directories
             .into_iter()
-            .map(Place::Directory)
-            .chain(prefixes.into_iter().map(Place::Prefix))
-            .take(MAX_PLACES)
+            .map(DefinitionSource::Directory)
+            .chain(prefixes.into_iter().map(DefinitionSource::Prefix))
+            .take(MAX_SOURCES)
             .collect();
-        places.push(Place::Embedded(dialect));
+        definition_sources.push(DefinitionSource::Embedded(dialect));
         let others = [
             Dialect::Rolling,
             Dialect::Kilted,
@@ -192,9 +192,9 @@ impl Library {
             Dialect::Humble,
         ];
         let others = others.into_iter().filter(|other| *other != dialect);
-        places.extend(others.map(Place::Embedded));
+        definition_sources.extend(others.map(DefinitionSource::Embedded));
         Self {
-            places,
+            definition_sources,
             kept: Mutex::default(),
         }
     }
@@ -223,7 +223,7 @@ impl Library {
         if let Some(found) = kept {
             return Ok(found);
         }
-        let found = Arc::new(Search::new(&self.places, &key.0).run(key.1.as_deref())?);
+        let found = Arc::new(Search::new(&self.definition_sources, &key.0).run(key.1.as_deref())?);
         self.keep(key, found.clone());
         Ok(found)
     }
@@ -236,7 +236,7 @@ impl Library {
             .map(|definition| definition.text.len())
             .sum::<usize>();
         if kept.types.len() >= MAX_KEPT || kept.text + text > MAX_KEPT_TEXT {
-            *kept = Kept::default();
+            *kept = CachedDefinition::default();
         }
         kept.text += text;
         kept.types.insert(key, found);

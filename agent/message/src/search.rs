@@ -6,8 +6,8 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use super::definition::{Definition, MessageType, NotClosed, TypeName};
-use super::library::{MAX_PLACES, NotFound};
-use super::place::Place;
+use super::definition_source::DefinitionSource;
+use super::library::{MAX_SOURCES, NotFound};
 
 /// How often a type is put together at most until it has the announced hash.
 const MAX_TRIES: usize = 256;
@@ -21,7 +21,7 @@ type Read = Result<Option<Arc<Definition>>, NotFound>;
 
 /// One search for one type.
 pub(super) struct Search<'a> {
-    places: &'a [Place],
+    sources: &'a [DefinitionSource],
     root: &'a TypeName,
     /// Which places have a file, and how often they were asked.
     having: HashMap<TypeName, Vec<usize>>,
@@ -32,10 +32,10 @@ pub(super) struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    pub(super) fn new(places: &'a [Place], root: &'a TypeName) -> Self {
+    pub(super) fn new(sources: &'a [DefinitionSource], root: &'a TypeName) -> Self {
         let (having, read) = Default::default();
         Self {
-            places,
+            sources,
             root,
             having,
             asked: 0,
@@ -50,7 +50,7 @@ impl<'a> Search<'a> {
     pub(super) fn run(&mut self, announced: Option<&str>) -> Result<MessageType, NotFound> {
         let mut firsts = BTreeSet::new();
         for file in self.root.files() {
-            firsts.extend(self.places_of(&file)?);
+            firsts.extend(self.sources_of(&file)?);
         }
         let Some(announced) = announced else {
             let Some(first) = firsts.first() else {
@@ -83,16 +83,16 @@ impl<'a> Search<'a> {
                 );
             }
         }
-        if let Some((place, found)) = another {
-            let place = self
-                .places
-                .get(place)
-                .map(Place::describe)
+        if let Some((source, found)) = another {
+            let location = self
+                .sources
+                .get(source)
+                .map(DefinitionSource::describe)
                 .unwrap_or_default();
             let (name, announced) = (self.root.clone(), announced.to_owned());
             return Err(NotFound::Another {
                 name,
-                place,
+                location,
                 found,
                 announced,
             });
@@ -111,16 +111,16 @@ impl<'a> Search<'a> {
     /// last from what is before it.
     fn assemble(&mut self, first: usize, second: usize) -> Result<MessageType, NotFound> {
         let root = self.root.clone();
-        let rank = |place: usize| match place {
-            _ if place == first => 0,
-            _ if place >= second => 1 + place - second,
-            _ => 1 + MAX_PLACES + place,
+        let rank = |source: usize| match source {
+            _ if source == first => 0,
+            _ if source >= second => 1 + source - second,
+            _ => 1 + MAX_SOURCES + source,
         };
         let found = MessageType::assemble(&root, |file| {
-            let mut places = self.places_of(file).map_err(Failure::Known)?;
-            places.sort_by_key(|place| rank(*place));
-            for place in places {
-                if let Some(found) = self.definition(place, file).map_err(Failure::Known)? {
+            let mut sources = self.sources_of(file).map_err(Failure::Known)?;
+            sources.sort_by_key(|source| rank(*source));
+            for source in sources {
+                if let Some(found) = self.definition(source, file).map_err(Failure::Known)? {
                     return Ok(Some(found));
                 }
             }
@@ -134,31 +134,31 @@ impl<'a> Search<'a> {
     }
 
     /// The places that have a file, readable or not.
-    fn places_of(&mut self, file: &TypeName) -> Result<Vec<usize>, NotFound> {
+    fn sources_of(&mut self, file: &TypeName) -> Result<Vec<usize>, NotFound> {
         if let Some(known) = self.having.get(file) {
             return Ok(known.clone());
         }
-        self.asked += self.places.len();
+        self.asked += self.sources.len();
         if self.asked > MAX_ASKED {
             let (root, reason) = (self.root.clone(), NotClosed::TooMany);
             return Err(NotFound::Refused { root, reason });
         }
-        let places = self.places.iter().enumerate();
-        let having: Vec<_> = places
-            .filter(|(_, place)| place.has(file))
+        let sources = self.sources.iter().enumerate();
+        let having: Vec<_> = sources
+            .filter(|(_, source)| source.has(file))
             .map(|(index, _)| index)
             .collect();
         self.having.insert(file.clone(), having.clone());
         Ok(having)
     }
 
-    fn definition(&mut self, place: usize, file: &TypeName) -> Read {
-        let key = (place, file.clone());
+    fn definition(&mut self, source: usize, file: &TypeName) -> Read {
+        let key = (source, file.clone());
         if let Some(known) = self.read.get(&key) {
             return known.clone();
         }
-        let found = match self.places.get(place) {
-            Some(place) => place.read(file).map(|found| found.map(Arc::new)),
+        let found = match self.sources.get(source) {
+            Some(source) => source.read(file).map(|found| found.map(Arc::new)),
             None => Ok(None),
         };
         if self.held > MAX_HELD {

@@ -9,7 +9,7 @@ use std::sync::LazyLock;
 use regex::Regex;
 
 use super::python;
-use super::shown::Shown;
+use super::truncation::Truncation;
 use super::value::{Array, Items, Message, Scalar, Value};
 
 /// Spaces of one level.
@@ -28,7 +28,7 @@ pub enum Style {
 }
 
 /// The whole document, its last line ended.
-pub fn document(message: &Message<'_>, shown: &Shown, style: Style) -> String {
+pub fn document(message: &Message<'_>, shown: &Truncation, style: Style) -> String {
     let mut writer = Writer {
         text: String::new(),
         shown,
@@ -45,7 +45,7 @@ pub fn document(message: &Message<'_>, shown: &Shown, style: Style) -> String {
 
 struct Writer<'a> {
     text: String,
-    shown: &'a Shown,
+    shown: &'a Truncation,
     style: Style,
     /// Inside of a sequence in flow style, where fewer strings are plain.
     is_in_flow: bool,

@@ -15,10 +15,10 @@ mod golden;
 use golden::{cases, library};
 use ros2probe_message::value::{Items, Scalar};
 use ros2probe_message::yaml::{self, Style};
-use ros2probe_message::{Decoded, Limits, Shown, Value, csv, decode};
+use ros2probe_message::{Decoded, Limits, Truncation, Value, csv, decode};
 
 /// What `ros2 topic echo` shows of arrays and strings unless told otherwise.
-const ECHO: Shown = Shown {
+const ECHO: Truncation = Truncation {
     truncate: Some(128),
     no_arrays: false,
     no_strings: false,
@@ -33,7 +33,7 @@ fn every_golden_payload_prints_as_the_original_prints_it() {
         let decoded = decode(&message_type, &case.payload, &Limits::default());
         let decoded = decoded.unwrap_or_else(|error| panic!("{case}: {error}"));
         let message = &decoded.message;
-        let shown = Shown::default();
+        let shown = Truncation::default();
         assert_eq!(
             yaml::document(message, &ECHO, Style::Block),
             case.yaml_echo,

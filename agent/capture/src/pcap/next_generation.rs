@@ -6,6 +6,7 @@
 use std::io::{self, Read};
 
 use ros2probe_wire::frame::Link;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Cursor, Endianness, Timestamp, WireError};
 
 use super::{Found, LONGEST_PACKET, PcapError, array, failed, fill, read_exactly};
@@ -22,7 +23,6 @@ const ENHANCED_PACKET: u32 = 6;
 const LONGEST_BLOCK: u32 = LONGEST_PACKET + 65_536;
 const MOST_INTERFACES: usize = 4096;
 const LONGEST_NAME: usize = 256;
-const NANOSECONDS_PER_SECOND: u128 = 1_000_000_000;
 
 /// A section: what its header and its interface descriptions said so far.
 pub(super) struct Section {
@@ -265,7 +265,7 @@ impl Interface {
     }
 
     fn time(&self, units: u64) -> Timestamp {
-        let nanoseconds = u128::from(units) * NANOSECONDS_PER_SECOND / self.units_per_second;
+        let nanoseconds = u128::from(units) * u128::from(SECOND) / self.units_per_second;
         let nanoseconds = u64::try_from(nanoseconds).unwrap_or(u64::MAX);
         let offset = self.offset_seconds.saturating_mul(1_000_000_000);
         Timestamp(nanoseconds.saturating_add_signed(offset))

@@ -3,7 +3,7 @@ use ros2probe_wire::record::kind;
 
 use super::*;
 
-const SECOND: u64 = 1_000_000_000;
+use ros2probe_wire::time::SECOND;
 const PART: usize = 1480;
 
 fn key(id: u32) -> FlowKey {

@@ -6,16 +6,16 @@
 //! It opens files for reading, takes no lock, registers nowhere and wakes nobody.
 
 pub mod cell;
+pub mod classifier;
+mod cpu_allowance;
+pub mod directories;
 mod inbox;
-mod listing;
 mod owner;
-pub mod pace;
+pub mod poll_interval;
 pub mod port;
-pub mod scan;
 pub mod segment;
 pub mod source;
 pub mod tap;
-pub mod verdict;
 
 #[cfg(test)]
 mod image;
@@ -34,9 +34,9 @@ use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
+use self::directories::{Name, ShmDirectories};
 use self::inbox::{Inbox, Item};
-use self::pace::{Budget, Need, Pace};
-use self::scan::{Name, Places};
+use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu};
 use crate::threads::{Spawn, Task};
@@ -75,7 +75,7 @@ pub struct Facts {
 struct Shared {
     inbox: Inbox,
     interest: Mutex<Vec<(Guid, Option<Verdict>)>>,
-    is_told: AtomicBool,
+    has_news: AtomicBool,
     wanted: AtomicU8,
     facts: Mutex<Facts>,
     /// Everything there is seen otherwise.
@@ -89,7 +89,7 @@ impl SharedMemory {
     ///
     /// # Errors
     /// There can be no more threads.
-    pub fn start(places: Places, budget: Budget, spawn: Spawn) -> io::Result<Self> {
+    pub fn start(directories: ShmDirectories, budget: Budget, spawn: Spawn) -> io::Result<Self> {
         let shared = Arc::new(Shared {
             inbox: Inbox::with_bell(),
             ..Shared::default()
@@ -99,7 +99,7 @@ impl SharedMemory {
         let thread = spawn(
             Task::SharedMemory,
             thread.stack_size(256 << 10),
-            Box::new(move || look(&looks, places, budget)),
+            Box::new(move || poll(&looks, directories, budget)),
         )?;
         Ok(Self {
             shared,
@@ -115,7 +115,7 @@ impl SharedMemory {
         let interest = self.shared.interest.lock();
         let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
         interest.extend_from_slice(changes);
-        self.shared.is_told.store(true, Ordering::Release);
+        self.shared.has_news.store(true, Ordering::Release);
     }
 
     /// Looks no longer, or again: everything is seen in the processes that send it.
@@ -130,7 +130,7 @@ impl SharedMemory {
     }
 
     /// Gives the model what was found since the last time.
-    pub fn take_in(&self, clocks: &Clocks, observer: &mut Observer) {
+    pub fn poll(&self, clocks: &Clocks, observer: &mut Observer) {
         for item in self.shared.inbox.take() {
             match item {
                 Item::Record(record) => {
@@ -202,33 +202,33 @@ impl Shared {
 }
 
 /// The thread.
-fn look(shared: &Shared, places: Places, budget: Budget) {
-    let mut tap = Tap::new(places, calendar);
+fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget) {
+    let mut tap = Tap::new(directories, calendar);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
-    let mut pace = Pace::new(budget).on(cpus);
+    let mut interval = PollInterval::new(budget).on(cpus);
     // Without it, somebody who comes is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched = BTreeSet::new();
     let (mut is_first, mut may_be_first) = (false, true);
     let (mut found, mut looks, mut reported, mut cpu) = (Vec::new(), 0, 0, 0.0);
     while !shared.stop.load(Ordering::Acquire) {
-        if shared.is_told.swap(false, Ordering::Acquire) {
+        if shared.has_news.swap(false, Ordering::Acquire) {
             let interest = shared.interest.lock();
             let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
             for (guid, verdict) in interest.drain(..) {
-                tap.judge.set(guid, verdict);
+                tap.classifier.set(guid, verdict);
             }
         }
         if shared.is_paused.load(Ordering::Acquire) {
-            tap.let_go();
+            tap.close_all();
             reported = 0;
-            shared.report(&tap, looks, pace.stretch());
+            shared.report(&tap, looks, interval.stretch());
             std::thread::sleep(PAUSE);
             continue;
         }
         let now = monotonic();
         let at = seconds(now);
-        let announced = tap.look(now, &mut found);
+        let announced = tap.poll(now, &mut found);
         shared.inbox.put(&mut found);
         looks += 1;
         if looks % ACCOUNT_EVERY == 0 || !(tap.is_hurried || tap.misses_nothing) {
@@ -236,7 +236,7 @@ fn look(shared: &Shared, places: Places, budget: Budget) {
         }
         if now.saturating_sub(reported) >= REPORT {
             reported = now;
-            shared.report(&tap, looks, pace.stretch());
+            shared.report(&tap, looks, interval.stretch());
         }
         let wanted = shared.wanted.load(Ordering::Relaxed);
         let need = if tap.has_ports() {
@@ -247,11 +247,11 @@ fn look(shared: &Shared, places: Places, budget: Budget) {
         } else {
             Need::Nothing
         };
-        if tap.met() {
-            pace.news(at);
+        if tap.take_discovery_seen() {
+            interval.news(at);
         }
-        let sleep = pace.sleep(at, cpu, announced, need);
-        tap.is_hurried = pace.is_meeting(at);
+        let sleep = interval.sleep(at, cpu, announced, need);
+        tap.is_hurried = interval.is_watching_closely(at);
         tap.misses_nothing = need == Need::Every;
         if may_be_first && (tap.is_hurried || tap.misses_nothing) != is_first {
             is_first = !is_first;
@@ -276,8 +276,8 @@ fn look(shared: &Shared, places: Places, budget: Budget) {
         let before = thread_cpu();
         if watch.wait(sleep, |name| Name::parse(name).is_some()) {
             tap.spend(thread_cpu().saturating_sub(before));
-            tap.somebody_comes();
-            pace.newcomer(at);
+            tap.expect_participant();
+            interval.newcomer(at);
         }
     }
 }

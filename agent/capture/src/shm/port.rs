@@ -24,7 +24,7 @@ const MAX_CAPACITY: u32 = 1 << 11;
 const UNFILLED_NANOSECONDS: u64 = 100_000_000;
 /// Attempts to read a ring that nobody moves meanwhile.
 const ATTEMPTS: usize = 3;
-/// The pace of a port is measured over this long, and forgotten by an eighth each time.
+/// The rate of a port is measured over this long, and forgotten by an eighth each time.
 const PACE_NANOSECONDS: u64 = 100_000_000;
 
 /// Where things lie in a port's file.
@@ -44,13 +44,13 @@ pub struct Port {
     shadow: Vec<Descriptor>,
     unfilled_since: Option<u64>,
     looked: u64,
-    pace: Pace,
+    pace: PeakRate,
     bytes: Vec<u8>,
 }
 
-/// What a look at a port found besides messages.
+/// What one poll of a port found besides messages.
 #[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
-pub struct Look {
+pub struct PortPoll {
     /// Messages announced since the last one.
     pub pushed: u64,
     /// Of those, overwritten before they were read.
@@ -63,7 +63,7 @@ pub struct Look {
 
 /// Messages a second at the port's busiest of late.
 #[derive(Debug, Default)]
-struct Pace {
+struct PeakRate {
     since: u64,
     count: u64,
     peak: u64,
@@ -84,7 +84,7 @@ impl Port {
             shadow: vec![Descriptor::default(); layout.capacity as usize],
             unfilled_since: None,
             looked: now,
-            pace: Pace::default(),
+            pace: PeakRate::default(),
             bytes: Vec::new(),
         };
         let mut before = port.write_position(source)?;
@@ -109,20 +109,20 @@ impl Port {
         Some((port, filled.collect()))
     }
 
-    /// Appends what was announced since the last look. `None` when the file is no port any more.
-    pub fn look<S: Source + ?Sized>(
+    /// Appends what was announced since the last poll. `None` when the file is no port any more.
+    pub fn poll<S: Source + ?Sized>(
         &mut self,
         source: &S,
         now: u64,
         found: &mut Vec<Descriptor>,
-    ) -> Option<Look> {
+    ) -> Option<PortPoll> {
         let elapsed = now.saturating_sub(std::mem::replace(&mut self.looked, now));
         let write = self.write_position(source)?;
         let capacity = self.layout.capacity;
         let mut ahead = self.layout.distance(self.position, write);
-        let mut look = Look {
+        let mut look = PortPoll {
             is_uncertain: self.pace.may_lap(elapsed, capacity),
-            ..Look::default()
+            ..PortPoll::default()
         };
         if ahead == 0 {
             self.unfilled_since = None;
@@ -237,8 +237,8 @@ impl Layout {
     }
 }
 
-impl Pace {
-    /// Whether two rounds, which look like none, may have passed at the pace of late.
+impl PeakRate {
+    /// Whether two rounds, which look like none, may have passed at the rate of late.
     fn may_lap(&self, elapsed: u64, capacity: u32) -> bool {
         let pushed = u128::from(self.peak) * u128::from(elapsed) / 1_000_000_000;
         pushed >= 2 * u128::from(capacity)
@@ -263,7 +263,7 @@ mod tests {
     use super::super::image::PortImage;
     use super::*;
 
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
 
     fn descriptor(number: u32) -> Descriptor {
         Descriptor {
@@ -273,9 +273,9 @@ mod tests {
         }
     }
 
-    fn look(port: &mut Port, image: &PortImage, now: u64) -> (Vec<u32>, Look) {
+    fn poll(port: &mut Port, image: &PortImage, now: u64) -> (Vec<u32>, PortPoll) {
         let mut found = Vec::new();
-        let look = port.look(image.bytes(), now, &mut found).unwrap();
+        let look = port.poll(image.bytes(), now, &mut found).unwrap();
         (found.iter().map(|found| found.node).collect(), look)
     }
 
@@ -290,7 +290,7 @@ mod tests {
                 image.push(descriptor(next));
                 next += 1;
             }
-            let (found, look) = look(&mut port, &image, step);
+            let (found, look) = poll(&mut port, &image, step);
             for found in found {
                 assert_eq!(found, wanted);
                 wanted += 1;
@@ -319,7 +319,7 @@ mod tests {
         let backlog: Vec<_> = backlog.iter().map(|found| found.node).collect();
         assert_eq!(backlog, [4, 5, 6, 7, 8, 9, 10, 11]);
         image.push(descriptor(12));
-        assert_eq!(look(&mut port, &image, 1).0, [12]);
+        assert_eq!(poll(&mut port, &image, 1).0, [12]);
     }
 
     #[test]
@@ -328,7 +328,7 @@ mod tests {
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         image.push(descriptor(1));
         image.pop_all();
-        assert_eq!(look(&mut port, &image, 1).0, [1]);
+        assert_eq!(poll(&mut port, &image, 1).0, [1]);
     }
 
     #[test]
@@ -337,13 +337,13 @@ mod tests {
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         let begun = image.begin_push();
         image.push(descriptor(2));
-        assert_eq!(look(&mut port, &image, 1).0, [0; 0]);
+        assert_eq!(poll(&mut port, &image, 1).0, [0; 0]);
         image.fill(begun, descriptor(1));
-        assert_eq!(look(&mut port, &image, 2).0, [1, 2]);
+        assert_eq!(poll(&mut port, &image, 2).0, [1, 2]);
         image.begin_push();
         image.push(descriptor(4));
-        assert_eq!(look(&mut port, &image, 3).0, [0; 0]);
-        let (found, seen) = look(&mut port, &image, 3 + UNFILLED_NANOSECONDS);
+        assert_eq!(poll(&mut port, &image, 3).0, [0; 0]);
+        let (found, seen) = poll(&mut port, &image, 3 + UNFILLED_NANOSECONDS);
         assert_eq!((found, seen.unfilled, seen.pushed), (vec![4], 1, 2));
     }
 
@@ -354,7 +354,7 @@ mod tests {
         for number in 1..=13 {
             image.push(descriptor(number));
         }
-        let (found, seen) = look(&mut port, &image, 1);
+        let (found, seen) = poll(&mut port, &image, 1);
         assert_eq!(found, [6, 7, 8, 9, 10, 11, 12, 13]);
         assert_eq!((seen.overwritten, seen.pushed), (5, 13));
     }
@@ -365,13 +365,13 @@ mod tests {
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         for step in 1..=200 {
             image.push(descriptor(step));
-            let (_, seen) = look(&mut port, &image, u64::from(step) * SECOND / 100);
+            let (_, seen) = poll(&mut port, &image, u64::from(step) * SECOND / 100);
             assert!(!seen.is_uncertain);
         }
         // 100 a second: 16 take 160 ms.
         let now = 2 * SECOND;
-        assert!(!look(&mut port, &image, now + 150_000_000).1.is_uncertain);
-        assert!(look(&mut port, &image, now + 500_000_000).1.is_uncertain);
+        assert!(!poll(&mut port, &image, now + 150_000_000).1.is_uncertain);
+        assert!(poll(&mut port, &image, now + 500_000_000).1.is_uncertain);
     }
 
     #[test]
@@ -381,11 +381,11 @@ mod tests {
         for end in 0..image.bytes().len() {
             let cut = &image.bytes()[..end];
             assert!(Port::attach(cut, 7411, 0).is_none(), "{end}");
-            let _ = port.look(cut, 1, &mut Vec::new());
+            let _ = port.poll(cut, 1, &mut Vec::new());
         }
         let mut image = PortImage::new(7411, 8, 0x100);
         image.set_write(8);
-        assert!(port.look(image.bytes(), 1, &mut Vec::new()).is_none());
+        assert!(port.poll(image.bytes(), 1, &mut Vec::new()).is_none());
     }
 
     proptest! {
@@ -409,7 +409,7 @@ mod tests {
                 for now in 1..4 {
                     change(&mut bytes, &later);
                     let mut found = Vec::new();
-                    let _ = port.look(bytes.as_slice(), now * SECOND, &mut found);
+                    let _ = port.poll(bytes.as_slice(), now * SECOND, &mut found);
                     prop_assert!(found.len() <= MAX_CAPACITY as usize);
                 }
             }

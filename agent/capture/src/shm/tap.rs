@@ -10,14 +10,14 @@ use std::path::{Path, PathBuf};
 use ros2probe_wire::record::{Record, flag};
 
 use super::cell::{Descriptor, SegmentId};
+use super::classifier::{MessageClassifier, MessageVerdict};
+use super::cpu_allowance::CpuAllowance;
+use super::directories::{Generation, Name, ShmDirectories, ShmDirectoryId};
 use super::inbox::Item;
-use super::listing::Allowance;
 use super::owner::Locks;
 use super::port::Port;
-use super::scan::{Generation, Name, PlaceId, Places};
 use super::segment::{Buffer, Message, Refusal};
 use super::source::SharedFile;
-use super::verdict::{Judge, Judgement};
 use crate::system::thread_cpu;
 
 /// Ports and segments that are open at once.
@@ -42,7 +42,7 @@ const FIND_IN_A_HURRY: u64 = 10_000_000_000;
 
 /// What is open and how far it was read.
 pub struct Tap {
-    places: Places,
+    directories: ShmDirectories,
     /// By number.
     ports: Vec<Open>,
     /// Ports that were listed and are not laid out yet.
@@ -50,9 +50,9 @@ pub struct Tap {
     /// Ports whose process is dead, by their inodes: they are looked at again at the next search.
     abandoned: HashSet<(PortKey, u64)>,
     segments: HashMap<SegmentKey, Segment>,
-    remembered: Remembered,
+    remembered: RecentMessages,
     /// The rules, and what is wanted.
-    pub judge: Judge,
+    pub classifier: MessageClassifier,
     /// Whether it has to be back soon: what takes long is put off.
     pub is_hurried: bool,
     /// Whether every message is wanted: silent ports are looked at as often as others.
@@ -69,7 +69,7 @@ pub struct Tap {
     announced: Vec<Descriptor>,
     latest: HashMap<(SegmentId, u32), usize>,
     records: Vec<Record>,
-    allowance: Allowance,
+    allowance: CpuAllowance,
     /// The port that is looked at first.
     turn: usize,
 }
@@ -82,7 +82,7 @@ pub struct Counters {
     /// Segments open now.
     pub segments: u64,
     /// Directories of shared memory.
-    pub places: u64,
+    pub directories: u64,
     /// Messages announced at ports, each port's for itself.
     pub announced: u64,
     /// Messages read, each once.
@@ -103,12 +103,12 @@ pub struct Counters {
     pub abandoned: u64,
     /// Looks that came so late that a ring may have gone round unnoticed.
     pub uncertain: u64,
-    /// Files and places left out because of a cap.
+    /// Files and directories left out because of a cap.
     pub left_out: u64,
 }
 
-type PortKey = (PlaceId, Generation, u32);
-type SegmentKey = (PlaceId, Generation, SegmentId);
+type PortKey = (ShmDirectoryId, Generation, u32);
+type SegmentKey = (ShmDirectoryId, Generation, SegmentId);
 
 struct Open {
     key: PortKey,
@@ -128,7 +128,7 @@ enum Segment {
 
 /// The latest messages by where they lay.
 #[derive(Default)]
-struct Remembered {
+struct RecentMessages {
     set: HashSet<Identity>,
     order: VecDeque<Identity>,
 }
@@ -154,15 +154,15 @@ struct Reading {
 impl Tap {
     /// Nothing open. `calendar` gives nanoseconds since the Unix epoch.
     #[must_use]
-    pub fn new(places: Places, calendar: impl FnMut() -> u64 + 'static) -> Self {
+    pub fn new(directories: ShmDirectories, calendar: impl FnMut() -> u64 + 'static) -> Self {
         Self {
-            places,
+            directories,
             ports: Vec::new(),
             unborn: Vec::new(),
             abandoned: HashSet::new(),
             segments: HashMap::new(),
-            remembered: Remembered::default(),
-            judge: Judge::default(),
+            remembered: RecentMessages::default(),
+            classifier: MessageClassifier::default(),
             is_hurried: false,
             misses_nothing: false,
             calendar: Box::new(calendar),
@@ -176,7 +176,7 @@ impl Tap {
             announced: Vec::new(),
             latest: HashMap::new(),
             records: Vec::new(),
-            allowance: Allowance::default(),
+            allowance: CpuAllowance::default(),
             turn: 0,
         }
     }
@@ -192,7 +192,7 @@ impl Tap {
     }
 
     /// Lists directories with the next look, and looks at every port however silent it was.
-    pub fn somebody_comes(&mut self) {
+    pub fn expect_participant(&mut self) {
         self.listed = 0;
         for open in &mut self.ports {
             (open.due, open.busy) = (0, open.busy.max(self.now));
@@ -200,7 +200,7 @@ impl Tap {
     }
 
     /// Lets go of everything that is open. What is there then is found with the next look.
-    pub fn let_go(&mut self) {
+    pub fn close_all(&mut self) {
         self.ports.clear();
         self.abandoned.clear();
         self.segments.clear();
@@ -209,22 +209,22 @@ impl Tap {
 
     /// Whether participants met since the last time that was asked: a port appeared, or an
     /// endpoint was announced.
-    pub fn met(&mut self) -> bool {
+    pub fn take_discovery_seen(&mut self) -> bool {
         std::mem::take(&mut self.met)
     }
 
     /// The directories that are looked at.
     pub fn directories(&self) -> impl Iterator<Item = &Path> {
-        self.places
-            .places
+        self.directories
+            .directories
             .values()
-            .map(|place| place.path.as_path())
+            .map(|directory| directory.path.as_path())
     }
 
     /// How many.
     #[must_use]
     pub fn directory_count(&self) -> usize {
-        self.places.places.len()
+        self.directories.directories.len()
     }
 
     /// Whether there is any port.
@@ -240,17 +240,17 @@ impl Tap {
         Counters {
             ports: self.ports.len() as u64,
             segments: self.segments.values().filter(open).count() as u64,
-            places: self.places.places.len() as u64,
-            left_out: self.counters.left_out + self.places.left_out,
+            directories: self.directories.directories.len() as u64,
+            left_out: self.counters.left_out + self.directories.left_out,
             ..self.counters
         }
     }
 
     /// Looks everywhere once, at `now` nanoseconds of the monotonic clock; appends what is of
     /// interest. How many messages were announced.
-    pub fn look(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
+    pub fn poll(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
-        self.judge.refill(now);
+        self.classifier.refill(now);
         let lists = now.saturating_sub(self.listed) >= LIST_EVERY || self.listed == 0;
         let tries = !self.unborn.is_empty() && now.saturating_sub(self.tried) >= TRY_EVERY;
         if (lists || tries) && self.may_list(now) {
@@ -274,7 +274,7 @@ impl Tap {
         for step in 0..ports {
             let index = (first + step) % ports;
             if self.ports.get(index).is_some_and(|open| open.due <= now) {
-                announced += self.look_at(index, now, found);
+                announced += self.poll_port(index, now, found);
                 if announced >= most {
                     // A flood at one port must not keep the others from being read.
                     self.turn = index + 1;
@@ -285,13 +285,13 @@ impl Tap {
         announced
     }
 
-    fn look_at(&mut self, index: usize, now: u64, found: &mut Vec<Item>) -> usize {
+    fn poll_port(&mut self, index: usize, now: u64, found: &mut Vec<Item>) -> usize {
         let Some(open) = self.ports.get_mut(index) else {
             return 0;
         };
         let key = open.key;
         let mut announced = std::mem::take(&mut self.announced);
-        let look = open.port.look(&open.file, now, &mut announced);
+        let look = open.port.poll(&open.file, now, &mut announced);
         let number = announced.len();
         let is_uncertain = look.is_some_and(|look| look.is_uncertain);
         let calendar = match number > 0 || is_uncertain {
@@ -322,8 +322,8 @@ impl Tap {
         }
         // A buffer that was announced again has lost what it held: only the last use can be read.
         let mut latest = std::mem::take(&mut self.latest);
-        let places = announced.iter().enumerate();
-        latest.extend(places.map(|(index, it)| ((it.segment, it.node), index)));
+        let directories = announced.iter().enumerate();
+        latest.extend(directories.map(|(index, it)| ((it.segment, it.node), index)));
         let reading = Reading {
             monotonic: now,
             calendar,
@@ -344,12 +344,12 @@ impl Tap {
     /// Reads one message. What stood in a ring before we came tells nothing of its time.
     fn read(
         &mut self,
-        (place, generation, port): PortKey,
+        (directory, generation, port): PortKey,
         descriptor: &Descriptor,
         reading: Reading,
         found: &mut Vec<Item>,
     ) {
-        let key = (place, generation, descriptor.segment);
+        let key = (directory, generation, descriptor.segment);
         self.open_segment(key, reading.monotonic);
         let Some(Segment::Open(segment, serial)) = self.segments.get(&key) else {
             self.counters.unreachable += 1;
@@ -382,26 +382,26 @@ impl Tap {
         };
         self.records.clear();
         let message = Message::new(segment, buffer);
-        let judgement = self
-            .judge
-            .judge(&message, buffer.length, template, &mut self.records);
+        let judgement =
+            self.classifier
+                .classify(&message, buffer.length, template, &mut self.records);
         let mut bytes = Vec::new();
-        let is_whole = judgement != Judgement::Captured || buffer.read(segment, &mut bytes);
+        let is_whole = judgement != MessageVerdict::Captured || buffer.read(segment, &mut bytes);
         if !buffer.is_valid(segment) {
             self.counters.missed += 1;
             return;
         }
         self.remembered.add(identity);
-        if judgement == Judgement::Foreign || !is_whole {
+        if judgement == MessageVerdict::Foreign || !is_whole {
             self.counters.malformed += 1;
             return;
         }
         self.counters.read += 1;
-        if judgement == Judgement::Captured {
+        if judgement == MessageVerdict::Captured {
             self.counters.captured += 1;
             // Samples that are read are no news of participants.
-            let is_news = !(self.misses_nothing && self.judge.is_wanted);
-            self.met |= self.judge.announces && is_news;
+            let is_news = !(self.misses_nothing && self.classifier.is_wanted);
+            self.met |= self.classifier.announces && is_news;
             self.counters.captured_bytes += bytes.len() as u64;
             found.push(Item::Message {
                 time: reading.calendar,
@@ -428,12 +428,12 @@ impl Tap {
             self.counters.left_out += 1;
             return;
         }
-        let (place, generation, id) = key;
-        let Some(place) = self.places.places.get(&place) else {
+        let (directory, generation, id) = key;
+        let Some(directory) = self.directories.directories.get(&directory) else {
             return;
         };
         let name = Name::Segment(generation, id).file_name();
-        let segment = SharedFile::open(&place.path.join(name));
+        let segment = SharedFile::open(&directory.path.join(name));
         self.opened += 1;
         let segment = segment.map_or(Segment::Missing(now), |segment| {
             Segment::Open(segment, self.opened)
@@ -451,36 +451,39 @@ impl Tap {
         let finds = now.saturating_sub(self.found) >= every || self.found == 0;
         if finds {
             self.found = now;
-            self.places.find();
+            self.directories.find();
             self.abandoned.clear();
         }
-        if !self.places.list() && !finds {
+        if !self.directories.list() && !finds {
             return;
         }
-        let places = &self.places.places;
-        let inode = |place: &PlaceId, name| places.get(place)?.files.get(&name).copied();
+        let directories = &self.directories.directories;
+        let inode = |directory: &ShmDirectoryId, name| {
+            directories.get(directory)?.files.get(&name).copied()
+        };
         self.ports.retain(|open| {
-            let (place, generation, number) = &open.key;
-            inode(place, Name::Port(*generation, *number)) == Some(open.file.inode())
+            let (directory, generation, number) = &open.key;
+            inode(directory, Name::Port(*generation, *number)) == Some(open.file.inode())
         });
         self.segments
-            .retain(|(place, generation, id), segment| match segment {
+            .retain(|(directory, generation, id), segment| match segment {
                 Segment::Open(file, _) => {
-                    let listed = inode(place, Name::Segment(*generation, *id));
+                    let listed = inode(directory, Name::Segment(*generation, *id));
                     listed == Some(file.inode()) && !file.is_unlinked()
                 }
                 Segment::Missing(_) => false,
             });
         let known: HashSet<_> = self.ports.iter().map(|open| open.key).collect();
         self.unborn.clear();
-        for (id, place) in places {
-            for (name, inode) in &place.files {
+        for (id, directory) in directories {
+            for (name, inode) in &directory.files {
                 let Name::Port(generation, number) = name else {
                     continue;
                 };
                 let key = (*id, *generation, *number);
                 if !known.contains(&key) && !self.abandoned.contains(&(key, *inode)) {
-                    self.unborn.push((key, place.path.join(name.file_name())));
+                    self.unborn
+                        .push((key, directory.path.join(name.file_name())));
                 }
             }
         }
@@ -574,14 +577,14 @@ impl Tap {
     }
 
     /// Whether the process that made this segment is dead.
-    fn is_abandoned(&self, locks: &Locks, (place, generation, id): SegmentKey) -> bool {
-        let place = self.places.places.get(&place);
+    fn is_abandoned(&self, locks: &Locks, (directory, generation, id): SegmentKey) -> bool {
+        let directory = self.directories.directories.get(&directory);
         let name = Name::Segment(generation, id).file_name();
-        place.is_some_and(|place| locks.is_abandoned(&place.path.join(name)))
+        directory.is_some_and(|directory| locks.is_abandoned(&directory.path.join(name)))
     }
 }
 
-impl Remembered {
+impl RecentMessages {
     fn add(&mut self, identity: Identity) {
         if self.order.len() >= REMEMBERED
             && let Some(oldest) = self.order.pop_front()

@@ -155,8 +155,9 @@ impl Start {
     }
 
     fn once(program: &Path, configuration: &Path, notify: &Path) -> Result<Start> {
-        let told = UnixDatagram::bind(notify).context("cannot bind a socket for READY=1")?;
-        told.set_nonblocking(true)?;
+        let agent_totals =
+            UnixDatagram::bind(notify).context("cannot bind a socket for READY=1")?;
+        agent_totals.set_nonblocking(true)?;
         let began = Instant::now();
         // It ends with this thread, whatever happens.
         let mut command = Command::new("setpriv");
@@ -170,7 +171,7 @@ impl Start {
                 return Ok(Start { ready, scrape });
             }
             let mut message = [0; 4096];
-            if let Ok(length) = told.recv(&mut message) {
+            if let Ok(length) = agent_totals.recv(&mut message) {
                 let message = String::from_utf8_lossy(message.get(..length).unwrap_or_default());
                 if message.contains("READY=1") {
                     ready.get_or_insert(began.elapsed());

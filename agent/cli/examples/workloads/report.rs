@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::window::{Observer, Told, UNIT_SECONDS, Window};
+use crate::window::{AgentTotals, Observer, UNIT_SECONDS, Window};
 use ros2probe_testing::harness::peer::Stack;
 use ros2probe_testing::harness::usage::Memory;
 
@@ -50,7 +50,7 @@ impl Miss {
     }
 
     /// On a machine that is as busy as this one.
-    pub(crate) const fn told(what: String) -> Miss {
+    pub(crate) const fn noted(what: String) -> Miss {
         Miss { what, fails: false }
     }
 }
@@ -139,17 +139,17 @@ impl Row {
                 ),
             );
         }
-        for (window, told) in self.told() {
-            if self.is_large() && told.copied > targets.copied {
-                miss(true, format!("{:.2} % copied", told.copied * 100.0));
+        for (window, agent_totals) in self.agent_totals() {
+            if self.is_large() && agent_totals.copied > targets.copied {
+                miss(true, format!("{:.2} % copied", agent_totals.copied * 100.0));
             }
-            if told.counted as u64 != window.sent {
-                let Told {
+            if agent_totals.counted as u64 != window.sent {
+                let AgentTotals {
                     counted,
                     lost,
                     dropped,
                     ..
-                } = told;
+                } = agent_totals;
                 miss(
                     true,
                     format!(
@@ -168,10 +168,10 @@ impl Row {
             .filter(move |window| window.observer == observer)
     }
 
-    fn told(&self) -> impl Iterator<Item = (&Window, &Told)> {
+    fn agent_totals(&self) -> impl Iterator<Item = (&Window, &AgentTotals)> {
         self.windows
             .iter()
-            .filter_map(|window| Some((window, window.told.as_ref()?)))
+            .filter_map(|window| Some((window, window.agent_totals.as_ref()?)))
     }
 
     fn cpu(&self, observer: Observer) -> f64 {
@@ -195,8 +195,10 @@ impl Row {
     }
 
     fn copied(&self, observer: Observer) -> f64 {
-        let told = self.of(observer).filter_map(|window| window.told.as_ref());
-        median(told.map(|told| told.copied)) * 100.0
+        let agent_totals = self
+            .of(observer)
+            .filter_map(|window| window.agent_totals.as_ref());
+        median(agent_totals.map(|agent_totals| agent_totals.copied)) * 100.0
     }
 
     fn memory(&self, observer: Observer) -> Memory {
@@ -213,8 +215,11 @@ impl fmt::Display for Row {
         let of_reference = self
             .reference
             .map_or_else(|| "-".to_owned(), |theirs| format!("{:.3}", host / theirs));
-        let counted: f64 = self.told().map(|(_, told)| told.counted).sum();
-        let sent: u64 = self.told().map(|(window, _)| window.sent).sum();
+        let counted: f64 = self
+            .agent_totals()
+            .map(|(_, agent_totals)| agent_totals.counted)
+            .sum();
+        let sent: u64 = self.agent_totals().map(|(window, _)| window.sent).sum();
         write!(
             formatter,
             "| {} | {:?} | {host:.4}, {wire:.4} | {subscriber:.3} | {:.3} | {of_reference} \

@@ -70,7 +70,7 @@ pub(crate) fn measure(program: &Path, length: Duration) -> Result<Vec<Miss>> {
     };
     let one = of(1) - of(0);
     Ok(Vec::from_iter((one >= OF_CORE).then(|| {
-        Miss::told(format!("one page takes {:.2} % of a core", one * 1e2))
+        Miss::noted(format!("one page takes {:.2} % of a core", one * 1e2))
     })))
 }
 

@@ -43,11 +43,11 @@ pub(crate) struct Window {
     /// Samples written, from the publishers' first to their last.
     pub(crate) sent: u64,
     /// What the agent says at the end.
-    pub(crate) told: Option<Told>,
+    pub(crate) agent_totals: Option<AgentTotals>,
 }
 
 /// The agent's numbers over its whole life, start included.
-pub(crate) struct Told {
+pub(crate) struct AgentTotals {
     pub(crate) counted: f64,
     pub(crate) lost: f64,
     /// Frames and records that the kernel dropped before the agent saw them.
@@ -149,19 +149,19 @@ impl Window {
             cpu: spent.cpu,
             memory: spent.memory,
             sent,
-            told: scrape.map(|scrape| Told::of(&scrape, streams, traffic)),
+            agent_totals: scrape.map(|scrape| AgentTotals::of(&scrape, streams, traffic)),
         })
     }
 }
 
-impl Told {
-    fn of(scrape: &Scrape, streams: &[Stream], traffic: f64) -> Told {
+impl AgentTotals {
+    fn of(scrape: &Scrape, streams: &[Stream], traffic: f64) -> AgentTotals {
         let sum = |name: &str| -> f64 {
             let each = streams.iter().map(|stream| stream.topic.as_str());
             each.map(|topic| scrape.sum(name, &[("topic", topic)]))
                 .sum()
         };
-        Told {
+        AgentTotals {
             counted: sum("ros2_topic_messages_total"),
             lost: sum("ros2_topic_lost_messages_total"),
             dropped: scrape.sum("ros2probe_capture_dropped_packets_total", &[])

@@ -9,7 +9,7 @@ use ros2probe::ros2::facts::Named;
 use ros2probe::ros2::{action, topic};
 
 use super::events::ActionEcho;
-use super::shared::{Graph, say, say_or_fail};
+use super::shared::{Graph, print_or_fail, print_text};
 
 /// `rp action VERB`.
 #[derive(Args, Debug)]
@@ -93,7 +93,7 @@ impl Action {
 impl List {
     fn ask(self) -> Result<ExitCode> {
         let actions = actions(&self.target)?.into_iter();
-        say(&action::list(actions, self.show_types, self.count_actions))
+        print_text(&action::list(actions, self.show_types, self.count_actions))
     }
 }
 
@@ -102,7 +102,7 @@ impl Info {
         let name = &self.action_name;
         let feedback = Graph::reach(&self.target)?.topic(&action::feedback_of(name))?;
         let text = action::info(name, feedback.as_ref(), self.show_types, self.count);
-        say(&text)
+        print_text(&text)
     }
 }
 
@@ -110,7 +110,7 @@ impl Type {
     fn ask(self) -> Result<ExitCode> {
         let actions = actions(&self.target)?;
         let kind = topic::type_of(&self.action_name, actions.iter().map(typed));
-        say_or_fail(kind.as_deref())
+        print_or_fail(kind.as_deref())
     }
 }
 
@@ -118,7 +118,7 @@ impl Find {
     fn ask(self) -> Result<ExitCode> {
         let actions = actions(&self.target)?;
         let typed = actions.iter().map(typed);
-        say(&topic::find(&self.action_type, typed, self.count_actions))
+        print_text(&topic::find(&self.action_type, typed, self.count_actions))
     }
 }
 

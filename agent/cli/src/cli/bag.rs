@@ -10,12 +10,12 @@ use ros2probe::ros2::bag::{self, Sort};
 use ros2probe::ros2::{Dialect, dialect};
 use ros2probe_bag::info;
 use ros2probe_bag::reindex::{self, Found};
-use ros2probe_daemon::visible::visible;
+use ros2probe_daemon::escape::visible;
 
 use super::convert::Convert;
 use super::interrupt::INTERRUPTED;
 use super::record::Record;
-use super::{Arguments, Output, Said};
+use super::{Arguments, Output, UserError};
 
 /// `rp bag VERB`.
 #[derive(Args, Debug)]
@@ -127,7 +127,7 @@ impl Reindex {
         require(&self.bag_path, "reindex");
         if !self.bag_path.is_dir() {
             let path = self.bag_path.display();
-            return Err(Said(format!("{path} is a file: give the bag's directory")).into());
+            return Err(UserError(format!("{path} is a file: give the bag's directory")).into());
         }
         let report = reindex::reindex(&self.bag_path)?;
         let mut output = Output::new();

@@ -8,7 +8,7 @@ use anyhow::Result;
 use clap::Args;
 use ros2probe::client::{Agent, ClientError, Target};
 use ros2probe::doctor::answers::Answers;
-use ros2probe::doctor::host::Host;
+use ros2probe::doctor::host_state::HostState;
 use ros2probe::doctor::report::Report;
 use ros2probe::doctor::text::{Style, text};
 use ros2probe::doctor::{Configured, Reach, examine, examine_capture, examine_remote};
@@ -60,7 +60,7 @@ impl Doctor {
             }
         } else {
             let configured = configured(self.config.as_deref())?;
-            examine(&Host::read(), &configured, &reach(&self.target))
+            examine(&HostState::read(), &configured, &reach(&self.target))
         };
         self.print(&report)?;
         Ok(match report.has_problems() {

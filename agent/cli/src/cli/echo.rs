@@ -9,14 +9,14 @@ use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
 use ros2probe::ros2::facts::Topic;
 use ros2probe::ros2::name::full_name;
-use ros2probe_daemon::visible::visible_lines;
+use ros2probe_daemon::escape::visible_lines;
 use ros2probe_message::TypeName;
 use ros2probe_message::filter::Filter;
 
-use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
+use super::follow::{Printing, StreamItem, StreamStatus, Types, follow, for_stdout, topic};
 use super::notes::{NOT_ALL_PRINTED, Notes};
 use super::shared::{Matching, Spinning, names_of};
-use super::{Output, Said};
+use super::{Output, UserError};
 
 /// Moves the cursor home and clears the terminal.
 const CLEAR: &str = "\x1b[H\x1b[2J\n";
@@ -87,7 +87,7 @@ impl Echo {
     pub(crate) fn ask(self) -> Result<ExitCode> {
         let options = self.options()?;
         let raw = options.raw;
-        let name = full_name(&self.topic_name).map_err(said)?;
+        let name = full_name(&self.topic_name).map_err(user_error)?;
         if self.lost_messages {
             eprintln!(
                 "WARNING: '--lost-messages' is deprecated; lost messages are reported by default"
@@ -95,7 +95,7 @@ impl Echo {
         }
         if let Some(message_type) = &self.message_type {
             let known: Result<TypeName, _> = message_type.parse();
-            known.map_err(|_| Said("The passed message type is invalid".to_owned()))?;
+            known.map_err(|_| UserError("The passed message type is invalid".to_owned()))?;
         }
         let domain_id = self.target.domain()?;
         let mut types = Types::new(self.printing.library(&self.target));
@@ -132,14 +132,14 @@ impl Echo {
         let mut is_seen = false;
         let names = std::slice::from_ref(&name);
         let mut notes = Notes::begin(&agent, domain_id, is_waiting, names, NOT_ALL_PRINTED);
-        let went = follow(&agent, domain_id, names, &mut notes, |came, now| {
+        let went = follow(&agent, domain_id, names, &mut notes, |received, now| {
             let start = *start.get_or_insert(now);
             let mut text = String::new();
             let mut is_enough = false;
-            match came {
-                Came::Clock => {}
-                Came::Missed(missed) => text = lost.missed(missed),
-                Came::Message(sample, payload) => {
+            match received {
+                StreamItem::Clock => {}
+                StreamItem::Missed(missed) => text = lost.missed(missed),
+                StreamItem::Message(sample, payload) => {
                     if !is_seen
                         && known.is_none()
                         && self.message_type.is_none()
@@ -152,7 +152,7 @@ impl Echo {
                     if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
                         let message_type = if raw { None } else { types.of(sample) };
                         let told = echo.message(sample, message_type.as_deref(), &payload);
-                        let told = told.map_err(said)?;
+                        let told = told.map_err(user_error)?;
                         eprint!("{}", visible_lines(&told.err));
                         if let Some(message) = told.out {
                             if self.clear {
@@ -170,9 +170,16 @@ impl Echo {
             is_enough |= self
                 .timeout
                 .is_some_and(|timeout| elapsed(start, now) >= timeout);
-            Ok(if is_enough { Went::Enough } else { Went::On })
+            Ok(if is_enough {
+                StreamStatus::Stopped
+            } else {
+                StreamStatus::Open
+            })
         })?;
-        let is_over = matches!(went, Went::ToTheEnd | Went::Cut);
+        let is_over = matches!(
+            went,
+            StreamStatus::CaptureEnded | StreamStatus::CaptureTruncated
+        );
         if is_over && !is_seen && known.is_none() && self.message_type.is_none() {
             match topic(&agent, domain_id, &name)? {
                 Some(known) => drop(self.expected(&known)?),
@@ -182,7 +189,9 @@ impl Echo {
         if echo.unreadable() > 1 {
             eprintln!("rp: {} messages could not be read", echo.unreadable());
         }
-        Ok(ExitCode::from(u8::from(went == Went::Cut)))
+        Ok(ExitCode::from(u8::from(
+            went == StreamStatus::CaptureTruncated,
+        )))
     }
 
     fn options(&self) -> Result<echo::Options> {
@@ -196,8 +205,8 @@ impl Echo {
             raw: self.raw,
             fields: fields
                 .collect::<Result<Vec<FieldPath>, _>>()
-                .map_err(said)?,
-            filter: filter.map_err(|error| Said(error.to_string()))?,
+                .map_err(user_error)?,
+            filter: filter.map_err(|error| UserError(error.to_string()))?,
             include_info: self.include_message_info,
         })
     }
@@ -216,7 +225,7 @@ impl Echo {
                     self.topic_name,
                     several.join(", ")
                 );
-                Err(Said(text).into())
+                Err(UserError(text).into())
             }
         }
     }
@@ -228,7 +237,7 @@ impl Echo {
         ))?;
         names_of(agent, domain_id)?;
         let text = "Could not determine the type for the passed topic";
-        Err(Said(text.to_owned()).into())
+        Err(UserError(text.to_owned()).into())
     }
 }
 
@@ -266,6 +275,6 @@ fn positive(text: &str) -> Result<f64, String> {
     value.ok_or_else(|| "value must be a positive number".to_owned())
 }
 
-fn said(refused: Refused) -> anyhow::Error {
-    Said(refused.0).into()
+fn user_error(refused: Refused) -> anyhow::Error {
+    UserError(refused.0).into()
 }

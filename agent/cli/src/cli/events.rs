@@ -8,12 +8,12 @@ use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, Echo};
 use ros2probe::ros2::name::full_name;
-use ros2probe_daemon::visible::visible_lines;
+use ros2probe_daemon::escape::visible_lines;
 
-use super::follow::{Came, Printing, Types, Went, follow, for_stdout, topic};
+use super::follow::{Printing, StreamItem, StreamStatus, Types, follow, for_stdout, topic};
 use super::notes::{NOT_ALL_PRINTED, Notes};
 use super::shared::{Matching, Spinning, names_of};
-use super::{Output, Said};
+use super::{Output, UserError};
 
 /// `rp service echo`.
 #[derive(Args, Debug)]
@@ -62,7 +62,7 @@ const PARTS: [(&str, &str); 5] = [
 
 impl ServiceEcho {
     pub(crate) fn ask(self) -> Result<ExitCode> {
-        let name = full_name(&self.service_name).map_err(said)?;
+        let name = full_name(&self.service_name).map_err(user_error)?;
         let events = format!("{name}/_service_event");
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
@@ -73,7 +73,7 @@ impl ServiceEcho {
                 let names = names_of(&agent, domain_id)?;
                 if names.services.iter().all(|service| service.name != name) {
                     let text = format!("Cannot find type for '{}'", self.service_name);
-                    return Err(Said(text).into());
+                    return Err(UserError(text).into());
                 }
             }
             let known = topic(&agent, domain_id, &events)?;
@@ -99,8 +99,8 @@ impl ServiceEcho {
 
 impl ActionEcho {
     pub(crate) fn ask(self) -> Result<ExitCode> {
-        let parts = chosen(self.interfaces.as_deref()).map_err(said)?;
-        let name = full_name(&self.action_name).map_err(said)?;
+        let parts = chosen(self.interfaces.as_deref()).map_err(user_error)?;
+        let name = full_name(&self.action_name).map_err(user_error)?;
         let domain_id = self.target.domain()?;
         if let Some(action_type) = &self.action_type {
             let types = Types::new(self.printing.library(&self.target));
@@ -112,7 +112,7 @@ impl ActionEcho {
             let feedback = format!("{name}/_action/feedback");
             if names.topics.iter().all(|topic| topic.name != feedback) {
                 let text = format!("Cannot find type for '{}'", self.action_name);
-                return Err(Said(text).into());
+                return Err(UserError(text).into());
             }
         }
         let topics: Vec<_> = parts
@@ -171,8 +171,8 @@ fn print(
     let is_replay = target.replay.is_some();
     let notes = Notes::begin(agent, domain_id, is_replay, &names, NOT_ALL_PRINTED);
     let mut notes = notes.of_parts();
-    let went = follow(agent, domain_id, &names, &mut notes, |came, _| {
-        if let Came::Message(sample, payload) = came
+    let went = follow(agent, domain_id, &names, &mut notes, |received, _| {
+        if let StreamItem::Message(sample, payload) = received
             && expected.is_none_or(|expected| expected == sample.message_type)
             && let Some(message_type) = types.of(sample)
         {
@@ -182,13 +182,15 @@ fn print(
             eprint!("{}", visible_lines(&told.err));
             output.write(&for_stdout(told.out.unwrap_or_default()))?;
         }
-        Ok(Went::On)
+        Ok(StreamStatus::Open)
     })?;
-    Ok(ExitCode::from(u8::from(went == Went::Cut)))
+    Ok(ExitCode::from(u8::from(
+        went == StreamStatus::CaptureTruncated,
+    )))
 }
 
-fn said(refused: Refused) -> anyhow::Error {
-    Said(refused.0).into()
+fn user_error(refused: Refused) -> anyhow::Error {
+    UserError(refused.0).into()
 }
 
 #[cfg(test)]

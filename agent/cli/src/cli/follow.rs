@@ -11,13 +11,13 @@ use clap::Args;
 use ros2probe::client::{Agent, ClientError, Target};
 use ros2probe::ros2::facts::Topic;
 use ros2probe_api::path::encoded;
+use ros2probe_daemon::escape::{visible, visible_lines};
 use ros2probe_daemon::subscriptions::line::{Line, MissedFacts, SampleFacts};
-use ros2probe_daemon::visible::{visible, visible_lines};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::Style;
-use ros2probe_message::{Library, Limits, MessageType, Shown, Sources, decode};
+use ros2probe_message::{Library, Limits, MessageType, Sources, Truncation, decode};
 
-use super::Said;
+use super::UserError;
 use super::notes::Notes;
 
 /// What is wrong when a live agent ends its stream.
@@ -55,8 +55,8 @@ pub(crate) struct Printing {
 }
 
 impl Printing {
-    pub(crate) fn shown(&self) -> Shown {
-        Shown {
+    pub(crate) fn shown(&self) -> Truncation {
+        Truncation {
             truncate: (!self.full_length).then_some(self.truncate_length),
             no_arrays: self.no_arr,
             no_strings: self.no_str,
@@ -86,11 +86,11 @@ pub(crate) fn library(target: &Target, directories: Vec<PathBuf>) -> Library {
     ))
 }
 
-/// What comes by a stream.
-pub(crate) enum Came<'a> {
+/// One item of a stream.
+pub(crate) enum StreamItem<'a> {
     Message(&'a SampleFacts, Bytes),
     Missed(&'a MissedFacts),
-    /// Everything up to here was told.
+    /// Everything up to here was delivered.
     Clock,
 }
 
@@ -104,16 +104,16 @@ pub(crate) fn for_stdout(text: String) -> String {
     }
 }
 
-/// How a stream went on.
+/// The state of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Went {
-    On,
-    /// Who reads it wants no more.
-    Enough,
+pub(crate) enum StreamStatus {
+    Open,
+    /// The reader wants no more.
+    Stopped,
     /// The capture has ended.
-    ToTheEnd,
+    CaptureEnded,
     /// The rest of the capture cannot be read, which stderr says.
-    Cut,
+    CaptureTruncated,
 }
 
 /// The messages of topics: each thing that comes, and the time in nanoseconds, until `visit` has
@@ -123,8 +123,8 @@ pub(crate) fn follow(
     domain_id: u32,
     topics: &[String],
     notes: &mut Notes<'_>,
-    mut visit: impl FnMut(Came<'_>, i64) -> Result<Went>,
-) -> Result<Went> {
+    mut visit: impl FnMut(StreamItem<'_>, i64) -> Result<StreamStatus>,
+) -> Result<StreamStatus> {
     let names: Vec<String> = topics.iter().map(|name| encoded(name)).collect();
     let names = names.join(",");
     let path = format!("/samples?topic={names}&domain_id={domain_id}&payload=true");
@@ -132,41 +132,41 @@ pub(crate) fn follow(
     let mut now = None;
     while let Some(line) = lines.line()? {
         let went = match serde_json::from_slice(&line)? {
-            Line::Open(_) => Went::On,
+            Line::Open(_) => StreamStatus::Open,
             Line::Sample(sample) => {
                 let length = sample.payload_bytes.unwrap_or(0);
                 let payload = lines.bytes(usize::try_from(length)?)?;
                 now = now.max(Some(sample.time_ns));
-                notes.came(&sample.topic, sample.sampled);
-                visit(Came::Message(&sample, payload), sample.time_ns)?
+                notes.received(&sample.topic, sample.sampled);
+                visit(StreamItem::Message(&sample, payload), sample.time_ns)?
             }
             Line::Clock(clock) => {
                 now = now.max(Some(clock.time_ns));
                 notes.now()?;
-                visit(Came::Clock, clock.time_ns)?
+                visit(StreamItem::Clock, clock.time_ns)?
             }
             Line::Missed(missed) => {
                 notes.missed(&missed);
                 match now {
-                    Some(now) => visit(Came::Missed(&missed), now)?,
-                    None => Went::On,
+                    Some(now) => visit(StreamItem::Missed(&missed), now)?,
+                    None => StreamStatus::Open,
                 }
             }
             Line::End(end) if end.reason == END_OF_CAPTURE => {
                 notes.end()?;
-                return Ok(Went::ToTheEnd);
+                return Ok(StreamStatus::CaptureEnded);
             }
             Line::End(_) if agent.outcome().is_some() => {
                 notes.end()?;
-                return Ok(Went::Cut);
+                return Ok(StreamStatus::CaptureTruncated);
             }
             Line::End(_) => break,
         };
-        if went != Went::On {
+        if went != StreamStatus::Open {
             return Ok(went);
         }
     }
-    Err(Said(AGENT_ENDED.to_owned()).into())
+    Err(UserError(AGENT_ENDED.to_owned()).into())
 }
 
 /// What an agent knows of a topic.
@@ -199,7 +199,7 @@ impl Types {
     /// The definition of a type that was named, or that all of a topic's writers have.
     pub(crate) fn find(&self, name: &str, hash: Option<&str>) -> Result<Arc<MessageType>> {
         let found = self.library.find(name, hash);
-        found.map_err(|error| Said(whole(&error)).into())
+        found.map_err(|error| UserError(error_chain(&error)).into())
     }
 
     /// The definition that a message was written by; `None` where there is none.
@@ -212,7 +212,7 @@ impl Types {
         let found = match self.library.find(&sample.message_type, hash) {
             Ok(found) => Some(found),
             Err(error) => {
-                let text = whole(&error);
+                let text = error_chain(&error);
                 if !self.undefined.contains(&text) && self.undefined.len() < MAX_WRITERS {
                     eprintln!(
                         "rp: {}",
@@ -232,15 +232,15 @@ impl Types {
 
 /// Lets messages through for which an expression is true. What has no definition, or is none of its
 /// type, does not pass; stderr says so once.
-pub(crate) struct Sieve {
+pub(crate) struct MessageFilter {
     filter: Filter,
     types: Types,
     is_told: bool,
 }
 
-impl Sieve {
+impl MessageFilter {
     pub(crate) fn new(filter: &str, library: Library) -> Result<Self> {
-        let filter = Filter::parse(filter).map_err(|error| Said(error.to_string()))?;
+        let filter = Filter::parse(filter).map_err(|error| UserError(error.to_string()))?;
         let types = Types::new(library);
         Ok(Self {
             filter,
@@ -256,7 +256,7 @@ impl Sieve {
         match decode(&message_type, payload, &Limits::default()) {
             Ok(decoded) => {
                 let passes = self.filter.passes(Subject::Message(&decoded.message));
-                passes.map_err(|error| Said(error.to_string()).into())
+                passes.map_err(|error| UserError(error.to_string()).into())
             }
             Err(error) => {
                 if !std::mem::replace(&mut self.is_told, true) {
@@ -273,7 +273,7 @@ impl Sieve {
 }
 
 /// An error with its causes in one line.
-fn whole(error: &dyn std::error::Error) -> String {
+fn error_chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();
     while let Some(cause) = source {
@@ -286,7 +286,7 @@ fn whole(error: &dyn std::error::Error) -> String {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_daemon::visible::visible_lines;
+    use ros2probe_daemon::escape::visible_lines;
 
     #[test]
     fn no_message_commands_a_terminal() {

@@ -31,7 +31,7 @@ use clap::{CommandFactory as _, Parser, Subcommand};
 use ros2probe_daemon::agent::DEFAULT_CONFIG;
 
 pub(crate) use discover::Discover;
-pub(crate) use output::{Output, Said, is_broken_pipe};
+pub(crate) use output::{Output, UserError, is_broken_pipe};
 pub(crate) use run::Run;
 
 /// Watches a ROS 2 robot from copies of its DDS traffic, without joining it.

@@ -5,10 +5,10 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use ros2probe::client::Target;
-use ros2probe::ros2::node::{self, Told};
+use ros2probe::ros2::node::{self, NodeText};
 
-use super::Said;
-use super::shared::{Graph, Spinning, say};
+use super::UserError;
+use super::shared::{Graph, Spinning, print_text};
 
 /// `rp node VERB`.
 #[derive(Args, Debug)]
@@ -65,21 +65,21 @@ impl Node {
 impl List {
     fn ask(self) -> Result<ExitCode> {
         let names = Graph::reach(&self.target)?.names()?;
-        tell(&node::list(&names.nodes, self.all, self.count_nodes))
+        print_node(&node::list(&names.nodes, self.all, self.count_nodes))
     }
 }
 
 impl Info {
     fn ask(self) -> Result<ExitCode> {
         let node = Graph::reach(&self.target)?.node(&self.node_name)?;
-        let told = node::info(&self.node_name, node.as_ref(), self.include_hidden);
-        tell(&told.map_err(|refused| Said(refused.0))?)
+        let text = node::info(&self.node_name, node.as_ref(), self.include_hidden);
+        print_node(&text.map_err(|refused| UserError(refused.0))?)
     }
 }
 
-fn tell(told: &Told) -> Result<ExitCode> {
-    if let Some(warning) = &told.warning {
+fn print_node(text: &NodeText) -> Result<ExitCode> {
+    if let Some(warning) = &text.warning {
         eprintln!("{warning}");
     }
-    say(&told.text)
+    print_text(&text.text)
 }

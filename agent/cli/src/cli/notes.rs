@@ -8,9 +8,9 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use ros2probe::client::{Agent, ClientError};
 use ros2probe_api::path::encoded;
-use ros2probe_daemon::recording::{Graph, GraphTopic, SeenTopic, Strangers};
+use ros2probe_daemon::escape::visible;
+use ros2probe_daemon::recording::{Graph, GraphTopic, PublishedTopic, UnknownWriterList};
 use ros2probe_daemon::subscriptions::line::{MissedFacts, Reason};
-use ros2probe_daemon::visible::visible;
 use serde::Deserialize;
 
 use super::shared::names_of;
@@ -108,7 +108,7 @@ impl<'a> Notes<'a> {
             let topics = notes.topics();
             let topics = topics.iter().filter(|topic| is_sampled(topic));
             let topics: Vec<String> = topics.map(|topic| topic.name.clone()).collect();
-            notes.say_sampled(&topics);
+            notes.print_sampled(&topics);
         }
         notes
     }
@@ -127,9 +127,9 @@ impl<'a> Notes<'a> {
     }
 
     /// A message came.
-    pub(crate) fn came(&mut self, topic: &str, sampled: bool) {
+    pub(crate) fn received(&mut self, topic: &str, sampled: bool) {
         if sampled && !self.sampled.contains(topic) {
-            self.say_sampled(&[topic.to_owned()]);
+            self.print_sampled(&[topic.to_owned()]);
         }
         if !self.heard.contains(topic) {
             self.heard.insert(topic.to_owned());
@@ -236,7 +236,7 @@ impl<'a> Notes<'a> {
         Some(text.to_owned())
     }
 
-    fn say_sampled(&mut self, topics: &[String]) {
+    fn print_sampled(&mut self, topics: &[String]) {
         let consequence = self.consequence;
         if let Some(text) = sampled(topics, consequence) {
             eprintln!("rp: {}", visible(&text));
@@ -245,7 +245,7 @@ impl<'a> Notes<'a> {
     }
 
     /// The named topics, or all of the domain; none where the agent does not answer.
-    fn topics(&self) -> Vec<SeenTopic> {
+    fn topics(&self) -> Vec<PublishedTopic> {
         let graph = match self.names.as_slice() {
             [name] => {
                 let topic = self.agent.get::<GraphTopic>(&path(name, self.domain_id));
@@ -257,7 +257,10 @@ impl<'a> Notes<'a> {
                 self.agent.get(&path)
             }
         };
-        let mut topics = graph.unwrap_or_default().sight(Strangers::default()).topics;
+        let mut topics = graph
+            .unwrap_or_default()
+            .into_snapshot(UnknownWriterList::default())
+            .topics;
         topics.retain(|topic| self.names.is_empty() || self.names.contains(&topic.name));
         topics
     }
@@ -310,8 +313,8 @@ pub(crate) fn samples_shared_memory(agent: &Agent) -> bool {
 }
 
 /// Whether all messages of a topic pass through shared memory.
-pub(crate) fn is_sampled(topic: &SeenTopic) -> bool {
-    topic.subscribed && topic.aside.as_deref() == Some("shared_memory")
+pub(crate) fn is_sampled(topic: &PublishedTopic) -> bool {
+    topic.subscribed && topic.other_transport.as_deref() == Some("shared_memory")
 }
 
 /// That topics are sampled, what follows from it, and what helps.

@@ -6,7 +6,7 @@ use std::io::{self, Write as _};
 /// A line for stderr as it is, as the original prints its errors; the exit code is 1.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
-pub(crate) struct Said(pub(crate) String);
+pub(crate) struct UserError(pub(crate) String);
 
 /// Standard output.
 #[derive(Debug)]
@@ -40,7 +40,7 @@ impl Output {
     }
 }
 
-/// The reader of standard output has gone: nothing is left to be said.
+/// The reader of standard output has gone: there is no output left to write.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         let cause = cause.downcast_ref::<io::Error>();

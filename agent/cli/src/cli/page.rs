@@ -9,7 +9,7 @@ use ros2probe::client::{Agent, Target};
 use serde::Deserialize;
 use serde_json::json;
 
-use super::{Output, Said};
+use super::{Output, UserError};
 
 /// The built-in port of the API.
 const PORT: &str = "17401";
@@ -55,13 +55,13 @@ impl Page {
         };
         if self.target.replay.is_some() {
             let way = "rp run --replay FILE serves the page of a capture".to_owned();
-            return Err(Said(way).into());
+            return Err(UserError(way).into());
         }
         let agent = Agent::reach(&self.target)?;
         let Token { token, address } = agent.post("/page/token", &json!({}))?;
         let Some(address) = address else {
             let reason = "the agent serves no page: api.listen or api.page is off".to_owned();
-            return Err(Said(reason).into());
+            return Err(UserError(reason).into());
         };
         // Where this program has just reached it, if that was by an address.
         let address = near.unwrap_or(address);
@@ -107,7 +107,7 @@ fn open(address: &str) -> Result<()> {
         Ok(status) if status.success() => Ok(()),
         _ => {
             let reason = format!("{OPENER} does not open it: copy the address into a browser");
-            Err(Said(reason).into())
+            Err(UserError(reason).into())
         }
     }
 }

@@ -15,11 +15,11 @@ use ros2probe::ros2::{Dialect, Refused};
 use ros2probe_api::path::encoded;
 use ros2probe_daemon::subscriptions::line::{Line, Reason};
 
-use super::follow::{AGENT_ENDED, END_OF_CAPTURE, Sieve, library};
+use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, library};
 use super::interrupt::INTERRUPTED;
 use super::notes::Notes;
 use super::shared::{Matching, Spinning, names_of};
-use super::{Output, Said};
+use super::{Output, UserError};
 
 /// Window of `hz` and `delay`.
 const LONG: usize = 10_000;
@@ -95,7 +95,9 @@ impl Hz {
     pub(crate) fn ask(self, hidden: bool) -> Result<ExitCode> {
         let target = &self.options.target;
         let library = || library(target, self.definitions);
-        let sieve = self.filter.map(|filter| Sieve::new(&filter, library()));
+        let sieve = self
+            .filter
+            .map(|filter| MessageFilter::new(&filter, library()));
         let sieve = sieve.transpose()?;
         measure(
             Quantity::Rate,
@@ -159,14 +161,16 @@ fn measure(
     topics: Topics,
     target: &Target,
     hidden: bool,
-    mut sieve: Option<Sieve>,
+    mut sieve: Option<MessageFilter>,
 ) -> Result<ExitCode> {
     let dialect = target.dialect();
     let domain_id = target.domain()?;
     let mut names = Vec::new();
     let (mut rates, query) = if topics.all {
         if !topics.names.is_empty() {
-            return Err(Said("Cannot specify both --all/-a and topic names".to_owned()).into());
+            return Err(
+                UserError("Cannot specify both --all/-a and topic names".to_owned()).into(),
+            );
         }
         let query = format!("all=true&hidden={hidden}");
         (Rates::of_all(quantity, dialect, window), query)
@@ -178,7 +182,7 @@ fn measure(
             let name = full_name(&typed)?;
             Ok(Named { typed, name })
         });
-        let named: Vec<Named> = named.collect::<Result<_, Refused>>().map_err(said)?;
+        let named: Vec<Named> = named.collect::<Result<_, Refused>>().map_err(user_error)?;
         names = named.iter().map(|named| named.name.clone()).collect();
         let query: Vec<String> = names.iter().map(|name| encoded(name)).collect();
         let query = format!("topic={}", query.join(","));
@@ -187,7 +191,7 @@ fn measure(
     let agent = Agent::reach_stream(target)?;
     let is_replay = target.replay.is_some();
     let mut notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
-    rates.said_sampled(notes.sampled());
+    rates.sampled_reported(notes.sampled());
     let mut code = ExitCode::SUCCESS;
     let payload = sieve.is_some();
     let path = format!("/samples?{query}&domain_id={domain_id}&payload={payload}");
@@ -205,7 +209,7 @@ fn measure(
                 rates.opened(&present)
             }
             Line::Sample(sample) => {
-                notes.came(&sample.topic, false);
+                notes.received(&sample.topic, false);
                 let arrival = Arrival {
                     time: sample.time_ns,
                     size: sample.size,
@@ -268,7 +272,7 @@ fn measure(
         match over {
             Ok(()) => {}
             Err(End::Idle) => break,
-            Err(End::Refused(refused)) => return Err(said(refused)),
+            Err(End::Refused(refused)) => return Err(user_error(refused)),
         }
     }
     Ok(code)
@@ -284,8 +288,8 @@ const fn sampled(quantity: Quantity) -> &'static str {
     }
 }
 
-fn said(refused: Refused) -> anyhow::Error {
-    Said(refused.0).into()
+fn user_error(refused: Refused) -> anyhow::Error {
+    UserError(refused.0).into()
 }
 
 /// What the original says when it is given no topic: a usage error as long as it took one alone.
@@ -297,7 +301,7 @@ fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
     };
     let text = "Either specify topic names or use --all/-a option";
     if several {
-        return Said(text.to_owned()).into();
+        return UserError(text.to_owned()).into();
     }
     clap::Error::raw(ErrorKind::MissingRequiredArgument, format!("{text}\n")).exit()
 }

@@ -16,16 +16,17 @@ use ros2probe::client::{Agent, Outcome, Samples, Target};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::name::full_name;
 use ros2probe_bag::{self, Form, Options, Storage, Writer};
+use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::recording::{
-    Announced, Asked, Ended, Filter, Going, Graph, Order, Recorder, Ring, Sight, Sources,
-    Strangers, default_name, record, schema, unobserved_lines,
+    Activity, Command, DiscoveredTopic, Filter, FilterOptions, Finished, Graph, GraphSnapshot,
+    Recorder, SampleRing, Sources, UnknownWriterList, default_name, record, schema,
+    unobserved_lines,
 };
-use ros2probe_daemon::visible::visible;
 use ros2probe_message::{Library, Sources as Places};
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::Said;
+use super::UserError;
 use super::interrupt::INTERRUPTED;
 use super::notes::{SILENT, is_sampled, sampled, samples_shared_memory};
 
@@ -181,11 +182,11 @@ struct Keys(Termios);
 struct Phase(Arc<AtomicU8>);
 
 /// What an agent says of topics, asked for all of them at once.
-struct Announcements<'a> {
+struct GraphCache<'a> {
     agent: &'a Agent,
     domain_id: u32,
-    known: HashMap<String, Announced>,
-    sight: Sight,
+    known: HashMap<String, DiscoveredTopic>,
+    graph: GraphSnapshot,
     at: Option<Instant>,
 }
 
@@ -208,7 +209,7 @@ impl Record {
 
     pub(crate) fn ask(self) -> Result<ExitCode> {
         let phase = Phase::starting();
-        let (give, orders) = channel();
+        let (give, commands) = channel();
         listen(give.clone(), phase.clone())?;
         let dialect = self.target.dialect();
         let filter = Filter::new(self.asked(dialect)?).map_err(|error| refused(&error))?;
@@ -216,7 +217,7 @@ impl Record {
         let domain_id = self.target.domain()?;
         let directory = self.output.clone().unwrap_or_else(|| default_name().into());
         if directory.exists() {
-            return Err(Said(format!(
+            return Err(UserError(format!(
                 "[ERROR] [ros2bag]: Output folder '{}' already exists.",
                 directory.display()
             ))
@@ -224,9 +225,9 @@ impl Record {
         }
         let agent = Agent::reach_stream_measured(&self.target)?;
         let query = filter.query(domain_id, self.max_cache_size);
-        let announcements = Arc::new(Mutex::new(Announcements::new(&agent, domain_id)));
+        let graph_cache = Arc::new(Mutex::new(GraphCache::new(&agent, domain_id)));
         // A replay goes on with the stream.
-        let before = locked(&announcements).sight();
+        let before = locked(&graph_cache).latest_snapshot();
         let mut samples = Samples::open(&agent, &query)?;
         let filter = if self.no_discovery {
             let opened = samples.opened().topics.iter();
@@ -241,10 +242,10 @@ impl Record {
             dialect,
         );
         let library = Library::new(places);
-        let (asked, seen) = (Arc::clone(&announcements), Arc::clone(&announcements));
+        let (asked, seen) = (Arc::clone(&graph_cache), Arc::clone(&graph_cache));
         let sources = Sources {
             announced: Box::new(move |names| locked(&asked).of(names)),
-            sight: Box::new(move || locked(&seen).sight()),
+            graph: Box::new(move || locked(&seen).latest_snapshot()),
             schema: Box::new(move |name, hash| schema(&library, name, hash)),
         };
         phase.begin();
@@ -252,13 +253,13 @@ impl Record {
         let mut recorder = Recorder::new(writer, filter, domain_id, before, sources);
         if self.snapshot_mode {
             let room = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
-            recorder = recorder.waiting_in(Ring::new(room, None));
+            recorder = recorder.waiting_in(SampleRing::new(room, None));
         }
         recorder.pause(self.start_paused);
         let is_live = self.target.replay.is_none();
-        let mut said = Told::new(is_live.then(|| Arc::clone(&announcements)));
+        let mut output = RecordingOutput::new(is_live.then(|| Arc::clone(&graph_cache)));
         if is_live && samples_shared_memory(&agent) {
-            said.sampled(&recorder, &locked(&announcements).sight);
+            output.sampled(&recorder, &locked(&graph_cache).graph);
         }
         let opened = samples.opened().topics.iter();
         recorder.declare(opened.filter_map(|topic| {
@@ -285,9 +286,9 @@ impl Record {
             },
         );
         let next = |patience: Duration| samples.next_within(patience);
-        let (ended, broke) = record(recorder, next, &orders, |going| said.tell(going));
+        let (ended, broke) = record(recorder, next, &commands, |going| output.update(going));
         drop(keys);
-        said.finish();
+        output.finish();
         let outcome = agent.outcome().unwrap_or_default();
         let code = report(&ended, &outcome, self.target.replay.is_some());
         match broke {
@@ -296,15 +297,15 @@ impl Record {
         }
     }
 
-    fn asked(&self, dialect: Dialect) -> Result<Asked> {
+    fn asked(&self, dialect: Dialect) -> Result<FilterOptions> {
         let full = |names: &[String]| -> Result<Vec<String>> {
             let names = names.iter().map(|name| full_name(name));
             let names: Result<_, _> = names.collect();
-            names.map_err(|refused| Said(refused.0).into())
+            names.map_err(|refused| UserError(refused.0).into())
         };
         let mut topics = full(&self.positional)?;
         topics.extend(full(&self.topics)?);
-        Ok(Asked {
+        Ok(FilterOptions {
             topics,
             all_topics: self.all || self.all_topics,
             topic_types: self.topic_types.clone(),
@@ -377,9 +378,9 @@ impl Drop for Keys {
 }
 
 /// What was said of a recording so far.
-struct Told<'a> {
+struct RecordingOutput<'a> {
     /// Asked why topics are silent, where that can be answered.
-    announcements: Option<Arc<Mutex<Announcements<'a>>>>,
+    graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>,
     begun: Instant,
     sampled: BTreeSet<String>,
     topics: usize,
@@ -390,10 +391,10 @@ struct Told<'a> {
     compressing: u64,
 }
 
-impl<'a> Told<'a> {
-    fn new(announcements: Option<Arc<Mutex<Announcements<'a>>>>) -> Self {
+impl<'a> RecordingOutput<'a> {
+    fn new(graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>) -> Self {
         Self {
-            announcements,
+            graph_cache,
             begun: Instant::now(),
             sampled: BTreeSet::new(),
             topics: 0,
@@ -404,17 +405,17 @@ impl<'a> Told<'a> {
         }
     }
 
-    fn tell(&mut self, going: Going<'_>) {
+    fn update(&mut self, going: Activity<'_>) {
         match going {
-            Going::Recording(recorder) => self.recording(recorder),
-            Going::Completing => {
+            Activity::Recording(recorder) => self.recording(recorder),
+            Activity::Completing => {
                 self.clear();
                 log(
                     "INFO",
                     "Completing the bag; Ctrl-C again to skip what takes long",
                 );
             }
-            Going::Compressing { done, of } => {
+            Activity::Compressing { done, of } => {
                 self.clear();
                 let percent = (100 * done).checked_div(of).unwrap_or(100);
                 let text = format!("compressing a file of {} MB: {percent} %", of / 1_000_000);
@@ -429,13 +430,13 @@ impl<'a> Told<'a> {
     }
 
     /// Names the topics that are sampled from the start.
-    fn sampled(&mut self, recorder: &Recorder<'_>, sight: &Sight) {
-        let topics = sight.topics.iter();
+    fn sampled(&mut self, recorder: &Recorder<'_>, graph: &GraphSnapshot) {
+        let topics = graph.topics.iter();
         let topics = topics.filter(|topic| is_sampled(topic) && recorder.takes(topic));
-        self.say_sampled(topics.map(|topic| topic.name.clone()).collect());
+        self.print_sampled(topics.map(|topic| topic.name.clone()).collect());
     }
 
-    fn say_sampled(&mut self, topics: Vec<String>) {
+    fn print_sampled(&mut self, topics: Vec<String>) {
         if let Some(text) = sampled(&topics, "not every message will be in the bag") {
             self.clear();
             log("WARN", &text);
@@ -448,14 +449,14 @@ impl<'a> Told<'a> {
         if self.begun.elapsed() < SILENT {
             return;
         }
-        let Some(announcements) = self.announcements.take() else {
+        let Some(graph_cache) = self.graph_cache.take() else {
             return;
         };
-        let sight = locked(&announcements).sight();
-        let mut lines = unobserved_lines(&recorder.unobserved(&sight));
-        let is_known = |name: &&String| sight.topics.iter().any(|topic| topic.name == **name);
+        let graph = locked(&graph_cache).latest_snapshot();
+        let mut lines = unobserved_lines(&recorder.unobserved(&graph));
+        let is_known = |name: &&String| graph.topics.iter().any(|topic| topic.name == **name);
         let unknown = recorder
-            .asked()
+            .options()
             .topics
             .iter()
             .filter(|name| !is_known(name));
@@ -471,7 +472,7 @@ impl<'a> Told<'a> {
     fn recording(&mut self, recorder: &Recorder<'_>) {
         self.explain(recorder);
         let new = recorder.sampled().difference(&self.sampled);
-        self.say_sampled(new.cloned().collect());
+        self.print_sampled(new.cloned().collect());
         let report = recorder.report();
         if report.topics.len() > self.topics {
             self.clear();
@@ -522,7 +523,7 @@ impl<'a> Told<'a> {
 
 /// What is in the bag and what is not. 1 where the storage refused something or nothing of a capture
 /// could be read, [`INCOMPLETE`] where something of a capture is not in the bag.
-fn report(ended: &Ended, outcome: &Outcome, is_replay: bool) -> ExitCode {
+fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> ExitCode {
     for line in ended.report.shortfalls() {
         log("WARN", &line);
     }
@@ -557,7 +558,7 @@ fn report(ended: &Ended, outcome: &Outcome, is_replay: bool) -> ExitCode {
 }
 
 fn refused(error: &ros2probe_daemon::recording::FilterError) -> anyhow::Error {
-    Said(format!("{error}")).into()
+    UserError(format!("{error}")).into()
 }
 
 impl Phase {
@@ -592,19 +593,19 @@ impl Phase {
     }
 }
 
-impl<'a> Announcements<'a> {
+impl<'a> GraphCache<'a> {
     fn new(agent: &'a Agent, domain_id: u32) -> Self {
         Self {
             agent,
             domain_id,
             known: HashMap::new(),
-            sight: Sight::default(),
+            graph: GraphSnapshot::default(),
             at: None,
         }
     }
 
     /// What was known last, where the agent does not answer any more.
-    fn of(&mut self, names: &[String]) -> Vec<Announced> {
+    fn of(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
         let is_old = self.at.is_none_or(|at| at.elapsed() > GRAPH_AGE);
         if is_old || names.iter().any(|name| !self.known.contains_key(name)) {
             self.ask();
@@ -613,32 +614,32 @@ impl<'a> Announcements<'a> {
         known.map(Option::unwrap_or_default).collect()
     }
 
-    fn sight(&mut self) -> Sight {
+    fn latest_snapshot(&mut self) -> GraphSnapshot {
         self.ask();
-        self.sight.clone()
+        self.graph.clone()
     }
 
     fn ask(&mut self) {
         let graph = self
             .agent
             .get_within::<Graph>("/topics?hidden=true", GRAPH_PATIENCE);
-        let strangers = self
+        let unknown_writers = self
             .agent
-            .get_within::<Strangers>("/participants", GRAPH_PATIENCE);
-        let (Ok(graph), Ok(strangers)) = (graph, strangers) else {
+            .get_within::<UnknownWriterList>("/participants", GRAPH_PATIENCE);
+        let (Ok(graph), Ok(unknown_writers)) = (graph, unknown_writers) else {
             return;
         };
         self.known = graph.clone().by_name(self.domain_id);
-        self.sight = graph.sight(strangers);
+        self.graph = graph.into_snapshot(unknown_writers);
         self.at = Some(Instant::now());
     }
 }
 
 /// What is behind the lock is whole at any moment.
 fn locked<'l, 'a>(
-    announcements: &'l Mutex<Announcements<'a>>,
-) -> std::sync::MutexGuard<'l, Announcements<'a>> {
-    announcements.lock().unwrap_or_else(PoisonError::into_inner)
+    graph_cache: &'l Mutex<GraphCache<'a>>,
+) -> std::sync::MutexGuard<'l, GraphCache<'a>> {
+    graph_cache.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Whose distribution this is, as far as the shell says.
@@ -662,7 +663,7 @@ fn pair(text: &str) -> Result<(String, String), String> {
 
 /// Ctrl-C and SIGTERM end the recording: the first one in order, the second one without what takes
 /// long, the third one at once. SIGUSR1 writes what waits.
-fn listen(give: Sender<Order>, phase: Phase) -> io::Result<()> {
+fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
         .build()?;
@@ -686,7 +687,7 @@ fn listen(give: Sender<Order>, phase: Phase) -> io::Result<()> {
             };
             stops = stops.saturating_add(u8::from(is_stop));
             let order = match stops {
-                _ if !is_stop => Order::Snapshot,
+                _ if !is_stop => Command::Snapshot,
                 1 if phase.cancel() => {
                     log(
                         "INFO",
@@ -694,8 +695,8 @@ fn listen(give: Sender<Order>, phase: Phase) -> io::Result<()> {
                     );
                     std::process::exit(INTERRUPTED.into());
                 }
-                1 => Order::Stop,
-                2 => Order::Hurry,
+                1 => Command::Stop,
+                2 => Command::Hurry,
                 _ => {
                     let text = "Interrupted; `rp bag reindex` makes the bag whole";
                     log("ERROR", text);
@@ -710,12 +711,12 @@ fn listen(give: Sender<Order>, phase: Phase) -> io::Result<()> {
     thread.spawn(move || runtime.block_on(wait)).map(drop)
 }
 
-fn read_keys(give: Sender<Order>) {
+fn read_keys(give: Sender<Command>) {
     let read = move || {
         for byte in io::stdin().lock().bytes() {
             match byte {
                 Ok(SPACE) => {
-                    let _ = give.send(Order::Toggle);
+                    let _ = give.send(Command::Toggle);
                 }
                 Ok(_) => {}
                 Err(_) => return,

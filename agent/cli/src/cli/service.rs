@@ -9,7 +9,7 @@ use ros2probe::ros2::facts::{Names, ServiceName};
 use ros2probe::ros2::{service, topic};
 
 use super::events::ServiceEcho;
-use super::shared::{Graph, Spinning, answer, say, say_or_fail};
+use super::shared::{Graph, Spinning, answer, print_or_fail, print_text};
 
 /// `rp service VERB`.
 #[derive(Args, Debug)]
@@ -106,7 +106,7 @@ impl List {
             count: self.count_services,
         };
         let services = shown(&names, hidden || self.include_hidden_services);
-        say(&service::list(services, options))
+        print_text(&service::list(services, options))
     }
 }
 
@@ -114,7 +114,7 @@ impl Type {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
         let names = Graph::reach(&self.target)?.names()?;
         let services = shown(&names, hidden).map(typed);
-        say_or_fail(topic::type_of(&self.service_name, services).as_deref())
+        print_or_fail(topic::type_of(&self.service_name, services).as_deref())
     }
 }
 
@@ -122,7 +122,7 @@ impl Find {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
         let names = Graph::reach(&self.target)?.names()?;
         let services = shown(&names, hidden || self.include_hidden_services).map(typed);
-        say(&topic::find(
+        print_text(&topic::find(
             &self.service_type,
             services,
             self.count_services,

@@ -12,7 +12,7 @@ use ros2probe::ros2::facts::{Names, Node, Topic};
 use ros2probe_api::path::encoded;
 use serde::de::DeserializeOwned;
 
-use super::{Output, Said};
+use super::{Output, UserError};
 
 /// Options that concern the original's own node; accepted, so that scripts go on working.
 #[derive(Args, Clone, Debug, Default)]
@@ -167,20 +167,20 @@ fn late(names: &Names, is_replay: bool) -> Option<String> {
 }
 
 /// Prints what there is to say.
-pub(crate) fn say(text: &str) -> Result<ExitCode> {
+pub(crate) fn print_text(text: &str) -> Result<ExitCode> {
     Output::new().write(text)?;
     Ok(ExitCode::SUCCESS)
 }
 
 /// As [`say`]; a refusal goes to stderr.
 pub(crate) fn answer(text: Result<String, Refused>) -> Result<ExitCode> {
-    say(&text.map_err(|refused| Said(refused.0))?)
+    print_text(&text.map_err(|refused| UserError(refused.0))?)
 }
 
 /// As [`say`]; where there is nothing, the exit code says so alone.
-pub(crate) fn say_or_fail(text: Option<&str>) -> Result<ExitCode> {
+pub(crate) fn print_or_fail(text: Option<&str>) -> Result<ExitCode> {
     match text {
-        Some(text) => say(text),
+        Some(text) => print_text(text),
         None => Ok(ExitCode::FAILURE),
     }
 }

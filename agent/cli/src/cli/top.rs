@@ -9,7 +9,7 @@ use ros2probe::client::{Agent, Target};
 use ros2probe::top::{self, Column, Options};
 use ros2probe_capture::pcap::Speed;
 
-use super::{Output, Said};
+use super::{Output, UserError};
 
 /// Longest pause between two looks.
 const MAX_INTERVAL: f64 = 3600.0;
@@ -77,7 +77,7 @@ impl Top {
         };
         if self.target.from.is_some() {
             let said = "rp: rp top shows a capture from its beginning on: leave out --from";
-            return Err(Said(said.to_owned()).into());
+            return Err(UserError(said.to_owned()).into());
         }
         let speed = self.speed.unwrap_or(Speed::Times(1.0));
         let agent = Agent::reach_measured(&self.target, (!self.once).then_some(speed))?;

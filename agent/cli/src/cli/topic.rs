@@ -11,7 +11,7 @@ use ros2probe::ros2::topic;
 use super::echo::Echo;
 use super::interrupt::INTERRUPTED;
 use super::rates::{Bandwidth, Delay, Hz};
-use super::shared::{Graph, Spinning, answer, say, say_or_fail};
+use super::shared::{Graph, Spinning, answer, print_or_fail, print_text};
 
 /// `rp topic VERB`.
 #[derive(Args, Debug)]
@@ -137,7 +137,7 @@ impl List {
             verbose: self.verbose,
         };
         let topics = shown(&names, hidden || self.include_hidden_topics);
-        say(&topic::list(topics, options))
+        print_text(&topic::list(topics, options))
     }
 }
 
@@ -153,7 +153,7 @@ impl Type {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
         let names = Graph::reach(&self.target)?.names()?;
         let topics = shown(&names, hidden).map(typed);
-        say_or_fail(topic::type_of(&self.topic_name, topics).as_deref())
+        print_or_fail(topic::type_of(&self.topic_name, topics).as_deref())
     }
 }
 
@@ -161,7 +161,7 @@ impl Find {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
         let names = Graph::reach(&self.target)?.names()?;
         let topics = shown(&names, hidden || self.include_hidden_topics).map(typed);
-        say(&topic::find(&self.topic_type, topics, self.count_topics))
+        print_text(&topic::find(&self.topic_type, topics, self.count_topics))
     }
 }
 

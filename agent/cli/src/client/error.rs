@@ -200,8 +200,8 @@ mod tests {
     fn without_an_agent_one_line_says_how_to_start_one_and_how_to_do_without() {
         let said = ClientError::NoAgent.to_string();
         assert!(!said.contains('\n'), "{said}");
-        for way in ["systemctl start ros2probe", "sudo rp run", "--replay FILE"] {
-            assert!(said.contains(way), "{said}");
+        for transport in ["systemctl start ros2probe", "sudo rp run", "--replay FILE"] {
+            assert!(said.contains(transport), "{said}");
         }
     }
 

@@ -94,12 +94,15 @@ impl<'a> Lines<'a> {
     pub fn bytes(&mut self, count: usize) -> Result<Bytes, ClientError> {
         let agent = self.agent;
         if count > MAX_BYTES {
-            return Err(agent.way.not_an_agent());
+            return Err(agent.transport.not_an_agent());
         }
         agent.runtime.block_on(async {
             while self.buffer.len() < count {
                 if !self.fill().await? {
-                    return Err(self.agent.way.broke("the stream ended within a message"));
+                    return Err(self
+                        .agent
+                        .transport
+                        .broke("the stream ended within a message"));
                 }
             }
             self.searched = 0;
@@ -120,7 +123,7 @@ impl<'a> Lines<'a> {
             }
             self.searched = self.buffer.len();
             if self.searched > MAX_LINE {
-                return Err(self.agent.way.not_an_agent());
+                return Err(self.agent.transport.not_an_agent());
             }
             if !self.fill().await? {
                 return Ok(None);
@@ -141,7 +144,7 @@ impl<'a> Lines<'a> {
                         return Ok(true);
                     }
                 }
-                Some(Err(error)) => return Err(self.agent.way.broke(error)),
+                Some(Err(error)) => return Err(self.agent.transport.broke(error)),
             }
         }
         Ok(false)
@@ -159,6 +162,6 @@ impl<'a> Lines<'a> {
             frame = timeout(GRACE, self.body.frame()).await;
         }
         self.waited = Duration::ZERO;
-        frame.map_err(|_| self.agent.way.slow())
+        frame.map_err(|_| self.agent.transport.slow())
     }
 }

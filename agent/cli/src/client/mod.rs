@@ -7,10 +7,10 @@
 
 mod error;
 mod lines;
-mod replayed;
+mod replay_agent;
 mod samples;
 mod target;
-mod way;
+mod transport;
 
 use std::time::Duration;
 
@@ -26,12 +26,12 @@ use tokio::time::timeout;
 
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
-pub use replayed::Outcome;
-use replayed::Stop;
+pub use replay_agent::Outcome;
+use replay_agent::Stop;
 use ros2probe_capture::pcap::Speed;
 pub use samples::Samples;
-pub use target::{Target, Unfit};
-use way::Way;
+pub use target::{InvalidEnvironment, Target};
+use transport::Transport;
 
 /// The longest wait for a whole answer: graphs of thousands of topics come within a second.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -46,7 +46,7 @@ const MAX_ANSWER: usize = 256 << 20;
 /// An agent that can be asked.
 pub struct Agent {
     runtime: Runtime,
-    way: Way,
+    transport: Transport,
     token: Option<String>,
 }
 
@@ -92,10 +92,10 @@ impl Agent {
             .build()
             .map_err(|source| ClientError::Runtime { source })?;
         let token = target.token()?;
-        let way = runtime.block_on(Way::find(target, stop))?;
+        let transport = runtime.block_on(Transport::find(target, stop))?;
         Ok(Self {
             runtime,
-            way,
+            transport,
             token,
         })
     }
@@ -164,49 +164,51 @@ impl Agent {
         self.runtime.block_on(async {
             let answer = self.send(Method::GET, path, None).await?;
             if answer.status().is_success() {
-                self.way.go_on();
+                self.transport.resume();
                 let silence = if path.starts_with("/events") {
                     BEATS
                 } else {
                     SILENCE
                 };
                 // A replay within this process has the pace of its capture.
-                let silence = (!self.way.is_replayed()).then_some(silence);
+                let silence = (!self.transport.is_replayed()).then_some(silence);
                 Ok(Lines::new(self, answer.into_body(), silence))
             } else {
                 let refused = self.whole(path, answer).await;
-                Err(refused.err().unwrap_or_else(|| self.way.not_an_agent()))
+                Err(refused
+                    .err()
+                    .unwrap_or_else(|| self.transport.not_an_agent()))
             }
         })
     }
 
     /// A line or an answer, read.
     fn decoded<T: DeserializeOwned>(&self, path: &str, text: &[u8]) -> Result<T, ClientError> {
-        serde_json::from_slice(text).map_err(|source| self.way.unreadable(path, source))
+        serde_json::from_slice(text).map_err(|source| self.transport.unreadable(path, source))
     }
 
     /// It ended before it said anything.
     fn hung_up(&self, path: &str) -> ClientError {
-        self.way
+        self.transport
             .broke(format!("{path} ended before its first byte"))
     }
 
     /// It is a capture that is asked.
     #[must_use]
     pub const fn is_replay(&self) -> bool {
-        matches!(self.way, Way::Replayed(_))
+        matches!(self.transport, Transport::ReplayAgent(_))
     }
 
     /// How the replay of a capture ended; `None` for a live agent, and while it goes on.
     #[must_use]
     pub fn outcome(&self) -> Option<Outcome> {
-        self.way.outcome()
+        self.transport.outcome()
     }
 
     /// Where it is, for people.
     #[must_use]
     pub fn place(&self) -> String {
-        self.way.to_string()
+        self.transport.to_string()
     }
 
     fn exchange<T: DeserializeOwned>(
@@ -222,7 +224,7 @@ impl Agent {
                 self.whole(path, answer).await
             };
             let answer = timeout(patience, exchange).await;
-            answer.unwrap_or_else(|_| Err(self.way.slow()))
+            answer.unwrap_or_else(|_| Err(self.transport.slow()))
         })?;
         self.decoded(path, &answer)
     }
@@ -236,7 +238,7 @@ impl Agent {
         let mut request = Request::builder()
             .method(method)
             .uri(path)
-            .header(HOST, self.way.host())
+            .header(HOST, self.transport.host())
             .header(ACCEPT, "*/*");
         if let Some(token) = &self.token {
             request = request.header(AUTHORIZATION, format!("Bearer {token}"));
@@ -248,11 +250,11 @@ impl Agent {
         let request = request.map_err(|_| ClientError::Path {
             path: path.to_owned(),
         })?;
-        if self.way.is_replayed() {
-            return self.way.send(request).await;
+        if self.transport.is_replayed() {
+            return self.transport.send(request).await;
         }
-        let answer = timeout(SILENCE, self.way.send(request)).await;
-        answer.unwrap_or_else(|_| Err(self.way.slow()))
+        let answer = timeout(SILENCE, self.transport.send(request)).await;
+        answer.unwrap_or_else(|_| Err(self.transport.slow()))
     }
 
     /// The whole body of an answer that is no refusal.
@@ -262,10 +264,10 @@ impl Agent {
         let mut whole = BytesMut::new();
         loop {
             let frame = timeout(SILENCE, body.frame()).await;
-            let Some(frame) = frame.map_err(|_| self.way.slow())? else {
+            let Some(frame) = frame.map_err(|_| self.transport.slow())? else {
                 break;
             };
-            let frame = frame.map_err(|source| self.way.broke(source))?;
+            let frame = frame.map_err(|source| self.transport.broke(source))?;
             whole.extend_from_slice(&frame.into_data().unwrap_or_default());
         }
         let body = whole.freeze();
@@ -273,11 +275,11 @@ impl Agent {
             return Ok(body);
         }
         let Some(refusal) = Refusal::read(status.as_u16(), &body) else {
-            return Err(self.way.not_an_agent());
+            return Err(self.transport.not_an_agent());
         };
         Err(match (status, refusal.code.as_str()) {
-            (StatusCode::UNAUTHORIZED, _) => self.way.unauthorized(self.token.is_some()),
-            (_, "not-found") => self.way.older(path),
+            (StatusCode::UNAUTHORIZED, _) => self.transport.unauthorized(self.token.is_some()),
+            (_, "not-found") => self.transport.older(path),
             _ => ClientError::Refused(refusal),
         })
     }
@@ -285,7 +287,7 @@ impl Agent {
 
 impl std::fmt::Debug for Agent {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "Agent({})", self.way)
+        write!(f, "Agent({})", self.transport)
     }
 }
 

@@ -5,15 +5,15 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::{Agent, ClientError, Lines, Next};
 use ros2probe_daemon::subscriptions::line::{Line, OfferedFacts, Open, Reason, SampleFacts};
-use ros2probe_daemon::subscriptions::{Got, Item, Missed, MissedReason, Topic};
+use ros2probe_daemon::subscriptions::{Item, Missed, MissedReason, NextItem, Topic};
 use ros2probe_model::discovery::hexadecimal;
 use ros2probe_model::payloads::Sample;
 
-const SECOND: i64 = 1_000_000_000;
 /// Writers that are remembered; of further ones each message makes its own description.
 const WRITERS: usize = 65_536;
 
@@ -64,27 +64,27 @@ impl<'a> Samples<'a> {
     ///
     /// # Errors
     /// The connection broke, or what comes cannot be read.
-    pub fn next_within(&mut self, patience: Duration) -> Result<Got, ClientError> {
+    pub fn next_within(&mut self, patience: Duration) -> Result<NextItem, ClientError> {
         let agent = self.lines.agent();
         let line = match self.lines.line_within(patience)? {
             Next::Line(line) => agent.decoded("/samples", &line)?,
-            Next::Nothing => return Ok(Got::Nothing),
-            Next::End => return Ok(Got::Gone),
+            Next::Nothing => return Ok(NextItem::Pending),
+            Next::End => return Ok(NextItem::Closed),
         };
         Ok(match line {
-            Line::Open(_) => Got::Nothing,
-            Line::Clock(clock) => Got::Item(Item::Clock(time(clock.time_ns))),
-            Line::End(_) => Got::Item(Item::End("the agent's stream ended")),
+            Line::Open(_) => NextItem::Pending,
+            Line::Clock(clock) => NextItem::Item(Item::Clock(time(clock.time_ns))),
+            Line::End(_) => NextItem::Item(Item::End("the agent's stream ended")),
             Line::Sample(facts) => {
                 let count = facts.payload_bytes.unwrap_or(0);
                 let count = usize::try_from(count).unwrap_or(usize::MAX);
                 let payload = self.lines.bytes(count)?;
                 let topic = self.writers_topic(&facts);
-                Got::Item(Item::Sample(Arc::new(sample(topic, &facts, payload))))
+                NextItem::Item(Item::Sample(Arc::new(sample(topic, &facts, payload))))
             }
             Line::Missed(facts) => {
                 let topic = self.topic(facts.domain_id, &facts.topic, None, None);
-                Got::Item(Item::Missed(Missed {
+                NextItem::Item(Item::Missed(Missed {
                     topic,
                     writer: guid(&facts.writer),
                     first: facts.first_sequence_number,
@@ -170,8 +170,8 @@ fn time(nanoseconds: i64) -> Timestamp {
 }
 
 fn stamp(nanoseconds: i64) -> Option<(i32, u32)> {
-    let seconds = i32::try_from(nanoseconds.div_euclid(SECOND)).ok()?;
-    let rest = u32::try_from(nanoseconds.rem_euclid(SECOND)).ok()?;
+    let seconds = i32::try_from(nanoseconds.div_euclid(SECOND.cast_signed())).ok()?;
+    let rest = u32::try_from(nanoseconds.rem_euclid(SECOND.cast_signed())).ok()?;
     Some((seconds, rest))
 }
 

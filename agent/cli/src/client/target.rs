@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::ClientError;
 use crate::ros2::{Dialect, dialect};
-use ros2probe_daemon::run::Moment;
+use ros2probe_daemon::run::CaptureTime;
 
 /// Highest domain there is.
 const MAX_DOMAIN: u32 = 232;
@@ -32,10 +32,10 @@ pub struct Target {
     pub replay: Option<PathBuf>,
     /// Messages from this time of the capture on: Unix seconds, or +S from its beginning
     #[arg(long, value_name = "T", requires = "replay")]
-    pub from: Option<Moment>,
+    pub from: Option<CaptureTime>,
     /// The capture up to this time
     #[arg(long, value_name = "T", requires = "replay")]
-    pub until: Option<Moment>,
+    pub until: Option<CaptureTime>,
     /// The robot's domain [default: $ROS_DOMAIN_ID, else 0]
     #[arg(long = "domain", value_name = "N",
         value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN)))]
@@ -48,14 +48,14 @@ pub struct Target {
 /// The environment says what cannot be.
 #[derive(Debug, thiserror::Error)]
 #[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN}")]
-pub struct Unfit(String);
+pub struct InvalidEnvironment(String);
 
 impl Target {
     /// The domain that is asked about.
     ///
     /// # Errors
     /// The environment names none that there is.
-    pub fn domain(&self) -> Result<u32, Unfit> {
+    pub fn domain(&self) -> Result<u32, InvalidEnvironment> {
         if let Some(domain_id) = self.domain_id {
             return Ok(domain_id);
         }
@@ -64,7 +64,7 @@ impl Target {
                 let domain_id = text.trim().parse().ok();
                 domain_id
                     .filter(|domain_id| *domain_id <= MAX_DOMAIN)
-                    .ok_or(Unfit(text))
+                    .ok_or(InvalidEnvironment(text))
             }
             _ => Ok(0),
         }

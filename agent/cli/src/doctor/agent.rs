@@ -8,7 +8,7 @@ use std::path::Path;
 
 use super::answers::{Answers, Health, Limit};
 use super::finding::{Area, Finding, Verdict};
-use super::host::Host;
+use super::host_state::HostState;
 use super::privileges::is_installed;
 use ros2probe_daemon::config::{self, Config, StateChoice};
 
@@ -41,7 +41,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
 
 /// None that answers, for this reason.
 #[must_use]
-pub fn absent(host: &Host, config: &Config, reason: &str, is_denied: bool) -> Vec<Finding> {
+pub fn absent(host: &HostState, config: &Config, reason: &str, is_denied: bool) -> Vec<Finding> {
     let finding = if is_denied {
         let sentence = "an agent is running, but this user may not query it";
         Finding::new(AREA, "reachable", Verdict::Unknown, sentence)
@@ -273,13 +273,13 @@ fn limit(table: &str) -> Option<&'static str> {
 
 fn watches(answers: &Answers) -> Finding {
     let watches = &answers.watches.watches;
-    let say = |verdict, sentence: String| {
+    let report = |verdict, sentence: String| {
         let finding = Finding::new(AREA, "watches", verdict, sentence);
         finding.seen(watches.len().to_string(), "GET /watch")
     };
     if watches.is_empty() {
         let sentence = "no watches: the graph is known, but no topic is measured";
-        return say(Verdict::Note, sentence.to_owned())
+        return report(Verdict::Note, sentence.to_owned())
             .configure("watch: ['/**']    # or: curl -X POST localhost:17401/watch/TOPIC");
     }
     let idle: Vec<_> = watches
@@ -288,7 +288,7 @@ fn watches(answers: &Answers) -> Finding {
         .map(|watch| watch.topic.as_str())
         .collect();
     match idle.len() {
-        0 => say(
+        0 => report(
             Verdict::Ok,
             match watches.len() {
                 1 => "1 watch, matching a topic".to_owned(),
@@ -305,7 +305,7 @@ fn watches(answers: &Answers) -> Finding {
                 "no topic matches the watches {} yet{more}",
                 named.join(", ")
             );
-            say(Verdict::Note, sentence).remedy("rp topic list    # check the name")
+            report(Verdict::Note, sentence).remedy("rp topic list    # check the name")
         }
     }
 }
@@ -327,7 +327,7 @@ fn kept(health: &Health) -> Finding {
 }
 
 /// Listeners that an agent would find taken.
-fn ports(host: &Host, config: &Config) -> Vec<Finding> {
+fn ports(host: &HostState, config: &Config) -> Vec<Finding> {
     let wanted = [
         ("metrics.listen", config.metrics.listen),
         ("api.listen", config.api.listen),
@@ -352,7 +352,7 @@ fn busy(key: &str, address: SocketAddr) -> Finding {
         .configure(key.replace('.', ": {") + ": 127.0.0.1:PORT}    # another one")
 }
 
-fn listening(host: &Host) -> Vec<u16> {
+fn listening(host: &HostState) -> Vec<u16> {
     let mut ports = Vec::new();
     for path in SOCKETS {
         let bytes = host.files.bytes(path, MAX_SOCKETS).unwrap_or_default();
@@ -368,15 +368,15 @@ fn listening(host: &Host) -> Vec<u16> {
 }
 
 /// Whether an agent could write where it keeps what it knows.
-fn state_directory(host: &Host, choice: &StateChoice) -> Option<Finding> {
+fn state_directory(host: &HostState, choice: &StateChoice) -> Option<Finding> {
     let path = match choice {
         StateChoice::Off => return None,
         StateChoice::At(path) => path.display().to_string(),
         StateChoice::Auto => STATE.to_owned(),
     };
-    let say = |verdict, sentence: String| Finding::new(AREA, "state", verdict, sentence);
+    let report = |verdict, sentence: String| Finding::new(AREA, "state", verdict, sentence);
     let finding = match fs::metadata(host.files.path(&path)) {
-        Ok(directory) if !directory.is_dir() => say(
+        Ok(directory) if !directory.is_dir() => report(
             Verdict::Problem,
             format!("{path} is not a directory: the agent cannot save its state"),
         )
@@ -386,17 +386,17 @@ fn state_directory(host: &Host, choice: &StateChoice) -> Option<Finding> {
         Ok(directory) => {
             let is_mine = host.is_root() || directory.uid() == host.user_id;
             let mode = directory.permissions().mode() & 0o7777;
-            let say = match is_mine || mode & 0o002 != 0 {
-                true => say(Verdict::Ok, format!("{path} is writable for saved state")),
-                false => say(
+            let report = match is_mine || mode & 0o002 != 0 {
+                true => report(Verdict::Ok, format!("{path} is writable for saved state")),
+                false => report(
                     Verdict::Note,
                     format!("an agent run by this user could not save its state in {path}"),
                 )
                 .remedy("sudo rp run    # or the service"),
             };
-            say.seen(format!("mode {mode:o}, user {}", directory.uid()), &path)
+            report.seen(format!("mode {mode:o}, user {}", directory.uid()), &path)
         }
-        Err(error) => say(
+        Err(error) => report(
             Verdict::Note,
             format!(
                 "{path} does not exist: an agent started by hand keeps no state across \
@@ -423,7 +423,7 @@ fn duration(seconds: f64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::tests::host;
+    use super::super::host_state::tests::host;
     use super::*;
 
     fn answers(health: &str, watches: &str) -> Answers {
@@ -596,8 +596,9 @@ mod tests {
     #[test]
     fn where_state_would_be_kept_is_looked_at() {
         let (_directory, mut host) = host(&[("/var/lib/ros2probe/x", ""), ("/file", "")]);
-        let of =
-            |host: &Host, choice| state_directory(host, &choice).map(|finding| finding.verdict);
+        let of = |host: &HostState, choice| {
+            state_directory(host, &choice).map(|finding| finding.verdict)
+        };
         let at = |path: &str| StateChoice::At(path.into());
         assert_eq!(of(&host, StateChoice::Off), None);
         assert_eq!(of(&host, at("/nowhere")), Some(Verdict::Note));

@@ -7,7 +7,7 @@
 
 use super::answers::{Answers, Measurement, Topic};
 use super::finding::{Area, Finding, Verdict};
-use super::host::{Files, Host, Unread};
+use super::host_state::{Files, HostState, Unread};
 
 const AREA: Area = Area::Buffers;
 const RECEIVE_MAX: Sysctl = Sysctl("net.core.rmem_max");
@@ -47,7 +47,7 @@ struct Largest {
 
 /// All of it.
 #[must_use]
-pub fn check(host: &Host, answers: Option<&Answers>) -> Vec<Finding> {
+pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     let topics = answers.map_or(&[][..], |answers| &answers.topics.topics);
     let largest = largest(topics);
     let mut findings = vec![receive(&host.files, largest.as_ref())];
@@ -127,12 +127,12 @@ fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
 }
 
 fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
-    let say = |verdict, sentence: String| Finding::new(AREA, "receive", verdict, sentence);
+    let report = |verdict, sentence: String| Finding::new(AREA, "receive", verdict, sentence);
     let (most, default) = (RECEIVE_MAX.read(files), RECEIVE_DEFAULT.read(files));
     let finding = match &most {
         Err(error) => {
             let sentence = format!("the maximum socket receive buffer is unknown: {error}");
-            say(Verdict::Unknown, sentence)
+            report(Verdict::Unknown, sentence)
                 .remedy("sysctl net.core.rmem_max    # on the host itself")
         }
         Ok(most) => {
@@ -164,7 +164,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
                 ),
             };
             let sentence = format!("a socket may buffer {}: {words}", size(*most));
-            let finding = say(verdict, sentence);
+            let finding = report(verdict, sentence);
             if verdict == Verdict::Ok {
                 finding
             } else {
@@ -187,13 +187,13 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
         } else {
             "reassembly_ipv6"
         };
-        let say = |verdict, sentence: String| Finding::new(AREA, check, verdict, sentence);
+        let report = |verdict, sentence: String| Finding::new(AREA, check, verdict, sentence);
         let Ok(most) = bytes else {
             // Without IPv6 there is none of it.
             if number == 0 {
                 let sentence = "the memory limit of IP reassembly is unknown".to_owned();
                 let finding =
-                    say(Verdict::Unknown, sentence).remedy(format!("sysctl {}", memory.0));
+                    report(Verdict::Unknown, sentence).remedy(format!("sysctl {}", memory.0));
                 findings.push(memory.show(finding, &bytes));
             }
             continue;
@@ -212,7 +212,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
                         .as_ref()
                         .map_or_else(|_| "30".to_owned(), u64::to_string),
                 );
-                say(
+                report(
                     if number == 0 {
                         Verdict::Note
                     } else {
@@ -223,7 +223,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
                 .remedy(memory.set(wanted))
                 .remedy(time.set(3))
             }
-            _ => say(
+            _ => report(
                 Verdict::Ok,
                 format!("reassembly of {version} may use {}", size(most)),
             ),
@@ -324,7 +324,7 @@ fn size(bytes: u64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::tests::host;
+    use super::super::host_state::tests::host;
     use super::*;
 
     const USUALLY: [(&str, &str); 6] = [

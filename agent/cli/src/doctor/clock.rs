@@ -1,7 +1,7 @@
 //! The clock: whether times of this host may be compared with those of others.
 
 use super::finding::{Area, Finding, Verdict};
-use super::host::Host;
+use super::host_state::HostState;
 
 const AREA: Area = Area::Clock;
 /// Who keeps clocks.
@@ -19,15 +19,15 @@ const COARSE: i64 = 10_000;
 
 /// All of it.
 #[must_use]
-pub fn check(host: &Host) -> Vec<Finding> {
+pub fn check(host: &HostState) -> Vec<Finding> {
     let keepers = keepers(host);
-    let say = |verdict, sentence: String| Finding::new(AREA, "synchronised", verdict, sentence);
+    let report = |verdict, sentence: String| Finding::new(AREA, "synchronised", verdict, sentence);
     let kept = match keepers.as_slice() {
         [] => "no NTP/PTP service found".to_owned(),
         names => format!("kept by {}", names.join(", ")),
     };
     let finding = match &host.clock {
-        Err(error) => say(
+        Err(error) => report(
             Verdict::Unknown,
             format!("the kernel does not report whether the clock is synchronised; {kept}"),
         )
@@ -43,7 +43,7 @@ pub fn check(host: &Host) -> Vec<Finding> {
                     "the clock is not synchronised ({kept}): latency within this host is right; \
                      between hosts it is off by the difference of their clocks"
                 );
-                say(Verdict::Warning, sentence).remedy(
+                report(Verdict::Warning, sentence).remedy(
                     "sudo apt install chrony    # on every host; for microseconds: linuxptp",
                 )
             } else if state.maximum_error > COARSE && state.estimated_error > COARSE {
@@ -51,14 +51,14 @@ pub fn check(host: &Host) -> Vec<Finding> {
                     "the clock is synchronised to {estimated} ms ({kept}): shorter latencies \
                      between hosts are not meaningful"
                 );
-                say(Verdict::Note, sentence)
+                report(Verdict::Note, sentence)
                     .remedy("chronyc tracking    # or ptp, for microseconds")
             } else {
                 let sentence = format!(
                     "the clock is synchronised, estimated error {estimated} ms, at most {maximum} ms \
                      ({kept})"
                 );
-                say(Verdict::Ok, sentence)
+                report(Verdict::Ok, sentence)
             };
             finding.seen(
                 format!(
@@ -72,7 +72,7 @@ pub fn check(host: &Host) -> Vec<Finding> {
     vec![finding.seen(kept, "/proc/<pid>/comm")]
 }
 
-fn keepers(host: &Host) -> Vec<&'static str> {
+fn keepers(host: &HostState) -> Vec<&'static str> {
     let mut found: Vec<_> = host
         .files
         .processes()
@@ -102,8 +102,8 @@ fn milliseconds(microseconds: i64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::ClockState;
-    use super::super::host::tests::host;
+    use super::super::host_state::ClockState;
+    use super::super::host_state::tests::host;
     use super::*;
 
     fn found(clock: Result<ClockState, String>) -> Finding {

@@ -74,7 +74,7 @@ pub struct Evidence {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Remedy {
     /// Where the line goes.
-    pub kind: Place,
+    pub kind: RemedyTarget,
     /// To be pasted there; what is in capitals is to be filled in.
     pub line: String,
     /// What to know of it.
@@ -85,7 +85,7 @@ pub struct Remedy {
 /// Where a remedy goes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Place {
+pub enum RemedyTarget {
     /// A shell.
     Command,
     /// The agent's configuration file.
@@ -165,22 +165,22 @@ impl Finding {
     /// This command helps. Four spaces and `#` begin a comment, here and below.
     #[must_use]
     pub fn remedy(self, line: impl Into<String>) -> Self {
-        self.with(Place::Command, line.into())
+        self.with(RemedyTarget::Command, line.into())
     }
 
     /// This in the agent's configuration helps.
     #[must_use]
     pub fn configure(self, line: impl Into<String>) -> Self {
-        self.with(Place::Configuration, line.into())
+        self.with(RemedyTarget::Configuration, line.into())
     }
 
     /// This helps, where the comment says.
     #[must_use]
     pub fn elsewhere(self, line: impl Into<String>) -> Self {
-        self.with(Place::Elsewhere, line.into())
+        self.with(RemedyTarget::Elsewhere, line.into())
     }
 
-    fn with(mut self, kind: Place, line: String) -> Self {
+    fn with(mut self, kind: RemedyTarget, line: String) -> Self {
         let (line, comment) = match line.split_once("    # ") {
             Some((line, comment)) => (line.to_owned(), Some(comment.to_owned())),
             None => (line, None),

@@ -34,13 +34,13 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
 }
 
 fn overview(participants: &[Participant], processes: Option<usize>, topics: usize) -> Finding {
-    let say = |verdict, sentence: String| {
+    let report = |verdict, sentence: String| {
         let finding = Finding::new(AREA, "participants", verdict, sentence);
         finding.seen(participants.len().to_string(), "GET /participants")
     };
     if participants.is_empty() {
         return match processes {
-            Some(count @ 1..) => say(
+            Some(count @ 1..) => report(
                 Verdict::Problem,
                 format!(
                     "the agent sees no participant, but {count} ROS processes are running here"
@@ -49,7 +49,7 @@ fn overview(participants: &[Participant], processes: Option<usize>, topics: usiz
             .remedy(
                 "rp doctor --verbose    # source, control group and interfaces above; RMW below",
             ),
-            _ => say(
+            _ => report(
                 Verdict::Note,
                 "the agent sees no participant: no DDS traffic".to_owned(),
             ),
@@ -70,7 +70,7 @@ fn overview(participants: &[Participant], processes: Option<usize>, topics: usiz
             format!("domain {domain}: {}", vendors.join(", "))
         })
         .collect();
-    say(
+    report(
         Verdict::Ok,
         format!(
             "{}, {}; {}",
@@ -195,7 +195,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             .collect()
     };
     let mut findings = Vec::new();
-    let mut say =
+    let mut report =
         |check, verdict, topics: &[&Topic], (verb, words): (&str, &str), remedy: Option<Helps>| {
             if topics.is_empty() {
                 return;
@@ -216,10 +216,10 @@ fn aside(answers: &Answers) -> Vec<Finding> {
     let shared = of("shared_memory");
     if able("shared_memory_exact") {
         let words = ("use", "only Fast DDS shared memory; every message is seen");
-        say("shared_memory", Verdict::Ok, &shared, words, None);
+        report("shared_memory", Verdict::Ok, &shared, words, None);
     } else if able("shared_memory") {
         let words = ("use", "only Fast DDS shared memory, which is sampled");
-        say(
+        report(
             "shared_memory",
             Verdict::Note,
             &shared,
@@ -232,7 +232,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         );
     } else {
         let words = ("use", "only Fast DDS shared memory, which is not read");
-        say(
+        report(
             "shared_memory",
             Verdict::Warning,
             &shared,
@@ -240,7 +240,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             Some(|finding| finding.configure("capture: {shm: {mode: auto}}")),
         );
     }
-    say(
+    report(
         "data_sharing",
         Verdict::Warning,
         &of("data_sharing"),
@@ -251,7 +251,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             )
         }),
     );
-    say(
+    report(
         "iceoryx",
         Verdict::Warning,
         &of("iceoryx"),
@@ -262,7 +262,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             )
         }),
     );
-    say(
+    report(
         "same_process",
         Verdict::Note,
         &of("same_process"),

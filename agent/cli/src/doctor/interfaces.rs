@@ -2,7 +2,7 @@
 
 use super::answers::Health;
 use super::finding::{Area, Finding, Verdict};
-use super::host::Host;
+use super::host_state::HostState;
 
 const AREA: Area = Area::Interfaces;
 const PLACE: &str = "/sys/class/net";
@@ -28,7 +28,7 @@ struct Interface {
 
 /// All of them. `localhost`: some ROS process is to talk to its own host only.
 #[must_use]
-pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Finding> {
+pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<Finding> {
     let names = match host.files.names(PLACE) {
         Ok(names) => names,
         Err(error) => {
@@ -83,7 +83,7 @@ pub fn check(host: &Host, agent: Option<&Health>, localhost: bool) -> Vec<Findin
 }
 
 /// `/sys` shows the network namespace in which it was mounted, which need not be this one.
-fn elsewhere(host: &Host, names: &[String]) -> Option<Finding> {
+fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
     let table = host.files.text(OWN).ok()?;
     let own = table
         .lines()
@@ -109,7 +109,7 @@ fn elsewhere(host: &Host, names: &[String]) -> Option<Finding> {
     Some(finding.remedy("ip -details link    # or: sudo ip netns exec NAME rp doctor"))
 }
 
-fn read(host: &Host, name: &str) -> Option<Interface> {
+fn read(host: &HostState, name: &str) -> Option<Interface> {
     let flags = host.files.text(&format!("{PLACE}/{name}/flags")).ok()?;
     let flags = u32::from_str_radix(flags.strip_prefix("0x")?, 16).ok()?;
     let state = host.files.text(&format!("{PLACE}/{name}/operstate"));
@@ -136,13 +136,13 @@ impl Interface {
 }
 
 fn overview(all: &[Interface]) -> Finding {
-    let say = |verdict, sentence: String| {
+    let report = |verdict, sentence: String| {
         Finding::new(AREA, "interfaces", verdict, sentence).seen(all.len().to_string(), PLACE)
     };
     let used: Vec<_> = all.iter().filter(|each| each.is_used()).collect();
     if used.is_empty() {
         let sentence = "only loopback is up: only this host's own nodes are visible";
-        return say(Verdict::Note, sentence.to_owned()).remedy("ip link");
+        return report(Verdict::Note, sentence.to_owned()).remedy("ip link");
     }
     let named: Vec<_> = used
         .iter()
@@ -155,7 +155,7 @@ fn overview(all: &[Interface]) -> Finding {
     } else {
         String::new()
     };
-    let mut finding = say(Verdict::Ok, format!("up: {}{more}", named.join(", ")));
+    let mut finding = report(Verdict::Ok, format!("up: {}{more}", named.join(", ")));
     let down: Vec<_> = all.iter().filter(|each| !each.is_up()).collect();
     if !down.is_empty() {
         finding.sentence = format!("{}; down: {}", finding.sentence, list(&down));
@@ -165,7 +165,7 @@ fn overview(all: &[Interface]) -> Finding {
 
 fn loopback(all: &[Interface], localhost: bool) -> Option<Finding> {
     let loopback = all.iter().find(|each| each.flags & LOOPBACK != 0)?;
-    let say = |verdict, sentence: String| {
+    let report = |verdict, sentence: String| {
         let from = format!("{PLACE}/{}/flags", loopback.name);
         Finding::new(AREA, "loopback", verdict, sentence)
             .seen(format!("{:#x}", loopback.flags), from)
@@ -173,17 +173,17 @@ fn loopback(all: &[Interface], localhost: bool) -> Option<Finding> {
     let name = &loopback.name;
     Some(if loopback.flags & UP == 0 {
         let sentence = format!("{name} is down: nodes of this host cannot use it");
-        say(Verdict::Problem, sentence).remedy(format!("sudo ip link set {name} up"))
+        report(Verdict::Problem, sentence).remedy(format!("sudo ip link set {name} up"))
     } else if loopback.flags & MULTICAST != 0 {
-        say(Verdict::Ok, format!("{name} is up, with multicast"))
+        report(Verdict::Ok, format!("{name} is up, with multicast"))
     } else if localhost {
         let sentence = format!(
             "{name} has no multicast, and nodes here are limited to it: some implementations \
              (Cyclone DDS) then discover each other only by probing unicast addresses"
         );
-        say(Verdict::Note, sentence).remedy(format!("sudo ip link set {name} multicast on"))
+        report(Verdict::Note, sentence).remedy(format!("sudo ip link set {name} multicast on"))
     } else {
-        say(
+        report(
             Verdict::Ok,
             format!("{name} is up, without multicast (the default)"),
         )
@@ -240,7 +240,7 @@ fn list(interfaces: &[&Interface]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::tests::host;
+    use super::super::host_state::tests::host;
     use super::*;
 
     /// Name, flags, MTU, state.

@@ -1,9 +1,9 @@
 //! What the kernel has of what the agent can use: its version, its types, its compiler, control
-//! groups. What of the hooks really works is tried or asked for in `sight`.
+//! groups. What of the hooks really works is tried or asked for in `visibility`.
 
 use super::finding::{Area, Finding, Verdict};
-use super::host::{Host, Unread};
-use ros2probe_capture::hierarchy::{Cgroup, HierarchyError, topmost};
+use super::host_state::{HostState, Unread};
+use ros2probe_capture::cgroup::{Cgroup, CgroupError, topmost};
 
 const AREA: Area = Area::Kernel;
 const RELEASE: &str = "/proc/sys/kernel/osrelease";
@@ -22,7 +22,7 @@ const LOCKED_BYTES: u64 = 64 << 20;
 
 /// All of them.
 #[must_use]
-pub fn check(host: &Host) -> Vec<Finding> {
+pub fn check(host: &HostState) -> Vec<Finding> {
     let release = host.files.text(RELEASE);
     let mut findings = vec![
         version(&release),
@@ -41,19 +41,19 @@ pub fn check(host: &Host) -> Vec<Finding> {
 }
 
 fn version(release: &Result<String, Unread>) -> Finding {
-    let say = |verdict, sentence: String| Finding::new(AREA, "version", verdict, sentence);
+    let report = |verdict, sentence: String| Finding::new(AREA, "version", verdict, sentence);
     match release {
-        Err(error) => say(Verdict::Unknown, "the kernel version is unknown".into())
+        Err(error) => report(Verdict::Unknown, "the kernel version is unknown".into())
             .seen(error.to_string(), RELEASE)
             .remedy("uname -r"),
         Ok(text) => match parse(text) {
-            Some(own) if own >= OLDEST => say(Verdict::Ok, format!("Linux {text}")),
-            Some(_) => say(
+            Some(own) if own >= OLDEST => report(Verdict::Ok, format!("Linux {text}")),
+            Some(_) => report(
                 Verdict::Problem,
                 format!("Linux {text} is too old: live capture needs 5.10 or newer"),
             )
             .remedy("rp run --replay FILE    # a capture from tcpdump works on any kernel"),
-            None => say(
+            None => report(
                 Verdict::Unknown,
                 format!("Linux `{text}`: version not recognised"),
             ),
@@ -62,7 +62,7 @@ fn version(release: &Result<String, Unread>) -> Finding {
     }
 }
 
-fn types(host: &Host) -> Finding {
+fn types(host: &HostState) -> Finding {
     if host.files.exists(TYPES) {
         return Finding::new(
             AREA,
@@ -79,50 +79,50 @@ fn types(host: &Host) -> Finding {
         .elsewhere("CONFIG_DEBUG_INFO_BTF=y    # in the kernel's configuration")
 }
 
-fn compiler(host: &Host) -> Finding {
-    let say = |verdict, sentence| Finding::new(AREA, "jit", verdict, sentence);
+fn compiler(host: &HostState) -> Finding {
+    let report = |verdict, sentence| Finding::new(AREA, "jit", verdict, sentence);
     match host.files.number::<u32>(COMPILER) {
-        Ok(0) => say(
+        Ok(0) => report(
             Verdict::Warning,
             "BPF programs are interpreted: each packet costs several times as much",
         )
         .seen("0", COMPILER)
         .remedy("sudo sysctl -w net.core.bpf_jit_enable=1"),
         Ok(value) => {
-            say(Verdict::Ok, "BPF programs are compiled (JIT)").seen(value.to_string(), COMPILER)
+            report(Verdict::Ok, "BPF programs are compiled (JIT)").seen(value.to_string(), COMPILER)
         }
         // Shown in the first network namespace only.
-        Err(Unread::Missing) => say(
+        Err(Unread::Missing) => report(
             Verdict::Ok,
             "BPF JIT status is not visible inside a container",
         )
         .seen("not there", COMPILER),
-        Err(error) => say(Verdict::Unknown, "the BPF JIT status is not readable")
+        Err(error) => report(Verdict::Unknown, "the BPF JIT status is not readable")
             .seen(error.to_string(), COMPILER)
             .remedy("sudo sysctl net.core.bpf_jit_enable"),
     }
 }
 
-fn unprivileged(host: &Host) -> Finding {
-    let say = |verdict, sentence| Finding::new(AREA, "unprivileged_bpf", verdict, sentence);
+fn unprivileged(host: &HostState) -> Finding {
+    let report = |verdict, sentence| Finding::new(AREA, "unprivileged_bpf", verdict, sentence);
     match host.files.number::<u32>(UNPRIVILEGED) {
-        Ok(0) => say(
+        Ok(0) => report(
             Verdict::Note,
             "any user may load BPF programs; the agent does not need this",
         )
         .seen("0", UNPRIVILEGED)
         .remedy("sudo sysctl -w kernel.unprivileged_bpf_disabled=1"),
-        Ok(value) => say(
+        Ok(value) => report(
             Verdict::Ok,
             "unprivileged BPF is disabled; loading needs CAP_BPF",
         )
         .seen(value.to_string(), UNPRIVILEGED),
-        Err(error) => say(Verdict::Ok, "loading BPF programs needs CAP_BPF")
+        Err(error) => report(Verdict::Ok, "loading BPF programs needs CAP_BPF")
             .seen(error.to_string(), UNPRIVILEGED),
     }
 }
 
-fn lockdown(host: &Host) -> Option<Finding> {
+fn lockdown(host: &HostState) -> Option<Finding> {
     let text = host.files.text(LOCKDOWN).ok()?;
     let mode = text.split_once('[')?.1.split_once(']')?.0.to_owned();
     let (verdict, sentence) = match mode.as_str() {
@@ -146,37 +146,37 @@ fn lockdown(host: &Host) -> Option<Finding> {
     })
 }
 
-fn control_groups(host: &Host) -> Finding {
-    let say = |verdict, sentence: String| Finding::new(AREA, "cgroup", verdict, sentence);
+fn control_groups(host: &HostState) -> Finding {
+    let report = |verdict, sentence: String| Finding::new(AREA, "cgroup", verdict, sentence);
     let mounts = host.files.bytes(MOUNTS, 1 << 20).unwrap_or_default();
     let Some(point) = topmost(&mounts) else {
         let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
             only, not sockets";
-        return say(Verdict::Warning, sentence.to_owned())
+        return report(Verdict::Warning, sentence.to_owned())
             .seen("no cgroup2", MOUNTS)
             .remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
     };
     let point = point.display().to_string();
     match Cgroup::open(&host.files.path(&point)) {
         Ok(group) if group.is_whole_host() => {
-            say(Verdict::Ok, format!("cgroup v2 hierarchy of the whole host at {point}"))
+            report(Verdict::Ok, format!("cgroup v2 hierarchy of the whole host at {point}"))
         }
-        Ok(_) => say(
+        Ok(_) => report(
             Verdict::Note,
             format!("{point} shows only part of the cgroup hierarchy: sockets of other \
                 containers are not visible"),
         )
         .elsewhere("--cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro    # docker run; hostPath in Kubernetes"),
-        Err(HierarchyError::Open { source, .. }) => say(
+        Err(CgroupError::Open { source, .. }) => report(
             Verdict::Unknown,
             format!("the cgroup hierarchy at {point} cannot be opened: {source}"),
         ),
-        Err(error) => say(Verdict::Warning, error.to_string()),
+        Err(error) => report(Verdict::Warning, error.to_string()),
     }
     .seen(point, MOUNTS)
 }
 
-fn pages(host: &Host) -> Finding {
+fn pages(host: &HostState) -> Finding {
     let kibibytes = host.page_bytes / 1024;
     let finding = match kibibytes {
         4 | 16 | 64 => Finding::new(
@@ -196,20 +196,20 @@ fn pages(host: &Host) -> Finding {
 }
 
 /// Of kernels that charge BPF maps to it.
-fn locked_memory(host: &Host) -> Finding {
-    let say = |verdict, sentence: String| Finding::new(AREA, "memlock", verdict, sentence);
+fn locked_memory(host: &HostState) -> Finding {
+    let report = |verdict, sentence: String| Finding::new(AREA, "memlock", verdict, sentence);
     let limits = host.files.text(LIMITS).unwrap_or_default();
     let line = limits
         .lines()
         .find_map(|line| line.strip_prefix("Max locked memory"));
     let soft = line.and_then(|line| line.split_whitespace().next());
     let finding = match soft {
-        Some("unlimited") => say(Verdict::Ok, "locked memory is not limited".to_owned()),
-        Some(soft) if soft.parse().is_ok_and(|soft: u64| soft >= LOCKED_BYTES) => say(
+        Some("unlimited") => report(Verdict::Ok, "locked memory is not limited".to_owned()),
+        Some(soft) if soft.parse().is_ok_and(|soft: u64| soft >= LOCKED_BYTES) => report(
             Verdict::Ok,
             format!("{soft} bytes may be locked, enough for the agent"),
         ),
-        Some(soft) => say(
+        Some(soft) => report(
             Verdict::Problem,
             format!(
                 "this kernel counts BPF maps as locked memory, but only {soft} bytes may be \
@@ -217,7 +217,7 @@ fn locked_memory(host: &Host) -> Finding {
             ),
         )
         .remedy("ulimit -l unlimited    # the unit has LimitMEMLOCK=infinity"),
-        None => say(
+        None => report(
             Verdict::Unknown,
             "the limit of locked memory is unknown".to_owned(),
         ),
@@ -233,7 +233,7 @@ fn parse(release: &str) -> Option<(u32, u32)> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::tests::host;
+    use super::super::host_state::tests::host;
     use super::*;
 
     const GOOD: [(&str, &str); 6] = [

@@ -10,30 +10,30 @@ pub mod buffers;
 pub mod clock;
 pub mod finding;
 pub mod graph;
-pub mod host;
+pub mod host_state;
 pub mod interfaces;
 pub mod kernel;
 pub mod privileges;
 pub mod processes;
 pub mod report;
 pub mod shell;
-pub mod sight;
 pub mod text;
 pub mod variables;
+pub mod visibility;
 
 use std::path::PathBuf;
 
 use answers::Answers;
 use finding::Finding;
-use host::Host;
+use host_state::HostState;
 use processes::Processes;
 use report::Report;
 use ros2probe_capture::live::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice};
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;
-use sight::Sight;
 use variables::{Range, Variables};
+use visibility::Visibility;
 
 /// What became of asking for an agent on this host.
 #[derive(Debug)]
@@ -57,7 +57,7 @@ pub struct Configured {
 
 /// This host, with or without an agent.
 #[must_use]
-pub fn examine(host: &Host, configured: &Configured, reach: &Reach) -> Report {
+pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Report {
     let config = &configured.config;
     let answers = match reach {
         Reach::Answered(answers, _) => Some(answers.as_ref()),
@@ -77,7 +77,7 @@ pub fn examine(host: &Host, configured: &Configured, reach: &Reach) -> Report {
         Reach::Denied(reason) => agent::absent(host, config, reason, true),
     });
     findings.extend(match health {
-        Some(health) => sight::check(&Sight::of_agent(health)),
+        Some(health) => visibility::check(&Visibility::of_agent(health)),
         None => tried(host, &config.capture),
     });
     findings.extend(kernel::check(host));
@@ -101,7 +101,7 @@ pub fn examine(host: &Host, configured: &Configured, reach: &Reach) -> Report {
 #[must_use]
 pub fn examine_remote(answers: &Answers, place: &str) -> Report {
     let mut findings = agent::check(answers, place, env!("CARGO_PKG_VERSION"));
-    findings.extend(sight::check(&Sight::of_agent(&answers.health)));
+    findings.extend(visibility::check(&Visibility::of_agent(&answers.health)));
     findings.extend(graph::check(answers, None));
     Report::new(place, findings)
 }
@@ -113,21 +113,21 @@ pub fn examine_capture(answers: &Answers, name: &str) -> Report {
 }
 
 /// What an agent would see: tried, where that is allowed. Not in other processes' code.
-fn tried(host: &Host, settings: &CaptureSettings) -> Vec<Finding> {
+fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     if let Some(missing) = privilege::missing(&host.capabilities, settings) {
-        return sight::untried(&format!("lacks {}", missing.needs()));
+        return visibility::untried(&format!("lacks {}", missing.needs()));
     }
     let mut settings = settings.clone();
     settings.shm.exact = ExactChoice::Off;
-    match run::look(&settings) {
-        Ok(facts) => sight::check(&Sight::of_trial(facts)),
-        Err(error) => sight::failed(&in_words(&error)),
+    match run::probe(&settings) {
+        Ok(facts) => visibility::check(&Visibility::of_trial(facts)),
+        Err(error) => visibility::failed(&in_words(&error)),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::host::tests::host;
+    use super::host_state::tests::host;
     use super::*;
     use finding::{Area, Verdict};
 

@@ -3,7 +3,7 @@
 
 use super::answers::{Answers, Health};
 use super::finding::{Area, Finding, Verdict};
-use super::host::Host;
+use super::host_state::HostState;
 use ros2probe_daemon::config::{CaptureSettings, ExactChoice, ShmMode};
 use ros2probe_daemon::privilege;
 
@@ -28,7 +28,11 @@ const CONTAINERS: [&str; 4] = ["docker", "containerd", "kubepods", "libpod"];
 
 /// All of them.
 #[must_use]
-pub fn check(host: &Host, settings: &CaptureSettings, answers: Option<&Answers>) -> Vec<Finding> {
+pub fn check(
+    host: &HostState,
+    settings: &CaptureSettings,
+    answers: Option<&Answers>,
+) -> Vec<Finding> {
     let mut findings = vec![own(host, settings, answers.is_some())];
     findings.extend(answers.map(|answers| of_agent(&answers.health)));
     findings.extend(answers.and_then(containers));
@@ -37,7 +41,7 @@ pub fn check(host: &Host, settings: &CaptureSettings, answers: Option<&Answers>)
     findings
 }
 
-fn own(host: &Host, settings: &CaptureSettings, is_running: bool) -> Finding {
+fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Finding {
     let mut held: Vec<_> = host.capabilities.iter().map(ToString::to_string).collect();
     held.sort();
     let held = match held.len() {
@@ -45,16 +49,16 @@ fn own(host: &Host, settings: &CaptureSettings, is_running: bool) -> Finding {
         1..=8 => held.join(", "),
         count => format!("{count} capabilities"),
     };
-    let say = |verdict, sentence: String| {
+    let report = |verdict, sentence: String| {
         Finding::new(AREA, "capabilities", verdict, sentence).seen(&held, "CapEff, this process")
     };
     match privilege::missing(&host.capabilities, settings) {
-        None => say(Verdict::Ok, "this shell may capture".to_owned()),
-        Some(_) if is_running => say(
+        None => report(Verdict::Ok, "this shell may capture".to_owned()),
+        Some(_) if is_running => report(
             Verdict::Ok,
             "this shell may not capture; the running agent does".to_owned(),
         ),
-        Some(missing) => say(
+        Some(missing) => report(
             Verdict::Note,
             format!("this shell may not capture: it lacks {}", missing.needs()),
         )
@@ -68,16 +72,16 @@ fn of_agent(health: &Health) -> Finding {
         [] => "no capabilities".to_owned(),
         held => held.join(", "),
     };
-    let say = |verdict, sentence: String| {
+    let report = |verdict, sentence: String| {
         let finding = Finding::new(AREA, "agent_capabilities", verdict, sentence);
         finding.seen(&held, "GET /health capabilities")
     };
     if let Some(reason) = &health.unfiltered_reason {
         let sentence =
             format!("the agent kept {held}, but its system calls are not filtered: {reason}");
-        return say(Verdict::Note, sentence);
+        return report(Verdict::Note, sentence);
     }
-    say(
+    report(
         Verdict::Ok,
         format!("the agent kept {held} and dropped the rest"),
     )
@@ -106,11 +110,11 @@ fn containers(answers: &Answers) -> Option<Finding> {
 }
 
 /// Exact mode, if it is asked for.
-fn probes(host: &Host, settings: &CaptureSettings) -> Option<Finding> {
+fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
         return None;
     }
-    let missing = ros2probe_capture::exact::lacking(&host.capabilities);
+    let missing = ros2probe_capture::uprobe::lacking(&host.capabilities);
     if missing.is_empty() {
         return None;
     }
@@ -125,33 +129,33 @@ fn probes(host: &Host, settings: &CaptureSettings) -> Option<Finding> {
 
 /// Whether there is a service to start.
 #[must_use]
-pub fn is_installed(host: &Host) -> bool {
+pub fn is_installed(host: &HostState) -> bool {
     host.files.exists(SYSTEMD) && installed(host).is_some()
 }
 
 /// Where its unit is.
-fn installed(host: &Host) -> Option<&'static str> {
+fn installed(host: &HostState) -> Option<&'static str> {
     let mut places = UNITS.into_iter();
     places.find(|place| host.files.exists(&format!("{place}/{UNIT}")))
 }
 
 /// The service, where there is systemd.
-fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
+fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
     if !host.files.exists(SYSTEMD) {
         return None;
     }
-    let say = |verdict, sentence| Finding::new(AREA, "unit", verdict, sentence);
+    let report = |verdict, sentence| Finding::new(AREA, "unit", verdict, sentence);
     let installed = UNITS
         .iter()
         .find(|place| host.files.exists(&format!("{place}/{UNIT}")));
     let Some(place) = installed else {
         return Some(
             match is_answering {
-                true => say(
+                true => report(
                     Verdict::Note,
                     "the agent was started by hand: no service is installed to restart it",
                 ),
-                false => say(Verdict::Note, "the service ros2probe is not installed"),
+                false => report(Verdict::Note, "the service ros2probe is not installed"),
             }
             .seen(
                 "not there",
@@ -167,18 +171,18 @@ fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
     });
     let is_enabled = std::fs::symlink_metadata(host.files.path(ENABLED)).is_ok();
     let finding = match (is_running, is_enabled) {
-        (true, true) => say(Verdict::Ok, "the service ros2probe is running and enabled"),
-        (true, false) => say(
+        (true, true) => report(Verdict::Ok, "the service ros2probe is running and enabled"),
+        (true, false) => report(
             Verdict::Note,
             "the service ros2probe is running but not enabled at boot",
         )
         .remedy("sudo systemctl enable ros2probe"),
-        (false, true) => say(
+        (false, true) => report(
             Verdict::Problem,
             "the service ros2probe is enabled but not running",
         )
         .remedy("systemctl status ros2probe; journalctl -u ros2probe -b"),
-        (false, false) => say(
+        (false, false) => report(
             Verdict::Note,
             "the service ros2probe is installed but not running",
         )
@@ -199,7 +203,7 @@ fn unit(host: &Host, is_answering: bool) -> Option<Finding> {
 mod tests {
     use caps::{Capability, CapsHashSet};
 
-    use super::super::host::tests::host;
+    use super::super::host_state::tests::host;
     use super::*;
     use ros2probe_daemon::config::Config;
 

@@ -8,9 +8,9 @@ use std::collections::BTreeMap;
 
 use super::answers::Participants;
 use super::finding::{Area, Finding, Verdict};
-use super::host::{Host, Unread, base_name};
+use super::host_state::{HostState, Unread, base_name};
 use super::variables::{Range, Variables};
-use ros2probe_capture::exact::processes::is_library;
+use ros2probe_capture::uprobe::processes::is_library;
 
 const AREA: Area = Area::Processes;
 /// Text of a process's map that is read.
@@ -46,7 +46,7 @@ pub struct Processes {
 impl Processes {
     /// Looks for them. `known`: what the agent says of participants.
     #[must_use]
-    pub fn find(host: &Host, known: Option<&Participants>) -> Self {
+    pub fn find(host: &HostState, known: Option<&Participants>) -> Self {
         let mut domains = BTreeMap::new();
         for participant in known.into_iter().flat_map(|known| &known.participants) {
             // Of those with a socket here the number is the process's, and no announced one.
@@ -73,7 +73,7 @@ impl Processes {
                     .collect(),
                 None => command,
             };
-            match look(host, id, command, domain_id) {
+            match read_process(host, id, command, domain_id) {
                 Ok(Some(_)) if processes.found.len() >= MAX_PROCESSES => break,
                 Ok(Some(process)) => processes.found.push(process),
                 Ok(None) | Err(Unread::Missing | Unread::Other(_)) => {}
@@ -98,7 +98,7 @@ impl Processes {
 
     /// Where they differ from each other and from this shell.
     #[must_use]
-    pub fn check(&self, host: &Host) -> Vec<Finding> {
+    pub fn check(&self, host: &HostState) -> Vec<Finding> {
         let mut findings = vec![self.overview()];
         findings.extend(self.unseen(host.is_root()));
         let domains = self.differing(
@@ -168,12 +168,12 @@ impl Processes {
     }
 
     fn overview(&self) -> Finding {
-        let say = |verdict, sentence: String| Finding::new(AREA, "processes", verdict, sentence);
+        let report = |verdict, sentence: String| Finding::new(AREA, "processes", verdict, sentence);
         let Some(first) = self.found.first() else {
             let sentence = "no ROS process was found on this host";
-            return say(Verdict::Note, sentence.to_owned()).seen("0", "/proc/<pid>/maps");
+            return report(Verdict::Note, sentence.to_owned()).seen("0", "/proc/<pid>/maps");
         };
-        let mut finding = say(
+        let mut finding = report(
             Verdict::Ok,
             match self.found.len() {
                 1 => format!("1 ROS process: {}", first.name()),
@@ -269,8 +269,8 @@ impl Process {
 }
 
 /// A process if it is one of ROS.
-fn look(
-    host: &Host,
+fn read_process(
+    host: &HostState,
     id: u32,
     command: String,
     domain_id: Option<u32>,
@@ -325,7 +325,7 @@ fn implementation(map: &str) -> Option<&'static str> {
 }
 
 /// What it was started as; a script by its own name. Empty for threads of the kernel.
-fn command(host: &Host, id: u32) -> String {
+fn command(host: &HostState, id: u32) -> String {
     let line = host.files.bytes(&format!("/proc/{id}/cmdline"), MAX_LINE);
     let line = line.unwrap_or_default();
     let words: Vec<_> = line
@@ -368,7 +368,7 @@ fn names(processes: &[&Process]) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::tests::host;
+    use super::super::host_state::tests::host;
     use super::*;
 
     const FAST: &str = "7f00-7f01 r-xp 0 fe:00 12 /opt/ros/lib/libfastrtps.so.2.14\n";

@@ -3,7 +3,7 @@
 use serde::Serialize;
 
 use super::finding::{Finding, Verdict};
-use ros2probe_daemon::visible::visible;
+use ros2probe_daemon::escape::visible;
 
 /// A report.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]

@@ -2,7 +2,7 @@
 //! the agent cannot see.
 
 use super::finding::{Area, Finding, Verdict};
-use super::host::{Host, Unread};
+use super::host_state::{HostState, Unread};
 use super::variables::{Range, Variables};
 
 const AREA: Area = Area::Shell;
@@ -18,7 +18,7 @@ const MAX_PROFILE: u64 = 256 << 10;
 
 /// All of it.
 #[must_use]
-pub fn check(host: &Host) -> Vec<Finding> {
+pub fn check(host: &HostState) -> Vec<Finding> {
     let variables = Variables::of(&host.environment);
     if !variables.is_ros() {
         return vec![none(host)];
@@ -33,7 +33,7 @@ pub fn check(host: &Host) -> Vec<Finding> {
     findings
 }
 
-fn none(host: &Host) -> Finding {
+fn none(host: &HostState) -> Finding {
     let is_sudo = host.environment.contains_key("SUDO_USER");
     let finding = Finding::new(
         AREA,
@@ -55,19 +55,19 @@ fn none(host: &Host) -> Finding {
     }
 }
 
-fn domain(host: &Host, variables: &Variables) -> Finding {
-    let say = |verdict, sentence: String| Finding::new(AREA, "domain", verdict, sentence);
+fn domain(host: &HostState, variables: &Variables) -> Finding {
+    let report = |verdict, sentence: String| Finding::new(AREA, "domain", verdict, sentence);
     let shown = variables
         .shown("ROS_DOMAIN_ID")
         .unwrap_or_else(|| "not set".to_owned());
     let finding = match variables.domain() {
-        Err(text) => say(
+        Err(text) => report(
             Verdict::Problem,
             format!("`{text}` is not a domain ID: nodes of this shell do not start"),
         )
         .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
         Ok(domain) => match ephemeral(host) {
-            Some((first, last)) if overlaps(domain, first, last) => say(
+            Some((first, last)) if overlaps(domain, first, last) => report(
                 Verdict::Warning,
                 format!(
                     "the ports of domain {domain} are in the ephemeral range ({first} to \
@@ -75,14 +75,14 @@ fn domain(host: &Host, variables: &Variables) -> Finding {
                 ),
             )
             .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
-            _ => say(Verdict::Ok, format!("domain {domain}")),
+            _ => report(Verdict::Ok, format!("domain {domain}")),
         },
     };
     finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
 }
 
 /// Ports that the kernel gives to whoever wants any.
-fn ephemeral(host: &Host) -> Option<(u32, u32)> {
+fn ephemeral(host: &HostState) -> Option<(u32, u32)> {
     let text = host.files.text(PORTS).ok()?;
     let mut numbers = text.split_whitespace().map(str::parse);
     Some((numbers.next()?.ok()?, numbers.next()?.ok()?))
@@ -95,26 +95,26 @@ fn overlaps(domain: u32, first: u32, last: u32) -> bool {
 }
 
 fn implementation(variables: &Variables) -> Finding {
-    let say = |verdict, sentence: String| Finding::new(AREA, "rmw", verdict, sentence);
+    let report = |verdict, sentence: String| Finding::new(AREA, "rmw", verdict, sentence);
     let name = variables.shown("RMW_IMPLEMENTATION");
     let finding = match name.as_deref() {
-        None => say(
+        None => report(
             Verdict::Ok,
             "the default implementation of ROS (Fast DDS)".to_owned(),
         ),
         Some(name @ ("rmw_fastrtps_cpp" | "rmw_fastrtps_dynamic_cpp" | "rmw_cyclonedds_cpp")) => {
-            say(Verdict::Ok, name.to_owned())
+            report(Verdict::Ok, name.to_owned())
         }
-        Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => say(
+        Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => report(
             Verdict::Note,
             format!("{name}: messages in its own shared memory are not visible"),
         ),
-        Some(name) if name.starts_with("rmw_zenoh") => say(
+        Some(name) if name.starts_with("rmw_zenoh") => report(
             Verdict::Warning,
             format!("{name} is not DDS: its nodes are not visible"),
         )
         .remedy("export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # or another RTPS implementation"),
-        Some(name) => say(
+        Some(name) => report(
             Verdict::Note,
             format!("{name}: visible where it uses RTPS over UDP"),
         ),
@@ -124,25 +124,25 @@ fn implementation(variables: &Variables) -> Finding {
 }
 
 fn range(variables: &Variables) -> Finding {
-    let say = |verdict, sentence: &str| Finding::new(AREA, "range", verdict, sentence);
+    let report = |verdict, sentence: &str| Finding::new(AREA, "range", verdict, sentence);
     let peers = variables.shown("ROS_STATIC_PEERS");
     let mut finding = match variables.range() {
-        Range::Subnet => say(Verdict::Ok, "discovery range: subnet"),
-        Range::System => say(
+        Range::Subnet => report(Verdict::Ok, "discovery range: subnet"),
+        Range::System => report(
             Verdict::Ok,
             "discovery range: as configured in the RMW implementation",
         ),
-        Range::Localhost => say(
+        Range::Localhost => report(
             Verdict::Note,
             "discovery range: this host only; other robots do not see these nodes",
         )
         .remedy("unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
-        Range::Off => say(
+        Range::Off => report(
             Verdict::Warning,
             "discovery is off: nodes of this shell find no others",
         )
         .remedy("export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
-        Range::Wrong(_) => say(
+        Range::Wrong(_) => report(
             Verdict::Warning,
             "ROS_AUTOMATIC_DISCOVERY_RANGE is invalid: ROS uses LOCALHOST",
         )
@@ -187,26 +187,26 @@ fn server(variables: &Variables) -> Option<Finding> {
 fn transports(variables: &Variables) -> Option<Finding> {
     let name = "FASTDDS_BUILTIN_TRANSPORTS";
     let value = variables.shown(name)?;
-    let say = |verdict, sentence: String| Finding::new(AREA, "transports", verdict, sentence);
+    let report = |verdict, sentence: String| Finding::new(AREA, "transports", verdict, sentence);
     let kind = value.split(['?', '&']).next().unwrap_or_default();
     let finding = match kind {
-        "LARGE_DATA" | "LARGE_DATAv6" | "P2P" => say(
+        "LARGE_DATA" | "LARGE_DATAv6" | "P2P" => report(
             Verdict::Warning,
             format!("with {kind}, Fast DDS uses TCP, which the agent does not read"),
         )
         .remedy("export FASTDDS_BUILTIN_TRANSPORTS=DEFAULT"),
-        "SHM" => say(
+        "SHM" => report(
             Verdict::Note,
             "nodes of this shell use only shared memory, which is sampled; other hosts do not \
              see them"
                 .to_owned(),
         ),
-        _ => say(Verdict::Ok, format!("Fast DDS uses the transports {kind}")),
+        _ => report(Verdict::Ok, format!("Fast DDS uses the transports {kind}")),
     };
     Some(finding.seen(value, format!("{name}, {FROM}")))
 }
 
-fn profiles(host: &Host, variables: &Variables) -> Vec<Finding> {
+fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
     let names = [
         "FASTDDS_DEFAULT_PROFILES_FILE",
         "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -215,12 +215,12 @@ fn profiles(host: &Host, variables: &Variables) -> Vec<Finding> {
         .into_iter()
         .filter_map(|name| Some((name, variables.get(name)?)));
     set.map(|(name, path)| {
-        let say = |verdict, sentence: String| {
+        let report = |verdict, sentence: String| {
             let shown = variables.shown(name).unwrap_or_default();
             Finding::new(AREA, "profiles", verdict, sentence).seen(shown, format!("{name}, {FROM}"))
         };
         match read(host, path) {
-            Err(error) => say(
+            Err(error) => report(
                 Verdict::Warning,
                 format!("Fast DDS's profiles cannot be read: {error}; nodes run with the defaults"),
             )
@@ -228,13 +228,13 @@ fn profiles(host: &Host, variables: &Variables) -> Vec<Finding> {
             Ok(bytes) => {
                 let text = String::from_utf8_lossy(&bytes);
                 if text.contains("TCPv4") || text.contains("TCPv6") || text.contains("LARGE_DATA") {
-                    say(
+                    report(
                         Verdict::Warning,
                         "Fast DDS's profiles use TCP, which the agent does not read".to_owned(),
                     )
                     .elsewhere("<type>UDPv4</type>    # in the transport descriptors of that file")
                 } else {
-                    say(Verdict::Ok, "Fast DDS profiles found".to_owned())
+                    report(Verdict::Ok, "Fast DDS profiles found".to_owned())
                 }
             }
         }
@@ -243,16 +243,16 @@ fn profiles(host: &Host, variables: &Variables) -> Vec<Finding> {
 }
 
 /// A file that a variable names, from where this shell is.
-fn read(host: &Host, path: &str) -> Result<Vec<u8>, Unread> {
+fn read(host: &HostState, path: &str) -> Result<Vec<u8>, Unread> {
     let path = std::path::absolute(path)?;
     host.files.bytes(&path.to_string_lossy(), MAX_PROFILE)
 }
 
-fn cyclone(host: &Host, variables: &Variables) -> Option<Finding> {
+fn cyclone(host: &HostState, variables: &Variables) -> Option<Finding> {
     let name = "CYCLONEDDS_URI";
     let value = variables.get(name)?;
     let shown = variables.shown(name)?;
-    let say = |verdict, sentence: String| {
+    let report = |verdict, sentence: String| {
         Finding::new(AREA, "cyclonedds", verdict, sentence)
             .seen(shown.clone(), format!("{name}, {FROM}"))
     };
@@ -271,7 +271,9 @@ fn cyclone(host: &Host, variables: &Variables) -> Option<Finding> {
                     "Cyclone DDS's configuration cannot be read: {error}; its nodes do not start"
                 );
                 let verdict = Verdict::Problem;
-                return Some(say(verdict, sentence).remedy("unset CYCLONEDDS_URI    # or fix it"));
+                return Some(
+                    report(verdict, sentence).remedy("unset CYCLONEDDS_URI    # or fix it"),
+                );
             }
         }
     }
@@ -282,13 +284,13 @@ fn cyclone(host: &Host, variables: &Variables) -> Option<Finding> {
             .is_some_and(|(_, rest)| rest.starts_with("true"))
     };
     Some(if is_on(shared) || text.contains("PubSubMessageExchange") {
-        say(
+        report(
             Verdict::Warning,
             "Cyclone DDS uses iceoryx within this host, which the agent cannot see".to_owned(),
         )
         .elsewhere("<SharedMemory><Enable>false</Enable></SharedMemory>")
     } else {
-        say(
+        report(
             Verdict::Ok,
             "Cyclone DDS has its own configuration".to_owned(),
         )
@@ -326,7 +328,7 @@ fn security(variables: &Variables) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host::tests::host;
+    use super::super::host_state::tests::host;
     use super::*;
 
     const FILES: [(&str, &str); 4] = [

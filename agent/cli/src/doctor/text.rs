@@ -4,9 +4,9 @@
 
 use std::borrow::Cow;
 
-use super::finding::{Finding, Place, Remedy, Verdict};
+use super::finding::{Finding, Remedy, RemedyTarget, Verdict};
 use super::report::Report;
-use ros2probe_daemon::visible::visible;
+use ros2probe_daemon::escape::visible;
 
 const WIDTH: usize = 80;
 /// Before sentences: two spaces, a verdict, a space.
@@ -104,9 +104,9 @@ impl Page {
         let line = visible(&remedy.line);
         let own = remedy.comment.as_deref().map(visible);
         let comment = match (remedy.kind, own) {
-            (Place::Configuration, None) => Some(FILE.to_owned()),
-            (Place::Configuration, Some(own)) => Some(format!("{FILE}; {own}")),
-            (Place::Command | Place::Elsewhere, own) => own.map(Cow::into_owned),
+            (RemedyTarget::Configuration, None) => Some(FILE.to_owned()),
+            (RemedyTarget::Configuration, Some(own)) => Some(format!("{FILE}; {own}")),
+            (RemedyTarget::Command | RemedyTarget::Elsewhere, own) => own.map(Cow::into_owned),
         };
         let mut short = String::new();
         if let Some(comment) = comment {

@@ -7,7 +7,7 @@ use jiff::tz::TimeZone;
 use super::Dialect;
 use ros2probe_bag::info::{Bag, Details, SERVICE_EVENT};
 use ros2probe_bag::metadata::Topic;
-use ros2probe_daemon::visible::visible;
+use ros2probe_daemon::escape::visible;
 
 /// The order of topics.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, clap::ValueEnum)]

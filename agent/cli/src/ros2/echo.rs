@@ -17,7 +17,7 @@ use super::{Dialect, Refused};
 use ros2probe_daemon::subscriptions::line::SampleFacts;
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::{self, Style};
-use ros2probe_message::{Decoded, Limits, MessageType, Shown, Value, csv, decode, python};
+use ros2probe_message::{Decoded, Limits, MessageType, Truncation, Value, csv, decode, python};
 
 /// Writers whose unreadable messages are told apart.
 const MAX_WRITERS: usize = 256;
@@ -39,7 +39,7 @@ pub struct Options {
     /// YAML in one line.
     pub style: Style,
     /// What of arrays and strings.
-    pub shown: Shown,
+    pub shown: Truncation,
     /// The payload's bytes instead of the message.
     pub raw: bool,
     /// Parts instead of the whole.
@@ -56,9 +56,9 @@ impl Default for Options {
             dialect: Dialect::default(),
             csv: false,
             style: Style::Block,
-            shown: Shown {
+            shown: Truncation {
                 truncate: Some(128),
-                ..Shown::default()
+                ..Truncation::default()
             },
             raw: false,
             fields: Vec::new(),
@@ -75,9 +75,9 @@ pub struct Echo {
     unreadable: HashMap<String, u64>,
 }
 
-/// What there is to say about one message.
+/// The text for one message.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub struct Told {
+pub struct MessageText {
     /// For stdout; `None` where the message did not pass the filter or cannot be read.
     pub out: Option<String>,
     /// For stderr, whole lines.
@@ -103,28 +103,28 @@ impl Echo {
         sample: &SampleFacts,
         message_type: Option<&MessageType>,
         payload: &[u8],
-    ) -> Result<Told, Refused> {
+    ) -> Result<MessageText, Refused> {
         if self.options.raw {
             if !self.passes(Subject::Bytes(payload))? {
-                return Ok(Told::default());
+                return Ok(MessageText::default());
             }
             let bytes = python::bytes(payload);
             let info = self.options.include_info.then(|| info_around(sample));
             let out = format!("{}{bytes}\n---\n", info.unwrap_or_default());
-            return Ok(Told {
+            return Ok(MessageText {
                 out: Some(out),
                 err: String::new(),
             });
         }
         let Some(message_type) = message_type else {
-            return Ok(Told::default());
+            return Ok(MessageText::default());
         };
         let (decoded, err) = self.decode(sample, message_type, payload);
         let Some(decoded) = decoded else {
-            return Ok(Told { out: None, err });
+            return Ok(MessageText { out: None, err });
         };
         let out = self.print(sample, &decoded)?;
-        Ok(Told { out, err })
+        Ok(MessageText { out, err })
     }
 
     /// An event of a service as `service echo` prints it; `interface` is the part of an action that
@@ -136,10 +136,10 @@ impl Echo {
         message_type: &MessageType,
         payload: &[u8],
         interface: Option<&str>,
-    ) -> Told {
+    ) -> MessageText {
         let (decoded, err) = self.decode(sample, message_type, payload);
         let Some(Decoded { message, .. }) = decoded else {
-            return Told { out: None, err };
+            return MessageText { out: None, err };
         };
         let mut out = interface.map_or_else(String::new, |name| format!("interface: {name}\n"));
         if self.options.csv {
@@ -150,7 +150,7 @@ impl Echo {
             out.push_str(&with_name_of_event(document));
             out.push_str("---\n");
         }
-        Told {
+        MessageText {
             out: Some(out),
             err,
         }

@@ -5,7 +5,7 @@ use std::borrow::Cow;
 
 use serde::{Deserialize, Deserializer};
 
-use ros2probe_daemon::visible::visible;
+use ros2probe_daemon::escape::visible;
 
 /// `/names`.
 #[derive(Clone, Debug, Default, Deserialize)]

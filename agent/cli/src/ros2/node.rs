@@ -8,7 +8,7 @@ use super::facts::{Named, Node, NodeName, is_hidden, is_hidden_node};
 
 /// What goes to stdout, and a warning for stderr.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Told {
+pub struct NodeText {
     /// For stdout.
     pub text: String,
     /// For stderr, where there is reason.
@@ -17,7 +17,7 @@ pub struct Told {
 
 /// `node list`.
 #[must_use]
-pub fn list(nodes: &[NodeName], all: bool, count: bool) -> Told {
+pub fn list(nodes: &[NodeName], all: bool, count: bool) -> NodeText {
     let shown = || {
         let shown = nodes
             .iter()
@@ -26,7 +26,7 @@ pub fn list(nodes: &[NodeName], all: bool, count: bool) -> Told {
     };
     if count {
         // Without the warning, as in the original.
-        return Told {
+        return NodeText {
             text: format!("{}\n", shown().count()),
             warning: None,
         };
@@ -40,14 +40,14 @@ pub fn list(nodes: &[NodeName], all: bool, count: bool) -> Told {
          have unintended side effects."
             .to_owned()
     });
-    Told { text, warning }
+    NodeText { text, warning }
 }
 
 /// `node info`; `None` where there is no such node.
 ///
 /// # Errors
 /// There is none, or it is hidden and hidden ones are not wanted.
-pub fn info(name: &str, node: Option<&Node>, hidden: bool) -> Result<Told, Refused> {
+pub fn info(name: &str, node: Option<&Node>, hidden: bool) -> Result<NodeText, Refused> {
     let node = node.filter(|node| node.name == name && (hidden || !is_hidden_node(name)));
     let node = node.ok_or_else(|| Refused(format!("Unable to find node '{name}'")))?;
     let mut text = format!("{name}\n");
@@ -79,7 +79,7 @@ pub fn info(name: &str, node: Option<&Node>, hidden: bool) -> Result<Told, Refus
              information about all of them."
         )
     });
-    Ok(Told { text, warning })
+    Ok(NodeText { text, warning })
 }
 
 #[cfg(test)]

@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
 use super::Options;
+use super::event_pane::EventPane;
 use super::facts::{Event, Health, Lagged, Topic, Topics};
-use super::news::News;
 use super::row::{Column, Key, Past, Row, Standing, shown_name};
 use super::text::safe;
 
@@ -33,23 +33,23 @@ pub enum Fact {
     /// The agent does not answer, and why.
     Gone(String),
     /// What became of a wish.
-    Said(String),
+    Status(String),
     /// Topics that are measured because this program asks for it.
-    Measured(BTreeMap<Key, Hold>),
+    Measured(BTreeMap<Key, MeasuredBy>),
 }
 
-/// How this program has a topic measured.
+/// What keeps a topic measured for this program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Hold {
+pub enum MeasuredBy {
     /// Until it ends.
-    Here,
+    Session,
     /// Also after that.
-    Kept,
+    Watch,
 }
 
-/// What the program should do.
+/// A command for the program.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Wish {
+pub enum Command {
     /// End.
     Quit,
     /// Details of this topic from now on.
@@ -137,7 +137,7 @@ pub struct App {
     /// The topic that is selected.
     pub selected: Option<Key>,
     /// The latest events.
-    pub news: News,
+    pub news: EventPane,
     /// First line of the details that is shown.
     pub details_scroll: usize,
     /// How many of the latest events are below the pane.
@@ -156,8 +156,8 @@ pub struct App {
     dropped_at: Option<Instant>,
     past: HashMap<Key, Past>,
     /// Topics that are measured for this program.
-    pub holds: BTreeMap<Key, Hold>,
-    said: Option<(Instant, String)>,
+    pub holds: BTreeMap<Key, MeasuredBy>,
+    status: Option<(Instant, String)>,
 }
 
 /// Lines of each pane.
@@ -216,8 +216,8 @@ impl App {
 
     /// The answer to the last key, while it is news.
     #[must_use]
-    pub fn said(&self, now: Instant) -> Option<&str> {
-        let (at, text) = self.said.as_ref()?;
+    pub fn status(&self, now: Instant) -> Option<&str> {
+        let (at, text) = self.status.as_ref()?;
         (now.saturating_duration_since(*at) < SAID).then_some(text.as_str())
     }
 
@@ -239,7 +239,7 @@ impl App {
     }
 
     /// Takes in what the agent says.
-    pub fn take(&mut self, fact: Fact, now: Instant) -> Vec<Wish> {
+    pub fn take(&mut self, fact: Fact, now: Instant) -> Vec<Command> {
         match fact {
             Fact::Topics(topics) => {
                 (self.updated, self.gone) = (Some(now), None);
@@ -270,7 +270,7 @@ impl App {
                 let since = self.gone.as_ref().map_or(now, |(since, _)| *since);
                 self.gone = Some((since, safe(&why)));
             }
-            Fact::Said(text) => self.said = Some((now, safe(&text))),
+            Fact::Status(text) => self.status = Some((now, safe(&text))),
             Fact::Measured(holds) => self.holds = holds,
         }
         Vec::new()
@@ -284,7 +284,7 @@ impl App {
         }
     }
 
-    fn take_topics(&mut self, topics: &Topics, now: Instant) -> Vec<Wish> {
+    fn take_topics(&mut self, topics: &Topics, now: Instant) -> Vec<Command> {
         let mut past = std::mem::take(&mut self.past);
         let rows = topics.topics.iter().map(|topic| {
             let key = Key {
@@ -301,7 +301,7 @@ impl App {
     }
 
     /// Sorts and filters; the selected topic stays selected, else the one in its place is.
-    pub fn arrange(&mut self) -> Vec<Wish> {
+    pub fn arrange(&mut self) -> Vec<Command> {
         let place = self.place_of_selected().unwrap_or(0);
         let (sort, reverse) = (self.sort, self.reverse);
         self.rows
@@ -316,7 +316,7 @@ impl App {
         self.select(place)
     }
 
-    fn select(&mut self, place: usize) -> Vec<Wish> {
+    fn select(&mut self, place: usize) -> Vec<Command> {
         let last = self.shown.len().saturating_sub(1);
         let row = self.shown().nth(place.min(last));
         let key = row.map(|row| row.key.clone());
@@ -328,7 +328,7 @@ impl App {
         self.details = None;
         self.details_scroll = 0;
         self.scroll();
-        vec![Wish::Select(key)]
+        vec![Command::Select(key)]
     }
 
     /// Keeps the selected topic on the screen, which has had [`Heights`] at last.
@@ -347,18 +347,18 @@ impl App {
     }
 
     /// What a key does.
-    pub fn key(&mut self, key: KeyEvent) -> Vec<Wish> {
+    pub fn key(&mut self, key: KeyEvent) -> Vec<Command> {
         if key.kind == KeyEventKind::Release {
             return Vec::new();
         }
         let control = key.modifiers.contains(KeyModifiers::CONTROL);
         if control && matches!(key.code, KeyCode::Char('c' | 'C')) {
-            return vec![Wish::Quit];
+            return vec![Command::Quit];
         }
         if self.help {
             self.help = false;
             return match key.code {
-                KeyCode::Char('q') => vec![Wish::Quit],
+                KeyCode::Char('q') => vec![Command::Quit],
                 _ => Vec::new(),
             };
         }
@@ -371,7 +371,7 @@ impl App {
             KeyCode::Char('u') if control => self.go_by(-self.page() / 2),
             KeyCode::Char('d') if control => self.go_by(self.page() / 2),
             KeyCode::Char(_) if control => Vec::new(),
-            KeyCode::Char('q') => vec![Wish::Quit],
+            KeyCode::Char('q') => vec![Command::Quit],
             KeyCode::Char('?') | KeyCode::F(1) => {
                 self.help = true;
                 Vec::new()
@@ -388,7 +388,7 @@ impl App {
     }
 
     /// Keys that change what is shown.
-    fn switch(&mut self, code: KeyCode) -> Vec<Wish> {
+    fn switch(&mut self, code: KeyCode) -> Vec<Command> {
         match code {
             KeyCode::Enter | KeyCode::Char('d') => {
                 self.details_open = !self.details_open;
@@ -415,7 +415,7 @@ impl App {
             KeyCode::Char('m') => self.filter.measured = !self.filter.measured,
             KeyCode::Char('h') => {
                 self.hidden = !self.hidden;
-                return vec![Wish::Hidden(self.hidden)];
+                return vec![Command::Hidden(self.hidden)];
             }
             KeyCode::Char('s' | '>') => self.sort_by(1),
             KeyCode::Char('<') => self.sort_by(Column::ALL.len() - 1),
@@ -431,7 +431,7 @@ impl App {
         self.arrange()
     }
 
-    fn edit(&mut self, code: KeyCode, control: bool) -> Vec<Wish> {
+    fn edit(&mut self, code: KeyCode, control: bool) -> Vec<Command> {
         match code {
             KeyCode::Enter => self.editing = None,
             KeyCode::Esc => self.filter.text = self.editing.take().unwrap_or_default(),
@@ -446,7 +446,7 @@ impl App {
         self.arrange()
     }
 
-    fn measure(&mut self, code: KeyCode) -> Vec<Wish> {
+    fn measure(&mut self, code: KeyCode) -> Vec<Command> {
         let selected = self.selected.as_ref();
         let row = self.rows.iter().find(|row| Some(&row.key) == selected);
         let Some(row) = row.filter(|row| row.standing != Standing::Gone) else {
@@ -454,8 +454,8 @@ impl App {
         };
         let (key, name) = (row.key.clone(), row.name.clone());
         vec![match code {
-            KeyCode::Char('W') => Wish::Keep(key, name),
-            _ => Wish::Toggle(key, name),
+            KeyCode::Char('W') => Command::Keep(key, name),
+            _ => Command::Toggle(key, name),
         }]
     }
 
@@ -510,7 +510,7 @@ impl App {
         isize::try_from(height.saturating_sub(1).max(1)).unwrap_or(1)
     }
 
-    fn go_by(&mut self, steps: isize) -> Vec<Wish> {
+    fn go_by(&mut self, steps: isize) -> Vec<Command> {
         match self.focus {
             Pane::Topics => {
                 let place = self.place_of_selected().unwrap_or(0);

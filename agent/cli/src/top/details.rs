@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 
 use serde_json::{Map, Value};
 
+use super::event_pane::shown;
 use super::facts::{Bucket, Delivered, Distribution, Endpoint, Measurement, Topic, Watching};
-use super::look::{Kind, Look};
-use super::news::shown;
 use super::row::{is_measured, shown_name};
 use super::text::{beginning, bound, bytes, counted, end, rate, ratio, safe, seconds};
+use super::theme::{Kind, Theme};
 
 /// Receivers and destinations that no reader is known for.
 const MAX_OTHERS: usize = 16;
@@ -21,7 +21,7 @@ pub type Styled = (String, Kind);
 
 /// All lines; longer ones are cut where they are drawn.
 #[must_use]
-pub fn lines(topic: &Topic, width: usize, look: Look) -> Vec<Styled> {
+pub fn lines(topic: &Topic, width: usize, theme: Theme) -> Vec<Styled> {
     let mut lines = Vec::new();
     let types: Vec<_> = topic.message_types.iter().map(|it| safe(it)).collect();
     let head = format!(
@@ -52,10 +52,10 @@ pub fn lines(topic: &Topic, width: usize, look: Look) -> Vec<Styled> {
         let line = format!("pairs of publisher and subscriber by: {}", ways.join(", "));
         lines.push((line, Kind::Plain));
     }
-    histograms(topic, width, look, &mut lines);
-    publishers(topic, look, &mut lines);
-    subscribers(topic, look, &mut lines);
-    others(topic, look, &mut lines);
+    histograms(topic, width, theme, &mut lines);
+    publishers(topic, theme, &mut lines);
+    subscribers(topic, theme, &mut lines);
+    others(topic, theme, &mut lines);
     lines
 }
 
@@ -263,7 +263,7 @@ fn unmatched(reason: &str) -> &str {
     }
 }
 
-fn histograms(topic: &Topic, width: usize, look: Look, lines: &mut Vec<Styled>) {
+fn histograms(topic: &Topic, width: usize, theme: Theme, lines: &mut Vec<Styled>) {
     let measured = topic.measurement.as_ref();
     let title = |what: &str, it: Option<Distribution>| {
         it.map(|it| {
@@ -289,7 +289,7 @@ fn histograms(topic: &Topic, width: usize, look: Look, lines: &mut Vec<Styled>) 
     let both: Vec<_> = both.collect();
     let half = width.saturating_sub(3) / 2;
     if let ([(left, left_buckets), (right, right_buckets)], true) = (both.as_slice(), half >= 48) {
-        let cut = look.cut();
+        let cut = theme.cut();
         let join = |left: &str, right: &str| {
             format!(
                 "{:<half$}   {}",
@@ -299,8 +299,8 @@ fn histograms(topic: &Topic, width: usize, look: Look, lines: &mut Vec<Styled>) 
         };
         lines.push((join(left, right), Kind::Heading));
         let (left, right) = (
-            bars(left_buckets, half, look),
-            bars(right_buckets, half, look),
+            bars(left_buckets, half, theme),
+            bars(right_buckets, half, theme),
         );
         for at in 0..left.len().max(right.len()) {
             let line = |lines: &[String]| lines.get(at).cloned().unwrap_or_default();
@@ -310,14 +310,14 @@ fn histograms(topic: &Topic, width: usize, look: Look, lines: &mut Vec<Styled>) 
     }
     for (title, buckets) in both {
         lines.push((title, Kind::Heading));
-        let bars = bars(buckets, width, look);
+        let bars = bars(buckets, width, theme);
         lines.extend(bars.into_iter().map(|bar| (bar, Kind::Plain)));
     }
 }
 
 /// A line for each bucket, from the first to the last that is not empty.
 #[must_use]
-pub fn bars(buckets: &[Bucket], width: usize, look: Look) -> Vec<String> {
+pub fn bars(buckets: &[Bucket], width: usize, theme: Theme) -> Vec<String> {
     let is_filled = |bucket: &Bucket| bucket.count > 0;
     let first = buckets.iter().position(is_filled).unwrap_or(0);
     let behind = buckets.iter().rposition(is_filled).map_or(0, |at| at + 1);
@@ -334,13 +334,13 @@ pub fn bars(buckets: &[Bucket], width: usize, look: Look) -> Vec<String> {
         format!(
             "  {bound} {:>digits$} {}",
             bucket.count,
-            look.bar(part, room)
+            theme.bar(part, room)
         )
     };
     filled.iter().map(line).collect()
 }
 
-fn publishers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
+fn publishers(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
     if topic.publishers.is_empty() {
         return;
     }
@@ -356,7 +356,7 @@ fn publishers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
         let latency = measured.and_then(|it| it.latency);
         let line = format!(
             "{:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  {}",
-            node(writer, look),
+            node(writer, theme),
             known(measured.map(|it| rate(it.rate_hertz))),
             known(measured.map(|it| bytes(it.bandwidth_bytes_per_second))),
             known(measured.map(|it| it.lost_messages.to_string())),
@@ -376,7 +376,7 @@ fn publishers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
     }
 }
 
-fn subscribers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
+fn subscribers(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
     if topic.subscriptions.is_empty() {
         return;
     }
@@ -404,7 +404,7 @@ fn subscribers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
         let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
         let line = format!(
             "{:<NODE$} {:>7} {:>6} {:>6}  {}",
-            node(reader, look),
+            node(reader, theme),
             known(sum.map(|it| it.messages.to_string())),
             known(sum.map(|it| it.lost_messages.to_string())),
             known(behind.map(|it| it.to_string())),
@@ -422,7 +422,7 @@ fn subscribers(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
 }
 
 /// Where messages arrive without a reader that is known, and where they leave to.
-fn others(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
+fn others(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
     let mut others: BTreeMap<String, Delivered> = BTreeMap::new();
     for delivery in &topic.deliveries {
         let to = match (delivery.direction.as_str(), &delivery.process) {
@@ -444,7 +444,7 @@ fn others(topic: &Topic, look: Look, lines: &mut Vec<Styled>) {
     let heading = format!("{:<NODE$} {:>7} {:>6}", "other ways", "CAME", "LOST");
     lines.push((heading, Kind::Heading));
     for (to, it) in others.iter().take(MAX_OTHERS) {
-        let to = beginning(to, NODE, look.cut());
+        let to = beginning(to, NODE, theme.cut());
         let line = format!("{to:<NODE$} {:>7} {:>6}", it.messages, it.lost_messages);
         lines.push((line, Kind::Plain));
     }
@@ -466,9 +466,9 @@ fn add(sum: &mut Delivered, one: &Delivered) {
     sum.pending_messages += one.pending_messages;
 }
 
-fn node(endpoint: &Endpoint, look: Look) -> String {
+fn node(endpoint: &Endpoint, theme: Theme) -> String {
     let name = safe(endpoint.node.as_deref().unwrap_or(&endpoint.guid));
-    end(&name, NODE, look.cut())
+    end(&name, NODE, theme.cut())
 }
 
 fn qos(endpoint: &Endpoint, topic: &Topic) -> String {
@@ -513,14 +513,14 @@ mod tests {
             bucket(None, 3),
         ];
         assert_eq!(
-            bars(&buckets, 30, Look::default()),
+            bars(&buckets, 30, Theme::default()),
             [
                 "  <= 5.0ms 120 ###############",
                 "  <=  10ms   0 ",
                 "     more    3 #",
             ]
         );
-        assert!(bars(&buckets[..1], 30, Look::default()).is_empty());
-        assert!(bars(&[], 30, Look::default()).is_empty());
+        assert!(bars(&buckets[..1], 30, Theme::default()).is_empty());
+        assert!(bars(&[], 30, Theme::default()).is_empty());
     }
 }

@@ -6,16 +6,16 @@ use std::time::{Duration, Instant};
 
 use super::app::App;
 use super::details::Styled;
-use super::look::{Kind, Look};
 use super::row::Standing;
 use super::text::{counted, safe};
+use super::theme::{Kind, Theme};
 
 /// What is shown should not be older: the agent itself calls this stale.
 const FRESH: Duration = Duration::from_secs(5);
 
 /// At most `most` lines; a width of 0 is as wide as they are.
 #[must_use]
-pub fn lines(app: &App, width: usize, most: usize, look: Look, now: Instant) -> Vec<Styled> {
+pub fn lines(app: &App, width: usize, most: usize, theme: Theme, now: Instant) -> Vec<Styled> {
     let mut lines = vec![
         (robot(app, width, now), Kind::Heading),
         (agent(app), Kind::Plain),
@@ -26,7 +26,7 @@ pub fn lines(app: &App, width: usize, most: usize, look: Look, now: Instant) -> 
         let more = warnings.len() - room;
         warnings.truncate(room);
         if let Some((last, _)) = warnings.last_mut() {
-            last.push_str(&format!(" {} {more} more", look.cut()));
+            last.push_str(&format!(" {} {more} more", theme.cut()));
         }
     }
     lines.extend(warnings);

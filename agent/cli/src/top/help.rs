@@ -1,7 +1,7 @@
 //! The keys, explained on one screen of 80x24.
 
 use super::details::Styled;
-use super::look::Kind;
+use super::theme::Kind;
 
 const HELP: &str = "\
 rp top: a robot's topics as its agent sees them     any key goes back

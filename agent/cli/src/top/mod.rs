@@ -6,18 +6,18 @@
 
 mod app;
 mod details;
+mod event_pane;
 mod facts;
-mod feed;
 mod header;
 mod help;
-mod holds;
-mod look;
-mod news;
+mod measure_requests;
+mod poller;
 mod row;
 mod server_sent;
 mod table;
 mod terminal;
 mod text;
+mod theme;
 mod view;
 
 use std::io;
@@ -25,12 +25,12 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 use crate::client::{Agent, ClientError};
-use app::{App, Fact, Wish};
-use feed::{Feed, Input};
-use look::Look;
+use app::{App, Command, Fact};
+use poller::{Input, Poller};
 pub use row::Column;
 use table::Table;
 use terminal::Screen;
+use theme::Theme;
 
 /// The screen is drawn anew after this time, for the age of what is shown.
 const TICK: Duration = Duration::from_millis(500);
@@ -63,16 +63,16 @@ pub struct Options {
 /// # Errors
 /// The agent is gone or refuses.
 pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
-    let (health, topics) = feed::ask(agent, options.domain_id, options.hidden)?;
+    let (health, topics) = poller::ask(agent, options.domain_id, options.hidden)?;
     let (mut app, now) = (App::new(options, agent.place()), Instant::now());
     app.take(Fact::Health(Box::new(health)), now);
     app.take(Fact::Topics(Box::new(topics)), now);
-    let look = Look::default();
+    let theme = Theme::default();
     let rows: Vec<_> = app.shown().collect();
-    let table = Table::whole(&rows, look.cut());
+    let table = Table::whole(&rows, theme.cut());
     let (heading, _) = table.heading(app.sort);
     let mut text = String::new();
-    let header = header::lines(&app, 0, MAX_HEADER, look, now);
+    let header = header::lines(&app, 0, MAX_HEADER, theme, now);
     let header = header.into_iter().map(|(line, _)| line);
     let rows = rows.iter().map(|row| table.line(row));
     for line in header.chain([heading]).chain(rows) {
@@ -87,28 +87,28 @@ pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
 /// # Errors
 /// There is no terminal, or no thread can be started.
 pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u8> {
-    let look = Look::of(|name| std::env::var(name).ok());
+    let theme = Theme::of(|name| std::env::var(name).ok());
     let mut app = App::new(options, agent.place());
     let mut screen = Screen::open()?;
     let (inputs, input) = sync_channel(MAX_WAITING);
     terminal::listen_to_signals(inputs.clone())?;
     terminal::listen(inputs.clone())?;
-    let feed = Feed::start(agent, options.domain_id, interval, &inputs)?;
+    let poller = Poller::start(agent, options.domain_id, interval, &inputs)?;
     if options.hidden {
-        feed.wish(Wish::Hidden(true));
+        poller.command(Command::Hidden(true));
     }
     loop {
         let draw =
-            |frame: &mut ratatui::Frame<'_>| view::draw(&mut app, frame, look, Instant::now());
+            |frame: &mut ratatui::Frame<'_>| view::draw(&mut app, frame, theme, Instant::now());
         screen.terminal().draw(draw)?;
-        if let Some(code) = take_in(&mut app, &feed, &input) {
+        if let Some(code) = handle_input(&mut app, &poller, &input) {
             return Ok(code);
         }
     }
 }
 
 /// Waits for what changes the screen and takes it in; the exit code when that was the end.
-fn take_in(app: &mut App, feed: &Feed, input: &Receiver<Input>) -> Option<u8> {
+fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Option<u8> {
     let begun = Instant::now();
     let mut is_news = false;
     loop {
@@ -118,17 +118,17 @@ fn take_in(app: &mut App, feed: &Feed, input: &Receiver<Input>) -> Option<u8> {
             Err(RecvTimeoutError::Timeout) => return None,
             Err(RecvTimeoutError::Disconnected) => return Some(1),
         };
-        let (wishes, is_urgent) = match next {
+        let (commands, is_urgent) = match next {
             Input::End(code) => return Some(code),
             Input::Key(key) => (app.key(key), true),
             Input::Resized => (Vec::new(), true),
             Input::Fact(fact) => (app.take(fact, Instant::now()), false),
         };
-        for wish in wishes {
-            if wish == Wish::Quit {
+        for command in commands {
+            if command == Command::Quit {
                 return Some(0);
             }
-            feed.wish(wish);
+            poller.command(command);
         }
         if is_urgent {
             return None;

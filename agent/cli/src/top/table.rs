@@ -130,7 +130,7 @@ impl Table {
         };
         let mut columns = vec![Field::Name, Field::Rate, Field::State];
         let mut left = width.saturating_sub(NAME + 6 + 9 + 2);
-        let wishes = [
+        let commands = [
             (Field::Domain, domains.len() > 1),
             (Field::Bandwidth, true),
             (Field::Loss, true),
@@ -139,7 +139,7 @@ impl Table {
             (Field::Wanted, is_expected),
             (Field::Median, true),
         ];
-        for (field, is_wanted) in wishes {
+        for (field, is_wanted) in commands {
             if is_wanted && left > field.width() {
                 left -= field.width() + 1;
                 columns.push(field);

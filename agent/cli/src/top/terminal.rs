@@ -17,7 +17,7 @@ use ratatui::crossterm::terminal::{
 use ratatui::crossterm::{cursor, execute};
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::feed::Input;
+use super::poller::Input;
 
 /// What the exit code of a panic is.
 const PANICKED: i32 = 101;

@@ -7,13 +7,13 @@ use ratatui::layout::Rect;
 use ratatui::style::Modifier;
 use ratatui::text::{Line, Span};
 
-use super::app::{App, Heights, Hold, Pane};
+use super::app::{App, Heights, MeasuredBy, Pane};
 use super::details::{self, Styled};
 use super::header;
 use super::help;
-use super::look::{Kind, Look};
 use super::table::Table;
 use super::text::{beginning, safe};
+use super::theme::{Kind, Theme};
 
 /// Smaller than this, nothing can be read.
 pub const LEAST: (u16, u16) = (40, 8);
@@ -21,21 +21,21 @@ pub const LEAST: (u16, u16) = (40, 8);
 const MARKS: usize = 2;
 
 /// Draws the screen and tells the model how much of it there is.
-pub fn draw(app: &mut App, frame: &mut Frame<'_>, look: Look, now: Instant) {
+pub fn draw(app: &mut App, frame: &mut Frame<'_>, theme: Theme, now: Instant) {
     let area = frame.area();
     if area.width < LEAST.0 || area.height < LEAST.1 {
         let (width, height) = LEAST;
         let text = format!("rp top needs {width}x{height}");
-        put(frame, area, 0, &text, look, Kind::Plain);
+        put(frame, area, 0, &text, theme, Kind::Plain);
         return;
     }
     if app.help {
-        write(frame, area, &help::lines(), look, 0);
+        write(frame, area, &help::lines(), theme, 0);
         return;
     }
     let most = usize::from(area.height / 4).max(3);
-    let header = header::lines(app, usize::from(area.width), most, look, now);
-    write(frame, area, &header, look, 0);
+    let header = header::lines(app, usize::from(area.width), most, theme, now);
+    write(frame, area, &header, theme, 0);
     let top = u16::try_from(header.len()).unwrap_or(u16::MAX);
     let body = Rect {
         y: area.y + top,
@@ -46,13 +46,13 @@ pub fn draw(app: &mut App, frame: &mut Frame<'_>, look: Look, now: Instant) {
     app.heights = panes.heights();
     let details = match (panes.details, &app.details) {
         (None, _) => Vec::new(),
-        (Some(area), Some(topic)) => details::lines(topic, usize::from(area.width), look),
+        (Some(area), Some(topic)) => details::lines(topic, usize::from(area.width), theme),
         (Some(_), None) => vec![("...".to_owned(), Kind::Faint)],
     };
     app.heights.details_needed = details.len();
     app.scroll();
     if let Some(area) = panes.topics {
-        topics(app, frame, area, look);
+        topics(app, frame, area, theme);
     }
     if let Some(area) = panes.details {
         let name = app.selected_name();
@@ -62,13 +62,13 @@ pub fn draw(app: &mut App, frame: &mut Frame<'_>, look: Look, now: Instant) {
             true => format!("{name} ({}/{})", shown.min(details.len()), details.len()),
             false => name,
         };
-        rule(frame, area, &title, app.focus == Pane::Details, look);
-        write(frame, below(area), &details, look, app.details_scroll);
+        rule(frame, area, &title, app.focus == Pane::Details, theme);
+        write(frame, below(area), &details, theme, app.details_scroll);
     }
     if let Some(area) = panes.events {
-        events(app, frame, area, look);
+        events(app, frame, area, theme);
     }
-    footer(app, frame, area, look, now);
+    footer(app, frame, area, theme, now);
 }
 
 /// Where the panes are; each has a line of its own on top.
@@ -121,13 +121,13 @@ impl Panes {
     }
 }
 
-fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
+fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     let width = usize::from(area.width) - MARKS;
     let rows: Vec<_> = app.shown().collect();
-    let table = Table::plan(width, &rows, look.cut());
+    let table = Table::plan(width, &rows, theme.cut());
     let (heading, sorted) = table.heading(app.sort);
     let heading = format!("{:MARKS$}{heading}", "");
-    put(frame, area, 0, &heading, look, Kind::Heading);
+    put(frame, area, 0, &heading, theme, Kind::Heading);
     if let Some((at, width)) = sorted {
         let column = |at: usize| u16::try_from(at).unwrap_or(u16::MAX);
         let area = Rect {
@@ -141,15 +141,15 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
     }
     let body = below(area);
     if rows.is_empty() {
-        put(frame, body, 0, nothing(app), look, Kind::Plain);
+        put(frame, body, 0, nothing(app), theme, Kind::Plain);
     }
     let visible = rows.iter().skip(app.offset).zip(0..body.height);
     for (row, at) in visible {
         let is_selected = app.selected.as_ref() == Some(&row.key);
         let hold = match app.holds.get(&row.key) {
             None => ' ',
-            Some(Hold::Here) => '+',
-            Some(Hold::Kept) => '=',
+            Some(MeasuredBy::Session) => '+',
+            Some(MeasuredBy::Watch) => '=',
         };
         let mark = if is_selected { '>' } else { ' ' };
         let line = format!("{mark}{hold}{}", table.line(row));
@@ -159,7 +159,7 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
             (false, true, false) => Kind::Faint,
             (false, true, true) => Kind::Plain,
         };
-        put(frame, body, at, &line, look, kind);
+        put(frame, body, at, &line, theme, kind);
     }
 }
 
@@ -172,7 +172,7 @@ fn nothing(app: &App) -> &'static str {
     }
 }
 
-fn events(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
+fn events(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     let body = below(area);
     let lines: Vec<_> = app.news.shown().collect();
     let behind = lines.len().saturating_sub(app.events_back);
@@ -184,9 +184,9 @@ fn events(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
     if app.events_back > 0 {
         title.push_str(&format!(" ({} newer below)", app.events_back));
     }
-    rule(frame, area, &title, app.focus == Pane::Events, look);
+    rule(frame, area, &title, app.focus == Pane::Events, theme);
     if lines.is_empty() {
-        put(frame, body, 0, "no events yet", look, Kind::Faint);
+        put(frame, body, 0, "no events yet", theme, Kind::Faint);
     }
     let shown = lines.get(first..behind).unwrap_or_default();
     for (line, at) in shown.iter().zip(0..body.height) {
@@ -195,22 +195,22 @@ fn events(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look) {
         } else {
             Kind::Plain
         };
-        put(frame, body, at, &line.text, look, kind);
+        put(frame, body, at, &line.text, theme, kind);
     }
 }
 
-fn footer(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look, now: Instant) {
+fn footer(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme, now: Instant) {
     let last = area.height.saturating_sub(1);
     if app.editing.is_some() {
         let text = format!("/{}", safe(&app.filter.text));
-        put(frame, area, last, &text, look, Kind::Plain);
+        put(frame, area, last, &text, theme, Kind::Plain);
         let column = u16::try_from(text.len()).unwrap_or(u16::MAX);
         let x = area.x + column.min(area.width.saturating_sub(1));
         frame.set_cursor_position((x, area.y + last));
         return;
     }
-    if let Some(said) = app.said(now) {
-        put(frame, area, last, said, look, Kind::Heading);
+    if let Some(status) = app.status(now) {
+        put(frame, area, last, status, theme, Kind::Heading);
         return;
     }
     let keys = match app.focus {
@@ -219,14 +219,14 @@ fn footer(app: &App, frame: &mut Frame<'_>, area: Rect, look: Look, now: Instant
         }
         _ => "q quit  ? help  Tab next pane  arrows scroll  z whole screen  Esc back",
     };
-    put(frame, area, last, keys, look, Kind::Faint);
+    put(frame, area, last, keys, theme, Kind::Faint);
 }
 
 /// The line on top of a pane.
-fn rule(frame: &mut Frame<'_>, area: Rect, title: &str, is_focused: bool, look: Look) {
-    let line = look.rule(is_focused);
+fn rule(frame: &mut Frame<'_>, area: Rect, title: &str, is_focused: bool, theme: Theme) {
+    let line = theme.rule(is_focused);
     let width = usize::from(area.width);
-    let title = beginning(title, width.saturating_sub(6), look.cut());
+    let title = beginning(title, width.saturating_sub(6), theme.cut());
     let text = format!("{line}{line} {title} ");
     let rest = width.saturating_sub(text.chars().count());
     let text: String = text
@@ -238,7 +238,7 @@ fn rule(frame: &mut Frame<'_>, area: Rect, title: &str, is_focused: bool, look: 
     } else {
         Kind::Plain
     };
-    put(frame, area, 0, &text, look, kind);
+    put(frame, area, 0, &text, theme, kind);
 }
 
 const fn below(area: Rect) -> Rect {
@@ -251,23 +251,23 @@ const fn below(area: Rect) -> Rect {
 }
 
 /// As many lines as there is room for, from `first` on.
-fn write(frame: &mut Frame<'_>, area: Rect, lines: &[Styled], look: Look, first: usize) {
+fn write(frame: &mut Frame<'_>, area: Rect, lines: &[Styled], theme: Theme, first: usize) {
     for ((text, kind), at) in lines.iter().skip(first).zip(0..area.height) {
-        put(frame, area, at, text, look, *kind);
+        put(frame, area, at, text, theme, *kind);
     }
 }
 
 /// One line, cut where the area ends.
-fn put(frame: &mut Frame<'_>, area: Rect, at: u16, text: &str, look: Look, kind: Kind) {
+fn put(frame: &mut Frame<'_>, area: Rect, at: u16, text: &str, theme: Theme, kind: Kind) {
     if at >= area.height {
         return;
     }
     let width = usize::from(area.width);
-    let mut text = beginning(text.trim_end(), width, look.cut());
+    let mut text = beginning(text.trim_end(), width, theme.cut());
     if kind == Kind::Selected {
         text = format!("{text:<width$}");
     }
-    let line = Line::from(Span::styled(text, look.style(kind)));
+    let line = Line::from(Span::styled(text, theme.style(kind)));
     frame
         .buffer_mut()
         .set_line(area.x, area.y + at, &line, area.width);

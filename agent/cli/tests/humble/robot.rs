@@ -122,7 +122,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
         })?;
     }
 
-    publisher.say("go")?;
+    publisher.write_line("go")?;
     publisher.wait_for("done", PATIENCE)?;
     let published = robot.log("publish")?;
     wait_until("the subscriber has all", || {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe::capture::intake::{Intake, MAX_WAITING};
+use ros2probe::capture::filter_reader::{FilterReader, MAX_WAITING};
 use ros2probe::capture::system::Clocks;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_testing::program_run::{self, Hook, Kernel};
@@ -135,19 +135,19 @@ fn runs_beyond_the_table_are_a_record_for_each_fragment() {
 
 #[test]
 fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted() {
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
     const SAMPLES: u32 = 32;
     let mut kernel = Kernel::load_hook(Hook::Ingress);
     kernel.set_interest(&BTreeMap::from([(writer(0), Verdict::Meter)]));
-    let mut intake = Intake::new(kernel.filter);
+    let mut intake = FilterReader::new(kernel.filter);
     let mut observer = Observer::new(Settings::default());
-    let counter = |intake: &Intake, which| {
+    let counter = |intake: &FilterReader, which| {
         let counters = intake.filter().counters().unwrap();
         let found = counters.iter().find(|(counter, _)| *counter == which);
         found.unwrap().1
     };
     let mut sent = 0;
-    let mut send = |intake: &Intake| {
+    let mut send = |intake: &FilterReader| {
         let message = program_run::message(writer(0), sent + 1..=sent + SAMPLES, 16);
         program_run::run(
             intake.filter().program(),
@@ -163,7 +163,7 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
         for _ in 0..50 {
             send(&intake);
         }
-        intake.take_in(&before, &mut observer);
+        intake.poll(&before, &mut observer);
     }
     let taken = intake.copied_bytes() as usize / size_of::<Record>();
     assert_eq!(taken, MAX_WAITING);
@@ -173,11 +173,11 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
     let mut later = Clocks::read();
     later.now = Timestamp(later.now.0 + SECOND);
     later.monotonic += SECOND;
-    intake.take_in(&later, &mut observer);
+    intake.poll(&later, &mut observer);
     let lost = counter(&intake, Counter::RecordsLost);
     let sent = u64::from(send(&intake));
     later.monotonic += SECOND;
-    intake.take_in(&later, &mut observer);
+    intake.poll(&later, &mut observer);
     let counted = observer.snapshot(later.now).records;
     println!("{sent} sent, {lost} lost, {counted} counted");
     assert_eq!(counter(&intake, Counter::RecordsLost), lost);

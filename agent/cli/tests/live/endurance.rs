@@ -381,7 +381,7 @@ fn the_clock_of_this_machine_is_set_an_hour_forth_and_back() -> Result<()> {
     for seconds in [step, -step] {
         crowd.rest(Duration::from_secs(5))?;
         let expired = robot.expired()?;
-        let set = SetClock::by(seconds)?;
+        let set = ClockStep::by(seconds)?;
         crowd.rest(Duration::from_millis(1200))?;
         let page = robot.agent.scrape()?;
         let shown = page.sum("ros2probe_snapshot_age_seconds", &[]);
@@ -515,15 +515,15 @@ impl Drop for Brake {
 }
 
 /// The machine's clock is wrong for as long as this lives.
-struct SetClock {
+struct ClockStep {
     right: Duration,
     since: Instant,
 }
 
-impl SetClock {
-    fn by(seconds: i64) -> Result<SetClock> {
+impl ClockStep {
+    fn by(seconds: i64) -> Result<ClockStep> {
         let right = SystemTime::now().duration_since(UNIX_EPOCH)?;
-        let set = SetClock {
+        let set = ClockStep {
             right,
             since: Instant::now(),
         };
@@ -533,7 +533,7 @@ impl SetClock {
     }
 }
 
-impl Drop for SetClock {
+impl Drop for ClockStep {
     fn drop(&mut self) {
         if let Err(error) = set_clock(self.right + self.since.elapsed()) {
             eprintln!("the clock is still wrong: {error:#}");

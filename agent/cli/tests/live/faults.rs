@@ -86,7 +86,7 @@ impl<'a> Scene<'a> {
         self.agent.process.pid()
     }
 
-    fn said(&self) -> String {
+    fn log(&self) -> String {
         std::fs::read_to_string(&self.log).unwrap_or_default()
     }
 
@@ -116,7 +116,7 @@ impl<'a> Scene<'a> {
         let began = Instant::now();
         self.agent.process.signal("TERM")?;
         let status = self.agent.process.wait(ENDING)?;
-        ensure!(status.success(), "it ended with {status}: {}", self.said());
+        ensure!(status.success(), "it ended with {status}: {}", self.log());
         Ok(began.elapsed())
     }
 }

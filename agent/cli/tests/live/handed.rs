@@ -10,9 +10,9 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
-use ros2probe::capture::exact::library;
 use ros2probe::capture::filter::{Filter, FilterSettings, Form, Probe, Probes};
-use ros2probe::capture::whole::Wholes;
+use ros2probe::capture::piece_assembler::PieceAssembler;
+use ros2probe::capture::uprobe::library;
 use ros2probe_testing::forged::{SAMPLES_WRITER, Talker};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::network::Namespace;
@@ -41,7 +41,7 @@ impl Handing {
         let host = Namespace::alone()?;
         let within = File::open(host.cgroup())?.metadata()?.ino();
         let (mut filter, mut probes) =
-            Filter::load_handed(&FilterSettings::default(), Some(within))?;
+            Filter::load_uprobe(&FilterSettings::default(), Some(within))?;
         let program = harness::peer::built(match form {
             Form::Whole => "handed",
             Form::List => "handed-list",
@@ -85,7 +85,7 @@ impl Handing {
 
     /// Whole messages, as they were captured.
     fn captured(&mut self) -> Vec<Vec<u8>> {
-        let (mut wholes, mut messages) = (Wholes::default(), Vec::new());
+        let (mut wholes, mut messages) = (PieceAssembler::default(), Vec::new());
         while let Some(captured) = self.filter.next_piece() {
             let (piece, bytes) = captured.read().unwrap();
             assert_eq!((piece.flags, piece.socket), (EXACT, 0));
@@ -114,7 +114,7 @@ fn hand(sender: &mut Process, message: &[u8], lengths: &[usize]) -> Result<()> {
     for byte in message {
         write!(line, "{byte:02x}")?;
     }
-    sender.say(&line)?;
+    sender.write_line(&line)?;
     sender.wait_for("handed", PATIENCE)
 }
 
@@ -235,7 +235,7 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
             .map(|record| (record.sequence_number, record.payload_len))
             .collect();
         assert_eq!(found, [(5, 140_000)]);
-        handing.sender.say("nowhere")?;
+        handing.sender.write_line("nowhere")?;
         handing.sender.wait_for("handed", PATIENCE)?;
         handing.hand(b"none of RTPS, and yet a message", &[31])?;
         handing.hand(b"short", &[5])?;

@@ -355,7 +355,7 @@ fn a_full_ring_costs_captures_and_nothing_else() -> Result<()> {
 #[test]
 fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go() -> Result<()> {
     const AT_ONCE: usize = 500;
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
     let cpus = std::thread::available_parallelism()?.get();
     ensure!(
         cpus >= 2,

@@ -44,12 +44,12 @@ impl Observed {
         let cgroup = Cgroup::create(&name).unwrap();
         let mut filter = Filter::load_host(settings).unwrap();
         filter.attach(&File::open(cgroup.path()).unwrap()).unwrap();
-        filter.look_inside(false);
+        filter.attach_tracepoints(false);
         Observed { filter, cgroup }
     }
 
     fn owners(&self, socket: u64) -> BTreeMap<u64, Owner> {
-        let owners = self.filter.inside().unwrap().owners().expect("owners");
+        let owners = self.filter.tracepoints().unwrap().owners().expect("owners");
         owners.refresh(&BTreeSet::from([socket])).unwrap()
     }
 
@@ -160,7 +160,7 @@ fn cookie(socket: &UdpSocket) -> u64 {
 #[test]
 fn a_socket_is_known_by_process_name_inode_and_drops() {
     let observed = Observed::new();
-    let abilities = observed.filter.inside().unwrap().abilities();
+    let abilities = observed.filter.tracepoints().unwrap().abilities();
     assert!(abilities.owners.is_ok(), "{abilities:?}");
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     let cookie = cookie(&socket);
@@ -326,9 +326,12 @@ fn one_that_too_many_others_have_overtaken_is_named_when_it_is_given_up() {
     wire.shuffle = |packets| *packets = HELD.lock().unwrap().drain(..).collect();
     wire.carry(&talker.sample(20_000)).unwrap();
     let at_once = observed.records(writer, SETTLED);
-    assert_eq!(told(&at_once), Told::from([(1, 0)]));
+    assert_eq!(fragment_numbers(&at_once), FragmentNumbers::from([(1, 0)]));
     let later = observed.records(writer, GIVEN_UP);
-    assert_eq!(told(&later), (2..=6).map(|number| (number, 0)).collect());
+    assert_eq!(
+        fragment_numbers(&later),
+        (2..=6).map(|number| (number, 0)).collect()
+    );
     assert_eq!(at_once.len() + later.len(), 6);
 }
 
@@ -371,11 +374,11 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
             .filter(|record| record.flags & flag::NOT_REASSEMBLED != 0)
             .collect();
         // The first one is waited for; the others have found no room.
-        let expected: Told = (some + 1..some + 5)
+        let expected: FragmentNumbers = (some + 1..some + 5)
             .map(|number| (number.into(), 0))
             .collect();
         assert_eq!(
-            (told(lost.iter().copied()), lost.len()),
+            (fragment_numbers(lost.iter().copied()), lost.len()),
             (expected, 4),
             "{family}"
         );
@@ -423,10 +426,14 @@ fn over_ipv6_and_multicast_it_is_named_likewise() {
         sender.carry(&talker.sample(60_000)).unwrap();
         let mut found = observed.records(writer, GIVEN_UP);
         found.retain(|record| record.flags & flag::NOT_REASSEMBLED != 0);
-        let expected: Told = (before + 1..before + 4)
+        let expected: FragmentNumbers = (before + 1..before + 4)
             .map(|number| (number.into(), 0))
             .collect();
-        assert_eq!((told(&found), found.len()), (expected, 3), "{to}");
+        assert_eq!(
+            (fragment_numbers(&found), found.len()),
+            (expected, 3),
+            "{to}"
+        );
         for record in found {
             let flags = flag::FRAGMENTED | flag::NOT_REASSEMBLED | family;
             assert_eq!(record.flags & !flag::STAMP, flags);
@@ -444,27 +451,27 @@ fn over_ipv6_and_multicast_it_is_named_likewise() {
 
 /// What of `sent` a socket that reads afterwards has got, and what is missing; samples by sequence
 /// number and first fragment.
-type Told = BTreeSet<(u64, u32)>;
+type FragmentNumbers = BTreeSet<(u64, u32)>;
 
-fn read_all(socket: &UdpSocket) -> Told {
+fn read_all(socket: &UdpSocket) -> FragmentNumbers {
     socket.set_nonblocking(true).unwrap();
     let mut buffer = vec![0; 65_536];
-    let mut got = Told::new();
+    let mut got = FragmentNumbers::new();
     while let Ok(len) = socket.recv(&mut buffer) {
         got.extend(samples(&buffer[..len]));
     }
     got
 }
 
-fn samples(payload: &[u8]) -> Told {
-    let mut found = Told::new();
+fn samples(payload: &[u8]) -> FragmentNumbers {
+    let mut found = FragmentNumbers::new();
     walk::datagram(payload, &Envelope::default(), None, |each| {
         found.insert((each.record.sequence_number, each.record.fragment_start));
     });
     found
 }
 
-fn told<'a>(records: impl IntoIterator<Item = &'a Record>) -> Told {
+fn fragment_numbers<'a>(records: impl IntoIterator<Item = &'a Record>) -> FragmentNumbers {
     let all = records.into_iter();
     all.map(|record| (record.sequence_number, record.fragment_start))
         .collect()
@@ -508,7 +515,7 @@ const SETTLED: Duration = Duration::from_millis(200);
 
 fn observed_link(number: u32, verdict: Verdict) -> (Observed, Link, Talker, Guid) {
     let mut observed = Observed::new();
-    let abilities = observed.filter.inside().unwrap().abilities();
+    let abilities = observed.filter.tracepoints().unwrap().abilities();
     assert!(abilities.socket_losses.is_ok(), "{abilities:?}");
     let link = Link::new().unwrap();
     for (host, address) in [(&link.robot, "fd99::1"), (&link.monitor, "fd99::2")] {
@@ -536,9 +543,9 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
         set(&receiver, libc::SO_RCVBUF, 32 * 1024);
         let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
         let before = full_buffers(&link.monitor);
-        let mut sent = Told::new();
+        let mut sent = FragmentNumbers::new();
         // Half of them find some room again.
-        let mut got = Told::new();
+        let mut got = FragmentNumbers::new();
         for round in 0..2 {
             for _ in 0..150 {
                 let message = talker.sample(1_000 + 4 * round);
@@ -548,7 +555,7 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
             std::thread::sleep(SETTLED);
             got.extend(read_all(&receiver));
         }
-        let missing: Told = sent.difference(&got).copied().collect();
+        let missing: FragmentNumbers = sent.difference(&got).copied().collect();
         assert!(
             missing.len() > 100 && got.len() > 20,
             "{} of {}",
@@ -559,9 +566,9 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
         let (refused, seen): (Vec<_>, Vec<_>) = records
             .iter()
             .partition(|record| record.flags & flag::NO_ROOM != 0);
-        assert_eq!(told(refused.iter().copied()), missing);
+        assert_eq!(fragment_numbers(refused.iter().copied()), missing);
         assert_eq!(refused.len(), missing.len());
-        assert_eq!(told(seen.iter().copied()), sent);
+        assert_eq!(fragment_numbers(seen.iter().copied()), sent);
         for record in &refused {
             // Each cancels one arrival: the same record but for the flag.
             let arrival = Record {
@@ -588,7 +595,7 @@ fn without_the_kernels_types_full_sockets_are_told_as_long_as_every_socket_is_se
         ..FilterSettings::default()
     };
     let one_cgroup = Observed::with(&settings);
-    let abilities = one_cgroup.filter.inside().unwrap().abilities();
+    let abilities = one_cgroup.filter.tracepoints().unwrap().abilities();
     let reason = abilities.socket_losses.clone().unwrap_err();
     assert!(reason.contains("limited to one cgroup"), "{reason}");
     assert!(abilities.owners.is_err() && abilities.reassembly_losses.is_err());
@@ -596,28 +603,28 @@ fn without_the_kernels_types_full_sockets_are_told_as_long_as_every_socket_is_se
     let mut filter = Filter::load_host(&settings).unwrap();
     let all = File::open(cgroup::hierarchy().unwrap()).unwrap();
     filter.attach(&all).unwrap();
-    filter.look_inside(true);
+    filter.attach_tracepoints(true);
     let (mut talker, writer) = talker(9);
     filter.set_interest(writer, Some(Verdict::Meter)).unwrap();
     let host = Namespace::alone().unwrap();
     let receiver = one_cgroup.socket(&host, "127.0.0.1:7411");
     set(&receiver, libc::SO_RCVBUF, 32 * 1024);
     let mut sender = forged::Sender::new(&host, "127.0.0.1:0", "127.0.0.1:7411").unwrap();
-    let mut sent = Told::new();
+    let mut sent = FragmentNumbers::new();
     for _ in 0..100 {
         let message = talker.sample(1_000);
         sent.extend(samples(&message));
         sender.carry(&message).unwrap();
     }
     std::thread::sleep(SETTLED);
-    let missing: Told = sent.difference(&read_all(&receiver)).copied().collect();
+    let missing: FragmentNumbers = sent.difference(&read_all(&receiver)).copied().collect();
     assert!(!missing.is_empty() && missing.len() < sent.len());
     let records = std::iter::from_fn(|| filter.next_record());
     let refused: Vec<_> = records
         .filter(|record| record.writer() == writer && record.flags & flag::NO_ROOM != 0)
         .collect();
     assert_eq!(
-        (told(&refused), refused.len()),
+        (fragment_numbers(&refused), refused.len()),
         (missing.clone(), missing.len())
     );
 }
@@ -638,7 +645,7 @@ fn of_two_sockets_in_one_group_only_the_full_one_is_reported() {
     join(&quick);
     let from = format!("{}:0", link.robot.address());
     let mut sender = forged::Sender::new(&link.robot, &from, &format!("{group}:7411")).unwrap();
-    let (mut sent, mut got) = (Told::new(), Told::new());
+    let (mut sent, mut got) = (FragmentNumbers::new(), FragmentNumbers::new());
     for _ in 0..200 {
         let message = talker.sample(2_000);
         sent.extend(samples(&message));
@@ -649,7 +656,7 @@ fn of_two_sockets_in_one_group_only_the_full_one_is_reported() {
     std::thread::sleep(SETTLED);
     got.extend(read_all(&quick));
     assert_eq!(got, sent);
-    let missing: Told = sent.difference(&read_all(&slow)).copied().collect();
+    let missing: FragmentNumbers = sent.difference(&read_all(&slow)).copied().collect();
     assert!(!missing.is_empty() && missing.len() < sent.len());
     let records = observed.records(writer, SETTLED);
     let refused: Vec<_> = records
@@ -657,7 +664,7 @@ fn of_two_sockets_in_one_group_only_the_full_one_is_reported() {
         .filter(|record| record.flags & flag::NO_ROOM != 0)
         .collect();
     assert!(refused.iter().all(|record| record.socket == cookie(&slow)));
-    assert_eq!(told(refused.iter().copied()), missing);
+    assert_eq!(fragment_numbers(refused.iter().copied()), missing);
     assert_eq!(refused.len(), missing.len());
     let no_room = |socket| {
         observed
@@ -678,7 +685,7 @@ fn of_samples_in_pieces_the_lost_fragments_are_named() {
     set(&receiver, libc::SO_RCVBUF, 200 * 1024);
     let from = format!("{}:0", link.robot.address());
     let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
-    let mut sent = Told::new();
+    let mut sent = FragmentNumbers::new();
     for number in 1..=10 {
         for start in 1..=4 {
             let message = fragment(&talker, number, start, 60_000);
@@ -687,7 +694,7 @@ fn of_samples_in_pieces_the_lost_fragments_are_named() {
         }
     }
     std::thread::sleep(SETTLED);
-    let missing: Told = sent.difference(&read_all(&receiver)).copied().collect();
+    let missing: FragmentNumbers = sent.difference(&read_all(&receiver)).copied().collect();
     assert!(
         !missing.is_empty() && missing.len() < sent.len(),
         "{missing:?}"
@@ -698,7 +705,7 @@ fn of_samples_in_pieces_the_lost_fragments_are_named() {
         records.iter().filter(refused)
     };
     assert_eq!(
-        (told(refused()), refused().count()),
+        (fragment_numbers(refused()), refused().count()),
         (missing.clone(), missing.len())
     );
     assert!(refused().all(|record| record.kind == kind::DATA_FRAG));
@@ -713,14 +720,14 @@ fn a_captured_datagram_that_found_no_room_is_told_by_its_token() {
     set(&receiver, libc::SO_RCVBUF, 32 * 1024);
     let from = format!("{}:0", link.robot.address());
     let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
-    let mut sent = Told::new();
+    let mut sent = FragmentNumbers::new();
     for _ in 0..150 {
         let message = talker.sample(2_000);
         sent.extend(samples(&message));
         sender.carry(&message).unwrap();
     }
     std::thread::sleep(SETTLED);
-    let missing: Told = sent.difference(&read_all(&receiver)).copied().collect();
+    let missing: FragmentNumbers = sent.difference(&read_all(&receiver)).copied().collect();
     assert!(!missing.is_empty() && missing.len() < sent.len());
     let mut captured = BTreeMap::new();
     while let Some(piece) = observed.filter.next_piece() {
@@ -728,7 +735,7 @@ fn a_captured_datagram_that_found_no_room_is_told_by_its_token() {
         captured.insert((piece.datagram, piece.socket), samples(bytes));
     }
     assert_eq!(captured.len(), sent.len());
-    let mut refused = Told::new();
+    let mut refused = FragmentNumbers::new();
     while let Some(record) = observed.filter.next_record() {
         if record.socket == cookie(&receiver) {
             assert_eq!(record.kind, kind::UNDELIVERED);

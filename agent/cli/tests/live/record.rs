@@ -85,7 +85,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         (status, &ended["state"]) == (200, &json!("ended")),
         "{ended}"
     );
-    ensure!(client.interrupt()?.code() == Some(0), "{}", client.said());
+    ensure!(client.interrupt()?.code() == Some(0), "{}", client.stderr());
     let by_client = robot.directory.path().join("client");
     for (bag, report) in [
         (robot.bags().join("all"), ended["report"].clone()),
@@ -151,7 +151,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     robot.agent.scrape_until("read", |page| {
         page.sum("ros2probe_queued_bytes", &[]) == 0.0
     })?;
-    ensure!(slow.interrupt()?.code() == Some(0), "{}", slow.said());
+    ensure!(slow.interrupt()?.code() == Some(0), "{}", slow.stderr());
     let bag = robot.directory.path().join("slow");
     let (numbers, report) = (numbers(&bag)?, report_of(&bag)?);
     for (topic, count, publisher, _) in &pairs {
@@ -179,10 +179,10 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         ensure!(is_large || dropped == 0, "{topic}: {report:#}");
     }
     ensure!(
-        slow.said().contains("/front: ")
-            && slow.said().contains("dropped, the storage was too slow"),
+        slow.stderr().contains("/front: ")
+            && slow.stderr().contains("dropped, the storage was too slow"),
         "{}",
-        slow.said()
+        slow.stderr()
     );
     Ok(())
 }
@@ -363,15 +363,15 @@ if test -e "$1/bag"; then cp -r "$1/bag" "$5"; fi; exit $code"#
             .env_remove("ROS_DISTRO")
             .env_remove("ROS_DOMAIN_ID")
             .output()?;
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        Ok((output.status.code(), said))
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        Ok((output.status.code(), stderr))
     };
-    let (code, said) = record("size=4m", &small.join("bag"))?;
-    let mut errors = said.lines().filter(|line| line.contains("[ERROR]"));
+    let (code, stderr) = record("size=4m", &small.join("bag"))?;
+    let mut errors = stderr.lines().filter(|line| line.contains("[ERROR]"));
     let error = errors.next().unwrap_or_default();
     ensure!(
         code == Some(1) && error.contains("no space left to write ") && errors.next().is_none(),
-        "{code:?} {said}"
+        "{code:?} {stderr}"
     );
     whole(&kept, &report_of(&kept)?)?;
 
@@ -379,10 +379,10 @@ if test -e "$1/bag"; then cp -r "$1/bag" "$5"; fi; exit $code"#
         ("ro", small.join("bag"), "cannot create "),
         ("size=4m", kept.clone(), "already exists."),
     ] {
-        let (code, said) = record(options, &output)?;
+        let (code, stderr) = record(options, &output)?;
         ensure!(
-            code == Some(1) && said.lines().count() == 1 && said.contains(message),
-            "{code:?} {said}"
+            code == Some(1) && stderr.lines().count() == 1 && stderr.contains(message),
+            "{code:?} {stderr}"
         );
     }
     Ok(())
@@ -511,12 +511,12 @@ impl<'a> Robot<'a> {
 /// An `rp bag record` that has begun.
 struct Recorder {
     process: Process,
-    said: PathBuf,
+    stderr: PathBuf,
 }
 
 impl Recorder {
     fn start(robot: &Robot<'_>, name: &str, arguments: &[&str]) -> Result<Recorder> {
-        let said = robot.directory.path().join(format!("{name}.said"));
+        let stderr = robot.directory.path().join(format!("{name}.said"));
         let output = robot.directory.path().join(name);
         let mut words = vec!["bag".to_owned(), "record".to_owned()];
         words.extend(arguments.iter().map(|word| (*word).to_owned()));
@@ -524,18 +524,18 @@ impl Recorder {
         words.extend(["--socket".to_owned(), robot.socket.display().to_string()]);
         let mut enter = robot.host.on_network();
         enter.extend(["env", "-u", "ROS_DISTRO", "-u", "ROS_DOMAIN_ID"].map(str::to_owned));
-        let errors = File::create(&said)?;
+        let errors = File::create(&stderr)?;
         let process = Process::start_with(&enter, RP, words, errors.into())?;
-        let recorder = Recorder { process, said };
+        let recorder = Recorder { process, stderr };
         wait_until("it records", || {
-            Ok(recorder.said().contains("Recording..."))
+            Ok(recorder.stderr().contains("Recording..."))
         })
-        .with_context(|| recorder.said())?;
+        .with_context(|| recorder.stderr())?;
         Ok(recorder)
     }
 
-    fn said(&self) -> String {
-        fs::read_to_string(&self.said).unwrap_or_default()
+    fn stderr(&self) -> String {
+        fs::read_to_string(&self.stderr).unwrap_or_default()
     }
 
     /// Ctrl-C.
@@ -625,7 +625,7 @@ fn whole(bag: &Path, report: &Value) -> Result<()> {
         recorded.len()
     );
     ensure!(report["bytes"] == recorded.len() * SCAN, "{report:#}");
-    // Without a gap, but for what is said to be missing.
+    // Without a gap, but for what is reported as missing.
     ensure!(
         span(&recorded)? <= recorded.len() as u64 + missing(report, "/points"),
         "{recorded:?} {report:#}"
@@ -637,8 +637,8 @@ fn whole(bag: &Path, report: &Value) -> Result<()> {
 
 /// A bag whose recorder was killed has, once it is indexed, all messages until shortly before.
 fn repaired(bag: &Path, publisher: &Peer, killed: Duration) -> Result<()> {
-    let (code, said) = rp(&["bag", "reindex", &bag.display().to_string()])?;
-    ensure!(code == Some(0), "{said}");
+    let (code, stderr) = rp(&["bag", "reindex", &bag.display().to_string()])?;
+    ensure!(code == Some(0), "{stderr}");
     let recorded = numbers(bag)?.remove("/imu").context("no /imu")?;
     ensure!(span(&recorded)? == recorded.len() as u64, "{recorded:?}");
     let last = recorded.last().context("nothing")?;
@@ -672,10 +672,10 @@ fn rp(arguments: &[&str]) -> Result<(Option<i32>, String)> {
         .args(arguments)
         .env_remove("ROS_DISTRO")
         .output()?;
-    let said = [output.stdout, output.stderr].concat();
+    let stderr = [output.stdout, output.stderr].concat();
     Ok((
         output.status.code(),
-        String::from_utf8_lossy(&said).into_owned(),
+        String::from_utf8_lossy(&stderr).into_owned(),
     ))
 }
 

@@ -66,7 +66,7 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
             .all(|stream| count(page, stream) >= 0.9 * stream.stretch as f64)
     })?;
     let share = 100.0 * (cpu(&half) - before) / began.elapsed().as_secs_f64();
-    println!("{share:.2} % of a CPU; {}", telling(&half));
+    println!("{share:.2} % of a CPU; {}", shared_memory_metrics(&half));
     // Nothing more comes until it is told to.
     let half = agent.settled_scrape("/imu", 0)?;
     let began = Instant::now();
@@ -95,7 +95,12 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
         assert_eq!(page.sum("ros2_topic_pairs", &passage), 1.0);
         assert_eq!(sum("ros2_topic_pairs"), 1.0);
         let second = count(&page, stream) - count(&half, stream);
-        assert_eq!(second, stream.stretch as f64, "{}", telling(&page));
+        assert_eq!(
+            second,
+            stream.stretch as f64,
+            "{}",
+            shared_memory_metrics(&page)
+        );
         // A DATA is padded to four bytes where another submessage follows it.
         let bytes = count(&page, stream) * stream.size as f64;
         assert!((sum("ros2_topic_bytes_total") - bytes).abs() <= 4.0 * stream.count as f64);
@@ -207,8 +212,8 @@ fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subs
         let count = |page: &Scrape| page.sum("ros2_topic_messages_total", &[("topic", topic)]);
         count(&page) - count(&before)
     };
-    println!("{}", telling(&page));
-    assert_eq!(more("/imu"), 200.0, "{}", telling(&page));
+    println!("{}", shared_memory_metrics(&page));
+    assert_eq!(more("/imu"), 200.0, "{}", shared_memory_metrics(&page));
     assert_eq!(more("/points"), 200.0);
     assert!(shows_all(&page), "{}", page.0);
     for topic in ["/imu", "/points"] {
@@ -267,7 +272,7 @@ fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Res
     agent.scrape_until("messages beside them", |page| {
         messages(page) > began + 200.0
     })?;
-    println!("{}", telling(&agent.scrape()?));
+    println!("{}", shared_memory_metrics(&agent.scrape()?));
 
     // A file of that name is somebody else's now, and the one that was open is let go.
     let copy = memory.join("copy");
@@ -456,7 +461,7 @@ fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Re
     assert!(
         page.sum("ros2_topic_sampled_seen_messages_total", &[]) > 0.0,
         "{}",
-        telling(&page)
+        shared_memory_metrics(&page)
     );
 
     let trace = fs::read_to_string(&trace)?;
@@ -779,7 +784,7 @@ fn run(agent: &Agent<'_>, mut publisher: Peer, stream: &Stream) -> Result<Scrape
 }
 
 /// What the agent says of its look at shared memory.
-fn telling(page: &Scrape) -> String {
+fn shared_memory_metrics(page: &Scrape) -> String {
     let lines = page.0.lines().filter(|line| {
         !line.starts_with('#') && (line.contains("_shm_") || line.contains("_sampled_"))
             || line.starts_with("ros2_topic_messages_total")

@@ -194,7 +194,7 @@ fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> 
     ensure!(
         (0.9..=1.0).contains(&(counted / SAMPLES as f64)) && lost == 0.0,
         "{counted} of {SAMPLES}, {lost} lost: {}",
-        telling(&page)
+        shared_memory_metrics(&page)
     );
     drop(publisher);
     drop(subscriber);
@@ -307,7 +307,7 @@ fn known(agent: &Agent<'_>, topic: &str) -> Result<()> {
     result.with_context(|| {
         agent
             .scrape()
-            .map(|page| telling(&page))
+            .map(|page| shared_memory_metrics(&page))
             .unwrap_or_default()
     })
 }
@@ -315,7 +315,7 @@ fn known(agent: &Agent<'_>, topic: &str) -> Result<()> {
 /// The page that counts so many messages of a topic, and later no more.
 fn counted(agent: &Agent<'_>, topic: &str, count: u64) -> Result<Scrape> {
     let page = agent.settled_scrape(topic, count)?;
-    println!("{}", telling(&page));
+    println!("{}", shared_memory_metrics(&page));
     let seen = page.sum("ros2_topic_messages_total", &[("topic", topic)]);
     ensure!(seen == count as f64, "{seen} of {count}");
     Ok(page)
@@ -353,7 +353,7 @@ fn mapped(process: u32, name: &str) -> Result<PathBuf> {
 }
 
 /// What the agent says of shared memory.
-fn telling(page: &Scrape) -> String {
+fn shared_memory_metrics(page: &Scrape) -> String {
     let lines = page.0.lines().filter(|line| {
         !line.starts_with('#') && (line.contains("_shm_") || line.contains("_sampled_"))
             || line.starts_with("ros2_topic_messages_total")

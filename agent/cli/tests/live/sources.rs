@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
 use injection::Injection;
-use ros2probe::capture::feed::Feed;
+use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Config, Watchlist};
@@ -139,7 +139,7 @@ impl Counts {
             .context("the watchlist")?;
         let mut observer = Observer::new(Settings::default());
         observer.input(Input::Watchlist(Arc::new(Watchlist::new(config.watches)?)));
-        let mut feed = Feed::new(Limits::default());
+        let mut feed = FrameDecoder::new(Limits::default());
         feed.run(&mut PcapReader::open(capture)?, &mut observer)?;
         let losses = observer.journal().losses();
         Ok(Counts::of(&observer.snapshot(feed.last()), losses))

@@ -214,9 +214,9 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
         step(&mut observer, &mut dice, now);
         if turn % 2_000 == 0 {
             observer.input(Input::Time(Timestamp(now)));
-            look(&observer.sizes(), &mut largest);
+            update(&observer.sizes(), &mut largest);
             history.take(Timestamp(now), observer.measured(Timestamp(now)));
-            look(&history.sizes(), &mut largest);
+            update(&history.sizes(), &mut largest);
             observer.drain();
         }
         if turn == messages / 2 {
@@ -228,7 +228,7 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
 }
 
 /// Asserts that no table is beyond its cap.
-fn look(sizes: &[Size], largest: &mut Largest) {
+fn update(sizes: &[Size], largest: &mut Largest) {
     for size in sizes {
         let seen = largest.entry(size.table).or_insert((0, size.cap));
         *seen = (seen.0.max(size.entries), size.cap);

@@ -6,10 +6,10 @@ use ros2probe::config::{Limits, Watch, Watchlist};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 use std::sync::Arc;
 
-const SECOND: u64 = 1_000_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
 const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);

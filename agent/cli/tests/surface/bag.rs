@@ -19,9 +19,9 @@ use ros2probe::bag::{
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::{Durability, History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::time::SECOND;
 use serde_json::{Value, json};
 
-const SECOND: u64 = 1_000_000_000;
 const BEGIN: u64 = 1_795_142_331_000_000_000;
 
 fn topic(name: &str, type_name: &str) -> TopicDescription {

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use proptest::prelude::*;
 use ros2probe::discover::Refusal;
-use ros2probe::discover::message::{Message, Speaker};
+use ros2probe::discover::message::{LocalParticipant, Message};
 use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
 use ros2probe::model::discovery::{Addresses, hexadecimal};
 use ros2probe::model::snapshot::{ParticipantFacts, ProcessFacts};
@@ -24,7 +24,7 @@ const DEFAULT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 741
 
 /// A recorded conversation.
 struct Recording {
-    speaker: Speaker,
+    speaker: LocalParticipant,
     target: Target,
     /// Nanoseconds since the first packet, and the datagram.
     sent: Vec<(u64, Vec<u8>)>,
@@ -61,7 +61,7 @@ impl Recording {
         let address: [u8; 4] = introduction[place + 16..place + 20].try_into().unwrap();
         let prefix = |at: usize| GuidPrefix(introduction[at..at + 12].try_into().unwrap());
         Self {
-            speaker: Speaker {
+            speaker: LocalParticipant {
                 prefix: prefix(8),
                 address: SocketAddrV4::new(address.into(), port),
                 domain_id: 0,
@@ -249,10 +249,10 @@ fn what_somebody_else_says_is_not_believed() {
 fn hanging_up_says_goodbye_once_and_only_to_whom_we_have_met() {
     let [recording, _] = Recording::both();
     let mut session = recording.session();
-    assert!(session.hang_up().is_empty());
+    assert!(session.say_goodbye().is_empty());
     session.advance(Timestamp(START));
-    assert_eq!(session.hang_up().len(), 1);
-    assert!(session.is_over() && session.hang_up().is_empty());
+    assert_eq!(session.say_goodbye().len(), 1);
+    assert!(session.is_over() && session.say_goodbye().is_empty());
     assert!(session.advance(Timestamp(START + LIMIT)).is_empty());
 }
 

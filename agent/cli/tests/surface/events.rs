@@ -351,7 +351,7 @@ fn without_samples(
 
 #[test]
 fn a_replay_tells_every_endpoint_that_the_capture_announces_in_its_own_time() {
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
     const START: u64 = 1_795_143_000 * SECOND;
     let alice = ros2probe_wire::GuidPrefix(*b"\x01\x10alice-host");
     let directory = tempfile::tempdir().unwrap();

@@ -639,10 +639,10 @@ fn every_cap_names_the_test_that_drives_it_over() {
 }
 
 /// What `rp` says and how it ends.
-fn said(arguments: &[&str]) -> (Option<i32>, String) {
+fn run_failing(arguments: &[&str]) -> (Option<i32>, String) {
     let output = rp().args(arguments).output().unwrap();
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    (output.status.code(), said)
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    (output.status.code(), stderr)
 }
 
 #[test]
@@ -662,11 +662,11 @@ fn a_configuration_for_a_newer_rp_is_refused_in_one_line_by_check_start_and_relo
         capture.to_str().unwrap(),
     ];
     for arguments in [&["check-config", path][..], &start] {
-        let (code, said) = said(arguments);
-        assert_eq!(code, Some(78), "{said}");
-        assert_eq!(said.lines().count(), 1, "{said}");
+        let (code, stderr) = run_failing(arguments);
+        assert_eq!(code, Some(78), "{stderr}");
+        assert_eq!(stderr.lines().count(), 1, "{stderr}");
         for part in [":1:10: version: is 2", "reads up to 1", "upgrade rp"] {
-            assert!(said.contains(part), "{said}");
+            assert!(stderr.contains(part), "{stderr}");
         }
     }
     agent.signal("-HUP");
@@ -676,7 +676,7 @@ fn a_configuration_for_a_newer_rp_is_refused_in_one_line_by_check_start_and_relo
     // One that says its version, and one that says none.
     for same in [format!("version: 1\n{before}"), before] {
         std::fs::write(&file, same).unwrap();
-        assert_eq!(said(&["check-config", path]).0, Some(0));
+        assert_eq!(run_failing(&["check-config", path]).0, Some(0));
         agent.signal("-HUP");
         agent.wait_for_log("the configuration was reloaded");
     }

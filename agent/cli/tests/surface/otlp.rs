@@ -194,14 +194,14 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
 }
 
 /// An event: its name and what is known of it.
-type Told = (String, BTreeMap<String, String>);
+type LoggedEvent = (String, BTreeMap<String, String>);
 
 /// What the event log keeps.
-fn told(agent: &LocalAgent) -> Vec<Told> {
+fn logged_events(agent: &LocalAgent) -> Vec<LoggedEvent> {
     let kept = "/events?after=0&follow=false";
     let body = local_agent::request(agent.api, "GET", kept, "").body;
     let data = body.lines().filter_map(|line| line.strip_prefix("data: "));
-    let told = data.map(|data| {
+    let logged_events = data.map(|data| {
         let event: serde_json::Value = serde_json::from_str(data).unwrap();
         let attributes = event["attributes"].as_object().unwrap().iter();
         let plain = attributes.filter_map(|(key, value)| match value {
@@ -211,7 +211,7 @@ fn told(agent: &LocalAgent) -> Vec<Told> {
         });
         (event["name"].as_str().unwrap().to_owned(), plain.collect())
     });
-    told.collect()
+    logged_events.collect()
 }
 
 #[test]
@@ -228,18 +228,18 @@ fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
     let retried = "ros2probe_otlp_exports_total{signal=\"events\",outcome=\"retried\"}";
     agent.wait_for_metric(retried, |count| count > 0.0);
 
-    let told = told(&agent);
-    assert!(told.len() > 50, "{}", told.len());
+    let logged_events = logged_events(&agent);
+    assert!(logged_events.len() > 50, "{}", logged_events.len());
     let mut receiver = Rotel::start(
         &mut Command::new(Rotel::binary()),
         directory.path(),
         Some(address),
     );
     let text = receiver.wait_for("it has all events", |text| {
-        text.matches("\nFlags: ").count() >= told.len()
+        text.matches("\nFlags: ").count() >= logged_events.len()
     });
     let exports = exports(&text);
-    let received: Vec<Told> = exports
+    let received: Vec<LoggedEvent> = exports
         .iter()
         .flat_map(|export| &export.items)
         .map(|record| {
@@ -252,7 +252,7 @@ fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
             )
         })
         .collect();
-    assert_eq!(received, told);
+    assert_eq!(received, logged_events);
     assert_eq!(exports[0].resource["robot.name"], "marvin");
     assert_eq!(exports[0].resource["service.name"], "ros2probe");
 
@@ -269,7 +269,7 @@ fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
     });
     assert_eq!(
         receiver.text().matches("\nEventName: ").count(),
-        told.len() + 2
+        logged_events.len() + 2
     );
 }
 

@@ -14,9 +14,9 @@ use crate::rp;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask};
 use ros2probe_testing::model::capture::{Capture, ETHERNET, reader, writer};
 use ros2probe_wire::GuidPrefix;
+use ros2probe_wire::time::SECOND;
 use serde_json::Value;
 
-const SECOND: u64 = 1_000_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
 /// Topics of a robot with navigation and two cameras.

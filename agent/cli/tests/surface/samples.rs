@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use crate::rp;
 use bytes::Bytes;
-use ros2probe::capture::feed::Feed;
+use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Watch, Watchlist};
@@ -21,9 +21,9 @@ use ros2probe_testing::local_agent;
 use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
-const SECOND: u64 = 1_000_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
@@ -75,7 +75,7 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
         observer.input(Input::Wishes(Arc::new(vec![wish(1, depth)])));
     }
     let mut reader = PcapReader::open(capture).unwrap();
-    let mut feed = Feed::new(Limits::default());
+    let mut feed = FrameDecoder::new(Limits::default());
     let mut news = Vec::new();
     let mut take = |observer: &mut Observer| {
         for given in observer.drain().samples {
@@ -276,7 +276,7 @@ impl Robot {
     }
 
     /// Read in shared memory, where others may have been missed.
-    fn look(&mut self, message: Message) {
+    fn receive(&mut self, message: Message) {
         self.at += 1_000_000;
         let envelope = forge::multicast(self.at, 0);
         self.observer.input(Input::SharedMemory {
@@ -348,11 +348,11 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
     robot.at += SECOND;
     let large = payload(3000);
     for start in [1, 2, 3] {
-        robot.look(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
+        robot.receive(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
     }
     // Looks at two ports may find them in another order, and twice.
     for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
-        robot.look(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
+        robot.receive(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
     }
     let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
     let given = robot.given();
@@ -360,10 +360,10 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
     // The last fragment of 2 was seen while one was missing: it was given up then.
     assert_eq!(whole, [expected[0].clone(), expected[2].clone()]);
     assert_eq!(missed, [(ALICE, 2, Err(MissedReason::NotCaptured))]);
-    robot.look(Message::from(ALICE).data(WRITER, 4, &payload(24)));
+    robot.receive(Message::from(ALICE).data(WRITER, 4, &payload(24)));
     // A fragment was overwritten before it was read.
     for start in [1, 3] {
-        robot.look(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
+        robot.receive(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
     }
     let expected = [
         (ALICE, 4, Ok(payload(24))),
@@ -378,7 +378,7 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
     robot.subscribe(&["/points"], Depth::Payloads);
     let small = payload(24);
     let look = |robot: &mut Robot, number| {
-        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
     };
     for number in [1, 2, 5] {
         look(&mut robot, number);
@@ -417,7 +417,7 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
     let mut times = BTreeMap::new();
     // 3 is sent again, 5 was not seen.
     for number in [1, 2, 4, 6, 3, 7] {
-        robot.look(Message::from(ALICE).data(WRITER, number, &small));
+        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
         times.insert(number, robot.at);
     }
     let now = Timestamp(robot.at + SECOND / 20);
@@ -452,7 +452,7 @@ fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_r
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);
     let small = payload(24);
-    robot.look(Message::from(ALICE).data(WRITER, 1, &small));
+    robot.receive(Message::from(ALICE).data(WRITER, 1, &small));
     // INFO_DST and ACKNACK: all below 4.
     let body = [
         &[0, 0, 0x12, 0x04][..],
@@ -461,7 +461,7 @@ fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_r
         &[0; 8],
     ];
     let acknowledgement = Message::from(BOB).submessage(0x0e, 0x01, &ALICE.0);
-    robot.look(acknowledgement.submessage(0x06, 0x03, &body.concat()));
+    robot.receive(acknowledgement.submessage(0x06, 0x03, &body.concat()));
     robot
         .observer
         .input(Input::Time(Timestamp(robot.at + SECOND / 20)));

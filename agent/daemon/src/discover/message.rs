@@ -36,9 +36,9 @@ const PL_CDR_LE: [u8; 4] = [0x00, 0x03, 0x00, 0x00];
 /// Disposed and unregistered; STATUS_INFO is big-endian always (RTPS 2.5, 9.6.4.9).
 const GONE: [u8; 4] = [0, 0, 0, 3];
 
-/// Who speaks: a participant of a moment.
+/// The participant that sends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Speaker {
+pub struct LocalParticipant {
     /// Its GUID prefix.
     pub prefix: GuidPrefix,
     /// Its one socket.
@@ -52,10 +52,10 @@ pub struct Speaker {
 pub struct Message(Vec<u8>);
 
 impl Message {
-    /// From the speaker to this participant alone.
+    /// From the local participant to this participant alone.
     #[must_use]
-    pub fn new(speaker: Speaker, target: GuidPrefix) -> Self {
-        let header = [&b"RTPS\x02\x03"[..], &VENDOR.0, &speaker.prefix.0];
+    pub fn new(local: LocalParticipant, target: GuidPrefix) -> Self {
+        let header = [&b"RTPS\x02\x03"[..], &VENDOR.0, &local.prefix.0];
         Self(header.concat()).submessage(SubmessageId::INFO_DST, NONE, &[&target.0])
     }
 
@@ -63,11 +63,11 @@ impl Message {
     /// graph shows it. Cyclone DDS forgets the address after the goodbye only if there is a
     /// multicast locator.
     #[must_use]
-    pub fn announce(self, speaker: Speaker) -> Self {
-        let own = Guid::new(speaker.prefix, EntityId::PARTICIPANT);
-        let unicast = locator(*speaker.address.ip(), speaker.address.port());
+    pub fn announce(self, local: LocalParticipant) -> Self {
+        let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
+        let unicast = locator(*local.address.ip(), local.address.port());
         // 7400 + 250 d (RTPS 2.5, 9.6.1.1); beyond domain 232 there are no ports.
-        let port = speaker.domain_id.saturating_mul(250).saturating_add(7400);
+        let port = local.domain_id.saturating_mul(250).saturating_add(7400);
         let multicast = locator(MULTICAST.into(), port);
         let payload = Parameters::default()
             .add(ParameterId::PROTOCOL_VERSION, &[2, 3, 0, 0])
@@ -90,8 +90,8 @@ impl Message {
 
     /// SPDP: here I was.
     #[must_use]
-    pub fn goodbye(self, speaker: Speaker) -> Self {
-        let own = Guid::new(speaker.prefix, EntityId::PARTICIPANT);
+    pub fn goodbye(self, local: LocalParticipant) -> Self {
+        let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
         let inline_qos = Parameters::default()
             .add(ParameterId::KEY_HASH, &own.to_bytes())
             .add(ParameterId::STATUS_INFO, &GONE)
@@ -106,9 +106,9 @@ impl Message {
 
     /// SEDP: I read `ros_discovery_info`, and that is all I have.
     #[must_use]
-    pub fn read_nodes(self, speaker: Speaker) -> Self {
-        let own = Guid::new(speaker.prefix, EntityId::PARTICIPANT);
-        let reader = Guid::new(speaker.prefix, NODES_READER);
+    pub fn read_nodes(self, local: LocalParticipant) -> Self {
+        let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
+        let reader = Guid::new(local.prefix, NODES_READER);
         let payload = Parameters::default()
             .add(ParameterId::ENDPOINT_GUID, &reader.to_bytes())
             .add(ParameterId::PARTICIPANT_GUID, &own.to_bytes())
@@ -281,14 +281,14 @@ mod tests {
     use super::*;
 
     const TARGET: GuidPrefix = GuidPrefix([9; 12]);
-    const SPEAKER: Speaker = Speaker {
+    const LOCAL: LocalParticipant = LocalParticipant {
         prefix: GuidPrefix(*b"\x01\x7fabcdefghij"),
         address: SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 7), 40_123),
         domain_id: 3,
     };
 
     fn message() -> Message {
-        Message::new(SPEAKER, TARGET)
+        Message::new(LOCAL, TARGET)
     }
 
     fn walked(bytes: &[u8]) -> Vec<Found<'_>> {
@@ -300,67 +300,73 @@ mod tests {
 
     #[test]
     fn the_announcement_is_the_one_that_was_measured_and_can_be_read() {
-        let bytes = message().announce(SPEAKER).bytes();
+        let bytes = message().announce(LOCAL).bytes();
         assert_eq!(bytes.len(), 208);
         let found = walked(&bytes);
         let record = found[0].record;
         assert_eq!(
             record.writer(),
-            Guid::new(SPEAKER.prefix, EntityId::SPDP_WRITER)
+            Guid::new(LOCAL.prefix, EntityId::SPDP_WRITER)
         );
         assert_eq!(record.reader(), Guid::new(TARGET, SPDP_READER));
         assert_eq!((found.len(), record.sequence_number), (1, 1));
         let payload = Payload::Data(found[0].payload);
-        let told = discovery::participant(VENDOR, payload, &InlineQos::default()).unwrap();
-        let Discovery::Alive(told) = told else {
-            panic!("{told:?}")
+        let announced = discovery::participant(VENDOR, payload, &InlineQos::default()).unwrap();
+        let Discovery::Alive(announced) = announced else {
+            panic!("{announced:?}")
         };
-        assert_eq!(told.guid, Guid::new(SPEAKER.prefix, EntityId::PARTICIPANT));
         assert_eq!(
-            (told.vendor, told.lease),
+            announced.guid,
+            Guid::new(LOCAL.prefix, EntityId::PARTICIPANT)
+        );
+        assert_eq!(
+            (announced.vendor, announced.lease),
             (VENDOR, Duration::Finite(3_000_000_000))
         );
-        assert_eq!((told.enclave, told.builtin_endpoints.0), (None, 0x39));
+        assert_eq!(
+            (announced.enclave, announced.builtin_endpoints.0),
+            (None, 0x39)
+        );
         let udp = |locators: &[ros2probe_wire::rtps::Locator]| {
             let all = locators.iter().map(|it| it.udp().unwrap().to_string());
             all.collect::<Vec<_>>()
         };
-        assert_eq!(udp(&told.metatraffic_unicast), ["10.0.0.7:40123"]);
-        assert_eq!(udp(&told.default_unicast), ["10.0.0.7:40123"]);
-        assert_eq!(udp(&told.metatraffic_multicast), ["239.255.0.1:8150"]);
-        assert!(told.default_multicast.is_empty());
+        assert_eq!(udp(&announced.metatraffic_unicast), ["10.0.0.7:40123"]);
+        assert_eq!(udp(&announced.default_unicast), ["10.0.0.7:40123"]);
+        assert_eq!(udp(&announced.metatraffic_multicast), ["239.255.0.1:8150"]);
+        assert!(announced.default_multicast.is_empty());
     }
 
     #[test]
     fn the_goodbye_names_the_participant_by_its_key_hash() {
-        let bytes = message().goodbye(SPEAKER).bytes();
+        let bytes = message().goodbye(LOCAL).bytes();
         let found = walked(&bytes);
         assert_eq!(found[0].record.sequence_number, 2);
         assert_eq!(
             (found[0].record.status_info, found[0].payload.len()),
             (3, 0)
         );
-        let own = Guid::new(SPEAKER.prefix, EntityId::PARTICIPANT).to_bytes();
+        let own = Guid::new(LOCAL.prefix, EntityId::PARTICIPANT).to_bytes();
         assert!(bytes.windows(16).any(|window| window == own));
     }
 
     #[test]
     fn the_reader_is_one_that_a_ros_writer_matches() {
-        let bytes = message().read_nodes(SPEAKER).bytes();
+        let bytes = message().read_nodes(LOCAL).bytes();
         let found = walked(&bytes);
         let payload = Payload::Data(found[0].payload);
-        let told = discovery::endpoint(Role::Reader, VENDOR, payload, &InlineQos::default());
-        let Discovery::Alive(told) = told.unwrap() else {
+        let announced = discovery::endpoint(Role::Reader, VENDOR, payload, &InlineQos::default());
+        let Discovery::Alive(announced) = announced.unwrap() else {
             panic!("not alive")
         };
-        assert_eq!(told.guid, Guid::new(SPEAKER.prefix, NODES_READER));
-        assert_eq!(told.topic.as_str(), "ros_discovery_info");
+        assert_eq!(announced.guid, Guid::new(LOCAL.prefix, NODES_READER));
+        assert_eq!(announced.topic.as_str(), "ros_discovery_info");
         assert_eq!(
-            told.type_name.message().as_str(),
+            announced.type_name.message().as_str(),
             "rmw_dds_common/msg/ParticipantEntitiesInfo"
         );
-        assert_eq!(told.qos.reliability, Reliability::RELIABLE);
-        assert_eq!(told.qos.durability, Durability::TRANSIENT_LOCAL);
+        assert_eq!(announced.qos.reliability, Reliability::RELIABLE);
+        assert_eq!(announced.qos.durability, Durability::TRANSIENT_LOCAL);
         let heartbeat = found[1].record;
         let record::Body::Heartbeat(heartbeat) = heartbeat.body() else {
             panic!("{heartbeat:?}")
@@ -398,7 +404,7 @@ mod tests {
             );
             assert_eq!(
                 record.reader(),
-                Guid::new(SPEAKER.prefix, PUBLICATIONS_READER)
+                Guid::new(LOCAL.prefix, PUBLICATIONS_READER)
             );
         }
         let bytes = message()

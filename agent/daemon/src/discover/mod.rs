@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
-use self::message::{Speaker, VENDOR};
+use self::message::{LocalParticipant, VENDOR};
 use self::session::{Outgoing, Session, Target};
 use ros2probe_model::snapshot::ParticipantFacts;
 
@@ -104,7 +104,10 @@ impl Refusal {
 ///
 /// # Errors
 /// No socket or no random numbers.
-pub fn speaker(target: &Target, domain_id: u32) -> Result<(Speaker, UdpSocket), DiscoverError> {
+pub fn local_participant(
+    target: &Target,
+    domain_id: u32,
+) -> Result<(LocalParticipant, UdpSocket), DiscoverError> {
     let open = || {
         let address = leaving(target.metatraffic)?;
         let socket = UdpSocket::bind((address, 0))?;
@@ -123,12 +126,12 @@ pub fn speaker(target: &Target, domain_id: u32) -> Result<(Speaker, UdpSocket), 
     for (byte, mark) in prefix.iter_mut().zip(VENDOR.0) {
         *byte = mark;
     }
-    let speaker = Speaker {
+    let local = LocalParticipant {
         prefix: GuidPrefix(prefix),
         address,
         domain_id: u16::try_from(domain_id).unwrap_or(0),
     };
-    Ok((speaker, socket))
+    Ok((local, socket))
 }
 
 /// Holds the conversation, goodbye included; how long it took.
@@ -148,7 +151,7 @@ pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, D
         let round =
             send(socket, &outgoing).and_then(|()| listen(session, socket, &mut buffer, now));
         if let Err(error) = round {
-            let _ = send(socket, &session.hang_up());
+            let _ = send(socket, &session.say_goodbye());
             return Err(error);
         }
     }

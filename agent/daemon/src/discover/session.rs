@@ -17,7 +17,8 @@ use ros2probe_wire::walk::{self, Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::message::{
-    MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER, SUBSCRIPTIONS_READER, Speaker,
+    LocalParticipant, MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
+    SUBSCRIPTIONS_READER,
 };
 use ros2probe_model::pieces::Pieces;
 
@@ -27,7 +28,7 @@ pub const MOST_PACKETS: u32 = 6;
 const MILLISECOND: u64 = 1_000_000;
 /// Both announce themselves within 2 ms; when nothing comes for this long, the introduction is
 /// repeated once.
-const DEAF: u64 = 500 * MILLISECOND;
+const SILENCE: u64 = 500 * MILLISECOND;
 /// Between the first HEARTBEAT and asking, for the second one.
 const GATHER: u64 = 20 * MILLISECOND;
 /// What was asked for comes within this, or it is asked for again.
@@ -68,7 +69,7 @@ pub struct Outgoing {
 
 /// Packets and their bytes (UDP payload).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Tally {
+pub struct Traffic {
     /// Packets.
     pub packets: u32,
     /// Bytes.
@@ -78,7 +79,7 @@ pub struct Tally {
 /// One conversation.
 #[derive(Debug)]
 pub struct Session {
-    speaker: Speaker,
+    local: LocalParticipant,
     target: Target,
     wants_nodes: bool,
     began: Timestamp,
@@ -97,8 +98,8 @@ pub struct Session {
     /// First and last number of user writers, by HEARTBEAT.
     user_writers: BTreeMap<EntityId, RangeInclusive<u64>>,
     nodes: Nodes,
-    sent: Tally,
-    received: Tally,
+    sent: Traffic,
+    received: Traffic,
     over: bool,
 }
 
@@ -120,7 +121,7 @@ enum Nodes {
     /// Not asked for, since when.
     Open { since: Option<Timestamp> },
     /// Asked for.
-    Asked(Timestamp),
+    FilterOptions(Timestamp),
     /// This is the list.
     Told(Vec<NodeEntities>),
     /// It cannot be had.
@@ -130,9 +131,9 @@ enum Nodes {
 impl Session {
     /// Ready to speak; [`Self::advance`] begins.
     #[must_use]
-    pub fn new(speaker: Speaker, target: Target, wants_nodes: bool) -> Self {
+    pub fn new(local: LocalParticipant, target: Target, wants_nodes: bool) -> Self {
         Self {
-            speaker,
+            local,
             target,
             wants_nodes,
             began: Timestamp(0),
@@ -147,8 +148,8 @@ impl Session {
             endpoints: BTreeMap::new(),
             user_writers: BTreeMap::new(),
             nodes: Nodes::Open { since: None },
-            sent: Tally::default(),
-            received: Tally::default(),
+            sent: Traffic::default(),
+            received: Traffic::default(),
             over: false,
         }
     }
@@ -158,7 +159,7 @@ impl Session {
     pub fn plan(&self) -> Vec<Outgoing> {
         let full = || (1, 1..=MOST_NUMBERS);
         let mut plan = vec![
-            self.to_discovery("introduction", self.message().announce(self.speaker)),
+            self.to_discovery("introduction", self.message().announce(self.local)),
             self.to_discovery("request", self.request([full(), full()])),
         ];
         if self.wants_nodes {
@@ -166,22 +167,22 @@ impl Session {
             let message = message.ask(NODES_READER, EntityId::UNKNOWN, 1, [1], 1);
             plan.push(self.to_user("node request", message));
         }
-        plan.push(self.to_discovery("goodbye", self.message().goodbye(self.speaker)));
+        plan.push(self.to_discovery("goodbye", self.message().goodbye(self.local)));
         plan
     }
 
-    /// Takes in a datagram that came to the speaker's socket.
+    /// Takes in a datagram that came to the local participant's socket.
     pub fn datagram(&mut self, now: Timestamp, bytes: &[u8]) {
         self.received.add(bytes.len());
         let vendor = bytes.get(6..8).and_then(|vendor| vendor.try_into().ok());
         let vendor = VendorId(vendor.unwrap_or_default());
         walk::datagram(bytes, &Envelope::default(), None, |found| {
             let record = &found.record;
-            let for_us = [self.speaker.prefix, GuidPrefix::UNKNOWN];
+            let for_us = [self.local.prefix, GuidPrefix::UNKNOWN];
             if record.writer().prefix == self.target.prefix
                 && for_us.contains(&record.reader().prefix)
             {
-                self.take_in(now, &found, vendor);
+                self.receive(now, &found, vendor);
             }
         });
     }
@@ -196,7 +197,7 @@ impl Session {
             self.began = now;
             self.introduce(now, &mut outgoing);
         }
-        let is_deaf = self.heard.is_none() && since(self.announced, now) >= DEAF;
+        let is_deaf = self.heard.is_none() && since(self.announced, now) >= SILENCE;
         if is_deaf && self.sent.packets == 1 {
             self.introduce(now, &mut outgoing);
         } else if is_deaf || since(self.began, now) >= LIMIT {
@@ -213,7 +214,7 @@ impl Session {
     }
 
     /// Says goodbye now, if that was not done.
-    pub fn hang_up(&mut self) -> Vec<Outgoing> {
+    pub fn say_goodbye(&mut self) -> Vec<Outgoing> {
         let mut outgoing = Vec::new();
         if !self.over && self.sent.packets > 0 {
             self.end(&mut outgoing);
@@ -271,11 +272,11 @@ impl Session {
 
     /// What was sent, and what came.
     #[must_use]
-    pub const fn cost(&self) -> (Tally, Tally) {
+    pub const fn cost(&self) -> (Traffic, Traffic) {
         (self.sent, self.received)
     }
 
-    fn take_in(&mut self, now: Timestamp, found: &Found<'_>, vendor: VendorId) {
+    fn receive(&mut self, now: Timestamp, found: &Found<'_>, vendor: VendorId) {
         let record = &found.record;
         let entity = record.writer().entity;
         let announcers = [&mut self.publications, &mut self.subscriptions];
@@ -309,14 +310,14 @@ impl Session {
                 if came || announcer.is_none() && Some(entity) != self.nodes_writer() {
                     return;
                 }
-                let Some((payload, qos)) = self.whole(now, found, sample, vendor) else {
+                let Some((payload, qos)) = self.complete_payload(now, found, sample, vendor) else {
                     return;
                 };
                 let payload = payload.borrow();
                 if Some(entity) == self.nodes_writer() {
-                    self.told_nodes(payload);
+                    self.nodes_announced(payload);
                 } else {
-                    self.told(entity, number, vendor, payload, &qos);
+                    self.endpoint_announced(entity, number, vendor, payload, &qos);
                 }
             }
             _ => {}
@@ -324,16 +325,16 @@ impl Session {
     }
 
     /// The payload of a sample that is complete.
-    fn whole<'a>(
+    fn complete_payload<'a>(
         &mut self,
         now: Timestamp,
         found: &Found<'a>,
         sample: Sample<'_>,
         vendor: VendorId,
-    ) -> Option<(Whole<'a>, InlineQos)> {
+    ) -> Option<(SamplePayload<'a>, InlineQos)> {
         let Sample::DataFrag(fragments) = sample else {
             let qos = found.inline_qos(vendor).ok()?;
-            return Some((Whole::Borrowed(found.payload()), qos));
+            return Some((SamplePayload::Borrowed(found.payload()), qos));
         };
         let key = (found.record.writer().entity, sample.sequence_number());
         let Some(bytes) = self.pieces.put(fragments, found.payload) else {
@@ -347,11 +348,11 @@ impl Session {
             status_info: sample.status_info(),
             ..InlineQos::default()
         };
-        Some((Whole::Joined(bytes), qos))
+        Some((SamplePayload::Joined(bytes), qos))
     }
 
     /// An announcement of an endpoint.
-    fn told(
+    fn endpoint_announced(
         &mut self,
         entity: EntityId,
         number: u64,
@@ -377,7 +378,7 @@ impl Session {
         }
     }
 
-    fn told_nodes(&mut self, payload: Payload<'_>) {
+    fn nodes_announced(&mut self, payload: Payload<'_>) {
         if let Ok(entities) = ParticipantEntities::parse(payload.bytes())
             && entities.participant.prefix == self.target.prefix
         {
@@ -396,7 +397,7 @@ impl Session {
 
     fn introduce(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
         self.announced = now;
-        let message = self.message().announce(self.speaker);
+        let message = self.message().announce(self.local);
         self.send(self.to_discovery("introduction", message), outgoing);
     }
 
@@ -443,7 +444,7 @@ impl Session {
             return;
         }
         let message = self.message().ask(NODES_READER, writer, last, [last], 1);
-        self.nodes = Nodes::Asked(now);
+        self.nodes = Nodes::FilterOptions(now);
         self.send(self.to_user("node request", message), outgoing);
     }
 
@@ -508,26 +509,26 @@ impl Session {
         }
         match &mut self.nodes {
             Nodes::Told(_) | Nodes::Missing => true,
-            Nodes::Asked(asked) => since(*asked, now) >= NODES_PATIENCE,
+            Nodes::FilterOptions(asked) => since(*asked, now) >= NODES_PATIENCE,
             Nodes::Open { since: open } => since(*open.get_or_insert(now), now) >= NODES_PATIENCE,
         }
     }
 
     fn end(&mut self, outgoing: &mut Vec<Outgoing>) {
-        let message = self.message().goodbye(self.speaker);
+        let message = self.message().goodbye(self.local);
         self.send(self.to_discovery("goodbye", message), outgoing);
         self.over = true;
     }
 
     fn message(&self) -> Message {
-        Message::new(self.speaker, self.target.prefix)
+        Message::new(self.local, self.target.prefix)
     }
 
     /// Asks for these numbers from their bases on; the first request introduces the reader of nodes.
     fn request<N: IntoIterator<Item = u64>>(&self, wanted: [(u64, N); 2]) -> Message {
         let mut message = self.message();
         if self.wants_nodes && self.asked.is_none() {
-            message = message.read_nodes(self.speaker);
+            message = message.read_nodes(self.local);
         }
         let both = [&self.publications, &self.subscriptions];
         for (announcer, (base, numbers)) in both.into_iter().zip(wanted) {
@@ -562,12 +563,12 @@ impl Session {
 }
 
 /// The payload of a sample, as it came or put together.
-enum Whole<'a> {
+enum SamplePayload<'a> {
     Borrowed(Payload<'a>),
     Joined(Vec<u8>),
 }
 
-impl Whole<'_> {
+impl SamplePayload<'_> {
     fn borrow(&self) -> Payload<'_> {
         match self {
             Self::Borrowed(payload) => *payload,
@@ -631,7 +632,7 @@ impl Announcer {
     }
 }
 
-impl Tally {
+impl Traffic {
     fn add(&mut self, length: usize) {
         self.packets += 1;
         self.bytes += length as u64;

@@ -39,11 +39,11 @@ pub struct DropError(CapsError);
 /// The calling thread has no capability in any set that would give it one, and can gain none: what
 /// is asked for to serve HTTP.
 #[derive(Debug)]
-pub struct Powerless(());
+pub struct Unprivileged(());
 
 /// It has.
 #[derive(Debug, thiserror::Error)]
-pub enum StillPowerful {
+pub enum CapabilitiesRemain {
     /// These are left.
     #[error("refusing to serve: {left} left in the {set:?} set after all were given up")]
     Capabilities {
@@ -132,23 +132,23 @@ pub(super) fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError
     caps::set(None, CapSet::Permitted, &kept).map_err(DropError)
 }
 
-impl Powerless {
+impl Unprivileged {
     /// Reads back what the calling thread has left.
     ///
     /// # Errors
     /// There is something, or it cannot be read.
-    pub fn verify() -> Result<Self, StillPowerful> {
+    pub fn verify() -> Result<Self, CapabilitiesRemain> {
         for set in [
             CapSet::Effective,
             CapSet::Permitted,
             CapSet::Inheritable,
             CapSet::Ambient,
         ] {
-            let left = caps::read(None, set).map_err(StillPowerful::Unreadable)?;
+            let left = caps::read(None, set).map_err(CapabilitiesRemain::Unreadable)?;
             if !left.is_empty() {
                 let mut left: Vec<_> = left.iter().map(Capability::to_string).collect();
                 left.sort();
-                return Err(StillPowerful::Capabilities {
+                return Err(CapabilitiesRemain::Capabilities {
                     left: left.join(", "),
                     set,
                 });
@@ -156,8 +156,8 @@ impl Powerless {
         }
         match rustix::thread::no_new_privs() {
             Ok(true) => Ok(Self(())),
-            Ok(false) => Err(StillPowerful::MayGain),
-            Err(error) => Err(StillPowerful::Unknown(error.into())),
+            Ok(false) => Err(CapabilitiesRemain::MayGain),
+            Err(error) => Err(CapabilitiesRemain::Unknown(error.into())),
         }
     }
 }

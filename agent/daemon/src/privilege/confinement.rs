@@ -10,9 +10,9 @@ use caps::Capability;
 use super::calls::{self, FilterError};
 use super::capabilities::{self, DropError};
 use super::probe::map_updates_need_bpf;
-use ros2probe_capture::exact;
 use ros2probe_capture::system::allow_running_first;
 use ros2probe_capture::threads::Task;
+use ros2probe_capture::uprobe;
 
 /// Whether filters are in force, as the kernel answered when the first thread was confined: its answer
 /// is the same for all.
@@ -147,7 +147,7 @@ impl Role {
                 Capability::CAP_SYS_NICE => needs_nice,
                 _ => false,
             },
-            Self::Exact => exact::requires(capability),
+            Self::Exact => uprobe::requires(capability),
         }
     }
 }
@@ -196,16 +196,16 @@ pub fn spawn(
     thread: Builder,
     work: impl FnOnce() + Send + 'static,
 ) -> Result<JoinHandle<()>, SpawnError> {
-    let (tell, told) = mpsc::channel();
+    let (report, confined) = mpsc::channel();
     let thread = thread.spawn(move || {
         let confined = confine(role);
         let may_begin = confined.is_ok();
-        let _ = tell.send(confined);
+        let _ = report.send(confined);
         if may_begin {
             work();
         }
     })?;
-    told.recv().map_err(|_| SpawnError::Died)??;
+    confined.recv().map_err(|_| SpawnError::Died)??;
     Ok(thread)
 }
 

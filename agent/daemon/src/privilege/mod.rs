@@ -13,9 +13,9 @@ mod probe;
 mod threads;
 mod user;
 
-pub use capabilities::{DropError, Missing, Powerless, StillPowerful, check, missing};
+pub use capabilities::{CapabilitiesRemain, DropError, Missing, Unprivileged, check, missing};
 pub use confinement::{
     ConfineError, Role, Sandbox, SpawnError, confine, give_up, sandbox, spawn, spawn_source,
 };
-pub use threads::{ThreadPowers, threads};
+pub use threads::{ThreadCapabilities, threads};
 pub use user::{Identity, become_own_user};

@@ -17,14 +17,14 @@ pub(super) fn map_updates_need_bpf() -> bool {
     let thread = std::thread::Builder::new().name("probe".to_owned());
     let probe = thread.spawn(|| {
         // A thread that could not give up has not tried anything.
-        keep(|_| false).is_err() || look_up_nothing().raw_os_error() == Some(libc::EPERM)
+        keep(|_| false).is_err() || probe_lookup().raw_os_error() == Some(libc::EPERM)
     });
     // No answer is no leave.
     probe.map_or(true, |probe| probe.join().unwrap_or(true))
 }
 
 /// Always fails.
-fn look_up_nothing() -> io::Error {
+fn probe_lookup() -> io::Error {
     // No descriptor has the number -1.
     let attributes = [u64::from(u32::MAX), 0, 0, 0_u64];
     // SAFETY: the attributes' size is given and they outlive the call; key and value are null, and
@@ -63,7 +63,7 @@ mod tests {
 
     #[test]
     fn what_does_not_exist_is_not_found() {
-        let error = look_up_nothing().raw_os_error();
+        let error = probe_lookup().raw_os_error();
         assert!(
             matches!(error, Some(libc::EBADF | libc::EPERM)),
             "{error:?}"

@@ -7,7 +7,7 @@ use caps::Capability;
 
 /// One thread.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ThreadPowers {
+pub struct ThreadCapabilities {
     /// Its name; `rp` for the first one.
     pub name: String,
     /// Capabilities that it can use, by name.
@@ -18,7 +18,7 @@ pub struct ThreadPowers {
 
 /// All of them, by the order in which they began; none where `/proc` does not tell.
 #[must_use]
-pub fn threads() -> Vec<ThreadPowers> {
+pub fn threads() -> Vec<ThreadCapabilities> {
     let entries = fs::read_dir("/proc/self/task").into_iter().flatten();
     let number = |name: &str| name.parse::<u32>().ok();
     let mut numbers: Vec<_> = entries
@@ -31,7 +31,7 @@ pub fn threads() -> Vec<ThreadPowers> {
     readable.map(|status| read(&status)).collect()
 }
 
-fn read(status: &str) -> ThreadPowers {
+fn read(status: &str) -> ThreadCapabilities {
     let value = |name: &str| {
         let mut lines = status.lines();
         let value = lines.find_map(|line| line.strip_prefix(name)?.strip_prefix(':'));
@@ -44,7 +44,7 @@ fn read(status: &str) -> ThreadPowers {
         .map(Capability::to_string)
         .collect();
     capabilities.sort();
-    ThreadPowers {
+    ThreadCapabilities {
         name: value("Name").to_owned(),
         capabilities,
         filtered: value("Seccomp") == "2",
@@ -62,7 +62,7 @@ mod tests {
             CapAmb:\t0000000000000000\nNoNewPrivs:\t1\nSeccomp:\t2\nSeccomp_filters:\t1\n";
         assert_eq!(
             read(status),
-            ThreadPowers {
+            ThreadCapabilities {
                 name: "shm".to_owned(),
                 capabilities: vec!["CAP_SYS_NICE".to_owned(), "CAP_SYS_PTRACE".to_owned()],
                 filtered: true,

@@ -24,7 +24,7 @@ const MAX_EXPRESSION: usize = 1024;
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields, default)]
 #[schema(as = RecordedTopics)]
-pub struct Asked {
+pub struct FilterOptions {
     /// These topics, by ROS name.
     pub topics: Vec<String>,
     /// Every topic.
@@ -69,7 +69,7 @@ pub struct Candidate<'a> {
 /// What was asked for, ready to be held against topics.
 #[derive(Clone, Debug)]
 pub struct Filter {
-    asked: Asked,
+    options: FilterOptions,
     regex: Option<Regex>,
     exclude_regex: Option<Regex>,
     only: Option<HashSet<String>>,
@@ -97,7 +97,7 @@ pub enum FilterError {
     },
 }
 
-impl Asked {
+impl FilterOptions {
     /// Every topic, as `-a` of Humble.
     #[must_use]
     pub fn everything() -> Self {
@@ -113,14 +113,14 @@ impl Filter {
     ///
     /// # Errors
     /// Nothing could match, or an expression or a name is wrong.
-    pub fn new(asked: Asked) -> Result<Self, FilterError> {
+    pub fn new(options: FilterOptions) -> Result<Self, FilterError> {
         let names = [
-            &asked.topics,
-            &asked.services,
-            &asked.exclude_topics,
-            &asked.exclude_services,
+            &options.topics,
+            &options.services,
+            &options.exclude_topics,
+            &options.exclude_services,
         ];
-        let types = [&asked.topic_types, &asked.exclude_topic_types];
+        let types = [&options.topic_types, &options.exclude_topic_types];
         if names
             .iter()
             .chain(&types)
@@ -131,19 +131,23 @@ impl Filter {
         if let Some(wrong) = names.into_iter().flatten().find(|name| !is_absolute(name)) {
             return Err(FilterError::Name(wrong.clone()));
         }
-        let something = asked.all_topics
-            || asked.all_services
-            || asked.regex.is_some()
-            || !asked.topics.is_empty()
-            || !asked.topic_types.is_empty()
-            || !asked.services.is_empty();
+        let something = options.all_topics
+            || options.all_services
+            || options.regex.is_some()
+            || !options.topics.is_empty()
+            || !options.topic_types.is_empty()
+            || !options.services.is_empty();
         if !something {
             return Err(FilterError::Nothing);
         }
-        let regex = asked.regex.as_deref().map(expression).transpose()?;
-        let exclude_regex = asked.exclude_regex.as_deref().map(expression).transpose()?;
+        let regex = options.regex.as_deref().map(expression).transpose()?;
+        let exclude_regex = options
+            .exclude_regex
+            .as_deref()
+            .map(expression)
+            .transpose()?;
         Ok(Self {
-            asked,
+            options,
             regex,
             exclude_regex,
             only: None,
@@ -152,8 +156,8 @@ impl Filter {
 
     /// What was asked for.
     #[must_use]
-    pub const fn asked(&self) -> &Asked {
-        &self.asked
+    pub const fn options(&self) -> &FilterOptions {
+        &self.options
     }
 
     /// What to subscribe to: everything that [`Self::takes`] may take, and little more.
@@ -161,61 +165,63 @@ impl Filter {
     /// # Errors
     /// A name cannot be a topic's.
     pub fn selection(&self) -> Result<Selection, ChoiceError> {
-        let asked = &self.asked;
+        let options = &self.options;
         let event = |service: &String| Choice::Name(format!("{service}{SERVICE_EVENT}"));
         let mut include = Vec::new();
-        if asked.all_topics || !asked.topic_types.is_empty() {
+        if options.all_topics || !options.topic_types.is_empty() {
             include.push(Choice::All);
         }
-        if asked.all_services || asked.regex.is_some() {
+        if options.all_services || options.regex.is_some() {
             include.push(Choice::regex(EVERY_SERVICE_EVENT)?);
         }
-        include.extend(asked.services.iter().map(event));
-        if let Some(regex) = &asked.regex {
+        include.extend(options.services.iter().map(event));
+        if let Some(regex) = &options.regex {
             include.push(Choice::regex(regex)?);
         }
-        include.extend(asked.topics.iter().cloned().map(Choice::Name));
+        include.extend(options.topics.iter().cloned().map(Choice::Name));
         let mut exclude = Vec::new();
-        if let Some(regex) = &asked.exclude_regex {
+        if let Some(regex) = &options.exclude_regex {
             exclude.push(Choice::regex(regex)?);
         }
-        exclude.extend(asked.exclude_topics.iter().cloned().map(Choice::Name));
-        exclude.extend(asked.exclude_services.iter().map(event));
+        exclude.extend(options.exclude_topics.iter().cloned().map(Choice::Name));
+        exclude.extend(options.exclude_services.iter().map(event));
         Ok(Selection {
             include,
             exclude,
             // A service's events are hidden; what else is hidden is for `takes` to leave out.
-            hidden: asked.include_hidden_topics || asked.all_services || asked.regex.is_some(),
+            hidden: options.include_hidden_topics
+                || options.all_services
+                || options.regex.is_some(),
         })
     }
 
     /// The same as a query of the API's `/samples`, with so much room for what waits.
     #[must_use]
     pub fn query(&self, domain_id: u32, queue_bytes: u64) -> String {
-        let asked = &self.asked;
+        let options = &self.options;
         let event = |service: &String| format!("{service}{SERVICE_EVENT}");
         let list = |names: &[String], services: &[String]| {
             let names = names.iter().cloned().chain(services.iter().map(event));
             names.collect::<Vec<_>>().join(",")
         };
-        let every_event = asked.all_services || asked.regex.is_some();
+        let every_event = options.all_services || options.regex.is_some();
         let events = every_event.then(|| EVERY_SERVICE_EVENT.to_owned());
-        let regex = asked.regex.as_ref().map(|regex| format!("(?:{regex})"));
+        let regex = options.regex.as_ref().map(|regex| format!("(?:{regex})"));
         let regex: Vec<String> = regex.into_iter().chain(events).collect();
-        let all = asked.all_topics || !asked.topic_types.is_empty();
-        let hidden = asked.include_hidden_topics || every_event;
+        let all = options.all_topics || !options.topic_types.is_empty();
+        let hidden = options.include_hidden_topics || every_event;
         let mut query = format!("domain_id={domain_id}&queue_bytes={queue_bytes}");
         query.push_str(&format!("&all={all}&hidden={hidden}"));
         let texts = [
-            ("topic", list(&asked.topics, &asked.services)),
+            ("topic", list(&options.topics, &options.services)),
             ("regex", regex.join("|")),
             (
                 "exclude",
-                list(&asked.exclude_topics, &asked.exclude_services),
+                list(&options.exclude_topics, &options.exclude_services),
             ),
             (
                 "exclude_regex",
-                asked.exclude_regex.clone().unwrap_or_default(),
+                options.exclude_regex.clone().unwrap_or_default(),
             ),
         ];
         for (key, text) in texts.into_iter().filter(|(_, text)| !text.is_empty()) {
@@ -236,7 +242,7 @@ impl Filter {
     /// Whether `topic` is to be recorded.
     #[must_use]
     pub fn takes(&self, topic: &Candidate<'_>) -> bool {
-        let asked = &self.asked;
+        let options = &self.options;
         let found = |expression: &Option<Regex>, name: &str| {
             let expression = expression.as_ref();
             expression.is_some_and(|expression| expression.is_match(name.as_bytes()))
@@ -249,23 +255,25 @@ impl Filter {
         }
         if let Some(service) = topic.name.strip_suffix(SERVICE_EVENT) {
             let named = |list: &[String]| list.iter().any(|name| name == service);
-            return !named(&asked.exclude_services)
-                && (asked.all_services || named(&asked.services) || found(&self.regex, service));
+            return !named(&options.exclude_services)
+                && (options.all_services
+                    || named(&options.services)
+                    || found(&self.regex, service));
         }
         let named = |list: &[String]| list.iter().any(|name| name == topic.name);
         let typed = |list: &[String]| topic.types.iter().any(|each| list.contains(each));
-        if named(&asked.exclude_topics)
-            || typed(&asked.exclude_topic_types)
-            || (asked.ignore_leaf_topics && !topic.subscribed)
-            || (!asked.include_unpublished_topics && !topic.published)
+        if named(&options.exclude_topics)
+            || typed(&options.exclude_topic_types)
+            || (options.ignore_leaf_topics && !topic.subscribed)
+            || (!options.include_unpublished_topics && !topic.published)
         {
             return false;
         }
         // Who names a hidden topic means it.
-        named(&asked.topics)
-            || ((asked.include_hidden_topics || !is_hidden(topic.name))
-                && (asked.all_topics
-                    || typed(&asked.topic_types)
+        named(&options.topics)
+            || ((options.include_hidden_topics || !is_hidden(topic.name))
+                && (options.all_topics
+                    || typed(&options.topic_types)
                     || found(&self.regex, topic.name)))
     }
 }
@@ -297,9 +305,9 @@ fn is_hidden(name: &str) -> bool {
 mod tests {
     use super::*;
 
-    fn takes(asked: Asked, name: &str) -> bool {
+    fn takes(options: FilterOptions, name: &str) -> bool {
         let types = ["std_msgs/msg/String".to_owned()];
-        Filter::new(asked).unwrap().takes(&Candidate {
+        Filter::new(options).unwrap().takes(&Candidate {
             name,
             types: &types,
             published: true,
@@ -313,11 +321,11 @@ mod tests {
 
     #[test]
     fn all_topics_are_those_that_are_not_hidden_and_no_service_events() {
-        let all = Asked::everything();
+        let all = FilterOptions::everything();
         assert!(takes(all.clone(), "/chatter"));
         assert!(!takes(all.clone(), "/fibonacci/_action/feedback"));
         assert!(!takes(all.clone(), "/add/_service_event"));
-        let hidden = Asked {
+        let hidden = FilterOptions {
             include_hidden_topics: true,
             ..all
         };
@@ -327,73 +335,73 @@ mod tests {
 
     #[test]
     fn a_named_topic_is_taken_though_it_is_hidden() {
-        let asked = Asked {
+        let options = FilterOptions {
             topics: strings(&["/a/_hidden"]),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
-        assert!(takes(asked.clone(), "/a/_hidden"));
-        assert!(!takes(asked, "/a"));
+        assert!(takes(options.clone(), "/a/_hidden"));
+        assert!(!takes(options, "/a"));
     }
 
     #[test]
     fn a_regular_expression_adds_and_another_takes_away() {
-        let asked = Asked {
+        let options = FilterOptions {
             topics: strings(&["/chatter"]),
             regex: Some("camera/.*".to_owned()),
             exclude_regex: Some("raw$|chat".to_owned()),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
-        assert!(takes(asked.clone(), "/camera/info"));
-        assert!(!takes(asked.clone(), "/camera/raw"));
-        assert!(!takes(asked.clone(), "/chatter"));
-        assert!(!takes(asked, "/odom"));
+        assert!(takes(options.clone(), "/camera/info"));
+        assert!(!takes(options.clone(), "/camera/raw"));
+        assert!(!takes(options.clone(), "/chatter"));
+        assert!(!takes(options, "/odom"));
     }
 
     #[test]
     fn services_are_chosen_by_their_own_names() {
-        let asked = Asked {
+        let options = FilterOptions {
             services: strings(&["/add"]),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
-        assert!(takes(asked.clone(), "/add/_service_event"));
-        assert!(!takes(asked, "/add"));
-        let asked = Asked {
+        assert!(takes(options.clone(), "/add/_service_event"));
+        assert!(!takes(options, "/add"));
+        let options = FilterOptions {
             all_services: true,
             exclude_services: strings(&["/add"]),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
-        assert!(takes(asked.clone(), "/sub/_service_event"));
-        assert!(!takes(asked, "/add/_service_event"));
+        assert!(takes(options.clone(), "/sub/_service_event"));
+        assert!(!takes(options, "/add/_service_event"));
     }
 
     #[test]
     fn types_and_the_graph_around_a_topic_decide() {
-        let typed = Asked {
+        let typed = FilterOptions {
             topic_types: strings(&["std_msgs/msg/String"]),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
         assert!(takes(typed, "/chatter"));
-        let excluded = Asked {
+        let excluded = FilterOptions {
             exclude_topic_types: strings(&["std_msgs/msg/String"]),
-            ..Asked::everything()
+            ..FilterOptions::everything()
         };
         assert!(!takes(excluded, "/chatter"));
-        let lonely = |asked| {
+        let lonely = |options| {
             let topic = Candidate {
                 name: "/chatter",
                 types: &[],
                 published: false,
                 subscribed: false,
             };
-            Filter::new(asked).unwrap().takes(&topic)
+            Filter::new(options).unwrap().takes(&topic)
         };
-        assert!(!lonely(Asked::everything()));
-        let unpublished = Asked {
+        assert!(!lonely(FilterOptions::everything()));
+        let unpublished = FilterOptions {
             include_unpublished_topics: true,
-            ..Asked::everything()
+            ..FilterOptions::everything()
         };
         assert!(lonely(unpublished.clone()));
-        assert!(!lonely(Asked {
+        assert!(!lonely(FilterOptions {
             ignore_leaf_topics: true,
             ..unpublished
         }));
@@ -401,44 +409,44 @@ mod tests {
 
     #[test]
     fn what_cannot_be_chosen_is_told() {
-        let error = |asked| Filter::new(asked).unwrap_err().to_string();
-        assert!(error(Asked::default()).starts_with("name topics"));
-        let relative = Asked {
+        let error = |options| Filter::new(options).unwrap_err().to_string();
+        assert!(error(FilterOptions::default()).starts_with("name topics"));
+        let relative = FilterOptions {
             topics: strings(&["chatter"]),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
         assert!(error(relative).contains("`chatter` is no topic"));
         for wrong in ["(", r"(a)\1", "a{1000000}"] {
             let regex = Some(wrong.to_owned());
-            let asked = Asked {
+            let options = FilterOptions {
                 regex,
-                ..Asked::default()
+                ..FilterOptions::default()
             };
-            assert!(error(asked).contains("cannot be used: "), "{wrong}");
+            assert!(error(options).contains("cannot be used: "), "{wrong}");
         }
-        let long = Asked {
+        let long = FilterOptions {
             regex: Some("a".repeat(MAX_EXPRESSION + 1)),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
         assert!(error(long).ends_with("longer than 1024 bytes"));
     }
 
     #[test]
     fn what_is_asked_of_an_agent_is_no_less_than_what_is_taken() {
-        let asked = Asked {
+        let options = FilterOptions {
             topics: strings(&["/a", "/b"]),
             services: strings(&["/add"]),
             regex: Some("^/c&d".to_owned()),
             exclude_topics: strings(&["/x"]),
-            ..Asked::default()
+            ..FilterOptions::default()
         };
         assert_eq!(
-            Filter::new(asked).unwrap().query(3, 100),
+            Filter::new(options).unwrap().query(3, 100),
             "domain_id=3&queue_bytes=100&all=false&hidden=true\
              &topic=/a%2C/b%2C/add/_service_event\
              &regex=%28%3F%3A%5E/c%26d%29%7C/_service_event%24&exclude=/x"
         );
-        let all = Filter::new(Asked::everything()).unwrap();
+        let all = Filter::new(FilterOptions::everything()).unwrap();
         assert_eq!(
             all.query(0, 1),
             "domain_id=0&queue_bytes=1&all=true&hidden=false"

@@ -4,22 +4,26 @@
 //! network tells that there is one. The agent writes some itself (`service`), and the last seconds
 //! before an incident (`snapshot`). How a bag looks on disk is the business of `ros2probe_bag`.
 
-mod announced;
+mod disk_quota;
 mod filter;
+mod graph;
 mod recorder;
 mod report;
-mod ring;
-mod room;
+mod sample_ring;
 mod service;
 mod session;
 mod snapshot;
 
-pub use announced::{Announced, Graph, GraphTopic, SeenTopic, Sight, Strangers};
-pub use filter::{Asked, Candidate, Filter, FilterError};
-pub use recorder::{Ended, Recorder, Sources};
+pub use disk_quota::DiskQuota;
+pub use filter::{Candidate, Filter, FilterError, FilterOptions};
+pub use graph::{
+    DiscoveredTopic, Graph, GraphSnapshot, GraphTopic, PublishedTopic, UnknownWriterList,
+};
+pub use recorder::{Finished, Recorder, Sources};
 pub use report::{MissingRun, OtherDomain, Report, TopicReport, UnknownWriters, unobserved_lines};
-pub use ring::Ring;
-pub use room::Room;
-pub use service::{Recording, Recordings, Refusal, Stage, Status, Wanted, default_name, schema};
-pub use session::{Going, Order, record};
-pub use snapshot::{Snapshots, Written};
+pub use sample_ring::SampleRing;
+pub use service::{
+    Recording, RecordingOptions, RecordingState, Recordings, Refusal, Status, default_name, schema,
+};
+pub use session::{Activity, Command, record};
+pub use snapshot::{Snapshots, WrittenBag};

@@ -8,20 +8,20 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
 
 use ros2probe_wire::qos::Qos;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
-use super::announced::{Announced, SeenTopic, Sight};
-use super::filter::{Asked, Candidate, Filter};
+use super::disk_quota::DiskQuota;
+use super::filter::{Candidate, Filter, FilterOptions};
+use super::graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic};
 use super::report::{NO_SUBSCRIBER, OtherDomain, Report};
-use super::ring::Ring;
-use super::room::Room;
+use super::sample_ring::SampleRing;
 use crate::subscriptions::{Item, Topic};
 use ros2probe_bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
 };
 use ros2probe_model::payloads::{Offered, Sample};
 
-const SECOND: u64 = 1_000_000_000;
 /// How often what was taken is handed to the system, by the time of the samples: so much is lost
 /// when the process is killed.
 const FLUSH: u64 = SECOND;
@@ -35,13 +35,13 @@ pub struct Sources<'a> {
     /// What is announced at the moment of the topics of these names, in their order.
     pub announced: Box<Announcements<'a>>,
     /// What is there at the moment, in all domains.
-    pub sight: Box<dyn FnMut() -> Sight + Send + 'a>,
+    pub graph: Box<dyn FnMut() -> GraphSnapshot + Send + 'a>,
     /// How messages of a type look; the type and its announced hash.
     pub schema: Box<Schemas<'a>>,
 }
 
 /// What is announced of topics, asked for all at once: each question may take a while.
-pub type Announcements<'a> = dyn FnMut(&[String]) -> Vec<Announced> + Send + 'a;
+pub type Announcements<'a> = dyn FnMut(&[String]) -> Vec<DiscoveredTopic> + Send + 'a;
 
 /// The schema of a type, by its name and announced hash.
 pub type Schemas<'a> = dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send + 'a;
@@ -51,19 +51,19 @@ pub struct Recorder<'a> {
     writer: Writer,
     domain_id: u32,
     /// What was counted when it began.
-    before: Before,
+    before: Baseline,
     filter: Filter,
     sources: Sources<'a>,
-    topics: HashMap<String, Place>,
+    topics: HashMap<String, TopicDecision>,
     /// Of those, the ones in the bag.
     order: Vec<String>,
     report: Report,
     sampled: BTreeSet<String>,
     paused: bool,
     /// In snapshot mode: samples that wait for being asked for.
-    ring: Option<Ring>,
+    ring: Option<SampleRing>,
     /// What it may take of the disk.
-    room: Option<Room>,
+    quota: Option<DiskQuota>,
     flushed: Timestamp,
     synced: Timestamp,
 }
@@ -71,20 +71,20 @@ pub struct Recorder<'a> {
 /// Counts at the beginning: messages of topics in other domains, and of writers that were never
 /// announced.
 #[derive(Default)]
-struct Before {
+struct Baseline {
     topics: HashMap<(u32, String), u64>,
     unknown_writers: HashMap<String, u64>,
 }
 
 /// What was decided for a topic.
-enum Place {
+enum TopicDecision {
     /// It is in the bag.
-    Taken(Box<Taken>),
+    Recorded(Box<RecordedTopic>),
     /// The filter does not take it.
-    LeftOut,
+    Excluded,
 }
 
-struct Taken {
+struct RecordedTopic {
     id: TopicId,
     description: TopicDescription,
     /// Of each publisher by its GUID, for the description.
@@ -95,7 +95,7 @@ struct Taken {
 
 /// What became of a recording.
 #[derive(Debug)]
-pub struct Ended {
+pub struct Finished {
     /// The bag, where it could be completed.
     pub summary: Option<Summary>,
     /// What it has and has not.
@@ -112,10 +112,10 @@ impl<'a> Recorder<'a> {
         writer: Writer,
         filter: Filter,
         domain_id: u32,
-        before: Sight,
+        before: GraphSnapshot,
         sources: Sources<'a>,
     ) -> Self {
-        let Sight {
+        let GraphSnapshot {
             topics,
             unknown_writers,
         } = before;
@@ -126,7 +126,7 @@ impl<'a> Recorder<'a> {
             Some(((topic.domain_id, topic.name), messages))
         });
         Self {
-            before: Before {
+            before: Baseline {
                 topics: topics.collect(),
                 unknown_writers,
             },
@@ -140,7 +140,7 @@ impl<'a> Recorder<'a> {
             sampled: BTreeSet::new(),
             paused: false,
             ring: None,
-            room: None,
+            quota: None,
             flushed: Timestamp(0),
             synced: Timestamp(0),
         }
@@ -148,7 +148,7 @@ impl<'a> Recorder<'a> {
 
     /// Keeps the last samples in memory and writes them when [`Self::snapshot`] asks for them.
     #[must_use]
-    pub fn waiting_in(self, ring: Ring) -> Self {
+    pub fn waiting_in(self, ring: SampleRing) -> Self {
         Self {
             ring: Some(ring),
             ..self
@@ -157,9 +157,9 @@ impl<'a> Recorder<'a> {
 
     /// Ends with an error when the room is used up.
     #[must_use]
-    pub fn within(self, room: Room) -> Self {
+    pub fn within(self, quota: DiskQuota) -> Self {
         Self {
-            room: Some(room),
+            quota: Some(quota),
             ..self
         }
     }
@@ -169,7 +169,7 @@ impl<'a> Recorder<'a> {
     /// # Errors
     /// The storage takes no more.
     pub fn snapshot(&mut self) -> Result<(), Error> {
-        let waiting: Vec<_> = self.ring.iter_mut().flat_map(Ring::drain).collect();
+        let waiting: Vec<_> = self.ring.iter_mut().flat_map(SampleRing::drain).collect();
         for sample in waiting {
             self.write(&sample)?;
         }
@@ -185,17 +185,17 @@ impl<'a> Recorder<'a> {
     /// Of these topics, the published ones that it takes and that have no message yet although the
     /// reason is known: by name, the reason as in [`Report::unobserved`].
     #[must_use]
-    pub fn unobserved(&self, sight: &Sight) -> BTreeMap<String, String> {
-        let topics = sight.topics.iter();
+    pub fn unobserved(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
+        let topics = graph.topics.iter();
         let topics = topics.filter(|topic| topic.domain_id == self.domain_id && self.takes(topic));
         let topics = topics.filter_map(|topic| {
             let recorded = self.report.topics.get(&topic.name);
             if recorded.is_some_and(|topic| topic.messages > 0 || topic.paused > 0) {
                 return None;
             }
-            let why = match &topic.aside {
+            let why = match &topic.other_transport {
                 _ if !topic.subscribed => NO_SUBSCRIBER.to_owned(),
-                aside => aside.clone()?,
+                other_transport => other_transport.clone()?,
             };
             Some((topic.name.clone(), why))
         });
@@ -204,13 +204,13 @@ impl<'a> Recorder<'a> {
 
     /// What was asked for.
     #[must_use]
-    pub const fn asked(&self) -> &Asked {
-        self.filter.asked()
+    pub const fn options(&self) -> &FilterOptions {
+        self.filter.options()
     }
 
     /// Whether this topic is recorded, in whichever domain it is.
     #[must_use]
-    pub fn takes(&self, topic: &SeenTopic) -> bool {
+    pub fn takes(&self, topic: &PublishedTopic) -> bool {
         self.filter.takes(&Candidate {
             name: &topic.name,
             types: &topic.message_types,
@@ -280,11 +280,11 @@ impl<'a> Recorder<'a> {
         let mut topics: Vec<(&str, &str)> = topics.into_iter().collect();
         topics.retain(|(name, _)| !self.topics.contains_key(*name));
         let names: Vec<String> = topics.iter().map(|(name, _)| (*name).to_owned()).collect();
-        let announced = self.ask(&names);
+        let announced = self.discover(&names);
         for ((name, message_type), announced) in topics.into_iter().zip(announced) {
             let place = self.decide(name, message_type, None, &announced, false)?;
             // One that is left out may yet be published.
-            if matches!(place, Place::Taken(_)) {
+            if matches!(place, TopicDecision::Recorded(_)) {
                 self.topics.insert(name.to_owned(), place);
             }
         }
@@ -321,7 +321,7 @@ impl<'a> Recorder<'a> {
 
     /// Completes the bag. `error` is what ended it, if that was the storage.
     #[must_use]
-    pub fn finish(self, error: Option<Error>) -> Ended {
+    pub fn finish(self, error: Option<Error>) -> Finished {
         self.finish_with(error, |work| work.run().map(Some))
     }
 
@@ -331,13 +331,13 @@ impl<'a> Recorder<'a> {
         mut self,
         error: Option<Error>,
         compress: impl FnMut(FileCompression) -> Result<Option<Compressed>, Error>,
-    ) -> Ended {
+    ) -> Finished {
         if let Some(Error::Limit(limit)) = &error {
             self.report.limit_reached = Some(limit.clone());
         }
-        let sight = (self.sources.sight)();
-        self.note_what_was_sent_before(&sight);
-        self.note_what_was_not_observed(sight);
+        let graph = (self.sources.graph)();
+        self.note_what_was_sent_before(&graph);
+        self.note_what_was_not_observed(graph);
         // Before the report goes into the bag.
         self.writer.settle();
         for (topic, messages, bytes) in self.writer.unwritten() {
@@ -349,7 +349,7 @@ impl<'a> Recorder<'a> {
             Ok(summary) => (Some(summary), None),
             Err(error) => (None, Some(error)),
         };
-        Ended {
+        Finished {
             summary,
             report: self.report,
             error: error.or(close_error),
@@ -362,7 +362,7 @@ impl<'a> Recorder<'a> {
         };
         let topic = &*sample.topic;
         if self.paused {
-            if self.would_take(&topic.name) {
+            if self.accepts(&topic.name) {
                 self.report.paused(&topic.name);
             }
             return Ok(());
@@ -375,10 +375,10 @@ impl<'a> Recorder<'a> {
             *first = sample.sequence_number.min(*first);
         } else if taken.first.len() < WRITERS {
             taken.first.insert(sample.writer, sample.sequence_number);
-            self.introduce(topic, sample.writer)?;
+            self.describe_again(topic, sample.writer)?;
         }
-        if let Some(room) = &mut self.room {
-            room.take(self.writer.expected_bytes(), payload.len() as u64)?;
+        if let Some(quota) = &mut self.quota {
+            quota.take(self.writer.expected_bytes(), payload.len() as u64)?;
         }
         let sent = sample.source_timestamp.unwrap_or(sample.time);
         self.writer
@@ -396,9 +396,9 @@ impl<'a> Recorder<'a> {
         }
         let since = |before: Timestamp| now.0.abs_diff(before.0);
         if since(self.flushed) >= FLUSH
-            && let Some(room) = &self.room
+            && let Some(quota) = &self.quota
         {
-            room.check()?;
+            quota.check()?;
         }
         if since(self.synced) >= SYNC {
             (self.flushed, self.synced) = (now, now);
@@ -411,12 +411,12 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    fn would_take(&self, name: &str) -> bool {
-        !matches!(self.topics.get(name), Some(Place::LeftOut))
+    fn accepts(&self, name: &str) -> bool {
+        !matches!(self.topics.get(name), Some(TopicDecision::Excluded))
     }
 
     /// The place of a topic of which something came; `None` where it is not recorded.
-    fn place(&mut self, topic: &Topic) -> Result<Option<&mut Taken>, Error> {
+    fn place(&mut self, topic: &Topic) -> Result<Option<&mut RecordedTopic>, Error> {
         let Topic {
             name, message_type, ..
         } = topic;
@@ -424,13 +424,13 @@ impl<'a> Recorder<'a> {
             let offered = topic.offered.as_deref();
             // What the writer announced comes with its messages; the rest has to be asked for.
             let announced = match offered {
-                Some(_) if !self.filter.asked().ignore_leaf_topics => Announced::default(),
-                _ => self.ask_one(name),
+                Some(_) if !self.filter.options().ignore_leaf_topics => DiscoveredTopic::default(),
+                _ => self.discover_one(name),
             };
             let place = self.decide(name, message_type, offered, &announced, true)?;
             self.topics.insert(name.to_string(), place);
         }
-        let Some(Place::Taken(taken)) = self.topics.get_mut(&**name) else {
+        let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
         };
         // A loss may be told before the first message, and without a type.
@@ -449,17 +449,17 @@ impl<'a> Recorder<'a> {
     }
 
     /// What is announced of these topics: as many answers as there are names.
-    fn ask(&mut self, names: &[String]) -> Vec<Announced> {
+    fn discover(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
         if names.is_empty() {
             return Vec::new();
         }
         let mut announced = (self.sources.announced)(names);
-        announced.resize_with(names.len(), Announced::default);
+        announced.resize_with(names.len(), DiscoveredTopic::default);
         announced
     }
 
-    fn ask_one(&mut self, name: &str) -> Announced {
-        self.ask(&[name.to_owned()]).pop().unwrap_or_default()
+    fn discover_one(&mut self, name: &str) -> DiscoveredTopic {
+        self.discover(&[name.to_owned()]).pop().unwrap_or_default()
     }
 
     fn decide(
@@ -467,9 +467,9 @@ impl<'a> Recorder<'a> {
         name: &str,
         message_type: &str,
         offered: Option<&Offered>,
-        announced: &Announced,
+        announced: &DiscoveredTopic,
         came: bool,
-    ) -> Result<Place, Error> {
+    ) -> Result<TopicDecision, Error> {
         let known = announced
             .message_types
             .first()
@@ -483,7 +483,7 @@ impl<'a> Recorder<'a> {
             subscribed: !announced.subscriptions.is_empty(),
         };
         if !self.filter.takes(&candidate) {
-            return Ok(Place::LeftOut);
+            return Ok(TopicDecision::Excluded);
         }
         let type_hash = offered.and_then(|offered| offered.type_hash.as_ref());
         let type_hash = type_hash.map(ToString::to_string);
@@ -505,7 +505,7 @@ impl<'a> Recorder<'a> {
         description.schema = None;
         self.report.topic(name);
         self.order.push(name.to_owned());
-        Ok(Place::Taken(Box::new(Taken {
+        Ok(TopicDecision::Recorded(Box::new(RecordedTopic {
             id,
             description,
             offered,
@@ -514,8 +514,8 @@ impl<'a> Recorder<'a> {
     }
 
     /// Describes a topic again when a writer is new that offers something.
-    fn introduce(&mut self, topic: &Topic, writer: Guid) -> Result<(), Error> {
-        let (Some(offered), Some(Place::Taken(taken))) =
+    fn describe_again(&mut self, topic: &Topic, writer: Guid) -> Result<(), Error> {
+        let (Some(offered), Some(TopicDecision::Recorded(taken))) =
             (&topic.offered, self.topics.get_mut(&*topic.name))
         else {
             return Ok(());
@@ -531,14 +531,14 @@ impl<'a> Recorder<'a> {
     }
 
     /// Publishers that keep samples for late joiners, of which the first ones are not in the bag.
-    fn note_what_was_sent_before(&mut self, sight: &Sight) {
+    fn note_what_was_sent_before(&mut self, graph: &GraphSnapshot) {
         let mut names: Vec<String> = Vec::new();
-        for topic in sight
+        for topic in graph
             .topics
             .iter()
             .filter(|topic| topic.domain_id == self.domain_id)
         {
-            let Some(Place::Taken(taken)) = self.topics.get(&topic.name) else {
+            let Some(TopicDecision::Recorded(taken)) = self.topics.get(&topic.name) else {
                 continue;
             };
             let begun: HashSet<String> = taken
@@ -547,7 +547,11 @@ impl<'a> Recorder<'a> {
                 .filter(|(_, first)| **first <= 1)
                 .map(|(writer, _)| writer.to_string())
                 .collect();
-            if topic.keepers.iter().any(|keeper| !begun.contains(keeper)) {
+            if topic
+                .durable_publishers
+                .iter()
+                .any(|keeper| !begun.contains(keeper))
+            {
                 names.push(topic.name.clone());
             }
         }
@@ -556,10 +560,10 @@ impl<'a> Recorder<'a> {
     }
 
     /// What would have been taken, had it been seen, announced, or in this domain.
-    fn note_what_was_not_observed(&mut self, sight: Sight) {
+    fn note_what_was_not_observed(&mut self, graph: GraphSnapshot) {
         let mut domains: BTreeMap<u32, OtherDomain> = BTreeMap::new();
-        self.report.unobserved = self.unobserved(&sight);
-        for topic in sight.topics {
+        self.report.unobserved = self.unobserved(&graph);
+        for topic in graph.topics {
             if topic.domain_id == self.domain_id || !self.takes(&topic) {
                 continue;
             }
@@ -573,7 +577,7 @@ impl<'a> Recorder<'a> {
             }
         }
         self.report.other_domains = domains.into_values().collect();
-        for (writer, messages) in sight.unknown_writers {
+        for (writer, messages) in graph.unknown_writers {
             let before = self.before.unknown_writers.get(&writer);
             let new = messages.saturating_sub(before.copied().unwrap_or(0));
             if new > 0 {
@@ -636,7 +640,7 @@ mod tests {
         }))
     }
 
-    fn keepers() -> Announced {
+    fn durable_publishers() -> DiscoveredTopic {
         let publishers = format!(r#"[{{"guid": "{}", "qos": {KEEPER}}}]"#, writer(1));
         let json = format!(
             r#"{{"message_types": [], "type_hashes": [], "publishers": {publishers},
@@ -646,45 +650,50 @@ mod tests {
     }
 
     /// A publisher of `/tf_static` that keeps its samples.
-    fn static_transforms() -> Sight {
-        Sight {
-            topics: vec![SeenTopic {
+    fn static_transforms() -> GraphSnapshot {
+        GraphSnapshot {
+            topics: vec![PublishedTopic {
                 name: "/tf_static".to_owned(),
                 subscribed: true,
-                keepers: vec![writer(1).to_string()],
-                ..SeenTopic::default()
+                durable_publishers: vec![writer(1).to_string()],
+                ..PublishedTopic::default()
             }],
-            ..Sight::default()
+            ..GraphSnapshot::default()
         }
     }
 
-    fn recorder(directory: &std::path::Path, asked: Asked) -> Recorder<'static> {
-        recorder_of(directory, asked, Sight::default(), static_transforms())
+    fn recorder(directory: &std::path::Path, options: FilterOptions) -> Recorder<'static> {
+        recorder_of(
+            directory,
+            options,
+            GraphSnapshot::default(),
+            static_transforms(),
+        )
     }
 
     /// With what is there when it begins and when it ends.
     fn recorder_of(
         directory: &std::path::Path,
-        asked: Asked,
-        before: Sight,
-        after: Sight,
+        options: FilterOptions,
+        before: GraphSnapshot,
+        after: GraphSnapshot,
     ) -> Recorder<'static> {
         let sources = Sources {
-            sight: Box::new(move || after.clone()),
+            graph: Box::new(move || after.clone()),
             announced: Box::new(|names| {
                 let announced = names.iter().map(|name| match name.as_str() {
-                    "/tf_static" => keepers(),
-                    _ => Announced::default(),
+                    "/tf_static" => durable_publishers(),
+                    _ => DiscoveredTopic::default(),
                 });
                 announced.collect()
             }),
             schema: Box::new(|_, _| None),
         };
         let bag = Writer::create(directory, Options::default()).unwrap();
-        Recorder::new(bag, Filter::new(asked).unwrap(), 0, before, sources)
+        Recorder::new(bag, Filter::new(options).unwrap(), 0, before, sources)
     }
 
-    fn numbers(ended: &Ended) -> Vec<(String, u32)> {
+    fn numbers(ended: &Finished) -> Vec<(String, u32)> {
         let mut found = Vec::new();
         for file in &ended.summary.as_ref().unwrap().files {
             let bytes = std::fs::read(file).unwrap();
@@ -699,11 +708,11 @@ mod tests {
     #[test]
     fn what_the_filter_takes_is_in_the_bag_and_what_is_missing_in_the_report() {
         let directory = tempfile::tempdir().unwrap();
-        let asked = Asked {
+        let options = FilterOptions {
             exclude_topics: vec!["/noise".to_owned()],
-            ..Asked::everything()
+            ..FilterOptions::everything()
         };
-        let mut recorder = recorder(&directory.path().join("bag"), asked);
+        let mut recorder = recorder(&directory.path().join("bag"), options);
         for item in [sample("/a", 1), sample("/noise", 1), sample("/a", 2)] {
             recorder.take(&item).unwrap();
         }
@@ -741,9 +750,9 @@ mod tests {
             max_bytes: Some(10_000),
             ..Default::default()
         };
-        let room = Room::new(directory.path(), limits);
+        let quota = DiskQuota::new(directory.path(), limits);
         let mut recorder =
-            recorder(&directory.path().join("bag"), Asked::everything()).within(room);
+            recorder(&directory.path().join("bag"), FilterOptions::everything()).within(quota);
         let refused = (1..).find_map(|number| recorder.take(&sample("/a", number)).err());
         let ended = recorder.finish(refused);
         let limit = ended.report.limit_reached.clone().unwrap();
@@ -767,7 +776,7 @@ mod tests {
     #[test]
     fn samples_go_by_while_it_is_paused() {
         let directory = tempfile::tempdir().unwrap();
-        let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+        let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
         recorder.take(&sample("/a", 1)).unwrap();
         recorder.pause(true);
         recorder.take(&sample("/a", 2)).unwrap();
@@ -784,7 +793,7 @@ mod tests {
     #[test]
     fn a_topic_of_two_types_keeps_the_first_and_says_so() {
         let directory = tempfile::tempdir().unwrap();
-        let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+        let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
         recorder.take(&sample("/a", 1)).unwrap();
         let Item::Sample(other) = sample("/a", 2) else {
             unreachable!()
@@ -806,14 +815,14 @@ mod tests {
     fn what_publishers_sent_before_is_named_unless_it_is_there() {
         for (number, expected) in [(1, 0), (2, 1)] {
             let directory = tempfile::tempdir().unwrap();
-            let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+            let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
             recorder.take(&sample("/tf_static", number)).unwrap();
             recorder.take(&sample("/a", 2)).unwrap();
             assert_eq!(recorder.finish(None).report.sent_before.len(), expected);
         }
         // Nothing came at all: it is in the bag by its name.
         let directory = tempfile::tempdir().unwrap();
-        let mut recorder = recorder(&directory.path().join("bag"), Asked::everything());
+        let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
         let topics = [
             ("/tf_static", "tf2_msgs/msg/TFMessage"),
             ("/nobody", "std_msgs/msg/String"),
@@ -828,7 +837,7 @@ mod tests {
     fn what_came_is_on_the_disk_after_a_second_of_samples() {
         let directory = tempfile::tempdir().unwrap();
         let bag = directory.path().join("bag");
-        let mut recorder = recorder(&bag, Asked::everything());
+        let mut recorder = recorder(&bag, FilterOptions::everything());
         recorder.take(&Item::Clock(Timestamp(1))).unwrap();
         recorder.take(&sample("/a", 1)).unwrap();
         let size = || std::fs::metadata(bag.join("bag_0.mcap")).unwrap().len();
@@ -839,15 +848,16 @@ mod tests {
 
     #[test]
     fn what_was_not_observed_is_counted_from_the_beginning_of_the_recording() {
-        let topic = |domain_id, name: &str, aside: Option<&str>, messages| SeenTopic {
-            domain_id,
-            name: name.to_owned(),
-            subscribed: name != "/alone",
-            aside: aside.map(str::to_owned),
-            messages,
-            ..SeenTopic::default()
-        };
-        let sight = |writers: &[(&str, u64)], others: u64| Sight {
+        let topic =
+            |domain_id, name: &str, other_transport: Option<&str>, messages| PublishedTopic {
+                domain_id,
+                name: name.to_owned(),
+                subscribed: name != "/alone",
+                other_transport: other_transport.map(str::to_owned),
+                messages,
+                ..PublishedTopic::default()
+            };
+        let graph = |writers: &[(&str, u64)], others: u64| GraphSnapshot {
             topics: vec![
                 topic(0, "/alone", None, None),
                 topic(0, "/quiet", None, None),
@@ -863,10 +873,10 @@ mod tests {
                 .collect(),
         };
         let directory = tempfile::tempdir().unwrap();
-        let before = sight(&[("01", 5), ("02", 7)], 100);
-        let after = sight(&[("01", 5), ("02", 10), ("03", 1)], 140);
+        let before = graph(&[("01", 5), ("02", 7)], 100);
+        let after = graph(&[("01", 5), ("02", 10), ("03", 1)], 140);
         let bag = directory.path().join("bag");
-        let mut recorder = recorder_of(&bag, Asked::everything(), before, after);
+        let mut recorder = recorder_of(&bag, FilterOptions::everything(), before, after);
         recorder.take(&sample("/a", 1)).unwrap();
         let report = recorder.finish(None).report;
         let why = |name: &str| report.unobserved.get(name).map(String::as_str);

@@ -12,17 +12,18 @@ use std::time::{Duration, SystemTime};
 use jiff::Zoned;
 use tokio::sync::Notify;
 
-use super::announced::{Announced, Sight};
-use super::filter::{Asked, Filter, FilterError};
-use super::recorder::{Ended, Recorder, Sources};
+use super::disk_quota::DiskQuota;
+use super::filter::{Filter, FilterError, FilterOptions};
+use super::graph::{DiscoveredTopic, GraphSnapshot};
+use super::recorder::{Finished, Recorder, Sources};
 use super::report::Report;
-use super::room::Room;
-use super::session::{self, Going, Order};
+use super::session::{self, Activity, Command};
 use crate::config::{Limit, RecordingLimits};
 use crate::subscriptions::{
-    ChoiceError, Depth, Got, Overflow, Refused, Request, Selection, Subscription, Subscriptions,
+    ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
+    Subscriptions,
 };
-use crate::surface::{AgentEvent, Board, Place, Places};
+use crate::surface::{AgentEvent, Board, Slot, Slots};
 use ros2probe_bag::{Options, Schema, Writer};
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::Library;
@@ -46,16 +47,16 @@ pub struct Recordings {
     subscriptions: Arc<Subscriptions>,
     library: Arc<Library>,
     list: Mutex<Vec<Arc<Recording>>>,
-    places: Arc<Places>,
+    slots: Arc<Slots>,
 }
 
 /// What a client wants to be recorded.
 #[derive(Debug)]
-pub struct Wanted {
+pub struct RecordingOptions {
     /// Name of the directory; the time when it is left out.
     pub name: Option<String>,
     /// Which topics.
-    pub asked: Asked,
+    pub asked: FilterOptions,
     /// Of which domain.
     pub domain_id: u32,
     /// How it is written.
@@ -74,11 +75,11 @@ pub struct Recording {
     /// Of which domain.
     pub domain_id: u32,
     /// What is recorded.
-    pub asked: Asked,
+    pub asked: FilterOptions,
     /// When it began.
     pub began: SystemTime,
     status: Mutex<Status>,
-    orders: Mutex<Sender<Order>>,
+    commands: Mutex<Sender<Command>>,
     thread: Mutex<Option<JoinHandle<()>>>,
     over: Notify,
 }
@@ -87,7 +88,7 @@ pub struct Recording {
 #[derive(Clone, Debug, Default)]
 pub struct Status {
     /// What it is doing.
-    pub stage: Stage,
+    pub state: RecordingState,
     /// What it has and has not.
     pub report: Report,
     /// Bytes of its files.
@@ -100,7 +101,7 @@ pub struct Status {
 
 /// What a recording is doing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Stage {
+pub enum RecordingState {
     /// Taking what comes.
     #[default]
     Recording,
@@ -157,12 +158,12 @@ impl Recordings {
         subscriptions: Arc<Subscriptions>,
         library: Arc<Library>,
     ) -> Self {
-        let places = board.limits().places(Limit::Recordings);
+        let slots = board.limits().slots(Limit::Recordings);
         Self {
             directory,
             limits,
             queue_bytes,
-            places,
+            slots,
             board,
             subscriptions,
             library,
@@ -174,17 +175,17 @@ impl Recordings {
     ///
     /// # Errors
     /// It cannot be.
-    pub fn begin(&self, wanted: Wanted) -> Result<Arc<Recording>, Refusal> {
+    pub fn begin(&self, wanted: RecordingOptions) -> Result<Arc<Recording>, Refusal> {
         let filter = Filter::new(wanted.asked.clone())?;
-        let (name, directory) = self.place(wanted.name)?;
+        let (name, directory) = self.bag_directory(wanted.name)?;
         let mut list = self.list();
-        let Some(place) = self.places.take() else {
+        let Some(place) = self.slots.take() else {
             self.board.limits().reached(Limit::Recordings, 1);
-            return Err(Refusal::TooMany(self.places.cap()));
+            return Err(Refusal::TooMany(self.slots.cap()));
         };
-        let room = self.room(&directory);
-        room.check().map_err(|error| refusal(&name, error))?;
-        let before = Sight::from(self.board.state().known());
+        let quota = self.quota(&directory);
+        quota.check().map_err(|error| refusal(&name, error))?;
+        let before = GraphSnapshot::from(self.board.state().known());
         let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
         let mut options = wanted.options;
         options.storage.chunk_bytes = options.storage.chunk_bytes.min(CHUNK_BYTES);
@@ -193,7 +194,7 @@ impl Recordings {
         let writer = writer.map_err(|error| refusal(&name, error))?;
         let sources = self.sources(wanted.domain_id);
         let mut recorder =
-            Recorder::new(writer, filter, wanted.domain_id, before, sources).within(room);
+            Recorder::new(writer, filter, wanted.domain_id, before, sources).within(quota);
         recorder.pause(wanted.paused);
         let known = self.board.state();
         let covered = known.known().topics.iter().filter(|topic| {
@@ -211,7 +212,7 @@ impl Recordings {
         });
         let declared = recorder.declare(covered);
         declared.map_err(|error| refusal(&name, error))?;
-        let (give, orders) = channel();
+        let (give, commands) = channel();
         let recording = Arc::new(Recording {
             name,
             directory,
@@ -219,21 +220,21 @@ impl Recordings {
             asked: wanted.asked,
             began: SystemTime::now(),
             status: Mutex::default(),
-            orders: Mutex::new(give),
+            commands: Mutex::new(give),
             thread: Mutex::default(),
             over: Notify::new(),
         });
-        self.board.events().tell(AgentEvent::RecordingStarted {
+        self.board.events().record(AgentEvent::RecordingStarted {
             recording: recording.name.clone(),
         });
         let (worker, board) = (Arc::clone(&recording), Arc::clone(&self.board));
-        let work = move || worker.work(recorder, subscription, &orders, &board, place);
+        let work = move || worker.work(recorder, subscription, &commands, &board, place);
         let thread = std::thread::Builder::new().name("recording".to_owned());
         let thread = thread.spawn(work).map_err(|error| {
             // The bag was made just now, and nothing is in it.
             let _ = std::fs::remove_dir_all(&recording.directory);
             let reason = format!("no thread for it: {error}");
-            self.board.events().tell(AgentEvent::RecordingEnded {
+            self.board.events().record(AgentEvent::RecordingEnded {
                 recording: recording.name.clone(),
                 messages: 0,
                 missing: 0,
@@ -266,7 +267,7 @@ impl Recordings {
     pub fn finish(&self) {
         let list = self.all();
         for recording in &list {
-            recording.order(Order::Stop);
+            recording.command(Command::Stop);
         }
         for recording in list {
             let thread = locked(&recording.thread).take();
@@ -291,8 +292,8 @@ impl Recordings {
     }
 
     /// The room of a bag that is to lie there.
-    pub(super) fn room(&self, bag: &Path) -> Room {
-        Room::new(bag.parent().unwrap_or(bag), self.limits)
+    pub(super) fn quota(&self, bag: &Path) -> DiskQuota {
+        DiskQuota::new(bag.parent().unwrap_or(bag), self.limits)
     }
 
     /// Opens what `filter` takes, of one domain.
@@ -327,7 +328,7 @@ impl Recordings {
         let (board, library) = (Arc::clone(&self.board), Arc::clone(&self.library));
         let seen = Arc::clone(&self.board);
         Sources {
-            sight: Box::new(move || Sight::from(seen.state().known())),
+            graph: Box::new(move || GraphSnapshot::from(seen.state().known())),
             announced: Box::new(move |names| {
                 let state = board.state();
                 let topics = state.known().topics.iter();
@@ -336,7 +337,9 @@ impl Recordings {
                     topics.map(|topic| (topic.name.as_str(), topic)).collect();
                 let announced = names.iter().map(|name| {
                     let topic = topics.get(name.as_str());
-                    topic.map_or_else(Announced::default, |topic| Announced::from(*topic))
+                    topic.map_or_else(DiscoveredTopic::default, |topic| {
+                        DiscoveredTopic::from(*topic)
+                    })
                 });
                 announced.collect()
             }),
@@ -345,7 +348,7 @@ impl Recordings {
     }
 
     /// Name and directory, checked.
-    pub(super) fn place(&self, name: Option<String>) -> Result<(String, PathBuf), Refusal> {
+    pub(super) fn bag_directory(&self, name: Option<String>) -> Result<(String, PathBuf), Refusal> {
         let Some(directory) = &self.directory else {
             return Err(Refusal::NoDirectory);
         };
@@ -375,9 +378,9 @@ impl Recording {
     }
 
     /// Asks for something; nothing happens where it is over.
-    pub fn order(&self, order: Order) {
+    pub fn command(&self, command: Command) {
         // Nobody takes orders where it is over.
-        let _ = locked(&self.orders).send(order);
+        let _ = locked(&self.commands).send(command);
     }
 
     /// Waits until the bag is complete, but no longer than `patience`.
@@ -395,20 +398,20 @@ impl Recording {
     }
 
     fn is_over(&self) -> bool {
-        locked(&self.status).stage == Stage::Ended
+        locked(&self.status).state == RecordingState::Ended
     }
 
     fn work(
         &self,
         recorder: Recorder<'static>,
         mut subscription: Subscription,
-        orders: &Receiver<Order>,
+        commands: &Receiver<Command>,
         board: &Board,
-        place: Place,
+        slot: Slot,
     ) {
         let next = |patience| {
             let item = subscription.next_blocking(patience);
-            Ok::<_, std::convert::Infallible>(item.map_or(Got::Nothing, Got::Item))
+            Ok::<_, std::convert::Infallible>(item.map_or(NextItem::Pending, NextItem::Item))
         };
         let figures = board.recordings();
         figures.active.fetch_add(1, Ordering::Relaxed);
@@ -422,17 +425,17 @@ impl Recording {
             );
             counted = now;
         };
-        let (ended, _) = session::record(recorder, next, orders, |going| {
-            if let Going::Recording(recorder) = going {
+        let (ended, _) = session::record(recorder, next, commands, |going| {
+            if let Activity::Recording(recorder) = going {
                 count(recorder.report());
-                self.tell(recorder);
+                self.report_status(recorder);
             }
         });
         count(&ended.report);
         figures.active.fetch_sub(1, Ordering::Relaxed);
-        drop((subscription, place));
+        drop((subscription, slot));
         let error = ended.error.as_ref().map(causes);
-        board.events().tell(AgentEvent::RecordingEnded {
+        board.events().record(AgentEvent::RecordingEnded {
             recording: self.name.clone(),
             messages: ended.report.messages,
             missing: ended.report.missing,
@@ -443,12 +446,12 @@ impl Recording {
         give_back_memory();
     }
 
-    fn tell(&self, recorder: &Recorder<'_>) {
+    fn report_status(&self, recorder: &Recorder<'_>) {
         let status = Status {
-            stage: if recorder.is_paused() {
-                Stage::Paused
+            state: if recorder.is_paused() {
+                RecordingState::Paused
             } else {
-                Stage::Recording
+                RecordingState::Recording
             },
             report: recorder.report().clone(),
             file_bytes: recorder.writer().bytes(),
@@ -458,10 +461,10 @@ impl Recording {
         *locked(&self.status) = status;
     }
 
-    fn finish(&self, ended: Ended, error: Option<String>) {
+    fn finish(&self, ended: Finished, error: Option<String>) {
         let summary = ended.summary.as_ref();
         let status = Status {
-            stage: Stage::Ended,
+            state: RecordingState::Ended,
             report: ended.report,
             file_bytes: summary.map_or(0, |summary| summary.bytes),
             files: summary.map_or(0, |summary| summary.files.len()),

@@ -12,20 +12,20 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use ros2probe_wire::Timestamp;
 
-use super::recorder::{Ended, Recorder};
-use crate::subscriptions::{Got, Item};
+use super::recorder::{Finished, Recorder};
+use crate::subscriptions::{Item, NextItem};
 use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 
 /// How long orders wait at most.
 const LOOK: Duration = Duration::from_millis(100);
 /// How often whoever watches is told.
-const TELL: Duration = Duration::from_millis(500);
+const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// How long what was sent before the end is waited for.
 const FAREWELL: Duration = Duration::from_secs(2);
 
 /// What may be asked of a recording under way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Order {
+pub enum Command {
     /// Let samples go by from now on.
     Pause,
     /// Take them again.
@@ -44,7 +44,7 @@ pub enum Order {
 
 /// What a recording is doing.
 #[derive(Clone, Copy, Debug)]
-pub enum Going<'a> {
+pub enum Activity<'a> {
     /// It takes messages.
     Recording(&'a Recorder<'a>),
     /// It takes the last messages and completes the bag.
@@ -62,11 +62,11 @@ pub enum Going<'a> {
 #[derive(Default)]
 struct Compressing {
     waiting: VecDeque<FileCompression>,
-    under_way: Option<UnderWay>,
+    task: Option<CompressionTask>,
 }
 
 /// A file that is being compressed by a thread of its own.
-struct UnderWay {
+struct CompressionTask {
     thread: JoinHandle<Result<Compressed, Error>>,
     progress: Arc<Progress>,
     bytes: u64,
@@ -74,36 +74,36 @@ struct UnderWay {
 
 /// Orders and the one who listens, while the bag is being completed.
 struct Completion<'a, T> {
-    orders: &'a Receiver<Order>,
-    tell: T,
-    told: Instant,
+    commands: &'a Receiver<Command>,
+    report_activity: T,
+    reported: Instant,
     hurry: bool,
 }
 
-/// Records until it ends; the second value is why the source did, if it broke. `tell` hears of the
+/// Records until it ends; the second value is why the source did, if it broke. `report_activity` hears of the
 /// recording now and then, and whenever an order was carried out.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
-    mut next: impl FnMut(Duration) -> Result<Got, E>,
-    orders: &Receiver<Order>,
-    mut tell: impl FnMut(Going<'_>),
-) -> (Ended, Option<E>) {
+    mut next: impl FnMut(Duration) -> Result<NextItem, E>,
+    commands: &Receiver<Command>,
+    mut report_activity: impl FnMut(Activity<'_>),
+) -> (Finished, Option<E>) {
     let mut compressing = Compressing::default();
     let mut stopping: Option<(Timestamp, Instant)> = None;
     let mut hurry = false;
-    let mut told = Instant::now();
-    tell(Going::Recording(&recorder));
+    let mut reported = Instant::now();
+    report_activity(Activity::Recording(&recorder));
     let (refused, broke) = loop {
-        match carry_out(orders, &mut recorder) {
-            Ok(Carried::Nothing) => {}
-            Ok(Carried::Out) => tell(Going::Recording(&recorder)),
-            Ok(Carried::Stop) => {
+        match carry_out(commands, &mut recorder) {
+            Ok(CommandOutcome::Nothing) => {}
+            Ok(CommandOutcome::Out) => report_activity(Activity::Recording(&recorder)),
+            Ok(CommandOutcome::Stop) => {
                 if stopping.is_none() {
                     stopping = Some((now(), Instant::now() + FAREWELL));
-                    tell(Going::Completing);
+                    report_activity(Activity::Completing);
                 }
             }
-            Ok(Carried::Hurry) => {
+            Ok(CommandOutcome::Hurry) => {
                 hurry = true;
                 break (None, None);
             }
@@ -113,10 +113,10 @@ pub fn record<E>(
             Ok(got) => got,
             Err(error) => break (None, Some(error)),
         };
-        if told.elapsed() >= TELL {
-            told = Instant::now();
-            tell(Going::Recording(&recorder));
-            if let Err(error) = compressing.look(&mut recorder) {
+        if reported.elapsed() >= REPORT_INTERVAL {
+            reported = Instant::now();
+            report_activity(Activity::Recording(&recorder));
+            if let Err(error) = compressing.poll(&mut recorder) {
                 break (Some(error), None);
             }
         }
@@ -124,9 +124,9 @@ pub fn record<E>(
             break (None, None);
         }
         let item = match got {
-            Got::Item(item) => item,
-            Got::Nothing => continue,
-            Got::Gone => break (None, None),
+            NextItem::Item(item) => item,
+            NextItem::Pending => continue,
+            NextItem::Closed => break (None, None),
         };
         if let Err(error) = recorder.take(&item) {
             break (Some(error), None);
@@ -137,60 +137,63 @@ pub fn record<E>(
             _ => {}
         }
     };
-    tell(Going::Recording(&recorder));
+    report_activity(Activity::Recording(&recorder));
     let mut completion = Completion {
-        orders,
-        tell,
-        told: Instant::now(),
+        commands,
+        report_activity,
+        reported: Instant::now(),
         hurry,
     };
     let compressed = compressing.finish(&mut recorder, &mut completion);
     let refused = refused.or(compressed.err());
-    let compress = |work| match UnderWay::begin(work) {
-        Some(under_way) => under_way.wait(&mut completion),
+    let compress = |work| match CompressionTask::begin(work) {
+        Some(task) => task.wait(&mut completion),
         None => Ok(None),
     };
     (recorder.finish_with(refused, compress), broke)
 }
 
-enum Carried {
+enum CommandOutcome {
     Nothing,
     Out,
     Stop,
     Hurry,
 }
 
-fn carry_out(orders: &Receiver<Order>, recorder: &mut Recorder<'_>) -> Result<Carried, Error> {
-    let mut carried = Carried::Nothing;
+fn carry_out(
+    commands: &Receiver<Command>,
+    recorder: &mut Recorder<'_>,
+) -> Result<CommandOutcome, Error> {
+    let mut outcome = CommandOutcome::Nothing;
     loop {
-        match orders.try_recv() {
-            Ok(Order::Pause) => recorder.pause(true),
-            Ok(Order::Resume) => recorder.pause(false),
-            Ok(Order::Toggle) => recorder.pause(!recorder.is_paused()),
-            Ok(Order::Split) => recorder.split()?,
-            Ok(Order::Snapshot) => recorder.snapshot()?,
-            Ok(Order::Hurry) => return Ok(Carried::Hurry),
+        match commands.try_recv() {
+            Ok(Command::Pause) => recorder.pause(true),
+            Ok(Command::Resume) => recorder.pause(false),
+            Ok(Command::Toggle) => recorder.pause(!recorder.is_paused()),
+            Ok(Command::Split) => recorder.split()?,
+            Ok(Command::Snapshot) => recorder.snapshot()?,
+            Ok(Command::Hurry) => return Ok(CommandOutcome::Hurry),
             // Who could give orders has gone.
-            Ok(Order::Stop) | Err(TryRecvError::Disconnected) => return Ok(Carried::Stop),
-            Err(TryRecvError::Empty) => return Ok(carried),
+            Ok(Command::Stop) | Err(TryRecvError::Disconnected) => return Ok(CommandOutcome::Stop),
+            Err(TryRecvError::Empty) => return Ok(outcome),
         }
-        carried = Carried::Out;
+        outcome = CommandOutcome::Out;
     }
 }
 
 impl Compressing {
     /// Takes over what is done, and begins with what waits.
-    fn look(&mut self, recorder: &mut Recorder<'_>) -> Result<(), Error> {
-        if let Some(under_way) = &self.under_way
-            && !under_way.thread.is_finished()
+    fn poll(&mut self, recorder: &mut Recorder<'_>) -> Result<(), Error> {
+        if let Some(task) = &self.task
+            && !task.thread.is_finished()
         {
             return Ok(());
         }
-        if let Some(done) = self.under_way.take().and_then(UnderWay::join) {
+        if let Some(done) = self.task.take().and_then(CompressionTask::join) {
             recorder.compressed(&done?)?;
         }
         self.waiting.extend(recorder.take_compressions());
-        self.under_way = self.waiting.pop_front().and_then(UnderWay::begin);
+        self.task = self.waiting.pop_front().and_then(CompressionTask::begin);
         Ok(())
     }
 
@@ -198,12 +201,12 @@ impl Compressing {
     fn finish(
         &mut self,
         recorder: &mut Recorder<'_>,
-        completion: &mut Completion<'_, impl FnMut(Going<'_>)>,
+        completion: &mut Completion<'_, impl FnMut(Activity<'_>)>,
     ) -> Result<(), Error> {
         let waiting = std::mem::take(&mut self.waiting).into_iter();
-        let waiting = waiting.filter_map(UnderWay::begin);
-        for under_way in self.under_way.take().into_iter().chain(waiting) {
-            if let Some(done) = under_way.wait(completion)? {
+        let waiting = waiting.filter_map(CompressionTask::begin);
+        for task in self.task.take().into_iter().chain(waiting) {
+            if let Some(done) = task.wait(completion)? {
                 recorder.compressed(&done)?;
             }
         }
@@ -211,7 +214,7 @@ impl Compressing {
     }
 }
 
-impl UnderWay {
+impl CompressionTask {
     /// `None` without a thread: then the file stays as it is, which is no loss.
     fn begin(work: FileCompression) -> Option<Self> {
         let progress = Arc::new(Progress::default());
@@ -232,7 +235,7 @@ impl UnderWay {
     /// Waits until the file is compressed; `None` where that was given up.
     fn wait(
         self,
-        completion: &mut Completion<'_, impl FnMut(Going<'_>)>,
+        completion: &mut Completion<'_, impl FnMut(Activity<'_>)>,
     ) -> Result<Option<Compressed>, Error> {
         while !self.thread.is_finished() {
             if completion.is_hurried() {
@@ -251,16 +254,19 @@ impl UnderWay {
     }
 }
 
-impl<T: FnMut(Going<'_>)> Completion<'_, T> {
+impl<T: FnMut(Activity<'_>)> Completion<'_, T> {
     fn is_hurried(&mut self) -> bool {
-        self.hurry |= self.orders.try_iter().any(|order| order == Order::Hurry);
+        self.hurry |= self
+            .commands
+            .try_iter()
+            .any(|order| order == Command::Hurry);
         self.hurry
     }
 
     fn compressing(&mut self, done: u64, of: u64) {
-        if self.told.elapsed() >= TELL {
-            self.told = Instant::now();
-            (self.tell)(Going::Compressing { done, of });
+        if self.reported.elapsed() >= REPORT_INTERVAL {
+            self.reported = Instant::now();
+            (self.report_activity)(Activity::Compressing { done, of });
         }
     }
 }

@@ -14,10 +14,10 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::announced::Sight;
-use super::filter::{Asked, Filter};
+use super::filter::{Filter, FilterOptions};
+use super::graph::GraphSnapshot;
 use super::recorder::Recorder;
-use super::ring::Ring;
+use super::sample_ring::SampleRing;
 use super::service::{Recordings, Refusal, causes, default_name, refusal};
 use crate::config::SnapshotSettings;
 use crate::subscriptions::{Item, Selection, Subscription};
@@ -26,7 +26,7 @@ use crate::surface::{AgentEvent, Board, SnapshotFigures};
 use ros2probe_bag::{Options, Writer};
 
 /// How long orders and events wait at most.
-const LOOK: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Between two bags, at least.
 const PAUSE: Duration = Duration::from_secs(10);
 /// All bags of one snapshot together.
@@ -37,7 +37,7 @@ const EXPECTATION: &str = "ros2.topic.expectation_changed";
 
 /// A bag that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Written {
+pub struct WrittenBag {
     /// Name of its directory.
     pub name: String,
     /// Where it lies.
@@ -46,7 +46,7 @@ pub struct Written {
     pub messages: u64,
 }
 
-type Answer = oneshot::Sender<Result<Written, String>>;
+type Answer = oneshot::Sender<Result<WrittenBag, String>>;
 
 /// All snapshots of the configuration.
 #[derive(Debug, Default)]
@@ -64,11 +64,11 @@ struct Snapshot {
 }
 
 /// What its thread works with.
-struct Keeper {
+struct SnapshotTask {
     settings: SnapshotSettings,
     recordings: Arc<Recordings>,
     board: Arc<Board>,
-    ring: Ring,
+    ring: SampleRing,
     figures: SnapshotFigures,
     /// The last event that was looked at.
     event: u64,
@@ -96,11 +96,11 @@ impl Snapshots {
             let subscription = recordings.open(selection, settings.domain_id, &settings.name)?;
             let (clients, waiting) = sync_channel(CLIENTS);
             let asked = Arc::new(AtomicBool::new(false));
-            let keeper = Keeper {
+            let keeper = SnapshotTask {
                 settings: settings.clone(),
                 recordings: Arc::clone(recordings),
                 board: Arc::clone(board),
-                ring: Ring::new(settings.max_bytes, Some(settings.span)),
+                ring: SampleRing::new(settings.max_bytes, Some(settings.span)),
                 figures: SnapshotFigures::default(),
                 event: board.events().last(),
                 written: None,
@@ -127,7 +127,7 @@ impl Snapshots {
     }
 
     /// Has the one of this name written, whatever was written before; `None` = there is none.
-    pub async fn write(&self, name: &str) -> Option<Result<Written, String>> {
+    pub async fn write(&self, name: &str) -> Option<Result<WrittenBag, String>> {
         let snapshot = self.list.iter().find(|each| each.settings.name == name)?;
         let (answer, written) = oneshot::channel();
         if snapshot.clients.try_send(answer).is_err() {
@@ -157,7 +157,7 @@ impl Snapshots {
     }
 }
 
-impl Keeper {
+impl SnapshotTask {
     fn work(
         mut self,
         mut subscription: Subscription,
@@ -167,14 +167,14 @@ impl Keeper {
     ) {
         let mut looked = Instant::now();
         while !stop.load(Ordering::Relaxed) {
-            match subscription.next_blocking(LOOK) {
+            match subscription.next_blocking(POLL_INTERVAL) {
                 Some(Item::Sample(sample)) => self.ring.push(sample),
                 Some(Item::Clock(now)) => self.ring.advance(now),
                 Some(Item::Missed(_)) => {}
-                Some(Item::End(_)) => std::thread::sleep(LOOK),
+                Some(Item::End(_)) => std::thread::sleep(POLL_INTERVAL),
                 None => {}
             }
-            if looked.elapsed() < LOOK {
+            if looked.elapsed() < POLL_INTERVAL {
                 continue;
             }
             looked = Instant::now();
@@ -213,14 +213,14 @@ impl Keeper {
         violated
     }
 
-    fn write(&mut self) -> Result<Written, String> {
+    fn write(&mut self) -> Result<WrittenBag, String> {
         self.written = Some(Instant::now());
         let (name, outcome) = self.bag();
         match &outcome {
             Ok(_) => self.figures.written += 1,
             Err(_) => self.figures.failed += 1,
         }
-        self.board.events().tell(AgentEvent::SnapshotTaken {
+        self.board.events().record(AgentEvent::SnapshotTaken {
             snapshot: self.settings.name.clone(),
             recording: name,
             messages: outcome.as_ref().map_or(0, |written| written.messages),
@@ -231,7 +231,7 @@ impl Keeper {
     }
 
     /// What is kept, in a bag of its own; it stays in memory where that fails.
-    fn bag(&mut self) -> (String, Result<Written, String>) {
+    fn bag(&mut self) -> (String, Result<WrittenBag, String>) {
         let base = format!("{}_{}", self.settings.name, default_name());
         let mut wanted = base.clone();
         let directory = self.recordings.directory();
@@ -241,7 +241,7 @@ impl Keeper {
             copies += 1;
             wanted = format!("{base}_{copies}");
         }
-        let (name, directory) = match self.recordings.place(Some(wanted.clone())) {
+        let (name, directory) = match self.recordings.bag_directory(Some(wanted.clone())) {
             Ok(place) => place,
             Err(refusal) => return (wanted, Err(refusal.to_string())),
         };
@@ -252,14 +252,14 @@ impl Keeper {
             );
             return (name, Err(reason));
         }
-        let write = || -> Result<Written, Refusal> {
-            let filter = Filter::new(Asked {
+        let write = || -> Result<WrittenBag, Refusal> {
+            let filter = Filter::new(FilterOptions {
                 include_hidden_topics: true,
                 all_services: true,
-                ..Asked::everything()
+                ..FilterOptions::everything()
             })?;
-            let room = self.recordings.room(&directory);
-            room.check().map_err(|error| refusal(&name, error))?;
+            let quota = self.recordings.quota(&directory);
+            quota.check().map_err(|error| refusal(&name, error))?;
             let writer = Writer::create(&directory, Options::default());
             let writer = writer.map_err(|error| refusal(&name, error))?;
             let mut sources = self.recordings.sources(self.settings.domain_id);
@@ -267,18 +267,18 @@ impl Keeper {
             // The report is about the topics in memory, not about what else is there.
             let names = self.ring.iter().map(|sample| sample.topic.name.to_string());
             let names: HashSet<String> = names.collect();
-            let mut all = sources.sight;
-            sources.sight = Box::new(move || {
-                let mut sight = all();
-                sight.unknown_writers.clear();
-                sight
+            let mut all = sources.graph;
+            sources.graph = Box::new(move || {
+                let mut graph = all();
+                graph.unknown_writers.clear();
+                graph
                     .topics
                     .retain(|topic| topic.domain_id == domain_id && names.contains(&topic.name));
-                sight
+                graph
             });
-            let before = Sight::default();
+            let before = GraphSnapshot::default();
             let mut recorder =
-                Recorder::new(writer, filter, domain_id, before, sources).within(room);
+                Recorder::new(writer, filter, domain_id, before, sources).within(quota);
             let mut failed = None;
             for sample in self.ring.iter() {
                 if let Err(error) = recorder.take(&Item::Sample(Arc::clone(sample))) {
@@ -292,7 +292,7 @@ impl Keeper {
                     reason: causes(error),
                 });
             }
-            Ok(Written {
+            Ok(WrittenBag {
                 name: name.clone(),
                 directory: directory.clone(),
                 messages: ended.report.messages,

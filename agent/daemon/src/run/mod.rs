@@ -1,7 +1,7 @@
 //! The agent's one working thread: takes packets from the source, feeds the model, pins a snapshot
 //! to the board once a second and when a scrape asks for one. Surfaces never reach in here; they read the board.
 
-mod moment;
+mod capture_time;
 pub mod replay;
 mod source;
 
@@ -13,12 +13,12 @@ use std::time::{Duration, Instant};
 use ros2probe_wire::{GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
-use crate::state::Keeper;
+use crate::state::StateWriter;
 use crate::subscriptions::Subscriptions;
 use crate::surface::Board;
-use crate::surface::events::Drops;
+use crate::surface::events::DropMonitor;
 use crate::watches::Watches;
-pub use moment::Moment;
+pub use capture_time::CaptureTime;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
@@ -26,7 +26,7 @@ use ros2probe_model::history::History;
 use ros2probe_model::observer::Observer;
 use ros2probe_model::selection::Wish;
 use ros2probe_model::snapshot::Snapshot;
-pub use source::{Source, look};
+pub use source::{Source, probe};
 
 /// Longest time without looking at commands and the clock. Captured frames and a record ring that
 /// is half full end it earlier; each round costs a wake-up, and on a quiet host nothing else does.
@@ -58,15 +58,15 @@ pub struct Run {
     /// Participants whose last message the kernel filter notes.
     followed: BTreeSet<GuidPrefix>,
     board: Arc<Board>,
-    drops: Drops,
+    drops: DropMonitor,
     watches: Arc<Watches>,
     subscriptions: Arc<Subscriptions>,
     /// Those that subscriptions wait for to be in force.
     wishes: Option<Arc<Vec<Wish>>>,
     /// The time that subscriptions were last told.
-    told: Timestamp,
+    published_until: Timestamp,
     stop: CancellationToken,
-    keeper: Option<Keeper>,
+    keeper: Option<StateWriter>,
     history: Option<History>,
 }
 
@@ -86,11 +86,11 @@ impl Run {
             observer,
             followed: BTreeSet::new(),
             board,
-            drops: Drops::default(),
+            drops: DropMonitor::default(),
             watches,
             subscriptions,
             wishes: None,
-            told: Timestamp::default(),
+            published_until: Timestamp::default(),
             stop,
             keeper: None,
             history: None,
@@ -99,7 +99,7 @@ impl Run {
 
     /// Keeps what discovery knows for the next start.
     #[must_use]
-    pub fn keeping(self, keeper: Option<Keeper>) -> Self {
+    pub fn keeping(self, keeper: Option<StateWriter>) -> Self {
         Self { keeper, ..self }
     }
 
@@ -127,7 +127,11 @@ impl Run {
     }
 
     fn work(&mut self) -> Result<(), RunError> {
-        self.take_watches();
+        let has_asked_all = self.take_watches();
+        self.hand_over();
+        if has_asked_all {
+            self.confirm_wishes();
+        }
         self.publish();
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
@@ -145,7 +149,7 @@ impl Run {
             let bell = self.board.bell();
             let polled = self.source.poll(slice, step, bell, &mut self.observer);
             self.board.hear();
-            self.take_watches();
+            let has_asked_all = self.take_watches();
             let finished = self.source.is_finished();
             if finished {
                 if let Some(end) = self.source.cut() {
@@ -157,15 +161,18 @@ impl Run {
             }
             self.remember();
             self.hand_over();
+            if has_asked_all {
+                self.confirm_wishes();
+            }
             let age = published.elapsed();
             let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
-            let held = self.source.takes_a_rest();
+            let held = self.source.reached_pause();
             if finished || held || polled.is_err() || due {
                 self.publish();
                 published = Instant::now();
             }
             if held {
-                self.source.rest();
+                self.source.report_pause();
             }
             if finished {
                 self.board.events().settle();
@@ -186,13 +193,14 @@ impl Run {
     /// Where a replay has to stop for a moment: where subscribers are told the time, or where a
     /// second ends.
     fn step(&self, subscribed: bool) -> Option<Timestamp> {
-        let told = subscribed.then(|| Timestamp(self.told.0.saturating_add(CLOCK_NANOSECONDS)));
+        let published_until =
+            subscribed.then(|| Timestamp(self.published_until.0.saturating_add(CLOCK_NANOSECONDS)));
         let second = self.history.as_ref().map(History::due);
         // Before the first packet nothing is known of the capture's time.
         let second = second.filter(|second| second.0 > 0);
-        match (told, second) {
-            (Some(told), Some(second)) => Some(told.min(second)),
-            (told, second) => told.or(second),
+        match (published_until, second) {
+            (Some(published_until), Some(second)) => Some(published_until.min(second)),
+            (published_until, second) => published_until.or(second),
         }
     }
 
@@ -216,34 +224,37 @@ impl Run {
         self.board.events().add(output.events, now);
         self.board.add_spans(output.spans);
         let clock = self.observer.given_until(now);
-        if clock.0.saturating_add(SET_BACK) < self.told.0 {
-            self.told = clock;
+        if clock.0.saturating_add(SET_BACK) < self.published_until.0 {
+            self.published_until = clock;
         }
-        let news = (clock > self.told).then_some(clock);
-        self.told = self.told.max(clock);
+        let news = (clock > self.published_until).then_some(clock);
+        self.published_until = self.published_until.max(clock);
         self.subscriptions.deliver(output.samples, news);
     }
 
-    /// Watches and gives what is asked for since the last look. The kernel knows it before the next
-    /// packets. Where many topics are matched against many globs, packets are taken in between, and
-    /// lists that change meanwhile wait.
-    fn take_watches(&mut self) {
+    /// Gives the model changed lists of watches and wishes. Returns whether every topic was matched
+    /// against them. Where many topics meet many globs, packets are taken in between, and lists that
+    /// change meanwhile wait.
+    fn take_watches(&mut self) -> bool {
         if self.ask() {
-            if let Some(watchlist) = self.watches.take_news() {
+            if let Some(watchlist) = self.watches.take_changed() {
                 self.subscriptions.retain(watchlist.watches());
                 self.observer.input(Input::Watchlist(watchlist));
             }
-            if let Some(wishes) = self.subscriptions.take_news() {
+            if let Some(wishes) = self.subscriptions.take_changed() {
                 self.observer.input(Input::Wishes(Arc::clone(&wishes)));
                 self.wishes = Some(wishes);
             }
         }
-        let has_asked_all = self.ask();
-        self.hand_over();
-        if has_asked_all && let Some(wishes) = self.wishes.take() {
+        self.ask()
+    }
+
+    /// Confirms wishes whose verdicts the kernel has, before the next packets.
+    fn confirm_wishes(&mut self) {
+        if let Some(wishes) = self.wishes.take() {
             self.subscriptions.in_force(&wishes);
             if wishes.is_empty() {
-                // Those of large messages are gone, and it may be long until somebody asks again.
+                // Buffers of large messages are free now, and the next subscription may be far off.
                 give_back_memory();
             }
         }
@@ -281,8 +292,8 @@ impl Run {
             }
             facts.state = Some(keeper.facts());
         }
-        for drop in self.drops.look(&facts, Instant::now()) {
-            self.board.events().tell(drop);
+        for drop in self.drops.check(&facts, Instant::now()) {
+            self.board.events().record(drop);
         }
         self.board.publish(snapshot, facts);
     }

@@ -11,8 +11,8 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::Link;
 use tokio::sync::watch;
 
-use super::Moment;
-use ros2probe_capture::feed::Feed;
+use super::CaptureTime;
+use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
 use ros2probe_capture::reassembly::{Limits, Reassembly};
 use ros2probe_model::observer::Observer;
@@ -22,50 +22,54 @@ const PROGRESS: Duration = Duration::from_secs(1);
 /// A packet this far from the last one is gone to at once, not step by step.
 const FAR: u64 = 3600 * 1_000_000_000;
 
-/// While it rests, what the agent is asked is answered so often.
-const REST: Duration = Duration::from_millis(5);
+/// The polling period of requests while a replay is paused.
+const PAUSE_POLL: Duration = Duration::from_millis(5);
 
-/// Both ends of a rest that a replay takes at some moment, until it is told to go on.
+/// Both ends of a pause of a replay, which lasts until it is resumed.
 #[must_use]
-pub fn rest(at: Option<Moment>) -> (Rest, Waiter) {
-    let (go_on, told) = mpsc::channel();
-    let (resting, rests) = watch::channel(false);
-    let rest = Rest { at, told, resting };
-    (rest, Waiter { go_on, rests })
+pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
+    let (resume, resumed) = mpsc::channel();
+    let (pausing, paused) = watch::channel(false);
+    let pause = PausePoint {
+        at,
+        resumed,
+        pausing,
+    };
+    (pause, ReplayControl { resume, paused })
 }
 
 /// Where a replay waits.
 #[derive(Debug)]
-pub struct Rest {
+pub struct PausePoint {
     /// The beginning when left out.
-    at: Option<Moment>,
-    told: mpsc::Receiver<()>,
-    resting: watch::Sender<bool>,
+    at: Option<CaptureTime>,
+    resumed: mpsc::Receiver<()>,
+    pausing: watch::Sender<bool>,
 }
 
-/// Who waits for the replay's rest, and ends it.
+/// Waits for the pause of a replay, and ends it.
 #[derive(Debug)]
-pub struct Waiter {
-    go_on: mpsc::Sender<()>,
-    rests: watch::Receiver<bool>,
+pub struct ReplayControl {
+    resume: mpsc::Sender<()>,
+    paused: watch::Receiver<bool>,
 }
 
-impl Waiter {
-    /// Returns when the replay rests, or when it has ended before.
-    pub async fn rests(&mut self) {
-        let _ = self.rests.wait_for(|resting| *resting).await;
+impl ReplayControl {
+    /// Returns when the replay pauses, or when it has ended before.
+    pub async fn paused(&mut self) {
+        let _ = self.paused.wait_for(|pausing| *pausing).await;
     }
 
     /// Has the replay go on.
-    pub fn go_on(&self) {
-        let _ = self.go_on.send(());
+    pub fn resume(&self) {
+        let _ = self.resume.send(());
     }
 }
 
 /// A capture being replayed.
 pub struct Replay {
     reader: PcapReader,
-    feed: Feed,
+    decoder: FrameDecoder,
     pacer: Pacer,
     speed: Speed,
     /// Read but not due yet.
@@ -77,8 +81,8 @@ pub struct Replay {
     unsupported: BTreeMap<u16, u64>,
     began: Option<Timestamp>,
     progress: Option<Instant>,
-    until: Option<Moment>,
-    rest: Option<Rest>,
+    until: Option<CaptureTime>,
+    pause: Option<PausePoint>,
     /// The capture goes on where the replay ends.
     cut: bool,
     finished: bool,
@@ -105,7 +109,7 @@ impl Replay {
         }
         Ok(Self {
             reader,
-            feed: Feed::new(limits),
+            decoder: FrameDecoder::new(limits),
             pacer: Pacer::new(speed),
             speed,
             waiting: None,
@@ -116,7 +120,7 @@ impl Replay {
             began: None,
             progress: std::io::stderr().is_terminal().then(Instant::now),
             until: None,
-            rest: None,
+            pause: None,
             cut: false,
             finished: false,
         })
@@ -124,7 +128,7 @@ impl Replay {
 
     /// Ends at this moment, as if the capture ended there.
     #[must_use]
-    pub fn until(self, until: Option<Moment>) -> Self {
+    pub fn until(self, until: Option<CaptureTime>) -> Self {
         Self { until, ..self }
     }
 
@@ -139,9 +143,9 @@ impl Replay {
 
     /// Waits at some moment until it is told to go on.
     #[must_use]
-    pub fn resting(self, rest: Rest) -> Self {
+    pub fn pausing_at(self, pause: PausePoint) -> Self {
         Self {
-            rest: Some(rest),
+            pause: Some(pause),
             ..self
         }
     }
@@ -166,8 +170,8 @@ impl Replay {
             }
             if let Some(waiting) = &self.waiting {
                 let (time, beginning) = (waiting.time, self.began.unwrap_or_default());
-                let rest = self.rest.as_ref();
-                if rest.is_some_and(|rest| rest.at_or_behind(time, beginning)) {
+                let pause = self.pause.as_ref();
+                if pause.is_some_and(|pause| pause.at_or_behind(time, beginning)) {
                     self.wait();
                     break;
                 }
@@ -220,7 +224,7 @@ impl Replay {
                     bytes,
                     length,
                 };
-                self.feed.packet(&captured, observer);
+                self.decoder.packet(&captured, observer);
             }
             self.next()?;
         }
@@ -292,31 +296,32 @@ impl Replay {
     /// Waits a moment for being told to go on. What was asked for meanwhile is to be taken before the
     /// next packets.
     fn wait(&mut self) {
-        let Some(rest) = &self.rest else { return };
-        let begins = rest
+        let Some(pause) = &self.pause else { return };
+        let begins = pause
             .at
             .map(|moment| moment.in_capture(self.began.unwrap_or_default()));
         self.clock = self.clock.max(begins.unwrap_or_default());
-        if *rest.resting.borrow() && rest.told.recv_timeout(REST) != Err(RecvTimeoutError::Timeout)
+        if *pause.pausing.borrow()
+            && pause.resumed.recv_timeout(PAUSE_POLL) != Err(RecvTimeoutError::Timeout)
         {
-            self.rest = None;
+            self.pause = None;
         }
     }
 
     /// It has come to where it waits and nobody was told yet.
     #[must_use]
-    pub fn takes_a_rest(&self) -> bool {
+    pub fn reached_pause(&self) -> bool {
         let time = self.waiting.as_ref().map(|waiting| waiting.time);
         let beginning = self.began.unwrap_or_default();
-        time.zip(self.rest.as_ref()).is_some_and(|(time, rest)| {
-            rest.at_or_behind(time, beginning) && !*rest.resting.borrow()
+        time.zip(self.pause.as_ref()).is_some_and(|(time, pause)| {
+            pause.at_or_behind(time, beginning) && !*pause.pausing.borrow()
         })
     }
 
-    /// Tells who waits for the rest.
-    pub fn rest(&mut self) {
-        if let Some(rest) = &self.rest {
-            rest.resting.send_replace(true);
+    /// Reports the pause to its waiter.
+    pub fn report_pause(&mut self) {
+        if let Some(pause) = &self.pause {
+            pause.pausing.send_replace(true);
         }
     }
 
@@ -369,7 +374,7 @@ impl Replay {
     /// What puts its fragments together, for its counters.
     #[must_use]
     pub const fn reassembly(&self) -> &Reassembly {
-        self.feed.reassembly()
+        self.decoder.reassembly()
     }
 
     fn show_progress(&mut self) {
@@ -397,7 +402,7 @@ fn step(speed: Speed) -> Duration {
     }
 }
 
-impl Rest {
+impl PausePoint {
     fn at_or_behind(&self, time: Timestamp, beginning: Timestamp) -> bool {
         self.at.is_none_or(|at| at.in_capture(beginning) <= time)
     }

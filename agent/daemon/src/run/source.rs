@@ -15,7 +15,7 @@ use crate::config::CaptureSettings;
 use crate::surface::{
     Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
-use ros2probe_capture::host::HostTap;
+use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
@@ -34,7 +34,7 @@ pub enum Source {
 ///
 /// # Errors
 /// A capability is missing, or the kernel refuses.
-pub fn look(settings: &CaptureSettings) -> Result<AgentFacts, CaptureError> {
+pub fn probe(settings: &CaptureSettings) -> Result<AgentFacts, CaptureError> {
     let live = LiveSource::open(settings, Limits::default())?;
     Ok(Source::Live(Box::new(live)).facts())
 }
@@ -61,7 +61,7 @@ impl Source {
         if !live.is_on_the_wire() && !settings.network_namespaces.is_empty() {
             tracing::info!("capture.network_namespaces is not needed: all sockets are seen");
         }
-        for (ability, able) in inside(live).into_iter().flatten() {
+        for (ability, able) in tracepoint_abilities(live).into_iter().flatten() {
             if let Err(reason) = able {
                 tracing::warn!(ability = ability.label(), reason, "not available here");
             }
@@ -119,17 +119,17 @@ impl Source {
     }
 
     /// A replay has just come to where it waits: what is known there is to be shown.
-    pub(super) fn takes_a_rest(&self) -> bool {
+    pub(super) fn reached_pause(&self) -> bool {
         match self {
             Self::Live(_) => false,
-            Self::Replay(replay) => replay.takes_a_rest(),
+            Self::Replay(replay) => replay.reached_pause(),
         }
     }
 
     /// It is shown.
-    pub(super) fn rest(&mut self) {
+    pub(super) fn report_pause(&mut self) {
         if let Self::Replay(replay) = self {
-            replay.rest();
+            replay.report_pause();
         }
     }
 
@@ -188,7 +188,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     }));
     interfaces.extend(live.host().map(|host| InterfaceFacts {
         name: "sockets".to_owned(),
-        packets: Some(host.intake().datagrams()),
+        packets: Some(host.reader().datagrams()),
         dropped: None,
     }));
     interfaces.extend(live.messages_of_processes().map(|messages| InterfaceFacts {
@@ -259,7 +259,7 @@ fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
         open: vec![
             ("port", counters.ports),
             ("segment", counters.segments),
-            ("directory", counters.places),
+            ("directory", counters.directories),
         ],
         events: vec![
             ("announced", counters.announced),
@@ -292,7 +292,7 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     if live.host().is_some_and(HostTap::is_whole_host) {
         abilities.push(Ability::Containers);
     }
-    let inside = inside(live).into_iter().flatten();
+    let inside = tracepoint_abilities(live).into_iter().flatten();
     abilities.extend(inside.filter_map(|(ability, able)| able.is_ok().then_some(ability)));
     if live.host().is_some() && live.is_on_the_wire() {
         abilities.push(Ability::Forwarded);
@@ -313,7 +313,7 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
         let lost = Ability::ALL.into_iter().filter(|one| !able.contains(one));
         return lost.map(|ability| (ability, reason.clone())).collect();
     }
-    let inside = inside(live).into_iter().flatten();
+    let inside = tracepoint_abilities(live).into_iter().flatten();
     let mut blind: Vec<_> = inside
         .filter_map(|(ability, able)| Some((ability, able.as_ref().err()?.clone())))
         .collect();
@@ -324,7 +324,7 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
 }
 
 /// What depends on the kernel.
-fn inside(live: &LiveSource) -> Option<[(Ability, &Result<(), String>); 3]> {
+fn tracepoint_abilities(live: &LiveSource) -> Option<[(Ability, &Result<(), String>); 3]> {
     let abilities = live.host()?.abilities()?;
     Some([
         (Ability::SocketLosses, &abilities.socket_losses),

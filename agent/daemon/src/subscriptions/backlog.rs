@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
 
 use super::Item;
-use super::channel::Charge;
+use super::channel::QueuedBytes;
 
 /// Entries by their place in the order of coming.
 #[derive(Debug, Default)]
@@ -28,7 +28,7 @@ struct Entry {
     item: Item,
     bytes: usize,
     /// Given back when the entry goes.
-    _charge: Option<Arc<Charge>>,
+    _charge: Option<Arc<QueuedBytes>>,
 }
 
 /// Domain and DDS name: writers of one topic stand together.
@@ -47,7 +47,7 @@ impl Backlog {
         self.bytes
     }
 
-    pub(super) fn push(&mut self, item: Item, bytes: usize, charge: Option<Arc<Charge>>) {
+    pub(super) fn push(&mut self, item: Item, bytes: usize, charge: Option<Arc<QueuedBytes>>) {
         let place = self.places;
         self.places += 1;
         self.bytes += bytes;

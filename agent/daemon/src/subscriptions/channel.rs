@@ -28,7 +28,7 @@ const LOOK: Duration = Duration::from_millis(50);
 pub(super) struct Channel {
     id: u64,
     selection: Arc<Selection>,
-    request: Terms,
+    request: ChannelOptions,
     queue: Mutex<Queue>,
     /// Bytes in the queue, to be read without its lock.
     bytes: AtomicUsize,
@@ -40,7 +40,7 @@ pub(super) struct Channel {
 }
 
 #[derive(Debug)]
-struct Terms {
+struct ChannelOptions {
     domain_id: Option<u32>,
     depth: Depth,
     queue_bytes: usize,
@@ -62,12 +62,12 @@ struct Queue {
 
 /// Bytes that count in the sum of all queues for as long as this lives.
 #[derive(Debug)]
-pub(super) struct Charge {
+pub(super) struct QueuedBytes {
     queued: Arc<AtomicUsize>,
     bytes: usize,
 }
 
-impl Charge {
+impl QueuedBytes {
     /// For one payload, in however many queues.
     pub(super) fn new(queued: &Arc<AtomicUsize>, bytes: usize) -> Arc<Self> {
         queued.fetch_add(bytes, Ordering::Relaxed);
@@ -78,7 +78,7 @@ impl Charge {
     }
 }
 
-impl Drop for Charge {
+impl Drop for QueuedBytes {
     fn drop(&mut self) {
         self.queued.fetch_sub(self.bytes, Ordering::Relaxed);
     }
@@ -89,7 +89,7 @@ impl Channel {
         Self {
             id,
             selection: Arc::new(request.topics),
-            request: Terms {
+            request: ChannelOptions {
                 domain_id: request.domain_id,
                 depth: request.depth,
                 queue_bytes: request.queue_bytes,
@@ -151,7 +151,7 @@ impl Channel {
     pub(super) fn sample(
         &self,
         sample: &Arc<Sample>,
-        charge: Option<&Arc<Charge>>,
+        charge: Option<&Arc<QueuedBytes>>,
         stop: &CancellationToken,
     ) {
         let bytes = OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len);
@@ -295,7 +295,7 @@ impl Channel {
         queue
     }
 
-    fn push(&self, queue: &mut Queue, item: Item, bytes: usize, charge: Option<Arc<Charge>>) {
+    fn push(&self, queue: &mut Queue, item: Item, bytes: usize, charge: Option<Arc<QueuedBytes>>) {
         if queue.closed {
             return;
         }

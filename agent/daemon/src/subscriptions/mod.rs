@@ -96,13 +96,13 @@ pub enum Item {
 
 /// What came within a time.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Got {
+pub enum NextItem {
     /// Something.
     Item(Item),
     /// Nothing yet.
-    Nothing,
+    Pending,
     /// The agent hung up.
-    Gone,
+    Closed,
 }
 
 /// All subscriptions.
@@ -238,7 +238,7 @@ impl Subscriptions {
 
     /// For the capture thread: all wishes, when they have changed since the last call.
     #[must_use]
-    pub fn take_news(&self) -> Option<Arc<Vec<Wish>>> {
+    pub fn take_changed(&self) -> Option<Arc<Vec<Wish>>> {
         self.news.swap(None)
     }
 
@@ -340,8 +340,8 @@ impl Subscriptions {
                 _ => sample,
             };
             if let Some(payload) = &sample.payload {
-                let charge =
-                    charge.get_or_insert_with(|| channel::Charge::new(&self.queued, payload.len()));
+                let charge = charge
+                    .get_or_insert_with(|| channel::QueuedBytes::new(&self.queued, payload.len()));
                 channel.sample(sample, Some(charge), &self.stop);
             } else {
                 channel.sample(sample, None, &self.stop);

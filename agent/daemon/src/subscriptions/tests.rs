@@ -81,7 +81,7 @@ fn each_reader_gets_what_is_for_it_and_bytes_only_when_asked() {
     let mut arrivals = all.open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest));
     let mut payloads = all.open(request(Depth::Payloads, 1 << 16, Overflow::DropOldest));
     let (arrivals, payloads) = (arrivals.as_mut().unwrap(), payloads.as_mut().unwrap());
-    let wishes = all.take_news().unwrap();
+    let wishes = all.take_changed().unwrap();
     assert_eq!(wishes.len(), 2);
     all.deliver(
         vec![given(&[1, 2], 1, Some(5)), given(&[2], 2, Some(6))],
@@ -250,9 +250,9 @@ fn dropping_a_subscription_closes_its_interest_and_makes_room_for_another() {
     all.deliver(vec![given(&[4], 1, Some(1000))], None);
     readers.pop();
     assert_eq!((all.facts().open, all.facts().queued_bytes), (3, 0));
-    let wishes = all.take_news().unwrap();
+    let wishes = all.take_changed().unwrap();
     assert_eq!(wishes.iter().map(|wish| wish.id).max(), Some(3));
-    assert!(all.take_news().is_none());
+    assert!(all.take_changed().is_none());
     assert!(open().is_ok());
     assert_eq!(all.facts().refused, 1);
 }
@@ -294,7 +294,7 @@ async fn a_reader_is_woken_told_the_end_and_then_nothing() {
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
         .unwrap();
     assert!(!reader.in_force(Duration::from_millis(1)).await);
-    all.in_force(&all.take_news().unwrap());
+    all.in_force(&all.take_changed().unwrap());
     assert!(reader.in_force(LONG).await);
     let source = std::thread::spawn({
         let all = Arc::clone(&all);

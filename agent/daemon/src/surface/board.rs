@@ -95,7 +95,7 @@ impl Board {
     pub fn new(source: SourceKind, settings: Settings) -> Self {
         let agent = AgentFacts::new(source, Instant::now());
         let events = EventLog::new();
-        events.tell(AgentEvent::Started { source });
+        events.record(AgentEvent::Started { source });
         let reload = Reload {
             successful: true,
             last_success: SystemTime::now(),
@@ -212,7 +212,7 @@ impl Board {
     /// Pins new settings after a reload that worked.
     pub fn reloaded(&self, settings: Settings) {
         let watches = settings.watches.len();
-        self.events.tell(AgentEvent::Reloaded { watches });
+        self.events.record(AgentEvent::Reloaded { watches });
         self.settings.store(Arc::new(settings));
         let reload = Reload {
             successful: true,
@@ -224,7 +224,7 @@ impl Board {
     /// Notes that a reload was refused, and why.
     pub fn reload_failed(&self, error: &str) {
         let error = error.to_owned();
-        self.events.tell(AgentEvent::ReloadFailed { error });
+        self.events.record(AgentEvent::ReloadFailed { error });
         let last_success = self.reload.load().last_success;
         self.reload.store(Arc::new(Reload {
             successful: false,

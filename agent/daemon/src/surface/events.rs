@@ -1,17 +1,17 @@
 //! The log of events: the last ones, numbered, for any number of readers that come and go.
 //!
-//! Who tells is never held up: it appends under a lock that readers hold only to copy references.
-//! A reader keeps its own place; what was overwritten before it came is counted and told to it,
+//! A writer is never held up: it appends under a lock that readers hold only to copy references.
+//! A reader keeps its own position; what was overwritten before it came is counted and told to it,
 //! never passed over in silence. Storms are cut here: so many events of one name in a second, the
 //! rest in one number. The seconds of what happened to the robot are those of the source's clock, so
 //! that a capture gives the same events at any speed.
 //!
 //! A number belongs to one run of the agent. Written out, an id names the run too, so that after a
-//! restart nobody mistakes an old place for a new one.
+//! restart nobody mistakes an old position for a new one.
 
 mod record;
+mod self_monitor;
 mod table;
-mod watchman;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -20,15 +20,15 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 use tokio::sync::Notify;
 
-use record::Happened;
+use record::Occurrence;
 pub use record::{AgentEvent, Record, Value};
 use ros2probe_model::event::{Class, Taken};
+pub use self_monitor::{DropMonitor, SourceMonitor};
 pub use table::{Definition, EVENTS, Severity, markdown};
-pub use watchman::{Drops, Sight};
 
-const SECOND: u64 = 1_000_000_000;
 /// Events kept.
 const KEPT: usize = 4096;
 /// Events of one name in a second.
@@ -57,13 +57,13 @@ pub enum Reader {
     Otlp,
 }
 
-/// A place in some run's events.
+/// A position in some run's events.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Place {
+pub enum Position {
     /// Behind the event of this number in this run.
-    Behind(u64),
+    After(u64),
     /// In another run, or where this one never was.
-    Elsewhere,
+    Unknown,
 }
 
 /// What a reader gets.
@@ -82,7 +82,7 @@ struct Log {
     kept: VecDeque<Arc<Entry>>,
     /// Number of the latest event.
     last: u64,
-    told: BTreeMap<&'static str, u64>,
+    recorded: BTreeMap<&'static str, u64>,
     /// Of the robot, in seconds of the source's clock.
     robot: Storm,
     /// Of the agent, in seconds of its life.
@@ -94,7 +94,7 @@ struct Log {
 #[derive(Debug, Default)]
 struct Storm {
     second: u64,
-    told: BTreeMap<&'static str, u32>,
+    recorded: BTreeMap<&'static str, u32>,
     held_back: BTreeMap<&'static str, u64>,
 }
 
@@ -103,7 +103,7 @@ struct Entry {
     number: u64,
     at: Timestamp,
     observed: Timestamp,
-    happened: Happened,
+    occurrence: Occurrence,
 }
 
 impl Default for EventLog {
@@ -125,14 +125,14 @@ impl EventLog {
         }
     }
 
-    /// Tells what the model noticed until `clock`, the source's. Called with nothing too, so that a
+    /// Records what the model noticed until `clock`, the source's. Called with nothing too, so that a
     /// storm's end is told.
     pub fn add(&self, taken: Taken, clock: Timestamp) {
         let mut log = self.log();
         let before = log.last;
         for event in taken.events {
             log.turn_robot(event.at.0 / SECOND);
-            log.tell(event.at, Happened::Robot(event.kind));
+            log.record(event.at, Occurrence::Robot(event.kind));
         }
         for (class, count) in taken.overflow {
             log.hold_back(group(class), count);
@@ -146,17 +146,17 @@ impl EventLog {
         }
     }
 
-    /// Nothing more will come: tells what is still held back.
+    /// Nothing more will come: records what is still held back.
     pub fn settle(&self) {
         let mut log = self.log();
-        log.tell_held_back();
+        log.record_suppressed();
         drop(log);
         self.news.notify_waiters();
     }
 
-    /// Tells what happened to the agent just now.
-    pub fn tell(&self, event: AgentEvent) {
-        self.tell_at(event, Instant::now());
+    /// Records what happened to the agent just now.
+    pub fn record(&self, event: AgentEvent) {
+        self.record_at(event, Instant::now());
     }
 
     /// Events behind this number, oldest first, not more than so many.
@@ -215,15 +215,15 @@ impl EventLog {
 
     /// What an id means to this run; `None` = it is no id.
     #[must_use]
-    pub fn place(&self, id: &str) -> Option<Place> {
+    pub fn position(&self, id: &str) -> Option<Position> {
         let (run, number) = id.split_once('-')?;
         let run = Run(u64::from_str_radix(run, 16).ok()?);
         let number = number.parse().ok()?;
         let ours = run == self.run && number <= self.last();
         Some(if ours {
-            Place::Behind(number)
+            Position::After(number)
         } else {
-            Place::Elsewhere
+            Position::Unknown
         })
     }
 
@@ -234,14 +234,14 @@ impl EventLog {
         }
     }
 
-    /// Events told, by name, also those of which there was none.
+    /// Events recorded, by name, also those of which there was none.
     #[must_use]
-    pub fn told(&self) -> Vec<(&'static str, u64)> {
+    pub fn recorded(&self) -> Vec<(&'static str, u64)> {
         let log = self.log();
-        let told = |name: &str| log.told.get(name).copied().unwrap_or(0);
+        let recorded = |name: &str| log.recorded.get(name).copied().unwrap_or(0);
         EVENTS
             .iter()
-            .map(|event| (event.name, told(event.name)))
+            .map(|event| (event.name, recorded(event.name)))
             .collect()
     }
 
@@ -256,16 +256,16 @@ impl EventLog {
         dropped
     }
 
-    fn tell_at(&self, event: AgentEvent, now: Instant) {
+    fn record_at(&self, event: AgentEvent, now: Instant) {
         let second = now.saturating_duration_since(self.begun).as_secs();
         let mut log = self.log();
         if second > log.agent.second {
             for (event, count) in log.agent.turn(second) {
                 let suppressed = AgentEvent::Suppressed { event, count };
-                log.append(wall_clock(), Happened::Agent(suppressed));
+                log.append(wall_clock(), Occurrence::Agent(suppressed));
             }
         }
-        log.tell(wall_clock(), Happened::Agent(event));
+        log.record(wall_clock(), Occurrence::Agent(event));
         drop(log);
         self.news.notify_waiters();
     }
@@ -294,26 +294,26 @@ impl Log {
         if second == current || second.checked_add(1) == Some(current) {
             return;
         }
-        self.tell_held_back();
+        self.record_suppressed();
         self.robot.turn(second);
     }
 
-    fn tell_held_back(&mut self) {
+    fn record_suppressed(&mut self) {
         let end = Timestamp(self.robot.second.saturating_add(1).saturating_mul(SECOND));
         for (event, count) in std::mem::take(&mut self.robot.held_back) {
             let suppressed = AgentEvent::Suppressed { event, count };
-            self.append(end, Happened::Agent(suppressed));
+            self.append(end, Occurrence::Agent(suppressed));
         }
     }
 
-    fn tell(&mut self, at: Timestamp, happened: Happened) {
-        let name = happened.definition().name;
-        let storm = match happened {
-            Happened::Robot(_) => &mut self.robot,
-            Happened::Agent(_) => &mut self.agent,
+    fn record(&mut self, at: Timestamp, occurrence: Occurrence) {
+        let name = occurrence.definition().name;
+        let storm = match occurrence {
+            Occurrence::Robot(_) => &mut self.robot,
+            Occurrence::Agent(_) => &mut self.agent,
         };
         if storm.admits(name) {
-            self.append(at, happened);
+            self.append(at, occurrence);
         } else {
             self.suppressed += 1;
         }
@@ -324,9 +324,12 @@ impl Log {
         self.suppressed += count;
     }
 
-    fn append(&mut self, at: Timestamp, happened: Happened) {
+    fn append(&mut self, at: Timestamp, occurrence: Occurrence) {
         self.last += 1;
-        *self.told.entry(happened.definition().name).or_default() += 1;
+        *self
+            .recorded
+            .entry(occurrence.definition().name)
+            .or_default() += 1;
         if self.kept.len() >= KEPT {
             self.kept.pop_front();
         }
@@ -334,7 +337,7 @@ impl Log {
             number: self.last,
             at,
             observed: wall_clock(),
-            happened,
+            occurrence,
         }));
     }
 }
@@ -343,18 +346,18 @@ impl Storm {
     /// Begins this second; what the one before held back, by name.
     fn turn(&mut self, second: u64) -> BTreeMap<&'static str, u64> {
         self.second = second;
-        self.told.clear();
+        self.recorded.clear();
         std::mem::take(&mut self.held_back)
     }
 
     /// Whether there is room for an event of this name; held back otherwise.
     fn admits(&mut self, name: &'static str) -> bool {
-        let told = self.told.entry(name).or_default();
-        if *told >= MOST {
+        let recorded = self.recorded.entry(name).or_default();
+        if *recorded >= MOST {
             *self.held_back.entry(name).or_default() += 1;
             return false;
         }
-        *told += 1;
+        *recorded += 1;
         true
     }
 }
@@ -365,9 +368,9 @@ impl Entry {
             number: self.number,
             at: self.at,
             observed: self.observed,
-            definition: self.happened.definition(),
-            severity: self.happened.severity(),
-            attributes: self.happened.attributes(self.at),
+            definition: self.occurrence.definition(),
+            severity: self.occurrence.severity(),
+            attributes: self.occurrence.attributes(self.at),
         }
     }
 }

@@ -7,9 +7,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use super::board::Board;
-use super::page::Page;
+use super::collect::collect;
+use super::metric_sink::MetricSink;
 use super::text::Text;
-use super::walk::walk;
 
 /// The two text formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -99,9 +99,9 @@ impl Exposition {
     pub fn write(&self, format: Format, page: &mut impl Write) -> fmt::Result {
         let start = Instant::now();
         let last = Duration::from_nanos(self.last_scrape_nanoseconds.load(Ordering::Relaxed));
-        let mut text = Page::Text(Text::new(page, format));
-        walk(&mut text, &self.board, last)?;
-        if let Page::Text(mut text) = text {
+        let mut text = MetricSink::Text(Text::new(page, format));
+        collect(&mut text, &self.board, last)?;
+        if let MetricSink::Text(mut text) = text {
             text.end()?;
         }
         let took = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);

@@ -23,12 +23,12 @@ use tokio_util::sync::CancellationToken;
 use super::authority;
 use super::basic_auth::{self, Gate};
 use super::board::Board;
-use super::bounded::{Bounded, Refusal};
+use super::compressed_text::{Encoding, TextCompressor};
+use super::connection::Connection;
 use super::exposition::{Exposition, Format};
-use super::large::Answers;
+use super::large_responses::LargeResponses;
+use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;
-use super::pace::Connection;
-use super::packed::{Encoding, Packer};
 use super::serving::{self, Plain};
 #[cfg(feature = "tls")]
 use super::tls::Acceptor;
@@ -134,7 +134,7 @@ impl Server {
         #[cfg(not(feature = "tls"))]
         let full = Some(full);
         let listener = TcpListener::from_std(self.listener)?;
-        let listener = Bounded::new(listener, Arc::clone(&self.board), limit, full);
+        let listener = LimitedListener::new(listener, Arc::clone(&self.board), limit, full);
         let mut router = router(self.board);
         if let Some(gate) = self.gate {
             router = router.layer(middleware::from_fn_with_state(gate, basic_auth::guard));
@@ -194,7 +194,7 @@ fn router(board: Arc<Board>) -> Router {
 }
 
 /// Pages that are being made and read.
-static PAGES: Answers = Answers::new();
+static PAGES: LargeResponses = LargeResponses::new();
 
 /// The capture thread hears the bell at once, unless it has a flood of packets to read.
 const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
@@ -219,7 +219,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
         )
             .into_response();
     };
-    let mut packer = Packer::new(encoding);
+    let mut packer = TextCompressor::new(encoding);
     let written = pages.exposition.write(format, &mut packer);
     let (Ok(()), Ok(page)) = (written, packer.finish()) else {
         return StatusCode::INTERNAL_SERVER_ERROR.into_response();

@@ -1,6 +1,6 @@
 //! How far the caps of the configuration are used, and what was refused or given up because of each.
 //!
-//! Most of it the model counts in its tables anyway. What surfaces and recordings hand out (places
+//! Most of it the model counts in its tables anyway. What surfaces and recordings hand out (slots
 //! of connections, bags, watches) is counted here, where it is handed out.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -33,11 +33,11 @@ pub struct LimitFacts {
 #[derive(Debug)]
 pub struct LimitFigures {
     caps: Limits,
-    /// What is not handed out as places.
+    /// What is not handed out as slots.
     used: [AtomicU64; LIMITS],
     reached: [AtomicU64; LIMITS],
     rises: Mutex<[Rise; LIMITS]>,
-    places: Mutex<Vec<(Limit, Weak<Places>)>>,
+    slots: Mutex<Vec<(Limit, Weak<Slots>)>>,
 }
 
 /// When the count of what was refused or given up rose last.
@@ -47,17 +47,17 @@ struct Rise {
     at: Option<Instant>,
 }
 
-/// Places of which only so many can be taken at once.
+/// Slots of which only so many can be taken at once.
 #[derive(Debug)]
-pub struct Places {
+pub struct Slots {
     cap: usize,
     taken: AtomicUsize,
 }
 
-/// One place; free again when this is dropped.
+/// One slot; free again when this is dropped.
 #[derive(Debug)]
-pub struct Place {
-    of: Arc<Places>,
+pub struct Slot {
+    of: Arc<Slots>,
 }
 
 impl LimitFigures {
@@ -69,7 +69,7 @@ impl LimitFigures {
             used: std::array::from_fn(|_| AtomicU64::new(0)),
             reached: std::array::from_fn(|_| AtomicU64::new(0)),
             rises: Mutex::default(),
-            places: Mutex::default(),
+            slots: Mutex::default(),
         }
     }
 
@@ -79,23 +79,23 @@ impl LimitFigures {
         &self.caps
     }
 
-    /// As many places as `limit` allows, to whoever hands them out: a listener of several has its
+    /// As many slots as `limit` allows, to whoever hands them out: a listener of several has its
     /// own, so that who fills one does not lock the others.
     #[must_use]
-    pub fn places(&self, limit: Limit) -> Arc<Places> {
-        let places = Arc::new(Places {
+    pub fn slots(&self, limit: Limit) -> Arc<Slots> {
+        let slots = Arc::new(Slots {
             cap: self.caps.get(limit),
             taken: AtomicUsize::new(0),
         });
-        let mut all = self.places.lock().unwrap_or_else(PoisonError::into_inner);
-        all.push((limit, Arc::downgrade(&places)));
-        places
+        let mut all = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+        all.push((limit, Arc::downgrade(&slots)));
+        slots
     }
 
     /// So many are in use now.
     pub fn set_used(&self, limit: Limit, used: usize) {
-        if let Some(place) = self.used.get(limit as usize) {
-            place.store(used as u64, Ordering::Relaxed);
+        if let Some(slot) = self.used.get(limit as usize) {
+            slot.store(used as u64, Ordering::Relaxed);
         }
     }
 
@@ -192,23 +192,23 @@ impl LimitFigures {
             let count = counts.get(limit as usize);
             count.map_or(0, |count| count.load(Ordering::Relaxed))
         };
-        let all = self.places.lock().unwrap_or_else(PoisonError::into_inner);
-        let places = all.iter().filter(|(of, _)| *of == limit);
-        let taken = places.filter_map(|(_, places)| Some(places.upgrade()?.taken() as u64));
+        let all = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+        let slots = all.iter().filter(|(of, _)| *of == limit);
+        let taken = slots.filter_map(|(_, slots)| Some(slots.upgrade()?.taken() as u64));
         // The fullest of several: there the next one is refused.
         let taken = taken.max().unwrap_or(0);
         (taken.max(read(&self.used)), read(&self.reached))
     }
 }
 
-impl Places {
-    /// A place, if one is free.
-    pub fn take(self: &Arc<Self>) -> Option<Place> {
+impl Slots {
+    /// A slot, if one is free.
+    pub fn take(self: &Arc<Self>) -> Option<Slot> {
         let more = |taken| (taken < self.cap).then_some(taken + 1);
         let taken = self
             .taken
             .fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
-        taken.ok().map(|_| Place {
+        taken.ok().map(|_| Slot {
             of: Arc::clone(self),
         })
     }
@@ -224,7 +224,7 @@ impl Places {
     }
 }
 
-impl Drop for Place {
+impl Drop for Slot {
     fn drop(&mut self) {
         self.of.taken.fetch_sub(1, Ordering::Relaxed);
     }
@@ -242,14 +242,14 @@ mod tests {
             recordings: 2,
             ..Limits::default()
         });
-        let places = figures.places(Limit::Recordings);
-        let taken = [places.take().unwrap(), places.take().unwrap()];
-        assert!(places.take().is_none());
+        let slots = figures.slots(Limit::Recordings);
+        let taken = [slots.take().unwrap(), slots.take().unwrap()];
+        assert!(slots.take().is_none());
         figures.reached(Limit::Recordings, 1);
         assert_eq!(figures.own(Limit::Recordings), (2, 1));
         drop(taken);
         assert_eq!(figures.own(Limit::Recordings), (0, 1));
-        assert!(places.take().is_some());
+        assert!(slots.take().is_some());
     }
 
     #[test]
@@ -295,8 +295,8 @@ mod tests {
     fn of_several_listeners_the_fullest_one_is_shown_and_one_that_is_gone_is_not() {
         let figures = LimitFigures::new(Limits::default());
         let (one, other) = (
-            figures.places(Limit::ApiClients),
-            figures.places(Limit::ApiClients),
+            figures.slots(Limit::ApiClients),
+            figures.slots(Limit::ApiClients),
         );
         let _one = one.take().unwrap();
         let two = [other.take().unwrap(), other.take().unwrap()];

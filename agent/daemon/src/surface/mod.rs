@@ -1,34 +1,34 @@
 //! What people and machines read and write: metrics, health and the control API over HTTP, from
 //! immutable snapshots. Nothing here ever makes the capture wait.
 
-mod agent;
 pub mod agent_facts;
+mod agent_metrics;
 pub mod api;
 mod authority;
 mod basic_auth;
 pub mod board;
-mod bounded;
 pub mod catalogue;
-mod deliveries;
-mod diagnoses;
+mod collect;
+mod compressed_text;
+mod connection;
+mod delivery_metrics;
+mod diagnosis_metrics;
 pub mod events;
 pub mod exposition;
 pub mod http;
-mod large;
+mod large_responses;
 pub mod limit_facts;
+mod limited_listener;
 mod listen;
+mod metric_sink;
 pub mod otlp;
-mod pace;
-mod packed;
-mod page;
 mod process;
 pub mod recording_facts;
-mod robot;
+mod ros2_metrics;
 mod serving;
 mod text;
 #[cfg(feature = "tls")]
 mod tls;
-mod walk;
 pub mod web_config;
 
 pub use agent_facts::{
@@ -37,5 +37,5 @@ pub use agent_facts::{
 pub use board::{Board, Settings, State};
 pub use events::{AgentEvent, EventLog};
 pub use exposition::{Exposition, Format};
-pub use limit_facts::{LimitFacts, LimitFigures, Place, Places};
+pub use limit_facts::{LimitFacts, LimitFigures, Slot, Slots};
 pub use recording_facts::{RecordingFigures, SnapshotFigures};

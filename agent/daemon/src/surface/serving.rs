@@ -1,4 +1,4 @@
-//! Serving connections: HTTP/1.1 with bounded heads, each request watched by the [`Pace`] of its
+//! Serving connections: HTTP/1.1 with bounded heads, each request watched by the [`ConnectionState`] of its
 //! connection, and an orderly end.
 
 use std::convert::Infallible;
@@ -21,8 +21,8 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
-use super::bounded::Bounded;
-use super::pace::{Connection, Pace};
+use super::connection::{Connection, ConnectionState};
+use super::limited_listener::LimitedListener;
 
 /// Bytes of a request's head, and how many fields it may have.
 pub(super) const MAX_HEAD: usize = 48 << 10;
@@ -51,7 +51,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Plain {
 /// Answers every connection until `stop`, then finishes the answers that have begun. `mark` adds to
 /// each request of a connection what the routes want to know of it.
 pub(super) async fn serve<L, W, M>(
-    mut listener: Bounded<L>,
+    mut listener: LimitedListener<L>,
     wrap: W,
     router: Router,
     mark: impl Fn(&Connection<L::Io>) -> M,
@@ -69,10 +69,10 @@ pub(super) async fn serve<L, W, M>(
             () = stop.cancelled() => break,
             connection = listener.accept() => connection,
         };
-        let pace = Arc::clone(connection.pace());
+        let state = Arc::clone(connection.state());
         let mark = mark(&connection);
         let io = wrap.wrap(connection);
-        connections.spawn(answer(io, pace, router.clone(), mark, stop.clone()));
+        connections.spawn(answer(io, state, router.clone(), mark, stop.clone()));
     }
     while connections.join_next().await.is_some() {}
 }
@@ -80,27 +80,27 @@ pub(super) async fn serve<L, W, M>(
 /// The requests of one connection.
 async fn answer<M: Clone + Send + Sync + 'static>(
     io: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
-    pace: Arc<Pace>,
+    state: Arc<ConnectionState>,
     router: Router,
     mark: M,
     stop: CancellationToken,
 ) {
     let router = TowerToHyperService::new(router);
-    let paced = Arc::clone(&pace);
+    let paced = Arc::clone(&state);
     let service = service_fn(move |request: Request<Incoming>| {
-        let pace = Arc::clone(&paced);
-        pace.requested(request.body().is_end_stream());
+        let state = Arc::clone(&paced);
+        state.requested(request.body().is_end_stream());
         let mut request = request.map(|body| {
-            let pace = Arc::clone(&pace);
-            Body::new(Received { body, pace })
+            let state = Arc::clone(&state);
+            Body::new(Received { body, state })
         });
         request.extensions_mut().insert(mark.clone());
         let answer = router.call(request);
         async move {
             let answer = answer.await?;
             let length = answer.body().size_hint().exact();
-            pace.answers(length.is_some() || answer.headers().contains_key(CONTENT_LENGTH));
-            Ok::<_, Infallible>(answer.map(|body| Answered { body, pace }))
+            state.answers(length.is_some() || answer.headers().contains_key(CONTENT_LENGTH));
+            Ok::<_, Infallible>(answer.map(|body| Answered { body, state }))
         }
     });
     let connection = Builder::new()
@@ -113,29 +113,29 @@ async fn answer<M: Clone + Send + Sync + 'static>(
     tokio::select! {
         // A client that breaks off is no concern of the log.
         _ = connection.as_mut() => return,
-        () = pace.ended() => return,
+        () = state.ended() => return,
         () = stop.cancelled() => {}
     }
-    if pace.is_idle() {
+    if state.is_idle() {
         return;
     }
     connection.as_mut().graceful_shutdown();
     tokio::select! {
         _ = connection => {}
-        () = pace.ended() => {}
+        () = state.ended() => {}
     }
 }
 
 /// The body of a request; the pace hears of its end.
 struct Received {
     body: Incoming,
-    pace: Arc<Pace>,
+    state: Arc<ConnectionState>,
 }
 
 /// The body of an answer; the pace hears of its end.
 struct Answered {
     body: Body,
-    pace: Arc<Pace>,
+    state: Arc<ConnectionState>,
 }
 
 impl HttpBody for Received {
@@ -148,7 +148,7 @@ impl HttpBody for Received {
     ) -> Poll<Option<Result<Frame<Bytes>, hyper::Error>>> {
         let frame = Pin::new(&mut self.body).poll_frame(context);
         if matches!(frame, Poll::Ready(None)) || self.body.is_end_stream() {
-            self.pace.received();
+            self.state.received();
         }
         frame
     }
@@ -184,6 +184,6 @@ impl HttpBody for Answered {
 
 impl Drop for Answered {
     fn drop(&mut self) {
-        self.pace.answered();
+        self.state.answered();
     }
 }

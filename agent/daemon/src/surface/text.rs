@@ -5,7 +5,7 @@ use std::fmt::{self, Write};
 
 use super::catalogue::{Kind, Metric};
 use super::exposition::Format;
-use super::page::{Label, Number, write_capped};
+use super::metric_sink::{Label, Number, write_capped};
 use ros2probe_model::histogram::Histogram;
 
 /// A page being written.

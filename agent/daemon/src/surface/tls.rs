@@ -19,7 +19,7 @@ use tokio_rustls::rustls::{self, RootCertStore, ServerConfig};
 use tokio_rustls::server::TlsStream;
 use tokio_rustls::{Accept, TlsAcceptor};
 
-use super::pace::Connection;
+use super::connection::Connection;
 use super::serving::Wrap;
 use super::web_config::TlsFiles;
 

@@ -244,7 +244,7 @@ fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, St
             ));
         }
     };
-    let place = |length: usize| {
+    let index = |length: usize| {
         let length = i128::try_from(length).unwrap_or(i128::MAX);
         let index = if index < 0 { index + length } else { index };
         usize::try_from(index)
@@ -254,27 +254,27 @@ fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, St
     };
     Ok(match object {
         Object::Array(array) => {
-            let place = place(array.length)?;
+            let index = index(array.length)?;
             let element = match &array.items {
-                Items::Scalars(scalars) => scalars.get(place).map(Object::scalar),
+                Items::Scalars(scalars) => scalars.get(index).map(Object::scalar),
                 Items::Texts(texts) => texts
-                    .get(place)
+                    .get(index)
                     .map(|text| Object::Text(Cow::Borrowed(text))),
-                Items::Messages(messages) => messages.get(place).map(Object::Message),
+                Items::Messages(messages) => messages.get(index).map(Object::Message),
             };
             element.ok_or("index out of range")?
         }
         Object::List(items) => items
-            .get(place(items.len())?)
+            .get(index(items.len())?)
             .cloned()
             .ok_or("index out of range")?,
         Object::Bytes(bytes) => {
-            let byte = bytes.get(place(bytes.len())?).ok_or("index out of range")?;
+            let byte = bytes.get(index(bytes.len())?).ok_or("index out of range")?;
             Object::Int((*byte).into())
         }
         Object::Text(text) => {
-            let place = place(text.chars().count())?;
-            let character = text.chars().nth(place).ok_or("index out of range")?;
+            let index = index(text.chars().count())?;
+            let character = text.chars().nth(index).ok_or("index out of range")?;
             Object::Text(Cow::Owned(character.to_string()))
         }
         _ => {

@@ -1,44 +1,44 @@
 //! From words to an expression, by Python's precedence.
 
-use super::words::{Word, WordKind};
+use super::tokens::{Token, TokenKind};
 use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
 
 /// How deep parentheses, lists and signs may be nested.
 const MAX_DEPTH: usize = 32;
 
 /// The expression that all words are.
-pub(super) fn expression(words: &[Word]) -> Result<Node, FilterError> {
+pub(super) fn expression(tokens: &[Token]) -> Result<Node, FilterError> {
     let mut parser = Parser {
-        words,
+        tokens,
         position: 0,
         depth: 0,
     };
     let node = parser.or()?;
     match parser.peek() {
-        WordKind::End => Ok(node),
-        WordKind::Sign("=") => Err(parser.error("`=` assigns; `==` compares")),
+        TokenKind::End => Ok(node),
+        TokenKind::Sign("=") => Err(parser.error("`=` assigns; `==` compares")),
         _ => Err(parser.error("expected an operator or the end")),
     }
 }
 
 struct Parser<'a> {
-    words: &'a [Word],
+    tokens: &'a [Token],
     position: usize,
     depth: usize,
 }
 
 impl<'a> Parser<'a> {
-    fn peek(&self) -> &'a WordKind {
-        self.words
+    fn peek(&self) -> &'a TokenKind {
+        self.tokens
             .get(self.position)
-            .map_or(&WordKind::End, |word| &word.kind)
+            .map_or(&TokenKind::End, |token| &token.kind)
     }
 
     fn column(&self) -> usize {
-        self.words
+        self.tokens
             .get(self.position)
-            .or(self.words.last())
-            .map_or(1, |word| word.column)
+            .or(self.tokens.last())
+            .map_or(1, |token| token.column)
     }
 
     fn error(&self, message: impl Into<String>) -> FilterError {
@@ -46,13 +46,13 @@ impl<'a> Parser<'a> {
     }
 
     fn sign(&mut self, sign: &str) -> bool {
-        let found = matches!(self.peek(), WordKind::Sign(found) if *found == sign);
+        let found = matches!(self.peek(), TokenKind::Sign(found) if *found == sign);
         self.position += usize::from(found);
         found
     }
 
     fn name(&mut self, name: &str) -> bool {
-        let found = matches!(self.peek(), WordKind::Name(found) if found == name);
+        let found = matches!(self.peek(), TokenKind::Name(found) if found == name);
         self.position += usize::from(found);
         found
     }
@@ -136,16 +136,16 @@ impl<'a> Parser<'a> {
 
     fn comparison_sign(&mut self) -> Result<Option<Comparison>, FilterError> {
         let comparison = match self.peek() {
-            WordKind::Sign("<") => Comparison::Less,
-            WordKind::Sign("<=") => Comparison::LessOrEqual,
-            WordKind::Sign(">") => Comparison::Greater,
-            WordKind::Sign(">=") => Comparison::GreaterOrEqual,
-            WordKind::Sign("==") => Comparison::Equal,
-            WordKind::Sign("!=") => Comparison::NotEqual,
-            WordKind::Name(name) if name == "in" => Comparison::In,
-            WordKind::Name(name) if name == "not" => {
+            TokenKind::Sign("<") => Comparison::Less,
+            TokenKind::Sign("<=") => Comparison::LessOrEqual,
+            TokenKind::Sign(">") => Comparison::Greater,
+            TokenKind::Sign(">=") => Comparison::GreaterOrEqual,
+            TokenKind::Sign("==") => Comparison::Equal,
+            TokenKind::Sign("!=") => Comparison::NotEqual,
+            TokenKind::Name(name) if name == "in" => Comparison::In,
+            TokenKind::Name(name) if name == "not" => {
                 self.position += 1;
-                if !matches!(self.peek(), WordKind::Name(name) if name == "in") {
+                if !matches!(self.peek(), TokenKind::Name(name) if name == "in") {
                     return Err(self.error("expected `in` after `not`"));
                 }
                 Comparison::NotIn
@@ -161,8 +161,8 @@ impl<'a> Parser<'a> {
         loop {
             let column = self.column();
             let operator = match self.peek() {
-                WordKind::Sign("+") => Operator::Add,
-                WordKind::Sign("-") => Operator::Subtract,
+                TokenKind::Sign("+") => Operator::Add,
+                TokenKind::Sign("-") => Operator::Subtract,
                 _ => return Ok(left),
             };
             self.position += 1;
@@ -179,10 +179,10 @@ impl<'a> Parser<'a> {
         loop {
             let column = self.column();
             let operator = match self.peek() {
-                WordKind::Sign("*") => Operator::Multiply,
-                WordKind::Sign("/") => Operator::Divide,
-                WordKind::Sign("//") => Operator::FloorDivide,
-                WordKind::Sign("%") => Operator::Remainder,
+                TokenKind::Sign("*") => Operator::Multiply,
+                TokenKind::Sign("/") => Operator::Divide,
+                TokenKind::Sign("//") => Operator::FloorDivide,
+                TokenKind::Sign("%") => Operator::Remainder,
                 _ => return Ok(left),
             };
             self.position += 1;
@@ -229,7 +229,7 @@ impl<'a> Parser<'a> {
                 return Err(self.error(format!("nested deeper than {MAX_DEPTH} levels")));
             }
             if self.sign(".") {
-                let WordKind::Name(name) = self.peek() else {
+                let TokenKind::Name(name) = self.peek() else {
                     return Err(self.error("expected a field's name"));
                 };
                 self.position += 1;
@@ -250,7 +250,7 @@ impl<'a> Parser<'a> {
                 };
             } else if self.sign("[") {
                 let index = self.deeper(Self::or)?;
-                if matches!(self.peek(), WordKind::Sign(":")) {
+                if matches!(self.peek(), TokenKind::Sign(":")) {
                     return Err(self.error("slices are not read"));
                 }
                 self.expect("]")?;
@@ -281,19 +281,19 @@ impl<'a> Parser<'a> {
 
     fn atom(&mut self) -> Result<Node, FilterError> {
         let column = self.column();
-        let word = self.peek();
+        let token = self.peek();
         self.position += 1;
-        let kind = match word {
-            WordKind::Int(number) => Kind::Int(*number),
-            WordKind::Float(number) => Kind::Float(*number),
-            WordKind::Text(text) => Kind::Text(text.clone()),
-            WordKind::Sign("[") => Kind::List(self.deeper(|parser| parser.list("]"))?),
-            WordKind::Sign("(") => return self.deeper(|parser| parser.parenthesis(column)),
-            WordKind::Name(name) => self.named(name, column)?,
-            WordKind::Sign(sign) => {
+        let kind = match token {
+            TokenKind::Int(number) => Kind::Int(*number),
+            TokenKind::Float(number) => Kind::Float(*number),
+            TokenKind::Text(text) => Kind::Text(text.clone()),
+            TokenKind::Sign("[") => Kind::List(self.deeper(|parser| parser.list("]"))?),
+            TokenKind::Sign("(") => return self.deeper(|parser| parser.parenthesis(column)),
+            TokenKind::Name(name) => self.named(name, column)?,
+            TokenKind::Sign(sign) => {
                 return Err(FilterError::new(column, format!("unexpected `{sign}`")));
             }
-            WordKind::End => {
+            TokenKind::End => {
                 return Err(FilterError::new(
                     column,
                     "expected a value: the expression ends",

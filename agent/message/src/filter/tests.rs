@@ -162,13 +162,13 @@ fn depth_and_length_are_bounded() {
 proptest! {
     #[test]
     fn no_text_makes_it_panic(
-        words in prop::collection::vec(prop::sample::select(vec![
+        tokens in prop::collection::vec(prop::sample::select(vec![
             "m", ".x", ".n", ".name", ".names", ".three", "[", "]", "(", ")", "0", "1", "-1", "2.5",
             "'a'", "+", "-", "*", "/", "//", "%", "**", "<", "==", "in", "not", "and", "or", ",",
             "len", "abs", "sum", "max", "int", "170141183460469231731687303715884105727", "\u{e9}",
         ]), 0..24)
     ) {
-        let _ = evaluate(&words.join(" "));
-        let _ = evaluate(&words.concat());
+        let _ = evaluate(&tokens.join(" "));
+        let _ = evaluate(&tokens.concat());
     }
 }

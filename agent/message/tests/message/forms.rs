@@ -7,7 +7,7 @@ use std::io::Read as _;
 use flate2::read::GzDecoder;
 use ros2probe_message::value::{Array, Items, Message, Scalar, ScalarKind, Scalars};
 use ros2probe_message::yaml::{self, Style};
-use ros2probe_message::{Element, Field, Shape, Shown, Structure, Value, python};
+use ros2probe_message::{Element, Field, Shape, Structure, Truncation, Value, python};
 use ros2probe_wire::cursor::Endianness::Little;
 use serde::Deserialize;
 
@@ -62,10 +62,10 @@ impl Form {
             } => {
                 let differ = [
                     (python::string(string), repr),
-                    (document(string, Place::Single, Style::Block), block),
-                    (document(string, Place::Nested, Style::Flow), flow),
-                    (document(string, Place::Nested, Style::Block), nested),
-                    (document(string, Place::Listed, Style::Block), listed),
+                    (document(string, Nesting::Single, Style::Block), block),
+                    (document(string, Nesting::Nested, Style::Flow), flow),
+                    (document(string, Nesting::Nested, Style::Block), nested),
+                    (document(string, Nesting::Listed, Style::Block), listed),
                 ];
                 (0, differences(&differ))
             }
@@ -118,7 +118,7 @@ impl Form {
                     structure: &structure,
                     values,
                 };
-                let printed = yaml::document(&message, &Shown::default(), Style::Block);
+                let printed = yaml::document(&message, &Truncation::default(), Style::Block);
                 let differ = [
                     (python::float(double), repr),
                     (python::float32(short), single),
@@ -138,13 +138,13 @@ fn differences<const N: usize>(pairs: &[(String, &String); N]) -> Vec<String> {
 }
 
 #[derive(Clone, Copy)]
-enum Place {
+enum Nesting {
     Single,
     Nested,
     Listed,
 }
 
-fn document(text: &str, place: Place, style: Style) -> String {
+fn document(text: &str, nesting: Nesting, style: Style) -> String {
     let string = || Element::String { bound: None };
     let nested = || Element::Nested("a/msg/B".parse().unwrap());
     let list = structure("data", string(), Shape::Unbounded);
@@ -155,9 +155,9 @@ fn document(text: &str, place: Place, style: Style) -> String {
         structure,
         values: vec![Value::Text(Cow::Borrowed(text))],
     };
-    let message = match place {
-        Place::Single => one(&single),
-        Place::Nested => {
+    let message = match nesting {
+        Nesting::Single => one(&single),
+        Nesting::Nested => {
             let items = Items::Messages(vec![one(&single), one(&single)]);
             let array = Value::Array(Array {
                 field: &inner.fields[0],
@@ -173,7 +173,7 @@ fn document(text: &str, place: Place, style: Style) -> String {
                 values: vec![Value::Message(inner)],
             }
         }
-        Place::Listed => {
+        Nesting::Listed => {
             let items = Items::Texts(vec![Cow::Borrowed(text), Cow::Borrowed("x")]);
             let array = Value::Array(Array {
                 field: &list.fields[0],
@@ -190,7 +190,7 @@ fn document(text: &str, place: Place, style: Style) -> String {
             }
         }
     };
-    yaml::document(&message, &Shown::default(), style)
+    yaml::document(&message, &Truncation::default(), style)
 }
 
 fn structure(name: &str, element: Element, shape: Shape) -> Structure {

@@ -179,11 +179,11 @@ impl<C: Carrier> Crowd<C> {
     /// Says again all that still holds, for an observer that could not listen.
     pub fn repeat(&mut self) -> Result<()> {
         for farewell in self.farewells.clone() {
-            self.say(&farewell)?;
+            self.send(&farewell)?;
         }
         for index in 0..self.members.len() {
             for message in self.members[index].introduction() {
-                self.say(&message)?;
+                self.send(&message)?;
             }
             self.members[index].seen = Instant::now();
             self.tick(false)?;
@@ -263,7 +263,7 @@ impl<C: Carrier> Crowd<C> {
             // Held up while it renewed others, this may be too late for some.
             if member.seen.elapsed() > member.lease / 3 && !member.is_late() {
                 let message = member.announcement();
-                self.say(&message)?;
+                self.send(&message)?;
                 self.members[index].seen = Instant::now();
             }
         }
@@ -307,7 +307,7 @@ impl<C: Carrier> Crowd<C> {
         }
         member.number_endpoints();
         for message in member.introduction() {
-            self.say(&message)?;
+            self.send(&message)?;
         }
         member.seen = Instant::now();
         self.count("participant", "appeared", 1);
@@ -335,7 +335,7 @@ impl<C: Carrier> Crowd<C> {
     fn dispose(&mut self) -> Result<()> {
         if let Some(member) = self.take() {
             let message = member.disposal(SPDP_WRITER, 2, PARTICIPANT, self.dice.pick(2) == 0);
-            self.say(&message)?;
+            self.send(&message)?;
             self.farewells.push(message);
             self.count_end(&member, "disposed");
         }
@@ -384,7 +384,7 @@ impl<C: Carrier> Crowd<C> {
                 message
             }
         };
-        self.say(&message)?;
+        self.send(&message)?;
         // Whoever speaks is alive.
         self.members[index].seen = Instant::now();
         Ok(())
@@ -410,10 +410,10 @@ impl<C: Carrier> Crowd<C> {
         let member = &mut self.members[position];
         member.seen = Instant::now();
         let message = member.message(entity, self.messages[index], &payload);
-        self.say(&message)
+        self.send(&message)
     }
 
-    fn say(&mut self, message: &[u8]) -> Result<()> {
+    fn send(&mut self, message: &[u8]) -> Result<()> {
         self.due = (self.due + Duration::from_secs_f64(1.0 / PACE)).max(Instant::now());
         self.carrier.carry(message)?;
         let ahead = self.due.saturating_duration_since(Instant::now());

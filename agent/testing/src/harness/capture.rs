@@ -18,27 +18,27 @@ const BUFFER_KILOBYTES: &str = "65536";
 pub struct Capture {
     process: Process,
     path: PathBuf,
-    said: PathBuf,
+    stderr: PathBuf,
 }
 
 impl Capture {
     /// Records every frame of the host's interface into a file until [`Capture::finish`].
     pub fn start(host: &Namespace, path: &Path) -> Result<Capture> {
-        let said = path.with_extension("said");
+        let stderr = path.with_extension("said");
         let errors =
-            File::create(&said).with_context(|| format!("cannot create {}", said.display()))?;
+            File::create(&stderr).with_context(|| format!("cannot create {}", stderr.display()))?;
         let words = ["-i", INTERFACE, "-B", BUFFER_KILOBYTES, "-Z", "root", "-w"];
         let words = words.iter().map(AsRef::as_ref).chain([path.as_os_str()]);
         let process = Process::start_with(&host.inside(), "tcpdump", words, errors.into())?;
         let capture = Capture {
             process,
             path: path.to_owned(),
-            said,
+            stderr,
         };
         let deadline = Instant::now() + Duration::from_secs(30);
-        while !capture.said()?.contains("listening on") {
+        while !capture.stderr()?.contains("listening on") {
             if Instant::now() > deadline {
-                bail!("tcpdump does not begin: {}", capture.said()?);
+                bail!("tcpdump does not begin: {}", capture.stderr()?);
             }
             std::thread::sleep(Duration::from_millis(10));
         }
@@ -53,17 +53,17 @@ impl Capture {
             .process
             .wait(Duration::from_secs(30))
             .context("tcpdump")?;
-        let said = self.said()?;
+        let stderr = self.stderr()?;
         if !status.success() {
-            bail!("tcpdump ended with {status}: {said}");
+            bail!("tcpdump ended with {status}: {stderr}");
         }
-        if !said.contains("\n0 packets dropped by kernel") {
-            bail!("tcpdump missed frames: {said}");
+        if !stderr.contains("\n0 packets dropped by kernel") {
+            bail!("tcpdump missed frames: {stderr}");
         }
         Ok(self.path)
     }
 
-    fn said(&self) -> Result<String> {
-        fs::read_to_string(&self.said).context("cannot read what tcpdump says")
+    fn stderr(&self) -> Result<String> {
+        fs::read_to_string(&self.stderr).context("cannot read what tcpdump says")
     }
 }

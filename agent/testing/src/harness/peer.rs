@@ -211,7 +211,7 @@ impl Peer {
 
     /// Lets a publisher send.
     pub fn go(&mut self) -> Result<()> {
-        self.process.say("go")
+        self.process.write_line("go")
     }
 
     /// Waits until a publisher has sent everything.

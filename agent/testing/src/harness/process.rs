@@ -115,7 +115,7 @@ impl Process {
         }
     }
 
-    pub fn say(&mut self, line: &str) -> Result<()> {
+    pub fn write_line(&mut self, line: &str) -> Result<()> {
         let input = self
             .input
             .as_mut()

@@ -9,15 +9,15 @@ use std::rc::Rc;
 use proptest::prelude::*;
 use ros2probe_wire::Guid;
 use ros2probe_wire::record::{Sample, Verdict, kind};
+use ros2probe_wire::time::SECOND;
 use tempfile::TempDir;
 
+use super::super::cpu_allowance::{SAVINGS, SHARE};
+use super::super::directories::Scope;
 use super::super::image::{PortImage, SegmentImage};
-use super::super::listing::{SAVINGS, SHARE};
-use super::super::scan::Scope;
 use super::*;
 
 const MILLISECOND: u64 = 1_000_000;
-const SECOND: u64 = 1000 * MILLISECOND;
 
 fn writer() -> Guid {
     let mut bytes = [9; 16];
@@ -49,11 +49,11 @@ impl Host {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
         let directories = vec![directory.path().to_path_buf()];
-        let places = Places::new(Scope::Directories(directories));
+        let directories = ShmDirectories::new(Scope::Directories(directories));
         let calendar = Rc::new(Cell::new(SECOND));
         let clock = Rc::clone(&calendar);
-        let mut tap = Tap::new(places, move || clock.get());
-        tap.judge.set(writer(), Some(Verdict::Meter));
+        let mut tap = Tap::new(directories, move || clock.get());
+        tap.classifier.set(writer(), Some(Verdict::Meter));
         Self {
             directory,
             tap,
@@ -83,12 +83,12 @@ impl Host {
         self.now += nanoseconds;
         self.calendar.set(self.calendar.get() + nanoseconds);
         let mut found = Vec::new();
-        self.tap.look(self.now, &mut found);
+        self.tap.poll(self.now, &mut found);
         found
     }
 
     /// Lets time pass and looks; the numbers of the samples that were found.
-    fn look_after(&mut self, nanoseconds: u64) -> Vec<u64> {
+    fn poll_after(&mut self, nanoseconds: u64) -> Vec<u64> {
         let found = self.find_after(nanoseconds);
         let numbers = found.iter().filter_map(|item| match item {
             Item::Record(record) if record.kind == kind::DATA => Some(record.sequence_number),
@@ -115,12 +115,12 @@ impl Host {
 fn a_sample_that_several_ports_announce_is_found_once() {
     let mut host = Host::new();
     let (mut one, mut two, mut segment) = (host.port(7411), host.port(7413), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     let descriptor = segment.put(&sample(7));
     one.push(descriptor);
     two.push(descriptor);
-    assert_eq!(host.look_after(MILLISECOND), [7]);
-    assert_eq!(host.look_after(MILLISECOND), [0; 0]);
+    assert_eq!(host.poll_after(MILLISECOND), [7]);
+    assert_eq!(host.poll_after(MILLISECOND), [0; 0]);
     let counters = host.tap.counters();
     assert_eq!((counters.announced, counters.read), (2, 1));
     assert_eq!((counters.ports, counters.segments), (2, 1));
@@ -130,7 +130,7 @@ fn a_sample_that_several_ports_announce_is_found_once() {
 fn discovery_is_handed_on_whole_with_the_port_it_came_by() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7410), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     let mut message = sample(1);
     message[44..48].copy_from_slice(&[0, 1, 0, 0xc2]);
     port.push(segment.put(&message));
@@ -145,9 +145,9 @@ fn discovery_is_handed_on_whole_with_the_port_it_came_by() {
 #[test]
 fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
     let mut host = Host::new();
-    host.tap.judge.set(writer(), Some(Verdict::Capture));
+    host.tap.classifier.set(writer(), Some(Verdict::Capture));
     let (mut port, mut segment) = (host.port(7411), host.large_segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     // The last submessage of a message may be longer than its length field can tell: 0, to the end.
     let mut message = sample(1);
     message[34..36].fill(0);
@@ -159,7 +159,7 @@ fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
     };
     assert_eq!(bytes, &message);
     // Metered, it is one sample of that size.
-    host.tap.judge.set(writer(), Some(Verdict::Meter));
+    host.tap.classifier.set(writer(), Some(Verdict::Meter));
     port.push(segment.put(&message));
     let found = host.find_after(MILLISECOND);
     let [Item::Record(record)] = found.as_slice() else {
@@ -173,14 +173,14 @@ fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
 fn a_message_bears_the_time_after_it_was_announced_and_not_that_of_the_look_s_beginning() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     // It is sent while the look is under way already.
     let clock = Rc::clone(&host.calendar);
     host.tap.calendar = Box::new(move || clock.replace(clock.get() + 1000));
     port.push(segment.put(&sample(1)));
     let sent = host.calendar.get();
     let mut found = Vec::new();
-    host.tap.look(host.now, &mut found);
+    host.tap.poll(host.now, &mut found);
     let [Item::Record(record)] = found.as_slice() else {
         panic!("{found:?}");
     };
@@ -191,19 +191,19 @@ fn a_message_bears_the_time_after_it_was_announced_and_not_that_of_the_look_s_be
 fn while_every_message_is_wanted_a_silent_port_is_looked_at_each_time() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     host.tap.misses_nothing = true;
-    host.look_after(SILENT_AFTER + 1);
-    host.look_after(MILLISECOND);
+    host.poll_after(SILENT_AFTER + 1);
+    host.poll_after(MILLISECOND);
     let descriptor = segment.put(&sample(5));
     port.push(descriptor);
-    assert_eq!(host.look_after(MILLISECOND), [5]);
+    assert_eq!(host.poll_after(MILLISECOND), [5]);
     // One that is read tells of no participant: looks stay within the budget for readers.
-    host.tap.judge.set(writer(), Some(Verdict::Capture));
-    host.tap.met();
+    host.tap.classifier.set(writer(), Some(Verdict::Capture));
+    host.tap.take_discovery_seen();
     port.push(segment.put(&sample(6)));
     assert_eq!(host.find_after(MILLISECOND).len(), 1);
-    assert!(!host.tap.met());
+    assert!(!host.tap.take_discovery_seen());
     // Its buffer is used again before a port at rest would be looked at.
     segment.free(descriptor);
 }
@@ -243,17 +243,17 @@ fn files_of_a_killed_process_are_no_port_and_their_messages_no_traffic() {
     let locks = [port.path(host.path()), segment.path(host.path())];
     let killed = locks.each_ref().map(|path| lock_of(path, false));
     port.push(segment.put(&sample(1)));
-    assert_eq!(host.look_after(SECOND), [0; 0]);
-    assert!(!host.tap.has_ports() && !host.tap.met());
+    assert_eq!(host.poll_after(SECOND), [0; 0]);
+    assert!(!host.tap.has_ports() && !host.tap.take_discovery_seen());
     // Its port is another's now, who was sent something by one that lives.
     let mut living = host.segment(2);
     let lives = [port.path(host.path()), living.path(host.path())];
     let lives = lives.each_ref().map(|path| lock_of(path, true));
     port.push(living.put(&sample(2)));
-    assert_eq!(host.look_after(FIND_EVERY), [2]);
-    assert!(host.tap.has_ports() && host.tap.met());
+    assert_eq!(host.poll_after(FIND_EVERY), [2]);
+    assert!(host.tap.has_ports() && host.tap.take_discovery_seen());
     port.push(living.put(&sample(3)));
-    assert_eq!(host.look_after(MILLISECOND), [3]);
+    assert_eq!(host.poll_after(MILLISECOND), [3]);
     drop((killed, lives));
 }
 
@@ -264,7 +264,7 @@ fn what_one_that_lives_sent_to_the_port_of_a_killed_process_counts() {
     let _dead = lock_of(&port.path(host.path()), false);
     let _lives = lock_of(&segment.path(host.path()), true);
     port.push(segment.put(&sample(1)));
-    assert_eq!(host.look_after(SECOND), [1]);
+    assert_eq!(host.poll_after(SECOND), [1]);
     assert!(!host.tap.has_ports());
 }
 
@@ -272,11 +272,11 @@ fn what_one_that_lives_sent_to_the_port_of_a_killed_process_counts() {
 fn a_buffer_that_was_used_again_is_missed_and_not_misread() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     let descriptor = segment.put(&sample(1));
     port.push(descriptor);
     segment.free(descriptor);
-    assert_eq!(host.look_after(MILLISECOND), [0; 0]);
+    assert_eq!(host.poll_after(MILLISECOND), [0; 0]);
     assert_eq!(host.tap.counters().missed, 1);
 }
 
@@ -285,15 +285,15 @@ fn a_restarted_participants_new_files_are_taken_and_the_old_ones_let_go() {
     let mut host = Host::new();
     for round in 1..=5 {
         let (mut port, mut segment) = (host.port(7411), host.segment(1));
-        host.look_after(200 * MILLISECOND);
+        host.poll_after(200 * MILLISECOND);
         port.push(segment.put(&sample(round)));
-        assert_eq!(host.look_after(MILLISECOND), [u64::from(round)]);
+        assert_eq!(host.poll_after(MILLISECOND), [u64::from(round)]);
         assert_eq!(host.descriptors(), 2);
         // Each removes what the one before it left: the same names, other files.
         fs::remove_file(port.path(host.path())).unwrap();
         fs::remove_file(segment.path(host.path())).unwrap();
     }
-    host.look_after(200 * MILLISECOND);
+    host.poll_after(200 * MILLISECOND);
     assert_eq!(host.descriptors(), 0);
     let counters = host.tap.counters();
     assert_eq!((counters.ports, counters.segments), (0, 0));
@@ -303,17 +303,17 @@ fn a_restarted_participants_new_files_are_taken_and_the_old_ones_let_go() {
 fn a_segment_that_changes_its_owner_while_its_port_stays_is_opened_anew() {
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     port.push(segment.put(&sample(1)));
-    assert_eq!(host.look_after(MILLISECOND), [1]);
+    assert_eq!(host.poll_after(MILLISECOND), [1]);
     fs::remove_file(segment.path(host.path())).unwrap();
     let mut segment = host.segment(1);
-    host.look_after(200 * MILLISECOND);
+    host.poll_after(200 * MILLISECOND);
     port.push(segment.put(&sample(2)));
     // The new segment lays its first buffer where the old one did, with the same validity.
     segment.free(segment_descriptor(&segment, 2));
     port.push(segment.put(&sample(3)));
-    let found = host.look_after(MILLISECOND);
+    let found = host.poll_after(MILLISECOND);
     assert_eq!(found.last(), Some(&3));
 }
 
@@ -326,20 +326,20 @@ fn segment_descriptor(_: &SegmentImage, number: u32) -> Descriptor {
 fn a_port_that_is_truncated_under_us_is_let_go_and_found_again_when_it_is_whole() {
     let mut host = Host::new();
     let (port, mut segment) = (host.port(7411), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     fs::File::options()
         .write(true)
         .open(port.path(host.path()))
         .unwrap()
         .set_len(100)
         .unwrap();
-    host.look_after(MILLISECOND);
+    host.poll_after(MILLISECOND);
     assert_eq!(host.tap.counters().ports, 0);
     fs::remove_file(port.path(host.path())).unwrap();
     let mut port = host.port(7411);
-    host.look_after(200 * MILLISECOND);
+    host.poll_after(200 * MILLISECOND);
     port.push(segment.put(&sample(1)));
-    assert_eq!(host.look_after(MILLISECOND), [1]);
+    assert_eq!(host.poll_after(MILLISECOND), [1]);
     let descriptor = segment.put(&sample(2));
     fs::File::options()
         .write(true)
@@ -348,7 +348,7 @@ fn a_port_that_is_truncated_under_us_is_let_go_and_found_again_when_it_is_whole(
         .set_len(0)
         .unwrap();
     port.push(descriptor);
-    host.look_after(MILLISECOND);
+    host.poll_after(MILLISECOND);
     assert_eq!(host.tap.counters().read, 1);
 }
 
@@ -357,17 +357,17 @@ fn a_hundred_and_twenty_eight_idle_ports_are_looked_at_seldom_and_missed_by_nobo
     let mut host = Host::new();
     let mut ports: Vec<_> = (0..128).map(|index| host.port(7411 + 2 * index)).collect();
     let mut segment = host.segment(1);
-    host.look_after(SECOND);
-    host.look_after(SILENT_AFTER + 1);
-    host.look_after(MILLISECOND);
+    host.poll_after(SECOND);
+    host.poll_after(SILENT_AFTER + 1);
+    host.poll_after(MILLISECOND);
     let due = host.tap.ports.iter();
     let due = due.filter(|open| open.due <= host.now + MILLISECOND);
     assert_eq!(due.count(), 0);
     ports[77].push(segment.put(&sample(5)));
-    assert_eq!(host.look_after(SILENT_EVERY), [5]);
+    assert_eq!(host.poll_after(SILENT_EVERY), [5]);
     // From now on that one is looked at each time.
     ports[77].push(segment.put(&sample(6)));
-    assert_eq!(host.look_after(MILLISECOND), [6]);
+    assert_eq!(host.poll_after(MILLISECOND), [6]);
     assert_eq!(host.tap.counters().ports, 128);
 }
 
@@ -376,7 +376,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
     let mut host = Host::new();
     let mut flooded = PortImage::new(7400, 256, 0x100).in_directory(host.path());
     let (mut other, mut segment) = (host.port(7411), host.segment(1));
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     host.tap.is_hurried = true;
     let descriptor = segment.put(&sample(1));
     let mut found = Vec::new();
@@ -387,7 +387,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
         if round == 0 {
             other.push(segment.put(&sample(2)));
         }
-        found.extend(host.look_after(MILLISECOND));
+        found.extend(host.poll_after(MILLISECOND));
     }
     assert!(found.contains(&2), "{found:?}");
 }
@@ -398,20 +398,20 @@ fn files_that_come_and_go_without_end_cost_no_more_than_listing_may() {
     for number in 0..2000 {
         fs::write(host.path().join(format!("fastrtps_port{number}")), "").unwrap();
     }
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     let (before, began) = (thread_cpu(), host.now);
     while host.now < began + 20 * SECOND {
-        host.tap.somebody_comes();
-        host.look_after(10 * MILLISECOND);
+        host.tap.expect_participant();
+        host.poll_after(10 * MILLISECOND);
     }
     let spent = thread_cpu() - before;
     let most = SAVINGS + (host.now - began) / SHARE;
     assert!(spent < 2 * most, "{spent} {most}");
     // A new port is opened all the same, when the share allows it.
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
-    host.look_after(100 * SECOND);
+    host.poll_after(100 * SECOND);
     port.push(segment.put(&sample(5)));
-    assert_eq!(host.look_after(MILLISECOND), [5]);
+    assert_eq!(host.poll_after(MILLISECOND), [5]);
 }
 
 #[test]
@@ -424,9 +424,9 @@ fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
     std::os::unix::fs::symlink("/dev/zero", file("fastrtps_port7417")).unwrap();
     fs::write(file("fastrtps_port7419_el"), "").unwrap();
     let mut port = host.port(7421);
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     let counters = host.tap.counters();
-    assert_eq!((counters.ports, counters.places), (1, 1));
+    assert_eq!((counters.ports, counters.directories), (1, 1));
     // It announces something that is nowhere, and something in a file that is no segment.
     port.push(Descriptor {
         segment: SegmentId([2; 8]),
@@ -439,7 +439,7 @@ fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
         node: 16,
         validity: 1,
     });
-    assert_eq!(host.look_after(MILLISECOND), [0; 0]);
+    assert_eq!(host.poll_after(MILLISECOND), [0; 0]);
     let counters = host.tap.counters();
     assert_eq!((counters.unreachable, counters.malformed), (1, 1));
 }
@@ -453,7 +453,7 @@ proptest! {
         use std::os::unix::fs::FileExt as _;
         let mut host = Host::new();
         let (mut port, mut segment) = (host.port(7411), host.segment(1));
-        host.look_after(SECOND);
+        host.poll_after(SECOND);
         for (number, (in_port, at, word)) in damage.into_iter().enumerate() {
             let path = match in_port {
                 true => port.path(host.path()),
@@ -462,8 +462,8 @@ proptest! {
             let file = fs::File::options().write(true).open(path).unwrap();
             file.write_all_at(&word.to_le_bytes(), at as u64).unwrap();
             port.push(segment.put(&sample(number as u32)));
-            prop_assert!(host.look_after(MILLISECOND).len() <= 64);
-            host.look_after(200 * MILLISECOND);
+            prop_assert!(host.poll_after(MILLISECOND).len() <= 64);
+            host.poll_after(200 * MILLISECOND);
         }
         prop_assert!(host.descriptors() <= 2);
     }
@@ -473,7 +473,7 @@ proptest! {
 fn ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_other_s() {
     let mut host = Host::new();
     let crowd: Vec<_> = (0..600).map(|number| host.port(20_000 + number)).collect();
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     assert_eq!(host.tap.ports.len(), MAX_PORTS);
     assert!(host.tap.counters.left_out >= 600 - MAX_PORTS as u64);
 
@@ -481,16 +481,16 @@ fn ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_ot
     for path in [7411].map(|number| host.path().join(format!("fastrtps_port{number}"))) {
         std::os::unix::fs::chown(path, Some(64_123), None).unwrap();
     }
-    host.look_after(SECOND);
+    host.poll_after(SECOND);
     assert_eq!(host.tap.ports.len(), MAX_PORTS);
     assert!(host.tap.ports.iter().any(|open| open.key.2 == 7411));
     drop((crowd, real));
 
-    let (place, generation, _) = host.tap.ports[0].key;
+    let (directory, generation, _) = host.tap.ports[0].key;
     for number in 0..600_u64 {
         let id = number.to_be_bytes();
         host.tap
-            .open_segment((place, generation, SegmentId(id)), host.now);
+            .open_segment((directory, generation, SegmentId(id)), host.now);
     }
     assert_eq!(host.tap.segments.len(), MAX_SEGMENTS);
 }

@@ -153,7 +153,7 @@ fn a_writer_whose_messages_cannot_be_read_is_named_once() {
             .starts_with("rp: /a of writer 01.02: a message is no a/msg/B: "),
         "{first:?}"
     );
-    assert_eq!(tell(&[]), Told::default());
+    assert_eq!(tell(&[]), MessageText::default());
     assert!(tell(&payload()).out.is_some());
     assert_eq!(echo.unreadable(), 2);
 }

@@ -138,7 +138,7 @@ impl Unit {
 mod tests {
     use super::*;
 
-    const SECOND: i64 = 1_000_000_000;
+    use super::super::SECOND;
 
     #[test]
     fn the_span_goes_until_now() {

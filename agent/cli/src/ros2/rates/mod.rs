@@ -21,7 +21,7 @@ use self::table::table;
 use super::{Dialect, Refused};
 use ros2probe_model::header::begins_with_header;
 
-const SECOND: i64 = 1_000_000_000;
+const SECOND: i64 = ros2probe_wire::time::SECOND.cast_signed();
 /// Of a nanosecond, in seconds.
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.
@@ -58,15 +58,15 @@ pub struct Rates {
     /// Number and time of the newest message of each writer of which not every one is seen.
     last_sampled: HashMap<String, (u64, i64)>,
     /// Topics of which it was said that they are sampled.
-    said_sampled: HashSet<String>,
+    sampled_reported: HashSet<String>,
     /// When the next report of every second is due.
     next: Option<i64>,
-    said: Said,
+    output: Output,
 }
 
 /// Text for the two outputs.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Said {
+pub struct Output {
     /// For standard output.
     pub out: String,
     /// For standard error.
@@ -155,9 +155,9 @@ impl Rates {
             places: HashMap::new(),
             waiting: Vec::new(),
             last_sampled: HashMap::new(),
-            said_sampled: HashSet::new(),
+            sampled_reported: HashSet::new(),
             next: None,
-            said: Said::default(),
+            output: Output::default(),
         }
     }
 
@@ -172,12 +172,12 @@ impl Rates {
                 .filter(|(_, types)| self.measurable(types))
                 .collect();
             if present.is_empty() {
-                self.said.out.push_str("No topics available\n");
+                self.output.out.push_str("No topics available\n");
                 return Err(End::Idle);
             }
             let count = present.len();
             let _ = writeln!(
-                self.said.out,
+                self.output.out,
                 "Subscribing to all {count} available topics..."
             );
             for (name, _) in &present {
@@ -198,7 +198,7 @@ impl Rates {
                 Some(types) => self.appeared(&name, types)?,
                 None => {
                     let _ = writeln!(
-                        self.said.out,
+                        self.output.out,
                         "WARNING: topic [{typed}] does not appear to be published yet"
                     );
                 }
@@ -240,7 +240,7 @@ impl Rates {
         }
         watched.message_type = Some(message_type.clone());
         if many || self.quantity == Quantity::Bandwidth {
-            let _ = writeln!(self.said.out, "Subscribed to [{typed}]");
+            let _ = writeln!(self.output.out, "Subscribed to [{typed}]");
         }
         Ok(())
     }
@@ -294,9 +294,9 @@ impl Rates {
         let topic = self.topics.get_mut(place);
         if let Some(watched) = topic.filter(|_| (1..=MAX_UNSEEN).contains(&between)) {
             let is_new = !mem::replace(&mut watched.sampled, true);
-            if is_new && !self.said_sampled.contains(name) {
+            if is_new && !self.sampled_reported.contains(name) {
                 let _ = writeln!(
-                    self.said.err,
+                    self.output.err,
                     "rp: {name} is sampled in shared memory; unseen messages are counted from \
                      sequence numbers and their times estimated"
                 );
@@ -317,9 +317,9 @@ impl Rates {
     }
 
     /// That these topics are sampled was said before.
-    pub fn said_sampled<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
+    pub fn sampled_reported<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
         for name in names {
-            self.said_sampled.insert(name.to_owned());
+            self.sampled_reported.insert(name.to_owned());
         }
     }
 
@@ -351,7 +351,7 @@ impl Rates {
             Some(Series::Rate(intervals)) => {
                 intervals.arrived(arrival.time);
                 if reported_at_message && let Some(rate) = intervals.report_at_message() {
-                    self.said.out.push_str(&rate.lines());
+                    self.output.out.push_str(&rate.lines());
                 }
             }
             Some(Series::Bandwidth(sizes)) => sizes.arrived(arrival.time, arrival.size),
@@ -387,8 +387,8 @@ impl Rates {
     }
 
     /// What was said since the last time.
-    pub fn take(&mut self) -> Said {
-        mem::take(&mut self.said)
+    pub fn take(&mut self) -> Output {
+        mem::take(&mut self.output)
     }
 
     fn add(&mut self, topic: Named) {
@@ -426,7 +426,7 @@ impl Rates {
 
     fn clear(&mut self) {
         if self.all {
-            self.said.out.push_str(CLEAR);
+            self.output.out.push_str(CLEAR);
         }
     }
 
@@ -437,7 +437,7 @@ impl Rates {
             Quantity::Bandwidth => self.bandwidths(now),
             Quantity::Delay => self.delays(),
         };
-        self.said.out.push_str(&text);
+        self.output.out.push_str(&text);
     }
 
     fn rates(&mut self) -> String {
@@ -494,7 +494,7 @@ impl Rates {
                 sizes.report(now)
             };
             let report = report.unwrap_or_else(|_| {
-                self.said.err.push_str("WARNING: time is reset!\n");
+                self.output.err.push_str("WARNING: time is reset!\n");
                 None
             });
             let Some(report) = report else {

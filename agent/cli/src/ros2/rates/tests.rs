@@ -79,7 +79,7 @@ fn a_topic_that_is_not_there_is_told_once_and_waited_for() {
     assert_eq!(rates.take().out, warning);
     rates.clock(at(0));
     rates.clock(at(5000));
-    assert_eq!(rates.take(), Said::default());
+    assert_eq!(rates.take(), Output::default());
     rates.appeared("/x", &[STRING.to_owned()]).unwrap();
     rates.appeared("/x", &[STRING.to_owned()]).unwrap();
     assert_eq!(rates.take().out, "Subscribed to [x]\n");
@@ -314,12 +314,15 @@ fn what_is_not_seen_in_shared_memory_counts_by_its_numbers() {
         rates.sampled("/imu", arrival, origin).unwrap();
         rates.clock(at(time));
     }
-    let said = rates.take();
+    let output = rates.take();
     let report = "\tmin: 0.100s max: 0.100s std dev: 0.00000s window: ";
     let report = |window| format!("average rate: 10.000\n{report}{window}\n");
-    assert_eq!(said.out, report(11) + &report(21));
+    assert_eq!(output.out, report(11) + &report(21));
     assert_eq!(
-        said.err.matches("/imu is sampled in shared memory").count(),
+        output
+            .err
+            .matches("/imu is sampled in shared memory")
+            .count(),
         1
     );
 }
@@ -334,9 +337,9 @@ fn a_clock_that_was_set_is_no_flood_and_no_silence() {
     assert_eq!(rates.take().out.matches(" from 2 messages").count(), 1);
     rates.clock(at(-60_000));
     rates.clock(at(-59_000));
-    let said = rates.take();
+    let output = rates.take();
     assert_eq!(
-        (said.out.as_str(), said.err.as_str()),
+        (output.out.as_str(), output.err.as_str()),
         ("", "WARNING: time is reset!\n")
     );
     messages(&mut rates, "/imu", [-58_900, -58_800]);

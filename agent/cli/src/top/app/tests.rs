@@ -32,7 +32,7 @@ fn app() -> App {
     app.heights.topics = 10;
     assert_eq!(
         app.take(topics(&all), Instant::now()),
-        [Wish::Select(key("/a"))]
+        [Command::Select(key("/a"))]
     );
     app
 }
@@ -44,13 +44,13 @@ fn key(name: &str) -> Option<Key> {
     })
 }
 
-fn press(app: &mut App, code: KeyCode) -> Vec<Wish> {
+fn press(app: &mut App, code: KeyCode) -> Vec<Command> {
     app.key(KeyEvent::new(code, KeyModifiers::NONE))
 }
 
-fn keys(app: &mut App, keys: &str) -> Vec<Wish> {
-    let wishes = keys.chars().flat_map(|key| press(app, KeyCode::Char(key)));
-    wishes.collect()
+fn keys(app: &mut App, keys: &str) -> Vec<Command> {
+    let commands = keys.chars().flat_map(|key| press(app, KeyCode::Char(key)));
+    commands.collect()
 }
 
 fn names(app: &App) -> Vec<String> {
@@ -89,7 +89,7 @@ fn the_filter_narrows_while_it_is_typed_and_escape_undoes_it() {
     keys(&mut app, "/IMU");
     assert_eq!(names(&app), ["/d"]);
     // Keys are text now.
-    assert_eq!(keys(&mut app, "q"), [Wish::Select(None)]);
+    assert_eq!(keys(&mut app, "q"), [Command::Select(None)]);
     press(&mut app, KeyCode::Backspace);
     press(&mut app, KeyCode::Enter);
     assert_eq!(
@@ -115,24 +115,24 @@ fn the_filter_narrows_while_it_is_typed_and_escape_undoes_it() {
 #[test]
 fn the_selection_follows_its_topic_and_asks_for_details_once() {
     let mut app = app();
-    assert_eq!(press(&mut app, KeyCode::Down), [Wish::Select(key("/b"))]);
+    assert_eq!(press(&mut app, KeyCode::Down), [Command::Select(key("/b"))]);
     assert_eq!(keys(&mut app, "s"), []);
     assert_eq!(
         (app.selected.clone(), app.place_of_selected()),
         (key("/b"), Some(0))
     );
-    assert_eq!(press(&mut app, KeyCode::End), [Wish::Select(key("/d"))]);
+    assert_eq!(press(&mut app, KeyCode::End), [Command::Select(key("/d"))]);
     assert_eq!(press(&mut app, KeyCode::Down), []);
-    assert_eq!(press(&mut app, KeyCode::Home), [Wish::Select(key("/b"))]);
+    assert_eq!(press(&mut app, KeyCode::Home), [Command::Select(key("/b"))]);
     // It goes: the one in its place is selected.
     let left = json!([{"name": "/c", "dds_name": "rt/c"}]);
     assert_eq!(
         app.take(topics(&left), Instant::now()),
-        [Wish::Select(key("/c"))]
+        [Command::Select(key("/c"))]
     );
     assert_eq!(
         app.take(topics(&json!([])), Instant::now()),
-        [Wish::Select(None)]
+        [Command::Select(None)]
     );
 }
 
@@ -155,9 +155,9 @@ fn w_and_capital_w_ask_for_the_selected_topic() {
     let (key, name) = (key("/d").unwrap(), "/d".to_owned());
     assert_eq!(
         keys(&mut app, "w"),
-        [Wish::Toggle(key.clone(), name.clone())]
+        [Command::Toggle(key.clone(), name.clone())]
     );
-    assert_eq!(keys(&mut app, "W"), [Wish::Keep(key, name)]);
+    assert_eq!(keys(&mut app, "W"), [Command::Keep(key, name)]);
     app.take(topics(&json!([])), Instant::now());
     assert_eq!(keys(&mut app, "wW"), []);
 }
@@ -168,12 +168,12 @@ fn quitting_works_from_everywhere() {
     for state in ["", "?", "/text", "e", "d"] {
         let mut app = app();
         keys(&mut app, state);
-        assert_eq!(app.key(control_c), [Wish::Quit], "{state}");
+        assert_eq!(app.key(control_c), [Command::Quit], "{state}");
     }
     for state in ["", "?", "e"] {
         let mut app = app();
         keys(&mut app, state);
-        assert_eq!(keys(&mut app, "q"), [Wish::Quit], "{state}");
+        assert_eq!(keys(&mut app, "q"), [Command::Quit], "{state}");
     }
 }
 

@@ -12,7 +12,7 @@ use super::super::facts::{Health, Topics};
 use super::super::row::{Column, Key};
 use super::*;
 
-const ASCII: Look = Look {
+const ASCII: Theme = Theme {
     unicode: false,
     colours: false,
 };
@@ -171,11 +171,11 @@ fn press(app: &mut App, keys: &str) {
 }
 
 /// The screen as text, without what is empty at the end of lines.
-fn screen(app: &mut App, size: (u16, u16), look: Look, now: Instant) -> String {
+fn screen(app: &mut App, size: (u16, u16), theme: Theme, now: Instant) -> String {
     let mut terminal = Terminal::new(TestBackend::new(size.0, size.1)).unwrap();
     // Twice: what is known of the panes' sizes comes with the first time.
     for _ in 0..2 {
-        terminal.draw(|frame| draw(app, frame, look, now)).unwrap();
+        terminal.draw(|frame| draw(app, frame, theme, now)).unwrap();
     }
     let buffer = terminal.backend().buffer();
     let mut text = String::new();
@@ -220,15 +220,15 @@ fn the_screens_are_as_they_were_looked_at() {
     };
     let imu = robot().topics.swap_remove(0);
     shown.selected = Some(key.clone());
-    shown.holds.insert(key.clone(), Hold::Here);
+    shown.holds.insert(key.clone(), MeasuredBy::Session);
     press(&mut shown, "\ne");
     shown.take(Fact::Details(key, Some(Box::new(imu))), now);
     compare("details-80x24", &screen(&mut shown, (80, 24), ASCII, now));
-    let look = Look {
+    let theme = Theme {
         unicode: true,
         colours: true,
     };
-    compare("details-120x40", &screen(&mut shown, (120, 40), look, now));
+    compare("details-120x40", &screen(&mut shown, (120, 40), theme, now));
     press(&mut shown, "\tz");
     compare("zoomed-80x24", &screen(&mut shown, (80, 24), ASCII, now));
 }
@@ -281,7 +281,7 @@ fn nothing_from_the_network_reaches_the_terminal_unescaped() {
     shown.selected = Some(key.clone());
     press(&mut shown, "\ne");
     shown.take(Fact::Details(key, Some(Box::new(hostile))), now);
-    shown.take(Fact::Said("\u{1b}[5m".to_owned()), now);
+    shown.take(Fact::Status("\u{1b}[5m".to_owned()), now);
     for size in [(80, 24), (200, 60)] {
         let text = screen(&mut shown, size, ASCII, now);
         let is_plain = |each: char| (' '..='~').contains(&each) || each == '\n';
@@ -311,10 +311,10 @@ fn no_colour_is_used_where_none_is_wanted() {
     let mut shown = app(now);
     press(&mut shown, "e");
     for (colours, is_coloured) in [(false, false), (true, true)] {
-        let look = Look { colours, ..ASCII };
+        let theme = Theme { colours, ..ASCII };
         let mut terminal = Terminal::new(TestBackend::new(80, 24)).unwrap();
         terminal
-            .draw(|frame| draw(&mut shown, frame, look, now))
+            .draw(|frame| draw(&mut shown, frame, theme, now))
             .unwrap();
         let cells = terminal.backend().buffer().content().iter();
         let is_plain = |color: Color| color == Color::Reset;

@@ -28,7 +28,7 @@ const SEED: &str = "ROS2PROBE_SOAK_SEED";
 
 /// What the agent is doing when it is killed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Moment {
+enum CaptureTime {
     Starting,
     Measuring,
     Recording,
@@ -39,27 +39,28 @@ enum Moment {
     Watching,
 }
 
-impl Moment {
-    const ALL: [Moment; 8] = [
-        Moment::Starting,
-        Moment::Measuring,
-        Moment::Recording,
-        Moment::Keeping,
-        Moment::Reloading,
-        Moment::Ending,
-        Moment::TakingASnapshot,
-        Moment::Watching,
+impl CaptureTime {
+    const ALL: [CaptureTime; 8] = [
+        CaptureTime::Starting,
+        CaptureTime::Measuring,
+        CaptureTime::Recording,
+        CaptureTime::Keeping,
+        CaptureTime::Reloading,
+        CaptureTime::Ending,
+        CaptureTime::TakingASnapshot,
+        CaptureTime::Watching,
     ];
 
     /// How long that lasts.
     const fn span(self, start: Duration) -> Duration {
         match self {
-            Moment::Starting => start,
-            Moment::Ending | Moment::Reloading => Duration::from_millis(60),
-            Moment::Keeping => Duration::from_millis(3_200),
-            Moment::Measuring | Moment::Recording | Moment::TakingASnapshot | Moment::Watching => {
-                Duration::from_millis(400)
-            }
+            CaptureTime::Starting => start,
+            CaptureTime::Ending | CaptureTime::Reloading => Duration::from_millis(60),
+            CaptureTime::Keeping => Duration::from_millis(3_200),
+            CaptureTime::Measuring
+            | CaptureTime::Recording
+            | CaptureTime::TakingASnapshot
+            | CaptureTime::Watching => Duration::from_millis(400),
         }
     }
 }
@@ -161,11 +162,11 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     let rounds = if long().is_some() {
         200
     } else {
-        Moment::ALL.len()
+        CaptureTime::ALL.len()
     };
     let (mut slowest, mut objects) = (Duration::ZERO, 0);
     for round in 0..rounds {
-        let moment = Moment::ALL[round % Moment::ALL.len()];
+        let moment = CaptureTime::ALL[round % CaptureTime::ALL.len()];
         let span = moment.span(start);
         let after = Duration::from_micros(dice.pick(span.as_micros() as u64 + 1));
         let began = Instant::now();
@@ -211,13 +212,13 @@ fn until(
     link: &Link,
     places: &Places,
     round: usize,
-    moment: Moment,
+    moment: CaptureTime,
     after: Duration,
 ) -> Result<(usize, Option<Duration>)> {
     let began = Instant::now();
     let enter = link.robot.on_network();
     let process = launch(&enter, &places.configuration, Stdio::inherit())?;
-    if moment == Moment::Starting {
+    if moment == CaptureTime::Starting {
         std::thread::sleep(after);
         return Ok((kill(process, link)?, None));
     }
@@ -236,19 +237,19 @@ fn until(
         ask(&mut stream, method, path, body)
     };
     match moment {
-        Moment::Starting | Moment::Measuring | Moment::Keeping => {}
-        Moment::Recording => {
+        CaptureTime::Starting | CaptureTime::Measuring | CaptureTime::Keeping => {}
+        CaptureTime::Recording => {
             let (status, begun) =
                 ask("POST", "/recordings", &format!(r#"{{"name": "r{round}"}}"#))?;
             ensure!(status == 201, "{status} {begun}");
         }
-        Moment::Watching => {
+        CaptureTime::Watching => {
             let (status, added) = ask("POST", &format!("/watch/added_{}", round % 16), "")?;
             ensure!(status == 201 || status == 200, "{status} {added}");
         }
-        Moment::Reloading => agent.process.signal("HUP")?,
-        Moment::Ending => agent.process.signal("TERM")?,
-        Moment::TakingASnapshot => agent.process.signal("USR1")?,
+        CaptureTime::Reloading => agent.process.signal("HUP")?,
+        CaptureTime::Ending => agent.process.signal("TERM")?,
+        CaptureTime::TakingASnapshot => agent.process.signal("USR1")?,
     }
     std::thread::sleep(after);
     Ok((kill(agent.process, link)?, Some(ready)))

@@ -128,7 +128,7 @@ fn receivers_and_scrapers_that_misbehave_cost_counters_and_no_message() -> Resul
     })?;
     let delivered = page.sum("ros2probe_otlp_exports_total", &[("outcome", "delivered")]);
     ensure!(delivered == 0.0, "{delivered} were taken by nobody");
-    let said = scene.said();
+    let said = scene.log();
     let lines = said.matches("refuses the export").count();
     ensure!((2..=3).contains(&lines), "{said}");
     let took = scene.end()?;

@@ -52,14 +52,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_WALKED",
-        "agent/capture/src/order.rs",
-        "agent/capture/src/order.rs",
+        "agent/capture/src/reorder_buffer.rs",
+        "agent/capture/src/reorder_buffer.rs",
         "no_more_wait_than_there_is_room_for",
     ],
     [
         "MAX_OPEN",
-        "agent/capture/src/whole.rs",
-        "agent/capture/src/whole.rs",
+        "agent/capture/src/piece_assembler.rs",
+        "agent/capture/src/piece_assembler.rs",
         "more_than_there_is_room_for_push_out_the_oldest",
     ],
     [
@@ -232,14 +232,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "AT_ONCE",
-        "agent/daemon/src/surface/large.rs",
-        "agent/daemon/src/surface/large.rs",
+        "agent/daemon/src/surface/large_responses.rs",
+        "agent/daemon/src/surface/large_responses.rs",
         "a_third_answer_waits_until_one_of_two_is_made",
     ],
     [
         "KEPT",
-        "agent/daemon/src/surface/large.rs",
-        "agent/daemon/src/surface/large.rs",
+        "agent/daemon/src/surface/large_responses.rs",
+        "agent/daemon/src/surface/large_responses.rs",
         "slow_readers_of_large_answers_never_keep_others_from_theirs",
     ],
     [
@@ -250,14 +250,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "UNFINISHED",
-        "agent/daemon/src/surface/pace.rs",
-        "agent/daemon/src/surface/pace.rs",
+        "agent/daemon/src/surface/connection.rs",
+        "agent/daemon/src/surface/connection.rs",
         "unfinished_requests_of_all_connections_share_a_budget_and_small_ones_need_none",
     ],
     [
         "LEAST",
-        "agent/daemon/src/surface/pace.rs",
-        "agent/daemon/src/surface/pace.rs",
+        "agent/daemon/src/surface/connection.rs",
+        "agent/daemon/src/surface/connection.rs",
         "a_whole_answer_that_is_read_too_slowly_ends_and_a_stream_may_stall_for_longer",
     ],
     [
@@ -274,13 +274,13 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_SHOWN",
-        "agent/daemon/src/surface/deliveries.rs",
+        "agent/daemon/src/surface/delivery_metrics.rs",
         "agent/cli/tests/surface/caps.rs",
         "acknowledging_readers_beyond_the_page_s_cap_are_counted_as_not_shown",
     ],
     [
         "MAX_UNKNOWN_WRITERS",
-        "agent/daemon/src/surface/robot.rs",
+        "agent/daemon/src/surface/ros2_metrics.rs",
         "agent/cli/tests/surface/caps.rs",
         "unknown_writers_beyond_the_page_s_cap_are_in_the_sum_alone",
     ],
@@ -418,14 +418,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_FILES",
-        "agent/capture/src/shm/scan.rs",
-        "agent/capture/src/shm/scan.rs",
+        "agent/capture/src/shm/directories.rs",
+        "agent/capture/src/shm/directories.rs",
         "files_of_living_processes_are_found_among_more_forged_ones_than_are_kept",
     ],
     [
         "SHARE",
-        "agent/capture/src/shm/listing.rs",
-        "agent/capture/src/shm/listing.rs",
+        "agent/capture/src/shm/cpu_allowance.rs",
+        "agent/capture/src/shm/cpu_allowance.rs",
         "listings_that_are_always_wanted_cost_no_more_than_their_share",
     ],
     [
@@ -496,20 +496,20 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "MAX_WAITING",
-        "agent/capture/src/intake.rs",
+        "agent/capture/src/filter_reader.rs",
         "agent/cli/tests/kernel/caps.rs",
         "records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted",
     ],
     [
         "MAX_LIBRARIES",
-        "agent/capture/src/exact/search.rs",
-        "agent/capture/src/exact/search.rs",
+        "agent/capture/src/uprobe/search.rs",
+        "agent/capture/src/uprobe/search.rs",
         "a_library_beyond_the_cap_is_said_to_be_uncovered_until_another_is_no_longer_used",
     ],
     [
         "MAX_LISTED",
-        "agent/capture/src/shm/scan.rs",
-        "agent/capture/src/shm/scan.rs",
+        "agent/capture/src/shm/directories.rs",
+        "agent/capture/src/shm/directories.rs",
         "of_more_entries_than_are_looked_through_those_of_files_that_were_known_stay",
     ],
 ];

@@ -7,7 +7,7 @@ use std::os::unix::net::UnixStream;
 
 use seccompiler::TargetArch;
 
-use super::super::{Powerless, confine};
+use super::super::{Unprivileged, confine};
 use super::*;
 
 const ROLES: [Role; 7] = [
@@ -306,11 +306,11 @@ fn who_is_confined_has_no_power_left_and_who_is_not_is_refused() {
         .unwrap()
         .is_empty();
     if !has_none {
-        let error = Powerless::verify().unwrap_err().to_string();
+        let error = Unprivileged::verify().unwrap_err().to_string();
         assert!(error.starts_with("refusing to serve: CAP_"), "{error}");
     }
     confined(Role::Service, || {
-        assert!(Powerless::verify().is_ok());
+        assert!(Unprivileged::verify().is_ok());
     });
 }
 

@@ -28,7 +28,7 @@ use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use crate::config::{Watch, Watchlist};
 use crate::surface::EventLog;
-use crate::surface::events::{EVENTS, Place, Reader, Record, Value};
+use crate::surface::events::{EVENTS, Position, Reader, Record, Value};
 
 /// Streams at once, of all listeners: fewer than connections, so that requests find one.
 static STREAMS: Semaphore = Semaphore::const_new(MAX_STREAMS);
@@ -161,9 +161,9 @@ async fn events(
     let (place, restarted) = match last_event_id.or(selection.after.as_deref()) {
         None => (log.last(), false),
         Some(OLDEST) => (0, false),
-        Some(id) => match log.place(id).ok_or_else(|| no_id(id))? {
-            Place::Behind(number) => (number, false),
-            Place::Elsewhere => (0, true),
+        Some(id) => match log.position(id).ok_or_else(|| no_id(id))? {
+            Position::After(number) => (number, false),
+            Position::Unknown => (0, true),
         },
     };
     let permit = STREAMS.try_acquire().map_err(|_| {
@@ -405,12 +405,12 @@ mod tests {
     async fn a_slow_client_is_told_how_many_events_it_missed() {
         let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
         let mut stream = stream(&log, &stop);
-        log.tell(AgentEvent::Reloaded { watches: 0 });
+        log.record(AgentEvent::Reloaded { watches: 0 });
         assert!(format!("{:?}", stream.next().await).contains("watches"));
         log.overwrite(7);
         assert!(format!("{:?}", stream.next().await).contains("lagged"));
         assert!(log.dropped().contains(&("stream_lagged", 7)));
-        log.tell(AgentEvent::Reloaded { watches: 0 });
+        log.record(AgentEvent::Reloaded { watches: 0 });
         assert!(format!("{:?}", stream.next().await).contains("watches"));
         assert_eq!(stream.place, 9);
     }
@@ -418,7 +418,7 @@ mod tests {
     #[tokio::test]
     async fn a_stream_ends_with_the_agent_after_what_has_happened() {
         let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
-        log.tell(AgentEvent::Reloaded { watches: 1 });
+        log.record(AgentEvent::Reloaded { watches: 1 });
         stop.cancel();
         let mut stream = stream(&log, &stop);
         stream.begin(true);

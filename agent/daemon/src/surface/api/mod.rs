@@ -54,7 +54,7 @@ use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::board::{Board, State};
-use super::large::Answers;
+use super::large_responses::LargeResponses;
 use crate::config::{Access, Limit};
 use crate::recording::{Recordings, Snapshots};
 use crate::subscriptions::Subscriptions;
@@ -144,7 +144,7 @@ fn views() -> OpenApiRouter<Context> {
 }
 
 /// Views that are being made and read.
-static VIEWS: Answers = Answers::new();
+static VIEWS: LargeResponses = LargeResponses::new();
 
 /// Marks a response that is a stream: it is passed on as it comes, and takes no turn of a view.
 #[derive(Clone, Copy, Debug)]

@@ -22,7 +22,9 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
 use crate::config::RecordingLimits;
 use crate::config::watch::MAX_DOMAIN;
-use crate::recording::{Asked, Order, Recording, Refusal, Report, Stage, Wanted};
+use crate::recording::{
+    Command, FilterOptions, Recording, RecordingOptions, RecordingState, Refusal, Report,
+};
 use ros2probe_bag::{Form, Options, Storage};
 
 /// How long an answer waits for a bag to be completed.
@@ -77,7 +79,7 @@ struct RecordingView {
     /// Why it ended, if that was not asked for.
     error: Option<String>,
     /// What was asked for.
-    topics: Asked,
+    topics: FilterOptions,
     /// What it has and has not.
     report: Report,
 }
@@ -90,7 +92,7 @@ struct RecordingRequest {
     #[schema(max_length = 128, pattern = "^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
     name: Option<String>,
     /// Which topics.
-    topics: Asked,
+    topics: FilterOptions,
     /// Of which domain.
     #[schema(minimum = 0, maximum = 232)]
     domain_id: u32,
@@ -219,7 +221,7 @@ async fn end(
     Path(name): Path<String>,
 ) -> Result<Response, Problem> {
     let recording = find(&context, &name)?;
-    recording.order(Order::Stop);
+    recording.command(Command::Stop);
     let status = if recording.over(PATIENCE).await {
         StatusCode::OK
     } else {
@@ -245,7 +247,7 @@ async fn pause(
     State(context): State<Context>,
     Path(name): Path<String>,
 ) -> Result<Response, Problem> {
-    order(&context, &name, Order::Pause)
+    order(&context, &name, Command::Pause)
 }
 
 /// Take messages again
@@ -265,7 +267,7 @@ async fn resume(
     State(context): State<Context>,
     Path(name): Path<String>,
 ) -> Result<Response, Problem> {
-    order(&context, &name, Order::Resume)
+    order(&context, &name, Command::Resume)
 }
 
 /// Go on in a new file
@@ -284,12 +286,12 @@ async fn split(
     State(context): State<Context>,
     Path(name): Path<String>,
 ) -> Result<Response, Problem> {
-    order(&context, &name, Order::Split)
+    order(&context, &name, Command::Split)
 }
 
-fn order(context: &Context, name: &str, order: Order) -> Result<Response, Problem> {
+fn order(context: &Context, name: &str, command: Command) -> Result<Response, Problem> {
     let recording = find(context, name)?;
-    recording.order(order);
+    recording.command(command);
     Ok((StatusCode::ACCEPTED, Json(view(&recording))).into_response())
 }
 
@@ -302,7 +304,7 @@ pub(super) fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Prob
     })
 }
 
-fn wanted(request: RecordingRequest) -> Result<Wanted, Problem> {
+fn wanted(request: RecordingRequest) -> Result<RecordingOptions, Problem> {
     let invalid = |detail: String| Problem::new(Code::InvalidRequest, detail);
     if request.domain_id > MAX_DOMAIN {
         let id = request.domain_id;
@@ -314,8 +316,8 @@ fn wanted(request: RecordingRequest) -> Result<Wanted, Problem> {
         let detail = format!("max_bag_duration_seconds must be at most {MAX_DURATION}");
         return Err(invalid(detail));
     }
-    let asked = if request.topics == Asked::default() {
-        Asked::everything()
+    let asked = if request.topics == FilterOptions::default() {
+        FilterOptions::everything()
     } else {
         request.topics
     };
@@ -336,7 +338,7 @@ fn wanted(request: RecordingRequest) -> Result<Wanted, Problem> {
             ..Options::default()
         })
     };
-    Ok(Wanted {
+    Ok(RecordingOptions {
         options: options().map_err(|error| invalid(error.to_string()))?,
         name: request.name,
         asked,
@@ -381,10 +383,10 @@ fn view(recording: &Recording) -> RecordingView {
         name: recording.name.clone(),
         directory: recording.directory.display().to_string(),
         domain_id: recording.domain_id,
-        state: match status.stage {
-            Stage::Recording => "recording",
-            Stage::Paused => "paused",
-            Stage::Ended => "ended",
+        state: match status.state {
+            RecordingState::Recording => "recording",
+            RecordingState::Paused => "paused",
+            RecordingState::Ended => "ended",
         },
         began_timestamp_seconds: began.unwrap_or_default().as_secs_f64(),
         file_bytes: status.file_bytes,

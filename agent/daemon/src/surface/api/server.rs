@@ -18,7 +18,7 @@ use super::problem::{Code, MEDIA_TYPE, Problem, ProblemBody};
 use super::security::{Door, Granted, Kind, Token, TokenError};
 use super::{Context, router};
 use crate::config::{Access, Limit};
-use crate::surface::bounded::{Bounded, Refusal};
+use crate::surface::limited_listener::{LimitedListener, Refusal};
 use crate::surface::listen::listen;
 use crate::surface::serving::{self, Plain};
 
@@ -228,7 +228,7 @@ where
     let router = router(&context, door);
     let limit = Limit::ApiClients;
     let full = full(context.board.limits().caps().get(limit));
-    let listener = Bounded::new(listener, Arc::clone(&context.board), limit, Some(full));
+    let listener = LimitedListener::new(listener, Arc::clone(&context.board), limit, Some(full));
     serving::serve(listener, Plain, router, |_| (), context.stop).await;
     Ok(())
 }

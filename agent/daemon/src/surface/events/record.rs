@@ -7,10 +7,11 @@ use std::fmt::{Display, Write as _};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
+use ros2probe_wire::time::SECOND;
 
 use super::table::{self, Definition, Severity};
 use crate::surface::SourceKind;
-use crate::surface::robot::series_name;
+use crate::surface::ros2_metrics::series_name;
 use ros2probe_model::churn;
 use ros2probe_model::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::event::{EventKind, LossBurst, bounded};
@@ -18,11 +19,10 @@ use ros2probe_model::snapshot::WatchState;
 use ros2probe_model::topic::Naming;
 
 const SECONDS_OF_A_DAY: u64 = 86_400;
-const NANOSECONDS: u64 = 1_000_000_000;
 
 /// What happened to the robot or the agent.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Happened {
+pub(super) enum Occurrence {
     Robot(EventKind),
     Agent(AgentEvent),
 }
@@ -157,7 +157,7 @@ impl Record {
     }
 }
 
-impl Happened {
+impl Occurrence {
     /// Its entry of the table.
     pub(super) const fn definition(&self) -> &'static Definition {
         use churn::Event::{Appeared, Cascaded, Changed, Disposed, Expired};
@@ -513,8 +513,8 @@ fn seconds(at: Timestamp, last: Timestamp) -> f64 {
 /// year 0, so that the leap day is a year's last.
 fn rfc3339(at: Timestamp) -> String {
     let (days, rest) = (
-        at.0 / NANOSECONDS / SECONDS_OF_A_DAY,
-        at.0 / NANOSECONDS % SECONDS_OF_A_DAY,
+        at.0 / SECOND / SECONDS_OF_A_DAY,
+        at.0 / SECOND % SECONDS_OF_A_DAY,
     );
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
@@ -533,7 +533,7 @@ fn rfc3339(at: Timestamp) -> String {
     let _ = write!(
         time,
         "{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{:09}Z",
-        at.0 % NANOSECONDS
+        at.0 % SECOND
     );
     time
 }
@@ -552,7 +552,7 @@ mod tests {
             (1_795_219_199, "2026-11-20T23:59:59.000000000Z"),
             (4_107_542_400, "2100-03-01T00:00:00.000000000Z"),
         ] {
-            assert_eq!(rfc3339(Timestamp(seconds * NANOSECONDS)), expected);
+            assert_eq!(rfc3339(Timestamp(seconds * SECOND)), expected);
         }
         assert!(rfc3339(Timestamp(7)).ends_with("00.000000007Z"));
     }
@@ -560,7 +560,7 @@ mod tests {
     #[test]
     fn a_goodbye_is_no_warning_and_an_expired_lease_is_one() {
         let lost = |change| {
-            Happened::Robot(EventKind::Participant {
+            Occurrence::Robot(EventKind::Participant {
                 change,
                 domain_id: 0,
                 guid: ros2probe_wire::Guid::from_bytes([1; 16]),

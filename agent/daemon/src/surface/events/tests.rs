@@ -112,9 +112,12 @@ fn a_storm_is_cut_in_each_second_and_told_in_one_event() {
         ]
     );
     assert_eq!(log.dropped()[0], ("storm", 60));
-    let told: BTreeMap<_, _> = log.told().into_iter().collect();
-    assert_eq!(told["ros2.node.discovered"], u64::from(MOST) + 1);
-    assert_eq!((told[suppressed], told["ros2.message.lost"]), (2, 0));
+    let recorded: BTreeMap<_, _> = log.recorded().into_iter().collect();
+    assert_eq!(recorded["ros2.node.discovered"], u64::from(MOST) + 1);
+    assert_eq!(
+        (recorded[suppressed], recorded["ros2.message.lost"]),
+        (2, 0)
+    );
 }
 
 #[test]
@@ -122,10 +125,10 @@ fn a_storm_of_the_agent_is_cut_by_the_seconds_of_its_life() {
     let log = EventLog::new();
     let at = |seconds| log.begun + Duration::from_secs(seconds);
     for _ in 0..MOST + 3 {
-        log.tell_at(AgentEvent::Reloaded { watches: 1 }, at(1));
+        log.record_at(AgentEvent::Reloaded { watches: 1 }, at(1));
     }
     assert_eq!(log.last(), u64::from(MOST));
-    log.tell_at(AgentEvent::Reloaded { watches: 1 }, at(2));
+    log.record_at(AgentEvent::Reloaded { watches: 1 }, at(2));
     let rest = log.read(MOST.into(), 10);
     assert_eq!(names(&rest)[0], "ros2probe.events.suppressed");
     assert_eq!(rest.records.len(), 2);
@@ -140,17 +143,17 @@ fn a_replay_at_full_speed_tells_what_one_at_the_capture_s_pace_tells() {
         let clock = event.at;
         paced.add(taken(vec![event]), clock);
     }
-    let told = |log: &EventLog| {
+    let recorded = |log: &EventLog| {
         log.settle();
         let records = log.read(0, KEPT).records;
-        let told = records
+        let recorded = records
             .iter()
             .map(|record| (record.at, record.definition.name));
-        told.collect::<Vec<_>>()
+        recorded.collect::<Vec<_>>()
     };
-    let told_at_once = told(&at_once);
+    let told_at_once = recorded(&at_once);
     assert_eq!(told_at_once.len(), 430);
-    assert_eq!(told_at_once, told(&paced));
+    assert_eq!(told_at_once, recorded(&paced));
 }
 
 #[test]
@@ -177,14 +180,14 @@ fn what_was_overwritten_is_told_to_the_reader_that_missed_it() {
 fn an_id_means_something_to_its_own_run_alone() {
     let log = EventLog::new();
     log.add(taken(vec![node(1), node(2)]), second(0));
-    assert_eq!(log.place(&log.id(1)), Some(Place::Behind(1)));
+    assert_eq!(log.position(&log.id(1)), Some(Position::After(1)));
     let mut before = EventLog::new();
     before.run = Run(log.run.0 - 1);
     before.add(taken(vec![node(1), node(2), node(3)]), second(0));
-    assert_eq!(log.place(&before.id(1)), Some(Place::Elsewhere));
-    assert_eq!(log.place(&log.id(3)), Some(Place::Elsewhere));
+    assert_eq!(log.position(&before.id(1)), Some(Position::Unknown));
+    assert_eq!(log.position(&log.id(3)), Some(Position::Unknown));
     for nonsense in ["", "1", "-", "x-1", "1-x", "1--1", "1-1-1"] {
-        assert_eq!(log.place(nonsense), None, "{nonsense}");
+        assert_eq!(log.position(nonsense), None, "{nonsense}");
     }
 }
 
@@ -192,7 +195,7 @@ fn an_id_means_something_to_its_own_run_alone() {
 async fn who_waits_is_woken_by_the_next_event() {
     let log = Arc::new(EventLog::new());
     log.wait(0).await_soon(false).await;
-    log.tell(AgentEvent::Reloaded { watches: 3 });
+    log.record(AgentEvent::Reloaded { watches: 3 });
     log.wait(0).await_soon(true).await;
     let waiting = Arc::clone(&log);
     let woken = tokio::spawn(async move { waiting.wait(1).await });

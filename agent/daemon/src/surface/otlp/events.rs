@@ -17,7 +17,7 @@ use opentelemetry_proto::tonic::resource::v1::Resource;
 use prost::Message as _;
 
 use super::client::Request;
-use super::outlet::Outlet;
+use super::signal_sender::SignalSender;
 use crate::surface::board::Board;
 use crate::surface::events::EventLog;
 use crate::surface::events::{Batch, Reader, Record, Value};
@@ -46,34 +46,34 @@ impl Reporter {
     }
 
     /// Exports until the agent ends.
-    pub(super) async fn run(mut self, mut outlet: Outlet) {
-        while self.gather(&outlet).await {
-            while let Some(request) = self.take(&outlet, MOST) {
-                outlet.deliver(vec![request], None).await;
-                if outlet.is_stopped() {
+    pub(super) async fn run(mut self, mut sender: SignalSender) {
+        while self.gather(&sender).await {
+            while let Some(request) = self.take(&sender, MOST) {
+                sender.deliver(vec![request], None).await;
+                if sender.is_stopped() {
                     break;
                 }
             }
         }
-        let rest = std::iter::from_fn(|| self.take(&outlet, MOST));
+        let rest = std::iter::from_fn(|| self.take(&sender, MOST));
         let rest = rest.collect();
-        outlet.finish(rest, false).await;
+        sender.finish(rest, false).await;
     }
 
     /// Waits for events and for those that follow at once; `false` when the agent ends.
-    async fn gather(&self, outlet: &Outlet) -> bool {
+    async fn gather(&self, sender: &SignalSender) -> bool {
         let news = async {
             self.log.wait(self.place).await;
             tokio::time::sleep(GATHER).await;
         };
         tokio::select! {
             () = news => true,
-            () = outlet.stopped() => false,
+            () = sender.stopped() => false,
         }
     }
 
     /// The next events as a request.
-    fn take(&mut self, outlet: &Outlet, most: usize) -> Option<Request> {
+    fn take(&mut self, sender: &SignalSender, most: usize) -> Option<Request> {
         let Batch {
             lagged,
             records,
@@ -81,7 +81,7 @@ impl Reporter {
         } = self.log.read(self.place, most);
         if lagged > 0 {
             self.log.overtook(Reader::Otlp, lagged);
-            outlet.overflowed(lagged);
+            sender.overflowed(lagged);
         }
         self.place = last;
         (!records.is_empty()).then(|| request(&self.resource, &records))
@@ -155,7 +155,7 @@ mod tests {
     #[test]
     fn a_record_says_what_the_event_says_with_its_types() {
         let log = EventLog::new();
-        log.tell(AgentEvent::Dropped {
+        log.record(AgentEvent::Dropped {
             what: "packets",
             count: 7,
         });
@@ -184,7 +184,7 @@ mod tests {
     fn a_request_holds_all_records_under_one_resource() {
         let log = EventLog::new();
         for watches in 0..3 {
-            log.tell(AgentEvent::Reloaded { watches });
+            log.record(AgentEvent::Reloaded { watches });
         }
         let records = log.read(0, 10).records;
         let Request { body, items } = request(&Resource::default(), &records);

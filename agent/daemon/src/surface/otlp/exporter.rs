@@ -13,8 +13,8 @@ use super::client::Client;
 use super::events::Reporter;
 use super::exports::Signal;
 use super::metrics::Collector;
-use super::outlet::Outlet;
 use super::settings::{Settings, SettingsError, Target};
+use super::signal_sender::SignalSender;
 use super::traces::Tracing;
 use crate::privilege::{self, Role, SpawnError};
 use crate::surface::board::Board;
@@ -85,9 +85,9 @@ impl Exporter {
 /// What the thread does.
 struct Jobs {
     board: Arc<Board>,
-    metrics: Option<(Collector, Outlet, Duration)>,
-    events: Option<(Reporter, Outlet)>,
-    traces: Option<(Tracing, Outlet)>,
+    metrics: Option<(Collector, SignalSender, Duration)>,
+    events: Option<(Reporter, SignalSender)>,
+    traces: Option<(Tracing, SignalSender)>,
 }
 
 impl Jobs {
@@ -99,14 +99,14 @@ impl Jobs {
     ) -> Result<Self, SettingsError> {
         // Connections belong to the runtime from their beginning.
         let _inside = runtime.enter();
-        let outlet = |signal: Signal, target: Option<Target>| {
+        let sender = |signal: Signal, target: Option<Target>| {
             let client = target.map(|target| Client::new(signal, target, Arc::clone(board)));
             Ok(client
                 .transpose()?
-                .map(|client| Outlet::new(client, stop.clone())))
+                .map(|client| SignalSender::new(client, stop.clone())))
         };
-        let metrics = outlet(Signal::Metrics, settings.metrics)?;
-        let events = outlet(Signal::Events, settings.events)?;
+        let metrics = sender(Signal::Metrics, settings.metrics)?;
+        let events = sender(Signal::Events, settings.events)?;
         let collector = || {
             Collector::new(
                 Arc::clone(board),
@@ -114,30 +114,30 @@ impl Jobs {
                 SystemTime::now(),
             )
         };
-        let traces = outlet(Signal::Traces, settings.traces)?;
+        let traces = sender(Signal::Traces, settings.traces)?;
         let tracing = || Tracing::new(settings.resource.clone(), settings.host);
         Ok(Self {
             board: Arc::clone(board),
-            traces: traces.map(|outlet| (tracing(), outlet)),
-            metrics: metrics.map(|outlet| (collector(), outlet, settings.interval)),
-            events: events.map(|outlet| (Reporter::new(board, settings.resource.clone()), outlet)),
+            traces: traces.map(|sender| (tracing(), sender)),
+            metrics: metrics.map(|sender| (collector(), sender, settings.interval)),
+            events: events.map(|sender| (Reporter::new(board, settings.resource.clone()), sender)),
         })
     }
 
     async fn run(self) {
         let metrics = async {
-            if let Some((collector, outlet, interval)) = self.metrics {
-                collector.run(outlet, interval).await;
+            if let Some((collector, sender, interval)) = self.metrics {
+                collector.run(sender, interval).await;
             }
         };
         let events = async {
-            if let Some((reporter, outlet)) = self.events {
-                reporter.run(outlet).await;
+            if let Some((reporter, sender)) = self.events {
+                reporter.run(sender).await;
             }
         };
         let traces = async {
-            if let Some((tracing, outlet)) = self.traces {
-                tracing.run(outlet, self.board.spans()).await;
+            if let Some((tracing, sender)) = self.traces {
+                tracing.run(sender, self.board.spans()).await;
             }
         };
         tokio::join!(metrics, events, traces);

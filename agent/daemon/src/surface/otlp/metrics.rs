@@ -9,11 +9,11 @@ use std::time::{Duration, Instant, SystemTime};
 use opentelemetry_proto::tonic::resource::v1::Resource;
 use tokio::time::{MissedTickBehavior, interval_at};
 
-use super::outlet::Outlet;
 use super::points::{Collection, Points};
+use super::signal_sender::SignalSender;
 use crate::surface::board::Board;
-use crate::surface::page::Page;
-use crate::surface::walk::walk;
+use crate::surface::collect::collect;
+use crate::surface::metric_sink::MetricSink;
 
 /// As long as a scrape waits for the capture thread.
 const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
@@ -36,23 +36,23 @@ impl Collector {
     }
 
     /// Exports every `period` and at the end.
-    pub(super) async fn run(mut self, mut outlet: Outlet, period: Duration) {
+    pub(super) async fn run(mut self, mut sender: SignalSender, period: Duration) {
         // Not all robots of a fleet that was switched on at once report in the same moment.
         let mut ticks = interval_at(tokio::time::Instant::now() + period / 4, period);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             let now = tokio::select! {
                 now = ticks.tick() => now,
-                () = outlet.stopped() => break,
+                () = sender.stopped() => break,
             };
             self.board.refresh(REFRESH_PATIENCE).await;
             let Collection { requests, dropped } = self.collect(SystemTime::now());
-            outlet.overflowed(dropped);
-            outlet.deliver(requests, Some(now + period)).await;
+            sender.overflowed(dropped);
+            sender.deliver(requests, Some(now + period)).await;
         }
         let Collection { requests, dropped } = self.collect(SystemTime::now());
-        outlet.overflowed(dropped);
-        outlet.finish(requests, true).await;
+        sender.overflowed(dropped);
+        sender.finish(requests, true).await;
     }
 
     /// What is on the board now.
@@ -60,8 +60,8 @@ impl Collector {
         let begun = Instant::now();
         self.points.begin(unix_nanoseconds(now));
         // Points are pushed to memory, which does not fail.
-        let _ = walk(
-            &mut Page::Points(&mut self.points),
+        let _ = collect(
+            &mut MetricSink::Points(&mut self.points),
             &self.board,
             self.previous,
         );

@@ -9,10 +9,10 @@ mod exporter;
 mod exports;
 mod metrics;
 mod naming;
-mod outlet;
 pub(super) mod points;
 mod resource;
 mod settings;
+mod signal_sender;
 mod starts;
 #[cfg(test)]
 mod tests;

@@ -18,7 +18,7 @@ use prost::Message as _;
 use super::client::Request;
 use super::starts::Starts;
 use crate::surface::catalogue::{Kind, Metric};
-use crate::surface::page::{Label, Number, write_capped};
+use crate::surface::metric_sink::{Label, Number, write_capped};
 use ros2probe_model::histogram::Histogram;
 
 /// Where a request ends and the next one begins, in encoded bytes.

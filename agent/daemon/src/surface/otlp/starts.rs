@@ -9,7 +9,7 @@ use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher as _, Hash as _, Hasher as _};
 
 use crate::surface::catalogue::Metric;
-use crate::surface::page::Label;
+use crate::surface::metric_sink::Label;
 
 /// Series remembered.
 const MAX_SERIES: usize = 200_000;

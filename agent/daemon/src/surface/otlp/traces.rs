@@ -18,8 +18,8 @@ use prost::Message as _;
 use tokio::sync::Notify;
 
 use super::client::Request;
-use super::outlet::Outlet;
 use super::points::{attribute, key_value, scope};
+use super::signal_sender::SignalSender;
 use ros2probe_model::identity::Identity;
 use ros2probe_model::trace::{Span, Stage};
 
@@ -87,7 +87,7 @@ impl Tracing {
     }
 
     /// Exports what comes into the queue until the end.
-    pub(super) async fn run(self, mut outlet: Outlet, queue: &SpanQueue) {
+    pub(super) async fn run(self, mut sender: SignalSender, queue: &SpanQueue) {
         loop {
             let gathered = async {
                 queue.filled().await;
@@ -95,14 +95,14 @@ impl Tracing {
             };
             tokio::select! {
                 () = gathered => {}
-                () = outlet.stopped() => break,
+                () = sender.stopped() => break,
             }
-            while !outlet.is_stopped() {
+            while !sender.is_stopped() {
                 let spans = queue.take();
                 if spans.is_empty() {
                     break;
                 }
-                outlet.deliver(vec![self.request(&spans)], None).await;
+                sender.deliver(vec![self.request(&spans)], None).await;
             }
         }
         let mut last = Vec::new();
@@ -113,7 +113,7 @@ impl Tracing {
             }
             last.push(self.request(&spans));
         }
-        outlet.finish(last, false).await;
+        sender.finish(last, false).await;
     }
 
     fn request(&self, spans: &[Span]) -> Request {

@@ -1,0 +1,203 @@
+//! Where the control group hierarchy (v2) is, to which the host hook is attached.
+//!
+//! Read from `/proc/self/mountinfo` (`man 5 proc_pid_mountinfo`). Nothing is mounted or created.
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io;
+use std::os::unix::ffi::OsStringExt as _;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
+
+const MOUNTS: &str = "/proc/self/mountinfo";
+/// Inode of the topmost group: its id, the same on every host.
+const ROOT_INODE: u64 = 1;
+
+/// Why there is no control group to attach to.
+#[derive(Debug, thiserror::Error)]
+pub enum CgroupError {
+    /// The list of mounts.
+    #[error("cannot read {MOUNTS}")]
+    Mounts(#[source] io::Error),
+    /// Only v1, or nothing.
+    #[error("no cgroup v2 hierarchy is mounted: `mount -t cgroup2 none /sys/fs/cgroup`")]
+    NotMounted,
+    /// The directory.
+    #[error("cannot open the control group {}", path.display())]
+    Open {
+        /// Which.
+        path: PathBuf,
+        /// Why not.
+        source: io::Error,
+    },
+    /// It is something else.
+    #[error("{} is not a control group of the hierarchy v2", path.display())]
+    Other {
+        /// Which.
+        path: PathBuf,
+    },
+}
+
+/// One control group.
+#[derive(Debug)]
+pub struct Cgroup {
+    path: PathBuf,
+    directory: File,
+    whole_host: bool,
+}
+
+impl Cgroup {
+    /// The topmost one that this process can see.
+    ///
+    /// # Errors
+    /// None is mounted.
+    pub fn topmost() -> Result<Self, CgroupError> {
+        Self::open(&mount_point()?)
+    }
+
+    /// The one at `path`.
+    ///
+    /// # Errors
+    /// It does not exist or is none.
+    pub fn open(path: &Path) -> Result<Self, CgroupError> {
+        let failed = |source| CgroupError::Open {
+            path: path.to_path_buf(),
+            source,
+        };
+        let directory = File::open(path).map_err(failed)?;
+        let inode = directory.metadata().map_err(failed)?.ino();
+        // Every group of v2 has it, those of v1 and plain directories do not; the kernel would say
+        // no more than "bad file descriptor".
+        if !path.join("cgroup.controllers").exists() {
+            let path = path.to_path_buf();
+            return Err(CgroupError::Other { path });
+        }
+        Ok(Self {
+            path: path.to_path_buf(),
+            directory,
+            whole_host: inode == ROOT_INODE,
+        })
+    }
+
+    /// Where it is.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The open directory, to attach programs to.
+    #[must_use]
+    pub const fn directory(&self) -> &File {
+        &self.directory
+    }
+
+    /// Every process of the host is in it or below: it is the topmost one, also seen from outside
+    /// of all containers.
+    #[must_use]
+    pub const fn is_whole_host(&self) -> bool {
+        self.whole_host
+    }
+}
+
+/// Where the hierarchy is mounted that begins the furthest up.
+///
+/// # Errors
+/// Nowhere.
+pub fn mount_point() -> Result<PathBuf, CgroupError> {
+    let mounts = fs::read(MOUNTS).map_err(CgroupError::Mounts)?;
+    topmost(&mounts).ok_or(CgroupError::NotMounted)
+}
+
+/// Of several mounts one that shows all, that is `/` of the hierarchy.
+#[must_use]
+pub fn topmost(mounts: &[u8]) -> Option<PathBuf> {
+    let found = mounts
+        .split(|byte| *byte == b'\n')
+        .filter_map(mount)
+        .min_by_key(|mount| mount.root.len())?;
+    Some(PathBuf::from(OsString::from_vec(found.point)))
+}
+
+struct Mount {
+    /// What of the hierarchy is mounted.
+    root: Vec<u8>,
+    /// Where.
+    point: Vec<u8>,
+}
+
+/// A line if it is about `cgroup2`: number, parent, device, root, mount point, options, optional
+/// fields, a dash, type.
+fn mount(line: &[u8]) -> Option<Mount> {
+    let mut fields = line.split(|byte| *byte == b' ');
+    let root = unescape(fields.nth(3)?);
+    let point = unescape(fields.next()?);
+    fields.find(|field| *field == b"-")?;
+    (fields.next()? == b"cgroup2").then_some(Mount { root, point })
+}
+
+/// Space, tab, newline and backslash are written as three octal digits.
+fn unescape(field: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(field.len());
+    let mut rest = field;
+    while let Some((byte, tail)) = rest.split_first() {
+        let octal = tail.get(..3).filter(|_| *byte == b'\\').and_then(|digits| {
+            let digits = std::str::from_utf8(digits).ok()?;
+            u8::from_str_radix(digits, 8).ok()
+        });
+        bytes.push(octal.unwrap_or(*byte));
+        rest = if octal.is_some() {
+            tail.get(3..).unwrap_or_default()
+        } else {
+            tail
+        };
+    }
+    bytes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topmost_of(mounts: &str) -> Option<String> {
+        topmost(mounts.as_bytes()).map(|path| path.display().to_string())
+    }
+
+    #[test]
+    fn the_hierarchy_is_found_wherever_it_is_mounted() {
+        let unified = "24 18 0:22 / /sys/fs/cgroup rw,nosuid shared:4 - cgroup2 cgroup2 rw";
+        assert_eq!(topmost_of(unified).unwrap(), "/sys/fs/cgroup");
+        let hybrid = "\
+30 23 0:25 / /sys/fs/cgroup ro shared:9 - tmpfs tmpfs ro,mode=755
+31 30 0:26 / /sys/fs/cgroup/unified rw shared:10 master:3 - cgroup2 cgroup2 rw,nsdelegate
+32 30 0:27 / /sys/fs/cgroup/systemd rw - cgroup cgroup rw,xattr,name=systemd
+";
+        assert_eq!(topmost_of(hybrid).unwrap(), "/sys/fs/cgroup/unified");
+        let v1 = "32 30 0:27 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu";
+        assert_eq!(topmost_of(v1), None);
+        assert_eq!(topmost_of("\n - cgroup2\n1 2 3 4\n"), None);
+    }
+
+    #[test]
+    fn of_several_the_one_that_shows_more_is_taken() {
+        let mounts = "\
+31 30 0:26 /docker/abc /sys/fs/cgroup ro - cgroup2 cgroup rw
+40 30 0:26 / /host\\040sys/fs/cgroup ro - cgroup2 cgroup rw
+";
+        assert_eq!(topmost_of(mounts).unwrap(), "/host sys/fs/cgroup");
+        // A backslash that is no escape, and one that is cut off.
+        assert_eq!(unescape(br"a\9990\04"), br"a\9990\04");
+    }
+
+    #[test]
+    fn this_host_has_one_and_a_directory_is_none() {
+        let topmost = Cgroup::topmost().unwrap();
+        assert!(topmost.path().join("cgroup.procs").exists());
+        let other = Cgroup::open(Path::new("/proc")).unwrap_err();
+        assert_eq!(
+            other.to_string(),
+            "/proc is not a control group of the hierarchy v2"
+        );
+        let missing = Cgroup::open(Path::new("/sys/fs/cgroup/no such")).unwrap_err();
+        assert!(missing.to_string().contains("no such"), "{missing}");
+    }
+}

@@ -1,0 +1,177 @@
+//! Control groups by their number: a socket's cgroup is known by the inode of its directory.
+//!
+//! Walks the version 2 hierarchy when a number comes up that it has not met, and remembers what it
+//! was asked for, also what is not there. Bounded in directories and depth; reads nothing in them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::os::unix::fs::DirEntryExt as _;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Path, PathBuf};
+
+/// Directories that one walk looks at.
+const MAX_DIRECTORIES: usize = 16_384;
+/// Levels that a walk descends.
+const MAX_DEPTH: usize = 24;
+/// Letters of a container's id, and how many of them tools show.
+const CONTAINER_ID: usize = 64;
+const CONTAINER_ID_SHOWN: usize = 12;
+
+/// The control groups below a directory.
+#[derive(Debug)]
+pub struct CgroupPaths {
+    root: PathBuf,
+    /// `None`: it is not there.
+    known: BTreeMap<u64, Option<String>>,
+}
+
+impl CgroupPaths {
+    /// Those below the place where the version 2 hierarchy is mounted.
+    #[must_use]
+    pub const fn new(root: PathBuf) -> Self {
+        Self {
+            root,
+            known: BTreeMap::new(),
+        }
+    }
+
+    /// Finds those of `wanted` that are not known yet, and forgets what is no longer wanted.
+    pub fn refresh(&mut self, wanted: &BTreeSet<u64>) {
+        self.known.retain(|id, _| wanted.contains(id));
+        let mut missing: BTreeSet<u64> = wanted.iter().copied().collect();
+        missing.retain(|id| !self.known.contains_key(id));
+        if missing.is_empty() {
+            return;
+        }
+        let found = walk(&self.root, &mut missing);
+        self.known.extend(found);
+        self.known.extend(missing.iter().map(|id| (*id, None)));
+    }
+
+    /// Path below the root, `/` for the root itself; `None` when it is not there, for instance
+    /// because it is gone, or was not asked for.
+    #[must_use]
+    pub fn path(&self, id: u64) -> Option<&str> {
+        self.known.get(&id)?.as_deref()
+    }
+}
+
+/// A name for people: the first letters of a container's id, else the system manager's unit, else
+/// the last part of the path.
+#[must_use]
+pub fn short_name(path: &str) -> &str {
+    let parts = || path.rsplit('/').filter(|part| !part.is_empty());
+    parts()
+        .find_map(container)
+        .or_else(|| parts().find(|part| part.ends_with(".service") || part.ends_with(".scope")))
+        .or_else(|| parts().next())
+        .unwrap_or("/")
+}
+
+/// `docker-<id>.scope`, `cri-containerd-<id>.scope`, `<id>`: the id, shortened.
+fn container(part: &str) -> Option<&str> {
+    let name = part.strip_suffix(".scope").unwrap_or(part);
+    let id = name.rsplit(['-', ':']).next()?;
+    let is_id = id.len() == CONTAINER_ID && id.bytes().all(|byte| byte.is_ascii_hexdigit());
+    is_id.then(|| id.get(..CONTAINER_ID_SHOWN)).flatten()
+}
+
+/// Takes what it finds out of `missing`; ends when nothing is missing any more.
+fn walk(root: &Path, missing: &mut BTreeSet<u64>) -> Vec<(u64, Option<String>)> {
+    let mut found = Vec::new();
+    if let Ok(metadata) = fs::metadata(root)
+        && missing.remove(&metadata.ino())
+    {
+        found.push((metadata.ino(), Some("/".to_owned())));
+    }
+    let mut directories = vec![(String::new(), 0)];
+    let mut looked_at = 0;
+    while let Some((path, depth)) = directories.pop() {
+        looked_at += 1;
+        if missing.is_empty() || looked_at > MAX_DIRECTORIES {
+            break;
+        }
+        let Ok(entries) = fs::read_dir(root.join(path.trim_start_matches('/'))) else {
+            continue;
+        };
+        for entry in entries.flatten() {
+            if !entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+                continue;
+            }
+            let below = format!("{path}/{}", entry.file_name().to_string_lossy());
+            if missing.remove(&entry.ino()) {
+                found.push((entry.ino(), Some(below.clone())));
+            }
+            if depth < MAX_DEPTH {
+                directories.push((below, depth + 1));
+            }
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_becomes_a_path_and_what_is_gone_is_not_looked_for_again() {
+        let root = tempfile::tempdir().unwrap();
+        let service = root.path().join("system.slice/robot.service");
+        fs::create_dir_all(&service).unwrap();
+        fs::write(root.path().join("system.slice/cgroup.procs"), "").unwrap();
+        let inode = |path: &Path| fs::metadata(path).unwrap().ino();
+        let (top, below) = (inode(root.path()), inode(&service));
+        let gone = 1;
+        let mut groups = CgroupPaths::new(root.path().to_path_buf());
+        assert_eq!(groups.path(below), None);
+        groups.refresh(&BTreeSet::from([top, below, gone]));
+        assert_eq!(groups.path(top), Some("/"));
+        assert_eq!(groups.path(below), Some("/system.slice/robot.service"));
+        assert_eq!(groups.path(gone), None);
+        // Nothing is new, so nothing is walked: a path that has changed meanwhile stays.
+        fs::rename(&service, root.path().join("system.slice/other.service")).unwrap();
+        groups.refresh(&BTreeSet::from([below, gone]));
+        assert_eq!(groups.path(below), Some("/system.slice/robot.service"));
+        assert_eq!(groups.path(top), None);
+        groups.refresh(&BTreeSet::new());
+        groups.refresh(&BTreeSet::from([below]));
+        assert_eq!(groups.path(below), Some("/system.slice/other.service"));
+    }
+
+    #[test]
+    fn a_hierarchy_that_is_not_there_has_nothing() {
+        let mut groups = CgroupPaths::new(PathBuf::from("/nonexistent"));
+        groups.refresh(&BTreeSet::from([1]));
+        assert_eq!(groups.path(1), None);
+    }
+
+    #[test]
+    fn people_read_a_container_or_a_unit() {
+        let id = "0123456789abcdef".repeat(4);
+        let short = "0123456789ab";
+        for path in [
+            format!("/system.slice/docker-{id}.scope"),
+            format!("/docker/{id}"),
+            format!("/docker/{id}/system.slice/inside.service"),
+            format!("/kubepods.slice/kubepods-pod7.slice/cri-containerd-{id}.scope"),
+            format!("/kubepods/besteffort/pod7/{id}"),
+            format!("/machine.slice/libpod-{id}.scope/container"),
+        ] {
+            assert_eq!(short_name(&path), short, "{path}");
+        }
+        for (path, name) in [
+            ("/", "/"),
+            ("/system.slice/robot.service", "robot.service"),
+            ("/system.slice/robot.service/nodes", "robot.service"),
+            (
+                "/user.slice/user-0.slice/session-3.scope",
+                "session-3.scope",
+            ),
+            ("/robots/arm", "arm"),
+            ("/robots/0123456789abcdef", "0123456789abcdef"),
+        ] {
+            assert_eq!(short_name(path), name);
+        }
+    }
+}

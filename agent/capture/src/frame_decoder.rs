@@ -1,0 +1,126 @@
+//! Feeds the core with captured frames: frames to datagrams to the observer, in the frames' own time.
+//!
+//! The live source takes its frames from the ring itself. Nothing here waits; whoever replays at
+//! a certain speed does so between packets.
+
+use ros2probe_model::input::Input;
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::frame::{self, PacketType, Payload};
+use ros2probe_wire::walk::Envelope;
+
+use super::pcap::{Captured, PcapError, PcapReader};
+use crate::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_model::observer::Observer;
+
+/// One capture on its way into the core.
+#[derive(Debug)]
+pub struct FrameDecoder {
+    reassembly: Reassembly,
+    last: Timestamp,
+}
+
+impl FrameDecoder {
+    /// At the beginning.
+    #[must_use]
+    pub fn new(limits: Limits) -> Self {
+        Self {
+            reassembly: Reassembly::new(limits),
+            last: Timestamp(0),
+        }
+    }
+
+    /// Replays the rest of a capture as fast as it goes, and settles.
+    ///
+    /// # Errors
+    /// When the capture cannot be read on; what came before it counts.
+    pub fn run(
+        &mut self,
+        reader: &mut PcapReader,
+        observer: &mut Observer,
+    ) -> Result<(), PcapError> {
+        while let Some(captured) = reader.next_packet()? {
+            self.packet(&captured, observer);
+        }
+        observer.input(Input::End);
+        Ok(())
+    }
+
+    /// Replays one frame.
+    pub fn packet(&mut self, captured: &Captured<'_>, observer: &mut Observer) {
+        // Several interfaces of one capture may be a little out of order.
+        self.last = self.last.max(captured.time);
+        observer.input(Input::Time(self.last));
+        let parsed = match frame::parse(captured.link, captured.bytes, captured.length) {
+            Ok(parsed) => parsed,
+            Err(error) => {
+                observer.input(Input::DecodeError {
+                    stage: "frame",
+                    reason: error.reason,
+                });
+                return;
+            }
+        };
+        let Some(packet) = parsed.packet else { return };
+        let interface = parsed.interface.unwrap_or(captured.interface);
+        let outgoing = parsed.packet_type == PacketType::OUTGOING;
+        let envelope = Envelope {
+            time: captured.time.0,
+            destination: packet.destination,
+            interface,
+            outgoing,
+            ..Envelope::default()
+        };
+        match packet.payload {
+            Payload::Datagram(datagram) => {
+                let envelope = Envelope {
+                    source_port: datagram.source_port,
+                    destination_port: datagram.destination_port,
+                    ..envelope
+                };
+                give(observer, &envelope, datagram.payload, datagram.length);
+            }
+            Payload::Fragment(fragment) => {
+                let key = FlowKey::new(0, interface, outgoing, &packet, &fragment);
+                let whole = self.reassembly.fragment(captured.time, key, &fragment);
+                if let Some(whole) = whole {
+                    let envelope = Envelope {
+                        source_port: whole.source_port,
+                        destination_port: whole.destination_port,
+                        fragmented: true,
+                        ..envelope
+                    };
+                    give(observer, &envelope, whole.payload(), whole.length);
+                }
+            }
+            Payload::Other(_) => {}
+        }
+    }
+
+    /// The reassembly, for its counters.
+    #[must_use]
+    pub const fn reassembly(&self) -> &Reassembly {
+        &self.reassembly
+    }
+
+    /// Time of the latest frame.
+    #[must_use]
+    pub const fn last(&self) -> Timestamp {
+        self.last
+    }
+}
+
+fn give(observer: &mut Observer, envelope: &Envelope, payload: &[u8], length: u32) {
+    if payload.len() < usize::try_from(length).unwrap_or(usize::MAX) {
+        observer.input(Input::CutDatagram {
+            envelope,
+            payload,
+            length,
+        });
+    } else {
+        observer.input(Input::Datagram {
+            envelope,
+            payload,
+            handover: None,
+        });
+    }
+}

@@ -1,0 +1,248 @@
+//! Puts captured datagrams together again that the host hook gives in pieces.
+//!
+//! Pieces of one datagram come in order, others may lie between them. One whose rest does not come
+//! lacked room in the ring: it is given up and counted. Bounded in number, and so in bytes. Knows
+//! nothing of what is in them.
+
+use std::borrow::Cow;
+use std::collections::VecDeque;
+
+use ros2probe_wire::host::{PIECE_BYTES, Piece};
+
+/// Datagrams that may wait for their rest, 4 MB at most. Only those of programs that run at the same
+/// time do, or those whose rest will not come.
+const MAX_OPEN: usize = 64;
+/// A program writes all pieces within microseconds, unless it loses its CPU.
+const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
+
+/// Datagrams of which not all pieces have come, the oldest first.
+#[derive(Debug, Default)]
+pub struct PieceAssembler {
+    open: VecDeque<Open>,
+    given_up: u64,
+}
+
+#[derive(Debug)]
+struct Open {
+    first: Piece,
+    bytes: Vec<u8>,
+}
+
+impl PieceAssembler {
+    /// Takes in a piece and the bytes that follow it; gives the datagram when it is whole, with its
+    /// first piece.
+    pub fn piece<'a>(&mut self, piece: &Piece, bytes: &'a [u8]) -> Option<(Piece, Cow<'a, [u8]>)> {
+        let bytes = bytes.get(..piece.len as usize).unwrap_or_default();
+        let end = piece.offset.checked_add(piece.len);
+        let fits = !bytes.is_empty()
+            && piece.len <= PIECE_BYTES
+            && piece.datagram_len <= u16::MAX.into()
+            && end.is_some_and(|end| end <= piece.datagram_len);
+        let open = self
+            .open
+            .iter()
+            .position(|open| open.first.datagram == piece.datagram);
+        if piece.offset == 0 {
+            // The token is used again: the rest of the other one will not come.
+            self.give_up(open);
+            if !fits {
+                self.given_up += 1;
+                return None;
+            }
+            if piece.len == piece.datagram_len {
+                return Some((*piece, Cow::Borrowed(bytes)));
+            }
+            if self.open.len() >= MAX_OPEN {
+                self.give_up(Some(0));
+            }
+            self.open.push_back(Open {
+                first: *piece,
+                bytes: bytes.to_vec(),
+            });
+            return None;
+        }
+        // Without the first piece it has been given up already, or never was here.
+        let index = open?;
+        let open = self.open.get_mut(index)?;
+        if !fits || !open.is_followed_by(piece) {
+            self.give_up(Some(index));
+            return None;
+        }
+        open.bytes.extend_from_slice(bytes);
+        if open.bytes.len() < piece.datagram_len as usize {
+            return None;
+        }
+        let whole = self.open.remove(index)?;
+        Some((whole.first, Cow::Owned(whole.bytes)))
+    }
+
+    /// Gives up what has waited too long, in the kernel's clock.
+    pub fn advance(&mut self, now: u64) {
+        let before = self.open.len();
+        self.open
+            .retain(|open| now.saturating_sub(open.first.time) < LIFETIME_NANOSECONDS);
+        self.given_up += (before - self.open.len()) as u64;
+    }
+
+    /// Datagrams that were begun and never became whole.
+    #[must_use]
+    pub const fn given_up(&self) -> u64 {
+        self.given_up
+    }
+
+    /// Bytes that wait.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        self.open.iter().map(|open| open.bytes.len()).sum()
+    }
+
+    fn give_up(&mut self, index: Option<usize>) {
+        if index.and_then(|index| self.open.remove(index)).is_some() {
+            self.given_up += 1;
+        }
+    }
+}
+
+impl Open {
+    /// Of the same datagram, and where this ends.
+    fn is_followed_by(&self, piece: &Piece) -> bool {
+        piece.offset as usize == self.bytes.len()
+            && piece.datagram_len == self.first.datagram_len
+            && piece.socket == self.first.socket
+            && piece.time == self.first.time
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn piece(datagram: u32, offset: u32, len: u32, datagram_len: u32) -> Piece {
+        Piece {
+            time: 1,
+            datagram,
+            offset,
+            len,
+            datagram_len,
+            ..Piece::default()
+        }
+    }
+
+    /// Byte `i` of a datagram is not that of its neighbours.
+    fn content(datagram: u32, offset: u32, len: u32) -> Vec<u8> {
+        (offset..offset + len)
+            .map(|at| (at * 7 + at / 256 + datagram) as u8)
+            .collect()
+    }
+
+    fn pieces(datagram: u32, datagram_len: u32) -> Vec<(Piece, Vec<u8>)> {
+        (0..datagram_len)
+            .step_by(PIECE_BYTES as usize)
+            .map(|offset| {
+                let len = PIECE_BYTES.min(datagram_len - offset);
+                let piece = piece(datagram, offset, len, datagram_len);
+                (piece, content(datagram, offset, len))
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_datagram_in_one_piece_is_not_copied() {
+        let mut wholes = PieceAssembler::default();
+        let (piece, bytes) = pieces(1, 1472).remove(0);
+        let whole = wholes.piece(&piece, &bytes).unwrap();
+        assert!(matches!(whole.1, Cow::Borrowed(same) if same == bytes));
+    }
+
+    #[test]
+    fn the_largest_datagrams_of_two_cpus_come_whole_when_their_pieces_mingle() {
+        let mut wholes = PieceAssembler::default();
+        let (one, two) = (pieces(1, 65_507), pieces(2, 65_507));
+        assert_eq!(one.len(), 4);
+        let mut complete = Vec::new();
+        for (one, two) in one.iter().zip(&two) {
+            for (piece, bytes) in [one, two] {
+                if let Some((first, whole)) = wholes.piece(piece, bytes) {
+                    assert_eq!(whole, content(first.datagram, 0, 65_507));
+                    complete.push(first.datagram);
+                }
+            }
+        }
+        assert_eq!(complete, [1, 2]);
+        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 0));
+    }
+
+    #[test]
+    fn one_whose_rest_never_comes_is_given_up_once() {
+        let mut wholes = PieceAssembler::default();
+        let all = pieces(1, 40_000);
+        assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
+        // The second had no room.
+        assert!(wholes.piece(&all[2].0, &all[2].1).is_none());
+        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 1));
+        assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
+        wholes.advance(LIFETIME_NANOSECONDS);
+        assert_eq!(wholes.given_up(), 1);
+        wholes.advance(LIFETIME_NANOSECONDS + 1);
+        assert_eq!((wholes.bytes(), wholes.given_up()), (0, 2));
+        // Nor is a rest that comes after all taken for anything.
+        assert!(wholes.piece(&all[1].0, &all[1].1).is_none());
+        assert_eq!(wholes.given_up(), 2);
+    }
+
+    #[test]
+    fn a_token_that_comes_again_begins_anew() {
+        let mut wholes = PieceAssembler::default();
+        let (old, new) = (pieces(1, 40_000), pieces(1, 20_000));
+        assert!(wholes.piece(&old[0].0, &old[0].1).is_none());
+        assert!(wholes.piece(&new[0].0, &new[0].1).is_none());
+        let (_, whole) = wholes.piece(&new[1].0, &new[1].1).unwrap();
+        assert_eq!(whole, content(1, 0, 20_000));
+        assert_eq!(wholes.given_up(), 1);
+    }
+
+    #[test]
+    fn more_than_there_is_room_for_push_out_the_oldest() {
+        let mut wholes = PieceAssembler::default();
+        for token in 0..1000 {
+            let all = pieces(token, 65_507);
+            assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
+        }
+        assert_eq!(wholes.open.len(), MAX_OPEN);
+        assert_eq!(wholes.given_up(), 1000 - MAX_OPEN as u64);
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_comes_only_true_datagrams_are_given(
+            sequence in proptest::collection::vec(
+                (0_u32..3, 0_u32..5, 0_u32..4, 0_u32..3),
+                0..60,
+            ),
+        ) {
+            let lens: [u32; 3] = [20_000, 40_000, 65_507];
+            let mut wholes = PieceAssembler::default();
+            for (token, step, damage, len) in sequence {
+                let datagram_len = lens[len as usize];
+                let offset = step * PIECE_BYTES;
+                let len = PIECE_BYTES.min(datagram_len.saturating_sub(offset));
+                let (piece, bytes) = match damage {
+                    0 => (piece(token, offset, u32::MAX, datagram_len), vec![0; 100]),
+                    1 => (piece(token, u32::MAX, len, datagram_len), vec![0; 100_000]),
+                    _ => (
+                        piece(token, offset, len, datagram_len),
+                        content(token, offset, len),
+                    ),
+                };
+                if let Some((first, whole)) = wholes.piece(&piece, &bytes) {
+                    prop_assert_eq!(whole.len(), first.datagram_len as usize);
+                    prop_assert_eq!(&*whole, &*content(first.datagram, 0, first.datagram_len));
+                }
+                prop_assert!(wholes.open.len() <= MAX_OPEN);
+                prop_assert!(wholes.bytes() <= MAX_OPEN * 65_535);
+            }
+        }
+    }
+}

@@ -1,0 +1,332 @@
+//! Puts what is counted back into the order in which it was captured.
+//!
+//! Records come from the kernel program's ring or, of a datagram that was captured whole, from the
+//! walk of its bytes, and either way may be the quicker one. A retransmission must not overtake the
+//! gap that it fills: it would count as a sample that was never missing. Everything waits until
+//! both ways have had their time. It decides nothing and knows no writer.
+//!
+//! That a socket had no room is known after its datagram was reported, and has to be said before:
+//! such records go first among all of their time or later. Of a captured datagram the kernel names
+//! the token only; its records are then said twice, first as not delivered.
+
+use std::collections::{HashSet, VecDeque};
+
+use ros2probe_wire::Record;
+use ros2probe_wire::record::{Body, flag};
+
+use super::system::Clocks;
+
+/// Records of captured datagrams that may wait: some 2.5 MB. Two thousand fit a datagram that means
+/// harm.
+const MAX_WALKED: usize = 16_384;
+/// Room for records that is kept when none wait; what a burst took beyond is given back.
+const KEPT: usize = 512;
+/// How much later than the word that it was not delivered a captured datagram may be read.
+const LATE_NANOSECONDS: u64 = 1_000_000_000;
+
+/// The records of one tap.
+#[derive(Debug, Default)]
+pub struct ReorderBuffer {
+    /// In the kernel's clock.
+    kernel: VecDeque<Record>,
+    /// Those with [`flag::NO_ROOM`], in the kernel's clock and sorted by it.
+    no_room: VecDeque<Record>,
+    walked: VecDeque<Walked>,
+    /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
+    undelivered: VecDeque<(u64, u32)>,
+    undelivered_tokens: HashSet<u32>,
+}
+
+/// A record of a captured datagram.
+#[derive(Clone, Copy, Debug)]
+struct Walked {
+    /// Its time in the kernel's clock.
+    at: u64,
+    /// Its time is calendar time.
+    record: Record,
+    /// It has been said that its datagram was not delivered.
+    no_room_said: bool,
+}
+
+/// One record whose turn it is, in calendar time.
+#[derive(Clone, Copy, Debug)]
+pub enum Next {
+    /// Written by the kernel program.
+    Kernel(Record),
+    /// Found in a captured datagram.
+    Walked(Record),
+}
+
+impl ReorderBuffer {
+    /// Takes in a record of the kernel's ring, its time in the kernel's clock.
+    pub fn kernel(&mut self, record: Record) {
+        if matches!(record.body(), Body::Undelivered) {
+            self.undelivered.push_back((record.time, record.datagram));
+            self.undelivered_tokens.insert(record.datagram);
+        } else if record.flags & flag::NO_ROOM != 0 {
+            // CPUs may be microseconds out of order.
+            let place = self
+                .no_room
+                .partition_point(|other| other.time <= record.time);
+            self.no_room.insert(place, record);
+        } else {
+            self.kernel.push_back(record);
+        }
+    }
+
+    /// Takes in a record of a captured datagram, its time in calendar time and `at` the same in the
+    /// kernel's clock; gives it back when too many wait.
+    #[must_use]
+    pub fn walked(&mut self, at: u64, record: Record) -> Option<Record> {
+        if self.walked.len() >= MAX_WALKED {
+            return Some(record);
+        }
+        self.walked.push_back(Walked {
+            at,
+            record,
+            no_room_said: false,
+        });
+        None
+    }
+
+    /// Records of the kernel's ring that wait.
+    #[must_use]
+    pub fn waiting(&self) -> usize {
+        self.kernel.len() + self.no_room.len()
+    }
+
+    /// The oldest record, if it is not younger than `until` in the kernel's clock.
+    pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
+        let kernel = self.kernel.front().map(|record| record.time);
+        let walked = self.walked.front().map(|walked| walked.at);
+        let no_room = self.no_room.front().map(|record| record.time);
+        let oldest = kernel.into_iter().chain(walked).chain(no_room).min();
+        if oldest.is_none_or(|oldest| oldest > until) {
+            self.forget_undelivered(until);
+            self.give_back();
+            return None;
+        }
+        let of_kernel = |mut record: Record| {
+            record.time = clocks.calendar(record.time).0;
+            Next::Kernel(record)
+        };
+        if no_room == oldest {
+            return self.no_room.pop_front().map(of_kernel);
+        }
+        if kernel == oldest {
+            return self.kernel.pop_front().map(of_kernel);
+        }
+        let walked = self.walked.front_mut()?;
+        let record = walked.record;
+        if !walked.no_room_said && self.undelivered_tokens.contains(&record.datagram) {
+            walked.no_room_said = true;
+            if record.is_sample() {
+                let flags = record.flags | flag::NO_ROOM;
+                return Some(Next::Walked(Record { flags, ..record }));
+            }
+        }
+        let mut record = record;
+        if clocks.step != 0 {
+            record.time = clocks.calendar(walked.at).0;
+        }
+        self.walked.pop_front();
+        Some(Next::Walked(record))
+    }
+
+    fn give_back(&mut self) {
+        for records in [&mut self.kernel, &mut self.no_room] {
+            if records.is_empty() && records.capacity() > KEPT {
+                *records = VecDeque::new();
+            }
+        }
+        if self.walked.is_empty() && self.walked.capacity() > KEPT {
+            self.walked = VecDeque::new();
+        }
+    }
+
+    /// Of the last second, records up to `until` may not have come yet.
+    fn forget_undelivered(&mut self, until: u64) {
+        let before = until.saturating_sub(LATE_NANOSECONDS);
+        while let Some((_, token)) = self.undelivered.pop_front_if(|(at, _)| *at < before) {
+            self.undelivered_tokens.remove(&token);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::Timestamp;
+    use ros2probe_wire::record::kind;
+
+    use super::*;
+
+    const MILLISECOND: u64 = 1_000_000;
+    const SETTLE: u64 = 80 * MILLISECOND;
+
+    fn clocks(milliseconds: u64) -> Clocks {
+        Clocks {
+            now: Timestamp((1_000_000 + milliseconds) * MILLISECOND),
+            monotonic: milliseconds * MILLISECOND,
+            step: 0,
+        }
+    }
+
+    fn of_the_kernel(number: u64, milliseconds: u64) -> Record {
+        Record {
+            kind: kind::DATA,
+            sequence_number: number,
+            time: clocks(milliseconds).monotonic,
+            ..Record::default()
+        }
+    }
+
+    fn no_room(number: u64, milliseconds: u64) -> Record {
+        Record {
+            flags: flag::NO_ROOM,
+            ..of_the_kernel(number, milliseconds)
+        }
+    }
+
+    fn undelivered(datagram: u32, milliseconds: u64) -> Record {
+        Record {
+            kind: kind::UNDELIVERED,
+            datagram,
+            ..of_the_kernel(0, milliseconds)
+        }
+    }
+
+    /// Time in the kernel's clock, and record.
+    fn captured(number: u64, milliseconds: u64) -> (u64, Record) {
+        let clocks = clocks(milliseconds);
+        let record = Record {
+            time: clocks.now.0,
+            ..of_the_kernel(number, milliseconds)
+        };
+        (clocks.monotonic, record)
+    }
+
+    fn walked(order: &mut ReorderBuffer, (at, record): (u64, Record)) {
+        assert!(order.walked(at, record).is_none());
+    }
+
+    /// Sequence numbers, negative where the record says that there was no room.
+    fn numbers(order: &mut ReorderBuffer, clocks: &Clocks) -> Vec<i64> {
+        std::iter::from_fn(|| order.next(clocks, clocks.monotonic.saturating_sub(SETTLE)))
+            .map(|next| {
+                let (Next::Kernel(record) | Next::Walked(record)) = next;
+                let age = clocks.now.nanoseconds_since(Timestamp(record.time));
+                assert!(age >= SETTLE.cast_signed(), "{age}");
+                let number = record.sequence_number.cast_signed();
+                let delivered = record.flags & flag::NO_ROOM == 0;
+                if delivered { number } else { -number }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_retransmission_in_a_captured_frame_does_not_overtake_the_gap_it_fills() {
+        let mut order = ReorderBuffer::default();
+        // 10 was lost; it comes again in a frame that user space gets before the record of 11.
+        walked(&mut order, captured(10, 30));
+        order.kernel(of_the_kernel(9, 1));
+        order.kernel(of_the_kernel(11, 20));
+        order.kernel(of_the_kernel(12, 35));
+        assert!(numbers(&mut order, &clocks(80)).is_empty());
+        assert_eq!(numbers(&mut order, &clocks(105)), [9, 11]);
+        assert_eq!(numbers(&mut order, &clocks(200)), [10, 12]);
+    }
+
+    #[test]
+    fn no_room_is_said_before_everything_of_its_time_or_later() {
+        let mut order = ReorderBuffer::default();
+        order.kernel(of_the_kernel(1, 5));
+        order.kernel(of_the_kernel(2, 10));
+        // Another CPU's, and two that are out of order.
+        order.kernel(of_the_kernel(3, 12));
+        order.kernel(no_room(3, 12));
+        order.kernel(no_room(2, 10));
+        walked(&mut order, captured(4, 12));
+        assert_eq!(numbers(&mut order, &clocks(200)), [1, -2, 2, -3, 3, 4]);
+        // The arrival waits in a run and comes with the time of the last fragment.
+        order.kernel(no_room(7, 300));
+        order.kernel(of_the_kernel(6, 299));
+        order.kernel(of_the_kernel(7, 320));
+        assert_eq!(numbers(&mut order, &clocks(390)), [6, -7]);
+        assert_eq!(numbers(&mut order, &clocks(400)), [7]);
+    }
+
+    #[test]
+    fn what_a_captured_datagram_holds_is_said_as_not_delivered_first() {
+        for pieces_first in [true, false] {
+            let mut order = ReorderBuffer::default();
+            let heartbeat = |(at, record)| {
+                let record = Record {
+                    kind: kind::HEARTBEAT,
+                    ..record
+                };
+                (at, record)
+            };
+            let of = |token, (at, record)| {
+                let record = Record {
+                    datagram: token,
+                    ..record
+                };
+                (at, record)
+            };
+            if !pieces_first {
+                order.kernel(undelivered(8, 10));
+            }
+            walked(&mut order, of(7, captured(1, 9)));
+            walked(&mut order, of(8, captured(2, 10)));
+            walked(&mut order, of(8, captured(3, 10)));
+            walked(&mut order, of(8, heartbeat(captured(4, 10))));
+            walked(&mut order, of(9, captured(5, 11)));
+            if pieces_first {
+                order.kernel(undelivered(8, 10));
+            }
+            assert_eq!(
+                numbers(&mut order, &clocks(200)),
+                [1, -2, 2, -3, 3, 4, 5],
+                "{pieces_first}"
+            );
+            // Tokens come again.
+            assert!(numbers(&mut order, &clocks(4000)).is_empty());
+            walked(&mut order, of(8, captured(6, 5000)));
+            assert_eq!(numbers(&mut order, &clocks(6000)), [6]);
+        }
+    }
+
+    #[test]
+    fn a_clock_that_was_set_holds_nothing_up() {
+        let mut order = ReorderBuffer::default();
+        let (_, back) = captured(1, 3_600_000);
+        let at = clocks(10).monotonic_of(Timestamp(back.time));
+        assert!(order.walked(at, back).is_none());
+        let next = order.next(&clocks(90), 10 * MILLISECOND);
+        assert!(matches!(next, Some(Next::Walked(_))), "{next:?}");
+    }
+
+    #[test]
+    fn what_a_burst_took_is_given_back_when_it_is_over() {
+        let mut order = ReorderBuffer::default();
+        for number in 0..20_000 {
+            order.kernel(of_the_kernel(number, 1));
+            let (at, record) = captured(number, 1);
+            let _ = order.walked(at, record);
+        }
+        assert!(order.kernel.capacity() >= 20_000);
+        while order.next(&clocks(900), 900 * MILLISECOND).is_some() {}
+        assert!(order.kernel.capacity() <= KEPT);
+        assert!(order.walked.capacity() <= KEPT);
+    }
+
+    #[test]
+    fn no_more_wait_than_there_is_room_for() {
+        let mut order = ReorderBuffer::default();
+        let refused = (0..20_000).filter(|number| {
+            let (at, record) = captured(*number, 1);
+            order.walked(at, record).is_some()
+        });
+        assert_eq!(refused.count(), 20_000 - MAX_WALKED);
+    }
+}

@@ -1,0 +1,589 @@
+//! Which files of shared memory there are, in every mount namespace of the host.
+//!
+//! Each `/dev/shm` is listed only when it changed; processes are gone through only for those that
+//! are new. What is behind `/proc/<pid>/root` belongs to somebody else: links are not followed
+//! there.
+
+use std::collections::{HashMap, HashSet};
+use std::fs::{self, Metadata};
+use std::os::unix::fs::{DirEntryExt as _, MetadataExt as _};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use super::cell::SegmentId;
+use super::owner::{LOCKED, Locks};
+
+/// Where shared memory is.
+const SHARED_MEMORY: &str = "/dev/shm";
+/// File names begin with one of these: Fast DDS 2.x, 3.x.
+const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
+/// Mount namespaces with a `/dev/shm` of their own that are looked at.
+const MAX_DIRECTORIES: usize = 64;
+/// Files of one of them.
+const MAX_FILES: usize = 2048;
+/// Entries of one of them that are looked through for those.
+const MAX_LISTED: usize = 65_536;
+/// A directory that changed so lately may change again without its time telling.
+const COARSE: Duration = Duration::from_secs(1);
+/// A process that was met no more often than this may still be mounting what it needs; an older
+/// one is asked again at every so many rounds.
+const YOUNG: u32 = 10;
+const ROUNDS: u32 = 32;
+/// Levels of cgroups and processes of a scope that are gone through.
+const DEPTH: usize = 8;
+const MAX_PROCESSES: usize = 8192;
+
+/// A directory of shared memory, by the device and inode it has.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct ShmDirectoryId {
+    device: u64,
+    inode: u64,
+}
+
+/// The ports' and segments' files of one Fast DDS generation: index of its prefix.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub struct Generation(u8);
+
+/// What a file is by its name.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+pub enum Name {
+    /// A port.
+    Port(Generation, u32),
+    /// A segment.
+    Segment(Generation, SegmentId),
+}
+
+/// One directory of shared memory.
+#[derive(Debug)]
+pub struct ShmDirectory {
+    /// Where it can be reached now.
+    pub path: PathBuf,
+    /// Files by name, with their inodes.
+    pub files: HashMap<Name, u64>,
+    changed: Option<SystemTime>,
+    seen: bool,
+}
+
+/// Whose shared memory is read.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub enum Scope {
+    /// The agent's own, and that of every process.
+    AllProcesses,
+    /// That of the processes of this cgroup and those below it.
+    Cgroup(PathBuf),
+    /// The agent's own, and that of processes in these network namespaces.
+    Networks(Vec<PathBuf>),
+    /// These directories.
+    Directories(Vec<PathBuf>),
+}
+
+/// All of them.
+#[derive(Debug)]
+pub struct ShmDirectories {
+    scope: Scope,
+    /// Inodes of the network namespaces, where those are the scope.
+    networks: Vec<u64>,
+    /// By identity.
+    pub directories: HashMap<ShmDirectoryId, ShmDirectory>,
+    /// Processes gone through, with the directory they have and how often they were met.
+    processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
+    /// Directories and files left out because of a cap.
+    pub left_out: u64,
+}
+
+impl Scope {
+    /// Its processes. Those of directories are not known.
+    #[must_use]
+    pub fn processes(&self) -> Vec<u32> {
+        match self {
+            Self::AllProcesses | Self::Networks(_) => all_processes(),
+            Self::Cgroup(cgroup) => {
+                let mut processes = Vec::new();
+                processes_of(cgroup, DEPTH, &mut processes);
+                processes
+            }
+            Self::Directories(_) => Vec::new(),
+        }
+    }
+}
+
+impl Name {
+    /// From a file's name; `None` for everything that is not read.
+    #[must_use]
+    pub fn parse(name: &str) -> Option<Self> {
+        let (generation, rest) = (0_u8..)
+            .zip(PREFIXES)
+            .find_map(|(index, prefix)| Some((Generation(index), name.strip_prefix(prefix)?)))?;
+        if let Some(number) = rest.strip_prefix("port") {
+            let is_number = !number.is_empty() && number.bytes().all(|b| b.is_ascii_digit());
+            let number = number.parse().ok().filter(|_| is_number)?;
+            return Some(Self::Port(generation, number));
+        }
+        let bytes = rest.as_bytes();
+        let mut id = [0; 8];
+        let is_id =
+            bytes.len() == 16 && bytes.iter().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
+        let (pairs, _) = bytes.as_chunks::<2>();
+        for (byte, [high, low]) in id.iter_mut().zip(pairs.iter().filter(|_| is_id)) {
+            let digit = |digit: u8| char::from(digit).to_digit(16).unwrap_or(0) as u8;
+            *byte = digit(*high) << 4 | digit(*low);
+        }
+        is_id.then_some(Self::Segment(generation, SegmentId(id)))
+    }
+
+    /// Of the file whose lock this file bears.
+    fn of_lock(name: &str) -> Option<Self> {
+        let suffix = |suffix: &&str| name.strip_suffix(*suffix).and_then(Self::parse);
+        LOCKED.iter().find_map(suffix)
+    }
+
+    /// The file's name.
+    #[must_use]
+    pub fn file_name(&self) -> String {
+        let prefix = |generation: &Generation| {
+            let prefix = PREFIXES.get(usize::from(generation.0));
+            prefix.copied().unwrap_or_default()
+        };
+        match self {
+            Self::Port(generation, number) => format!("{}port{number}", prefix(generation)),
+            Self::Segment(generation, id) => format!("{}{id}", prefix(generation)),
+        }
+    }
+}
+
+impl ShmDirectories {
+    /// None found yet.
+    #[must_use]
+    pub fn new(scope: Scope) -> Self {
+        let networks = match &scope {
+            Scope::Networks(paths) => paths.iter().filter_map(|path| inode(path)).collect(),
+            _ => Vec::new(),
+        };
+        Self {
+            scope,
+            networks,
+            directories: HashMap::new(),
+            processes: HashMap::new(),
+            left_out: 0,
+        }
+    }
+
+    /// Finds the directories of shared memory. What no living process reaches any more is forgotten.
+    pub fn find(&mut self) {
+        for directory in self.directories.values_mut() {
+            directory.seen = false;
+        }
+        match self.scope.clone() {
+            Scope::Directories(directories) => {
+                for directory in directories {
+                    self.reach(&directory);
+                }
+            }
+            Scope::Cgroup(cgroup) => {
+                let mut processes = Vec::new();
+                processes_of(&cgroup, DEPTH, &mut processes);
+                // The agent may be there, and shares nothing.
+                processes.retain(|pid| *pid != std::process::id());
+                self.go_through(processes);
+            }
+            Scope::AllProcesses | Scope::Networks(_) => {
+                self.reach(Path::new(SHARED_MEMORY));
+                self.go_through(all_processes());
+            }
+        }
+        self.directories.retain(|_, directory| directory.seen);
+    }
+
+    /// Lists what changed since the last time; whether anything did.
+    pub fn list(&mut self) -> bool {
+        let mut any = false;
+        for directory in self.directories.values_mut() {
+            any |= directory.list(&mut self.left_out);
+        }
+        any
+    }
+
+    fn go_through(&mut self, processes: Vec<u32>) {
+        let before = std::mem::take(&mut self.processes);
+        for pid in processes {
+            let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
+            let is_settled = met > YOUNG && met % ROUNDS != pid % ROUNDS;
+            let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
+                // Its path may lead through another process, which need not live any more.
+                Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {
+                    directory.seen = true;
+                    known
+                }
+                None if is_settled => None,
+                _ => self.directory_of(pid),
+            };
+            self.processes
+                .insert(pid, (directory, met.saturating_add(1)));
+        }
+    }
+
+    fn directory_of(&mut self, pid: u32) -> Option<ShmDirectoryId> {
+        if matches!(self.scope, Scope::Networks(_)) {
+            let network = inode(Path::new(&format!("/proc/{pid}/ns/net")))?;
+            if !self.networks.contains(&network) {
+                return None;
+            }
+        }
+        let is_directory =
+            |path: &Path| fs::symlink_metadata(path).is_ok_and(|metadata| metadata.is_dir());
+        let devices = PathBuf::from(format!("/proc/{pid}/root/dev"));
+        let within = devices.join("shm");
+        let is_plain = is_directory(&devices) && is_directory(&within);
+        is_plain.then(|| self.reach(&within)).flatten()
+    }
+
+    fn reach(&mut self, path: &Path) -> Option<ShmDirectoryId> {
+        let metadata = fs::metadata(path).ok().filter(Metadata::is_dir)?;
+        let id = ShmDirectoryId {
+            device: metadata.dev(),
+            inode: metadata.ino(),
+        };
+        if let Some(directory) = self.directories.get_mut(&id) {
+            if !directory.seen && directory.path != path && !directory.path.exists() {
+                directory.path = path.to_path_buf();
+            }
+            directory.seen = true;
+            return Some(id);
+        }
+        if self.directories.len() >= MAX_DIRECTORIES {
+            self.left_out += 1;
+            return None;
+        }
+        self.directories.insert(
+            id,
+            ShmDirectory {
+                path: path.to_path_buf(),
+                files: HashMap::new(),
+                changed: None,
+                seen: true,
+            },
+        );
+        Some(id)
+    }
+}
+
+impl ShmDirectory {
+    fn list(&mut self, left_out: &mut u64) -> bool {
+        let changed = fs::metadata(&self.path).and_then(|metadata| metadata.modified());
+        let changed = changed.ok();
+        let settled = changed.is_some_and(|at| at.elapsed().is_ok_and(|age| age > COARSE));
+        if settled && changed == self.changed {
+            return false;
+        }
+        self.changed = changed.filter(|_| settled);
+        let known = std::mem::take(&mut self.files);
+        let Ok(entries) = fs::read_dir(&self.path) else {
+            return true;
+        };
+        let (mut files, mut locks) = (Vec::new(), Vec::new());
+        let mut entries = entries.flatten();
+        for entry in entries.by_ref().take(MAX_LISTED) {
+            let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+            let name = entry.file_name();
+            let Some(name) = name.to_str().filter(|_| is_file) else {
+                continue;
+            };
+            if let Some(name) = Name::parse(name) {
+                files.push((name, entry.ino()));
+            } else if let Some(name) = Name::of_lock(name) {
+                locks.push((name, entry.ino()));
+            }
+        }
+        if entries.next().is_some() {
+            *left_out += 1;
+            files = self.keep(files, known);
+        }
+        *left_out += files.len().saturating_sub(MAX_FILES) as u64;
+        if files.len() > MAX_FILES {
+            files = self.choose(files, &locks);
+        }
+        self.files.extend(files);
+        true
+    }
+
+    /// Of a directory that was not looked through to its end the files that were `listed`, and those
+    /// `known` before that are still there.
+    fn keep(&self, listed: Vec<(Name, u64)>, known: HashMap<Name, u64>) -> Vec<(Name, u64)> {
+        let mut files: HashMap<Name, u64> = listed.into_iter().collect();
+        for (name, inode) in known {
+            let metadata = || fs::symlink_metadata(self.path.join(name.file_name()));
+            let is_same = |metadata: Metadata| metadata.is_file() && metadata.ino() == inode;
+            if !files.contains_key(&name) && metadata().is_ok_and(is_same) {
+                files.insert(name, inode);
+            }
+        }
+        files.into_iter().collect()
+    }
+
+    /// Of too many files those whose processes live, and of those that are left as many of each
+    /// user, the oldest first: a user who makes many hides none of another's.
+    fn choose(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
+        let device = fs::metadata(&self.path).map_or(0, |metadata| metadata.dev());
+        let held = Locks::read();
+        let locks = locks.iter();
+        let locks = locks.filter(|(_, inode)| held.is_held(device, *inode) == Some(true));
+        let alive: HashSet<Name> = locks.map(|(name, _)| *name).collect();
+        let (mut chosen, others) = files
+            .into_iter()
+            .partition::<Vec<_>, _>(|(name, _)| alive.contains(name));
+        if chosen.len() > MAX_FILES {
+            return self.share(chosen, MAX_FILES);
+        }
+        chosen.extend(self.share(others, MAX_FILES - chosen.len()));
+        chosen
+    }
+
+    /// So many of them, an equal number of each user's.
+    fn share(&self, files: Vec<(Name, u64)>, room: usize) -> Vec<(Name, u64)> {
+        let files = files.into_iter().filter_map(|(name, inode)| {
+            let metadata = fs::symlink_metadata(self.path.join(name.file_name())).ok()?;
+            let age = (metadata.ctime(), metadata.ctime_nsec());
+            Some((metadata.uid(), age, inode, name))
+        });
+        let mut files: Vec<_> = files.collect();
+        files.sort_unstable_by_key(|(user, age, inode, _)| (*user, *age, *inode));
+        let mut taken: HashMap<u32, usize> = HashMap::new();
+        let turns = files.into_iter().map(|(user, age, inode, name)| {
+            let turn = taken.entry(user).or_default();
+            *turn += 1;
+            (*turn, age, name, inode)
+        });
+        let mut turns: Vec<_> = turns.collect();
+        turns.sort_unstable_by_key(|(turn, age, _, inode)| (*turn, *age, *inode));
+        let chosen = turns.into_iter().take(room);
+        chosen.map(|(_, _, name, inode)| (name, inode)).collect()
+    }
+}
+
+fn inode(path: &Path) -> Option<u64> {
+    fs::metadata(path).ok().map(|metadata| metadata.ino())
+}
+
+fn all_processes() -> Vec<u32> {
+    let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
+    let processes = entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
+    processes.take(MAX_PROCESSES).collect()
+}
+
+fn processes_of(cgroup: &Path, depth: usize, processes: &mut Vec<u32>) {
+    let members = fs::read_to_string(cgroup.join("cgroup.procs")).unwrap_or_default();
+    let members = members.lines().filter_map(|line| line.parse::<u32>().ok());
+    processes.extend(members.take(MAX_PROCESSES.saturating_sub(processes.len())));
+    let entries = fs::read_dir(cgroup).into_iter().flatten().flatten();
+    for entry in entries.filter(|_| depth > 0) {
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            processes_of(&entry.path(), depth - 1, processes);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_ports_and_segments_are_read_and_written() {
+        for name in [
+            "fastrtps_port7411",
+            "fastdds_port7661",
+            "fastrtps_0011aabbccddeeff",
+            "fastdds_ffffffffffffffff",
+        ] {
+            assert_eq!(Name::parse(name).unwrap().file_name(), name);
+        }
+    }
+
+    #[test]
+    fn locks_semaphores_data_sharing_and_nonsense_are_left_alone() {
+        for name in [
+            "fastrtps_port7411_el",
+            "fastrtps_port7411_sl",
+            "sem.fastrtps_port7411_mutex",
+            "fastrtps_0011aabbccddeeff_el",
+            "fastrtps_0011AABBCCDDEEFF",
+            "fastrtps_0011aabbccddeef",
+            "fast_datasharing_0011aabbccddeeff",
+            "fastrtps_port",
+            "fastrtps_port+7411",
+            "fastrtps_port99999999999",
+            "fastrtps_",
+            "",
+        ] {
+            assert_eq!(Name::parse(name), None, "{name}");
+        }
+    }
+
+    #[test]
+    fn files_that_come_and_go_are_noticed_also_within_one_tick_of_the_clock() {
+        let directory = tempfile::tempdir().unwrap();
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
+        let port = Name::parse("fastrtps_port7411").unwrap();
+        let path = directory.path().join(port.file_name());
+        let count = |directories: &ShmDirectories| {
+            let files = directories
+                .directories
+                .values()
+                .map(|directory| directory.files.len());
+            files.sum::<usize>()
+        };
+        for _ in 0..20 {
+            fs::write(&path, "x").unwrap();
+            directories.list();
+            assert_eq!(count(&directories), 1);
+            fs::remove_file(&path).unwrap();
+            directories.list();
+            assert_eq!(count(&directories), 0);
+        }
+        drop(directory);
+        directories.find();
+        assert!(directories.directories.is_empty());
+    }
+
+    fn files(directories: &ShmDirectories) -> HashSet<Name> {
+        let files = directories
+            .directories
+            .values()
+            .flat_map(|directory| directory.files.keys());
+        files.copied().collect()
+    }
+
+    #[test]
+    fn files_of_living_processes_are_found_among_more_forged_ones_than_are_kept() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = |name: &str| fs::File::create(directory.path().join(name)).unwrap();
+        for number in 0..MAX_FILES + 500 {
+            file(&format!("fastrtps_{number:016x}"));
+        }
+        let real = ["fastrtps_port7411", "fastrtps_ffffffffffffffff"];
+        let locks = real.map(|name| {
+            file(name);
+            let lock = file(&format!("{name}_el"));
+            lock.try_lock().unwrap();
+            lock
+        });
+        for number in 0..MAX_FILES + 500 {
+            file(&format!("fastrtps_port{}", 20_000 + number));
+        }
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
+        directories.list();
+        let found = files(&directories);
+        assert_eq!(found.len(), MAX_FILES);
+        for name in real {
+            assert!(found.contains(&Name::parse(name).unwrap()), "{name}");
+        }
+        assert!(directories.left_out > 0);
+        drop(locks);
+    }
+
+    #[test]
+    fn of_more_entries_than_are_looked_through_those_of_files_that_were_known_stay() {
+        let directory = tempfile::tempdir_in(SHARED_MEMORY).unwrap();
+        let path = |name: &str| directory.path().join(name);
+        let flood = |numbers: std::ops::Range<usize>| {
+            for number in numbers {
+                fs::File::create(path(&format!("fastrtps_{number:016x}"))).unwrap();
+            }
+        };
+        let real = ["fastrtps_port7411", "fastrtps_port7413"];
+        let make = |name: &str| {
+            fs::File::create(path(name)).unwrap();
+            std::os::unix::fs::chown(path(name), Some(64_123), None).unwrap();
+        };
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
+        // Whichever end of the directory the file system lists first.
+        make(real[0]);
+        flood(0..MAX_LISTED - real.len());
+        make(real[1]);
+        directories.list();
+        assert_eq!(directories.left_out, (MAX_LISTED - MAX_FILES) as u64);
+        let has_real = |directories: &ShmDirectories| {
+            let found = files(directories);
+            assert_eq!(found.len(), MAX_FILES);
+            real.map(|name| found.contains(&Name::parse(name).unwrap()))
+        };
+        assert_eq!(has_real(&directories), [true; 2]);
+        flood(MAX_LISTED..MAX_LISTED + 2 * MAX_FILES);
+        directories.left_out = 0;
+        directories.list();
+        // One for all entries that were not looked at, and the files beyond those that are kept.
+        let left_out = usize::try_from(directories.left_out).unwrap();
+        let bound = 1 + MAX_LISTED - MAX_FILES..=1 + MAX_LISTED;
+        assert!(bound.contains(&left_out), "{left_out}");
+        assert_eq!(has_real(&directories), [true; 2]);
+        fs::remove_file(path(real[0])).unwrap();
+        directories.list();
+        assert_eq!(has_real(&directories), [false, true]);
+    }
+
+    #[test]
+    fn a_user_who_makes_too_many_files_hides_none_of_another_user() {
+        let directory = tempfile::tempdir().unwrap();
+        let file = |name: &str| directory.path().join(name);
+        for number in 0..MAX_FILES + 500 {
+            fs::write(file(&format!("fastrtps_{number:016x}")), "").unwrap();
+        }
+        let real = Name::parse("fastrtps_port7411").unwrap();
+        fs::write(file("fastrtps_port7411"), "").unwrap();
+        std::os::unix::fs::chown(file("fastrtps_port7411"), Some(64_123), None).unwrap();
+        let mut directories =
+            ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
+        directories.find();
+        directories.list();
+        let found = files(&directories);
+        assert!(found.len() == MAX_FILES && found.contains(&real));
+    }
+
+    #[test]
+    fn a_directory_that_another_is_mounted_over_is_left_for_the_other() {
+        let above = tempfile::tempdir().unwrap();
+        let path = above.path().join("shm");
+        fs::create_dir(&path).unwrap();
+        fs::write(path.join("fastrtps_port7411"), "").unwrap();
+        let mut directories = ShmDirectories::new(Scope::Directories(vec![path.clone()]));
+        let mut assert_only = |name: &str| {
+            directories.find();
+            directories.list();
+            assert_eq!(
+                files(&directories),
+                HashSet::from([Name::parse(name).unwrap()])
+            );
+        };
+        assert_only("fastrtps_port7411");
+        // Another directory with the same path, as after a mount.
+        fs::rename(&path, above.path().join("below")).unwrap();
+        fs::create_dir(&path).unwrap();
+        fs::write(path.join("fastrtps_port7413"), "").unwrap();
+        assert_only("fastrtps_port7413");
+    }
+
+    #[test]
+    fn this_hosts_shared_memory_is_found_once_however_many_processes_have_it() {
+        let mut directories = ShmDirectories::new(Scope::AllProcesses);
+        directories.find();
+        let own = directories
+            .directories
+            .values()
+            .filter(|directory| directory.path == Path::new(SHARED_MEMORY));
+        assert_eq!(own.count(), 1);
+        // Of this process's network there is that one too, of a cgroup without processes nothing.
+        let network = PathBuf::from("/proc/self/ns/net");
+        let mut directories = ShmDirectories::new(Scope::Networks(vec![network]));
+        directories.find();
+        let mut own = directories.directories.values();
+        assert!(own.any(|directory| directory.path == Path::new(SHARED_MEMORY)));
+        let mut directories = ShmDirectories::new(Scope::Cgroup(PathBuf::from("/nowhere")));
+        directories.find();
+        assert!(directories.directories.is_empty());
+    }
+}

@@ -1,0 +1,392 @@
+//! How long the tap sleeps between two polls.
+//!
+//! Waking up is what a look costs. So it looks again soon where there was much, slower and slower
+//! where there was nothing, and whatever it would like to do is stretched until it stays within its
+//! share of a CPU. Knows no clock but what it is told.
+
+use std::time::Duration;
+
+/// Between looks while messages come in bursts, and at most while something is measured.
+const BURST: f64 = 100e-6;
+const WATCHING: f64 = 1e-3;
+/// At most when only discovery is wanted, and when nothing came for a while.
+const NAMES: f64 = 5e-3;
+const QUIET: f64 = 10e-3;
+/// Where nothing is wanted: a glance, for what was said last can still be read.
+const NOTHING: f64 = 100e-3;
+/// Nothing came for so long.
+const QUIET_AFTER: f64 = 3.0;
+/// How much longer each sleep after nothing is.
+const SLOWER: f64 = 1.5;
+/// The share of the CPU is looked at this often.
+const ACCOUNT: f64 = 0.1;
+/// When participants meet, each says its names once, and uses the buffer again some 50 us later.
+/// Short sleeps see more than none: who sleeps is woken before those who compute.
+const MEETING: f64 = 10e-6;
+/// Messages come in bursts, and it does not sleep at all for so long after each.
+const BURSTS: f64 = 200e-6;
+/// How long that goes on after a participant created its files, and after anything was announced.
+const NEWCOMER: f64 = 0.3;
+const NEWS: f64 = 0.1;
+/// CPU time for it: at most so many seconds, and so much more each second.
+const CREDIT: f64 = 10.0;
+const CREDIT_PER_SECOND: f64 = 0.01;
+/// At most while every message is wanted. In a burst a sender uses its buffers again after some
+/// 100 us, and its reader is quicker than that.
+const EVERY: f64 = 50e-6;
+const SOON: f64 = 20e-6;
+/// CPU time that may be saved for it, so that a short recording lacks nothing, and overdrawn.
+const SAVINGS: f64 = 5.0;
+const OVERDRAFT: f64 = 0.25;
+/// Sleeps get no longer than this, whatever it costs.
+const LONGEST: f64 = 50e-3;
+
+/// What the tap is there for at the moment.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Need {
+    /// Nothing is measured that can pass here, and no name is lacking. Who comes is noticed.
+    Nothing,
+    /// Nothing is measured; node names and endpoints may come.
+    Names,
+    /// Something is measured.
+    Watching,
+    /// Every message is wanted, not their number alone.
+    Every,
+}
+
+impl Need {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::Nothing, Self::Names, Self::Watching, Self::Every];
+}
+
+/// Shares of a CPU, 0.015 for 1.5 %.
+#[derive(Clone, Copy, PartialEq, Debug)]
+pub struct Budget {
+    /// While messages are counted and names are read.
+    pub watching: f64,
+    /// While every message is wanted.
+    pub every: f64,
+}
+
+/// The sleeps.
+#[derive(Debug)]
+pub struct PollInterval {
+    budget: Budget,
+    need: Need,
+    sleep: f64,
+    stretch: f64,
+    quiet_since: f64,
+    accounted: (f64, f64),
+    meeting_until: f64,
+    awake_until: f64,
+    /// Others have a CPU while it does not sleep.
+    has_company: bool,
+    was_close: bool,
+    /// CPU time for close looks that is left.
+    credit: f64,
+    /// What is left of the budget while every message is wanted, as of a time and the CPU time that
+    /// was used up to then.
+    savings: f64,
+    spent: (f64, f64),
+}
+
+impl PollInterval {
+    /// Within these shares of a CPU.
+    #[must_use]
+    pub const fn new(budget: Budget) -> Self {
+        Self {
+            budget,
+            need: Need::Nothing,
+            sleep: WATCHING,
+            stretch: 1.0,
+            quiet_since: 0.0,
+            accounted: (0.0, 0.0),
+            meeting_until: 0.0,
+            awake_until: 0.0,
+            has_company: false,
+            was_close: false,
+            credit: CREDIT,
+            savings: SAVINGS,
+            spent: (0.0, 0.0),
+        }
+    }
+
+    /// With more than one CPU it may stay awake for a moment.
+    #[must_use]
+    pub const fn on(self, cpus: usize) -> Self {
+        Self {
+            has_company: cpus > 1,
+            ..self
+        }
+    }
+
+    /// Somebody comes: for a moment it looks as closely as it can, while there is credit for that.
+    pub fn newcomer(&mut self, now: f64) {
+        self.watch_closely(now + NEWCOMER);
+    }
+
+    /// Something was announced, and more of it may follow.
+    pub fn news(&mut self, now: f64) {
+        self.watch_closely(now + NEWS);
+    }
+
+    /// Whether it looks closely because somebody comes.
+    #[must_use]
+    pub fn is_watching_closely(&self, now: f64) -> bool {
+        now < self.meeting_until
+    }
+
+    /// How long to sleep after a look at `now` that found so many messages; `cpu` is what the
+    /// thread has used so far. Both in seconds.
+    pub fn sleep(&mut self, now: f64, cpu: f64, found: usize, need: Need) -> Duration {
+        if found > 0 {
+            self.quiet_since = now;
+        }
+        if self.was_close {
+            let (_, used) = std::mem::replace(&mut self.accounted, (now, cpu));
+            self.credit -= cpu - used;
+        }
+        self.was_close = self.is_watching_closely(now) && self.credit > 0.0;
+        if self.was_close {
+            self.sleep = MEETING;
+            if found > 0 && self.has_company {
+                self.awake_until = now + BURSTS;
+            }
+            if now < self.awake_until {
+                return Duration::ZERO;
+            }
+            return Duration::from_secs_f64(MEETING);
+        }
+        self.meeting_until = now;
+        if (need == Need::Every) != (self.need == Need::Every) {
+            // By another measure from now on.
+            (self.stretch, self.accounted) = (1.0, (now, cpu));
+            let saved = (now - self.spent.0) * self.budget.every;
+            self.savings = (self.savings + saved).min(SAVINGS);
+            self.spent = (now, cpu);
+        }
+        self.need = need;
+        self.account(now, cpu);
+        if need == Need::Every {
+            return self.sleep_little(now, cpu, found);
+        }
+        let longest = match need {
+            Need::Nothing => NOTHING,
+            _ if now - self.quiet_since > QUIET_AFTER => QUIET,
+            Need::Names => NAMES,
+            Need::Watching | Need::Every => WATCHING,
+        };
+        self.sleep = match found {
+            0 => (self.sleep * SLOWER).min(longest),
+            1 => (longest / 2.0).max(BURST),
+            _ => BURST,
+        };
+        let stretched = (self.sleep * self.stretch).min(LONGEST.max(longest));
+        Duration::from_secs_f64(stretched)
+    }
+
+    /// By how much sleeps are longer than they would be without a budget.
+    #[must_use]
+    pub const fn stretch(&self) -> f64 {
+        self.stretch
+    }
+
+    /// The sleep while every message is wanted: shorter for a moment after each, which may be the
+    /// first of a burst. It always sleeps, for it runs before those whose messages it reads.
+    fn sleep_little(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
+        let (then, used) = std::mem::replace(&mut self.spent, (now, cpu));
+        let saved = (now - then) * self.budget.every - (cpu - used);
+        self.savings = (self.savings + saved).clamp(-OVERDRAFT, SAVINGS);
+        self.sleep = EVERY;
+        if found > 0 {
+            self.awake_until = now + BURSTS;
+        }
+        if self.savings <= 0.0 {
+            let slower = EVERY * self.stretch.max(SLOWER);
+            return Duration::from_secs_f64(slower.min(LONGEST));
+        }
+        Duration::from_secs_f64(if now < self.awake_until { SOON } else { EVERY })
+    }
+
+    fn watch_closely(&mut self, until: f64) {
+        if self.credit > 0.0 {
+            self.meeting_until = self.meeting_until.max(until);
+        }
+    }
+
+    fn account(&mut self, now: f64, cpu: f64) {
+        let (then, used) = self.accounted;
+        let elapsed = now - then;
+        if elapsed < ACCOUNT {
+            return;
+        }
+        self.accounted = (now, cpu);
+        self.credit = (self.credit + elapsed * CREDIT_PER_SECOND).min(CREDIT);
+        let share = (cpu - used) / elapsed;
+        let budget = match self.need {
+            Need::Every => self.budget.every,
+            Need::Nothing | Need::Names | Need::Watching => self.budget.watching,
+        };
+        // Waking up less often by the factor that it costs too much, but not all at once.
+        let wanted = share / budget;
+        let correction = wanted.clamp(0.8, 1.5);
+        self.stretch = (self.stretch * correction).clamp(1.0, LONGEST / BURST);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BUDGET: Budget = Budget {
+        watching: 0.015,
+        every: 0.25,
+    };
+
+    /// Runs for `seconds` with a look costing `cost`; the share of CPU over the second half, and
+    /// the looks in it.
+    fn run(
+        interval: &mut PollInterval,
+        seconds: f64,
+        cost: f64,
+        need: Need,
+        mut found: impl FnMut(f64) -> usize,
+    ) -> (f64, f64) {
+        let (mut now, mut cpu, mut looks, mut half) = (0.0, 0.0, 0_u32, (0.0, 0.0));
+        while now < seconds {
+            let slept = interval.sleep(now, cpu, found(now), need);
+            now += slept.as_secs_f64() + cost;
+            cpu += cost;
+            if now >= seconds / 2.0 {
+                if half.0 == 0.0 {
+                    half = (now, cpu);
+                }
+                looks += 1;
+            }
+        }
+        let elapsed = now - half.0;
+        ((cpu - half.1) / elapsed, f64::from(looks) / elapsed)
+    }
+
+    #[test]
+    fn whatever_a_look_costs_the_budget_holds() {
+        for budget in [0.005, 0.015, 0.1] {
+            for cost in [5e-6, 25e-6, 200e-6] {
+                for burst in [0, 1, 40] {
+                    let mut interval = PollInterval::new(Budget {
+                        watching: budget,
+                        every: 1.0,
+                    });
+                    let (share, _) = run(&mut interval, 20.0, cost, Need::Watching, |_| burst);
+                    // A look that costs 200 us at every 50 ms is 0.4 %: less is not to be had.
+                    assert!(share <= budget * 1.1, "{budget} {cost} {burst}: {share}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn it_looks_a_thousand_times_a_second_while_it_may() {
+        let mut interval = PollInterval::new(BUDGET);
+        let busy = |now: f64| usize::from(now % 1.0 < 0.01);
+        let (_, looks) = run(&mut interval, 10.0, 5e-6, Need::Watching, busy);
+        assert!(looks > 900.0, "{looks}");
+    }
+
+    #[test]
+    fn where_little_is_needed_it_looks_seldom() {
+        let polls = |need| {
+            let mut interval = PollInterval::new(BUDGET);
+            run(&mut interval, 20.0, 5e-6, need, |_| 0).1
+        };
+        assert!((9.0..11.0).contains(&polls(Need::Nothing)));
+        assert!((90.0..110.0).contains(&polls(Need::Watching)));
+        assert!((90.0..110.0).contains(&polls(Need::Names)));
+    }
+
+    #[test]
+    fn when_somebody_comes_it_looks_closely_but_not_for_ever() {
+        let mut interval = PollInterval::new(BUDGET);
+        interval.newcomer(100.0);
+        let microseconds = |interval: &mut PollInterval, now, cpu| {
+            interval.sleep(now, cpu, 0, Need::Nothing).as_micros()
+        };
+        assert_eq!(microseconds(&mut interval, 100.01, 0.0), 10);
+        assert_eq!(microseconds(&mut interval, 100.2, 0.0), 10);
+        assert!(microseconds(&mut interval, 100.6, 0.0) > 10);
+        // Somebody comes all the time, and close looks take a third of a CPU.
+        let (mut now, mut cpu) = (101.0, 0.0);
+        while now < 201.0 {
+            interval.newcomer(now);
+            let close = microseconds(&mut interval, now, cpu) == 10;
+            now += 0.01;
+            cpu += if close { 0.003 } else { 0.0 };
+        }
+        // The credit, and what a hundred seconds give.
+        assert!((10.0..=11.1).contains(&cpu), "{cpu}");
+    }
+
+    #[test]
+    fn after_each_message_of_a_newcomer_it_stays_awake_where_others_have_a_cpu() {
+        for cpus in [1, 2] {
+            let mut interval = PollInterval::new(BUDGET).on(cpus);
+            interval.newcomer(100.0);
+            let mut microseconds =
+                |now, found| interval.sleep(now, 0.0, found, Need::Names).as_micros();
+            let awake = if cpus > 1 { 0 } else { 10 };
+            assert_eq!(microseconds(100.0, 0), 10);
+            assert_eq!(microseconds(100.001, 1), awake);
+            assert_eq!(microseconds(100.001_1, 0), awake);
+            assert_eq!(microseconds(100.001_3, 0), 10);
+        }
+    }
+
+    #[test]
+    fn while_every_message_is_wanted_it_looks_every_50_us_within_a_budget_of_its_own() {
+        let idle = |_: f64| 0;
+        let mut interval = PollInterval::new(BUDGET).on(2);
+        let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);
+        assert!(looks > 15_000.0 && share < 0.16, "{looks} {share}");
+        // A hundred thousand messages a second, and looks that cost much.
+        for cost in [8e-6, 60e-6] {
+            let mut interval = PollInterval::new(BUDGET).on(2);
+            (interval.need, interval.savings) = (Need::Every, 0.0);
+            let (share, looks) = run(&mut interval, 20.0, cost, Need::Every, |_| 10);
+            assert!(share <= 0.27 && looks > 2000.0, "{cost} {share} {looks}");
+            // Nobody wants them any more: what was learnt of the cost does not carry over.
+            let first = interval.sleep(30.0, 9.0, 1, Need::Watching);
+            assert!(first <= Duration::from_micros(500), "{first:?}");
+        }
+    }
+
+    #[test]
+    fn after_a_message_that_is_wanted_it_looks_again_soon_while_the_budget_allows_it() {
+        let mut interval = PollInterval::new(BUDGET).on(2);
+        let mut microseconds =
+            |now, cpu, found| interval.sleep(now, cpu, found, Need::Every).as_micros();
+        assert_eq!(microseconds(1.0, 0.0, 0), 50);
+        assert_eq!(microseconds(1.001, 0.0, 1), 20);
+        assert_eq!(microseconds(1.001_1, 0.0, 0), 20);
+        assert_eq!(microseconds(1.001_3, 0.0, 0), 50);
+        // What was saved is spent, and saved again.
+        assert_eq!(microseconds(1.5, 7.0, 1), 75);
+        assert_eq!(microseconds(4.5, 7.0, 1), 20);
+    }
+
+    #[test]
+    fn a_burst_is_followed_closely_and_then_left_alone() {
+        let mut interval = PollInterval::new(BUDGET);
+        assert_eq!(
+            interval.sleep(0.01, 0.0, 5, Need::Watching).as_micros(),
+            100
+        );
+        let mut last = Duration::ZERO;
+        for step in 0..10 {
+            let now = 0.01 + f64::from(step) * 1e-3;
+            let slept = interval.sleep(now, 0.0, 0, Need::Watching);
+            assert!(slept >= last);
+            last = slept;
+        }
+        assert_eq!(last.as_micros(), 1000);
+    }
+}

@@ -1,0 +1,319 @@
+//! The programs that look where the host hook cannot: at full receive buffers, at datagrams that
+//! never became complete, at who holds a socket.
+//!
+//! None of them is needed to observe. One that this kernel does not allow or cannot serve is left
+//! out with the reason, which [`Abilities`] tells.
+
+use std::error::Error;
+use std::fmt::Write as _;
+
+use aya::programs::raw_trace_point::RawTracePointLink;
+use aya::programs::{ProgramError, RawTracePoint};
+use aya::{Ebpf, EbpfLoader};
+use ros2probe_wire::host::Layout;
+
+use super::kernel_types::KernelTypes;
+use super::owners::Owners;
+
+/// What can be told on this kernel, or why not.
+#[derive(Clone, Debug)]
+pub struct Abilities {
+    /// Datagrams that a socket had no room for, by writer and sequence number.
+    pub socket_losses: Result<(), String>,
+    /// Datagrams that lacked IP fragments, by writer and sequence number.
+    pub reassembly_losses: Result<(), String>,
+    /// Which process holds a socket.
+    pub owners: Result<(), String>,
+}
+
+/// The running kernel's types, as far as the programs read them.
+#[derive(Debug)]
+pub struct KernelLayout {
+    array: [u32; Layout::COUNT],
+    /// Why there are none at all.
+    unknown: Option<String>,
+}
+
+/// The enumeration of reasons why a packet is thrown away: Linux 5.17; those about fragments: 6.2.
+const REASONS: &str = "skb_drop_reason";
+
+/// From this release on the kernel tells of datagrams over IPv6 that a socket had no room for.
+const REPORTS_IPV6: (u32, u32) = (6, 6);
+
+/// The kernel's name of each entry: a structure's member, its size where there is none, or an enumerator.
+const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
+    (Layout::BufferHead, "sk_buff", "head"),
+    (Layout::BufferTail, "sk_buff", "tail"),
+    (Layout::BufferNetworkHeader, "sk_buff", "network_header"),
+    (Layout::BufferTransportHeader, "sk_buff", "transport_header"),
+    (Layout::BufferInterface, "sk_buff", "skb_iif"),
+    (
+        Layout::ReasonBufferFull,
+        REASONS,
+        "SKB_DROP_REASON_SOCKET_RCVBUFF",
+    ),
+    (Layout::ReasonMemory, REASONS, "SKB_DROP_REASON_PROTO_MEM"),
+    (
+        Layout::ReasonTimeout,
+        REASONS,
+        "SKB_DROP_REASON_FRAG_REASM_TIMEOUT",
+    ),
+    (
+        Layout::ReasonTooFar,
+        REASONS,
+        "SKB_DROP_REASON_FRAG_TOO_FAR",
+    ),
+    (Layout::ReasonNone, REASONS, "SKB_DROP_REASON_NOT_SPECIFIED"),
+    (Layout::BufferDevice, "sk_buff", "dev"),
+    (Layout::DeviceNamespace, "net_device", "nd_net"),
+    (Layout::NamespaceFragments4, "net", "ipv4.fqdir"),
+    (Layout::NamespaceFragments6, "net", "ipv6.fqdir"),
+    (Layout::FragmentsMemory, "fqdir", "mem"),
+    (Layout::FragmentsLimit, "fqdir", "high_thresh"),
+    (Layout::SocketCookie, "sock", "__sk_common.skc_cookie"),
+    (Layout::SocketDrops, "sock", "sk_drops"),
+    (Layout::SocketDropCounters, "sock", "sk_drop_counters"),
+    (Layout::SecondDropCounter, "numa_drop_counters", "drops1"),
+    (Layout::FileInode, "file", "f_inode"),
+    (Layout::FilePrivate, "file", "private_data"),
+    (Layout::InodeMode, "inode", "i_mode"),
+    (Layout::InodeNumber, "inode", "i_ino"),
+    (Layout::SocketFile, "socket", "file"),
+    (Layout::SocketSock, "socket", "sk"),
+    (Layout::TaskLeader, "task_struct", "group_leader"),
+    (Layout::TaskProcess, "task_struct", "tgid"),
+    (Layout::TaskName, "task_struct", "comm"),
+    (Layout::TaskPid, "task_struct", "thread_pid"),
+    (Layout::PidLevel, "pid", "level"),
+    (Layout::PidNumbers, "pid", "numbers"),
+    (Layout::PidNumberSize, "upid", ""),
+];
+
+/// The programs in place; they go with this value.
+pub struct Tracepoints {
+    abilities: Abilities,
+    owners: Option<Owners>,
+    _links: Vec<RawTracePointLink>,
+}
+
+impl KernelLayout {
+    /// Of the running kernel.
+    #[must_use]
+    pub fn read() -> Self {
+        match KernelTypes::read() {
+            Ok(types) => Self::of(&types),
+            Err(error) => Self::unknown(chain(&error)),
+        }
+    }
+
+    /// None are known, for this reason.
+    #[must_use]
+    pub const fn unknown(reason: String) -> Self {
+        Self {
+            array: [Layout::ABSENT; Layout::COUNT],
+            unknown: Some(reason),
+        }
+    }
+
+    fn of(types: &KernelTypes) -> Self {
+        let mut array = [Layout::ABSENT; Layout::COUNT];
+        for (place, structure, member) in TABLE {
+            let value = match (structure, member) {
+                (REASONS, reason) => types.enumerator(structure, reason),
+                (_, "") => types.size(structure),
+                (_, member) => types.offset(structure, member),
+            };
+            if let (Some(slot), Some(value)) = (array.get_mut(place as usize), value) {
+                *slot = value;
+            }
+        }
+        Self {
+            array,
+            unknown: None,
+        }
+    }
+
+    /// Tells the programs of an object that is about to be loaded.
+    pub fn set_globals<'a>(&'a self, loader: &mut EbpfLoader<'a>) {
+        loader.override_global("LAYOUT", &self.array, true);
+    }
+
+    /// Nothing, if all of these are known; otherwise the reason why a program cannot do without.
+    fn need(&self, layout: &[Layout]) -> Result<(), String> {
+        if let Some(unknown) = &self.unknown {
+            return Err(unknown.clone());
+        }
+        let absent = TABLE.iter().find(|(place, _, _)| {
+            layout.contains(place) && self.array.get(*place as usize) == Some(&Layout::ABSENT)
+        });
+        match absent {
+            Some((_, structure, member)) => Err(format!("this kernel has no {structure} {member}")),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Tracepoints {
+    /// Loads and attaches what this kernel has of them, from an object that [`KernelLayout::set_globals`] was
+    /// told about. `whole_host`: the host hook sees every socket.
+    #[must_use]
+    pub fn attach(ebpf: &mut Ebpf, layout: &KernelLayout, whole_host: bool) -> Self {
+        let mut links = Vec::new();
+        let socket_losses =
+            socket_losses(ebpf, layout, whole_host).map(|mut more| links.append(&mut more));
+        let reassembly_losses = reassembly_losses(ebpf, layout).map(|link| links.push(link));
+        let owners = owners(ebpf, layout);
+        Self {
+            abilities: Abilities {
+                socket_losses,
+                reassembly_losses,
+                owners: owners.as_ref().map(|_| ()).map_err(Clone::clone),
+            },
+            owners: owners.ok(),
+            _links: links,
+        }
+    }
+
+    /// What can be told.
+    #[must_use]
+    pub const fn abilities(&self) -> &Abilities {
+        &self.abilities
+    }
+
+    /// The table of sockets' owners, where there is one.
+    #[must_use]
+    pub const fn owners(&self) -> Option<&Owners> {
+        self.owners.as_ref()
+    }
+}
+
+fn socket_losses(
+    ebpf: &mut Ebpf,
+    layout: &KernelLayout,
+    whole_host: bool,
+) -> Result<Vec<RawTracePointLink>, String> {
+    if !whole_host && let Err(reason) = layout.need(&[Layout::SocketCookie]) {
+        // A socket that the hook does not see could be taken for one that it does.
+        return Err(format!("limited to one cgroup, and {reason}"));
+    }
+    let mut links = vec![tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")?];
+    if release().is_none_or(|release| release < REPORTS_IPV6) {
+        let reasons = [Layout::ReasonBufferFull, Layout::ReasonMemory];
+        let program = if layout.need(&reasons).is_ok() {
+            "no_room_freed"
+        } else {
+            "no_room_unexplained"
+        };
+        links.push(tracepoint(ebpf, program, "kfree_skb")?);
+    }
+    Ok(links)
+}
+
+/// The kernel's major and minor version.
+fn release() -> Option<(u32, u32)> {
+    let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").ok()?;
+    let mut parts = release.split(['.', '-', '+']);
+    Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))
+}
+
+fn reassembly_losses(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<RawTracePointLink, String> {
+    layout.need(&[
+        Layout::BufferHead,
+        Layout::BufferTail,
+        Layout::BufferNetworkHeader,
+        Layout::BufferInterface,
+    ])?;
+    let program = if layout.need(&[Layout::ReasonNone]).is_ok() {
+        "not_reassembled"
+    } else {
+        "not_reassembled_unexplained"
+    };
+    tracepoint(ebpf, program, "kfree_skb")
+}
+
+fn owners(ebpf: &mut Ebpf, layout: &KernelLayout) -> Result<Owners, String> {
+    layout.need(&[
+        Layout::SocketCookie,
+        Layout::FileInode,
+        Layout::FilePrivate,
+        Layout::InodeMode,
+        Layout::InodeNumber,
+        Layout::SocketFile,
+        Layout::SocketSock,
+        Layout::TaskLeader,
+        Layout::TaskProcess,
+        Layout::TaskName,
+        Layout::TaskPid,
+        Layout::PidLevel,
+        Layout::PidNumbers,
+        Layout::PidNumberSize,
+    ])?;
+    Owners::load(ebpf).map_err(|error| chain(&error))
+}
+
+fn tracepoint(
+    ebpf: &mut Ebpf,
+    program: &'static str,
+    tracepoint: &'static str,
+) -> Result<RawTracePointLink, String> {
+    let mut attach = || -> Result<RawTracePointLink, ProgramError> {
+        let Some(found) = ebpf.program_mut(program) else {
+            return Err(ProgramError::NotLoaded);
+        };
+        let found: &mut RawTracePoint = found.try_into()?;
+        found.load()?;
+        let link = found.attach(tracepoint)?;
+        found.take_link(link)
+    };
+    attach().map_err(|error| format!("tracepoint {tracepoint}: {}", chain(&error)))
+}
+
+/// An error and its causes in one line; of a verifier's log, the first line.
+fn chain(error: &dyn Error) -> String {
+    let mut text = String::new();
+    let mut cause = Some(error);
+    while let Some(error) = cause {
+        let separator = if text.is_empty() { "" } else { ": " };
+        let message = error.to_string();
+        let first = message.lines().next().unwrap_or_default();
+        if !text.ends_with(first) {
+            let _ = write!(text, "{separator}{first}");
+        }
+        cause = error.source();
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_place_has_its_name_once() {
+        for index in 0..Layout::COUNT {
+            let named = TABLE
+                .iter()
+                .filter(|(place, _, _)| *place as usize == index);
+            assert_eq!(named.count(), 1, "{index}");
+        }
+    }
+
+    #[test]
+    fn a_reason_names_what_the_kernel_does_not_have() {
+        let mut layout = KernelLayout {
+            array: [7; Layout::COUNT],
+            unknown: None,
+        };
+        let needed = [Layout::BufferHead, Layout::ReasonTimeout];
+        assert_eq!(layout.need(&needed), Ok(()));
+        layout.array[Layout::ReasonTimeout as usize] = Layout::ABSENT;
+        let reason = layout.need(&needed).unwrap_err();
+        assert_eq!(
+            reason,
+            "this kernel has no skb_drop_reason SKB_DROP_REASON_FRAG_REASM_TIMEOUT"
+        );
+        assert_eq!(layout.need(&[Layout::BufferHead]), Ok(()));
+        let unknown = KernelLayout::unknown("no types".to_owned());
+        assert_eq!(unknown.need(&needed), Err("no types".to_owned()));
+    }
+}

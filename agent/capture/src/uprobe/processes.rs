@@ -1,0 +1,294 @@
+//! Which processes use Fast DDS, and which file their library is.
+//!
+//! Reads `/proc/<pid>/maps` of processes that are new, of young ones for a while, and of the others
+//! now and then: a library may be loaded late. Looks into no memory.
+
+use std::collections::{HashMap, HashSet};
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::path::PathBuf;
+
+use crate::shm::directories::Scope;
+
+/// Names of the library: Fast DDS 2.x, 3.x. A version may follow.
+const LIBRARIES: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];
+/// Files of its shared memory, that whoever sends or receives there maps, however it was linked.
+const SHARED: [&str; 2] = ["/dev/shm/fastrtps_", "/dev/shm/fastdds_"];
+/// Of a replaced or removed file.
+const DELETED: &str = " (deleted)";
+/// Who holds locks.
+const LOCKS: &str = "/proc/locks";
+/// Text of one process's map that is read: some forty thousand mappings.
+const MAX_TEXT: u64 = 4 << 20;
+/// A process that was met no more often than this may still be loading libraries; an older one is
+/// asked again at every so many rounds.
+const YOUNG: u32 = 10;
+const ROUNDS: u32 = 32;
+
+/// A library's file, by the device and inode that processes map.
+#[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub struct LibraryId {
+    /// `major:minor`, as the kernel writes it.
+    pub device: String,
+    /// Inode.
+    pub inode: u64,
+}
+
+/// A library in a process.
+#[derive(Clone, PartialEq, Eq, Debug)]
+pub struct Mapped {
+    /// The file.
+    pub id: LibraryId,
+    /// Its name in the process's own file system.
+    pub path: PathBuf,
+    /// Its first range of addresses, as the kernel writes it.
+    pub range: String,
+}
+
+/// What a process maps of Fast DDS.
+#[derive(Clone, Default, PartialEq, Eq, Debug)]
+pub struct Use {
+    /// Its libraries.
+    pub libraries: Vec<Mapped>,
+    /// It has files of Fast DDS's shared memory open.
+    pub shares: bool,
+}
+
+/// All processes that are looked at.
+#[derive(Debug)]
+pub struct Processes {
+    scope: Scope,
+    known: HashMap<u32, Process>,
+}
+
+#[derive(Debug)]
+struct Process {
+    met: u32,
+    use_of_it: Use,
+    /// Its map may not be read.
+    is_closed: bool,
+}
+
+impl Use {
+    /// From the text of a map.
+    #[must_use]
+    pub fn parse(text: &str) -> Self {
+        let mut found = Self::default();
+        for line in text.lines() {
+            // Range, permissions, offset, device, inode; the rest is the path.
+            let Some(path) = line.find('/').and_then(|at| line.get(at..)) else {
+                continue;
+            };
+            found.shares |= SHARED.iter().any(|start| path.starts_with(start));
+            let name = path.rsplit('/').next().unwrap_or_default();
+            let is_library = is_library(name.strip_suffix(DELETED).unwrap_or(name));
+            let mut fields = line.split_ascii_whitespace();
+            let (range, device, inode) = (fields.next(), fields.nth(2), fields.next());
+            let inode = inode.and_then(|inode| inode.parse().ok());
+            if let (true, Some(range), Some(device), Some(inode)) =
+                (is_library, range, device, inode)
+            {
+                let device = device.to_owned();
+                let id = LibraryId { device, inode };
+                if found.libraries.iter().all(|known| known.id != id) {
+                    let (path, range) = (PathBuf::from(path), range.to_owned());
+                    found.libraries.push(Mapped { id, path, range });
+                }
+            }
+        }
+        found
+    }
+
+    fn read(process: u32) -> io::Result<Self> {
+        let mut bytes = Vec::new();
+        let file = File::open(format!("/proc/{process}/maps"))?;
+        file.take(MAX_TEXT).read_to_end(&mut bytes)?;
+        Ok(Self::parse(&String::from_utf8_lossy(&bytes)))
+    }
+
+    /// Whether it has to do with Fast DDS at all.
+    #[must_use]
+    pub const fn is_any(&self) -> bool {
+        self.shares || !self.libraries.is_empty()
+    }
+}
+
+impl Processes {
+    /// None found yet.
+    #[must_use]
+    pub fn new(scope: Scope) -> Self {
+        Self {
+            scope,
+            known: HashMap::new(),
+        }
+    }
+
+    /// One process, found already.
+    #[cfg(test)]
+    pub(super) fn of(process: u32, use_of_it: Use) -> Self {
+        let known = Process {
+            met: 1,
+            use_of_it,
+            is_closed: false,
+        };
+        Self {
+            scope: Scope::Directories(Vec::new()),
+            known: HashMap::from([(process, known)]),
+        }
+    }
+
+    /// Looks which there are. `all`: also at those that had nothing to do with Fast DDS lately.
+    pub fn find(&mut self, all: bool) {
+        let mut before = std::mem::take(&mut self.known);
+        for pid in self.scope.processes() {
+            let known = before.remove(&pid);
+            let met = known.as_ref().map_or(0, |known| known.met);
+            let is_asked = met <= YOUNG
+                || met % ROUNDS == pid % ROUNDS
+                || all
+                    && known
+                        .as_ref()
+                        .is_some_and(|known| !known.use_of_it.is_any());
+            let mut process = match known {
+                Some(known) if !is_asked => known,
+                _ => match Use::read(pid) {
+                    Ok(use_of_it) => Process {
+                        met,
+                        use_of_it,
+                        is_closed: false,
+                    },
+                    Err(error) => Process {
+                        met,
+                        use_of_it: Use::default(),
+                        is_closed: error.kind() == io::ErrorKind::PermissionDenied,
+                    },
+                },
+            };
+            process.met = met.saturating_add(1);
+            self.known.insert(pid, process);
+        }
+    }
+
+    /// Those that use Fast DDS.
+    pub fn using(&self) -> impl Iterator<Item = (u32, &Use)> {
+        self.known
+            .iter()
+            .filter(|(_, process)| process.use_of_it.is_any())
+            .map(|(pid, process)| (*pid, &process.use_of_it))
+    }
+
+    /// One that may not be looked at and may use Fast DDS: whoever does holds locks.
+    #[must_use]
+    pub fn closed(&self) -> Option<u32> {
+        let mut closed = self.known.iter().filter(|(_, process)| process.is_closed);
+        let first = closed.clone().next().map(|(pid, _)| *pid)?;
+        let Ok(locks) = fs::read_to_string(LOCKS) else {
+            return Some(first);
+        };
+        let holders: HashSet<u32> = locks.lines().filter_map(holder).collect();
+        closed
+            .find(|(pid, _)| holders.contains(pid))
+            .map(|(pid, _)| *pid)
+    }
+}
+
+/// Whether a file by this name is Fast DDS's library.
+#[must_use]
+pub fn is_library(name: &str) -> bool {
+    let version = LIBRARIES
+        .iter()
+        .find_map(|library| name.strip_prefix(library));
+    version.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+}
+
+/// Who holds the lock that a line of [`LOCKS`] is about, if it is one of the kind that Fast DDS takes
+/// for its ports and segments.
+fn holder(line: &str) -> Option<u32> {
+    let mut fields = line.split_ascii_whitespace().skip(1);
+    // Of a lock that is waited for, an arrow comes first.
+    let kind = fields.find(|field| *field != "->")?;
+    (kind == "FLOCK").then(|| fields.nth(2)?.parse().ok())?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn libraries_and_shared_memory_are_found_in_a_map() {
+        let text = "\
+563200000000-563200001000 r--p 00000000 fe:00 11   /usr/bin/talker
+7f3da9800000-7f3da9a00000 r--p 00000000 fe:00 1234 /usr/lib/x86_64-linux-gnu/libfastrtps.so.2.9.1
+7f3da9a00000-7f3da9f00000 r-xp 00200000 fe:00 1234 /usr/lib/x86_64-linux-gnu/libfastrtps.so.2.9.1
+7f3daa000000-7f3daa100000 r-xp 00000000 00:2b 77   /opt/my robot/libfastdds.so
+7f3daa200000-7f3daa300000 r-xp 00000000 fe:00 9    /usr/lib/libfastrtps.so.2.6 (deleted)
+7f3dab000000-7f3dab100000 rw-s 00000000 00:1a 5    /dev/shm/fastrtps_0011aabbccddeeff
+7f3dac000000-7f3dac100000 rw-p 00000000 00:00 0    [heap]
+";
+        let found = Use::parse(text);
+        let libraries: Vec<_> = found
+            .libraries
+            .iter()
+            .map(|library| {
+                (
+                    &library.range[..12],
+                    library.id.inode,
+                    library.path.to_str().unwrap(),
+                )
+            })
+            .collect();
+        assert_eq!(
+            libraries,
+            [
+                (
+                    "7f3da9800000",
+                    1234,
+                    "/usr/lib/x86_64-linux-gnu/libfastrtps.so.2.9.1"
+                ),
+                ("7f3daa000000", 77, "/opt/my robot/libfastdds.so"),
+                ("7f3daa200000", 9, "/usr/lib/libfastrtps.so.2.6 (deleted)"),
+            ]
+        );
+        assert!(found.shares && found.is_any());
+    }
+
+    #[test]
+    fn what_only_looks_alike_is_left_alone() {
+        for path in [
+            "/usr/lib/libfastrtpsx.so.2",
+            "/usr/lib/librmw_fastrtps_cpp.so",
+            "/usr/lib/libfastrtps.sock",
+            "/dev/shm/other",
+            "[vdso]",
+            "",
+        ] {
+            let line = format!("7f0000000000-7f0000001000 r-xp 00000000 fe:00 1 {path}\n");
+            assert!(!Use::parse(&line).is_any(), "{path}");
+        }
+        assert!(!Use::parse("nonsense /usr/lib/libfastdds.so").is_any());
+    }
+
+    #[test]
+    fn holders_of_locks_are_read() {
+        assert_eq!(
+            holder("1: FLOCK  ADVISORY  WRITE 4711 00:1a:5 0 EOF"),
+            Some(4711)
+        );
+        assert_eq!(
+            holder("2: -> FLOCK  ADVISORY  WRITE 12 00:1a:5 0 EOF"),
+            Some(12)
+        );
+        for other in ["3: POSIX  ADVISORY  WRITE 7 00:1a:5 0 EOF", "4: FLOCK", ""] {
+            assert_eq!(holder(other), None);
+        }
+    }
+
+    #[test]
+    fn this_process_is_met_and_uses_none_of_it() {
+        let mut processes = Processes::new(Scope::AllProcesses);
+        processes.find(true);
+        let own = std::process::id();
+        assert!(processes.known.contains_key(&own));
+        assert!(processes.using().all(|(pid, _)| pid != own));
+    }
+}

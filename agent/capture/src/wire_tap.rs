@@ -1,0 +1,544 @@
+//! One network namespace seen on its interfaces: packet socket, ring, kernel filter, and what they
+//! found on its way to the model.
+//!
+//! Frames and records come through two rings, either may be the quicker one; both wait until they
+//! are taken in by time. Nothing is ever sent.
+
+use ros2probe_model::input::Input;
+use std::collections::{BTreeMap, BTreeSet};
+use std::os::fd::{AsFd as _, BorrowedFd};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use ros2probe_wire::frame::{self, PacketType, Payload};
+use ros2probe_wire::record::Body;
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{Reason, Record, Timestamp, WireError};
+
+use super::filter::{Filter, FilterError, FilterSettings};
+use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
+use super::reattach::{Identity, identity};
+use super::reorder_buffer::{Next, ReorderBuffer};
+use super::ring::{self, Ring, RingError, RingFrame};
+use super::system::Clocks;
+use crate::ahead::{Ahead, Ready};
+use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
+use ros2probe_model::observer::Observer;
+
+/// Records younger than this wait, so that frames captured before them are taken in first: a frame
+/// waits up to 100 ms for its block to fill.
+pub const SETTLE_NANOSECONDS: u64 = 120_000_000;
+/// Fragments of one sample follow each other within microseconds; after this they do not.
+const STALLED_NANOSECONDS: u64 = 60_000_000;
+/// Records taken in at a time: several rings of the built-in size.
+const RECORDS_PER_ROUND: usize = 32_768;
+
+/// Why an interface cannot be looked at, or no longer.
+#[derive(Debug, thiserror::Error)]
+pub enum WireTapError {
+    /// The kernel filter.
+    #[error(transparent)]
+    Filter(#[from] FilterError),
+    /// The packet socket or its ring.
+    #[error(transparent)]
+    Ring(#[from] RingError),
+    /// The list of interfaces.
+    #[error(transparent)]
+    Interfaces(#[from] InterfacesError),
+}
+
+/// Which interfaces of a namespace are looked at, and with how much memory.
+#[derive(Clone, Debug)]
+pub struct WireTapSettings {
+    /// Which interfaces.
+    pub selection: Selection,
+    /// Bytes of the packet ring.
+    pub ring_bytes: usize,
+    /// Bytes of the record ring.
+    pub record_ring_bytes: usize,
+    /// For what has to be put together from IP fragments.
+    pub reassembly: Limits,
+}
+
+/// One network namespace.
+pub struct WireTap {
+    path: Option<PathBuf>,
+    /// Device and inode of what was at the path. The socket keeps the namespace, so that the kernel
+    /// gives no other one the same.
+    identity: Option<Identity>,
+    /// Something else is at the path, or nothing.
+    is_gone: bool,
+    ring: Ring,
+    filter: Filter,
+    interfaces: Interfaces,
+    selection: Selection,
+    /// Frames captured by interface index.
+    packets: BTreeMap<u32, u64>,
+    frames: FrameAssembly,
+    refused_interfaces: u64,
+    included: IncludedInterfaces,
+}
+
+impl WireTap {
+    /// In the calling thread's namespace, which is the one at `path` or, without, the agent's own.
+    /// `number` tells the taps apart. The filter knows the interfaces before the socket sees the
+    /// first frame.
+    ///
+    /// # Errors
+    /// A capability is missing, or the kernel refuses.
+    pub fn open(
+        settings: &WireTapSettings,
+        number: u32,
+        path: Option<PathBuf>,
+    ) -> Result<Self, WireTapError> {
+        let selection = settings.selection.clone();
+        let mut filter = Filter::load(&FilterSettings {
+            record_ring_bytes: u32::try_from(settings.record_ring_bytes).unwrap_or(u32::MAX >> 1),
+            accept_new_interfaces: selection.accepts_unknown(),
+            ..FilterSettings::default()
+        })?;
+        let interfaces = Interfaces::open()?;
+        for interface in interfaces.iter() {
+            filter.accept_interface(interface.index, selection.accepts(&interface.name))?;
+        }
+        let mut included = IncludedInterfaces::default();
+        included.update(&selection, &interfaces);
+        let ring = Ring::open(
+            ring::Settings::with_memory(settings.ring_bytes),
+            Some(filter.program()),
+        )?;
+        Ok(Self {
+            identity: path.as_deref().and_then(identity),
+            is_gone: false,
+            path,
+            ring,
+            filter,
+            interfaces,
+            selection,
+            packets: BTreeMap::new(),
+            frames: FrameAssembly {
+                number,
+                reassembly: Reassembly::new(settings.reassembly),
+                ahead: Ahead::default(),
+                order: ReorderBuffer::default(),
+                copied_bytes: 0,
+            },
+            refused_interfaces: 0,
+            included,
+        })
+    }
+
+    /// Network namespace as configured; `None` = the agent's own.
+    #[must_use]
+    pub fn namespace(&self) -> Option<&Path> {
+        self.path.as_deref()
+    }
+
+    /// Logs when another namespace is at the path by now, or none: its frames are not seen, and
+    /// entering it would take privileges that were given up. Logs when the first one is there again.
+    pub fn check_namespace(&mut self) {
+        let Some(path) = &self.path else { return };
+        let is_gone = identity(path) != self.identity;
+        if is_gone == self.is_gone {
+            return;
+        }
+        self.is_gone = is_gone;
+        let namespace = path.display();
+        if is_gone {
+            tracing::warn!(
+                %namespace,
+                "the network namespace was removed or replaced: restart to observe the current one"
+            );
+        } else {
+            tracing::info!(%namespace, "the network namespace is there again");
+        }
+    }
+
+    /// What is gone, in plain words: the namespace, or an interface that the configuration names.
+    #[must_use]
+    pub fn gone(&self) -> Option<String> {
+        if let (Some(path), true) = (&self.path, self.is_gone) {
+            let path = path.display();
+            return Some(format!(
+                "the network namespace {path} was removed or replaced: restart to observe the \
+                 current one"
+            ));
+        }
+        let interface = self.included.missing()?;
+        Some(match &self.path {
+            Some(path) => format!(
+                "the interface {interface} of the network namespace {} is gone",
+                path.display()
+            ),
+            None => format!("the interface {interface} is gone"),
+        })
+    }
+
+    /// Readable when there is something to take in.
+    #[must_use]
+    pub fn descriptors(&self) -> [BorrowedFd<'_>; 3] {
+        [
+            self.ring.as_fd(),
+            self.filter.record_ring(),
+            self.interfaces.as_fd(),
+        ]
+    }
+
+    /// Takes in all there is, and gives the model what is [`SETTLE_NANOSECONDS`] old.
+    ///
+    /// # Errors
+    /// The kernel refuses to go on.
+    pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) -> Result<(), WireTapError> {
+        self.follow_interfaces();
+        self.take_frames(clocks, observer)?;
+        self.frames.take_records(&mut self.filter);
+        let stalled = clocks.monotonic.saturating_sub(STALLED_NANOSECONDS);
+        self.frames.take_stalled(&mut self.filter, stalled);
+        let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
+        self.frames.deliver(clocks, settled, observer);
+        self.frames.advance(clocks);
+        Ok(())
+    }
+
+    /// Gives the model what still waits, at the end.
+    pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
+        self.frames.take_records(&mut self.filter);
+        self.frames.take_stalled(&mut self.filter, clocks.monotonic);
+        self.frames.deliver(clocks, u64::MAX, observer);
+    }
+
+    /// The kernel filter.
+    #[must_use]
+    pub const fn filter(&self) -> &Filter {
+        &self.filter
+    }
+
+    /// The kernel filter, to tell it what is of interest.
+    pub const fn filter_mut(&mut self) -> &mut Filter {
+        &mut self.filter
+    }
+
+    /// Captured frames by the name of the interface, or its index if it went away before it was
+    /// known.
+    pub fn packets(&self) -> impl Iterator<Item = (String, u64)> + '_ {
+        self.packets.iter().map(|(index, packets)| {
+            let name = self
+                .interfaces
+                .by_index(*index)
+                .map_or_else(|| index.to_string(), |interface| interface.name.clone());
+            (name, *packets)
+        })
+    }
+
+    /// Frames that the kernel dropped because the ring was full.
+    ///
+    /// # Errors
+    /// The kernel does not tell.
+    pub fn drops(&mut self) -> Result<u64, WireTapError> {
+        Ok(self.ring.statistics()?.drops)
+    }
+
+    /// Bytes that came from the kernel: frames and records.
+    #[must_use]
+    pub const fn copied_bytes(&self) -> u64 {
+        self.frames.copied_bytes
+    }
+
+    /// Fragmented datagrams that were begun and never became complete: the kernel filter's and
+    /// those reassembled here.
+    #[must_use]
+    pub const fn incomplete_datagrams(&self) -> u64 {
+        let reassembly = self.frames.reassembly.counters();
+        self.frames.ahead.given_up() + reassembly.evicted + reassembly.timed_out
+    }
+
+    /// Bytes held for reassembly.
+    #[must_use]
+    pub const fn reassembly_bytes(&self) -> usize {
+        self.frames.reassembly.bytes()
+    }
+
+    /// Datagrams given up for want of room.
+    #[must_use]
+    pub const fn reassembly_evicted(&self) -> u64 {
+        self.frames.reassembly.counters().evicted
+    }
+
+    /// Interfaces that the kernel filter could not be told of.
+    #[must_use]
+    pub const fn refused_interfaces(&self) -> u64 {
+        self.refused_interfaces
+    }
+
+    /// A list that cannot be read now is read the next time. Of an interface that is gone nothing
+    /// is kept: containers come and go for years.
+    fn follow_interfaces(&mut self) {
+        let changes = self.interfaces.changes().unwrap_or_default();
+        if !changes.is_empty() {
+            self.included.update(&self.selection, &self.interfaces);
+        }
+        for change in changes {
+            let told = match change {
+                Change::Present(Interface { index, name, .. }) => {
+                    let accept = self.selection.accepts(&name);
+                    self.filter.accept_interface(index, accept)
+                }
+                Change::Gone(Interface { index, .. }) => {
+                    let interfaces = &self.interfaces;
+                    self.packets
+                        .retain(|index, _| interfaces.by_index(*index).is_some());
+                    self.filter.forget_interface(index)
+                }
+            };
+            self.refused_interfaces += u64::from(told.is_err());
+        }
+    }
+
+    /// What frames announce the model gets at once, what they count for in its turn. Before each
+    /// frame it gets what is older: a writer's last samples count before its farewell is read.
+    fn take_frames(
+        &mut self,
+        clocks: &Clocks,
+        observer: &mut Observer,
+    ) -> Result<(), WireTapError> {
+        // Clears what the socket reports when a link goes down; without, waiting would never wait.
+        self.ring.wait(Duration::ZERO)?;
+        // No more than the ring holds: a flood must not keep us from everything else.
+        for _ in 0..self.ring.blocks() {
+            let Some(block) = self.ring.block() else {
+                break;
+            };
+            self.frames.take_records(&mut self.filter);
+            let mut frames = block.frames();
+            for captured in frames.by_ref() {
+                *self.packets.entry(captured.interface).or_default() += 1;
+                if let Err(error) = self.frames.frame(clocks, &captured, observer) {
+                    observer.input(Input::DecodeError {
+                        stage: "frame",
+                        reason: error.reason,
+                    });
+                }
+            }
+            if frames.damaged() {
+                observer.input(Input::DecodeError {
+                    stage: "frame",
+                    reason: Reason::BadLength,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Interfaces that the configuration names and that were there, with whether they are now.
+#[derive(Debug, Default)]
+struct IncludedInterfaces(BTreeMap<String, bool>);
+
+impl IncludedInterfaces {
+    fn update(&mut self, selection: &Selection, interfaces: &Interfaces) {
+        let there: BTreeSet<_> = interfaces.iter().map(|it| it.name.as_str()).collect();
+        for (name, was_there) in &mut self.0 {
+            let is_there = there.contains(name.as_str());
+            if *was_there && !is_there {
+                tracing::warn!(interface = name, "the interface is gone");
+            } else if is_there && !*was_there {
+                tracing::info!(interface = name, "the interface is there again");
+            }
+            *was_there = is_there;
+        }
+        for name in there.into_iter().filter(|name| selection.names(name)) {
+            self.0.entry(name.to_owned()).or_insert(true);
+        }
+    }
+
+    fn missing(&self) -> Option<&str> {
+        let mut missing = self.0.iter().filter(|(_, is_there)| !**is_there);
+        missing.next().map(|(name, _)| name.as_str())
+    }
+}
+
+/// One tap's frames and records on their way to the model.
+struct FrameAssembly {
+    number: u32,
+    reassembly: Reassembly,
+    ahead: Ahead,
+    /// What is to be counted, waiting for its turn.
+    order: ReorderBuffer,
+    copied_bytes: u64,
+}
+
+impl FrameAssembly {
+    /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
+    /// A flood may fill it as fast as it is emptied: what is left is taken the next time.
+    fn take_records(&mut self, filter: &mut Filter) {
+        for _ in 0..RECORDS_PER_ROUND {
+            let Some(record) = filter.next_record() else {
+                return;
+            };
+            self.copied_bytes += size_of::<Record>() as u64;
+            self.order.kernel(record);
+        }
+    }
+
+    /// Takes runs of fragments that nobody has continued since `before` in the filter's clock.
+    fn take_stalled(&mut self, filter: &mut Filter, before: u64) {
+        for record in filter.stalled_runs(before) {
+            self.copied_bytes += size_of::<Record>() as u64;
+            self.order.kernel(record);
+        }
+    }
+
+    /// Gives the model the records up to a time of the filter's clock.
+    fn deliver(&mut self, clocks: &Clocks, until: u64, observer: &mut Observer) {
+        while let Some(next) = self.order.next(clocks, until) {
+            let record = match next {
+                Next::Kernel(record) => record,
+                Next::Walked(record) => {
+                    observer.input(Input::Record(&record));
+                    continue;
+                }
+            };
+            if matches!(record.body(), Body::Handover) {
+                let (at, key) = (
+                    Timestamp(record.time),
+                    FlowKey::of_handover(self.number, &record),
+                );
+                if let Some(rest) = self.reassembly.hand_over(at, key, &record) {
+                    let ready = |each| poll(each, observer);
+                    self.ahead.rest(self.number, rest, ready);
+                }
+            }
+            let ready = |each| poll(each, observer);
+            self.ahead.record(self.number, record, ready);
+        }
+    }
+
+    /// Gives up what has waited too long for its rest.
+    fn advance(&mut self, clocks: &Clocks) {
+        self.ahead.advance(clocks.now);
+        self.reassembly.advance(clocks.now);
+    }
+
+    fn frame(
+        &mut self,
+        clocks: &Clocks,
+        captured: &RingFrame<'_>,
+        observer: &mut Observer,
+    ) -> Result<(), WireError> {
+        self.copied_bytes += captured.bytes.len() as u64;
+        let time = clocks.stamped(captured.time);
+        let since = time.nanoseconds_since(clocks.now);
+        let at = clocks.monotonic.saturating_add_signed(since);
+        self.deliver(clocks, at, observer);
+        let packet = frame::parse_cooked(
+            captured.protocol,
+            captured.packet_type,
+            captured.bytes,
+            captured.length,
+        )?;
+        let Some(packet) = packet else { return Ok(()) };
+        let outgoing = captured.packet_type == PacketType::OUTGOING;
+        let mut envelope = Envelope {
+            time: time.0,
+            destination: packet.destination,
+            interface: captured.interface,
+            outgoing,
+            ..Envelope::default()
+        };
+        match &packet.payload {
+            Payload::Datagram(udp) => {
+                (envelope.source_port, envelope.destination_port) =
+                    (udp.source_port, udp.destination_port);
+                decode_frame(&envelope, udp.payload, clocks, &mut self.order, observer);
+            }
+            Payload::Fragment(fragment) => {
+                let key =
+                    FlowKey::new(self.number, captured.interface, outgoing, &packet, fragment);
+                let Some(whole) = self.reassembly.fragment(time, key, fragment) else {
+                    return Ok(());
+                };
+                if whole.handover.is_some() {
+                    let ready = |each| poll(each, observer);
+                    self.ahead.rest(self.number, whole, ready);
+                } else {
+                    (envelope.source_port, envelope.destination_port) =
+                        (whole.source_port, whole.destination_port);
+                    envelope.fragmented = true;
+                    let payload = whole.payload();
+                    decode_frame(&envelope, payload, clocks, &mut self.order, observer);
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+}
+
+/// A captured datagram.
+fn decode_frame(
+    envelope: &Envelope,
+    payload: &[u8],
+    clocks: &Clocks,
+    order: &mut ReorderBuffer,
+    observer: &mut Observer,
+) {
+    let at = clocks.monotonic_of(Timestamp(envelope.time));
+    let mut records = Vec::new();
+    observer.input(Input::Announcements {
+        envelope,
+        payload,
+        records: &mut records,
+    });
+    for record in records {
+        if let Some(record) = order.walked(at, record) {
+            observer.input(Input::Record(&record));
+        }
+    }
+}
+
+/// What has become complete.
+fn poll(ready: Ready, observer: &mut Observer) {
+    match ready {
+        Ready::Record(record) => observer.input(Input::Record(&record)),
+        Ready::Rest(rest) => decode_rest(&rest, observer),
+    }
+}
+
+fn decode_rest(rest: &Reassembled, observer: &mut Observer) {
+    let Some(record) = rest.handover else { return };
+    let envelope = Envelope::of_handover(&record, rest.last_seen);
+    observer.input(Input::Datagram {
+        envelope: &envelope,
+        payload: rest.payload(),
+        handover: Some(&record.handover()),
+    });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::netns::tests::{in_new_namespace, ip};
+
+    #[test]
+    fn an_interface_that_the_configuration_names_is_missed_until_it_is_there_again() {
+        in_new_namespace(|| {
+            let names = ["one", "never", "patt*"].map(str::to_owned);
+            let selection = Selection::new(&names, &[]).unwrap();
+            let mut interfaces = Interfaces::open().unwrap();
+            let mut included = IncludedInterfaces::default();
+            let mut update = |command: &str| {
+                ip(command);
+                interfaces.changes().unwrap();
+                included.update(&selection, &interfaces);
+                included.missing().map(str::to_owned)
+            };
+            assert_eq!(update("link add one type veth peer name pattern"), None);
+            let missing = Some("one".to_owned());
+            assert_eq!(update("link set one name other"), missing);
+            assert_eq!(update("link set other name one"), None);
+            // The other end goes with it: a pattern names no interface.
+            assert_eq!(update("link delete one"), missing);
+            assert_eq!(update("link add one type veth peer name far"), None);
+        });
+    }
+}

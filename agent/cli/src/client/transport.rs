@@ -1,0 +1,248 @@
+//! The transport to an agent: one connection for each request, for connections on a host are cheap and
+//! what is kept open would have to be minded.
+
+use std::fmt;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::Full;
+use hyper::body::Incoming;
+use hyper::client::conn::http1;
+use hyper::{Request, Response};
+use hyper_util::rt::TokioIo;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpStream, UnixStream};
+use tokio::time::timeout;
+
+use super::replay_agent::{Outcome, ReplayAgent, Stop};
+use super::{ClientError, Target};
+
+/// Where the package and the service manager put the agent's socket.
+const SOCKET: &str = "/run/ros2probe/api.sock";
+/// Where an agent listens by default.
+const LOOPBACK: &str = "127.0.0.1:17401";
+/// Where an agent listens when only its host is named.
+const PORT: &str = "17401";
+/// The longest wait for a connection.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// How an agent is reached.
+#[derive(Debug)]
+pub(super) enum Transport {
+    /// By its socket.
+    Socket(PathBuf),
+    /// By host name or address, and port.
+    Address(String),
+    /// Within this process.
+    ReplayAgent(Box<ReplayAgent>),
+}
+
+impl Transport {
+    /// As `target` says; else by what there is on this host.
+    pub(super) async fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
+        if let Some(capture) = &target.replay {
+            let replayed = ReplayAgent::start(capture, target, stop).await?;
+            return Ok(Self::ReplayAgent(Box::new(replayed)));
+        }
+        if let Some(host) = &target.host {
+            return Ok(Self::Address(with_port(host)));
+        }
+        if let Some(path) = &target.socket {
+            return Ok(Self::Socket(path.clone()));
+        }
+        let path = Path::new(SOCKET);
+        let socket = match within(UnixStream::connect(path)).await {
+            Ok(_) => return Ok(Self::Socket(path.to_path_buf())),
+            Err(error) => error,
+        };
+        match within(TcpStream::connect(LOOPBACK)).await {
+            Ok(_) => Ok(Self::Address(LOOPBACK.to_owned())),
+            Err(_) if socket.kind() == io::ErrorKind::PermissionDenied => {
+                let path = path.to_path_buf();
+                Err(ClientError::Denied { path })
+            }
+            Err(_) => Err(ClientError::NoAgent),
+        }
+    }
+
+    /// What requests call the agent.
+    pub(super) fn host(&self) -> &str {
+        match self {
+            Self::Socket(_) | Self::ReplayAgent(_) => "localhost",
+            Self::Address(address) => address,
+        }
+    }
+
+    /// The answer's head; its body comes while it is read.
+    pub(super) async fn send(
+        &self,
+        request: Request<Full<Bytes>>,
+    ) -> Result<Response<Incoming>, ClientError> {
+        match self {
+            Self::Socket(path) => {
+                let stream = self.in_time(UnixStream::connect(path)).await?;
+                self.ask(stream, request).await
+            }
+            Self::Address(address) => {
+                let stream = self.in_time(TcpStream::connect(address)).await?;
+                let _ = stream.set_nodelay(true);
+                self.ask(stream, request).await
+            }
+            Self::ReplayAgent(replayed) => self.ask(replayed.connect(), request).await,
+        }
+    }
+
+    /// Whether it is within this process.
+    pub(super) const fn is_replayed(&self) -> bool {
+        matches!(self, Self::ReplayAgent(_))
+    }
+
+    /// What a replay waited for has begun.
+    pub(super) fn resume(&self) {
+        if let Self::ReplayAgent(replayed) = self {
+            replayed.resume();
+        }
+    }
+
+    /// How a replay ended, if this is one that did.
+    pub(super) fn outcome(&self) -> Option<Outcome> {
+        match self {
+            Self::ReplayAgent(replayed) => replayed.outcome(),
+            Self::Socket(_) | Self::Address(_) => None,
+        }
+    }
+
+    async fn in_time<S>(
+        &self,
+        connect: impl Future<Output = io::Result<S>>,
+    ) -> Result<S, ClientError> {
+        within(connect).await.map_err(|source| match self {
+            Self::Socket(path) if source.kind() == io::ErrorKind::PermissionDenied => {
+                ClientError::Denied { path: path.clone() }
+            }
+            _ => ClientError::Unreachable {
+                place: self.to_string(),
+                source,
+            },
+        })
+    }
+
+    async fn ask<S>(
+        &self,
+        stream: S,
+        request: Request<Full<Bytes>>,
+    ) -> Result<Response<Incoming>, ClientError>
+    where
+        S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
+    {
+        let shaken = http1::handshake(TokioIo::new(stream)).await;
+        let (mut sender, connection) = shaken.map_err(|error| self.broke(error))?;
+        tokio::spawn(connection);
+        let answer = sender.send_request(request).await;
+        answer.map_err(|error| {
+            if error.is_parse() {
+                self.not_an_agent()
+            } else {
+                self.broke(error)
+            }
+        })
+    }
+
+    pub(super) fn broke(
+        &self,
+        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
+    ) -> ClientError {
+        ClientError::Broke {
+            place: self.to_string(),
+            source: source.into(),
+        }
+    }
+
+    pub(super) fn slow(&self) -> ClientError {
+        ClientError::Slow {
+            place: self.to_string(),
+        }
+    }
+
+    pub(super) fn not_an_agent(&self) -> ClientError {
+        ClientError::NotAnAgent {
+            place: self.to_string(),
+        }
+    }
+
+    pub(super) fn unauthorized(&self, offered: bool) -> ClientError {
+        ClientError::Unauthorized {
+            place: self.to_string(),
+            offered,
+        }
+    }
+
+    pub(super) fn older(&self, path: &str) -> ClientError {
+        ClientError::Older {
+            place: self.to_string(),
+            path: without_query(path),
+        }
+    }
+
+    pub(super) fn unreadable(&self, path: &str, source: serde_json::Error) -> ClientError {
+        ClientError::Unreadable {
+            place: self.to_string(),
+            path: without_query(path),
+            source,
+        }
+    }
+}
+
+impl fmt::Display for Transport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Socket(path) => write!(f, "{}", path.display()),
+            Self::Address(address) => f.write_str(address),
+            Self::ReplayAgent(replayed) => write!(f, "{}", replayed.capture().display()),
+        }
+    }
+}
+
+async fn within<S>(connect: impl Future<Output = io::Result<S>>) -> io::Result<S> {
+    let connected = timeout(PATIENCE, connect).await;
+    connected.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
+}
+
+fn without_query(path: &str) -> String {
+    path.split('?').next().unwrap_or_default().to_owned()
+}
+
+/// `robot1`, `robot1:80`, `::1`, `[::1]` and `[::1]:80` all have a port in the end.
+fn with_port(host: &str) -> String {
+    let is_bare_v6 = host.matches(':').count() > 1 && !host.starts_with('[');
+    if is_bare_v6 {
+        return format!("[{host}]:{PORT}");
+    }
+    let behind = host.rsplit(']').next().unwrap_or_default();
+    if behind.contains(':') {
+        host.to_owned()
+    } else {
+        format!("{host}:{PORT}")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_host_gets_a_port() {
+        for (host, address) in [
+            ("robot1", "robot1:17401"),
+            ("robot1:80", "robot1:80"),
+            ("10.0.0.2", "10.0.0.2:17401"),
+            ("::1", "[::1]:17401"),
+            ("[::1]", "[::1]:17401"),
+            ("[::1]:80", "[::1]:80"),
+        ] {
+            assert_eq!(with_port(host), address);
+        }
+    }
+}

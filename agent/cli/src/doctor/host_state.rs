@@ -1,0 +1,275 @@
+//! This host as far as checks look at it: files below a root, and what the kernel tells this process.
+//!
+//! Every file is read through [`Files`], bounded, so that a test can give a directory. Nothing is
+//! written and nobody is asked over a network.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use caps::{CapSet, CapsHashSet};
+
+/// Bytes of one file that are read, unless a check says otherwise.
+const MAX_FILE: u64 = 256 << 10;
+/// Names of one directory that are read.
+const MAX_NAMES: usize = 1 << 16;
+
+/// What checks look at.
+#[derive(Debug)]
+pub struct HostState {
+    /// `/proc`, `/sys`, `/etc` and `/run`.
+    pub files: Files,
+    /// Bytes of a page; 0 = not known.
+    pub page_bytes: u64,
+    /// Effective capabilities of this process.
+    pub capabilities: CapsHashSet,
+    /// Effective user.
+    pub user_id: u32,
+    /// Its groups.
+    pub group_ids: Vec<u32>,
+    /// Variables of this shell.
+    pub environment: BTreeMap<String, String>,
+    /// What the kernel says of the clock.
+    pub clock: Result<ClockState, String>,
+}
+
+/// The kernel's state of its clock, `adjtimex(2)`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ClockState {
+    /// Somebody keeps it synchronised.
+    pub synchronised: bool,
+    /// Estimated error in microseconds.
+    pub estimated_error: i64,
+    /// Largest error in microseconds.
+    pub maximum_error: i64,
+}
+
+/// Files below a root.
+#[derive(Debug)]
+pub struct Files {
+    root: PathBuf,
+}
+
+/// Why a file was not read.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Unread {
+    /// There is none.
+    #[error("not there")]
+    Missing,
+    /// Not by this user.
+    #[error("not permitted")]
+    NotPermitted,
+    /// Something else.
+    #[error("{0}")]
+    Other(String),
+}
+
+impl HostState {
+    /// This one.
+    #[must_use]
+    pub fn read() -> Self {
+        // SAFETY: none of these has preconditions.
+        let user_id = unsafe { libc::geteuid() };
+        Self {
+            files: Files::below("/"),
+            page_bytes: page_bytes(),
+            capabilities: caps::read(None, CapSet::Effective).unwrap_or_default(),
+            user_id,
+            group_ids: group_ids(),
+            environment: environment(),
+            clock: clock(),
+        }
+    }
+
+    /// Whether it is root's process.
+    #[must_use]
+    pub const fn is_root(&self) -> bool {
+        self.user_id == 0
+    }
+}
+
+impl Files {
+    /// Those below `root`.
+    #[must_use]
+    pub fn below(root: impl Into<PathBuf>) -> Self {
+        Self { root: root.into() }
+    }
+
+    /// Where an absolute path really is.
+    #[must_use]
+    pub fn path(&self, path: &str) -> PathBuf {
+        self.root.join(path.trim_start_matches('/'))
+    }
+
+    /// A file's text without its last newline. What is no UTF-8 is replaced.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn text(&self, path: &str) -> Result<String, Unread> {
+        let bytes = self.bytes(path, MAX_FILE)?;
+        Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
+    }
+
+    /// Up to `most` bytes of a file.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn bytes(&self, path: &str, most: u64) -> Result<Vec<u8>, Unread> {
+        let mut bytes = Vec::new();
+        let file = File::open(self.path(path))?;
+        file.take(most).read_to_end(&mut bytes)?;
+        Ok(bytes)
+    }
+
+    /// A file that holds a number.
+    ///
+    /// # Errors
+    /// It cannot be read, or holds something else.
+    pub fn number<T: FromStr>(&self, path: &str) -> Result<T, Unread> {
+        let text = self.text(path)?;
+        let number = text.parse();
+        number.map_err(|_| Unread::Other(format!("`{text}` is not a number")))
+    }
+
+    /// Names in a directory, sorted.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn names(&self, path: &str) -> Result<Vec<String>, Unread> {
+        let entries = fs::read_dir(self.path(path))?;
+        let entries = entries.flatten().take(MAX_NAMES);
+        let mut names: Vec<_> = entries
+            .filter_map(|entry| entry.file_name().into_string().ok())
+            .collect();
+        names.sort();
+        Ok(names)
+    }
+
+    /// Whether something is there.
+    #[must_use]
+    pub fn exists(&self, path: &str) -> bool {
+        self.path(path).exists()
+    }
+
+    /// Processes, by number.
+    #[must_use]
+    pub fn processes(&self) -> Vec<u32> {
+        let names = self.names("/proc").unwrap_or_default();
+        let mut processes: Vec<u32> = names.iter().filter_map(|name| name.parse().ok()).collect();
+        processes.sort_unstable();
+        processes
+    }
+}
+
+impl From<io::Error> for Unread {
+    fn from(error: io::Error) -> Self {
+        match error.kind() {
+            io::ErrorKind::NotFound | io::ErrorKind::NotADirectory => Self::Missing,
+            io::ErrorKind::PermissionDenied => Self::NotPermitted,
+            _ => Self::Other(error.to_string()),
+        }
+    }
+}
+
+/// The last part of a path.
+#[must_use]
+pub fn base_name(path: &str) -> &str {
+    Path::new(path)
+        .file_name()
+        .and_then(|name| name.to_str())
+        .unwrap_or(path)
+}
+
+fn page_bytes() -> u64 {
+    // SAFETY: sysconf has no preconditions.
+    let bytes = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
+    u64::try_from(bytes).unwrap_or(0)
+}
+
+fn group_ids() -> Vec<u32> {
+    // SAFETY: has no preconditions.
+    let own = unsafe { libc::getegid() };
+    let mut groups = vec![0; 1024];
+    let room = libc::c_int::try_from(groups.len()).unwrap_or(0);
+    // SAFETY: `groups` has room for so many.
+    let count = unsafe { libc::getgroups(room, groups.as_mut_ptr()) };
+    groups.truncate(usize::try_from(count).unwrap_or(0));
+    groups.push(own);
+    groups
+}
+
+fn environment() -> BTreeMap<String, String> {
+    let variables = std::env::vars_os();
+    variables
+        .map(|(name, value)| {
+            let text = |text: std::ffi::OsString| text.to_string_lossy().into_owned();
+            (text(name), text(value))
+        })
+        .collect()
+}
+
+fn clock() -> Result<ClockState, String> {
+    // SAFETY: a `timex` is plain numbers, for which zero is a value; zero modes change nothing.
+    let mut state: libc::timex = unsafe { std::mem::zeroed() };
+    // SAFETY: `state` is ours and outlives the call.
+    let result = unsafe { libc::adjtimex(&raw mut state) };
+    if result < 0 {
+        return Err(io::Error::last_os_error().to_string());
+    }
+    Ok(ClockState {
+        synchronised: result != libc::TIME_ERROR && state.status & libc::STA_UNSYNC == 0,
+        estimated_error: state.esterror,
+        maximum_error: state.maxerror,
+    })
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// A host of these files alone, with no variables and no privileges.
+    pub(in crate::doctor) fn host(files: &[(&str, &str)]) -> (tempfile::TempDir, HostState) {
+        let directory = tempfile::tempdir().unwrap();
+        for (path, text) in files {
+            let path = directory.path().join(path.trim_start_matches('/'));
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        let host = HostState {
+            files: Files::below(directory.path()),
+            page_bytes: 4096,
+            capabilities: CapsHashSet::new(),
+            user_id: 1000,
+            group_ids: vec![1000],
+            environment: BTreeMap::new(),
+            clock: Err("not here".to_owned()),
+        };
+        (directory, host)
+    }
+
+    #[test]
+    fn files_are_read_below_the_root_and_no_further_than_allowed() {
+        let long = "x".repeat(300 << 10);
+        let (_directory, host) =
+            host(&[("/proc/a", "12\n"), ("/proc/b", &long), ("/proc/7/c", "")]);
+        assert_eq!(host.files.number::<u64>("/proc/a"), Ok(12));
+        assert_eq!(host.files.text("/proc/b").unwrap().len(), 256 << 10);
+        assert_eq!(host.files.bytes("/proc/b", 3).unwrap(), b"xxx");
+        assert_eq!(host.files.text("/proc/none"), Err(Unread::Missing));
+        let error = host.files.number::<u64>("/proc/b").unwrap_err();
+        assert!(matches!(error, Unread::Other(_)), "{error}");
+        assert_eq!(host.files.processes(), [7]);
+        assert!(host.files.exists("/proc/a") && !host.files.exists("/etc/passwd"));
+    }
+
+    #[test]
+    fn this_host_can_be_read() {
+        let host = HostState::read();
+        assert!(host.files.processes().contains(&std::process::id()));
+        assert!(host.page_bytes >= 4096);
+        assert!(!host.environment.is_empty());
+        assert!(!host.group_ids.is_empty());
+    }
+}

@@ -1,0 +1,317 @@
+//! What will be seen on this host and what not: as the running agent says of itself, or as a trial
+//! tells where none runs. The reasons are those of `capture`; here they get their consequences.
+
+use super::answers::Health;
+use super::finding::{Area, Finding, Verdict};
+use ros2probe_daemon::surface::{Ability, AgentFacts};
+
+const AREA: Area = Area::Sight;
+/// Where an agent says it.
+pub(super) const ASKED: &str = "GET /health";
+/// Where a trial told.
+pub(super) const TRIED: &str = "test load of the BPF programs";
+
+/// What a source can see.
+#[derive(Clone, Debug, Default)]
+pub struct Visibility {
+    /// `host` or `wire`.
+    pub source: String,
+    /// Why it is not the one that sees more.
+    pub source_reason: Option<String>,
+    /// What it can see.
+    pub able: Vec<Ability>,
+    /// Why not.
+    pub reasons: Vec<(Ability, String)>,
+    /// Who says so.
+    pub from: &'static str,
+}
+
+impl Visibility {
+    /// As a running agent says.
+    #[must_use]
+    pub fn of_agent(health: &Health) -> Self {
+        let known = |label: &str| Ability::ALL.into_iter().find(|each| each.label() == label);
+        let able = health.abilities.iter().filter(|each| each.able);
+        let reasons = health.abilities.iter().filter_map(|each| {
+            let reason = each.reason.clone()?;
+            Some((known(&each.ability)?, reason))
+        });
+        Self {
+            source: health.source.clone(),
+            source_reason: health.source_reason.clone(),
+            able: able.filter_map(|each| known(&each.ability)).collect(),
+            reasons: reasons.collect(),
+            from: ASKED,
+        }
+    }
+
+    /// As a trial told.
+    #[must_use]
+    pub fn of_trial(facts: AgentFacts) -> Self {
+        Self {
+            source: facts.source.label().to_owned(),
+            source_reason: facts.source_reason,
+            able: facts.abilities,
+            reasons: facts.blind,
+            from: TRIED,
+        }
+    }
+}
+
+/// Why nothing is known: neither does an agent run here, nor may a trial be made.
+#[must_use]
+pub fn untried(reason: &str) -> Vec<Finding> {
+    let sentence = "kernel support was not tested";
+    let finding = Finding::new(AREA, "source", Verdict::Unknown, sentence);
+    vec![
+        finding
+            .seen(reason, "this process")
+            .remedy("sudo rp doctor"),
+    ]
+}
+
+/// A trial that failed.
+#[must_use]
+pub fn failed(error: &str) -> Vec<Finding> {
+    let sentence = format!("the agent cannot observe this host: {error}");
+    let finding = Finding::new(AREA, "source", Verdict::Problem, sentence);
+    vec![
+        finding
+            .seen(error, TRIED)
+            .remedy("sudo rp run    # prints the full cause"),
+    ]
+}
+
+/// What it sees, and each thing that it does not.
+#[must_use]
+pub fn check(visibility: &Visibility) -> Vec<Finding> {
+    let mut findings = vec![source(visibility)];
+    let able = |ability: &Ability| visibility.able.contains(ability);
+    let (seen, blind): (Vec<_>, Vec<_>) = Ability::ALL.into_iter().partition(able);
+    let seen: Vec<_> = seen.into_iter().map(words).collect();
+    if !seen.is_empty() {
+        let sentence = format!("it sees {}", seen.join("; "));
+        let finding = Finding::new(AREA, "abilities", Verdict::Ok, sentence);
+        findings.push(finding.seen("1", format!("{} abilities", visibility.from)));
+    }
+    findings.extend(
+        blind
+            .into_iter()
+            .filter_map(|ability| lacking(visibility, ability)),
+    );
+    findings
+}
+
+fn source(visibility: &Visibility) -> Finding {
+    let say = |verdict, sentence: String| Finding::new(AREA, "source", verdict, sentence);
+    let finding = match (visibility.source.as_str(), &visibility.source_reason) {
+        ("host", _) => say(
+            Verdict::Ok,
+            "the agent observes the sockets of this host: whole messages, per subscriber"
+                .to_owned(),
+        ),
+        ("wire", Some(reason)) => say(
+            Verdict::Warning,
+            format!(
+                "the agent observes interfaces only: no figures per subscriber, no causes of \
+                 loss: {reason}"
+            ),
+        )
+        .configure("capture: {source: host}    # fails with the reason instead of falling back"),
+        ("wire", None) => say(
+            Verdict::Note,
+            "the agent observes interfaces, as configured: no figures per subscriber, no causes \
+             of loss"
+                .to_owned(),
+        )
+        .configure("capture: {source: auto}"),
+        (source, _) => say(Verdict::Note, format!("packets come from a {source}")),
+    };
+    finding.seen(&visibility.source, visibility.from)
+}
+
+/// What is seen.
+const fn words(ability: Ability) -> &'static str {
+    match ability {
+        Ability::Subscribers => "what each subscriber received",
+        Ability::Sent => "messages that leave this host",
+        Ability::SocketLosses => "messages lost in a full socket buffer",
+        Ability::ReassemblyLosses => "messages lost in IP reassembly",
+        Ability::Owners => "which process a socket belongs to",
+        Ability::Containers => "all containers",
+        Ability::Forwarded => "traffic merely forwarded by this host",
+        Ability::SharedMemory => "Fast DDS's shared memory, in samples",
+        Ability::SharedMemoryExact => "each message in Fast DDS's shared memory",
+    }
+}
+
+/// What is not seen, unless the source's own line says it.
+fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
+    let reason = visibility
+        .reasons
+        .iter()
+        .find(|(blind, _)| *blind == ability);
+    let reason = reason.map(|(_, reason)| reason.as_str());
+    let is_host = visibility.source == "host";
+    let (verdict, mut sentence, remedy) = match ability {
+        Ability::Subscribers if is_host => {
+            (Verdict::Warning, format!("not {}", words(ability)), None)
+        }
+        // The wire has none of these, which the source's line says.
+        Ability::Subscribers
+        | Ability::SocketLosses
+        | Ability::ReassemblyLosses
+        | Ability::Owners
+            if !is_host =>
+        {
+            return None;
+        }
+        Ability::Containers if !is_host => (
+            Verdict::Note,
+            "containers with their own network namespace are not seen".to_owned(),
+            Some("capture: {network_namespaces: [/run/netns/NAME]}"),
+        ),
+        Ability::Containers => (
+            Verdict::Note,
+            "limited to one cgroup; other containers are not visible".to_owned(),
+            Some("capture: {cgroup: null}    # and in a container the host's /sys/fs/cgroup"),
+        ),
+        Ability::Forwarded => (
+            Verdict::Note,
+            "traffic merely forwarded between other hosts is not seen".to_owned(),
+            Some(
+                "capture: {mirror_interfaces: [eth1]}    # a mirror port or a gateway's interface",
+            ),
+        ),
+        Ability::SharedMemory => (
+            Verdict::Warning,
+            "Fast DDS shared memory, which most nodes of one host use, is not seen".to_owned(),
+            Some("capture: {shm: {mode: auto}}"),
+        ),
+        Ability::SharedMemoryExact => (
+            Verdict::Note,
+            "Fast DDS shared memory is sampled; not every message is seen".to_owned(),
+            Some("capture: {shm: {exact: uprobe}}    # and CAP_SYS_ADMIN, CAP_SYS_PTRACE"),
+        ),
+        _ => (Verdict::Warning, format!("not {}", words(ability)), None),
+    };
+    if let Some(reason) = reason {
+        sentence = format!("{sentence}: {reason}");
+    }
+    let finding = Finding::new(AREA, ability.label(), verdict, sentence);
+    let finding = finding.seen(reason.unwrap_or("0"), visibility.from);
+    Some(match remedy {
+        Some(remedy) => finding.configure(remedy),
+        None => finding,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::finding::RemedyTarget;
+    use super::*;
+    use ros2probe_daemon::config::Config;
+
+    fn host(able: &[Ability]) -> Visibility {
+        Visibility {
+            source: "host".to_owned(),
+            able: able.to_vec(),
+            ..Visibility::default()
+        }
+    }
+
+    fn find<'a>(findings: &'a [Finding], check: &str) -> Option<&'a Finding> {
+        findings.iter().find(|finding| finding.check == check)
+    }
+
+    #[test]
+    fn who_sees_everything_is_told_so_in_two_lines() {
+        let findings = check(&host(&Ability::ALL));
+        assert_eq!(findings.len(), 2);
+        assert!(findings.iter().all(|each| each.verdict == Verdict::Ok));
+    }
+
+    #[test]
+    fn what_the_kernel_does_not_allow_is_said_with_its_reason() {
+        let mut able = Ability::ALL.to_vec();
+        able.retain(|each| *each != Ability::ReassemblyLosses);
+        let mut visibility = host(&able);
+        let reason = "the kernel does not tell".to_owned();
+        visibility.reasons = vec![(Ability::ReassemblyLosses, reason)];
+        let findings = check(&visibility);
+        let found = find(&findings, "reassembly_losses").unwrap();
+        assert_eq!(found.verdict, Verdict::Warning);
+        assert_eq!(
+            found.sentence,
+            "not messages lost in IP reassembly: the kernel does not tell"
+        );
+    }
+
+    #[test]
+    fn the_wire_is_a_choice_or_a_warning_and_lists_no_consequence_twice() {
+        let mut visibility = Visibility {
+            source: "wire".to_owned(),
+            able: vec![Ability::Sent, Ability::Forwarded],
+            ..Visibility::default()
+        };
+        let chosen = check(&visibility);
+        assert_eq!(find(&chosen, "source").unwrap().verdict, Verdict::Note);
+        visibility.source_reason = Some("no cgroup v2 hierarchy is mounted".to_owned());
+        let forced = check(&visibility);
+        let source = find(&forced, "source").unwrap();
+        assert_eq!(source.verdict, Verdict::Warning);
+        assert!(
+            source
+                .sentence
+                .ends_with("no cgroup v2 hierarchy is mounted")
+        );
+        assert!(find(&forced, "owners").is_none());
+        assert_eq!(
+            find(&forced, "shared_memory").unwrap().verdict,
+            Verdict::Warning
+        );
+    }
+
+    #[test]
+    fn what_is_to_be_configured_can_be() {
+        let mut configured = 0;
+        for source in ["host", "wire"] {
+            let visibility = Visibility {
+                source: source.to_owned(),
+                ..Visibility::default()
+            };
+            for finding in check(&visibility) {
+                for remedy in finding.remedies {
+                    assert_eq!(remedy.kind, RemedyTarget::Configuration, "{remedy:?}");
+                    let parsed = Config::parse(remedy.line.as_bytes());
+                    assert!(parsed.is_ok(), "{}: {parsed:?}", remedy.line);
+                    configured += 1;
+                }
+            }
+        }
+        assert!(configured > 5, "{configured}");
+    }
+
+    #[test]
+    fn an_agent_of_another_version_may_have_abilities_that_are_not_known() {
+        let health: Health = serde_json::from_str(
+            r#"{"source":"host","abilities":[{"ability":"x","able":true},
+            {"ability":"owners","able":true},{"ability":"socket_losses","able":false,"reason":"no"}]}"#,
+        )
+        .unwrap();
+        let visibility = Visibility::of_agent(&health);
+        assert_eq!(visibility.able, [Ability::Owners]);
+        assert_eq!(
+            visibility.reasons,
+            [(Ability::SocketLosses, "no".to_owned())]
+        );
+    }
+
+    #[test]
+    fn without_a_trial_there_is_the_command_that_makes_one() {
+        let findings = untried("CAP_BPF is missing");
+        assert_eq!(findings[0].verdict, Verdict::Unknown);
+        assert_eq!(findings[0].remedies[0].line, "sudo rp doctor");
+        assert_eq!(failed("x")[0].verdict, Verdict::Problem);
+    }
+}

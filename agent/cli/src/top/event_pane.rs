@@ -1,0 +1,170 @@
+//! What happens to the robot, as lines of the events pane: bounded, oldest first, safe to show.
+
+use std::collections::VecDeque;
+
+use serde_json::Value;
+
+use super::facts::{Event, Lagged};
+use super::text::safe;
+
+/// Events that are kept to scroll through.
+const KEPT: usize = 1_000;
+
+/// One event.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Line {
+    /// Somebody should know.
+    pub is_warning: bool,
+    /// `14:02:11 WARN message.lost /points count=3`.
+    pub text: String,
+}
+
+/// The latest events.
+#[derive(Clone, Debug, Default)]
+pub struct EventPane {
+    lines: VecDeque<Line>,
+    /// Only warnings are shown.
+    pub only_warnings: bool,
+}
+
+impl EventPane {
+    /// Takes in one event, unless it is of another domain than this.
+    pub fn add(&mut self, event: &Event, domain_id: Option<u32>) {
+        let own = event.attributes.get("domain_id").and_then(Value::as_u64);
+        if let (Some(own), Some(wanted)) = (own, domain_id)
+            && own != u64::from(wanted)
+        {
+            return;
+        }
+        let mut text = format!("{} {:<5} ", clock(&event.time), safe(&event.severity));
+        text.push_str(&safe(
+            event.name.strip_prefix("ros2.").unwrap_or(&event.name),
+        ));
+        let first = ["topic", "ros_node", "what", "watch", "error"];
+        let last = [
+            "endpoint",
+            "participant",
+            "participants",
+            "reader",
+            "writer",
+        ];
+        for key in first {
+            if let Some(value) = event.attributes.get(key) {
+                text.push(' ');
+                text.push_str(&shown(value));
+            }
+        }
+        // Identities are long and say least.
+        for is_identity in [false, true] {
+            for (key, value) in &event.attributes {
+                let key = key.as_str();
+                let is_noise = matches!(key, "domain_id" | "kind" | "message_type");
+                let value = shown(value);
+                let is_said = first.contains(&key) || is_noise || value.is_empty();
+                if !is_said && last.contains(&key) == is_identity {
+                    text.push_str(&format!(" {}={value}", safe(key)));
+                }
+            }
+        }
+        self.push(Line {
+            is_warning: event.severity != "INFO",
+            text,
+        });
+    }
+
+    /// Says that events are missing here.
+    pub fn lag(&mut self, lagged: &Lagged) {
+        let text = match lagged.missed {
+            Some(missed) => format!("-------- {missed} events are missing here"),
+            None => "-------- the agent was started again".to_owned(),
+        };
+        self.push(Line {
+            is_warning: true,
+            text,
+        });
+    }
+
+    /// What is shown, oldest first.
+    pub fn shown(&self) -> impl DoubleEndedIterator<Item = &Line> {
+        let lines = self.lines.iter();
+        lines.filter(|line| line.is_warning || !self.only_warnings)
+    }
+
+    fn push(&mut self, line: Line) {
+        self.lines.push_back(line);
+        if self.lines.len() > KEPT {
+            self.lines.pop_front();
+        }
+    }
+}
+
+/// The time of day of `2026-11-20T14:02:11.123456789Z`.
+fn clock(time: &str) -> String {
+    let time = safe(time);
+    let (_, clock) = time.split_once('T').unwrap_or_default();
+    clock.chars().take(8).collect()
+}
+
+/// A value of an event, or of what is wrong with the graph.
+#[must_use]
+pub fn shown(value: &Value) -> String {
+    match value {
+        Value::String(text) => safe(text),
+        Value::Array(list) => {
+            let items: Vec<_> = list.iter().map(shown).collect();
+            items.join(",")
+        }
+        Value::Number(number) => match number.as_f64() {
+            Some(real) if !number.is_u64() => format!("{real:.3}"),
+            _ => number.to_string(),
+        },
+        other => safe(&other.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn event(json: Value) -> Event {
+        serde_json::from_value(json).unwrap()
+    }
+
+    #[test]
+    fn an_event_begins_with_what_it_is_about() {
+        let mut news = EventPane::default();
+        let lost = event(json!({
+            "time": "2026-11-20T14:02:11.123Z", "name": "ros2.message.lost", "severity": "WARN",
+            "attributes": {"domain_id": 0, "count": 3, "topic": "/po\u{1b}[31mints", "writer": "01.02"},
+        }));
+        news.add(&lost, Some(0));
+        news.add(&lost, Some(7));
+        let lines: Vec<_> = news.shown().map(|line| line.text.as_str()).collect();
+        assert_eq!(
+            lines,
+            [r"14:02:11 WARN  message.lost /po\u{1b}[31mints count=3 writer=01.02"]
+        );
+    }
+
+    #[test]
+    fn it_remembers_only_the_latest_and_what_is_missing() {
+        let mut news = EventPane::default();
+        for number in 0..KEPT + 5 {
+            news.add(
+                &event(json!({"severity": "INFO", "attributes": {"count": number}})),
+                None,
+            );
+        }
+        news.lag(&Lagged {
+            missed: Some(7),
+            reason: "overwritten".to_owned(),
+        });
+        assert_eq!(news.shown().count(), KEPT);
+        news.only_warnings = true;
+        let lines: Vec<_> = news.shown().collect();
+        assert_eq!(lines.len(), 1);
+        assert!(lines[0].text.contains("7 events are missing"));
+    }
+}

@@ -1,0 +1,174 @@
+//! Topics that are measured because somebody pressed a key: until the program ends, by a connection
+//! that goes with the process however it ends, or also after that, by a watch.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::Sender;
+use std::thread;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+
+use super::app::MeasuredBy;
+use super::poller::Request;
+use super::row::Key;
+use crate::client::{Agent, ClientError, Next};
+use ros2probe_api::path::encoded;
+
+/// How often a connection looks whether it is still wanted.
+const POLL_INTERVAL: Duration = Duration::from_millis(200);
+/// Looks between two attempts to open it again.
+const PAUSE: u32 = 10;
+
+/// All of them.
+#[derive(Debug)]
+pub(super) struct MeasureRequests {
+    agent: Arc<Agent>,
+    requests: Sender<Request>,
+    all: BTreeMap<Key, MeasureRequest>,
+}
+
+#[derive(Debug)]
+enum MeasureRequest {
+    /// By a connection, until this is set.
+    Stream(Arc<AtomicBool>),
+    /// By a watch of this name.
+    Watch(String),
+}
+
+impl MeasureRequests {
+    pub(super) const fn new(agent: Arc<Agent>, requests: Sender<Request>) -> Self {
+        Self {
+            agent,
+            requests,
+            all: BTreeMap::new(),
+        }
+    }
+
+    /// As the table marks them.
+    pub(super) fn shown(&self) -> BTreeMap<Key, MeasuredBy> {
+        let hold = |held: &MeasureRequest| match held {
+            MeasureRequest::Stream(_) => MeasuredBy::Session,
+            MeasureRequest::Watch(_) => MeasuredBy::Watch,
+        };
+        let all = self.all.iter();
+        all.map(|(key, held)| (key.clone(), hold(held))).collect()
+    }
+
+    /// Has a topic measured while this program runs, or no longer.
+    pub(super) fn toggle(&mut self, key: &Key, name: &str) -> String {
+        match self.all.remove(key) {
+            Some(MeasureRequest::Stream(stop)) => {
+                stop.store(true, Ordering::Relaxed);
+                format!("{name}: no longer measured for rp top")
+            }
+            Some(MeasureRequest::Watch(path)) => match self.agent.delete(&path) {
+                Ok(()) => format!("{name}: the watch is removed"),
+                Err(error) => {
+                    let status = format!("{name}: {error}");
+                    // Somebody else may have removed it; else it is still there.
+                    if !error.is("no-such-watch") {
+                        self.all.insert(key.clone(), MeasureRequest::Watch(path));
+                    }
+                    status
+                }
+            },
+            None => match self.open(key) {
+                Ok(()) => format!("{name}: measured while rp top runs; W keeps it"),
+                Err(error) => format!("{name}: cannot be measured: {error}"),
+            },
+        }
+    }
+
+    /// Has a topic measured also after the end.
+    pub(super) fn keep(&mut self, key: &Key, name: &str) -> String {
+        if let Some(MeasureRequest::Watch(_)) = self.all.get(key) {
+            return format!("{name}: is kept already; w removes the watch");
+        }
+        let path = format!("/watch{}?domain_id={}", encoded(name), key.domain_id);
+        if !name.starts_with('/') {
+            return format!("{name}: only topics with a ROS name can be watched by a client");
+        }
+        match self.agent.post::<_, Value>(&path, &json!({})) {
+            Ok(_) => {
+                let before = self.all.insert(key.clone(), MeasureRequest::Watch(path));
+                if let Some(MeasureRequest::Stream(stop)) = before {
+                    stop.store(true, Ordering::Relaxed);
+                }
+                format!("{name}: stays watched after rp top ends; w removes it")
+            }
+            Err(error) => format!("{name}: {error}"),
+        }
+    }
+
+    /// A connection could not be opened.
+    pub(super) fn lost(&mut self, key: &Key, why: String) -> String {
+        self.all.remove(key);
+        why
+    }
+
+    fn open(&mut self, key: &Key) -> std::io::Result<()> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let stream = Stream {
+            agent: Arc::clone(&self.agent),
+            path: format!(
+                "/samples?topic={}&domain_id={}",
+                encoded(&key.dds_name),
+                key.domain_id
+            ),
+            key: key.clone(),
+            stop: Arc::clone(&stop),
+            requests: self.requests.clone(),
+        };
+        let thread = thread::Builder::new().name("interest".to_owned());
+        thread.spawn(move || stream.run())?;
+        self.all.insert(key.clone(), MeasureRequest::Stream(stop));
+        Ok(())
+    }
+}
+
+/// A connection that has a topic measured as long as it is open.
+#[derive(Debug)]
+struct Stream {
+    agent: Arc<Agent>,
+    path: String,
+    key: Key,
+    stop: Arc<AtomicBool>,
+    requests: Sender<Request>,
+}
+
+impl Stream {
+    /// Reads what comes, which nobody wants to see, and opens it again when it breaks.
+    fn run(self) {
+        while !self.is_over() {
+            match self.agent.stream(&self.path) {
+                Ok(mut lines) => {
+                    while !self.is_over() {
+                        match lines.line_within(POLL_INTERVAL) {
+                            Ok(Next::Line(_) | Next::Nothing) => {}
+                            Ok(Next::End) | Err(_) => break,
+                        }
+                    }
+                }
+                Err(error @ (ClientError::Refused(_) | ClientError::Older { .. })) => {
+                    let _ = self
+                        .requests
+                        .send(Request::Lost(self.key, error.to_string()));
+                    return;
+                }
+                Err(_) => {}
+            }
+            for _ in 0..PAUSE {
+                if self.is_over() {
+                    return;
+                }
+                thread::sleep(POLL_INTERVAL);
+            }
+        }
+    }
+
+    fn is_over(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+}

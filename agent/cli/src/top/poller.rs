@@ -1,0 +1,242 @@
+//! Reads the agent's API on threads of its own, so that a slow agent never holds up a key, and goes
+//! on asking when the agent is gone. Facts go into a channel; it shows nothing.
+
+use std::io;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use super::app::{Command, Fact};
+use super::facts::{Event, Health, Lagged, Topic, Topics};
+use super::measure_requests::MeasureRequests;
+use super::row::Key;
+use super::server_sent::Messages;
+use super::text::safe;
+use crate::client::{Agent, ClientError};
+use ros2probe_api::path::encoded;
+
+/// Pause before a stream of events that broke is opened again.
+const RETRY: Duration = Duration::from_secs(2);
+
+/// What the program waits for.
+#[derive(Debug)]
+pub enum Input {
+    /// The agent answered.
+    Fact(Fact),
+    /// A key was pressed.
+    Key(ratatui::crossterm::event::KeyEvent),
+    /// The terminal has another size.
+    Resized,
+    /// The program is to end with this code.
+    End(u8),
+}
+
+/// A request to the polling thread.
+#[derive(Debug)]
+pub(super) enum Request {
+    Command(Command),
+    /// A topic is measured no longer, and why.
+    Lost(Key, String),
+}
+
+/// The threads that read.
+#[derive(Debug)]
+pub struct Poller {
+    requests: Sender<Request>,
+}
+
+/// What is asked for again and again.
+#[derive(Debug)]
+struct Poll {
+    agent: Arc<Agent>,
+    domain_id: Option<u32>,
+    interval: Duration,
+    hidden: bool,
+    selected: Option<Key>,
+    holds: MeasureRequests,
+    inputs: SyncSender<Input>,
+}
+
+impl Poller {
+    /// Begins to ask, every `interval`, about one domain or all of them.
+    ///
+    /// # Errors
+    /// No thread can be started.
+    pub fn start(
+        agent: Agent,
+        domain_id: Option<u32>,
+        interval: Duration,
+        inputs: &SyncSender<Input>,
+    ) -> io::Result<Self> {
+        let agent = Arc::new(agent);
+        let (requests, asked) = std::sync::mpsc::channel();
+        let poll = Poll {
+            agent: Arc::clone(&agent),
+            domain_id,
+            interval,
+            hidden: false,
+            selected: None,
+            holds: MeasureRequests::new(Arc::clone(&agent), requests.clone()),
+            inputs: inputs.clone(),
+        };
+        let thread = thread::Builder::new().name("poll".to_owned());
+        thread.spawn(move || poll.run(&asked))?;
+        let inputs = inputs.clone();
+        let thread = thread::Builder::new().name("events".to_owned());
+        thread.spawn(move || follow_events(&agent, &inputs))?;
+        Ok(Self { requests })
+    }
+
+    /// Executes a command.
+    pub fn command(&self, command: Command) {
+        // The thread lives as long as the program: a panic of it ends both.
+        let _ = self.requests.send(Request::Command(command));
+    }
+}
+
+/// All topics and the agent's state, once.
+///
+/// # Errors
+/// The agent is gone or refuses.
+pub fn ask(
+    agent: &Agent,
+    domain_id: Option<u32>,
+    hidden: bool,
+) -> Result<(Health, Topics), ClientError> {
+    let mut query = format!("?hidden={hidden}");
+    if let Some(domain_id) = domain_id {
+        query.push_str(&format!("&domain_id={domain_id}"));
+    }
+    let topics = agent.get(&format!("/topics{query}"))?;
+    Ok((agent.get("/health")?, topics))
+}
+
+impl Poll {
+    fn run(mut self, asked: &Receiver<Request>) {
+        loop {
+            let begun = Instant::now();
+            self.all();
+            loop {
+                let left = self.interval.saturating_sub(begun.elapsed());
+                match asked.recv_timeout(left) {
+                    Ok(Request::Command(command)) => self.execute(command),
+                    Ok(Request::Lost(key, why)) => {
+                        let status = self.holds.lost(&key, why);
+                        self.send_measured(status);
+                    }
+                    Err(RecvTimeoutError::Timeout) => break,
+                    Err(RecvTimeoutError::Disconnected) => return,
+                }
+            }
+        }
+    }
+
+    fn all(&mut self) {
+        match ask(&self.agent, self.domain_id, self.hidden) {
+            Ok((health, topics)) => {
+                self.send(Fact::Health(Box::new(health)));
+                self.send(Fact::Topics(Box::new(topics)));
+                self.details();
+            }
+            Err(error) => self.send(Fact::Gone(error.to_string())),
+        }
+    }
+
+    fn details(&self) {
+        let Some(key) = self.selected.clone() else {
+            return;
+        };
+        let path = format!(
+            "/topics/{}?domain_id={}",
+            encoded(&key.dds_name),
+            key.domain_id
+        );
+        match self.agent.get::<Topic>(&path) {
+            Ok(topic) => self.send(Fact::Details(key, Some(Box::new(topic)))),
+            Err(ClientError::Refused(_)) => self.send(Fact::Details(key, None)),
+            // The next round tells that the agent is gone.
+            Err(_) => {}
+        }
+    }
+
+    fn execute(&mut self, command: Command) {
+        match command {
+            Command::Quit => {}
+            Command::Select(key) => {
+                self.selected = key;
+                self.details();
+            }
+            Command::Hidden(hidden) => {
+                self.hidden = hidden;
+                self.all();
+            }
+            Command::Toggle(key, name) => {
+                let status = self.holds.toggle(&key, &name);
+                self.send_measured(status);
+            }
+            Command::Keep(key, name) => {
+                let status = self.holds.keep(&key, &name);
+                self.send_measured(status);
+            }
+        }
+    }
+
+    fn send_measured(&self, status: String) {
+        self.send(Fact::Measured(self.holds.shown()));
+        self.send(Fact::Status(status));
+    }
+
+    fn send(&self, fact: Fact) {
+        // Whoever reads it ends the process when it ends.
+        let _ = self.inputs.send(Input::Fact(fact));
+    }
+}
+
+/// Follows the agent's events from the oldest it has, through every break.
+fn follow_events(agent: &Agent, inputs: &SyncSender<Input>) {
+    let mut messages = Messages::default();
+    let mut is_refused = false;
+    loop {
+        let after = messages.last_id.clone().unwrap_or_else(|| "0".to_owned());
+        match agent.stream(&format!("/events?after={}", encoded(&after))) {
+            Ok(mut lines) => {
+                while let Ok(Some(line)) = lines.line() {
+                    let message = messages.line(&line);
+                    let fact = message.and_then(|message| fact(&message.event, &message.data));
+                    if let Some(fact) = fact
+                        && inputs.send(Input::Fact(fact)).is_err()
+                    {
+                        return;
+                    }
+                }
+                is_refused = false;
+            }
+            Err(ClientError::Refused(refusal)) if !is_refused => {
+                let status = Fact::Status(format!("no events: {refusal}"));
+                let _ = inputs.send(Input::Fact(status));
+                is_refused = true;
+            }
+            Err(_) => {}
+        }
+        messages.cut();
+        thread::sleep(RETRY);
+    }
+}
+
+fn fact(event: &str, data: &str) -> Option<Fact> {
+    if event == "lagged" {
+        let lagged: Lagged = serde_json::from_str(data).ok()?;
+        return Some(Fact::Lagged(lagged));
+    }
+    let read = serde_json::from_str::<Event>(data).or_else(|_| {
+        // Shown rather than dropped.
+        serde_json::from_str::<Value>(data).map(|_| Event {
+            name: safe(event),
+            ..Event::default()
+        })
+    });
+    read.ok().map(|event| Fact::Event(Box::new(event)))
+}

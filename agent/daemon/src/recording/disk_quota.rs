@@ -1,0 +1,196 @@
+//! What recordings may take of the disk: each bag, all of them together, and what has to stay free for
+//! everything else.
+//!
+//! Asked before a message is taken, so that a recording ends in order before a disk is full. Looks at
+//! the file system at every few megabytes and every second; several recordings may overdraw a limit by
+//! so much.
+
+use std::ffi::CString;
+use std::io;
+use std::mem::MaybeUninit;
+use std::os::unix::ffi::OsStrExt as _;
+use std::path::{Path, PathBuf};
+
+use crate::config::RecordingLimits;
+use ros2probe_bag::Error;
+
+/// Bytes of messages between two checks of the file system.
+const STEP: u64 = 8 << 20;
+
+/// The quota of one recording.
+#[derive(Clone, Debug)]
+pub struct DiskQuota {
+    /// In which all bags lie.
+    directory: PathBuf,
+    limits: RecordingLimits,
+    /// Bytes taken since the last check.
+    unseen: u64,
+}
+
+/// A limit that is reached.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+enum QuotaExceeded {
+    #[error("the recording would be larger than {0} bytes (recordings.max_bytes)")]
+    Bag(u64),
+    #[error("all recordings take {used} bytes, of {limit} they may (recordings.max_total_bytes)")]
+    Total { used: u64, limit: u64 },
+    #[error(
+        "{free} bytes of the file system are free, of which {reserve} stay free \
+         (recordings.reserve_percent, recordings.reserve_bytes)"
+    )]
+    Reserve { free: u64, reserve: u64 },
+}
+
+impl DiskQuota {
+    /// Below this directory, which may not exist yet.
+    #[must_use]
+    pub fn new(directory: &Path, limits: RecordingLimits) -> Self {
+        Self {
+            directory: directory.to_owned(),
+            limits,
+            unseen: 0,
+        }
+    }
+
+    /// Takes quota for `more` bytes in a bag of `bag` bytes.
+    ///
+    /// # Errors
+    /// A limit would be exceeded.
+    pub fn take(&mut self, bag: u64, more: u64) -> Result<(), Error> {
+        if let Some(limit) = self.limits.max_bytes
+            && bag.saturating_add(more) > limit
+        {
+            return Err(QuotaExceeded::Bag(limit).into());
+        }
+        self.unseen = self.unseen.saturating_add(more);
+        if self.unseen >= STEP {
+            self.unseen = 0;
+            self.check()?;
+        }
+        Ok(())
+    }
+
+    /// Looks at the file system.
+    ///
+    /// # Errors
+    /// A limit is exceeded.
+    pub fn check(&self) -> Result<(), Error> {
+        if let Some(limit) = self.limits.max_total_bytes {
+            let used = used(&self.directory);
+            if used >= limit {
+                return Err(QuotaExceeded::Total { used, limit }.into());
+            }
+        }
+        // What cannot be asked shows itself in writing.
+        let Ok(space) = space(&self.directory) else {
+            return Ok(());
+        };
+        let percent = u64::from(self.limits.reserve_percent);
+        let reserve = (space.size / 100 * percent).max(self.limits.reserve_bytes);
+        // Without a reserve the storage itself refuses what it has no room for.
+        if reserve > 0 && space.free <= reserve {
+            let free = space.free;
+            return Err(QuotaExceeded::Reserve { free, reserve }.into());
+        }
+        Ok(())
+    }
+}
+
+impl From<QuotaExceeded> for Error {
+    fn from(full: QuotaExceeded) -> Self {
+        Self::Limit(full.to_string())
+    }
+}
+
+/// Bytes of all files in the directories of this one.
+fn used(directory: &Path) -> u64 {
+    let entries = |path: &Path| std::fs::read_dir(path).into_iter().flatten().flatten();
+    let bags = entries(directory);
+    let files = bags.flat_map(|bag| entries(&bag.path()).collect::<Vec<_>>());
+    let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
+    sizes.fold(0, u64::saturating_add)
+}
+
+/// Bytes of a file system.
+struct FilesystemSpace {
+    size: u64,
+    /// To users without privileges.
+    free: u64,
+}
+
+/// Of the file system in which a directory is, or would be.
+fn space(directory: &Path) -> io::Result<FilesystemSpace> {
+    let existing = directory.ancestors().find(|path| path.exists());
+    let path = existing.unwrap_or(directory);
+    let path = CString::new(path.as_os_str().as_bytes())?;
+    let mut statistics = MaybeUninit::<libc::statvfs>::uninit();
+    // SAFETY: the path ends in a zero, and both outlive the call.
+    if unsafe { libc::statvfs(path.as_ptr(), statistics.as_mut_ptr()) } != 0 {
+        return Err(io::Error::last_os_error());
+    }
+    // SAFETY: the call has filled it.
+    let statistics = unsafe { statistics.assume_init() };
+    let bytes = |blocks: libc::fsblkcnt_t| blocks.saturating_mul(statistics.f_frsize);
+    Ok(FilesystemSpace {
+        size: bytes(statistics.f_blocks),
+        free: bytes(statistics.f_bavail),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn quota(directory: &Path, limits: RecordingLimits) -> DiskQuota {
+        DiskQuota::new(directory, limits)
+    }
+
+    fn refused(result: Result<(), Error>) -> String {
+        result.unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_bag_all_bags_and_the_reserve_are_each_bounded() {
+        let directory = tempfile::tempdir().unwrap();
+        let bags = directory.path().join("bags");
+        let none = RecordingLimits {
+            reserve_percent: 0,
+            reserve_bytes: 0,
+            ..RecordingLimits::default()
+        };
+        let mut each = quota(
+            &bags,
+            RecordingLimits {
+                max_bytes: Some(1000),
+                ..none
+            },
+        );
+        each.take(900, 100).unwrap();
+        assert!(refused(each.take(900, 101)).contains("recordings.max_bytes"));
+
+        let all = RecordingLimits {
+            max_total_bytes: Some(100),
+            ..none
+        };
+        quota(&bags, all).check().unwrap();
+        std::fs::create_dir_all(bags.join("before")).unwrap();
+        std::fs::write(bags.join("before/before_0.mcap"), [0; 100]).unwrap();
+        assert!(refused(quota(&bags, all).check()).contains("recordings.max_total_bytes"));
+        let mut stepping = quota(&bags, all);
+        stepping.take(0, STEP - 1).unwrap();
+        assert!(stepping.take(0, 1).is_err(), "after every few megabytes");
+
+        let free = space(&bags).unwrap().free;
+        let reserve = RecordingLimits {
+            reserve_bytes: free * 2,
+            ..none
+        };
+        assert!(refused(quota(&bags, reserve).check()).contains("recordings.reserve_bytes"));
+        let percent = RecordingLimits {
+            reserve_percent: 100,
+            ..none
+        };
+        assert!(refused(quota(&bags, percent).check()).contains("recordings.reserve_percent"));
+        quota(&bags, none).check().unwrap();
+    }
+}

@@ -1,0 +1,171 @@
+//! The last samples, bounded in bytes and in time: what was there before something happened.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::Timestamp;
+
+use ros2probe_model::payloads::Sample;
+
+/// What keeping a sample costs besides its payload.
+const OVERHEAD: usize = 256;
+
+/// The last samples, oldest first.
+#[derive(Debug)]
+pub struct SampleRing {
+    samples: VecDeque<Arc<Sample>>,
+    bytes: usize,
+    limit: usize,
+    span: Option<Duration>,
+    /// Samples younger than the span that had to go for want of room.
+    crowded_out: u64,
+}
+
+impl SampleRing {
+    /// Keeps at most `limit` bytes, and nothing older than `span`.
+    #[must_use]
+    pub const fn new(limit: usize, span: Option<Duration>) -> Self {
+        Self {
+            samples: VecDeque::new(),
+            bytes: 0,
+            limit,
+            span,
+            crowded_out: 0,
+        }
+    }
+
+    /// Bytes kept.
+    #[must_use]
+    pub const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Samples kept.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.samples.len()
+    }
+
+    /// Nothing is kept.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.samples.is_empty()
+    }
+
+    /// Samples that the bytes had no room for although they were young enough.
+    #[must_use]
+    pub const fn crowded_out(&self) -> u64 {
+        self.crowded_out
+    }
+
+    /// Keeps this one.
+    pub fn push(&mut self, sample: Arc<Sample>) {
+        let now = sample.time;
+        self.bytes += cost(&sample);
+        self.samples.push_back(sample);
+        self.advance(now);
+        while self.bytes > self.limit && self.pop().is_some() {
+            self.crowded_out += 1;
+        }
+    }
+
+    /// Forgets what is too old.
+    pub fn advance(&mut self, now: Timestamp) {
+        let Some(span) = self.span else { return };
+        let is_old = |sample: &Arc<Sample>| {
+            let age = now.0.saturating_sub(sample.time.0);
+            u128::from(age) > span.as_nanos()
+        };
+        while self.samples.front().is_some_and(is_old) {
+            self.pop();
+        }
+    }
+
+    /// All of them, oldest first.
+    pub fn iter(&self) -> impl Iterator<Item = &Arc<Sample>> {
+        self.samples.iter()
+    }
+
+    /// Forgets all of them.
+    pub fn clear(&mut self) {
+        self.samples.clear();
+        self.bytes = 0;
+    }
+
+    /// Gives all of them away, oldest first.
+    pub fn drain(&mut self) -> impl Iterator<Item = Arc<Sample>> + use<> {
+        self.bytes = 0;
+        std::mem::take(&mut self.samples).into_iter()
+    }
+
+    fn pop(&mut self) -> Option<Arc<Sample>> {
+        let sample = self.samples.pop_front()?;
+        self.bytes -= cost(&sample);
+        Some(sample)
+    }
+}
+
+fn cost(sample: &Sample) -> usize {
+    OVERHEAD + sample.payload.as_ref().map_or(0, bytes::Bytes::len)
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::Guid;
+
+    use super::*;
+    use crate::subscriptions::Topic;
+
+    fn sample(seconds: u64, bytes: usize) -> Arc<Sample> {
+        Arc::new(Sample {
+            topic: Arc::new(Topic {
+                domain_id: 0,
+                name: "/a".into(),
+                dds_name: "rt/a".into(),
+                message_type: "std_msgs/msg/String".into(),
+                offered: None,
+            }),
+            time: Timestamp(seconds * 1_000_000_000),
+            writer: Guid::default(),
+            sequence_number: seconds,
+            source_timestamp: None,
+            header_stamp: None,
+            size: 0,
+            sampled: false,
+            payload: Some(vec![0; bytes].into()),
+        })
+    }
+
+    fn numbers(ring: &mut SampleRing) -> Vec<u64> {
+        ring.drain().map(|sample| sample.sequence_number).collect()
+    }
+
+    #[test]
+    fn what_is_older_than_the_span_goes() {
+        let mut ring = SampleRing::new(1 << 20, Some(Duration::from_secs(3)));
+        for second in 0..6 {
+            ring.push(sample(second, 10));
+        }
+        assert_eq!((ring.len(), ring.crowded_out()), (4, 0));
+        ring.advance(Timestamp(7_000_000_000));
+        assert_eq!(numbers(&mut ring), [4, 5]);
+        assert!(ring.is_empty() && ring.bytes() == 0);
+    }
+
+    #[test]
+    fn the_bytes_stay_below_the_limit_and_what_had_to_go_is_counted() {
+        let mut ring = SampleRing::new(3000, None);
+        for second in 0..5 {
+            ring.push(sample(second, 1000));
+            assert!(ring.bytes() <= 3000);
+        }
+        assert_eq!(ring.crowded_out(), 3);
+        assert_eq!(numbers(&mut ring), [3, 4]);
+        // One that is larger than everything is not kept, and nothing else is harmed by it later.
+        ring.push(sample(6, 5000));
+        assert!(ring.is_empty());
+        ring.push(sample(7, 10));
+        assert_eq!(ring.len(), 1);
+    }
+}

@@ -1,0 +1,81 @@
+//! A time in a capture, as people name it.
+
+use std::str::FromStr;
+
+use ros2probe_wire::Timestamp;
+
+/// A time in a capture.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CaptureTime {
+    /// Since the epoch.
+    At(Timestamp),
+    /// Nanoseconds since the capture's first packet.
+    After(u64),
+}
+
+impl CaptureTime {
+    /// The time in a capture that begins at `beginning`.
+    #[must_use]
+    pub const fn in_capture(self, beginning: Timestamp) -> Timestamp {
+        match self {
+            Self::At(time) => time,
+            Self::After(nanoseconds) => Timestamp(beginning.0.saturating_add(nanoseconds)),
+        }
+    }
+}
+
+impl FromStr for CaptureTime {
+    type Err = &'static str;
+
+    /// Unix seconds, or `+` and seconds from the capture's beginning; nanoseconds are kept.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        const WRONG: &str =
+            "must be Unix seconds, or `+S` for seconds from the capture's beginning";
+        let (seconds, is_after) = match text.strip_prefix('+') {
+            Some(seconds) => (seconds, true),
+            None => (text, false),
+        };
+        let (whole, fraction) = seconds.split_once('.').unwrap_or((seconds, ""));
+        let is_number = |text: &str| text.bytes().all(|byte| byte.is_ascii_digit());
+        if whole.is_empty() || fraction.len() > 9 || !is_number(whole) || !is_number(fraction) {
+            return Err(WRONG);
+        }
+        let whole: u64 = whole.parse().map_err(|_| WRONG)?;
+        let fraction: u64 = format!("{fraction:0<9}").parse().map_err(|_| WRONG)?;
+        let nanoseconds = whole.checked_mul(1_000_000_000);
+        let nanoseconds = nanoseconds.and_then(|whole| whole.checked_add(fraction));
+        let nanoseconds = nanoseconds.ok_or(WRONG)?;
+        Ok(if is_after {
+            Self::After(nanoseconds)
+        } else {
+            Self::At(Timestamp(nanoseconds))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn moments_keep_their_nanoseconds() {
+        let at = |text: &str| text.parse::<CaptureTime>();
+        let exact = Timestamp(1_795_142_407_300_015_394);
+        assert_eq!(at("1795142407.300015394"), Ok(CaptureTime::At(exact)));
+        assert_eq!(at("+2.5"), Ok(CaptureTime::After(2_500_000_000)));
+        assert_eq!(at("+3"), Ok(CaptureTime::After(3_000_000_000)));
+        for wrong in [
+            "",
+            "+",
+            ".5",
+            "-1",
+            "1.0000000001",
+            "1e9",
+            "12:00",
+            "++1",
+            "99999999999999",
+        ] {
+            assert!(at(wrong).is_err(), "{wrong}");
+        }
+    }
+}

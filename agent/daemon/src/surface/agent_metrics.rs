@@ -1,0 +1,331 @@
+//! The agent's part of the page: what it drops, cannot read or cannot hold (`ros2probe_*`), and its
+//! own process (`process_*`).
+
+use std::fmt;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
+use super::board::{Reload, State};
+use super::catalogue as metric;
+use super::events::EventLog;
+use super::limit_facts::{LimitFacts, LimitFigures};
+use super::metric_sink::{Label, MetricSink};
+use super::otlp::{Exports, Outcome, Reason};
+use super::process::Process;
+use super::recording_facts::{RecordingFigures, SnapshotFigures};
+use super::ros2_metrics::TopicRows;
+use ros2probe_model::payloads::MissedReason;
+
+/// What runs, where its packets come from, and whether it sees.
+pub(super) fn identity(sink: &mut MetricSink<'_>, state: &State, now: Instant) -> fmt::Result {
+    sink.family(&metric::BUILD_INFO, |family| {
+        let version = Label::Text(env!("CARGO_PKG_VERSION"));
+        family.info(&[version, Label::Text(std::env::consts::ARCH)])
+    })?;
+    sink.family(&metric::SOURCE_INFO, |family| {
+        let reason = state.agent.source_reason.as_deref().unwrap_or_default();
+        family.info(&[Label::Text(state.agent.source.label()), Label::Text(reason)])
+    })?;
+    sink.family(&metric::SANDBOX_INFO, |family| {
+        let sandbox = &state.agent.sandbox;
+        let reason = sandbox.reason().unwrap_or_default();
+        family.info(&[Label::Text(sandbox.label()), Label::Text(reason)])
+    })?;
+    sink.family(&metric::ABILITY, |family| {
+        Ability::ALL.into_iter().try_for_each(|ability| {
+            let able = state.agent.abilities.contains(&ability);
+            family.sample(&[Label::Text(ability.label())], able)
+        })
+    })?;
+    sink.single(&metric::READY, state.ready(now).is_ok())
+}
+
+/// The capture and the kernel filter.
+pub(super) fn capture(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
+    let agent = &state.agent;
+    sink.family(&metric::CAPTURE_PACKETS, |family| {
+        let counted = |each: &InterfaceFacts| Some((each.name.clone(), each.packets?));
+        agent
+            .interfaces
+            .iter()
+            .filter_map(counted)
+            .try_for_each(|(name, packets)| family.sample(&[Label::Text(&name)], packets))
+    })?;
+    sink.family(&metric::CAPTURE_DROPPED, |family| {
+        let counted = |each: &InterfaceFacts| Some((each.name.clone(), each.dropped?));
+        agent
+            .interfaces
+            .iter()
+            .filter_map(counted)
+            .try_for_each(|(name, dropped)| family.sample(&[Label::Text(&name)], dropped))
+    })?;
+    sink.single(&metric::CAPTURE_COPIED, agent.copied_bytes)?;
+    sink.family(&metric::FILTER_EVENTS, |family| {
+        agent
+            .filter_events
+            .iter()
+            .try_for_each(|(event, count)| family.sample(&[Label::Text(event)], *count))
+    })?;
+    sink.single(&metric::FILTER_REFUSED, agent.refused_updates)?;
+    sink.single(&metric::RECORDS_DROPPED, agent.records_dropped)?;
+    sink.single(&metric::PIECES_DROPPED, agent.pieces_dropped)?;
+    sink.single(&metric::CONTENDED, agent.contended)?;
+    sink.single(&metric::INCOMPLETE_DATAGRAMS, agent.incomplete_datagrams)?;
+    sink.single(
+        &metric::REASSEMBLY,
+        agent.reassembly_bytes + agent.pieces_bytes,
+    )?;
+    shared_memory(sink, agent.shared_memory.as_ref())?;
+    sink.family(&metric::SHM_EXACT_INFO, |family| {
+        agent.exact.iter().try_for_each(|facts| {
+            let (state, reason) = match &facts.refused {
+                None => ("attached", ""),
+                Some(reason) => ("refused", reason.as_str()),
+            };
+            family.info(&[
+                Label::Text(&facts.library),
+                Label::Text(state),
+                Label::Text(reason),
+            ])
+        })
+    })
+}
+
+/// The look at shared memory; nothing where there is none.
+fn shared_memory(sink: &mut MetricSink<'_>, facts: Option<&SharedMemoryFacts>) -> fmt::Result {
+    sink.family(&metric::SHM_OPEN, |family| {
+        let mut open = facts.into_iter().flat_map(|facts| &facts.open);
+        open.try_for_each(|(kind, count)| family.sample(&[Label::Text(kind)], *count))
+    })?;
+    sink.family(&metric::SHM_EVENTS, |family| {
+        let mut events = facts.into_iter().flat_map(|facts| &facts.events);
+        events.try_for_each(|(event, count)| family.sample(&[Label::Text(event)], *count))
+    })?;
+    sink.family(&metric::SHM_LOOKS, |family| match facts {
+        Some(facts) => family.sample(&[], facts.looks),
+        None => Ok(()),
+    })?;
+    sink.family(&metric::SHM_CPU, |family| match facts {
+        Some(facts) => family.sample(&[], facts.cpu_seconds),
+        None => Ok(()),
+    })
+}
+
+/// The model's tables and what it could not read.
+pub(super) fn model(
+    sink: &mut MetricSink<'_>,
+    state: &State,
+    rows: &TopicRows<'_>,
+    hidden_deliveries: usize,
+    limits: &LimitFigures,
+) -> fmt::Result {
+    let snapshot = state.snapshot.as_ref();
+    let tables = || snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
+    sink.single(
+        &metric::DATAGRAMS,
+        snapshot.map_or(0, |snapshot| snapshot.datagrams),
+    )?;
+    sink.single(
+        &metric::RECORDS,
+        snapshot.map_or(0, |snapshot| snapshot.records),
+    )?;
+    sink.family(&metric::DECODE_ERRORS, |family| {
+        let mut errors = snapshot
+            .into_iter()
+            .flat_map(|snapshot| &snapshot.decode_errors);
+        errors.try_for_each(|error| {
+            family.sample(
+                &[Label::Text(error.stage), Label::Text(error.reason)],
+                error.count,
+            )
+        })
+    })?;
+    sink.family(&metric::TABLE_ENTRIES, |family| {
+        tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.size))
+    })?;
+    sink.family(&metric::TABLE_LIMIT, |family| {
+        tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.limit))
+    })?;
+    sink.family(&metric::TABLE_EVICTIONS, |family| {
+        tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.evictions))
+    })?;
+    self::limits(sink, limits, state)?;
+    let tracked = rows
+        .shown
+        .iter()
+        .filter(|row| row.measurement().is_some())
+        .count();
+    sink.single(&metric::TRACKED_TOPICS, tracked)?;
+    sink.single(
+        &metric::TOPICS_REJECTED,
+        snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
+    )?;
+    sink.single(&metric::TOPICS_HIDDEN, rows.hidden)?;
+    sink.single(&metric::DELIVERIES_HIDDEN, hidden_deliveries)
+}
+
+/// The caps of the configuration.
+fn limits(sink: &mut MetricSink<'_>, figures: &LimitFigures, state: &State) -> fmt::Result {
+    type Read = fn(&LimitFacts) -> u64;
+    let families: [(_, Read); 4] = [
+        (&metric::LIMIT, |facts| facts.cap),
+        (&metric::LIMIT_USED, |facts| facts.used),
+        (&metric::LIMIT_REACHED, |facts| facts.reached),
+        (&metric::AT_LIMIT, |facts| facts.at_limit.into()),
+    ];
+    for (metric, read) in families {
+        sink.family(metric, |family| {
+            let mut facts = figures.facts(state).into_iter();
+            facts.try_for_each(|facts| {
+                family.sample(&[Label::Text(facts.limit.key())], read(&facts))
+            })
+        })?;
+    }
+    Ok(())
+}
+
+/// What is kept for the next start, and what came from the last one.
+pub(super) fn kept(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
+    let kept = state.agent.state;
+    sink.family(&metric::STATE_WRITES, |family| {
+        let counts = kept.map_or([None, None], |kept| {
+            [
+                Some(("written", kept.writes)),
+                Some(("failed", kept.failures)),
+            ]
+        });
+        let mut counts = counts.into_iter().flatten();
+        counts.try_for_each(|(outcome, count)| family.sample(&[Label::Text(outcome)], count))
+    })?;
+    let snapshot = state.snapshot.iter();
+    let participants = snapshot.flat_map(|snapshot| &snapshot.participants);
+    let restored = participants.filter(|participant| participant.restored);
+    sink.single(&metric::RESTORED, restored.count())
+}
+
+/// The surface itself.
+pub(super) fn surface(
+    sink: &mut MetricSink<'_>,
+    state: &State,
+    reload: Reload,
+    last_scrape: Duration,
+    now: Instant,
+) -> fmt::Result {
+    let age = now.saturating_duration_since(state.agent.at);
+    sink.single(&metric::SNAPSHOT_AGE, age.as_secs_f64())?;
+    sink.single(&metric::SCRAPE_DURATION, last_scrape.as_secs_f64())?;
+    sink.single(&metric::RELOAD_SUCCESSFUL, reload.successful)?;
+    let since_epoch = reload.last_success.duration_since(SystemTime::UNIX_EPOCH);
+    sink.single(
+        &metric::RELOAD_TIMESTAMP,
+        since_epoch.unwrap_or_default().as_secs_f64(),
+    )
+}
+
+/// Who gets messages one by one.
+pub(super) fn subscriptions(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
+    let facts = &state.agent.subscriptions;
+    sink.single(&metric::SUBSCRIPTIONS, facts.open)?;
+    sink.single(&metric::SUBSCRIPTIONS_REFUSED, facts.refused)?;
+    sink.single(&metric::SAMPLES_GIVEN, facts.given)?;
+    sink.family(&metric::SAMPLES_MISSED, |family| {
+        let mut missed = MissedReason::ALL.into_iter().zip(facts.missed);
+        missed.try_for_each(|(reason, count)| family.sample(&[Label::Text(reason.label())], count))
+    })?;
+    sink.single(&metric::SAMPLES_QUEUED, facts.queued_bytes)?;
+    sink.single(&metric::SAMPLES_RETAINED, facts.retained_bytes)
+}
+
+/// Events, told and not told.
+pub(super) fn events(sink: &mut MetricSink<'_>, log: &EventLog, lost_lines: u64) -> fmt::Result {
+    for (metric, counts) in [
+        (&metric::EVENTS, log.recorded()),
+        (&metric::EVENTS_DROPPED, log.dropped()),
+    ] {
+        sink.family(metric, |family| {
+            let mut counts = counts.into_iter();
+            counts.try_for_each(|(label, count)| family.sample(&[Label::Text(label)], count))
+        })?;
+    }
+    sink.single(&metric::LOG_LINES_LOST, lost_lines)
+}
+
+/// Bags that the agent writes, and what snapshots keep.
+pub(super) fn recordings(sink: &mut MetricSink<'_>, figures: &RecordingFigures) -> fmt::Result {
+    let counts = [
+        (&metric::RECORDINGS, &figures.active),
+        (&metric::RECORDED_MESSAGES, &figures.messages),
+        (&metric::RECORDED_BYTES, &figures.bytes),
+        (&metric::RECORDINGS_MISSING, &figures.missing),
+    ];
+    for (metric, count) in counts {
+        sink.single(metric, count.load(Ordering::Relaxed))?;
+    }
+    let snapshots = figures.snapshots();
+    type Read = fn(&SnapshotFigures) -> u64;
+    let families: [(_, Read); 5] = [
+        (&metric::SNAPSHOT_MESSAGES, |figures| figures.messages),
+        (&metric::SNAPSHOT_BYTES, |figures| figures.bytes),
+        (&metric::SNAPSHOT_CROWDED_OUT, |figures| figures.crowded_out),
+        (&metric::SNAPSHOTS_WRITTEN, |figures| figures.written),
+        (&metric::SNAPSHOTS_FAILED, |figures| figures.failed),
+    ];
+    for (metric, read) in families {
+        sink.family(metric, |family| {
+            let mut snapshots = snapshots.iter();
+            snapshots
+                .try_for_each(|(name, figures)| family.sample(&[Label::Text(name)], read(figures)))
+        })?;
+    }
+    Ok(())
+}
+
+/// What became of what was to be exported; nothing where nothing is.
+pub(super) fn exports(sink: &mut MetricSink<'_>, exports: &Exports) -> fmt::Result {
+    sink.family(&metric::OTLP_EXPORTS, |family| {
+        for signal in exports.signals() {
+            for outcome in Outcome::ALL {
+                let labels = [Label::Text(signal.label()), Label::Text(outcome.label())];
+                family.sample(&labels, exports.requests(signal, outcome))?;
+            }
+        }
+        Ok(())
+    })?;
+    sink.family(&metric::OTLP_DROPPED, |family| {
+        for signal in exports.signals() {
+            for reason in Reason::ALL {
+                let labels = [Label::Text(signal.label()), Label::Text(reason.label())];
+                family.sample(&labels, exports.dropped(signal, reason))?;
+            }
+        }
+        Ok(())
+    })
+}
+
+/// The process; what cannot be read is left out.
+pub(super) fn process(sink: &mut MetricSink<'_>) -> fmt::Result {
+    let Process {
+        cpu_seconds,
+        resident_bytes,
+        unreclaimable_bytes,
+        virtual_bytes,
+        open_fds,
+        max_fds,
+        start_time,
+    } = Process::read();
+    for (metric, value) in [
+        (&metric::PROCESS_CPU, cpu_seconds),
+        (&metric::PROCESS_RESIDENT, resident_bytes),
+        (&metric::PROCESS_UNRECLAIMABLE, unreclaimable_bytes),
+        (&metric::PROCESS_VIRTUAL, virtual_bytes),
+        (&metric::PROCESS_OPEN_FDS, open_fds),
+        (&metric::PROCESS_MAX_FDS, max_fds),
+        (&metric::PROCESS_START_TIME, start_time),
+    ] {
+        if let Some(value) = value {
+            sink.single(metric, value)?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,497 @@
+//! How long a connection may take, and how much it may make the agent hold. A client keeps its
+//! place by what it does: a whole request within a time, an answer read at a least rate. One that
+//! waits between requests makes room for the next client.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::sync::Notify;
+use tokio::time::{Instant, Sleep, sleep_until};
+use tokio_util::sync::CancellationToken;
+
+use super::limit_facts::Slot;
+
+/// A connection without a request is closed after so long; a stream on which nothing can be written
+/// for so long, too.
+const IDLE: Duration = Duration::from_secs(75);
+/// From the first byte of a request to its last one.
+const REQUEST: Duration = Duration::from_secs(10);
+/// A client that does not read must take [`LEAST`] bytes of a whole answer within this time.
+const PROGRESS: Duration = Duration::from_secs(10);
+const LEAST: usize = 64 << 10;
+/// Bytes of unfinished requests that a listener holds beside [`FREE`] for each connection.
+const UNFINISHED: usize = 256 << 10;
+/// Bytes of an unfinished request that every connection may hold.
+const FREE: usize = 4 << 10;
+
+/// The connections of one listener.
+#[derive(Debug, Default)]
+pub(super) struct Connections {
+    connections: Mutex<Vec<Arc<ConnectionState>>>,
+    unfinished: AtomicUsize,
+    left: Notify,
+}
+
+/// How far one connection is; shared by its stream and by what answers its requests.
+#[derive(Debug)]
+pub(super) struct ConnectionState {
+    progress: Mutex<Progress>,
+    /// Closes the connection.
+    end: CancellationToken,
+}
+
+#[derive(Debug)]
+struct Progress {
+    phase: Phase,
+    since: Instant,
+    /// Bytes of the request that were read.
+    read: usize,
+    /// Counted in [`Connections::unfinished`].
+    counted: usize,
+    /// Since when the client takes nothing, and what it took since then.
+    stalled: Option<(Instant, usize)>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    /// No request, or a part of its head.
+    Waiting,
+    /// A part of its body.
+    Receiving,
+    /// It is being handled.
+    Working,
+    /// A whole answer is being sent.
+    Answering,
+    /// An answer without an end is being sent.
+    Streaming,
+}
+
+/// A stream that fails when it takes too long or is asked to hold too much.
+#[derive(Debug)]
+pub(super) struct Connection<S> {
+    stream: S,
+    state: Arc<ConnectionState>,
+    connections: Arc<Connections>,
+    deadline: Pin<Box<Sleep>>,
+    _place: Slot,
+}
+
+impl Connections {
+    /// Takes a connection in, which leaves with its value.
+    pub(super) fn join<S>(self: &Arc<Self>, stream: S, slot: Slot) -> Connection<S> {
+        let state = Arc::new(ConnectionState::new());
+        self.lock().push(Arc::clone(&state));
+        Connection {
+            stream,
+            state,
+            connections: Arc::clone(self),
+            deadline: Box::pin(sleep_until(Instant::now() + IDLE)),
+            _place: slot,
+        }
+    }
+
+    /// Closes the connection that has been without a whole request for longest, if there is one.
+    pub(super) fn make_room(&self) -> bool {
+        let connections = self.lock();
+        let waiting = connections.iter().filter_map(|state| {
+            let progress = state.lock();
+            let is_waiting = matches!(progress.phase, Phase::Waiting | Phase::Receiving)
+                // The end of an answer is still on its way.
+                && progress.stalled.is_none();
+            (is_waiting && !state.end.is_cancelled()).then_some((progress.since, state))
+        });
+        let longest = waiting.min_by_key(|(since, _)| *since);
+        longest.map(|(_, state)| state.end.cancel()).is_some()
+    }
+
+    /// Returns when a connection has gone.
+    pub(super) async fn left(&self) {
+        self.left.notified().await;
+    }
+
+    /// Counts bytes of an unfinished request.
+    fn hold(&self, bytes: usize) -> bool {
+        let more = |held: usize| Some(held + bytes).filter(|held| *held <= UNFINISHED);
+        let unfinished = &self.unfinished;
+        let held = unfinished.fetch_update(Ordering::Relaxed, Ordering::Relaxed, more);
+        held.is_ok()
+    }
+
+    fn release(&self, bytes: usize) {
+        self.unfinished.fetch_sub(bytes, Ordering::Relaxed);
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Vec<Arc<ConnectionState>>> {
+        self.connections
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl ConnectionState {
+    fn new() -> Self {
+        Self {
+            progress: Mutex::new(Progress {
+                phase: Phase::Waiting,
+                since: Instant::now(),
+                read: 0,
+                counted: 0,
+                stalled: None,
+            }),
+            end: CancellationToken::new(),
+        }
+    }
+
+    /// The head of a request is here, and its body unless `is_whole`.
+    pub(super) fn requested(&self, is_whole: bool) {
+        let mut progress = self.lock();
+        if is_whole {
+            progress.enter(Phase::Working);
+        } else {
+            // Head and body have one time together.
+            progress.phase = Phase::Receiving;
+        }
+    }
+
+    /// The body of the request is here.
+    pub(super) fn received(&self) {
+        let mut progress = self.lock();
+        if progress.phase == Phase::Receiving {
+            progress.enter(Phase::Working);
+        }
+    }
+
+    /// The answer begins, which has an end if it `is_whole`.
+    pub(super) fn answers(&self, is_whole: bool) {
+        let phase = if is_whole {
+            Phase::Answering
+        } else {
+            Phase::Streaming
+        };
+        self.lock().enter(phase);
+    }
+
+    /// The answer has been handed over.
+    pub(super) fn answered(&self) {
+        self.lock().enter(Phase::Waiting);
+    }
+
+    /// Whether nothing is being asked or answered.
+    pub(super) fn is_idle(&self) -> bool {
+        let progress = self.lock();
+        progress.phase == Phase::Waiting && progress.stalled.is_none()
+    }
+
+    /// Returns when the connection is to be closed.
+    pub(super) async fn ended(&self) {
+        self.end.cancelled().await;
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Progress> {
+        self.progress.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Progress {
+    fn enter(&mut self, phase: Phase) {
+        self.phase = phase;
+        self.since = Instant::now();
+        if phase == Phase::Waiting {
+            self.read = 0;
+        }
+    }
+
+    /// Until when there must be progress.
+    fn deadline(&self) -> Instant {
+        if let Some((since, _)) = self.stalled
+            && self.phase != Phase::Streaming
+        {
+            return since + PROGRESS;
+        }
+        match self.phase {
+            Phase::Waiting if self.read == 0 => self.since + IDLE,
+            Phase::Waiting | Phase::Receiving => self.since + REQUEST,
+            Phase::Working | Phase::Answering | Phase::Streaming => self.since + IDLE,
+        }
+    }
+}
+
+impl<S> Connection<S> {
+    pub(super) const fn state(&self) -> &Arc<ConnectionState> {
+        &self.state
+    }
+
+    pub(super) const fn stream(&self) -> &S {
+        &self.stream
+    }
+
+    /// Pending, unless the time is over.
+    fn overdue<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
+        let deadline = self.state.lock().deadline();
+        if self.deadline.deadline() != deadline {
+            self.deadline.as_mut().reset(deadline);
+        }
+        self.deadline
+            .as_mut()
+            .poll(context)
+            .map(|()| Err(io::ErrorKind::TimedOut.into()))
+    }
+
+    /// Counts what was read of a request.
+    fn has_read(&self, bytes: usize) -> io::Result<()> {
+        let mut progress = self.state.lock();
+        if !matches!(progress.phase, Phase::Waiting | Phase::Receiving) {
+            return Ok(());
+        }
+        if progress.read == 0 {
+            // The first bytes of a request after a pause.
+            progress.since = Instant::now();
+        }
+        progress.read += bytes;
+        let beyond = progress.read.saturating_sub(FREE);
+        let fresh = beyond.saturating_sub(progress.counted);
+        if !self.connections.hold(fresh) {
+            return Err(io::Error::other("too many bytes of unfinished requests"));
+        }
+        progress.counted += fresh;
+        Ok(())
+    }
+
+    /// Counts what was written, or that nothing could be; fails where that was too little for too
+    /// long.
+    fn has_written(&self, bytes: usize) -> io::Result<()> {
+        let now = Instant::now();
+        let mut progress = self.state.lock();
+        // The request is behind it.
+        self.connections
+            .release(std::mem::take(&mut progress.counted));
+        if matches!(progress.phase, Phase::Answering | Phase::Streaming) {
+            progress.since = now;
+        }
+        if let Some((since, taken)) = &mut progress.stalled {
+            *taken += bytes;
+            if *taken >= LEAST {
+                progress.stalled = None;
+            } else if now.saturating_duration_since(*since) >= PROGRESS
+                && progress.phase != Phase::Streaming
+            {
+                return Err(io::ErrorKind::TimedOut.into());
+            }
+        }
+        Ok(())
+    }
+
+    fn stalls(&self) {
+        let mut progress = self.state.lock();
+        if progress.stalled.is_none() {
+            progress.stalled = Some((Instant::now(), 0));
+        }
+    }
+}
+
+impl<S> Drop for Connection<S> {
+    fn drop(&mut self) {
+        self.connections.release(self.state.lock().counted);
+        let mut connections = self.connections.lock();
+        connections.retain(|state| !Arc::ptr_eq(state, &self.state));
+        drop(connections);
+        self.connections.left.notify_one();
+    }
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let before = buffer.filled().len();
+        match Pin::new(&mut self.stream).poll_read(context, buffer) {
+            Poll::Pending => self.overdue(context),
+            Poll::Ready(Ok(())) => {
+                let bytes = buffer.filled().len().saturating_sub(before);
+                Poll::Ready(self.has_read(bytes))
+            }
+            failed => failed,
+        }
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        match Pin::new(&mut self.stream).poll_write(context, bytes) {
+            Poll::Pending => {
+                self.stalls();
+                self.overdue(context)
+            }
+            Poll::Ready(Ok(written)) => Poll::Ready(self.has_written(written).map(|()| written)),
+            failed => failed,
+        }
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        // All that there was has been taken.
+        self.state.lock().stalled = None;
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _, DuplexStream, duplex};
+
+    use super::*;
+    use crate::config::{Limit, Limits};
+    use crate::surface::limit_facts::LimitFigures;
+
+    /// A crowd, and a way to add a connection to it.
+    fn connections() -> (
+        Arc<Connections>,
+        impl Fn() -> (Connection<DuplexStream>, DuplexStream),
+    ) {
+        let connections = Arc::new(Connections::default());
+        let places = LimitFigures::new(Limits::default()).slots(Limit::ApiClients);
+        let joined = Arc::clone(&connections);
+        let join = move || {
+            let (ours, theirs) = duplex(1 << 10);
+            (joined.join(ours, places.take().unwrap()), theirs)
+        };
+        (connections, join)
+    }
+
+    /// Reads until the connection fails or ends; for how long, and why.
+    async fn read(connection: &mut Connection<DuplexStream>) -> (Duration, io::ErrorKind) {
+        let start = Instant::now();
+        let mut bytes = vec![0; 1 << 16];
+        loop {
+            match connection.read(&mut bytes).await {
+                Ok(0) => return (start.elapsed(), io::ErrorKind::UnexpectedEof),
+                Ok(_) => {}
+                Err(error) => return (start.elapsed(), error.kind()),
+            }
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_request_that_trickles_in_has_ten_seconds_and_a_pause_seventy_five() {
+        let (_crowd, join) = connections();
+        let (mut idle, _client) = join();
+        let (lasted, why) = read(&mut idle).await;
+        assert_eq!((lasted.as_secs(), why), (75, io::ErrorKind::TimedOut));
+
+        let (mut slow, mut client) = join();
+        let trickle = async {
+            loop {
+                if client.write_all(b"x").await.is_err() {
+                    return;
+                }
+                tokio::time::sleep(Duration::from_secs(1)).await;
+            }
+        };
+        let (lasted, why) = tokio::select! {
+            ended = read(&mut slow) => ended,
+            () = trickle => panic!("the client ended first"),
+        };
+        assert_eq!((lasted.as_secs(), why), (10, io::ErrorKind::TimedOut));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_whole_answer_that_is_read_too_slowly_ends_and_a_stream_may_stall_for_longer() {
+        for (is_whole, seconds) in [(true, 10..=20), (false, 75..=75)] {
+            let (_crowd, join) = connections();
+            let (mut connection, mut client) = join();
+            connection.state().requested(true);
+            connection.state().answers(is_whole);
+            let start = Instant::now();
+            let sent = connection.write_all(&[7; 1 << 20]);
+            // 5 KB a second of a whole answer; nothing of a stream.
+            let reading = async {
+                let mut bytes = [0; 512];
+                loop {
+                    tokio::time::sleep(Duration::from_millis(100)).await;
+                    if is_whole {
+                        client.read_exact(&mut bytes).await.unwrap();
+                    }
+                }
+            };
+            let failed = tokio::select! {
+                sent = sent => sent.unwrap_err(),
+                () = reading => unreachable!(),
+            };
+            assert_eq!(failed.kind(), io::ErrorKind::TimedOut);
+            let lasted = start.elapsed().as_secs();
+            assert!(seconds.contains(&lasted), "{lasted} s, whole: {is_whole}");
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn an_answer_that_is_read_at_twenty_kilobytes_a_second_is_sent_whole() {
+        let (_crowd, join) = connections();
+        let (mut connection, mut client) = join();
+        connection.state().requested(true);
+        connection.state().answers(true);
+        let reading = tokio::spawn(async move {
+            let mut bytes = [0; 2 << 10];
+            let mut read = 0;
+            while let Ok(length @ 1..) = client.read(&mut bytes).await {
+                read += length;
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+            read
+        });
+        connection.write_all(&[7; 1 << 20]).await.unwrap();
+        drop(connection);
+        assert_eq!(reading.await.unwrap(), 1 << 20);
+    }
+
+    #[tokio::test]
+    async fn unfinished_requests_of_all_connections_share_a_budget_and_small_ones_need_none() {
+        let (connections, join) = connections();
+        let mut large = Vec::new();
+        let mut refused = 0;
+        for _ in 0..20 {
+            let (mut connection, mut client) = join();
+            let sending = tokio::spawn(async move {
+                let sent = client.write_all(&[b'x'; 40 << 10]).await;
+                (client, sent)
+            });
+            let mut bytes = vec![0; 40 << 10];
+            refused += u32::from(connection.read_exact(&mut bytes).await.is_err());
+            large.push((connection, sending));
+        }
+        assert!(connections.unfinished.load(Ordering::Relaxed) <= UNFINISHED);
+        assert_eq!(refused, 13, "36 KiB each of 256");
+        let (mut small, mut client) = join();
+        client.write_all(b"GET /metrics").await.unwrap();
+        assert!(small.read(&mut [0; 64]).await.is_ok());
+        drop((large, small));
+        assert_eq!(connections.unfinished.load(Ordering::Relaxed), 0);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn the_connection_that_waits_longest_makes_room_and_one_that_is_answered_does_not() {
+        let (connections, join) = connections();
+        let (answered, _one) = join();
+        answered.state().requested(true);
+        let (oldest, _two) = join();
+        tokio::time::advance(Duration::from_secs(1)).await;
+        let (newest, _three) = join();
+        let is_closed = |connection: &Connection<DuplexStream>| connection.state.end.is_cancelled();
+        assert!(connections.make_room() && is_closed(&oldest) && !is_closed(&newest));
+        assert!(connections.make_room() && is_closed(&newest) && !is_closed(&answered));
+        assert!(!connections.make_room());
+    }
+}

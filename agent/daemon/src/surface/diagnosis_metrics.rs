@@ -1,0 +1,104 @@
+//! What is wrong with the graph, as the page shows it.
+
+use std::borrow::Cow;
+use std::collections::BTreeMap;
+use std::fmt;
+
+use super::catalogue::{self as metric, Metric};
+use super::metric_sink::{Label, MetricSink};
+use super::ros2_metrics::series_name;
+use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
+use ros2probe_model::snapshot::Snapshot;
+
+/// What one finding adds to a family.
+type Count = fn(&Diagnosis) -> usize;
+/// How many of something on each topic.
+type PerTopic<'a> = BTreeMap<(u32, Cow<'a, str>), usize>;
+
+/// One family of each kind of finding.
+pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
+    let found = &*snapshot.diagnoses;
+    sink.family(&metric::DIAGNOSES, |family| {
+        Diagnosis::KINDS.iter().try_for_each(|kind| {
+            let own = found.list.iter().filter(|each| each.kind() == *kind);
+            family.sample(&[Label::Text(kind)], own.count())
+        })
+    })?;
+    sink.family(&metric::QOS_INCOMPATIBLE_PAIRS, |family| {
+        let mut pairs = BTreeMap::new();
+        for each in &found.qos_pairs {
+            let (domain_id, topic) = series(&each.topic);
+            *pairs.entry((domain_id, topic, each.policy)).or_default() += each.pairs;
+        }
+        let mut pairs: std::collections::btree_map::Iter<'_, _, u64> = pairs.iter();
+        pairs.try_for_each(|((domain_id, topic, policy), count)| {
+            let labels = [
+                Label::Number((*domain_id).into()),
+                Label::Text(topic),
+                Label::Text(policy.label()),
+            ];
+            family.sample(&labels, *count)
+        })
+    })?;
+    let per_topic: [(&'static Metric, Count); 4] = [
+        (&metric::TOPIC_CONFLICTING_TYPES, |each| match each {
+            Diagnosis::TypeConflict { types, .. } => types.len(),
+            _ => 0,
+        }),
+        (&metric::TOPIC_CONFLICTING_TYPE_HASHES, |each| match each {
+            Diagnosis::TypeHashConflict { hashes, .. } => hashes.len(),
+            _ => 0,
+        }),
+        (&metric::UNHEARD_PUBLISHERS, |each| {
+            usize::from(matches!(each, Diagnosis::UnheardPublisher { .. }))
+        }),
+        (&metric::UNFED_SUBSCRIPTIONS, |each| {
+            usize::from(matches!(each, Diagnosis::UnfedSubscriber { .. }))
+        }),
+    ];
+    for (metric, count) in per_topic {
+        let mut counts = PerTopic::new();
+        for each in &found.list {
+            if let (Some(topic), count @ 1..) = (each.topic(), count(each)) {
+                *counts.entry(series(topic)).or_default() += count;
+            }
+        }
+        sink.family(metric, |family| {
+            counts.iter().try_for_each(|((domain_id, topic), count)| {
+                let labels = [Label::Number((*domain_id).into()), Label::Text(topic)];
+                family.sample(&labels, *count)
+            })
+        })?;
+    }
+    sink.family(&metric::DUPLICATE_NODES, |family| {
+        found.list.iter().try_for_each(|each| match each {
+            Diagnosis::DuplicateNode {
+                domain_id,
+                node,
+                participants,
+            } => {
+                let labels = [Label::Number((*domain_id).into()), Label::Text(node)];
+                family.sample(&labels, participants.len())
+            }
+            _ => Ok(()),
+        })
+    })?;
+    sink.family(&metric::NODE_DOMAINS, |family| {
+        found.list.iter().try_for_each(|each| match each {
+            Diagnosis::NodeInSeveralDomains {
+                node,
+                participant,
+                domains,
+            } => {
+                let labels = [Label::Text(node), Label::Guid(*participant)];
+                family.sample(&labels, domains.len())
+            }
+            _ => Ok(()),
+        })
+    })
+}
+
+fn series(topic: &TopicKey) -> (u32, Cow<'_, str>) {
+    let name = series_name(topic.kind, &topic.name, &topic.dds_name);
+    (topic.domain_id, name)
+}

@@ -1,0 +1,167 @@
+//! Watches what the agent knows of itself and makes events of it: it lost something,
+//! it does not see any more, it sees again. Each says a thing once.
+
+use std::time::{Duration, Instant};
+
+use super::AgentEvent;
+use crate::surface::AgentFacts;
+
+/// Losses are reported at most this often.
+const PAUSE: Duration = Duration::from_secs(1);
+
+/// What was lost on the way to the model.
+#[derive(Debug, Default)]
+pub struct DropMonitor {
+    reported: Losses,
+    at: Option<Instant>,
+}
+
+type Losses = [(&'static str, u64); 4];
+
+/// Whether the agent sees.
+#[derive(Debug, Default)]
+pub struct SourceMonitor {
+    blind_since: Option<Instant>,
+    /// When it was last looked at and saw. Until then it is starting, not blind.
+    saw: Option<Instant>,
+    attached_anew: u64,
+}
+
+impl DropMonitor {
+    /// What was lost since the last report.
+    pub fn check(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
+        let early = |at: Instant| now.saturating_duration_since(at) < PAUSE;
+        if self.at.is_some_and(early) {
+            return Vec::new();
+        }
+        let lost = losses(facts);
+        let before = self.reported.iter().map(|(_, count)| *count);
+        let new = lost
+            .iter()
+            .zip(before)
+            .filter_map(|((what, count), before)| {
+                let count = count.saturating_sub(before);
+                (count > 0).then_some(AgentEvent::Dropped { what, count })
+            });
+        let new: Vec<_> = new.collect();
+        if !new.is_empty() {
+            (self.reported, self.at) = (lost, Some(now));
+        }
+        new
+    }
+}
+
+fn losses(facts: &AgentFacts) -> Losses {
+    let interfaces = facts.interfaces.iter();
+    let packets = interfaces.filter_map(|interface| interface.dropped).sum();
+    [
+        ("packets", packets),
+        ("records", facts.records_dropped),
+        ("datagrams", facts.pieces_dropped),
+        ("contended", facts.contended),
+    ]
+}
+
+impl SourceMonitor {
+    /// Whether it sees at `now`, or why not, and how often the hook was attached anew; the events if
+    /// that is news. A control group that went and came between two looks makes both events, with the
+    /// time between the looks.
+    pub fn check(
+        &mut self,
+        ready: &Result<(), String>,
+        attached_anew: u64,
+        now: Instant,
+    ) -> Vec<AgentEvent> {
+        let is_anew = attached_anew > std::mem::replace(&mut self.attached_anew, attached_anew);
+        let mut events = Vec::new();
+        match ready {
+            Ok(()) => {
+                let saw = self.saw.replace(now).filter(|_| is_anew);
+                if self.blind_since.is_none() && saw.is_some() {
+                    let reason = "the cgroup was removed and made anew".to_owned();
+                    events.push(AgentEvent::Blind { reason });
+                }
+                if let Some(since) = self.blind_since.take().or(saw) {
+                    let blind_seconds = now.saturating_duration_since(since).as_secs_f64();
+                    events.push(AgentEvent::Seeing { blind_seconds });
+                }
+            }
+            Err(reason) if self.saw.is_some() && self.blind_since.is_none() => {
+                self.blind_since = Some(now);
+                let reason = reason.clone();
+                events.push(AgentEvent::Blind { reason });
+            }
+            Err(_) => {}
+        }
+        events
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::{InterfaceFacts, SourceKind};
+
+    #[test]
+    fn losses_are_told_as_what_came_since_and_at_most_once_a_second() {
+        let start = Instant::now();
+        let interface = |dropped| InterfaceFacts {
+            name: "any".to_owned(),
+            packets: None,
+            dropped: Some(dropped),
+        };
+        let facts = |dropped, records| AgentFacts {
+            interfaces: vec![interface(dropped), interface(1)],
+            records_dropped: records,
+            ..AgentFacts::new(SourceKind::Wire, start)
+        };
+        let drop = |what, count| AgentEvent::Dropped { what, count };
+        let mut drops = DropMonitor::default();
+        let second = |number| start + Duration::from_secs(number);
+        let nothing = AgentFacts::new(SourceKind::Wire, start);
+        assert_eq!(drops.check(&nothing, start), []);
+        let new = drops.check(&facts(4, 2), start);
+        assert_eq!(new, [drop("packets", 5), drop("records", 2)]);
+        assert_eq!(drops.check(&facts(5, 2), start), []);
+        assert_eq!(drops.check(&facts(9, 2), second(1)), [drop("packets", 5)]);
+        assert_eq!(drops.check(&facts(9, 2), second(3)), []);
+    }
+
+    #[test]
+    fn blindness_is_told_once_and_not_of_an_agent_that_starts() {
+        let start = Instant::now();
+        let mut sight = SourceMonitor::default();
+        let blind = Err("stuck".to_owned());
+        assert_eq!(sight.check(&blind, 0, start), []);
+        assert_eq!(sight.check(&Ok(()), 0, start), []);
+        let reason = "stuck".to_owned();
+        assert_eq!(
+            sight.check(&blind, 0, start),
+            [AgentEvent::Blind { reason }]
+        );
+        assert_eq!(sight.check(&blind, 0, start), []);
+        let later = start + Duration::from_secs(3);
+        let seeing = AgentEvent::Seeing { blind_seconds: 3.0 };
+        assert_eq!(sight.check(&Ok(()), 0, later), [seeing]);
+        assert_eq!(sight.check(&Ok(()), 0, later), []);
+    }
+
+    #[test]
+    fn a_cgroup_that_is_made_anew_between_two_looks_is_told_once() {
+        let start = Instant::now();
+        let second = |number| start + Duration::from_secs(number);
+        let mut sight = SourceMonitor::default();
+        assert_eq!(sight.check(&Ok(()), 0, start), []);
+        let events = sight.check(&Ok(()), 1, second(2));
+        let reason = "the cgroup was removed and made anew".to_owned();
+        let seeing = |blind_seconds| AgentEvent::Seeing { blind_seconds };
+        assert_eq!(events, [AgentEvent::Blind { reason }, seeing(2.0)]);
+        assert_eq!(sight.check(&Ok(()), 1, second(4)), []);
+
+        // Noticed while it was gone: that is told already.
+        let gone = Err("the cgroup /robot was removed".to_owned());
+        assert_eq!(sight.check(&gone, 1, second(6)).len(), 1);
+        assert_eq!(sight.check(&Ok(()), 2, second(9)), [seeing(3.0)]);
+        assert_eq!(sight.check(&Ok(()), 2, second(10)), []);
+    }
+}

@@ -1,0 +1,200 @@
+//! Answers that hold everything, as a page of metrics or all topics: megabytes on a large robot. A
+//! few are made at a time; they are kept compressed until they are read, and within a budget. A
+//! fresh answer takes the room of the one that has been read for longest.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use axum::body::{Body, Bytes};
+use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+
+use super::compressed_text::{CompressedText, Encoding, TextCompressor};
+
+/// Large answers of one surface that are made at once.
+const AT_ONCE: usize = 2;
+/// Bytes of answers of one surface that wait for their readers, compressed.
+const KEPT: usize = 4 << 20;
+/// From here on an answer is large.
+const LARGE: usize = 256 << 10;
+/// How long a turn is waited for.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Large answers of one surface.
+#[derive(Debug)]
+pub(super) struct LargeResponses {
+    making: Semaphore,
+    patience: Duration,
+    kept: Mutex<Vec<Pending>>,
+}
+
+/// An answer that is being read, by age.
+#[derive(Debug)]
+struct Pending {
+    bytes: usize,
+    /// Its reader gets no more.
+    given_up: CancellationToken,
+}
+
+/// The turn of one answer, while it is made.
+#[derive(Debug)]
+pub(super) struct RenderPermit {
+    of: &'static LargeResponses,
+    _making: SemaphorePermit<'static>,
+}
+
+/// The room of one answer, until it is read.
+#[derive(Debug)]
+pub(super) struct Reservation {
+    of: &'static LargeResponses,
+    given_up: CancellationToken,
+}
+
+impl LargeResponses {
+    /// Nothing made or kept.
+    pub(super) const fn new() -> Self {
+        Self {
+            making: Semaphore::const_new(AT_ONCE),
+            patience: PATIENCE,
+            kept: Mutex::new(Vec::new()),
+        }
+    }
+
+    /// A turn, within a moment.
+    pub(super) async fn turn(&'static self) -> Option<RenderPermit> {
+        let making = timeout(self.patience, self.making.acquire()).await;
+        let making = making.ok()?.ok()?;
+        Some(RenderPermit {
+            of: self,
+            _making: making,
+        })
+    }
+
+    /// Room for an answer of so many bytes, that of the oldest ones where need be.
+    fn room(&'static self, bytes: usize) -> Reservation {
+        let given_up = CancellationToken::new();
+        let mut kept = self.lock();
+        let mut sum: usize = kept.iter().map(|each| each.bytes).sum();
+        kept.retain(|each| {
+            let stays = sum + bytes <= KEPT;
+            if !stays {
+                each.given_up.cancel();
+                sum -= each.bytes;
+            }
+            stays
+        });
+        kept.push(Pending {
+            bytes,
+            given_up: given_up.clone(),
+        });
+        Reservation { of: self, given_up }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Vec<Pending>> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl RenderPermit {
+    /// The text as an answer.
+    pub(super) fn keep_packed(self, text: CompressedText) -> Body {
+        if text.len() < LARGE {
+            return text.into_body(None);
+        }
+        let room = self.of.room(text.kept());
+        text.into_body(Some(room))
+    }
+
+    /// The bytes as an answer of the same length.
+    pub(super) fn keep(self, bytes: Bytes) -> Body {
+        if bytes.len() < LARGE {
+            return bytes.into();
+        }
+        let mut packer = TextCompressor::new(Encoding::Identity);
+        let packed = packer.write(&bytes).and_then(|()| packer.finish());
+        match packed {
+            Ok(packed) => self.keep_packed(packed),
+            // Memory does not fail to be written.
+            Err(_) => Body::empty(),
+        }
+    }
+}
+
+impl Reservation {
+    /// Whether another answer has it.
+    pub(super) fn is_given_up(&self) -> bool {
+        self.given_up.is_cancelled()
+    }
+}
+
+impl Drop for Reservation {
+    fn drop(&mut self) {
+        self.given_up.cancel();
+        self.of.lock().retain(|each| !each.given_up.is_cancelled());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::body::to_bytes;
+
+    use super::*;
+
+    /// Bytes that do not become fewer when they are compressed.
+    fn noise(length: usize) -> Bytes {
+        let mut state = 1_u64;
+        let mut next = || {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            (state >> 56) as u8
+        };
+        (0..length).map(|_| next()).collect::<Vec<u8>>().into()
+    }
+
+    #[tokio::test]
+    async fn slow_readers_of_large_answers_never_keep_others_from_theirs() {
+        static ANSWERS: LargeResponses = LargeResponses {
+            making: Semaphore::const_new(AT_ONCE),
+            patience: Duration::ZERO,
+            kept: Mutex::new(Vec::new()),
+        };
+        let bytes = noise(1 << 20);
+        let mut bodies = Vec::new();
+        for _ in 0..12 {
+            let turn = ANSWERS.turn().await.unwrap();
+            bodies.push(turn.keep(bytes.clone()));
+        }
+        let held: usize = ANSWERS.lock().iter().map(|kept| kept.bytes).sum();
+        assert!(held <= KEPT, "{held}");
+        // The last ones are whole, the first ones end early.
+        let mut whole = 0;
+        for body in bodies {
+            match to_bytes(body, usize::MAX).await {
+                Ok(read) => {
+                    assert_eq!(read, bytes);
+                    whole += 1;
+                }
+                Err(_) => assert_eq!(whole, 0),
+            }
+        }
+        assert_eq!(whole, 3);
+        assert!(ANSWERS.lock().is_empty());
+    }
+
+    #[tokio::test]
+    async fn a_third_answer_waits_until_one_of_two_is_made() {
+        static ANSWERS: LargeResponses = LargeResponses {
+            making: Semaphore::const_new(AT_ONCE),
+            patience: Duration::ZERO,
+            kept: Mutex::new(Vec::new()),
+        };
+        let one = ANSWERS.turn().await.unwrap();
+        let _two = ANSWERS.turn().await.unwrap();
+        assert!(ANSWERS.turn().await.is_none());
+        let _small = one.keep(noise(LARGE - 1));
+        assert!(ANSWERS.turn().await.is_some());
+        assert!(ANSWERS.lock().is_empty(), "small answers take no room");
+    }
+}

@@ -1,0 +1,568 @@
+//! The robot's part of the page: graph, topics, watchlist (`ros2_*`).
+
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::sync::Arc;
+
+use super::board::Settings;
+use super::catalogue::{self as metric, Metric};
+use super::metric_sink::{Family, Label, MetricSink, Number};
+use crate::config::Watch;
+use ros2probe_model::histogram::Histogram;
+use ros2probe_model::snapshot::{
+    EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
+    WatchState,
+};
+
+/// Unknown writers with series of their own.
+const MAX_UNKNOWN_WRITERS: usize = 32;
+/// Different types or policies named in one label.
+const MAX_JOINED: usize = 4;
+
+/// How a counter is read.
+type Count = fn(&Measurement) -> u64;
+/// How a counter of a sampled view is read.
+type SampledCount = fn(&SampledFacts) -> u64;
+/// How a histogram is read.
+type Values = fn(&Measurement) -> &Histogram;
+
+/// A topic with series of its own.
+pub(super) struct TopicRow<'a> {
+    domain_id: u32,
+    name: Cow<'a, str>,
+    /// `None`: watched by name, but nobody has announced it.
+    pub(super) facts: Option<&'a TopicFacts>,
+    watched: bool,
+    /// A watch asks for series per delivery.
+    pub(super) per_subscriber: bool,
+}
+
+/// The topics to show, sorted, and how many are left out.
+pub(super) struct TopicRows<'a> {
+    pub(super) shown: Vec<TopicRow<'a>>,
+    pub(super) hidden: usize,
+}
+
+impl<'a> TopicRows<'a> {
+    /// Topics that are measured come first; services and other plumbing are shown when measured.
+    pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
+        let max_topics = settings.limits.topics;
+        let mut rows: BTreeMap<(u32, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
+        let mut hidden = 0;
+        let shown = |facts: &&TopicFacts| {
+            facts.measurement.is_some() || matches!(facts.kind, "topic" | "dds")
+        };
+        let (measured, others): (Vec<&TopicFacts>, Vec<&TopicFacts>) = snapshot
+            .topics
+            .iter()
+            .filter(shown)
+            .partition(|facts| facts.measurement.is_some());
+        for facts in measured.into_iter().chain(others) {
+            let name = series_name(facts.kind, &facts.name, &facts.dds_name);
+            let domain_id = facts.domain_id;
+            let key = (domain_id, name.clone());
+            if rows.contains_key(&key) || rows.len() >= max_topics {
+                hidden += 1;
+            } else {
+                rows.insert(
+                    key,
+                    TopicRow {
+                        domain_id,
+                        name,
+                        facts: Some(facts),
+                        watched: false,
+                        per_subscriber: false,
+                    },
+                );
+            }
+        }
+        let watched = snapshot.watches.iter().enumerate();
+        let watched = watched.flat_map(|(place, watch)| {
+            let configured = configured(place, watch, &settings.watches);
+            let per_subscriber = configured.is_some_and(|watch| watch.per_subscriber);
+            watch
+                .topics
+                .iter()
+                .map(move |topic| (topic, per_subscriber))
+        });
+        for (topic, per_subscriber) in watched {
+            let (domain_id, name) = (topic.domain_id, Cow::Borrowed(topic.topic.as_str()));
+            let key = (domain_id, name.clone());
+            if let Some(row) = rows.get_mut(&key) {
+                row.watched = true;
+                row.per_subscriber |= per_subscriber;
+            } else if rows.len() < max_topics {
+                rows.insert(
+                    key,
+                    TopicRow {
+                        domain_id,
+                        name,
+                        facts: None,
+                        watched: true,
+                        per_subscriber: false,
+                    },
+                );
+            }
+        }
+        Self {
+            shown: rows.into_values().collect(),
+            hidden,
+        }
+    }
+}
+
+impl<'a> TopicRow<'a> {
+    pub(super) fn labels(&self) -> [Label<'_>; 2] {
+        [
+            Label::Number(self.domain_id.into()),
+            Label::Text(&self.name),
+        ]
+    }
+
+    pub(super) fn measurement(&self) -> Option<&'a Measurement> {
+        self.facts.and_then(|facts| facts.measurement.as_deref())
+    }
+}
+
+/// Services and other plumbing keep their DDS names: a request, its reply and a topic may share
+/// their ROS name. A DDS name that looks like a ROS name is marked.
+pub(super) fn series_name<'a>(kind: &str, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
+    match kind {
+        "topic" | "action_feedback" | "action_status" => Cow::Borrowed(name),
+        _ if dds_name.starts_with('/') => Cow::Owned(format!("dds:{dds_name}")),
+        _ => Cow::Borrowed(dds_name),
+    }
+}
+
+/// The graph.
+pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
+    let mut domains: BTreeMap<u32, (usize, usize, usize)> = BTreeMap::new();
+    for participant in &snapshot.participants {
+        let counts = domains.entry(participant.domain_id).or_default();
+        counts.0 += 1;
+        counts.1 += usize::from(participant.secured);
+    }
+    for node in &snapshot.nodes {
+        domains.entry(node.domain_id).or_default().2 += 1;
+    }
+    if domains.is_empty() {
+        domains.insert(0, (0, 0, 0));
+    }
+    sink.family(&metric::PARTICIPANTS, |family| {
+        per_domain(family, &domains, |counts| counts.0)
+    })?;
+    sink.family(&metric::SECURED_PARTICIPANTS, |family| {
+        per_domain(family, &domains, |counts| counts.1)
+    })?;
+    sink.family(&metric::NODES, |family| {
+        per_domain(family, &domains, |counts| counts.2)
+    })?;
+    sink.family(&metric::NODE_INFO, |family| nodes(family, snapshot))?;
+    sink.family(&metric::PARTICIPANT_INFO, |family| {
+        snapshot.participants.iter().try_for_each(|participant| {
+            let [host, process, pid, cgroup] = place(&participant.process);
+            family.info(&[
+                Label::Number(participant.domain_id.into()),
+                Label::Guid(participant.guid),
+                Label::Text(&participant.vendor),
+                host,
+                process,
+                pid,
+                cgroup,
+            ])
+        })
+    })?;
+    sink.family(&metric::TOPICS, |family| {
+        let mut kinds: BTreeMap<(u32, &str), usize> = BTreeMap::new();
+        for topic in snapshot.topics.iter().filter(|topic| !topic.vanished) {
+            *kinds.entry((topic.domain_id, topic.kind)).or_default() += 1;
+        }
+        kinds.iter().try_for_each(|((domain_id, kind), count)| {
+            family.sample(
+                &[Label::Number((*domain_id).into()), Label::Text(kind)],
+                *count,
+            )
+        })
+    })?;
+    sink.family(&metric::DISCOVERY_EVENTS, |family| {
+        snapshot.churn.iter().try_for_each(|churn| {
+            let labels = [
+                Label::Number(churn.domain_id.into()),
+                Label::Text(churn.entity),
+                Label::Text(churn.event),
+            ];
+            family.sample(&labels, churn.count)
+        })
+    })?;
+    sink.single(&metric::UNKNOWN_WRITERS, snapshot.unknown_writers.len())?;
+    let unknown = || snapshot.unknown_writers.iter().take(MAX_UNKNOWN_WRITERS);
+    sink.family(&metric::UNKNOWN_WRITER_MESSAGES, |family| {
+        unknown().try_for_each(|writer| {
+            let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
+            family.sample(&labels, writer.measurement.messages)
+        })
+    })?;
+    sink.family(&metric::UNKNOWN_WRITER_RATE, |family| {
+        unknown().try_for_each(|writer| {
+            let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
+            family.sample(&labels, writer.measurement.rate_hz)
+        })
+    })?;
+    sink.family(&metric::UNKNOWN_WRITER_INFO, |family| {
+        unknown().try_for_each(|writer| {
+            let [host, process, pid, cgroup] = place(&writer.process);
+            let (guid, vendor) = (Label::Guid(writer.guid), Label::Text(&writer.vendor));
+            family.info(&[guid, vendor, host, process, pid, cgroup])
+        })
+    })
+}
+
+/// Host, process, process id and control group, each empty where it is not known.
+fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
+    [
+        Label::Text(process.host.as_deref().unwrap_or_default()),
+        Label::Text(process.name.as_deref().unwrap_or_default()),
+        process
+            .id
+            .map_or(Label::Text(""), |id| Label::Number(id.into())),
+        Label::Text(process.cgroup.as_deref().unwrap_or_default()),
+    ]
+}
+
+fn per_domain(
+    family: &mut Family<'_, '_>,
+    domains: &BTreeMap<u32, (usize, usize, usize)>,
+    count: fn(&(usize, usize, usize)) -> usize,
+) -> fmt::Result {
+    domains.iter().try_for_each(|(domain_id, counts)| {
+        family.sample(&[Label::Number((*domain_id).into())], count(counts))
+    })
+}
+
+fn nodes(family: &mut Family<'_, '_>, snapshot: &Snapshot) -> fmt::Result {
+    let participants: BTreeMap<_, _> = snapshot
+        .participants
+        .iter()
+        .map(|participant| (participant.guid, participant))
+        .collect();
+    let mut seen = BTreeSet::new();
+    for node in &snapshot.nodes {
+        // Two nodes of one name in one participant are a fault of the robot, not two series.
+        if !seen.insert((node.participant, node.name.as_str())) {
+            continue;
+        }
+        let participant = participants.get(&node.participant);
+        let vendor = participant.map_or("", |participant| participant.vendor.as_str());
+        let host = participant.and_then(|participant| participant.process.host.as_deref());
+        family.info(&[
+            Label::Number(node.domain_id.into()),
+            Label::Text(&node.name),
+            Label::Guid(node.participant),
+            Label::Text(vendor),
+            Label::Text(host.unwrap_or_default()),
+        ])?;
+    }
+    Ok(())
+}
+
+/// Topics.
+pub(super) fn topics(
+    sink: &mut MetricSink<'_>,
+    rows: &[TopicRow<'_>],
+    settings: &Settings,
+) -> fmt::Result {
+    sink.family(&metric::TOPIC_INFO, |family| {
+        rows.iter().try_for_each(|row| topic_info(family, row))
+    })?;
+    sink.family(&metric::TOPIC_PUBLISHERS, |family| {
+        rows.iter().try_for_each(|row| {
+            family.sample(
+                &row.labels(),
+                row.facts.map_or(0, |facts| facts.publishers.len()),
+            )
+        })
+    })?;
+    sink.family(&metric::TOPIC_SUBSCRIPTIONS, |family| {
+        rows.iter().try_for_each(|row| {
+            family.sample(
+                &row.labels(),
+                row.facts.map_or(0, |facts| facts.subscriptions.len()),
+            )
+        })
+    })?;
+    let counters: [(&Metric, Count); 6] = [
+        (&metric::TOPIC_MESSAGES, |measured| measured.messages),
+        (&metric::TOPIC_BYTES, |measured| measured.bytes),
+        (&metric::TOPIC_LOST, |measured| measured.lost),
+        (&metric::TOPIC_RECOVERED, |measured| measured.recovered),
+        (&metric::TOPIC_DUPLICATES, |measured| measured.duplicates),
+        (&metric::TOPIC_INCOMPLETE, |measured| measured.incomplete),
+    ];
+    for (metric, value) in counters {
+        sink.family(metric, |family| {
+            measured(family, rows, |facts| Some(value(facts).into()))
+        })?;
+    }
+    sink.family(&metric::TOPIC_LAST_MESSAGE, |family| {
+        rows.iter().try_for_each(|row| {
+            match row.measurement().and_then(|measured| measured.last_message) {
+                Some(time) => family.sample(&row.labels(), time.seconds()),
+                None => Ok(()),
+            }
+        })
+    })?;
+    sink.family(&metric::TOPIC_RATE, |family| {
+        measured(family, rows, |facts| Some(facts.rate_hz.into()))
+    })?;
+    sink.family(&metric::TOPIC_BANDWIDTH, |family| {
+        measured(family, rows, |facts| Some(facts.bandwidth.into()))
+    })?;
+    let doubts: [(&Metric, Count); 3] = [
+        (&metric::TOPIC_NEGATIVE_LATENCY, |measured| {
+            measured.negative_latency
+        }),
+        (&metric::TOPIC_IMPLAUSIBLE_LATENCY, |measured| {
+            measured.implausible_latency
+        }),
+        (&metric::TOPIC_DOUBTED_JUMPS, |measured| {
+            measured.sequence_jumps
+        }),
+    ];
+    for (metric, value) in doubts {
+        sink.family(metric, |family| {
+            measured(family, rows, |facts| Some(value(facts).into()))
+        })?;
+    }
+    sampled(sink, rows)?;
+    let histograms: [(&Metric, Values); 3] = [
+        (&metric::TOPIC_INTERARRIVAL, |measured| {
+            &measured.interarrival
+        }),
+        (&metric::TOPIC_LATENCY, |measured| &measured.source_latency),
+        (&metric::TOPIC_HEADER_LATENCY, |measured| {
+            &measured.header_latency
+        }),
+    ];
+    for (metric, values) in histograms {
+        sink.family(metric, |family| {
+            let measured = rows
+                .iter()
+                .filter_map(|row| Some((row, row.measurement()?)));
+            for (row, measured) in measured.filter(|_| settings.histograms) {
+                let values = values(measured);
+                if values.count() > 0 {
+                    family.histogram(&row.labels(), values)?;
+                }
+            }
+            Ok(())
+        })?;
+    }
+    Ok(())
+}
+
+/// Topics of which a part was seen in shared memory, and how messages pass.
+fn sampled(sink: &mut MetricSink<'_>, rows: &[TopicRow<'_>]) -> fmt::Result {
+    let counters: [(&Metric, SampledCount); 3] = [
+        (&metric::TOPIC_SAMPLED, |sampled| sampled.span),
+        (&metric::TOPIC_SAMPLED_SEEN, |sampled| sampled.seen),
+        (&metric::TOPIC_SAMPLED_UNCERTAIN, |sampled| {
+            sampled.uncertain
+        }),
+    ];
+    let of_rows = || {
+        let sampled =
+            |row: &'_ TopicRow<'_>| row.measurement().and_then(|measured| measured.sampled);
+        rows.iter()
+            .filter_map(move |row| Some((row, sampled(row)?)))
+    };
+    for (metric, value) in counters {
+        sink.family(metric, |family| {
+            of_rows().try_for_each(|(row, sampled)| family.sample(&row.labels(), value(&sampled)))
+        })?;
+    }
+    sink.family(&metric::TOPIC_COVERAGE, |family| {
+        let with_any = of_rows().filter_map(|(row, sampled)| Some((row, sampled.coverage()?)));
+        let mut with_any = with_any;
+        with_any.try_for_each(|(row, coverage)| family.sample(&row.labels(), coverage))
+    })?;
+    sink.family(&metric::TOPIC_PAIRS, |family| {
+        for row in rows {
+            for count in row.facts.iter().flat_map(|facts| &facts.passages) {
+                let [domain_id, topic] = row.labels();
+                let passage = Label::Text(count.passage.label());
+                family.sample(&[domain_id, topic, passage], count.pairs)?;
+            }
+        }
+        Ok(())
+    })
+}
+
+/// Writers, when `settings` ask for them.
+pub(super) fn writers(
+    sink: &mut MetricSink<'_>,
+    rows: &[TopicRow<'_>],
+    settings: &Settings,
+) -> fmt::Result {
+    let per_writer: [(&Metric, Count); 3] = [
+        (&metric::WRITER_MESSAGES, |measured| measured.messages),
+        (&metric::WRITER_BYTES, |measured| measured.bytes),
+        (&metric::WRITER_LOST, |measured| measured.lost),
+    ];
+    for (metric, value) in per_writer {
+        sink.family(metric, |family| {
+            rows.iter()
+                .filter(|_| settings.per_writer)
+                .try_for_each(|row| each_writer(family, row, value))
+        })?;
+    }
+    Ok(())
+}
+
+/// One sample for each topic that is measured or will be: watched ones begin with 0.
+fn measured(
+    family: &mut Family<'_, '_>,
+    rows: &[TopicRow<'_>],
+    value: impl Fn(&Measurement) -> Option<Number>,
+) -> fmt::Result {
+    let nothing = Measurement::default();
+    for row in rows {
+        let facts = row
+            .measurement()
+            .or_else(|| row.watched.then_some(&nothing));
+        if let Some(value) = facts.and_then(&value) {
+            family.sample(&row.labels(), value)?;
+        }
+    }
+    Ok(())
+}
+
+fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
+    let Some(facts) = row.facts else {
+        return Ok(());
+    };
+    let [domain_id, topic] = row.labels();
+    // Subscribers' wishes describe the topic only while nobody publishes.
+    let endpoints = if facts.publishers.is_empty() {
+        &facts.subscriptions
+    } else {
+        &facts.publishers
+    };
+    let policies = |policy: fn(&EndpointFacts) -> &String| joined(endpoints.iter().map(policy));
+    let message_types = joined(facts.message_types.iter());
+    let reliability = policies(|endpoint| &endpoint.reliability);
+    let durability = policies(|endpoint| &endpoint.durability);
+    family.info(&[
+        domain_id,
+        topic,
+        Label::Text(facts.kind),
+        Label::Text(&message_types),
+        Label::Text(&reliability),
+        Label::Text(&durability),
+    ])
+}
+
+/// The different values, sorted, a few of them.
+fn joined<'a>(values: impl Iterator<Item = &'a String>) -> String {
+    let different: BTreeSet<&str> = values.map(String::as_str).collect();
+    let mut text = String::new();
+    for value in different.iter().take(MAX_JOINED) {
+        if !text.is_empty() {
+            text.push(',');
+        }
+        text.push_str(value);
+    }
+    if different.len() > MAX_JOINED {
+        text.push_str(",...");
+    }
+    text
+}
+
+fn each_writer(family: &mut Family<'_, '_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
+    let mut seen = BTreeSet::new();
+    for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
+        let Some(measured) = &writer.measurement else {
+            continue;
+        };
+        if !seen.insert(writer.guid) {
+            continue;
+        }
+        let [domain_id, topic] = row.labels();
+        let node = writer.node.as_deref().unwrap_or_default();
+        let labels = [
+            domain_id,
+            topic,
+            Label::Guid(writer.guid),
+            Label::Text(node),
+        ];
+        family.sample(&labels, value(measured))?;
+    }
+    Ok(())
+}
+
+/// The watchlist's states and broken expectations.
+pub(super) fn watches(
+    sink: &mut MetricSink<'_>,
+    snapshot: &Snapshot,
+    configured: &[Arc<Watch>],
+) -> fmt::Result {
+    sink.family(&metric::WATCH_STATE, |family| {
+        for watch in &snapshot.watches {
+            let name = watch_name(watch);
+            for topic in &watch.topics {
+                for state in WatchState::ALL {
+                    let labels = [
+                        Label::Number(topic.domain_id.into()),
+                        Label::Text(&topic.topic),
+                        Label::Text(&name),
+                        Label::Text(state.label()),
+                    ];
+                    family.sample(&labels, topic.state == state)?;
+                }
+            }
+        }
+        Ok(())
+    })?;
+    sink.family(&metric::WATCH_VIOLATED, |family| {
+        for (place, watch) in snapshot.watches.iter().enumerate() {
+            let Some(configured) = self::configured(place, watch, configured) else {
+                continue;
+            };
+            let expectations = configured.expectations.keys();
+            let name = watch_name(watch);
+            for topic in &watch.topics {
+                for (expectation, _) in expectations.iter().filter(|(_, set)| *set) {
+                    let labels = [
+                        Label::Number(topic.domain_id.into()),
+                        Label::Text(&topic.topic),
+                        Label::Text(&name),
+                        Label::Text(expectation),
+                    ];
+                    family.sample(&labels, topic.violations.contains(expectation))?;
+                }
+            }
+        }
+        Ok(())
+    })
+}
+
+/// The entry that is in force for what the model calls `watch`: in the same place, unless the list
+/// has just changed.
+fn configured<'c>(
+    place: usize,
+    watch: &WatchFacts,
+    configured: &'c [Arc<Watch>],
+) -> Option<&'c Watch> {
+    let same =
+        |other: &&Watch| (&other.pattern, other.domain_id) == (&watch.pattern, watch.domain_id);
+    let there = configured.get(place).map(|watch| &**watch).filter(same);
+    there.or_else(|| configured.iter().map(|watch| &**watch).find(same))
+}
+
+/// `/points`, or `/points@5` when it is for one domain; `@` is in no ROS name.
+fn watch_name(watch: &WatchFacts) -> Cow<'_, str> {
+    match watch.domain_id {
+        None => Cow::Borrowed(&watch.pattern),
+        Some(domain_id) => Cow::Owned(format!("{}@{domain_id}", watch.pattern)),
+    }
+}

@@ -1,0 +1,403 @@
+//! What clients have added, on disk for the next start: `watches.json` in the state directory.
+//!
+//! Written by a thread of its own, the latest list only; who adds a watch does not wait for the
+//! disk. A file that cannot be used is kept aside and never ends the agent.
+
+use std::io;
+use std::mem;
+use std::path::PathBuf;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
+use crate::config::{Limit, check_globs};
+use crate::state::{Form, Found, Newer, StateDirectory, from_json};
+
+const FILE: &str = "watches.json";
+/// The form that is written. What was added to it so far may be lacking in a file; what is added
+/// from now on is a new version, for an agent that does not know it would take the file for broken.
+const VERSION: u32 = 1;
+const FORM: Form<Document> = Form {
+    file: FILE,
+    readers: &[(VERSION, from_json)],
+};
+/// Changes that come so close together are written once.
+const TOGETHER: Duration = Duration::from_millis(50);
+/// How long after a failure the disk is tried again.
+const AGAIN: Duration = Duration::from_secs(30);
+
+/// What was found at the start.
+#[derive(Debug, PartialEq)]
+pub enum LoadedWatches {
+    /// No file.
+    Nothing,
+    /// These watches.
+    These(Vec<Watch>),
+    /// A newer rp wrote them: they are left as they are, and nothing may be written in their place.
+    Newer(Newer),
+    /// It cannot be used, for this reason, and now lies there.
+    Unusable {
+        /// Why.
+        reason: String,
+        /// Where it lies, if it could be moved.
+        aside: Option<PathBuf>,
+    },
+}
+
+#[derive(Serialize, Deserialize)]
+struct Document {
+    version: u32,
+    watches: Vec<Line>,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Line {
+    topic: String,
+    domain_id: Option<u32>,
+    per_subscriber: bool,
+    #[serde(default)]
+    trace: f64,
+    #[serde(default)]
+    retain: Retain,
+    min_rate_hz: Option<f64>,
+    max_rate_hz: Option<f64>,
+    max_loss_ratio: Option<f64>,
+    max_latency_ms: Option<f64>,
+    max_silence_s: Option<f64>,
+}
+
+/// The thread that writes.
+#[derive(Debug)]
+pub(super) struct WatchWriter {
+    mailbox: Arc<Mailbox>,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+/// The mailbox of the thread.
+#[derive(Debug, Default)]
+struct Mailbox {
+    pending: Mutex<Pending>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Pending {
+    /// Not written yet.
+    latest: Option<Vec<Arc<Watch>>>,
+    is_failing: bool,
+    is_closed: bool,
+}
+
+/// What clients of the last agent had added. What is no such file is moved aside.
+#[must_use]
+pub fn load(directory: &StateDirectory) -> LoadedWatches {
+    let document = match directory.read(&FORM) {
+        Found::Nothing => return LoadedWatches::Nothing,
+        Found::Newer(newer) => return LoadedWatches::Newer(newer),
+        Found::Unusable { reason, aside } => return LoadedWatches::Unusable { reason, aside },
+        Found::This(document) => document,
+    };
+    let watches = if document.watches.len() > Limit::Watches.row().range.1 {
+        Err(format!("it has {} watches", document.watches.len()))
+    } else {
+        document.watches.into_iter().map(Watch::try_from).collect()
+    };
+    let watches = watches.and_then(|watches: Vec<Watch>| {
+        let patterns = watches.iter().map(|watch| watch.pattern.as_str());
+        check_globs(patterns).map_err(|many| format!("it has {many}"))?;
+        Ok(watches)
+    });
+    match watches {
+        Ok(watches) => LoadedWatches::These(watches),
+        Err(reason) => match directory.set_aside::<Document>(FILE, reason) {
+            Found::Unusable { reason, aside } => LoadedWatches::Unusable { reason, aside },
+            Found::Nothing | Found::This(_) | Found::Newer(_) => LoadedWatches::Nothing,
+        },
+    }
+}
+
+impl TryFrom<Line> for Watch {
+    type Error = String;
+
+    fn try_from(line: Line) -> Result<Self, String> {
+        check_pattern(&line.topic).map_err(|error| format!("`{}` {error}", line.topic))?;
+        if let Some(domain_id) = line.domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+            return Err(format!("there is no domain {domain_id}"));
+        }
+        let expectations = Expectations {
+            min_rate_hz: line.min_rate_hz,
+            max_rate_hz: line.max_rate_hz,
+            max_loss_ratio: line.max_loss_ratio,
+            max_latency_ms: line.max_latency_ms,
+            max_silence_s: line.max_silence_s,
+        };
+        expectations.check()?;
+        check_trace(line.trace)?;
+        Ok(Self {
+            pattern: line.topic,
+            domain_id: line.domain_id,
+            expectations,
+            per_subscriber: line.per_subscriber,
+            trace: line.trace,
+            retain: line.retain,
+        })
+    }
+}
+
+impl From<&Watch> for Line {
+    fn from(watch: &Watch) -> Self {
+        let Expectations {
+            min_rate_hz,
+            max_rate_hz,
+            max_loss_ratio,
+            max_latency_ms,
+            max_silence_s,
+        } = watch.expectations;
+        Self {
+            topic: watch.pattern.clone(),
+            domain_id: watch.domain_id,
+            per_subscriber: watch.per_subscriber,
+            trace: watch.trace,
+            retain: watch.retain,
+            min_rate_hz,
+            max_rate_hz,
+            max_loss_ratio,
+            max_latency_ms,
+            max_silence_s,
+        }
+    }
+}
+
+impl WatchWriter {
+    /// Starts the thread.
+    pub(super) fn start(directory: Arc<StateDirectory>) -> io::Result<Self> {
+        let mailbox = Arc::<Mailbox>::default();
+        let own = Arc::clone(&mailbox);
+        let thread = std::thread::Builder::new()
+            .name("watches".to_owned())
+            .spawn(move || own.write_until_closed(&directory))?;
+        Ok(Self {
+            mailbox,
+            thread: Mutex::new(Some(thread)),
+        })
+    }
+
+    /// Hands over what is to be on disk; returns at once.
+    pub(super) fn keep(&self, watches: Vec<Arc<Watch>>) {
+        self.mailbox.pending().latest = Some(watches);
+        self.mailbox.changed.notify_one();
+    }
+
+    /// The last write did not fail.
+    pub(super) fn works(&self) -> bool {
+        !self.mailbox.pending().is_failing
+    }
+
+    /// Waits until the latest list is written, or cannot be.
+    pub(super) fn finish(&self) {
+        self.mailbox.pending().is_closed = true;
+        self.mailbox.changed.notify_one();
+        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(thread) = thread.take() {
+            // If it has panicked, that is in the log.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Mailbox {
+    fn pending(&self) -> MutexGuard<'_, Pending> {
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn write_until_closed(&self, directory: &StateDirectory) {
+        while let Some(watches) = self.next() {
+            let document = Document {
+                version: VERSION,
+                watches: watches.iter().map(|watch| Line::from(&**watch)).collect(),
+            };
+            let written = directory.replace(FILE, &document);
+            let mut pending = self.pending();
+            let failed_before = mem::replace(&mut pending.is_failing, written.is_err());
+            // At the end a disk that fails is not tried for ever.
+            if pending.is_failing && !pending.is_closed {
+                pending.latest.get_or_insert(watches);
+            }
+            drop(pending);
+            let path = directory.path().display();
+            match written {
+                Ok(()) if failed_before => {
+                    tracing::info!(%path, "added watches are written again");
+                }
+                Err(error) if !failed_before => {
+                    tracing::error!(%path, %error, "added watches cannot be written: a restart would lose them");
+                }
+                Ok(()) | Err(_) => {}
+            }
+        }
+    }
+
+    /// The next list to write; `None` when there will be none.
+    fn next(&self) -> Option<Vec<Arc<Watch>>> {
+        let mut pending = self.pending();
+        if pending.is_failing && !pending.is_closed {
+            let again = self.changed.wait_timeout(pending, AGAIN);
+            pending = again.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        let idle = |pending: &mut Pending| pending.latest.is_none() && !pending.is_closed;
+        let pending = self.changed.wait_while(pending, idle);
+        let pending = pending.unwrap_or_else(PoisonError::into_inner);
+        // More may follow at once.
+        let open = |pending: &mut Pending| !pending.is_closed;
+        let waited = self.changed.wait_timeout_while(pending, TOGETHER, open);
+        let mut pending = waited.unwrap_or_else(PoisonError::into_inner).0;
+        pending.latest.take()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::time::Instant;
+
+    use super::*;
+
+    fn directory() -> (tempfile::TempDir, Arc<StateDirectory>) {
+        let place = tempfile::tempdir().unwrap();
+        let directory = StateDirectory::open(place.path()).unwrap();
+        (place, Arc::new(directory))
+    }
+
+    fn watches() -> Vec<Watch> {
+        let expecting = Watch {
+            domain_id: Some(5),
+            per_subscriber: true,
+            trace: 0.5,
+            retain: Retain::Last,
+            expectations: Expectations {
+                min_rate_hz: Some(9.5),
+                max_silence_s: Some(1.0),
+                ..Expectations::default()
+            },
+            ..Watch::named("/points").unwrap()
+        };
+        vec![expecting, Watch::named("/camera/**").unwrap()]
+    }
+
+    fn shared() -> Vec<Arc<Watch>> {
+        watches().into_iter().map(Arc::new).collect()
+    }
+
+    #[test]
+    fn what_is_added_is_read_again_as_it_was() {
+        let (_place, directory) = directory();
+        assert_eq!(load(&directory), LoadedWatches::Nothing);
+        let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
+        keeper.keep(Vec::new());
+        keeper.keep(shared());
+        keeper.finish();
+        assert_eq!(load(&directory), LoadedWatches::These(watches()));
+    }
+
+    #[test]
+    fn a_file_that_is_no_list_of_watches_is_kept_aside() {
+        let (place, directory) = directory();
+        let file = place.path().join(FILE);
+        let document = Document {
+            version: VERSION,
+            watches: watches().iter().map(Line::from).collect(),
+        };
+        directory.replace(FILE, &document).unwrap();
+        let whole = fs::read_to_string(&file).unwrap();
+        let broken = [
+            whole[..whole.len() / 2].to_owned(),
+            whole.replace("/points", "points"),
+            whole.replace("9.5", "-1"),
+            whole.replace("\"domain_id\":5", "\"domain_id\":5000"),
+            whole.replace("\"version\":1", "\"version\":0"),
+            whole.replace("\"version\":1,", ""),
+            whole.replace("per_subscriber", "for_ever"),
+            String::new(),
+        ];
+        for text in broken {
+            fs::write(&file, &text).unwrap();
+            let found = load(&directory);
+            assert!(
+                matches!(&found, LoadedWatches::Unusable { .. }),
+                "{text}: {found:?}"
+            );
+            let aside = place.path().join("watches.json.corrupt");
+            assert_eq!(fs::read_to_string(aside).unwrap(), text);
+            assert_eq!(load(&directory), LoadedWatches::Nothing);
+        }
+    }
+
+    #[test]
+    fn a_saved_list_whose_globs_take_too_long_is_kept_aside() {
+        let (place, directory) = directory();
+        let glob = |number| format!("/{}_{number}/**", "a*".repeat(7));
+        let globs = (0..1000).map(|number| Watch::named(&glob(number)).unwrap());
+        let document = Document {
+            version: VERSION,
+            watches: globs.map(|watch| Line::from(&watch)).collect(),
+        };
+        directory.replace(FILE, &document).unwrap();
+        let LoadedWatches::Unusable { reason, aside } = load(&directory) else {
+            panic!("it was read");
+        };
+        assert!(reason.contains("it has 1000 globs of"), "{reason}");
+        assert_eq!(aside, Some(place.path().join("watches.json.corrupt")));
+        assert_eq!(load(&directory), LoadedWatches::Nothing);
+    }
+
+    #[test]
+    fn watches_of_a_newer_agent_are_left_for_it_and_those_of_the_first_one_are_read() {
+        let (place, directory) = directory();
+        let file = place.path().join(FILE);
+        let newer = r#"{"version":2,"watches":[{"topic":"/points","colour":"red"}]}"#;
+        fs::write(&file, newer).unwrap();
+        let found = Newer {
+            path: file.clone(),
+            version: 2,
+            known: VERSION,
+        };
+        assert_eq!(load(&directory), LoadedWatches::Newer(found));
+        assert_eq!(fs::read_to_string(&file).unwrap(), newer);
+
+        fs::write(
+            &file,
+            r#"{"version":1,"watches":[{"topic":"/points","domain_id":5,"per_subscriber":true,
+                "min_rate_hz":9.5,"max_rate_hz":null,"max_loss_ratio":null,
+                "max_latency_ms":null,"max_silence_s":1.0}]}"#,
+        )
+        .unwrap();
+        let first = Watch {
+            trace: 0.0,
+            retain: Retain::None,
+            ..watches().remove(0)
+        };
+        assert_eq!(load(&directory), LoadedWatches::These(vec![first]));
+    }
+
+    #[test]
+    fn a_disk_that_cannot_be_written_ends_nothing_and_is_tried_again() {
+        let (place, directory) = directory();
+        // Nobody can write a file where a directory is.
+        let obstacle = place.path().join("watches.json.new");
+        fs::create_dir(&obstacle).unwrap();
+        let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();
+        keeper.keep(shared());
+        let start = Instant::now();
+        while keeper.works() {
+            assert!(start.elapsed() < Duration::from_secs(10));
+            std::thread::yield_now();
+        }
+        fs::remove_dir(obstacle).unwrap();
+        keeper.finish();
+        assert_eq!(load(&directory), LoadedWatches::These(watches()));
+    }
+}

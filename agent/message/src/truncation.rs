@@ -1,0 +1,79 @@
+//! How much of a message is shown: the options that all outputs of `echo` share, and the words that
+//! stand for what is left out (`rosidl_runtime_py`'s).
+
+use super::definition::{Element, Shape};
+use super::value::Array;
+
+/// What is shown of arrays and strings.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Truncation {
+    /// Elements and characters at most, `...` standing for the others.
+    pub truncate: Option<usize>,
+    /// Arrays only by type and length.
+    pub no_arrays: bool,
+    /// Strings only by length.
+    pub no_strings: bool,
+}
+
+impl Truncation {
+    /// A string, as far as it is shown.
+    pub fn text(&self, text: &str) -> Option<String> {
+        if self.no_strings {
+            return Some(format!("<string length: <{}>>", text.chars().count()));
+        }
+        let limit = self.truncate?;
+        // No character has more bytes than it is characters.
+        if text.len() <= limit {
+            return None;
+        }
+        let (end, _) = text.char_indices().nth(limit)?;
+        Some(format!("{}...", text.get(..end).unwrap_or_default()))
+    }
+
+    /// How many elements are shown of so many, and whether `...` follows.
+    pub fn elements(&self, length: usize) -> (usize, bool) {
+        match self.truncate {
+            Some(limit) if length > limit => (limit, true),
+            _ => (length, false),
+        }
+    }
+
+    /// The words for an array that is not shown.
+    pub fn array(&self, array: &Array<'_>) -> Option<String> {
+        if !self.no_arrays {
+            return None;
+        }
+        let element = element_name(&array.field.element);
+        let length = array.length;
+        Some(match array.field.shape {
+            Shape::Array(size) => format!("<array type: {element}[{size}]>"),
+            Shape::Bounded(bound) => {
+                format!("<sequence type: {element}[{bound}], length: {length}>")
+            }
+            Shape::Single | Shape::Unbounded => {
+                format!("<sequence type: {element}, length: {length}>")
+            }
+        })
+    }
+}
+
+/// An element's type in IDL, which ROS messages become.
+fn element_name(element: &Element) -> String {
+    match element {
+        Element::Bool => "boolean".to_owned(),
+        Element::Byte => "octet".to_owned(),
+        Element::Char | Element::UInt8 => "uint8".to_owned(),
+        Element::Int8 => "int8".to_owned(),
+        Element::Int16 => "int16".to_owned(),
+        Element::UInt16 => "uint16".to_owned(),
+        Element::Int32 => "int32".to_owned(),
+        Element::UInt32 => "uint32".to_owned(),
+        Element::Int64 => "int64".to_owned(),
+        Element::UInt64 => "uint64".to_owned(),
+        Element::Float32 => "float".to_owned(),
+        Element::Float64 => "double".to_owned(),
+        Element::String { .. } => "string".to_owned(),
+        Element::WString { .. } => "wstring".to_owned(),
+        Element::Nested(name) => name.to_string(),
+    }
+}
