@@ -404,11 +404,11 @@ impl FrameAssembly {
                     FlowKey::of_handover(self.number, &record),
                 );
                 if let Some(rest) = self.reassembly.hand_over(at, key, &record) {
-                    let ready = |each| poll(each, observer);
+                    let ready = |each| deliver_ready(each, observer);
                     self.ahead.rest(self.number, rest, ready);
                 }
             }
-            let ready = |each| poll(each, observer);
+            let ready = |each| deliver_ready(each, observer);
             self.ahead.record(self.number, record, ready);
         }
     }
@@ -458,7 +458,7 @@ impl FrameAssembly {
                     return Ok(());
                 };
                 if whole.handover.is_some() {
-                    let ready = |each| poll(each, observer);
+                    let ready = |each| deliver_ready(each, observer);
                     self.ahead.rest(self.number, whole, ready);
                 } else {
                     (envelope.source_port, envelope.destination_port) =
@@ -497,7 +497,7 @@ fn decode_frame(
 }
 
 /// What has become complete.
-fn poll(ready: Ready, observer: &mut Observer) {
+fn deliver_ready(ready: Ready, observer: &mut Observer) {
     match ready {
         Ready::Record(record) => observer.input(Input::Record(&record)),
         Ready::Rest(rest) => decode_rest(&rest, observer),
