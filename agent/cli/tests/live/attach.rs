@@ -188,6 +188,9 @@ fn a_cgroup_that_is_gone_for_a_moment_is_told_and_seen_again() -> Result<()> {
     let above = Cgroup::create(&format!("{PREFIX}-{}-moment", std::process::id()))?;
     let configuration = Configuration::at(above.path())?;
     let mut agent = configuration.start(&elsewhere)?;
+    agent.wait_ready(PATIENCE)?;
+    // An agent that starts is not blind. The thread that records events looks every 100 ms until then.
+    std::thread::sleep(Duration::from_secs(1));
     for round in 1..=2 {
         std::fs::remove_dir(above.path())?;
         std::fs::create_dir(above.path())?;

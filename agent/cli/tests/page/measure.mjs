@@ -4,7 +4,7 @@
 // MEASURE_MINUTES is how long the memory is watched (2).
 
 import assert from 'node:assert/strict';
-import { robot } from '../../page/test/robot.js';
+import { robot } from '../../../page/test/robot.js';
 import { ADDRESS, scenario, until } from './tab.mjs';
 
 const MINUTES = Number(process.env.MEASURE_MINUTES ?? 2);

@@ -12,8 +12,8 @@ import { createInterface } from 'node:readline';
 import { fileURLToPath } from 'node:url';
 
 /** What .ci/prerequisites.sh installs. */
-const TOOLS = fileURLToPath(new URL('../../../target/tools/page/', import.meta.url));
-const FAILURES = fileURLToPath(new URL('../../../target/page-failures/', import.meta.url));
+const TOOLS = fileURLToPath(new URL('../../../../target/tools/page/', import.meta.url));
+const FAILURES = fileURLToPath(new URL('../../../../target/page-failures/', import.meta.url));
 const CHROMIUM = '/usr/bin/chromium-headless-shell';
 /** Longest wait for anything; other tests keep the machine busy. */
 const PATIENCE_MS = 30_000;
