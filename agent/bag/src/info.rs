@@ -52,7 +52,7 @@ pub enum InfoError {
 /// How the name of a topic with service events ends.
 pub const SERVICE_EVENT: &str = "/_service_event";
 
-/// What only the files tell.
+/// Facts that are in the files of a bag and not in its metadata.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Details {
     /// Bytes of each topic's messages.

@@ -40,7 +40,7 @@ const REASONS: &str = "skb_drop_reason";
 /// From this release on the kernel tells of datagrams over IPv6 that a socket had no room for.
 const REPORTS_IPV6: (u32, u32) = (6, 6);
 
-/// The kernel's name of each entry: a structure's member, its size where there is none, or an enumerator.
+/// Kernel name of each entry: a member of a structure, an enumerator, or a structure whose size is read.
 const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::BufferHead, "sk_buff", "head"),
     (Layout::BufferTail, "sk_buff", "tail"),

@@ -38,7 +38,7 @@ fn main() -> ExitCode {
         if cli::is_broken_pipe(&error) {
             return ExitCode::from(BROKEN_PIPE);
         }
-        // Where nobody can be told, the exit code is left.
+        // If stderr is closed, the exit code still reports the failure.
         // Errors quote files, names and answers.
         let _ = writeln!(std::io::stderr(), "{}", visible_lines(&message(&error)));
         exit_code(&error)

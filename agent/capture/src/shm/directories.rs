@@ -168,7 +168,7 @@ impl ShmDirectories {
         }
     }
 
-    /// Finds the directories of shared memory. What no living process reaches any more is forgotten.
+    /// Finds the directories of shared memory, and forgets those that no living process reaches.
     pub fn find(&mut self) {
         for directory in self.directories.values_mut() {
             directory.seen = false;

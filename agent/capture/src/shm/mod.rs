@@ -20,7 +20,6 @@ pub mod tap;
 #[cfg(test)]
 mod image;
 
-use ros2probe_model::input::Input;
 use std::collections::BTreeSet;
 use std::io;
 use std::os::fd::BorrowedFd;
@@ -40,6 +39,7 @@ use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu};
 use crate::threads::{Spawn, Task};
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
 
 /// How often the counters are put where others can read them.

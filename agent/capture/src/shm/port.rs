@@ -109,7 +109,7 @@ impl Port {
         Some((port, filled.collect()))
     }
 
-    /// Appends what was announced since the last poll. `None` when the file is no port any more.
+    /// Appends the messages announced since the last poll. Returns `None` if the file is no longer a port.
     pub fn poll<S: Source + ?Sized>(
         &mut self,
         source: &S,

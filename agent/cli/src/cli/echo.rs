@@ -151,10 +151,10 @@ impl Echo {
                     let wanted = self.message_type.as_ref().or(expected.as_ref());
                     if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
                         let message_type = if raw { None } else { types.of(sample) };
-                        let told = echo.message(sample, message_type.as_deref(), &payload);
-                        let told = told.map_err(user_error)?;
-                        eprint!("{}", visible_lines(&told.err));
-                        if let Some(message) = told.out {
+                        let text = echo.message(sample, message_type.as_deref(), &payload);
+                        let text = text.map_err(user_error)?;
+                        eprint!("{}", visible_lines(&text.err));
+                        if let Some(message) = text.out {
                             if self.clear {
                                 output.write(CLEAR)?;
                             }
