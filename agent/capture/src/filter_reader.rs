@@ -3,7 +3,6 @@
 //!
 //! One for each loaded filter. It puts pieces together and everything in order; it decides nothing.
 
-use ros2probe_model::input::Input;
 use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
 
@@ -16,6 +15,7 @@ use super::filter::Filter;
 use super::piece_assembler::PieceAssembler;
 use super::reorder_buffer::{Next, ReorderBuffer};
 use super::system::Clocks;
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 
 /// Records younger than this wait for those that a run of fragments keeps back.
@@ -238,17 +238,9 @@ fn decode_datagram(
         host: piece.flags & flag::HOST != 0,
         ..Envelope::default()
     };
-    let mut records = Vec::new();
-    observer.input(Input::Announcements {
-        envelope: &envelope,
-        payload: bytes,
-        records: &mut records,
-    });
-    for mut record in records {
+    let complete = |record: &mut Record| {
         record.datagram = piece.datagram;
         record.flags |= piece.flags & (flag::SHM | flag::EXACT);
-        if let Some(record) = order.walked(piece.time, record) {
-            observer.input(Input::Record(&record));
-        }
-    }
+    };
+    order.datagram(piece.time, &envelope, bytes, complete, observer);
 }

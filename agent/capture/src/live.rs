@@ -4,7 +4,6 @@
 //! for each namespace; also both, for interfaces with traffic that no socket receives. Nothing is
 //! ever sent.
 
-use ros2probe_model::input::Input;
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::os::fd::BorrowedFd;
@@ -32,6 +31,7 @@ use super::uprobe::search::Facts as UprobeFacts;
 use super::wire_tap::{self, WireTap, WireTapError, WireTapSettings};
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
 
 /// What unclassified writers may cost each second, all together: a dozen nodes that start at once

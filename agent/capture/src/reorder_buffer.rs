@@ -11,8 +11,11 @@
 
 use std::collections::{HashSet, VecDeque};
 
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::Observer;
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{Body, flag};
+use ros2probe_wire::walk::Envelope;
 
 use super::system::Clocks;
 
@@ -35,6 +38,8 @@ pub struct ReorderBuffer {
     /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
     undelivered: VecDeque<(u64, u32)>,
     undelivered_tokens: HashSet<u32>,
+    /// Records of the datagram that is being walked, empty otherwise.
+    found: Vec<Record>,
 }
 
 /// A record of a captured datagram.
@@ -89,6 +94,32 @@ impl ReorderBuffer {
         None
     }
 
+    /// Gives the model what a captured datagram announces. The datagram's records of user data wait
+    /// for their turn, `at` being its time in the kernel's clock. `complete` adds to each what the
+    /// bytes do not hold.
+    pub fn datagram(
+        &mut self,
+        at: u64,
+        envelope: &Envelope,
+        payload: &[u8],
+        complete: impl Fn(&mut Record),
+        observer: &mut Observer,
+    ) {
+        let mut found = std::mem::take(&mut self.found);
+        observer.input(Input::Announcements {
+            envelope,
+            payload,
+            records: &mut found,
+        });
+        for mut record in found.drain(..) {
+            complete(&mut record);
+            if let Some(record) = self.walked(at, record) {
+                observer.input(Input::Record(&record));
+            }
+        }
+        self.found = found;
+    }
+
     /// Records of the kernel's ring that wait.
     #[must_use]
     pub fn waiting(&self) -> usize {
@@ -134,6 +165,9 @@ impl ReorderBuffer {
     }
 
     fn give_back(&mut self) {
+        if self.found.capacity() > KEPT {
+            self.found = Vec::new();
+        }
         for records in [&mut self.kernel, &mut self.no_room] {
             if records.is_empty() && records.capacity() > KEPT {
                 *records = VecDeque::new();

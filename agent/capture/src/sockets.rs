@@ -4,7 +4,6 @@
 //! Asks seldom: going through all open files of the host costs. Keeps no more sockets than the hook
 //! remembers.
 
-use ros2probe_model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
@@ -15,6 +14,7 @@ use super::cgroup_paths::CgroupPaths;
 use super::filter::Filter;
 use super::owners::Owner;
 use super::tracepoints::Tracepoints;
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 use ros2probe_model::snapshot::SocketFacts;
 

@@ -4,7 +4,6 @@
 //! Frames and records come through two rings, either may be the quicker one; both wait until they
 //! are taken in by time. Nothing is ever sent.
 
-use ros2probe_model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::path::{Path, PathBuf};
@@ -23,6 +22,7 @@ use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::Clocks;
 use crate::ahead::{Ahead, Ready};
 use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 
 /// Records younger than this wait, so that frames captured before them are taken in first: a frame
@@ -483,17 +483,7 @@ fn decode_frame(
     observer: &mut Observer,
 ) {
     let at = clocks.monotonic_of(Timestamp(envelope.time));
-    let mut records = Vec::new();
-    observer.input(Input::Announcements {
-        envelope,
-        payload,
-        records: &mut records,
-    });
-    for record in records {
-        if let Some(record) = order.walked(at, record) {
-            observer.input(Input::Record(&record));
-        }
-    }
+    order.datagram(at, envelope, payload, |_| {}, observer);
 }
 
 /// What has become complete.

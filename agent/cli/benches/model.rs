@@ -2,7 +2,6 @@
 //! for a whole capture.
 #![expect(clippy::unwrap_used, reason = "a benchmark may panic on its own input")]
 
-use ros2probe::model::input::Input;
 use std::hint::black_box;
 use std::path::Path;
 use std::sync::Arc;
@@ -12,6 +11,7 @@ use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Watch, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};

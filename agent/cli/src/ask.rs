@@ -1,6 +1,5 @@
 //! `rp discover` at the terminal: listen, say what will be sent, ask, say what came of it.
 
-use ros2probe_model::input::Input;
 use std::io::{Write, stdout};
 use std::time::{Duration, Instant};
 
@@ -12,6 +11,7 @@ use ros2probe_daemon::config::{CaptureSettings, ShmMode, SourceChoice};
 use ros2probe_daemon::discover::session::{MOST_PACKETS, Session, Target};
 use ros2probe_daemon::discover::{converse, local_participant};
 use ros2probe_daemon::privilege;
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::ParticipantFacts;
 use ros2probe_model::topic::Naming;

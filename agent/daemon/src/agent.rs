@@ -1,6 +1,5 @@
 //! The life of an agent in order, and the composition root of live agents and replays.
 
-use ros2probe_model::input::Input;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,6 +12,7 @@ use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::{Dialect, Library, Sources};
 use ros2probe_model::history::History;
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::{self, Observer};
 use tokio_util::sync::CancellationToken;
 

@@ -4,7 +4,6 @@
 //! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic,
 //! nothing delivered that was not there, an end, and an end that stays.
 
-use ros2probe::model::input::Input;
 use std::fs;
 use std::io::{Cursor, Write as _};
 use std::path::Path;
@@ -23,6 +22,7 @@ use ros2probe::capture::uprobe::library;
 use ros2probe::config::{Config, Watch, Watchlist};
 use ros2probe::message::filter::{Filter, Subject};
 use ros2probe::message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::selection::{Depth, Selection, Wish};
 use ros2probe::ros2::Dialect;

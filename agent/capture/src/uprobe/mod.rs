@@ -9,7 +9,6 @@ pub mod library;
 pub mod processes;
 pub mod search;
 
-use ros2probe_model::input::Input;
 use std::fs::File;
 use std::io;
 use std::os::fd::BorrowedFd;
@@ -23,6 +22,7 @@ use super::shm::directories::Scope;
 use super::system::Clocks;
 use crate::threads::Spawn;
 use caps::{CapSet, Capability, CapsHashSet};
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 
 /// A process hands over a hundred thousand messages a second if it can, ten times what a socket
@@ -52,8 +52,8 @@ pub enum UprobeError {
     Filter(#[from] FilterError),
 }
 
-/// Capabilities that attaching uprobes in other processes needs: `CAP_PERFMON` was enough from Linux
-/// 5.8 on and is not any more. Which files the processes of other users map needs both.
+/// Capabilities that uprobes in other processes need. `CAP_PERFMON` alone sufficed from Linux 5.8 on,
+/// and later kernels refuse it. Reading which files the processes of other users map needs both.
 const REQUIRED: [(Capability, &str); 2] = [
     (Capability::CAP_SYS_ADMIN, "CAP_SYS_ADMIN"),
     (Capability::CAP_SYS_PTRACE, "CAP_SYS_PTRACE"),

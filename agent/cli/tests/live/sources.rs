@@ -7,7 +7,6 @@
 
 mod injection;
 
-use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -19,6 +18,7 @@ use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Config, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::journal::Loss;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::Snapshot;

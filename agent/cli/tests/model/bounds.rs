@@ -1,6 +1,5 @@
 //! Who forges messages with every field another each time fills every table, and none beyond its
 //! cap.
-use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -10,6 +9,7 @@ use std::sync::Arc;
 use crate::allocator;
 use ros2probe::config::{Limits, Watch, Watchlist};
 use ros2probe::model::history::History;
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::selection::{Depth, Selection, Wish};
 use ros2probe::model::size::Size;

@@ -1,11 +1,11 @@
 //! What discovery tells of a graph that cannot work, from forged announcements in virtual time.
 
-use ros2probe::model::input::Input;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::Instant;
 
 use ros2probe::model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::time::SECOND;

@@ -2,10 +2,10 @@
 //!
 //! Each run is held against the same run without the forgery.
 
-use ros2probe::model::input::Input;
 use std::sync::Arc;
 
 use proptest::prelude::*;
+use ros2probe::model::input::Input;
 use ros2probe::model::payloads::{Given, News};
 use ros2probe::model::selection::{Depth, Selection, Wish};
 use ros2probe::model::snapshot::Measurement;

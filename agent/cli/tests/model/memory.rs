@@ -1,13 +1,13 @@
 //! What deliveries take: resident memory of a process in which nothing else happens, as nextest runs
 //! each test. `cargo test` needs the filter `memory::`.
 
-use ros2probe::model::input::Input;
 use std::fs;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 use ros2probe::bag::{Options, Storage, TopicDescription, Writer};
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::surface::{AgentFacts, Board, Exposition, Format, SourceKind};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};

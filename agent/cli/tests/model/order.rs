@@ -1,10 +1,10 @@
 //! Samples one by one in the order of a reliable subscriber: what waits for a repair, for how long,
 //! and what never waits. Virtual time and forged records.
 
-use ros2probe::model::input::Input;
 use std::sync::Arc;
 
 use proptest::prelude::*;
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::Settings;
 use ros2probe::model::payloads::{MissedReason, News};
 use ros2probe::model::selection::{Depth, Selection, Wish};

@@ -1,13 +1,13 @@
 //! An agent that is started anew on a running robot: what it knew comes along, and stays only if
 //! it is still true.
 
-use ros2probe::model::input::Input;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
 use proptest::prelude::*;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::discovery::Memory;
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::Snapshot;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};

@@ -1,11 +1,11 @@
 //! Tables that forgeries have filled: a real newcomer that is worth more finds room, what was there
 //! before stays, and no flood makes a packet expensive.
 
-use ros2probe::model::input::Input;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ros2probe::config::{Limits, Watch, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::{Snapshot, SocketFacts, TopicFacts};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};

@@ -1,6 +1,5 @@
 //! Fixed caps of docs/limits.md, driven over from outside; others have a test beside the constant.
 
-use ros2probe::model::input::Input;
 use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
@@ -10,6 +9,7 @@ use std::time::Instant;
 
 use crate::rp;
 use ros2probe::config::{Watch, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::surface::{AgentFacts, Board, Exposition, Format, SourceKind};
 use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, ask, metric};

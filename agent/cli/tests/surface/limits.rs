@@ -3,7 +3,6 @@
 
 mod driven;
 
-use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
@@ -14,6 +13,7 @@ use std::time::Instant;
 
 use crate::rp;
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::payloads::{Given, News, Sample};
 use ros2probe::model::snapshot::Snapshot;

@@ -1,7 +1,6 @@
 //! Samples one by one: from the model over replayed captures, and from the real binary by
 //! `GET /samples`.
 
-use ros2probe::model::input::Input;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,6 +11,7 @@ use ros2probe::capture::frame_decoder::FrameDecoder;
 use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Watch, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::payloads::{MissedReason, News};
 use ros2probe::model::selection::{Depth, Selection, Wish};

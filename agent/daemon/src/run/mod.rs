@@ -5,7 +5,6 @@ mod capture_time;
 pub mod replay;
 mod source;
 
-use ros2probe_model::input::Input;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -23,6 +22,7 @@ use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::pcap::PcapError;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_model::history::History;
+use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 use ros2probe_model::selection::Wish;
 use ros2probe_model::snapshot::Snapshot;

@@ -2,7 +2,6 @@
 //! sums only. It works as the agent does, and looks at sockets of the whole machine: give it a
 //! control group.
 
-use ros2probe::model::input::Input;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -14,6 +13,7 @@ use ros2probe::capture::live::LiveSource;
 use ros2probe::capture::netns;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Config, Watchlist};
+use ros2probe::model::input::Input;
 use ros2probe::model::journal::{DeliveryLoss, Loss};
 use ros2probe::model::observer::{self, Observer};
 use ros2probe::model::snapshot::Snapshot;

@@ -1,11 +1,11 @@
 //! A host in virtual time: a writer elsewhere or on it, and receivers at its sockets.
 
-use ros2probe::model::input::Input;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::cause::LossCause;
+use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::{
     DeliveryFacts, Direction, Measurement, Snapshot, SocketFacts, TopicFacts,
