@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use bytes::Bytes;
 use ros2probe_wire::record::{Sample, flag};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::size::Size;
@@ -18,7 +19,7 @@ const OVERHEAD: usize = 128;
 /// Samples under way at once.
 const SAMPLES: usize = 16_384;
 /// A sample that got nothing for so long will not be complete, nor counted.
-const FORGET: u64 = 30_000_000_000;
+const FORGET: u64 = 30 * SECOND;
 /// Least memory that is asked for at once.
 const LEAST: usize = 4096;
 

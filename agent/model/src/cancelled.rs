@@ -10,6 +10,7 @@ use std::collections::VecDeque;
 
 use ros2probe_wire::Record;
 use ros2probe_wire::record::Sample;
+use ros2probe_wire::time::SECOND;
 
 use super::size::Size;
 
@@ -18,7 +19,7 @@ const LIMIT: usize = 4096;
 /// Clock readings of the two reports may be converted this far apart, nanoseconds.
 const SLACK: u64 = 100_000;
 /// Arrivals come within this, or their record was lost.
-const LIFETIME: u64 = 60_000_000_000;
+const LIFETIME: u64 = 60 * SECOND;
 
 /// What waits for its arrival at one receiver.
 #[derive(Debug, Default)]
@@ -176,6 +177,7 @@ mod tests {
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use ros2probe_wire::time::MILLISECOND;
 
     fn fragments(start: u32, count: u32, time: u64, elapsed: u32) -> Record {
         Record {
@@ -202,8 +204,6 @@ mod tests {
         let samples = parts.iter().filter_map(Record::sample);
         samples.map(range).collect()
     }
-
-    const MILLISECOND: u64 = 1_000_000;
 
     #[test]
     fn what_had_no_room_is_taken_out_of_the_run_that_covers_it_once() {

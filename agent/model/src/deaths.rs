@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 use super::cause::LossCause;
 use super::size::Size;
@@ -16,7 +17,7 @@ const SAMPLES: usize = 8192;
 /// Runs of pending samples of one receiver.
 const RUNS: usize = 1024;
 /// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
-pub const REASSEMBLY: u64 = 35_000_000_000;
+pub const REASSEMBLY: u64 = 35 * SECOND;
 
 /// Both lists.
 #[derive(Debug, Default)]

@@ -10,6 +10,7 @@ mod deciding;
 use std::collections::BTreeSet;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
 use deciding::Deciding;
@@ -31,12 +32,12 @@ use super::writer::settle_window;
 /// delivery begins anew.
 const EXCUSED: u64 = 512;
 /// What left this host a moment ago may be under way still.
-const UNDER_WAY: u64 = 1_000_000_000;
+const UNDER_WAY: u64 = SECOND;
 /// A receiver that is silent for so long and of which nothing tells whether it lives has lost what
 /// left for it in the first moments. Whoever reads the kernel's tables notices earlier that a socket
 /// was closed.
-const SILENCE: u64 = 18_000_000_000;
-const FIRST_MOMENTS: u64 = 5_000_000_000;
+const SILENCE: u64 = 18 * SECOND;
+const FIRST_MOMENTS: u64 = 5 * SECOND;
 /// Samples that are lost in one go and wait for their cause when two deliveries become one.
 const LONG_RUN: u64 = 256;
 

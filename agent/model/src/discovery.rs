@@ -22,6 +22,7 @@ use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, R
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::rtps::Locator;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
 use facts::{ADDRESSES, domain, named};
@@ -39,7 +40,6 @@ use super::size::Size;
 use super::topic::Naming;
 use crate::watch::Watchlist;
 
-const SECOND: u64 = 1_000_000_000;
 /// Endpoints and nodes whose participant is not known yet: how many and how long.
 const PENDING: usize = 1024;
 /// Participants for which there was no room.

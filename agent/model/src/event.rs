@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::churn;
@@ -19,7 +20,6 @@ use super::journal::Loss;
 use super::size::Size;
 use super::snapshot::WatchState;
 
-const SECOND: u64 = 1_000_000_000;
 /// Events of one class in a second of the source's clock.
 const MOST: u16 = 512;
 /// So many wait that they should be taken before more comes.

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 use super::histogram::Histogram;
 use super::rate::SECONDS as WINDOW;
@@ -19,7 +20,6 @@ const ROWS: usize = 262_144;
 /// Names that are known, for each topic that may be measured: one that is measured no more is kept
 /// until there are twice as many.
 const NAMES: usize = 2;
-const SECOND: u64 = 1_000_000_000;
 
 /// The ring.
 #[derive(Debug)]

@@ -11,11 +11,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 use super::payloads::{EARLIER, Given, Sample};
 use super::size::Size;
 
-const SECOND: u64 = 1_000_000_000;
 /// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three seconds
 /// at the latest.
 const PATIENCE: u64 = 4 * SECOND;

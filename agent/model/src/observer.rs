@@ -12,6 +12,7 @@ use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::record::{Body, Handover, Sample, Verdict, flag};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 
@@ -40,7 +41,6 @@ use super::writer::{Counted, Traits};
 use crate::limits::Limits;
 use crate::watch::{Watch, Watchlist};
 
-const SECOND: u64 = 1_000_000_000;
 /// How often leases, windows and gaps are looked at.
 const TICK: u64 = SECOND / 10;
 /// A clock that jumps further than this is set, not followed tick by tick.

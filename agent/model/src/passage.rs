@@ -4,6 +4,7 @@
 //! It says what they would use, not what they did: whether their QoS fits is theirs to find out.
 
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::discovery::{Discovery, Endpoint};
@@ -12,8 +13,8 @@ use super::snapshot::{EndpointFacts, Passage, PassageCount};
 /// Pairs of one topic that are looked at; the rest is taken to be as those are.
 const MAX_PAIRS: usize = 1024;
 /// After so long a participant that told no nodes is none of ROS, and an endpoint is nobody's.
-const NODES_WITHIN: u64 = 30_000_000_000;
-const NODE_WITHIN: u64 = 10_000_000_000;
+const NODES_WITHIN: u64 = 30 * SECOND;
+const NODE_WITHIN: u64 = 10 * SECOND;
 
 /// Pairs of these writers and readers by how messages pass between them; each endpoint gets the
 /// ways it has a part in.

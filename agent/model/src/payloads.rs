@@ -11,6 +11,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{Guid, Timestamp, record};
 
 use super::assembly::Assembly;
@@ -26,7 +27,7 @@ const WAITING: usize = 65_536;
 pub(super) const EARLIER: usize = 1024;
 /// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
 /// not told of.
-pub const TELLING: u64 = 400_000_000;
+pub const TELLING: u64 = 400 * MILLISECOND;
 
 /// The topic of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]

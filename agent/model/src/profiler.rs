@@ -9,6 +9,7 @@ use std::ops::RangeInclusive;
 
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{Body, flag};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::calendar::Calendar;
@@ -23,7 +24,6 @@ use super::subscribers::{Room, Sight, Stage, Subscribers};
 use super::topic::TopicId;
 use super::writer::{Counted, Scene, Traits, Writer};
 
-const SECOND: u64 = 1_000_000_000;
 /// A stranger is shown and metered after this long: announcements come within a second or so.
 const STRANGE: u64 = 3 * SECOND;
 /// A stranger that is silent this long is forgotten; one that sent little makes room sooner.

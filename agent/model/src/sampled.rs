@@ -7,15 +7,16 @@
 //! network counts here too: it adds to what was seen.
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::{MILLISECOND, SECOND};
 
 use super::sequence::{Belief, MAX_WINDOW, Run, Sequence};
 use super::size::Size;
 use super::snapshot::SampledFacts;
 
 /// A writer that was not seen in shared memory for so long is not sampled any more.
-const HOLD: u64 = 10_000_000_000;
+const HOLD: u64 = 10 * SECOND;
 /// How long a sample that was not seen may still come by another way before it is left out.
-const PATIENCE: u64 = 200_000_000;
+const PATIENCE: u64 = 200 * MILLISECOND;
 /// Numbers below the next one of which it is known one by one whether they were seen.
 const WINDOW: u64 = u128::BITS as u64;
 
@@ -469,8 +470,7 @@ impl Sampled {
 mod tests {
     use super::super::sequence::{FAR, REACH, Settled};
     use super::*;
-
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
 
     struct View {
         sampled: Sampled,

@@ -12,6 +12,7 @@ mod doubt;
 use std::collections::VecDeque;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::MILLISECOND;
 
 use super::size::Size;
 pub use doubt::Run;
@@ -34,7 +35,7 @@ const REORDERING: i64 = 5_000_000;
 /// Gaps remembered for telling reordering from retransmission.
 const GAPS: usize = 32;
 /// A lower sequence number with a source time newer by this is a new incarnation of the writer.
-const INCARNATION: u64 = 100_000_000;
+const INCARNATION: u64 = 100 * MILLISECOND;
 /// So many consecutive samples below the window are one too, whatever their source time says.
 const STALE: u32 = 1024;
 /// Settling advances in this many steps per window.

@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::rtps::StatusInfo;
+use ros2probe_wire::time::{MILLISECOND, SECOND};
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::identity::Identity;
@@ -34,9 +35,9 @@ const MAX_FINISHED: usize = 2048;
 /// For bitmaps of fragments.
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements that come later are of no interest.
-const PATIENCE: u64 = 10_000_000_000;
+const PATIENCE: u64 = 10 * SECOND;
 /// What arrives may turn out to be a copy of what is sent from here.
-const DOUBT: u64 = 500_000_000;
+const DOUBT: u64 = 500 * MILLISECOND;
 /// The loopback interface, in every network namespace.
 const LOOPBACK: u32 = 1;
 /// The part of a trace's identity that decides, as in OpenTelemetry's samplers.
@@ -544,9 +545,9 @@ mod tests {
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;
+    use ros2probe_wire::time::SECOND;
 
     const WRITER: Guid = Guid::new(GuidPrefix([7; 12]), EntityId([0, 0, 1, 3]));
-    const SECOND: u64 = 1_000_000_000;
 
     fn reader(number: u8) -> Guid {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 4]))

@@ -5,6 +5,7 @@
 
 use std::collections::VecDeque;
 
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
 use super::receivers::{Around, Matched};
@@ -17,7 +18,6 @@ use super::way::{Place, Way};
 const LIMIT: usize = 512;
 /// Moments at which it is known what had left, one a second.
 const MOMENTS: usize = 24;
-const SECOND: u64 = 1_000_000_000;
 
 /// All ways of one writer, sorted.
 #[derive(Debug, Default)]

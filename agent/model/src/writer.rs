@@ -5,6 +5,7 @@
 //! [`super::sequence`] and [`super::samples`].
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
 use super::calendar::Calendar;
@@ -22,15 +23,15 @@ use super::size::Size;
 use super::snapshot::Measurement;
 
 /// How long a gap of a best-effort writer may fill by reordering.
-pub const BEST_EFFORT_WINDOW: u64 = 1_000_000_000;
+pub const BEST_EFFORT_WINDOW: u64 = SECOND;
 /// How long a reliable writer may take to retransmit: three of Fast DDS's HEARTBEAT periods.
-pub const RELIABLE_WINDOW: u64 = 10_000_000_000;
+pub const RELIABLE_WINDOW: u64 = 10 * SECOND;
 /// A first sample older than this is history that a late joiner asked for.
-const HISTORY: u64 = 10_000_000_000;
+const HISTORY: u64 = 10 * SECOND;
 
 /// A writer that was seen in its own process is so for this long after its last record: what else
 /// is read in shared memory in that time has been seen.
-const EXACT_FOR: u64 = 10_000_000_000;
+const EXACT_FOR: u64 = 10 * SECOND;
 
 /// What discovery says about the writer; all false while it is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -9,12 +9,12 @@ use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::{Measurement, Snapshot, SocketFacts, TopicFacts, WatchState};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 use std::sync::Arc;
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);

@@ -24,10 +24,10 @@ use ros2probe::surface::{AgentFacts, Board, SourceKind};
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
-const MILLISECOND: u64 = 1_000_000;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 
 /// How a cap stands: how much of it is used, how often it was reached.

@@ -13,6 +13,7 @@ use ros2probe_wire::discovery::{self, Discovery, EndpointAnnouncement, Role};
 use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
 use ros2probe_wire::record::{Body, Gap, Sample};
 use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::walk::{self, Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -25,7 +26,6 @@ use ros2probe_model::pieces::Pieces;
 /// Packets sent to one participant, goodbye included.
 pub const MOST_PACKETS: u32 = 6;
 
-const MILLISECOND: u64 = 1_000_000;
 /// Both announce themselves within 2 ms; when nothing comes for this long, the introduction is
 /// repeated once.
 const SILENCE: u64 = 500 * MILLISECOND;

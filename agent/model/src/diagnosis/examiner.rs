@@ -4,6 +4,7 @@ use std::cmp::Ordering;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::endpoints::{Lonely, Lookout};
@@ -12,7 +13,6 @@ use crate::discovery::Discovery;
 use crate::size::Size;
 use crate::topic::Topics;
 
-const SECOND: u64 = 1_000_000_000;
 /// How long an endpoint is alone before that is a finding: nodes start one after another.
 pub(super) const PATIENCE: u64 = 5 * SECOND;
 /// Most findings kept of each kind.

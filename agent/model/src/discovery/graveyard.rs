@@ -3,13 +3,14 @@
 
 use std::collections::VecDeque;
 
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::facts::Origin;
 use crate::size::Size;
 
 /// Announcements older than a disposal are stale, for this long after it.
-const BURIED: u64 = 500_000_000;
+const BURIED: u64 = 500 * MILLISECOND;
 const BURIALS: usize = 256;
 /// Samples on their way arrive within this.
 const UNDER_WAY: u64 = 4 * BURIED;

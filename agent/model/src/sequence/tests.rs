@@ -1,6 +1,5 @@
 use super::*;
-
-const SECOND: u64 = 1_000_000_000;
+use ros2probe_wire::time::SECOND;
 
 /// A sequence with virtual time and the verdicts in lists.
 #[derive(Default)]
@@ -346,7 +345,6 @@ fn ranges_of_a_bitmap_are_set_and_cleared_to_the_bit_also_around_its_end() {
 
 #[test]
 fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
-    const SECOND: u64 = 1_000_000_000;
     let mut sequence = Sequence::default();
     let mut lost = 0;
     let mut count = |settled| lost += u64::from(matches!(settled, Settled::Lost(_)));

@@ -2,13 +2,13 @@
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Reliability;
+use ros2probe_wire::time::SECOND;
 
 use super::{Stage, Subscribers, is_reader, scene};
 use crate::delivery::{Delivery, Receiver, Totals};
 use crate::receivers::{Matched, readers};
 use crate::way::Way;
 
-const SECOND: u64 = 1_000_000_000;
 /// A way by which nothing came for so long is forgotten, unless a reader is known at its end.
 const FORGET: u64 = 60 * SECOND;
 

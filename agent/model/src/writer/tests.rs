@@ -1,9 +1,8 @@
 use ros2probe_wire::record::kind;
+use ros2probe_wire::time::{MILLISECOND, SECOND};
 
 use super::*;
 
-const MILLISECOND: u64 = 1_000_000;
-const SECOND: u64 = 1000 * MILLISECOND;
 const START: u64 = 1_795_143_000 * SECOND;
 
 /// One writer with everything around it, in virtual time.
