@@ -104,8 +104,8 @@ impl Assembly {
         (self.bytes, self.limit, self.evictions)
     }
 
-    /// Keeps what a DATA or DATA_FRAG brings; `beside` bytes are spent elsewhere.
-    pub fn put(&mut self, sample: Sample<'_>, payload: &[u8], beside: usize) {
+    /// Keeps what a DATA or DATA_FRAG brings; `other_bytes` bytes are spent elsewhere.
+    pub fn put(&mut self, sample: Sample<'_>, payload: &[u8], other_bytes: usize) {
         let Some((size, fragment_size)) = sizes(sample, payload) else {
             return;
         };
@@ -133,7 +133,7 @@ impl Assembly {
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
-        while self.bytes + beside > self.limit || self.parts.len() > SAMPLES {
+        while self.bytes + other_bytes > self.limit || self.parts.len() > SAMPLES {
             let Some((_, key)) = self.ages.first_key_value() else {
                 return;
             };
@@ -288,8 +288,8 @@ mod tests {
     }
 
     /// [`Assembly::put`] of the sample that a record reports.
-    fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], beside: usize) {
-        assembly.put(record.sample().unwrap(), payload, beside);
+    fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], other_bytes: usize) {
+        assembly.put(record.sample().unwrap(), payload, other_bytes);
     }
 
     fn fragment(of: Guid, number: u64, start: u32, count: u32, size: u32, of_size: u32) -> Record {

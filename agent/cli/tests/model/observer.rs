@@ -780,7 +780,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
     world
         .observer
         .input(Input::Watchlist(Arc::new(watchlist(&patterns))));
-    assert!(!world.observer.has_asked_all());
+    assert!(!world.observer.has_applied_lists());
     let is_measured = |topic: &TopicFacts| topic.measurement.is_some();
     let some = world
         .snapshot()
@@ -792,7 +792,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
     // It goes on being counted.
     world.sample(alice(WRITER), 1);
     let mut rounds = 0;
-    while !world.observer.ask_more() {
+    while !world.observer.apply_more_lists() {
         rounds += 1;
     }
     assert!((2..10).contains(&rounds), "{rounds}");
