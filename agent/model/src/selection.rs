@@ -70,7 +70,7 @@ pub struct Selection {
 
 /// A subscription as the model sees it.
 #[derive(Clone, Debug)]
-pub struct Wish {
+pub struct SampleRequest {
     /// Names the subscription.
     pub id: u64,
     /// Which topics.
@@ -194,7 +194,7 @@ impl Selection {
     }
 }
 
-impl Wish {
+impl SampleRequest {
     /// Whether it is for this topic.
     #[must_use]
     pub fn covers(&self, domain_id: u32, naming: &Naming) -> bool {
@@ -213,14 +213,14 @@ mod tests {
 
     fn covers(selection: &Selection, dds_name: &str) -> bool {
         let naming = Naming::of(&DdsTopic::parse(dds_name).unwrap());
-        let wish = Wish {
+        let request = SampleRequest {
             id: 1,
             selection: Arc::new(selection.clone()),
             domain_id: Some(3),
             depth: Depth::Arrivals,
         };
-        assert!(!wish.covers(4, &naming));
-        wish.covers(3, &naming)
+        assert!(!request.covers(4, &naming));
+        request.covers(3, &naming)
     }
 
     #[test]

@@ -11,8 +11,8 @@ use ros2probe::model::discovery::Addresses;
 use ros2probe::model::histogram::Histogram;
 use ros2probe::model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
-    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Passage, PassageCount,
-    ProcessFacts, SampledFacts, Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts,
+    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
+    Snapshot, SocketFacts, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
     WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe::state::StateFacts;
@@ -217,7 +217,7 @@ pub fn topic(name: &str) -> TopicFacts {
         type_hash: None,
         first_seen: Timestamp(4),
         measurement: Some(Box::new(measurement())),
-        passages: 1,
+        transports: 1,
     };
     TopicFacts {
         domain_id: 0,
@@ -247,8 +247,8 @@ pub fn topic(name: &str) -> TopicFacts {
             last_seen: Timestamp(1_700_000_000_000_000_000),
         }],
         vanished: false,
-        passages: vec![PassageCount {
-            passage: Passage::SharedMemory,
+        transports: vec![TransportCount {
+            transport: Transport::SharedMemory,
             pairs: 1,
         }],
         is_read: false,

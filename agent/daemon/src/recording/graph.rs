@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use serde::Deserialize;
 
 use crate::subscriptions::line::{QosFacts, seconds};
-use ros2probe_model::snapshot::{EndpointFacts, Passage, Snapshot, TopicFacts};
+use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
 
 const VOLATILE: &str = "VOLATILE";
 
@@ -155,8 +155,8 @@ impl From<&Snapshot> for GraphSnapshot {
 
 impl From<&TopicFacts> for PublishedTopic {
     fn from(facts: &TopicFacts) -> Self {
-        let passages = facts.passages.iter();
-        let passages = passages.map(|count| (count.passage.label(), count.pairs));
+        let passages = facts.transports.iter();
+        let passages = passages.map(|count| (count.transport.label(), count.pairs));
         let publishers = facts.publishers.iter();
         let durable_publishers = publishers.filter(|publisher| publisher.durability != VOLATILE);
         Self {
@@ -184,7 +184,7 @@ fn is_topic(kind: &str) -> bool {
 fn other_transport<'a>(
     passages: impl Iterator<Item = (&'a str, usize)> + Clone,
 ) -> Option<&'a str> {
-    let network = Passage::Network.label();
+    let network = Transport::Network.label();
     if passages.clone().any(|(passage, _)| passage == network) {
         return None;
     }

@@ -388,9 +388,9 @@ fn sampled(sink: &mut MetricSink<'_>, rows: &[TopicRow<'_>]) -> fmt::Result {
     })?;
     sink.family(&metric::TOPIC_PAIRS, |family| {
         for row in rows {
-            for count in row.facts.iter().flat_map(|facts| &facts.passages) {
+            for count in row.facts.iter().flat_map(|facts| &facts.transports) {
                 let [domain_id, topic] = row.labels();
-                let passage = Label::Text(count.passage.label());
+                let passage = Label::Text(count.transport.label());
                 family.sample(&[domain_id, topic, passage], count.pairs)?;
             }
         }

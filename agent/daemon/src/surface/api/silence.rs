@@ -10,7 +10,7 @@ use super::index::Index;
 use crate::config::Watchlist;
 use crate::surface::agent_facts::SourceKind;
 use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::snapshot::{EndpointFacts, Measurement, Passage, Snapshot, TopicFacts};
+use ros2probe_model::snapshot::{EndpointFacts, Measurement, Snapshot, TopicFacts, Transport};
 
 /// One reason.
 #[derive(Debug, Serialize, ToSchema)]
@@ -186,37 +186,37 @@ impl<'a> Circumstances<'a> {
 
     /// How messages pass, if no pair of publisher and subscriber uses the network.
     fn aside(&self, topic: &TopicFacts) -> Option<(Cause, String)> {
-        let passages = topic.passages.iter();
-        let most = passages.clone().max_by_key(|count| count.pairs)?;
-        if passages
+        let transports = topic.transports.iter();
+        let most = transports.clone().max_by_key(|count| count.pairs)?;
+        if transports
             .clone()
-            .any(|count| count.passage == Passage::Network)
+            .any(|count| count.transport == Transport::Network)
         {
             return None;
         }
         let detail = |how: &str| format!("{how}; nothing crosses the network");
-        Some(match most.passage {
-            Passage::Network => return None,
-            Passage::SharedMemory if self.looks_at_memory => {
+        Some(match most.transport {
+            Transport::Network => return None,
+            Transport::SharedMemory if self.looks_at_memory => {
                 let how = "messages pass through shared memory; none was seen lately";
                 (Cause::SharedMemory, detail(how))
             }
-            Passage::SharedMemory => {
+            Transport::SharedMemory => {
                 let how = "messages pass through shared memory, which this agent does not read";
                 (Cause::SharedMemory, detail(how))
             }
-            Passage::DataSharing => {
+            Transport::DataSharing => {
                 let how = "subscribers read the publisher's history in memory (data sharing)";
                 (Cause::DataSharing, detail(how))
             }
-            Passage::SameProcess => (
+            Transport::SameProcess => (
                 Cause::SameProcess,
                 detail(
                     "publisher and subscriber share \
                 one process",
                 ),
             ),
-            Passage::Iceoryx => (Cause::Iceoryx, detail("messages pass through iceoryx")),
+            Transport::Iceoryx => (Cause::Iceoryx, detail("messages pass through iceoryx")),
         })
     }
 

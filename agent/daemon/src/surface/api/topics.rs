@@ -30,7 +30,7 @@ use crate::surface::Ability;
 use crate::surface::board::State as BoardState;
 use crate::watches::InForce;
 use ros2probe_model::snapshot::{
-    AcknowledgementFacts, DeliveryFacts, Passage, Snapshot, TopicFacts,
+    AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts, Transport,
 };
 
 /// Topics.
@@ -105,7 +105,7 @@ struct TopicDetails<'a> {
 
 /// Pairs of publisher and subscriber between which messages pass in one way.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Passage)]
+#[schema(as = Transport)]
 struct PassageView {
     /// `network`; `shared_memory`, of which samples are seen; `data_sharing`, `same_process` or
     /// `iceoryx`, which are not seen.
@@ -390,10 +390,10 @@ impl<'a> Desk<'a> {
         let endpoint = |facts| EndpointView::new(facts, index);
         let findings = index.findings(facts).iter();
         let watches = index.watches(facts).iter();
-        let passages = facts.passages.iter().map(|count| PassageView {
-            passage: count.passage.label(),
+        let passages = facts.transports.iter().map(|count| PassageView {
+            passage: count.transport.label(),
             pairs: count.pairs,
-            view: (count.passage == Passage::SharedMemory).then(|| self.view(facts)),
+            view: (count.transport == Transport::SharedMemory).then(|| self.view(facts)),
         });
         TopicView {
             domain_id: facts.domain_id,

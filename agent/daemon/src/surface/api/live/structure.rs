@@ -155,7 +155,7 @@ impl Ids {
             node,
             self.participants.number(participant, round),
             facts.guid,
-            facts.passages,
+            facts.transports,
             &facts.reliability,
             &facts.durability,
         )
