@@ -39,10 +39,14 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+#![forbid(unsafe_code)]
+
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
+
+use rustix::fs::OFlags;
 
 pub mod compression;
 mod file;
@@ -129,7 +133,8 @@ fn new_file(path: &Path) -> io::Result<File> {
 /// Opens a regular file to read it. Opening never waits, as it would for a pipe without a writer; the
 /// open file is checked, so nothing can take its place in between.
 fn open_file(path: &Path) -> io::Result<File> {
-    let flags = libc::O_NONBLOCK | libc::O_NOCTTY;
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+    let flags = flags.bits().cast_signed();
     let mut options = OpenOptions::new();
     let file = options.read(true).custom_flags(flags).open(path)?;
     match file.metadata()?.is_file() {

@@ -24,6 +24,7 @@
 
 pub mod ahead;
 pub mod bell;
+pub mod bpf;
 pub mod cgroup;
 pub mod cgroup_paths;
 pub mod clock_step;

@@ -14,6 +14,8 @@
 //! # Ok::<_, ros2probe_daemon::config::Mistakes>(())
 //! ```
 
+#![cfg_attr(not(test), forbid(unsafe_code))]
+
 pub mod agent;
 pub mod config;
 mod control;

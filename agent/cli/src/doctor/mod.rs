@@ -114,7 +114,7 @@ pub fn examine_capture(answers: &Answers, name: &str) -> Report {
 
 /// What an agent would see: tried, where that is allowed. Not in other processes' code.
 fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
-    if let Some(missing) = privilege::missing(&host.capabilities, settings) {
+    if let Some(missing) = privilege::missing(host.capabilities, settings) {
         return visibility::untried(&format!("lacks {}", missing.needs()));
     }
     let mut settings = settings.clone();
