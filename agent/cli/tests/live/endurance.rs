@@ -157,9 +157,11 @@ fn who_was_stopped_for_seconds_believes_nobody_gone_and_counts_what_it_missed() 
         robot.wait_ready()?;
         let ready = woke.elapsed();
         crowd.rest(Duration::from_secs(1))?;
-        let page = robot.agent.scrape_until("a fresh page with what was dropped", |page| {
-            page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0 && dropped(page) > 0.0
-        })?;
+        let page = robot
+            .agent
+            .scrape_until("a fresh page with what was dropped", |page| {
+                page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0 && dropped(page) > 0.0
+            })?;
         let missed = dropped(&page);
         ensure!(
             robot.expired()? == expired,
