@@ -349,48 +349,7 @@ fn check_endpoints(facts: &Value, found: &Found) {
             "type",
             &json!(endpoint.type_name.as_str()),
         );
-        check(
-            &context,
-            theirs,
-            "reliability",
-            &json!(endpoint.qos.reliability.to_string()),
-        );
-        check(
-            &context,
-            theirs,
-            "durability",
-            &json!(endpoint.qos.durability.to_string()),
-        );
-        check(
-            &context,
-            theirs,
-            "lifespan",
-            &seconds(endpoint.qos.lifespan),
-        );
-        check(
-            &context,
-            theirs,
-            "deadline",
-            &seconds(endpoint.qos.deadline),
-        );
-        check(
-            &context,
-            theirs,
-            "unicast_locator",
-            &locators(&endpoint.unicast),
-        );
-        let lease = seconds(endpoint.qos.liveliness_lease);
-        check(
-            &context,
-            theirs,
-            "liveliness",
-            &json!([endpoint.qos.liveliness.to_string(), lease]),
-        );
-        let history = endpoint.qos.history;
-        let text = history.map(|history| format!("{}({})", history.kind, history.depth));
-        check(&context, theirs, "history", &json!(text));
-        let is_fast = theirs["vendor"] == "1.15";
-        assert_eq!(history.is_none(), is_fast, "{context}: history");
+        check_qos(&context, theirs, endpoint);
         let hash = theirs["user_data"].as_str().and_then(|text| {
             Some(
                 text.split_once("typehash=")?
@@ -405,18 +364,53 @@ fn check_endpoints(facts: &Value, found: &Found) {
             endpoint.type_hash.map(|hash| hash.to_string()),
             "{context}"
         );
-        if theirs.get("reliability").is_none() {
-            let default = if endpoint.role == Role::Writer {
-                "RELIABLE"
-            } else {
-                "BEST_EFFORT"
-            };
-            assert_eq!(endpoint.qos.reliability.to_string(), default);
-        }
         assert!(
             !endpoint.is_truncated && endpoint.qos.partitions.is_empty(),
             "{context}"
         );
+    }
+}
+
+fn check_qos(context: &str, theirs: &Value, endpoint: &EndpointAnnouncement) {
+    check(
+        context,
+        theirs,
+        "reliability",
+        &json!(endpoint.qos.reliability.to_string()),
+    );
+    check(
+        context,
+        theirs,
+        "durability",
+        &json!(endpoint.qos.durability.to_string()),
+    );
+    check(context, theirs, "lifespan", &seconds(endpoint.qos.lifespan));
+    check(context, theirs, "deadline", &seconds(endpoint.qos.deadline));
+    check(
+        context,
+        theirs,
+        "unicast_locator",
+        &locators(&endpoint.unicast),
+    );
+    let lease = seconds(endpoint.qos.liveliness_lease);
+    check(
+        context,
+        theirs,
+        "liveliness",
+        &json!([endpoint.qos.liveliness.to_string(), lease]),
+    );
+    let history = endpoint.qos.history;
+    let text = history.map(|history| format!("{}({})", history.kind, history.depth));
+    check(context, theirs, "history", &json!(text));
+    let is_fast = theirs["vendor"] == "1.15";
+    assert_eq!(history.is_none(), is_fast, "{context}: history");
+    if theirs.get("reliability").is_none() {
+        let default = if endpoint.role == Role::Writer {
+            "RELIABLE"
+        } else {
+            "BEST_EFFORT"
+        };
+        assert_eq!(endpoint.qos.reliability.to_string(), default);
     }
 }
 

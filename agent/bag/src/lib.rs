@@ -50,9 +50,11 @@ use rustix::fs::OFlags;
 
 pub mod compression;
 mod file;
+mod file_compression;
 pub mod info;
 pub mod mcap;
 pub mod metadata;
+mod metadata_file;
 pub mod options;
 pub mod qos;
 pub mod read;
@@ -60,10 +62,9 @@ pub mod reindex;
 mod writer;
 
 pub use compression::{Compression, Progress};
+pub use file_compression::{Compressed, FileCompression};
 pub use options::{Form, Options, Storage};
-pub use writer::{
-    Compressed, FileCompression, Schema, Summary, TopicDescription, TopicId, TopicSummary, Writer,
-};
+pub use writer::{Schema, Summary, TopicDescription, TopicId, TopicSummary, Writer};
 
 /// Why a bag cannot be written. After an error a file is valid up to its last flushed chunk.
 #[derive(Debug, thiserror::Error)]
@@ -122,6 +123,13 @@ pub enum Error {
         /// The one refused.
         second: String,
     },
+}
+
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".");
+    name.push(suffix);
+    PathBuf::from(name)
 }
 
 /// Makes a file of a bag, which must not exist: for its owner, and for the group to read.

@@ -4,19 +4,21 @@ use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros2probe::model::diagnosis::{
+use ros2probe_daemon::state::StateFacts;
+use ros2probe_daemon::surface::{
+    AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
+};
+use ros2probe_model::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
 };
-use ros2probe::model::discovery::Addresses;
-use ros2probe::model::histogram::Histogram;
-use ros2probe::model::snapshot::{
+use ros2probe_model::discovery::Addresses;
+use ros2probe_model::histogram::Histogram;
+use ros2probe_model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
     Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
     Snapshot, SocketFacts, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
     WatchFacts, WatchState, WatchedTopicFacts,
 };
-use ros2probe::state::StateFacts;
-use ros2probe::surface::{AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 

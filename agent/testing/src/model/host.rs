@@ -3,11 +3,11 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
-use ros2probe::config::{Watch, Watchlist};
-use ros2probe::model::cause::LossCause;
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::snapshot::{
+use ros2probe_daemon::config::{Watch, Watchlist};
+use ros2probe_model::cause::LossCause;
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::{
     DeliveryFacts, Direction, Measurement, Snapshot, SocketFacts, TopicFacts,
 };
 use ros2probe_wire::record::{flag, guid_words, kind};

@@ -5,49 +5,49 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "INTEREST_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "the_interest_map_takes_so_many_and_refuses_the_next",
     ],
     [
         "PARTICIPANT_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "so_many_participants_are_followed_and_the_next_is_refused",
     ],
     [
         "UNKNOWN_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others",
     ],
     [
         "UNKNOWN_CAPTURE_BYTES",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others",
     ],
     [
         "UNKNOWN_BYTES_PER_SECOND",
         "agent/capture/src/live.rs",
-        "agent/cli/tests/kernel/filter.rs",
+        "agent/capture/tests/kernel/filter.rs",
         "an_unknown_writer_is_captured_until_its_budget_ends_then_metered_then_only_counted",
     ],
     [
         "FLOW_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "a_fragmented_datagram_is_forgotten_after_so_many_others_began",
     ],
     [
         "RUN_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "runs_beyond_the_table_are_a_record_for_each_fragment",
     ],
     [
         "INTERFACE_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "so_many_interfaces_are_judged_and_the_next_is_refused",
     ],
     [
@@ -317,19 +317,19 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "CHUNK_BYTES",
         "agent/daemon/src/recording/service.rs",
-        "agent/cli/tests/surface/bag.rs",
+        "agent/bag/tests/bag/written.rs",
         "messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones",
     ],
     [
         "INDEX_BYTES",
         "agent/daemon/src/recording/service.rs",
-        "agent/cli/tests/surface/bag.rs",
+        "agent/bag/tests/bag/written.rs",
         "a_file_is_split_when_its_index_takes_what_it_may",
     ],
     [
         "EXPANDED",
         "agent/bag/src/read.rs",
-        "agent/cli/tests/surface/bag/cut.rs",
+        "agent/bag/tests/bag/cut.rs",
         "a_small_file_that_expands_to_gigabytes_is_refused_before_it_does",
     ],
     [
@@ -491,13 +491,13 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "SOCKET_CAPACITY",
         "wire/src/host.rs",
-        "agent/cli/tests/live/host_hook.rs",
+        "agent/capture/tests/kernel/host_hook.rs",
         "a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go",
     ],
     [
         "MAX_WAITING",
         "agent/capture/src/filter_reader.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted",
     ],
     [

@@ -10,9 +10,9 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
-use ros2probe::capture::filter::{Filter, FilterSettings, Form, Probe, Probes};
-use ros2probe::capture::piece_assembler::PieceAssembler;
-use ros2probe::capture::uprobe::library;
+use ros2probe_capture::filter::{Filter, FilterSettings, Form, Probe, Probes};
+use ros2probe_capture::piece_assembler::PieceAssembler;
+use ros2probe_capture::uprobe::library;
 use ros2probe_testing::forged::{SAMPLES_WRITER, Talker};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::network::Namespace;

@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use ros2probe::bag::info::Bag;
-use ros2probe::bag::mcap::{self as records, Opcode};
-use ros2probe::bag::read;
-use ros2probe::bag::reindex::{Found, ReindexError, reindex};
-use ros2probe::bag::{Compression, Form, Options, Storage, Writer};
+use ros2probe_bag::info::Bag;
+use ros2probe_bag::mcap::{self as records, Opcode};
+use ros2probe_bag::read;
+use ros2probe_bag::reindex::{Found, ReindexError, reindex};
+use ros2probe_bag::{Compression, Form, Options, Storage, Writer};
 use ros2probe_wire::Timestamp;
 
 use super::{BEGIN, messages, metadata, text, topic};

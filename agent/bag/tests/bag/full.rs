@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use ros2probe::bag::{Error, Options, Writer};
+use ros2probe_bag::{Error, Options, Writer};
 use ros2probe_wire::Timestamp;
 
 use super::{BEGIN, cloud, messages, metadata, topic};
@@ -17,7 +17,7 @@ fn a_full_disk_leaves_a_complete_bag() {
     let directory = tempfile::tempdir().unwrap();
     let output = Command::new("unshare")
         .args(["--map-root-user", "--mount", "sh", "-c"])
-        .arg("mount -t tmpfs -o size=5m none \"$1\" && exec \"$0\" --exact bag::full::small_disk --ignored")
+        .arg("mount -t tmpfs -o size=5m none \"$1\" && exec \"$0\" --exact full::small_disk --ignored")
         .arg(std::env::current_exe().unwrap())
         .arg(directory.path())
         .env(PLACE, directory.path())

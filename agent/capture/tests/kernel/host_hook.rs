@@ -12,10 +12,10 @@ use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe::capture::filter::{Filter, FilterSettings};
-use ros2probe::capture::netns;
-use ros2probe::capture::sockets::Sockets;
-use ros2probe::model::observer::{Observer, Settings};
+use ros2probe_capture::filter::{Filter, FilterSettings};
+use ros2probe_capture::netns;
+use ros2probe_capture::sockets::Sockets;
+use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_testing::forged;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};

@@ -7,12 +7,12 @@ use std::path::Path;
 use std::sync::Arc;
 
 use criterion::{BatchSize, Criterion, Throughput, criterion_group, criterion_main};
-use ros2probe::capture::frame_decoder::FrameDecoder;
-use ros2probe::capture::pcap::PcapReader;
-use ros2probe::capture::reassembly::Limits;
-use ros2probe::config::{Watch, Watchlist};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
+use ros2probe_capture::frame_decoder::FrameDecoder;
+use ros2probe_capture::pcap::PcapReader;
+use ros2probe_capture::reassembly::Limits;
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use ros2probe::surface::{Board, Exposition, Format, Settings, SourceKind};
+use ros2probe_daemon::surface::{Board, Exposition, Format, Settings, SourceKind};
 use ros2probe_testing::sample_robot;
 
 fn scrape(criterion: &mut Criterion) {

@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe::capture::filter_reader::{FilterReader, MAX_WAITING};
-use ros2probe::capture::system::Clocks;
-use ros2probe::model::observer::{Observer, Settings};
+use ros2probe_capture::filter_reader::{FilterReader, MAX_WAITING};
+use ros2probe_capture::system::Clocks;
+use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_testing::program_run::{self, Hook, Kernel};
 use ros2probe_wire::filter::{
     Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,

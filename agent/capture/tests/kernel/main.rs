@@ -1,4 +1,5 @@
-//! The kernel programs, run by the kernel itself. Needs root.
+//! The kernel programs, run by the kernel itself: on packets of a test, and on sockets in network
+//! namespaces. Needs root.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -9,3 +10,6 @@
 
 mod caps;
 mod filter;
+mod handed;
+mod host_hook;
+mod inside;
