@@ -15,6 +15,7 @@ use ros2probe::model::snapshot::{
     Snapshot, SocketFacts, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
     WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe::model::topic_kind::TopicKind;
 use ros2probe::state::StateFacts;
 use ros2probe::surface::{AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 use ros2probe_wire::discovery::TypeHash;
@@ -108,7 +109,7 @@ fn diagnoses() -> Diagnoses {
         domain_id: 0,
         dds_name: "rt/points".into(),
         name: "/points".into(),
-        kind: "topic",
+        kind: TopicKind::Topic,
     };
     let mut policies = Policies::default();
     policies.insert(Policy::Reliability);
@@ -223,7 +224,7 @@ pub fn topic(name: &str) -> TopicFacts {
         domain_id: 0,
         name: name.to_owned(),
         dds_name: format!("rt{name}"),
-        kind: "topic",
+        kind: TopicKind::Topic,
         hidden: false,
         message_types: vec!["sensor_msgs/msg/PointCloud2".to_owned()],
         type_hashes: Vec::new(),
