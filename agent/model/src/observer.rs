@@ -34,6 +34,7 @@ use super::selection::SampleRequest;
 use super::size::Size;
 use super::snapshot::{Measurement, Snapshot, WatchState};
 use super::topic::{Naming, Topic, TopicId, Topics, Watched};
+use super::topic_kind::TopicKind;
 use super::trace::{Tracer, WriterDescription};
 use super::transport::{lacks_names, may_share_memory};
 use super::wall_clock::WallClock;
@@ -1010,7 +1011,7 @@ impl Observer {
                 let counts = naming(endpoint).is_some_and(|naming| naming.counts);
                 let measured = is_watched && counts;
                 let verdict = match topic.naming.kind {
-                    "discovery" => Verdict::Capture,
+                    TopicKind::Discovery => Verdict::Capture,
                     _ if measured && wants_bytes(topic) => Verdict::Capture,
                     _ if measured => Verdict::Meter,
                     _ => Verdict::Ignore,

@@ -9,6 +9,7 @@ use regex::bytes::{Regex, RegexBuilder};
 
 use super::glob;
 use super::topic::Naming;
+use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
 
 /// Largest compiled form of one regular expression, in bytes, and as much again while it is matched.
@@ -177,14 +178,11 @@ impl Selection {
             .count()
     }
 
-    /// Whether this topic is wanted. `kind` as in [`super::snapshot::TopicFacts`]: requests and
-    /// replies of services, and what follows no ROS convention, go by their exact names alone.
+    /// Whether this topic is wanted. Requests and replies of services, and what follows no ROS
+    /// convention, go by their exact names alone.
     #[must_use]
-    pub fn covers(&self, kind: &str, name: &str, dds_name: &str, hidden: bool) -> bool {
-        let is_ros = !matches!(
-            kind,
-            "service_request" | "service_reply" | "discovery" | "dds"
-        );
+    pub fn covers(&self, kind: TopicKind, name: &str, dds_name: &str, hidden: bool) -> bool {
+        let is_ros = kind.is_ros_topic();
         // The ROS name of a request is the service's, which may be a topic's as well.
         let name = if is_ros { name } else { dds_name };
         let shown = self.hidden || !hidden;

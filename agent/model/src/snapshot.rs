@@ -16,6 +16,7 @@ pub use delivery::{
 use super::diagnosis::Diagnoses;
 use super::discovery::Addresses;
 use super::histogram::Histogram;
+use super::topic_kind::TopicKind;
 
 /// All facts at `at`. Lists are sorted by their identity.
 #[derive(Clone, Debug, Default)]
@@ -119,9 +120,8 @@ pub struct TopicFacts {
     pub name: String,
     /// DDS name.
     pub dds_name: String,
-    /// What kind of ROS channel: `topic`, `service_request`, `service_reply`, `service_event`,
-    /// `action_feedback`, `action_status`, `discovery`, `dds`.
-    pub kind: &'static str,
+    /// What kind of ROS channel.
+    pub kind: TopicKind,
     /// Hidden by ROS convention (a token begins with `_`).
     pub hidden: bool,
     /// Message types announced on it, ROS form, sorted; more than one is a fault.

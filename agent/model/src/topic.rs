@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::names::{ActionPart, DdsTopic, RosName, TopicKind};
+use ros2probe_wire::names::{DdsTopic, Demangled, RosName};
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::delivery::Totals;
@@ -16,6 +16,7 @@ use super::expectation::Judgement;
 use super::selection::{Depth, SampleRequest};
 use super::size::Size;
 use super::snapshot::Measurement;
+use super::topic_kind::TopicKind;
 use crate::watch::Watchlist;
 
 /// Handle of a topic.
@@ -29,8 +30,8 @@ pub struct Naming {
     pub dds_name: Arc<str>,
     /// ROS name, or the DDS name.
     pub name: Arc<str>,
-    /// Label of what it is.
-    pub kind: &'static str,
+    /// What it is.
+    pub kind: TopicKind,
     /// Hidden by ROS convention.
     pub hidden: bool,
     /// The endpoint serves the topic from beside it, and is not one of its publishers.
@@ -117,13 +118,14 @@ impl Naming {
     /// Of a DDS topic.
     #[must_use]
     pub fn of(topic: &DdsTopic) -> Self {
-        let kind = topic.kind();
-        let (is_buffer, counts) = match kind {
-            TopicKind::CpuBuffer(_) => (true, true),
-            TopicKind::Buffer(_) => (true, false),
+        let demangled = topic.demangle();
+        let kind = TopicKind::of_demangled(&demangled);
+        let (is_buffer, counts) = match demangled {
+            Demangled::CpuBuffer(_) => (true, true),
+            Demangled::Buffer(_) => (true, false),
             _ => (false, true),
         };
-        let named = |name: &RosName, kind: &'static str, dds_name: &DdsTopic| Self {
+        let named = |name: &RosName, dds_name: &DdsTopic| Self {
             dds_name: dds_name.as_str().into(),
             name: name.as_str().into(),
             kind,
@@ -131,19 +133,18 @@ impl Naming {
             is_buffer,
             counts,
         };
-        match &kind {
-            TopicKind::Topic(name) => named(name, topic_label(name), topic),
-            TopicKind::CpuBuffer(name) | TopicKind::Buffer(name) => {
-                named(name, topic_label(name), &DdsTopic::of_topic(name))
+        match &demangled {
+            Demangled::CpuBuffer(name) | Demangled::Buffer(name) => {
+                named(name, &DdsTopic::of_topic(name))
             }
-            TopicKind::ServiceRequest(name) => named(name, "service_request", topic),
-            TopicKind::ServiceReply(name) => named(name, "service_reply", topic),
-            TopicKind::RosDiscovery => Self::verbatim(topic, "discovery"),
-            TopicKind::NotRos => Self::verbatim(topic, "dds"),
+            Demangled::Topic(name)
+            | Demangled::ServiceRequest(name)
+            | Demangled::ServiceReply(name) => named(name, topic),
+            Demangled::RosDiscovery | Demangled::NotRos => Self::verbatim(topic, kind),
         }
     }
 
-    fn verbatim(topic: &DdsTopic, kind: &'static str) -> Self {
+    fn verbatim(topic: &DdsTopic, kind: TopicKind) -> Self {
         let name: Arc<str> = topic.as_str().into();
         Self {
             dds_name: Arc::clone(&name),
@@ -160,7 +161,7 @@ impl Naming {
     /// `/**` is every topic that `ros2 topic list` shows.
     fn covered_by(&self, domain_id: u32, watchlist: &Watchlist) -> Vec<usize> {
         let mut covering = watchlist.matching(domain_id, self.watched_as());
-        if self.hidden && !self.is_service() {
+        if self.hidden && !self.kind.is_service() {
             let names_hidden = |index: &usize| {
                 watchlist
                     .watches()
@@ -177,13 +178,9 @@ impl Naming {
         watchlist.names(domain_id, self.watched_as())
     }
 
-    fn is_service(&self) -> bool {
-        matches!(self.kind, "service_request" | "service_reply")
-    }
-
     /// The name that watches are about.
     fn watched_as(&self) -> &str {
-        if self.is_service() {
+        if self.kind.is_service() {
             &self.dds_name
         } else {
             &self.name
@@ -210,15 +207,6 @@ impl Naming {
             ids: of_depth(Depth::Arrivals),
             payloads: of_depth(Depth::Payloads),
         })
-    }
-}
-
-fn topic_label(name: &RosName) -> &'static str {
-    match name.action() {
-        Some((_, ActionPart::Feedback)) => "action_feedback",
-        Some((_, ActionPart::Status)) => "action_status",
-        _ if name.service_of_events().is_some() => "service_event",
-        _ => "topic",
     }
 }
 

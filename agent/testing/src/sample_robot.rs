@@ -19,6 +19,7 @@ use ros2probe_model::snapshot::{
     Snapshot, SocketFacts, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
     WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -110,7 +111,7 @@ fn diagnoses() -> Diagnoses {
         domain_id: 0,
         dds_name: "rt/points".into(),
         name: "/points".into(),
-        kind: "topic",
+        kind: TopicKind::Topic,
     };
     let mut policies = Policies::default();
     policies.insert(Policy::Reliability);
@@ -225,7 +226,7 @@ pub fn topic(name: &str) -> TopicFacts {
         domain_id: 0,
         name: name.to_owned(),
         dds_name: format!("rt{name}"),
-        kind: "topic",
+        kind: TopicKind::Topic,
         hidden: false,
         message_types: vec!["sensor_msgs/msg/PointCloud2".to_owned()],
         type_hashes: Vec::new(),

@@ -7,6 +7,7 @@ use serde::Deserialize;
 
 use crate::subscriptions::line::{QosFacts, seconds};
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
+use ros2probe_model::topic_kind::TopicKind;
 
 const VOLATILE: &str = "VOLATILE";
 
@@ -40,6 +41,12 @@ struct PassagePairs {
 #[derive(Clone, Copy, Debug, Deserialize)]
 struct Counted {
     messages: u64,
+}
+
+impl GraphTopic {
+    fn is_ros_topic(&self) -> bool {
+        TopicKind::parse(&self.kind).is_none_or(TopicKind::is_ros_topic)
+    }
 }
 
 /// The API's `/participants`: who sends without having been announced.
@@ -96,7 +103,7 @@ impl Graph {
         let topics = self.topics.into_iter();
         let topics = topics.filter(|topic| topic.domain_id == domain_id);
         let topics = topics.map(|topic| {
-            let name = if is_topic(&topic.kind) {
+            let name = if topic.is_ros_topic() {
                 topic.name
             } else {
                 topic.dds_name
@@ -111,7 +118,7 @@ impl Graph {
     pub fn into_snapshot(self, unknown_writers: UnknownWriterList) -> GraphSnapshot {
         let topics = self.topics.into_iter();
         let topics = topics
-            .filter(|topic| is_topic(&topic.kind) && !topic.announced.publishers.is_empty())
+            .filter(|topic| topic.is_ros_topic() && !topic.announced.publishers.is_empty())
             .map(|topic| {
                 let passages = topic.passages.iter();
                 let passages = passages.map(|each| (each.passage.as_str(), each.pairs));
@@ -142,7 +149,8 @@ impl Graph {
 impl From<&Snapshot> for GraphSnapshot {
     fn from(snapshot: &Snapshot) -> Self {
         let topics = snapshot.topics.iter();
-        let topics = topics.filter(|topic| is_topic(topic.kind) && !topic.publishers.is_empty());
+        let topics =
+            topics.filter(|topic| topic.kind.is_ros_topic() && !topic.publishers.is_empty());
         let unknown_writers = snapshot.unknown_writers.iter();
         Self {
             topics: topics.map(PublishedTopic::from).collect(),
@@ -171,14 +179,6 @@ impl From<&TopicFacts> for PublishedTopic {
             messages: facts.measurement.as_ref().map(|measured| measured.messages),
         }
     }
-}
-
-/// Neither half of a service, nor what follows no ROS convention.
-fn is_topic(kind: &str) -> bool {
-    !matches!(
-        kind,
-        "service_request" | "service_reply" | "discovery" | "dds"
-    )
 }
 
 fn other_transport<'a>(

@@ -13,6 +13,7 @@ use super::matching::{self, Offer, Policies, Policy, Verdict};
 use super::{Diagnosis, QosPairs, TopicKey, Unmatched};
 use crate::discovery::{Discovery, Endpoint};
 use crate::topic::Topic;
+use crate::topic_kind::TopicKind;
 
 /// Incompatible pairs listed of one topic.
 const PAIRS_PER_TOPIC: usize = 32;
@@ -247,7 +248,7 @@ fn list(
 /// node's `transition_event`, hidden topics, and the topics of services and actions.
 fn is_about_hearing(topic: &Topic) -> bool {
     let naming = &topic.naming;
-    naming.kind == "topic"
+    naming.kind == TopicKind::Topic
         && !naming.hidden
         && !matches!(&*naming.name, "/rosout" | "/parameter_events")
         && !naming.name.ends_with("/transition_event")

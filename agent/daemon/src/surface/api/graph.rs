@@ -19,6 +19,7 @@ use super::problem::Problem;
 use super::scope::Scope;
 use super::services::services;
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::topic_kind::TopicKind;
 
 /// The graph.
 #[derive(Debug, Serialize, ToSchema)]
@@ -129,7 +130,7 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> GraphView {
     for topic in &snapshot.topics {
         let is_topic = !matches!(
             topic.kind,
-            "service_request" | "service_reply" | "discovery"
+            TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery
         );
         let is_shown = scope.admits(topic.domain_id) && (scope.shows_hidden() || !topic.hidden);
         if is_topic && is_shown && !topic.vanished {

@@ -159,10 +159,7 @@ fn names(snapshot: &Snapshot, scope: Scope) -> NamesView<'_> {
 
 /// What `ros2` takes for a topic, while it has an endpoint.
 fn topic(facts: &TopicFacts) -> Option<TopicName<'_>> {
-    let is_topic = matches!(
-        facts.kind,
-        "topic" | "service_event" | "action_feedback" | "action_status"
-    );
+    let is_topic = facts.kind.is_ros_topic();
     let (publishers, subscriptions) = (facts.publishers.len(), facts.subscriptions.len());
     (is_topic && publishers + subscriptions > 0).then_some(TopicName {
         domain_id: facts.domain_id,

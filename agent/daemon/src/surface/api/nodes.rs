@@ -22,6 +22,7 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Scope, only};
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::snapshot::{NodeFacts, Snapshot};
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Nodes.
 #[derive(Debug, Serialize, ToSchema)]
@@ -229,7 +230,7 @@ impl<'a> Desk<'a> {
                 continue;
             }
             match (topic.kind, side) {
-                ("service_request" | "service_reply", Some(side)) => {
+                (TopicKind::ServiceRequest | TopicKind::ServiceReply, Some(side)) => {
                     let names = match side {
                         Side::Server => &mut services,
                         Side::Client => &mut clients,

@@ -19,6 +19,7 @@ use super::party::{Parties, PartyView, service_type};
 use super::problem::Problem;
 use super::scope::Scope;
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Services.
 #[derive(Debug, Serialize, ToSchema)]
@@ -100,10 +101,10 @@ pub(super) fn services(snapshot: &Snapshot, scope: Scope) -> BTreeMap<(u32, &str
         let is_shown = scope.admits(topic.domain_id) && (!topic.hidden || scope.shows_hidden());
         let key = (topic.domain_id, topic.name.as_str());
         match topic.kind {
-            "service_request" if is_shown => {
+            TopicKind::ServiceRequest if is_shown => {
                 services.entry(key).or_default().requests = Some(topic);
             }
-            "service_reply" if is_shown => {
+            TopicKind::ServiceReply if is_shown => {
                 services.entry(key).or_default().replies = Some(topic);
             }
             _ => {}

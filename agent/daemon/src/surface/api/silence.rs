@@ -168,9 +168,9 @@ impl<'a> Circumstances<'a> {
     }
 
     fn unwatched(&self, topic: &'a TopicFacts) -> (Cause, String) {
-        let name = match topic.kind {
-            "service_request" | "service_reply" => &topic.dds_name,
-            _ => &topic.name,
+        let name = match topic.kind.is_service() {
+            true => &topic.dds_name,
+            false => &topic.name,
         };
         let is_covered = !self.watchlist.matching(topic.domain_id, name).is_empty();
         if is_covered && !topic.hidden {

@@ -32,6 +32,7 @@ use crate::watches::InForce;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts, Transport,
 };
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Topics.
 #[derive(Debug, Serialize, ToSchema)]
@@ -221,7 +222,7 @@ async fn list(
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let desk = Desk::new(&state, &in_force);
     let topics = desk.snapshot.topics.iter().filter(|topic| {
-        let is_plain = matches!(topic.kind, "topic" | "dds") && !topic.hidden;
+        let is_plain = matches!(topic.kind, TopicKind::Topic | TopicKind::Dds) && !topic.hidden;
         scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
     });
     let answer = TopicsView {
@@ -350,10 +351,7 @@ pub(super) struct TopicParameter {
 
 /// By the ROS name of a topic; services and what is not ROS by their DDS names.
 fn is_called(topic: &TopicFacts, name: &str) -> bool {
-    let is_ros_topic = !matches!(
-        topic.kind,
-        "service_request" | "service_reply" | "discovery" | "dds"
-    );
+    let is_ros_topic = topic.kind.is_ros_topic();
     is_ros_topic && topic.name == name || name.strip_prefix('/') == Some(topic.dds_name.as_str())
 }
 
@@ -399,7 +397,7 @@ impl<'a> Desk<'a> {
             domain_id: facts.domain_id,
             name: &facts.name,
             dds_name: &facts.dds_name,
-            kind: facts.kind,
+            kind: facts.kind.label(),
             hidden: facts.hidden,
             vanished: facts.vanished,
             message_types: &facts.message_types,
