@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe::client;
 use ros2probe::client::{Lines, Next};
-use ros2probe::subscriptions::line::{Line, MissedFacts, SampleFacts};
+use ros2probe_api::samples::{Line, Missed, Sample};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -195,8 +195,8 @@ fn open<'a>(client: &'a client::Agent, query: &str, topic: &str) -> Result<Lines
 
 /// What a stream tells.
 enum News {
-    Sample(SampleFacts, Vec<u8>),
-    Missed(MissedFacts),
+    Sample(Sample, Vec<u8>),
+    Missed(Missed),
 }
 
 /// The next sample with its payload, or that there is none; `None` at the end.
