@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, anyhow, bail, ensure};
 use ros2probe::client;
 use ros2probe::client::{Lines, Next};
-use ros2probe::subscriptions::line::{Line, MissedFacts, SampleFacts};
+use ros2probe_api::samples::{Line, Missed, Sample};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -210,8 +210,8 @@ fn open<'a>(client: &'a client::Agent, query: &str, topic: &str) -> Result<Lines
 
 /// What a stream tells.
 enum News {
-    Sample(SampleFacts, Vec<u8>),
-    Missed(MissedFacts),
+    Sample(Sample, Vec<u8>),
+    Missed(Missed),
     /// The clock goes on, and nothing else came.
     Nothing,
 }

@@ -18,7 +18,7 @@ use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::payloads::{MissedReason, SampleOutcome};
 use ros2probe::model::selection::{Depth, SampleRequest, Selection};
 use ros2probe::model::snapshot::Snapshot;
-use ros2probe::subscriptions::line::Line;
+use ros2probe_api::samples::Line;
 use ros2probe_testing::local_agent;
 use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
