@@ -48,28 +48,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         (Stack::Cyclone, "/imu", 320, SMALL),
         (Stack::Fast, "/odom", 320, SMALL),
     ];
-    let mut pairs = Vec::new();
-    for (stack, topic, size, count) in streams {
-        let small = Stream::small(2 * count);
-        let stream = Stream {
-            topic: topic.to_owned(),
-            size,
-            rate: if size == CLOUD { 20.0 } else { small.rate },
-            reliable: true,
-            depth: if size == CLOUD { 20 } else { 1000 },
-            stretch: count,
-            linger: 60.0,
-            ..small
-        };
-        let subscriber = Peer::launch(&host, stack, Role::Subscriber, &stream, &["/map"])?;
-        let publisher = Peer::launch(&host, stack, Role::Publisher, &stream, &["/driver"])?;
-        pairs.push((topic, count, publisher, subscriber));
-    }
-    for (_, _, publisher, subscriber) in &mut pairs {
-        subscriber.wait_ready()?;
-        publisher.wait_ready()?;
-        publisher.wait_matched()?;
-    }
+    let mut pairs = start_pairs(&host, &streams)?;
     robot.agent.scrape_until("published", |page| {
         let is_known = |topic| page.sum("ros2_topic_publishers", &[("topic", topic)]) > 0.0;
         streams.iter().all(|(_, topic, ..)| is_known(topic))
@@ -94,33 +73,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         (robot.bags().join("all"), ended["report"].clone()),
         (by_client.clone(), report_of(&by_client)?),
     ] {
-        let numbers = numbers(&bag)?;
-        let mut messages = 0;
-        for (topic, count, publisher, _) in &pairs {
-            let sent = sent(publisher)?;
-            let recorded = numbers.get(*topic).cloned().unwrap_or_default();
-            messages += recorded.len();
-            let missing = missing(&report, topic);
-            eprintln!(
-                "{}: {topic}: {} of {} recorded, {missing} missing",
-                bag.display(),
-                recorded.len(),
-                sent.len()
-            );
-            ensure!(sent.len() as u64 == *count, "{topic}: {} sent", sent.len());
-            ensure!(recorded.is_subset(&sent), "{topic}");
-            if is_exact(&page) {
-                let all = recorded.len() as u64 + missing;
-                ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
-            }
-            ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
-        }
-        ensure!(report["messages"] == messages, "{messages} of {report:#}");
-        let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
-        ensure!(
-            code == Some(0) && info.contains(&format!("Messages:          {messages}\n")),
-            "{info}"
-        );
+        all_or_counted(&bag, &report, &pairs, &page)?;
     }
     if is_exact(&page) {
         for (topic, count, ..) in &pairs {
@@ -137,14 +90,82 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         }
     }
 
-    // A reader that does nothing for a while, with room for four clouds.
+    a_slow_reader_loses_the_largest(&robot, &mut pairs)
+}
+
+/// Topic, messages of each stretch, publisher and subscriber.
+type Pair = (&'static str, u64, Peer, Peer);
+
+fn start_pairs(
+    host: &Namespace,
+    streams: &[(Stack, &'static str, usize, u64)],
+) -> Result<Vec<Pair>> {
+    let mut pairs = Vec::new();
+    for (stack, topic, size, count) in streams.iter().copied() {
+        let small = Stream::small(2 * count);
+        let stream = Stream {
+            topic: topic.to_owned(),
+            size,
+            rate: if size == CLOUD { 20.0 } else { small.rate },
+            reliable: true,
+            depth: if size == CLOUD { 20 } else { 1000 },
+            stretch: count,
+            linger: 60.0,
+            ..small
+        };
+        let subscriber = Peer::launch(host, stack, Role::Subscriber, &stream, &["/map"])?;
+        let publisher = Peer::launch(host, stack, Role::Publisher, &stream, &["/driver"])?;
+        pairs.push((topic, count, publisher, subscriber));
+    }
+    for (_, _, publisher, subscriber) in &mut pairs {
+        subscriber.wait_ready()?;
+        publisher.wait_ready()?;
+        publisher.wait_matched()?;
+    }
+    Ok(pairs)
+}
+
+/// Each message of the first stretch is in the bag, or its report counts it as missing.
+fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> Result<()> {
+    let numbers = numbers(bag)?;
+    let mut messages = 0;
+    for (topic, count, publisher, _) in pairs {
+        let sent = sent(publisher)?;
+        let recorded = numbers.get(*topic).cloned().unwrap_or_default();
+        messages += recorded.len();
+        let missing = missing(report, topic);
+        eprintln!(
+            "{}: {topic}: {} of {} recorded, {missing} missing",
+            bag.display(),
+            recorded.len(),
+            sent.len()
+        );
+        ensure!(sent.len() as u64 == *count, "{topic}: {} sent", sent.len());
+        ensure!(recorded.is_subset(&sent), "{topic}");
+        if is_exact(page) {
+            let all = recorded.len() as u64 + missing;
+            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+        }
+        ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
+    }
+    ensure!(report["messages"] == messages, "{messages} of {report:#}");
+    let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
+    ensure!(
+        code == Some(0) && info.contains(&format!("Messages:          {messages}\n")),
+        "{info}"
+    );
+    Ok(())
+}
+
+/// A reader that does nothing for a while, with room for four clouds.
+fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Result<()> {
     let arguments = ["/front", "/imu", "--max-cache-size", "3000000"];
-    let mut slow = Recorder::start(&robot, "slow", &arguments)?;
+    let mut slow = Recorder::start(robot, "slow", &arguments)?;
     slow.process.signal("STOP")?;
-    for (_, _, publisher, _) in &mut pairs {
+    for (_, _, publisher, _) in pairs.iter_mut() {
         publisher.go()?;
     }
-    let page = settled(&robot, &pairs, 2)?;
+    let page = settled(robot, pairs, 2)?;
     let memory = Usage::of(robot.agent.process.pid())?.memory.unreclaimable;
     let queued = page.sum("ros2probe_queued_bytes", &[]);
     eprintln!("agent {} MB with {queued} bytes queued", memory >> 20);
@@ -157,7 +178,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     ensure!(slow.interrupt()?.code() == Some(0), "{}", slow.stderr());
     let bag = robot.directory.path().join("slow");
     let (numbers, report) = (numbers(&bag)?, report_of(&bag)?);
-    for (topic, count, publisher, _) in &pairs {
+    for (topic, count, publisher, _) in &*pairs {
         let Some(recorded) = numbers.get(*topic) else {
             ensure!(!matches!(*topic, "/front" | "/imu"), "{topic}: {report:#}");
             continue;

@@ -55,136 +55,150 @@ fn wait_for(agent: &LocalAgent, path: &str, wanted: impl Fn(&Value) -> bool) -> 
     }
 }
 
+const JSON: &str = "Content-Type: application/json\r\n";
+const FORM: &str = "Content-Type: application/x-www-form-urlencoded\r\n";
+
+/// Method, path, headers and body of a request; status, code and words of its answer.
+type Refused = (
+    &'static str,
+    &'static str,
+    &'static str,
+    &'static str,
+    u16,
+    &'static str,
+    &'static str,
+);
+
+const REFUSED: [Refused; 18] = [
+    ("GET", "/watches", "", "", 404, "not-found", "/openapi.json"),
+    ("GET", "/watch/", "", "", 404, "not-found", ""),
+    (
+        "PATCH",
+        "/watch/a",
+        "",
+        "",
+        405,
+        "method-not-allowed",
+        "PATCH",
+    ),
+    ("POST", "/watch/2d", "", "", 422, "invalid-request", "digit"),
+    ("POST", "/watch/a/", "", "", 422, "invalid-request", "token"),
+    (
+        "POST",
+        "/watch/a%20b",
+        "",
+        "",
+        422,
+        "invalid-request",
+        "letters",
+    ),
+    (
+        "POST",
+        "/watch/a%ff",
+        "",
+        "",
+        400,
+        "malformed-request",
+        "UTF-8",
+    ),
+    (
+        "POST",
+        "/watch/a?domain=5",
+        "",
+        "",
+        400,
+        "malformed-request",
+        "domain",
+    ),
+    (
+        "POST",
+        "/watch/a?domain_id=300",
+        "",
+        "",
+        422,
+        "invalid-request",
+        "232",
+    ),
+    (
+        "POST",
+        "/watch/a",
+        "",
+        "{}",
+        415,
+        "unsupported-media-type",
+        "application/json",
+    ),
+    (
+        "POST",
+        "/watch/a",
+        FORM,
+        "{}",
+        415,
+        "unsupported-media-type",
+        "application/json",
+    ),
+    (
+        "POST",
+        "/watch/a",
+        JSON,
+        "{",
+        400,
+        "malformed-request",
+        "EOF",
+    ),
+    ("POST", "/watch/a", JSON, "[]", 422, "invalid-request", ""),
+    (
+        "POST",
+        "/watch/a",
+        JSON,
+        "{\"max_loss\": 1}",
+        422,
+        "invalid-request",
+        "max_loss_ratio",
+    ),
+    (
+        "POST",
+        "/watch/a",
+        JSON,
+        "{\"max_loss_ratio\": 2}",
+        422,
+        "invalid-request",
+        "1",
+    ),
+    (
+        "PUT",
+        "/watch/a",
+        JSON,
+        "{\"domain_id\": 233}",
+        422,
+        "invalid-request",
+        "232",
+    ),
+    (
+        "PUT",
+        "/watch/a?domain_id=1",
+        JSON,
+        "{\"domain_id\": 2}",
+        422,
+        "invalid-request",
+        "query",
+    ),
+    (
+        "POST",
+        "/-/reload",
+        "",
+        "",
+        409,
+        "nothing-to-reload",
+        "without a configuration file",
+    ),
+];
+
 #[test]
 fn what_cannot_be_is_answered_with_a_problem_that_says_why() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
-    let json = "Content-Type: application/json\r\n";
-    let form = "Content-Type: application/x-www-form-urlencoded\r\n";
-    for (method, path, headers, body, status, code, says) in [
-        ("GET", "/watches", "", "", 404, "not-found", "/openapi.json"),
-        ("GET", "/watch/", "", "", 404, "not-found", ""),
-        (
-            "PATCH",
-            "/watch/a",
-            "",
-            "",
-            405,
-            "method-not-allowed",
-            "PATCH",
-        ),
-        ("POST", "/watch/2d", "", "", 422, "invalid-request", "digit"),
-        ("POST", "/watch/a/", "", "", 422, "invalid-request", "token"),
-        (
-            "POST",
-            "/watch/a%20b",
-            "",
-            "",
-            422,
-            "invalid-request",
-            "letters",
-        ),
-        (
-            "POST",
-            "/watch/a%ff",
-            "",
-            "",
-            400,
-            "malformed-request",
-            "UTF-8",
-        ),
-        (
-            "POST",
-            "/watch/a?domain=5",
-            "",
-            "",
-            400,
-            "malformed-request",
-            "domain",
-        ),
-        (
-            "POST",
-            "/watch/a?domain_id=300",
-            "",
-            "",
-            422,
-            "invalid-request",
-            "232",
-        ),
-        (
-            "POST",
-            "/watch/a",
-            "",
-            "{}",
-            415,
-            "unsupported-media-type",
-            "application/json",
-        ),
-        (
-            "POST",
-            "/watch/a",
-            form,
-            "{}",
-            415,
-            "unsupported-media-type",
-            "application/json",
-        ),
-        (
-            "POST",
-            "/watch/a",
-            json,
-            "{",
-            400,
-            "malformed-request",
-            "EOF",
-        ),
-        ("POST", "/watch/a", json, "[]", 422, "invalid-request", ""),
-        (
-            "POST",
-            "/watch/a",
-            json,
-            "{\"max_loss\": 1}",
-            422,
-            "invalid-request",
-            "max_loss_ratio",
-        ),
-        (
-            "POST",
-            "/watch/a",
-            json,
-            "{\"max_loss_ratio\": 2}",
-            422,
-            "invalid-request",
-            "1",
-        ),
-        (
-            "PUT",
-            "/watch/a",
-            json,
-            "{\"domain_id\": 233}",
-            422,
-            "invalid-request",
-            "232",
-        ),
-        (
-            "PUT",
-            "/watch/a?domain_id=1",
-            json,
-            "{\"domain_id\": 2}",
-            422,
-            "invalid-request",
-            "query",
-        ),
-        (
-            "POST",
-            "/-/reload",
-            "",
-            "",
-            409,
-            "nothing-to-reload",
-            "without a configuration file",
-        ),
-    ] {
+    for (method, path, headers, body, status, code, says) in REFUSED {
         let answer = ask(&agent, method, path, headers, body);
         let case = format!("{method} {path} {body}: {}", answer.body);
         assert_eq!(problem(&answer), (status, code.to_owned()), "{case}");
@@ -193,7 +207,7 @@ fn what_cannot_be_is_answered_with_a_problem_that_says_why() {
     let refused = ask(&agent, "PATCH", "/watch/a", "", "");
     assert!(refused.headers.contains("allow: "), "{}", refused.headers);
     // What has no body may say what it likes about it; a name may come whole.
-    assert_eq!(ask(&agent, "POST", "/watch/%2Fa", form, "").status, 201);
+    assert_eq!(ask(&agent, "POST", "/watch/%2Fa", FORM, "").status, 201);
     assert_eq!(ask(&agent, "GET", "/watch/a", "", "").status, 200);
     let document: Value =
         serde_json::from_str(&ask(&agent, "GET", "/openapi.json", "", "").body).unwrap();
