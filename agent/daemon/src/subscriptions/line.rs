@@ -203,7 +203,7 @@ impl From<&Sample> for SampleFacts {
         let len = |payload: &bytes::Bytes| u32::try_from(payload.len()).unwrap_or(u32::MAX);
         Self {
             topic: name.to_string(),
-            domain_id: *domain_id,
+            domain_id: domain_id.0,
             message_type: message_type.to_string(),
             time_ns: nanoseconds(sample.time),
             writer: sample.writer.to_string(),
@@ -222,7 +222,7 @@ impl From<&Missed> for MissedFacts {
     fn from(missed: &Missed) -> Self {
         Self {
             topic: missed.topic.name.to_string(),
-            domain_id: missed.topic.domain_id,
+            domain_id: missed.topic.domain_id.0,
             writer: missed.writer.to_string(),
             samples: missed.samples,
             first_sequence_number: missed.first,

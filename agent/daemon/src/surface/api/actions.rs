@@ -18,6 +18,7 @@ use super::party::{Parties, PartyView, action, action_type};
 use super::problem::Problem;
 use super::scope::Scope;
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_wire::DomainId;
 
 /// Actions.
 #[derive(Debug, Serialize, ToSchema)]
@@ -76,7 +77,7 @@ async fn list(
     let answer = ActionsView {
         timestamp_seconds: snapshot.at.seconds(),
         actions: actions
-            .filter_map(|((domain_id, name), parts)| view(domain_id, name, &parts, &index))
+            .filter_map(|((domain_id, name), parts)| view(domain_id.0, name, &parts, &index))
             .collect(),
     };
     Ok(Json(answer).into_response())
@@ -86,7 +87,7 @@ async fn list(
 pub(super) fn actions(
     snapshot: &Snapshot,
     scope: Scope,
-) -> BTreeMap<(u32, String), Vec<&TopicFacts>> {
+) -> BTreeMap<(DomainId, String), Vec<&TopicFacts>> {
     let mut actions: BTreeMap<_, Vec<_>> = BTreeMap::new();
     let admitted = snapshot.topics.iter();
     for topic in admitted.filter(|topic| scope.admits(topic.domain_id)) {

@@ -73,7 +73,7 @@ pub(super) enum FindingView<'a> {
     /// One node in several domains on one machine.
     NodeInSeveralDomains {
         /// Domains.
-        domains: &'a [u32],
+        domains: Vec<u32>,
     },
 }
 
@@ -110,9 +110,9 @@ impl<'a> From<&'a Diagnosis> for FindingView<'a> {
                 reader: *reader,
                 reason: reason.label(),
             },
-            Diagnosis::NodeInSeveralDomains { domains, .. } => {
-                Self::NodeInSeveralDomains { domains }
-            }
+            Diagnosis::NodeInSeveralDomains { domains, .. } => Self::NodeInSeveralDomains {
+                domains: domains.iter().map(|id| id.0).collect(),
+            },
         }
     }
 }

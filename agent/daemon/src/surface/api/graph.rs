@@ -124,7 +124,7 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> GraphView {
     for node in &snapshot.nodes {
         let is_hidden = node.name.split('/').any(|token| token.starts_with('_'));
         if scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden) {
-            drawing.vertex(VertexKind::Node, node.domain_id, &node.name);
+            drawing.vertex(VertexKind::Node, node.domain_id.0, &node.name);
         }
     }
     for topic in &snapshot.topics {
@@ -139,11 +139,11 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> GraphView {
     }
     for ((domain_id, name), halves) in services(snapshot, scope) {
         let [servers, clients] = halves.parties().views();
-        drawing.joint(VertexKind::Service, domain_id, name, &servers, &clients);
+        drawing.joint(VertexKind::Service, domain_id.0, name, &servers, &clients);
     }
     for ((domain_id, name), parts) in actions(snapshot, scope) {
         let [servers, clients] = parties(&parts).views();
-        drawing.joint(VertexKind::Action, domain_id, &name, &servers, &clients);
+        drawing.joint(VertexKind::Action, domain_id.0, &name, &servers, &clients);
     }
     drawing.view(snapshot)
 }
@@ -178,11 +178,11 @@ impl Drawing {
 
     fn topic(&mut self, facts: &TopicFacts) {
         let domain_id = facts.domain_id;
-        let topic = self.vertex(VertexKind::Topic, domain_id, &facts.name);
+        let topic = self.vertex(VertexKind::Topic, domain_id.0, &facts.name);
         let whose = |guid: Guid| Guid::new(guid.prefix, EntityId::PARTICIPANT);
         for publisher in &facts.publishers {
             let who = (publisher.node.as_deref(), whose(publisher.guid));
-            let node = self.party(domain_id, who);
+            let node = self.party(domain_id.0, who);
             let rate = publisher.measurement.as_ref().map(|it| it.rate_hz);
             let key = (node, topic.clone(), EdgeKind::Publishes);
             let sum = self.edges.entry(key).or_default();
@@ -192,7 +192,7 @@ impl Drawing {
         }
         for subscription in &facts.subscriptions {
             let who = (subscription.node.as_deref(), whose(subscription.guid));
-            let node = self.party(domain_id, who);
+            let node = self.party(domain_id.0, who);
             let key = (topic.clone(), node, EdgeKind::Feeds);
             self.edges.insert(key, None);
         }

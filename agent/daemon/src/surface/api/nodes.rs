@@ -242,7 +242,7 @@ impl<'a> Desk<'a> {
             }
         }
         Some(NodeView {
-            domain_id: first.domain_id,
+            domain_id: first.domain_id.0,
             name: &first.name,
             hidden: is_hidden(&first.name),
             instances: nodes.iter().map(|node| self.instance(node)).collect(),

@@ -148,7 +148,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> ParticipantView
     let counts = counts.get(&facts.guid.prefix);
     ParticipantView {
         guid: facts.guid,
-        domain_id: facts.domain_id,
+        domain_id: facts.domain_id.0,
         vendor: &facts.vendor,
         enclave: facts.enclave.as_deref(),
         process: (&facts.process).into(),

@@ -394,7 +394,7 @@ impl<'a> Desk<'a> {
             view: (count.transport == Transport::SharedMemory).then(|| self.view(facts)),
         });
         TopicView {
-            domain_id: facts.domain_id,
+            domain_id: facts.domain_id.0,
             name: &facts.name,
             dds_name: &facts.dds_name,
             kind: facts.kind.label(),
@@ -441,10 +441,12 @@ impl<'a> Desk<'a> {
     }
 
     fn watching(&self, (watch, topic): Watching<'a>) -> WatchingView<'a> {
-        let entry = self.in_force.find(&watch.pattern, watch.domain_id);
+        let entry = self
+            .in_force
+            .find(&watch.pattern, watch.domain_id.map(|id| id.0));
         WatchingView {
             watch: &watch.pattern,
-            watch_domain_id: watch.domain_id,
+            watch_domain_id: watch.domain_id.map(|id| id.0),
             origin: entry.map(|entry| entry.origin.label()),
             state: topic.state.label(),
             violations: &topic.violations,

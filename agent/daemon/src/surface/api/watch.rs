@@ -3,6 +3,7 @@
 //! A watch is known by its topic, a name or a glob as in the configuration file, and its domain.
 //! POST adds and never changes what is there; PUT adds or replaces.
 
+use ros2probe_wire::DomainId;
 use std::sync::Arc;
 
 use axum::Json;
@@ -20,7 +21,7 @@ use super::body::Body;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
-use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
+use crate::config::watch::{Expectations, Retain, Watch, check_pattern, check_trace};
 use crate::watches::{Done, Entry, Origin, Refused};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
 
@@ -218,8 +219,11 @@ impl Domain {
     /// Refuses a domain that cannot be.
     fn checked(self) -> Result<Self, Problem> {
         match self.domain_id {
-            Some(domain_id) if domain_id > MAX_DOMAIN => {
-                let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+            Some(domain_id) if domain_id > DomainId::MAX.0 => {
+                let detail = format!(
+                    "domain_id is {domain_id}, must be at most {}",
+                    DomainId::MAX
+                );
                 Err(Problem::new(Code::MalformedRequest, detail))
             }
             _ => Ok(self),
@@ -393,9 +397,10 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         }
         (one, other) => one.or(other),
     };
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > DomainId::MAX.0) {
         return invalid(format!(
-            "domain_id is {domain_id}, must be between 0 and {MAX_DOMAIN}"
+            "domain_id is {domain_id}, must be between 0 and {}",
+            DomainId::MAX
         ));
     }
     let expectations = Expectations {
@@ -409,7 +414,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
     match expectations.check().and_then(|()| check_trace(trace)) {
         Ok(()) => Ok(Watch {
             pattern: topic,
-            domain_id,
+            domain_id: domain_id.map(DomainId),
             expectations,
             per_subscriber: settings.per_subscriber,
             trace,
@@ -424,10 +429,13 @@ fn answer(
     watch: &Watch,
     done: Result<Done, Refused>,
 ) -> Result<Response, Problem> {
-    let done = done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id))?;
+    let done =
+        done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id.map(|id| id.0)))?;
     let in_force = context.watches.in_force();
     // Gone again already: somebody else removes while this one adds.
-    let entry = in_force.find(&watch.pattern, watch.domain_id).cloned();
+    let entry = in_force
+        .find(&watch.pattern, watch.domain_id.map(|id| id.0))
+        .cloned();
     let entry = entry.unwrap_or_else(|| Entry {
         watch: Arc::new(watch.clone()),
         origin: Origin::Api,
@@ -498,7 +506,7 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
     };
     WatchView {
         topic: watch.pattern.clone(),
-        domain_id: watch.domain_id,
+        domain_id: watch.domain_id.map(|id| id.0),
         origin: match entry.origin {
             Origin::Config => OriginView::Config,
             Origin::CommandLine => OriginView::CommandLine,
@@ -528,10 +536,10 @@ impl From<&Expectations> for ExpectationsView {
 fn stage(watch: &Watch, snapshot: &Snapshot, facts: &WatchFacts) -> Stage {
     let measured = |topic: &str, domain_id: u32| {
         let mut topics = snapshot.topics.iter();
-        topics.any(|facts| facts.domain_id == domain_id && facts.name == topic)
+        topics.any(|facts| facts.domain_id == DomainId(domain_id) && facts.name == topic)
     };
     let mut covered = facts.topics.iter();
-    if covered.any(|topic| measured(&topic.topic, topic.domain_id)) {
+    if covered.any(|topic| measured(&topic.topic, topic.domain_id.0)) {
         Stage::Measuring
     } else if watch.is_literal() && facts.topics.is_empty() {
         Stage::Rejected
@@ -548,7 +556,7 @@ fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<TopicView> {
         let mut measurement = snapshot.topics.iter().filter(same);
         let measurement = measurement.find_map(|facts| facts.measurement.as_deref());
         TopicView {
-            domain_id: watched.domain_id,
+            domain_id: watched.domain_id.0,
             topic: watched.topic.clone(),
             state: match watched.state {
                 WatchState::Ok => TopicState::Ok,
