@@ -313,7 +313,7 @@ fn check_participants(facts: &Value, found: &Found) {
         let domain = theirs["other"]["0x000f"].as_str();
         let ours = participant
             .domain_id
-            .map(|id| id.to_le_bytes().map(|b| format!("{b:02x}")));
+            .map(|id| id.0.to_le_bytes().map(|b| format!("{b:02x}")));
         assert_eq!(
             domain.map(Into::into),
             ours.map(|bytes| bytes.concat()),

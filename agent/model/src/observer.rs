@@ -14,7 +14,7 @@ use ros2probe_wire::record::{Body, Handover, Sample, Verdict, flag};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 
 use super::diagnosis::{self, Examiner};
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin, Priority, endpoints_of};
@@ -459,7 +459,10 @@ impl Observer {
     }
 
     /// All that was counted by `now` of each topic that is measured: domain, DDS name and counts.
-    pub fn measured(&self, now: Timestamp) -> impl Iterator<Item = (u32, &Arc<str>, Measurement)> {
+    pub fn measured(
+        &self,
+        now: Timestamp,
+    ) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
         super::report::measured(self, self.wall_clock.model_time(now))
     }
 

@@ -3,6 +3,7 @@
 //! A subscription's choice, matched against topics as they appear. It decides nothing about
 //! measuring beyond that: the watchlist has its own patterns.
 
+use ros2probe_wire::DomainId;
 use std::sync::Arc;
 
 use regex::bytes::{Regex, RegexBuilder};
@@ -77,7 +78,7 @@ pub struct SampleRequest {
     /// Which topics.
     pub selection: Arc<Selection>,
     /// Only of this domain; `None` = every domain.
-    pub domain_id: Option<u32>,
+    pub domain_id: Option<DomainId>,
     /// How much of them.
     pub depth: Depth,
 }
@@ -195,7 +196,7 @@ impl Selection {
 impl SampleRequest {
     /// Whether it is for this topic.
     #[must_use]
-    pub fn covers(&self, domain_id: u32, naming: &Naming) -> bool {
+    pub fn covers(&self, domain_id: DomainId, naming: &Naming) -> bool {
         self.domain_id.is_none_or(|wanted| wanted == domain_id)
             && self
                 .selection
@@ -214,11 +215,11 @@ mod tests {
         let request = SampleRequest {
             id: 1,
             selection: Arc::new(selection.clone()),
-            domain_id: Some(3),
+            domain_id: Some(DomainId(3)),
             depth: Depth::Arrivals,
         };
-        assert!(!request.covers(4, &naming));
-        request.covers(3, &naming)
+        assert!(!request.covers(DomainId(4), &naming));
+        request.covers(DomainId(3), &naming)
     }
 
     #[test]

@@ -26,7 +26,7 @@ use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
 use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
 const STRING: &str = "std_msgs::msg::dds_::String_";
@@ -265,7 +265,7 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
 
 fn sample(number: u64) -> Dispatch {
     let topic = Topic {
-        domain_id: 0,
+        domain_id: DomainId(0),
         name: "/points".into(),
         dds_name: "rt/points".into(),
         message_type: "a/msg/B".into(),

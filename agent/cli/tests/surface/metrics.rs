@@ -1,5 +1,6 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
 
+use ros2probe_wire::DomainId;
 use std::collections::BTreeSet;
 use std::net::Ipv4Addr;
 use std::path::Path;
@@ -375,14 +376,14 @@ fn no_series_appears_twice() {
 #[test]
 fn a_watched_topic_that_nobody_announced_begins_with_zero() {
     let missing = WatchedTopicFacts {
-        domain_id: 0,
+        domain_id: DomainId(0),
         topic: "/cmd_vel".to_owned(),
         state: WatchState::NotPublished,
         violations: Vec::new(),
     };
     let watch = WatchFacts {
         pattern: "/cmd_vel".to_owned(),
-        domain_id: Some(0),
+        domain_id: Some(DomainId(0)),
         topics: vec![missing],
     };
     let snapshot = Snapshot {

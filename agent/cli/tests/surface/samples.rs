@@ -24,7 +24,7 @@ use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
@@ -101,7 +101,7 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<SampleOutcom
 }
 
 /// Samples and their bytes by topic, each sample checked to be the next and the only one.
-fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(u32, String), (u64, u64)> {
+fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
     let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     let mut last = 0;

@@ -127,7 +127,7 @@ impl From<&TopicFacts> for PublishedTopic {
         let publishers = facts.publishers.iter();
         let durable_publishers = publishers.filter(|publisher| publisher.durability != VOLATILE);
         Self {
-            domain_id: facts.domain_id,
+            domain_id: facts.domain_id.0,
             name: facts.name.clone(),
             message_types: facts.message_types.clone(),
             subscribed: !facts.subscriptions.is_empty(),

@@ -600,6 +600,7 @@ impl std::fmt::Debug for Recorder<'_> {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;
@@ -619,7 +620,7 @@ mod tests {
 
     fn topic(name: &str, message_type: &str) -> Arc<Topic> {
         Arc::new(Topic {
-            domain_id: 0,
+            domain_id: DomainId(0),
             name: name.into(),
             dds_name: format!("rt{name}").into(),
             message_type: message_type.into(),

@@ -15,6 +15,7 @@ use ros2probe_model::snapshot::{
     WatchState,
 };
 use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_wire::DomainId;
 
 /// Unknown writers with series of their own.
 const MAX_UNKNOWN_WRITERS: usize = 32;
@@ -49,7 +50,7 @@ impl<'a> TopicRows<'a> {
     /// Topics that are measured come first; services and other plumbing are shown when measured.
     pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
         let max_topics = settings.limits.topics;
-        let mut rows: BTreeMap<(u32, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
+        let mut rows: BTreeMap<(DomainId, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
         let mut hidden = 0;
         let shown = |facts: &&TopicFacts| {
             facts.measurement.is_some() || matches!(facts.kind, TopicKind::Topic | TopicKind::Dds)
@@ -69,7 +70,7 @@ impl<'a> TopicRows<'a> {
                 rows.insert(
                     key,
                     TopicRow {
-                        domain_id,
+                        domain_id: domain_id.0,
                         name,
                         facts: Some(facts),
                         watched: false,
@@ -97,7 +98,7 @@ impl<'a> TopicRows<'a> {
                 rows.insert(
                     key,
                     TopicRow {
-                        domain_id,
+                        domain_id: domain_id.0,
                         name,
                         facts: None,
                         watched: true,
@@ -140,7 +141,7 @@ pub(super) fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str)
 
 /// The graph.
 pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
-    let mut domains: BTreeMap<u32, (usize, usize, usize)> = BTreeMap::new();
+    let mut domains: BTreeMap<DomainId, (usize, usize, usize)> = BTreeMap::new();
     for participant in &snapshot.participants {
         let counts = domains.entry(participant.domain_id).or_default();
         counts.0 += 1;
@@ -150,7 +151,7 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         domains.entry(node.domain_id).or_default().2 += 1;
     }
     if domains.is_empty() {
-        domains.insert(0, (0, 0, 0));
+        domains.insert(DomainId(0), (0, 0, 0));
     }
     sink.family(&metric::PARTICIPANTS, |family| {
         per_domain(family, &domains, |counts| counts.0)
@@ -177,7 +178,7 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         })
     })?;
     sink.family(&metric::TOPICS, |family| {
-        let mut kinds: BTreeMap<(u32, TopicKind), usize> = BTreeMap::new();
+        let mut kinds: BTreeMap<(DomainId, TopicKind), usize> = BTreeMap::new();
         for topic in snapshot.topics.iter().filter(|topic| !topic.vanished) {
             *kinds.entry((topic.domain_id, topic.kind)).or_default() += 1;
         }
@@ -238,7 +239,7 @@ fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
 
 fn per_domain(
     family: &mut Family<'_, '_>,
-    domains: &BTreeMap<u32, (usize, usize, usize)>,
+    domains: &BTreeMap<DomainId, (usize, usize, usize)>,
     count: fn(&(usize, usize, usize)) -> usize,
 ) -> fmt::Result {
     domains.iter().try_for_each(|(domain_id, counts)| {

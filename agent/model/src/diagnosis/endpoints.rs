@@ -1,5 +1,6 @@
 //! One topic: do its writers and readers understand each other, and has each one somebody?
 
+use ros2probe_wire::DomainId;
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -24,7 +25,7 @@ const MAX_NAMED: usize = 16;
 #[derive(Debug)]
 pub(super) struct EndpointExaminer<'a> {
     discovery: &'a Discovery,
-    half_known: BTreeSet<u32>,
+    half_known: BTreeSet<DomainId>,
 }
 
 /// An endpoint without a counterpart: a finding once it lasts.

@@ -178,7 +178,7 @@ impl<'a> Desk<'a> {
             }
         }
         Some(Node {
-            domain_id: first.domain_id,
+            domain_id: first.domain_id.0,
             name: Cow::Borrowed(&first.name),
             hidden: is_hidden(&first.name),
             instances: nodes.iter().map(|node| self.instance(node)).collect(),

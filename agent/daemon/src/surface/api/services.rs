@@ -20,6 +20,7 @@ use super::scope::Scope;
 use ros2probe_api::services::{Service, ServiceList};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
 use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_wire::DomainId;
 
 /// A service's topics, as far as they are there.
 #[derive(Debug, Default)]
@@ -52,14 +53,17 @@ async fn list(
         timestamp_seconds: snapshot.at.seconds(),
         services: services(snapshot, scope)
             .into_iter()
-            .filter_map(|((domain_id, name), halves)| view(domain_id, name, &halves, &index))
+            .filter_map(|((domain_id, name), halves)| view(domain_id.0, name, &halves, &index))
             .collect(),
     };
     Ok(Json(answer).into_response())
 }
 
 /// Services by domain and name.
-pub(super) fn services(snapshot: &Snapshot, scope: Scope) -> BTreeMap<(u32, &str), Halves<'_>> {
+pub(super) fn services(
+    snapshot: &Snapshot,
+    scope: Scope,
+) -> BTreeMap<(DomainId, &str), Halves<'_>> {
     let mut services: BTreeMap<_, Halves<'_>> = BTreeMap::new();
     for topic in &snapshot.topics {
         let is_shown = scope.admits(topic.domain_id) && (!topic.hidden || scope.shows_hidden());

@@ -232,7 +232,7 @@ impl<'a> Desk<'a> {
             view: (count.transport == Transport::SharedMemory).then(|| self.view(facts).into()),
         });
         Topic {
-            domain_id: facts.domain_id,
+            domain_id: facts.domain_id.0,
             name: Cow::Borrowed(&facts.name),
             dds_name: Cow::Borrowed(&facts.dds_name),
             kind: Cow::Borrowed(facts.kind.label()),
@@ -279,10 +279,12 @@ impl<'a> Desk<'a> {
     }
 
     fn watching(&self, (watch, topic): Standing<'a>) -> Watching<'a> {
-        let entry = self.in_force.find(&watch.pattern, watch.domain_id);
+        let entry = self
+            .in_force
+            .find(&watch.pattern, watch.domain_id.map(|id| id.0));
         Watching {
             watch: Cow::Borrowed(&watch.pattern),
-            watch_domain_id: watch.domain_id,
+            watch_domain_id: watch.domain_id.map(|id| id.0),
             origin: entry.map(|entry| entry.origin.label().into()),
             state: topic.state.label().into(),
             violations: texts(&topic.violations),
