@@ -133,7 +133,7 @@ async fn samples(
         let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
-    let is_replay = context.board.state().agent.source == SourceKind::Replay;
+    let is_replay = context.latest.state().agent.source == SourceKind::Replay;
     let (depth, queue_bytes, media_type) = if wanted.payload {
         (Depth::Payloads, PAYLOADS_BYTES, SAMPLES)
     } else {
@@ -157,12 +157,12 @@ async fn samples(
         Problem::new(Code::TooManySubscriptions, refused.to_string())
     })?;
     let known = if is_replay {
-        context.board.state()
+        context.latest.state()
     } else {
         subscription.in_force(PATIENCE).await;
         context.state().await
     };
-    let most = context.board.limits().caps().topics;
+    let most = context.limits.caps().topics;
     let first = Line::Open(Open {
         topics: topics(known.known(), subscription.selection(), domain_id, most),
     });
