@@ -16,7 +16,7 @@ use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe::surface::events;
 use ros2probe::surface::otlp::Signal;
 use ros2probe::surface::{
-    Ability, AgentFacts, Board, Exposition, Format, Settings, SnapshotFigures, SourceKind,
+    Ability, AgentFacts, Exposition, Format, MetricSources, Settings, SnapshotFigures, SourceKind,
 };
 use ros2probe_testing::local_agent::promtool;
 use ros2probe_testing::sample_robot;
@@ -39,13 +39,14 @@ fn settings() -> Settings {
 }
 
 fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
-    let board = Arc::new(Board::new(SourceKind::Wire, settings));
-    board.publish(snapshot, sample_robot::agent());
-    board.exports().enable(Signal::Metrics);
-    board
-        .recordings()
+    let sources = MetricSources::new(SourceKind::Wire, settings);
+    let state = sources.latest.publish(snapshot, sample_robot::agent());
+    sources.limits.note(&state);
+    sources.exports.enable(Signal::Metrics);
+    sources
+        .recordings
         .snapshot("incident", SnapshotFigures::default());
-    Exposition::new(board).render(format).unwrap()
+    Exposition::new(sources).render(format).unwrap()
 }
 
 fn sample<'a>(page: &'a str, series: &str) -> Option<&'a str> {
@@ -314,8 +315,8 @@ fn series_of_deliveries_are_capped_and_never_twice() {
 
 #[test]
 fn promtool_finds_nothing_to_say() {
-    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
-    let starting = Exposition::new(board).render(Format::Classic).unwrap();
+    let sources = MetricSources::new(SourceKind::Wire, settings());
+    let starting = Exposition::new(sources).render(Format::Classic).unwrap();
     assert_eq!(promtool(&starting), "");
     let page = page(
         sample_robot::snapshot(["/points", "/imu"]),
@@ -430,9 +431,10 @@ fn what_the_source_sees_and_why_it_is_not_the_other_one_is_said() {
         source_reason: Some("no cgroup v2 hierarchy".to_owned()),
         ..sample_robot::agent()
     };
-    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
-    board.publish(Snapshot::default(), facts);
-    let wire = Exposition::new(board).render(Format::Classic).unwrap();
+    let sources = MetricSources::new(SourceKind::Wire, settings());
+    let state = sources.latest.publish(Snapshot::default(), facts);
+    sources.limits.note(&state);
+    let wire = Exposition::new(sources).render(Format::Classic).unwrap();
     let info = "source=\"wire\",reason=\"no cgroup v2 hierarchy\"";
     let info = format!("ros2probe_capture_source_info{{{info}}}");
     assert_eq!(sample(&wire, &info), Some("1"), "{wire}");
@@ -449,12 +451,13 @@ fn what_the_source_sees_and_why_it_is_not_the_other_one_is_said() {
 
 #[test]
 fn both_formats_hold_the_same_samples() {
-    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
-    board.publish(
+    let sources = MetricSources::new(SourceKind::Wire, settings());
+    let state = sources.latest.publish(
         sample_robot::snapshot(["/points", "/imu"]),
         sample_robot::agent(),
     );
-    let exposition = Exposition::new(board);
+    sources.limits.note(&state);
+    let exposition = Exposition::new(sources);
     let (open, classic) = (
         exposition.render(Format::OpenMetrics).unwrap(),
         exposition.render(Format::Classic).unwrap(),
