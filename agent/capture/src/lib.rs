@@ -28,6 +28,7 @@ pub mod bpf;
 pub mod cgroup;
 pub mod cgroup_paths;
 pub mod clock_step;
+pub mod error_chain;
 pub mod filter;
 pub mod filter_reader;
 pub mod frame_decoder;

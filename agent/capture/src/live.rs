@@ -7,7 +7,6 @@
 mod open;
 
 use std::collections::BTreeMap;
-use std::error::Error;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -18,6 +17,7 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::clock_step::ClockStep;
+use super::error_chain::in_words;
 use super::filter::{Filter, FilterError};
 use super::filter_reader::{self, FilterReader};
 use super::host_tap::{HostTap, HostTapError};
@@ -539,24 +539,4 @@ impl LiveSource {
             self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
     }
-}
-
-/// An error and its causes in one line; of a verifier's log, the first line.
-#[must_use]
-pub fn in_words(error: &dyn Error) -> String {
-    let mut words = String::new();
-    let mut cause = Some(error);
-    while let Some(error) = cause {
-        let message = error.to_string();
-        let first = message.lines().next().unwrap_or_default();
-        // A transparent error says what its cause says.
-        if !words.ends_with(first) {
-            if !words.is_empty() {
-                words.push_str(": ");
-            }
-            words.push_str(first);
-        }
-        cause = error.source();
-    }
-    words
 }

@@ -17,6 +17,7 @@ use std::sync::Arc;
 use ros2probe_wire::Guid;
 use ros2probe_wire::discovery::TypeHash;
 
+use super::topic_kind::TopicKind;
 pub use examiner::Examiner;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
 
@@ -29,8 +30,8 @@ pub struct TopicKey {
     pub dds_name: Arc<str>,
     /// Its ROS name, or the DDS name.
     pub name: Arc<str>,
-    /// As [`super::snapshot::TopicFacts::kind`].
-    pub kind: &'static str,
+    /// What it is.
+    pub kind: TopicKind,
 }
 
 /// One finding. What comes first in a variant identifies it, what comes last may change.
@@ -277,7 +278,7 @@ mod tests {
                 domain_id: 0,
                 dds_name: format!("rt{name}").into(),
                 name: name.into(),
-                kind: "topic",
+                kind: TopicKind::Topic,
             },
             writer: guid(writer),
             reason,

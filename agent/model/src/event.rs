@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::churn;
@@ -19,7 +20,6 @@ use super::journal::Loss;
 use super::size::Size;
 use super::snapshot::WatchState;
 
-const SECOND: u64 = 1_000_000_000;
 /// Events of one class in a second of the source's clock.
 const MOST: u16 = 512;
 /// So many wait that they should be taken before more comes.
@@ -168,13 +168,13 @@ pub struct Taken {
 #[derive(Debug, Default)]
 pub struct Events {
     waiting: Vec<Event>,
-    classes: BTreeMap<Class, Room>,
+    classes: BTreeMap<Class, ClassQuota>,
     bursts: BTreeMap<Guid, Burst>,
 }
 
 /// What one class has.
 #[derive(Clone, Copy, Debug, Default)]
-struct Room {
+struct ClassQuota {
     second: u64,
     in_second: u16,
     overflow: u64,
@@ -184,7 +184,7 @@ struct Room {
 #[derive(Debug)]
 struct Burst {
     at: Timestamp,
-    told: LossBurst,
+    losses: LossBurst,
 }
 
 impl Class {
@@ -215,19 +215,19 @@ impl EventKind {
 }
 
 impl Events {
-    /// Adds one, if there is room.
+    /// Adds one, if there is quota.
     pub fn push(&mut self, at: Timestamp, kind: EventKind) {
-        let room = self.classes.entry(kind.class()).or_default();
+        let quota = self.classes.entry(kind.class()).or_default();
         let second = at.0 / SECOND;
         // What is settled late belongs to the second before; further back the clock was set.
-        if second != room.second && second.checked_add(1) != Some(room.second) {
-            (room.second, room.in_second) = (second, 0);
+        if second != quota.second && second.checked_add(1) != Some(quota.second) {
+            (quota.second, quota.in_second) = (second, 0);
         }
-        if room.in_second >= MOST {
-            room.overflow += 1;
+        if quota.in_second >= MOST {
+            quota.overflow += 1;
             return;
         }
-        room.in_second += 1;
+        quota.in_second += 1;
         self.waiting.push(Event { at, kind });
     }
 
@@ -260,16 +260,16 @@ impl Events {
         let count = loss.last.saturating_sub(loss.first).saturating_add(1);
         if let Some(burst) = self.bursts.get_mut(&loss.writer) {
             burst.at = burst.at.max(loss.at);
-            burst.told.count = burst.told.count.saturating_add(count);
-            burst.told.first = burst.told.first.min(loss.first);
-            burst.told.last = burst.told.last.max(loss.last);
+            burst.losses.count = burst.losses.count.saturating_add(count);
+            burst.losses.first = burst.losses.first.min(loss.first);
+            burst.losses.last = burst.losses.last.max(loss.last);
             return;
         }
         if self.bursts.len() >= BURSTS {
             self.classes.entry(Class::Loss).or_default().overflow += 1;
             return;
         }
-        let told = LossBurst {
+        let losses = LossBurst {
             writer: loss.writer,
             topic: None,
             node: None,
@@ -277,28 +277,34 @@ impl Events {
             first: loss.first,
             last: loss.last,
         };
-        self.bursts.insert(loss.writer, Burst { at: loss.at, told });
+        self.bursts.insert(
+            loss.writer,
+            Burst {
+                at: loss.at,
+                losses,
+            },
+        );
     }
 
     /// This writer is no more: its burst, if there is one, was on this topic.
     pub fn name(&mut self, writer: Guid, domain_id: u32, topic: &Arc<str>) {
         if let Some(burst) = self.bursts.get_mut(&writer) {
-            burst.told.topic = Some((domain_id, Arc::clone(topic)));
+            burst.losses.topic = Some((domain_id, Arc::clone(topic)));
         }
     }
 
     /// Ends all bursts; `complete` adds what is known of their writers.
     pub fn end_bursts(&mut self, mut complete: impl FnMut(&mut LossBurst)) {
-        for (_, Burst { at, mut told }) in std::mem::take(&mut self.bursts) {
-            complete(&mut told);
-            self.push(at, EventKind::Loss(told));
+        for (_, Burst { at, mut losses }) in std::mem::take(&mut self.bursts) {
+            complete(&mut losses);
+            self.push(at, EventKind::Loss(losses));
         }
     }
 
     /// Everything since the last call.
     pub fn take(&mut self) -> Taken {
         let classes = self.classes.iter_mut();
-        let overflow = classes.map(|(class, room)| (*class, std::mem::take(&mut room.overflow)));
+        let overflow = classes.map(|(class, quota)| (*class, std::mem::take(&mut quota.overflow)));
         Taken {
             overflow: overflow.filter(|(_, count)| *count > 0).collect(),
             events: std::mem::take(&mut self.waiting),
@@ -379,7 +385,7 @@ mod tests {
                 burst.topic = Some((0, "rt/imu".into()));
             }
         });
-        let told: Vec<_> = events
+        let losses: Vec<_> = events
             .take()
             .events
             .into_iter()
@@ -396,7 +402,7 @@ mod tests {
             })
         };
         assert_eq!(
-            told,
+            losses,
             [
                 burst(guid(1), (0, "rt/imu"), 4, 5, 9),
                 burst(guid(2), (3, "rt/points"), 1, 1, 1)

@@ -8,6 +8,7 @@ use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 use super::histogram::Histogram;
 use super::rate::SECONDS as WINDOW;
@@ -19,7 +20,6 @@ const ROWS: usize = 262_144;
 /// Names that are known, for each topic that may be measured: one that is measured no more is kept
 /// until there are twice as many.
 const NAMES: usize = 2;
-const SECOND: u64 = 1_000_000_000;
 
 /// The ring.
 #[derive(Debug)]
@@ -31,7 +31,7 @@ pub struct History {
     seconds: VecDeque<Arc<Second>>,
     rows: usize,
     names: Arc<Names>,
-    before: HashMap<u32, Before>,
+    before: HashMap<u32, PreviousTotals>,
     /// The last id that was given away.
     last: u32,
     /// Topics whose past was given up for want of room.
@@ -64,8 +64,8 @@ pub struct Row {
     pub lost: u32,
     /// Payload bytes.
     pub bytes: f32,
-    latency: [Short; 2],
-    interarrival: [Short; 2],
+    latency: [Bfloat16; 2],
+    interarrival: [Bfloat16; 2],
 }
 
 /// A row with what it takes to read it among its neighbours.
@@ -81,7 +81,7 @@ pub struct Reading {
 
 /// The upper half of an `f32`: 8 bits of precision, more than a percentile of a histogram has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Short(u16);
+struct Bfloat16(u16);
 
 /// Ids of topics by domain and DDS name.
 #[derive(Clone, Debug, Default)]
@@ -91,7 +91,7 @@ struct Names {
 
 /// What had been counted of a topic by the end of the second before.
 #[derive(Debug)]
-struct Before {
+struct PreviousTotals {
     messages: u64,
     bytes: u64,
     lost: u64,
@@ -237,14 +237,14 @@ impl History {
     }
 
     fn row(&mut self, topic: u32, counted: &Measurement) -> Row {
-        let after = Before {
+        let after = PreviousTotals {
             messages: counted.messages,
             bytes: counted.bytes,
             lost: counted.lost,
             latency: counted.source_latency,
             interarrival: counted.interarrival,
         };
-        let nothing = || Before {
+        let nothing = || PreviousTotals {
             messages: 0,
             bytes: 0,
             lost: 0,
@@ -353,11 +353,11 @@ impl Row {
     }
 }
 
-fn pair([median, high]: [Short; 2]) -> Option<[f32; 2]> {
+fn pair([median, high]: [Bfloat16; 2]) -> Option<[f32; 2]> {
     Some([median.value()?, high.value()?])
 }
 
-impl Short {
+impl Bfloat16 {
     const NONE: Self = Self(0xffff);
 
     fn new(value: f64) -> Self {
@@ -383,18 +383,18 @@ impl Names {
     }
 }
 
-impl Before {
+impl PreviousTotals {
     /// What was counted between `before` and this. A count that fell belongs to a topic that was
     /// forgotten meanwhile: all of it is new.
     fn since(&self, topic: u32, before: &Self) -> Row {
         let more = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now);
         let count = |now, before| u32::try_from(more(now, before)).unwrap_or(u32::MAX);
         let percentiles = |now: &Histogram, before: &Histogram| {
-            let news = now.since(before);
-            let Some((minimum, maximum)) = now.range().filter(|_| news.count() > 0) else {
-                return [Short::NONE; 2];
+            let difference = now.since(before);
+            let Some((minimum, maximum)) = now.range().filter(|_| difference.count() > 0) else {
+                return [Bfloat16::NONE; 2];
             };
-            [0.5, 0.99].map(|part| Short::new(news.quantile(part).clamp(minimum, maximum)))
+            [0.5, 0.99].map(|part| Bfloat16::new(difference.quantile(part).clamp(minimum, maximum)))
         };
         #[expect(
             clippy::cast_precision_loss,
@@ -572,10 +572,10 @@ mod tests {
     #[test]
     fn short_numbers_keep_two_digits() {
         for value in [1e-6, 0.00123, 0.5, 9.99, 86_400.0] {
-            let short = f64::from(Short::new(value).value().unwrap());
-            assert!((short / value - 1.0).abs() < 0.004, "{value} {short}");
+            let rounded = f64::from(Bfloat16::new(value).value().unwrap());
+            assert!((rounded / value - 1.0).abs() < 0.004, "{value} {rounded}");
         }
-        assert_eq!(Short::NONE.value(), None);
-        assert!(Short::new(f64::MAX).value().is_some());
+        assert_eq!(Bfloat16::NONE.value(), None);
+        assert!(Bfloat16::new(f64::MAX).value().is_some());
     }
 }

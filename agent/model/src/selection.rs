@@ -9,6 +9,7 @@ use regex::bytes::{Regex, RegexBuilder};
 
 use super::glob;
 use super::topic::Naming;
+use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
 
 /// Largest compiled form of one regular expression, in bytes, and as much again while it is matched.
@@ -70,7 +71,7 @@ pub struct Selection {
 
 /// A subscription as the model sees it.
 #[derive(Clone, Debug)]
-pub struct Wish {
+pub struct SampleRequest {
     /// Names the subscription.
     pub id: u64,
     /// Which topics.
@@ -177,14 +178,11 @@ impl Selection {
             .count()
     }
 
-    /// Whether this topic is wanted. `kind` as in [`super::snapshot::TopicFacts`]: requests and
-    /// replies of services, and what follows no ROS convention, go by their exact names alone.
+    /// Whether this topic is wanted. Requests and replies of services, and what follows no ROS
+    /// convention, go by their exact names alone.
     #[must_use]
-    pub fn covers(&self, kind: &str, name: &str, dds_name: &str, hidden: bool) -> bool {
-        let is_ros = !matches!(
-            kind,
-            "service_request" | "service_reply" | "discovery" | "dds"
-        );
+    pub fn covers(&self, kind: TopicKind, name: &str, dds_name: &str, hidden: bool) -> bool {
+        let is_ros = kind.is_ros_topic();
         // The ROS name of a request is the service's, which may be a topic's as well.
         let name = if is_ros { name } else { dds_name };
         let shown = self.hidden || !hidden;
@@ -194,7 +192,7 @@ impl Selection {
     }
 }
 
-impl Wish {
+impl SampleRequest {
     /// Whether it is for this topic.
     #[must_use]
     pub fn covers(&self, domain_id: u32, naming: &Naming) -> bool {
@@ -213,14 +211,14 @@ mod tests {
 
     fn covers(selection: &Selection, dds_name: &str) -> bool {
         let naming = Naming::of(&DdsTopic::parse(dds_name).unwrap());
-        let wish = Wish {
+        let request = SampleRequest {
             id: 1,
             selection: Arc::new(selection.clone()),
             domain_id: Some(3),
             depth: Depth::Arrivals,
         };
-        assert!(!wish.covers(4, &naming));
-        wish.covers(3, &naming)
+        assert!(!request.covers(4, &naming));
+        request.covers(3, &naming)
     }
 
     #[test]

@@ -16,6 +16,7 @@ pub use delivery::{
 use super::diagnosis::Diagnoses;
 use super::discovery::Addresses;
 use super::histogram::Histogram;
+use super::topic_kind::TopicKind;
 
 /// All facts at `at`. Lists are sorted by their identity.
 #[derive(Clone, Debug, Default)]
@@ -119,9 +120,8 @@ pub struct TopicFacts {
     pub name: String,
     /// DDS name.
     pub dds_name: String,
-    /// What kind of ROS channel: `topic`, `service_request`, `service_reply`, `service_event`,
-    /// `action_feedback`, `action_status`, `discovery`, `dds`.
-    pub kind: &'static str,
+    /// What kind of ROS channel.
+    pub kind: TopicKind,
     /// Hidden by ROS convention (a token begins with `_`).
     pub hidden: bool,
     /// Message types announced on it, ROS form, sorted; more than one is a fault.
@@ -151,14 +151,14 @@ pub struct TopicFacts {
     pub vanished: bool,
     /// Pairs of its live writers and readers by how messages pass between them; those that there
     /// are.
-    pub passages: Vec<PassageCount>,
+    pub transports: Vec<TransportCount>,
     /// Its samples are given one by one.
     pub is_read: bool,
 }
 
 /// How messages pass between a writer and a reader, as both announce it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Passage {
+pub enum Transport {
     /// By the network, where all of them can be seen.
     Network,
     /// Through Fast DDS's shared memory, which is looked at now and then.
@@ -173,14 +173,14 @@ pub enum Passage {
 
 /// Pairs of writer and reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PassageCount {
+pub struct TransportCount {
     /// How messages pass between them.
-    pub passage: Passage,
+    pub transport: Transport,
     /// How many pairs.
     pub pairs: usize,
 }
 
-impl Passage {
+impl Transport {
     /// All of them.
     pub const ALL: [Self; 5] = [
         Self::Network,
@@ -242,8 +242,8 @@ pub struct EndpointFacts {
     pub first_seen: Timestamp,
     /// What was measured of this writer while its topic was watched.
     pub measurement: Option<Box<Measurement>>,
-    /// How messages pass between it and its counterparts: [`Passage::bit`] of each way.
-    pub passages: u8,
+    /// How messages pass between it and its counterparts: [`Transport::bit`] of each way.
+    pub transports: u8,
 }
 
 /// What was counted while the topic was watched. Counters never go down while the topic lives.

@@ -15,10 +15,11 @@ use ros2probe_model::discovery::Addresses;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
-    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Passage, PassageCount,
-    ProcessFacts, SampledFacts, Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts,
+    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
+    Snapshot, SocketFacts, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
     WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -110,7 +111,7 @@ fn diagnoses() -> Diagnoses {
         domain_id: 0,
         dds_name: "rt/points".into(),
         name: "/points".into(),
-        kind: "topic",
+        kind: TopicKind::Topic,
     };
     let mut policies = Policies::default();
     policies.insert(Policy::Reliability);
@@ -219,13 +220,13 @@ pub fn topic(name: &str) -> TopicFacts {
         type_hash: None,
         first_seen: Timestamp(4),
         measurement: Some(Box::new(measurement())),
-        passages: 1,
+        transports: 1,
     };
     TopicFacts {
         domain_id: 0,
         name: name.to_owned(),
         dds_name: format!("rt{name}"),
-        kind: "topic",
+        kind: TopicKind::Topic,
         hidden: false,
         message_types: vec!["sensor_msgs/msg/PointCloud2".to_owned()],
         type_hashes: Vec::new(),
@@ -249,8 +250,8 @@ pub fn topic(name: &str) -> TopicFacts {
             last_seen: Timestamp(1_700_000_000_000_000_000),
         }],
         vanished: false,
-        passages: vec![PassageCount {
-            passage: Passage::SharedMemory,
+        transports: vec![TransportCount {
+            transport: Transport::SharedMemory,
             pairs: 1,
         }],
         is_read: false,

@@ -8,7 +8,8 @@ use super::super::netns;
 use super::super::shm::directories::Scope;
 use super::super::uprobe::Uprobe;
 use super::super::wire_tap::{WireTap, WireTapSettings};
-use super::{CaptureError, in_words};
+use super::CaptureError;
+use crate::error_chain::in_words;
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ExactChoice, SourceChoice};
 

@@ -28,7 +28,7 @@ use finding::Finding;
 use host_state::HostState;
 use processes::Processes;
 use report::Report;
-use ros2probe_capture::live::in_words;
+use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice};
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;

@@ -153,16 +153,19 @@ fn who_was_stopped_for_seconds_believes_nobody_gone_and_counts_what_it_missed() 
         let expired = robot.expired()?;
         robot.agent.process.signal("STOP")?;
         crowd.rest(pause)?;
+        // On a busy machine the leases alone do not fill the ring.
+        crowd.repeat()?;
         robot.agent.process.signal("CONT")?;
         let woke = Instant::now();
         robot.wait_ready()?;
         let ready = woke.elapsed();
         crowd.rest(Duration::from_secs(1))?;
-        let page = robot.agent.scrape_until("a fresh page", |page| {
-            page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0
-        })?;
+        let page = robot
+            .agent
+            .scrape_until("a fresh page with what was dropped", |page| {
+                page.sum("ros2probe_snapshot_age_seconds", &[]) < 1.0 && dropped(page) > 0.0
+            })?;
         let missed = dropped(&page);
-        ensure!(missed > 0.0, "{pause:?} and nothing was dropped");
         ensure!(
             robot.expired()? == expired,
             "somebody is believed gone: {}",

@@ -8,10 +8,10 @@ use ros2probe::model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const IMAGE: &str = "sensor_msgs::msg::dds_::Image_";

@@ -9,12 +9,12 @@ use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::{Measurement, Snapshot, SocketFacts, TopicFacts, WatchState};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 use std::sync::Arc;
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
@@ -780,7 +780,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
     world
         .observer
         .input(Input::Watchlist(Arc::new(watchlist(&patterns))));
-    assert!(!world.observer.has_asked_all());
+    assert!(!world.observer.has_applied_lists());
     let is_measured = |topic: &TopicFacts| topic.measurement.is_some();
     let some = world
         .snapshot()
@@ -792,7 +792,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
     // It goes on being counted.
     world.sample(alice(WRITER), 1);
     let mut rounds = 0;
-    while !world.observer.ask_more() {
+    while !world.observer.apply_more_lists() {
         rounds += 1;
     }
     assert!((2..10).contains(&rounds), "{rounds}");

@@ -12,9 +12,9 @@ use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
 use ros2probe::model::discovery::{Addresses, hexadecimal};
 use ros2probe::model::snapshot::{ParticipantFacts, ProcessFacts};
 use ros2probe_wire::discovery::Role;
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 5_000 * MILLISECOND;
 /// A conversation takes no longer, and a tick.
 const LIMIT: u64 = 3_100 * MILLISECOND;

@@ -16,7 +16,7 @@ use crate::rp;
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::payloads::{Given, News, Sample};
+use ros2probe::model::payloads::{Dispatch, Sample, SampleOutcome};
 use ros2probe::model::snapshot::Snapshot;
 use ros2probe::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
@@ -25,10 +25,10 @@ use ros2probe::surface::{AgentFacts, Board, SourceKind};
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
-const MILLISECOND: u64 = 1_000_000;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 
 /// How a cap stands: how much of it is used, how often it was reached.
@@ -263,7 +263,7 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
     );
 }
 
-fn sample(number: u64) -> Given {
+fn sample(number: u64) -> Dispatch {
     let topic = Topic {
         domain_id: 0,
         name: "/points".into(),
@@ -271,9 +271,9 @@ fn sample(number: u64) -> Given {
         message_type: "a/msg/B".into(),
         offered: None,
     };
-    Given {
+    Dispatch {
         to: [1].into(),
-        news: News::Sample(Arc::new(Sample {
+        outcome: SampleOutcome::Sample(Arc::new(Sample {
             topic: Arc::new(topic),
             time: Timestamp(number),
             writer: writer(1, 1),

@@ -10,6 +10,7 @@ use ros2probe::config::{Limits, limits_markdown};
 use ros2probe::model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe::model::topic_kind::TopicKind;
 use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe::surface::events;
 use ros2probe::surface::otlp::Signal;
@@ -351,10 +352,10 @@ fn hostile_names_stay_inside_their_label() {
 fn no_series_appears_twice() {
     let mut snapshot = sample_robot::snapshot(["/points", "/points"]);
     let mut dds = sample_robot::topic("/points");
-    (dds.kind, dds.dds_name) = ("dds", "/points".to_owned());
+    (dds.kind, dds.dds_name) = (TopicKind::Dds, "/points".to_owned());
     snapshot.topics.push(dds);
     let mut request = sample_robot::topic("/points");
-    (request.kind, request.dds_name) = ("service_request", "rq/pointsRequest".to_owned());
+    (request.kind, request.dds_name) = (TopicKind::ServiceRequest, "rq/pointsRequest".to_owned());
     snapshot.topics.push(request);
     let nodes = snapshot.nodes.clone();
     snapshot.nodes.extend(nodes);

@@ -10,6 +10,7 @@ use globset::Glob;
 use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
+use super::otlp_endpoint::otlp_endpoint;
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
     WatchShape,
@@ -20,7 +21,6 @@ use super::{
     RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice,
     StateChoice,
 };
-use crate::surface::otlp::endpoint;
 
 /// Each keeps memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
@@ -383,7 +383,7 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
                  `[::1]:{port}`, or `off`"
             ))
         }
-        "otlp.endpoint" if text != "off" && endpoint(text).is_none() => Err(
+        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => Err(
             "must be an URL of a gRPC receiver, as in `http://collector:4317`, or `off`".to_owned(),
         ),
         "otlp.endpoint" if text.starts_with("https://") && !cfg!(feature = "tls") => Err(

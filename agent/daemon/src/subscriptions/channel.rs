@@ -14,7 +14,7 @@ use tokio_util::sync::CancellationToken;
 use super::backlog::Backlog;
 use super::{Depth, Item, Overflow, Request, Selection};
 use ros2probe_model::payloads::{Missed, MissedReason, Sample};
-use ros2probe_model::selection::Wish;
+use ros2probe_model::selection::SampleRequest;
 
 /// What a queued entry costs besides a payload.
 const OVERHEAD: usize = 256;
@@ -121,8 +121,8 @@ impl Channel {
         &self.selection
     }
 
-    pub(super) fn wish(&self) -> Wish {
-        Wish {
+    pub(super) fn request(&self) -> SampleRequest {
+        SampleRequest {
             id: self.id,
             selection: Arc::clone(&self.selection),
             domain_id: self.request.domain_id,

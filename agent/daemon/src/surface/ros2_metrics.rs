@@ -14,6 +14,7 @@ use ros2probe_model::snapshot::{
     EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
     WatchState,
 };
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Unknown writers with series of their own.
 const MAX_UNKNOWN_WRITERS: usize = 32;
@@ -51,7 +52,7 @@ impl<'a> TopicRows<'a> {
         let mut rows: BTreeMap<(u32, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
         let mut hidden = 0;
         let shown = |facts: &&TopicFacts| {
-            facts.measurement.is_some() || matches!(facts.kind, "topic" | "dds")
+            facts.measurement.is_some() || matches!(facts.kind, TopicKind::Topic | TopicKind::Dds)
         };
         let (measured, others): (Vec<&TopicFacts>, Vec<&TopicFacts>) = snapshot
             .topics
@@ -127,9 +128,11 @@ impl<'a> TopicRow<'a> {
 
 /// Services and other plumbing keep their DDS names: a request, its reply and a topic may share
 /// their ROS name. A DDS name that looks like a ROS name is marked.
-pub(super) fn series_name<'a>(kind: &str, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
+pub(super) fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
     match kind {
-        "topic" | "action_feedback" | "action_status" => Cow::Borrowed(name),
+        TopicKind::Topic | TopicKind::ActionFeedback | TopicKind::ActionStatus => {
+            Cow::Borrowed(name)
+        }
         _ if dds_name.starts_with('/') => Cow::Owned(format!("dds:{dds_name}")),
         _ => Cow::Borrowed(dds_name),
     }
@@ -174,13 +177,16 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         })
     })?;
     sink.family(&metric::TOPICS, |family| {
-        let mut kinds: BTreeMap<(u32, &str), usize> = BTreeMap::new();
+        let mut kinds: BTreeMap<(u32, TopicKind), usize> = BTreeMap::new();
         for topic in snapshot.topics.iter().filter(|topic| !topic.vanished) {
             *kinds.entry((topic.domain_id, topic.kind)).or_default() += 1;
         }
         kinds.iter().try_for_each(|((domain_id, kind), count)| {
             family.sample(
-                &[Label::Number((*domain_id).into()), Label::Text(kind)],
+                &[
+                    Label::Number((*domain_id).into()),
+                    Label::Text(kind.label()),
+                ],
                 *count,
             )
         })
@@ -388,9 +394,9 @@ fn sampled(sink: &mut MetricSink<'_>, rows: &[TopicRow<'_>]) -> fmt::Result {
     })?;
     sink.family(&metric::TOPIC_PAIRS, |family| {
         for row in rows {
-            for count in row.facts.iter().flat_map(|facts| &facts.passages) {
+            for count in row.facts.iter().flat_map(|facts| &facts.transports) {
                 let [domain_id, topic] = row.labels();
-                let passage = Label::Text(count.passage.label());
+                let passage = Label::Text(count.transport.label());
                 family.sample(&[domain_id, topic, passage], count.pairs)?;
             }
         }
@@ -455,7 +461,7 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
     family.info(&[
         domain_id,
         topic,
-        Label::Text(facts.kind),
+        Label::Text(facts.kind.label()),
         Label::Text(&message_types),
         Label::Text(&reliability),
         Label::Text(&durability),

@@ -12,7 +12,7 @@ use crate::discovery::{Discovery, Node, Participant};
 
 /// One node with whom it belongs to.
 #[derive(Clone, Copy, Debug)]
-struct Placed<'a> {
+struct HostedNode<'a> {
     prefix: GuidPrefix,
     participant: &'a Participant,
     node: &'a Node,
@@ -20,7 +20,7 @@ struct Placed<'a> {
 
 /// Adds what is found.
 pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
-    let mut names: BTreeMap<&Arc<str>, Vec<Placed<'_>>> = BTreeMap::new();
+    let mut names: BTreeMap<&Arc<str>, Vec<HostedNode<'_>>> = BTreeMap::new();
     for (prefix, participant) in discovery.participants() {
         // Who was there before the agent's start and was not heard since may be its own successor.
         if participant.restored.is_some() {
@@ -28,7 +28,7 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
         }
         for node in participant.nodes.iter().filter(|node| !is_hidden(node)) {
             let prefix = *prefix;
-            names.entry(&node.name).or_default().push(Placed {
+            names.entry(&node.name).or_default().push(HostedNode {
                 prefix,
                 participant,
                 node,
@@ -43,7 +43,7 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
             findings.add(Diagnosis::DuplicateNode {
                 domain_id: nodes.first().map_or(0, |each| each.participant.domain_id),
                 node: Arc::clone(name),
-                participants: nodes.iter().map(Placed::guid).collect(),
+                participants: nodes.iter().map(HostedNode::guid).collect(),
             });
         }
         several_domains(name, nodes, discovery, findings);
@@ -55,15 +55,15 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
 /// are a fleet as it should be.
 fn several_domains(
     name: &Arc<str>,
-    nodes: &[Placed<'_>],
+    nodes: &[HostedNode<'_>],
     discovery: &Discovery,
     findings: &mut Findings,
 ) {
     let mut machines: BTreeMap<BTreeSet<IpAddr>, (Guid, BTreeSet<u32>)> = BTreeMap::new();
-    let lonely = nodes.len() == 1;
+    let unmatched = nodes.len() == 1;
     for placed in nodes {
         let mut domains = placed.domains(discovery);
-        let machine = if lonely { None } else { placed.machine() };
+        let machine = if unmatched { None } else { placed.machine() };
         if let Some(machine) = machine {
             let (guid, all) = machines
                 .entry(machine)
@@ -90,7 +90,7 @@ fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<u32>) -> Diagn
     }
 }
 
-impl Placed<'_> {
+impl HostedNode<'_> {
     fn guid(&self) -> Guid {
         Guid::new(self.prefix, EntityId::PARTICIPANT)
     }

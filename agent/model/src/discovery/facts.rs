@@ -11,7 +11,7 @@ use ros2probe_wire::rtps::{Locator, VendorId};
 use ros2probe_wire::{Duration, Guid, GuidPrefix, Timestamp};
 use serde::{Deserialize, Serialize};
 
-use super::worth::Worth;
+use super::priority::Priority;
 
 /// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
 pub(super) const MAX_DOMAIN: u32 = 232;
@@ -49,7 +49,7 @@ pub struct Origin {
 
 /// What a participant says about itself, as far as it is shown.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Portrait {
+pub struct ParticipantProxy {
     /// Implementation.
     pub vendor: VendorId,
     /// ROS enclave.
@@ -81,7 +81,7 @@ pub struct Addresses {
 #[derive(Debug)]
 pub struct Participant {
     /// What it says.
-    pub portrait: Portrait,
+    pub proxy: ParticipantProxy,
     /// Where it is reached.
     pub addresses: Addresses,
     /// Known from before the agent's start, restored then, and not heard since.
@@ -97,7 +97,7 @@ pub struct Participant {
     /// Its nodes.
     pub nodes: Vec<Node>,
     /// Its announcements of readers were seen from the first on.
-    pub readers_told: bool,
+    pub all_readers_announced: bool,
     /// Its endpoints whose topics are watched by their exact names.
     pub(super) watched: usize,
     /// A socket of this host sends for it.
@@ -145,7 +145,7 @@ pub struct Endpoint {
     pub(super) watched: bool,
 }
 
-impl Portrait {
+impl ParticipantProxy {
     pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
         let low_bits = || announcement.process_id_low_bits().map(u32::from);
         Self {
@@ -187,8 +187,8 @@ impl Participant {
     }
 
     /// What it is worth when there is no room.
-    pub(super) const fn worth(&self) -> Worth {
-        Worth {
+    pub(super) const fn priority(&self) -> Priority {
+        Priority {
             watched: self.watched > 0,
             local: self.local,
             sends: self.sends,
@@ -249,7 +249,7 @@ impl Participant {
     pub(super) fn lists(&self) -> Lists {
         // A new list does not compile before it has a place here.
         let Self {
-            portrait: _,
+            proxy: _,
             addresses,
             restored: _,
             domain_id: _,
@@ -257,7 +257,7 @@ impl Participant {
             last_seen: _,
             endpoints,
             nodes,
-            readers_told: _,
+            all_readers_announced: _,
             domain_source: _,
             nodes_from: _,
             watched: _,

@@ -19,7 +19,7 @@ use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::facts::{
-    Addresses, DomainSource, Endpoint, MAX_DOMAIN, Node, Participant, Portrait, named,
+    Addresses, DomainSource, Endpoint, MAX_DOMAIN, Node, Participant, ParticipantProxy, named,
 };
 use super::{Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT};
 
@@ -167,21 +167,21 @@ impl Remembered {
         participant: &Participant,
         endpoints: Vec<RememberedEndpoint>,
     ) -> Self {
-        let portrait = &participant.portrait;
+        let proxy = &participant.proxy;
         let text = |text: &Option<Box<str>>| text.as_deref().map(str::to_owned);
-        let [first, second] = portrait.vendor.0;
+        let [first, second] = proxy.vendor.0;
         Self {
             prefix: prefix.to_string(),
             vendor: format!("{first:02x}{second:02x}"),
             domain_id: participant.domain_id,
             domain_source: participant.domain_source,
-            enclave: text(&portrait.enclave),
-            host: text(&portrait.host),
-            process_name: text(&portrait.process_name),
-            process_id: portrait.process_id,
-            lease: nanoseconds(portrait.lease),
-            secured: portrait.secured,
-            shared_memory: portrait.shared_memory,
+            enclave: text(&proxy.enclave),
+            host: text(&proxy.host),
+            process_name: text(&proxy.process_name),
+            process_id: proxy.process_id,
+            lease: nanoseconds(proxy.lease),
+            secured: proxy.secured,
+            shared_memory: proxy.shared_memory,
             addresses: participant.addresses.clone(),
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
             nodes_from: participant
@@ -201,7 +201,7 @@ impl Remembered {
         let text = |text: &Option<String>| text.as_deref().map(Into::into);
         let nodes_from = self.nodes_from.as_ref();
         let participant = Participant {
-            portrait: Portrait {
+            proxy: ParticipantProxy {
                 vendor: VendorId(hexadecimal(&self.vendor)?),
                 enclave: text(&self.enclave),
                 host: text(&self.host),
@@ -219,7 +219,7 @@ impl Remembered {
             endpoints: BTreeSet::new(),
             nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
             // Readers may have come while nobody looked.
-            readers_told: false,
+            all_readers_announced: false,
             watched: 0,
             local: false,
             sends: false,

@@ -117,7 +117,7 @@ pub const FIXED: &[[&str; 4]] = &[
         "nodes_of_unknown_participants_keep_within_their_bytes",
     ],
     [
-        "PLACES",
+        "MAX_ADDRESSES",
         "agent/model/src/receivers.rs",
         "agent/cli/tests/model/bounds.rs",
         "one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone",
@@ -142,13 +142,13 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "BUDGET",
-        "agent/model/src/pieces.rs",
-        "agent/model/src/pieces.rs",
+        "agent/model/src/discovery_fragments.rs",
+        "agent/model/src/discovery_fragments.rs",
         "large_samples_that_never_end_keep_within_the_bytes",
     ],
     [
         "LIMIT",
-        "agent/model/src/ways.rs",
+        "agent/model/src/routes.rs",
         "agent/cli/tests/model/deliveries.rs",
         "a_storm_of_forged_destinations_stays_bounded_and_real_receivers_are_counted",
     ],
@@ -400,20 +400,20 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "KEPT",
-        "agent/model/src/sequence/doubt.rs",
-        "agent/model/src/sequence/doubt.rs",
+        "agent/model/src/sequence/unconfirmed.rs",
+        "agent/model/src/sequence/unconfirmed.rs",
         "the_oldest_numbers_of_a_long_run_are_forgotten",
     ],
     [
         "RUNS",
-        "agent/model/src/deaths.rs",
-        "agent/model/src/deaths.rs",
+        "agent/model/src/loss_causes.rs",
+        "agent/model/src/loss_causes.rs",
         "resolving_every_other_sample_of_a_long_run_makes_no_more_runs_than_there_may_be",
     ],
     [
         "LIMIT",
-        "agent/model/src/cancelled.rs",
-        "agent/model/src/cancelled.rs",
+        "agent/model/src/undelivered.rs",
+        "agent/model/src/undelivered.rs",
         "arrivals_that_take_out_the_middle_of_what_had_no_room_stay_bounded",
     ],
     [

@@ -49,13 +49,13 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
     let sent = robot.at;
     let now = Timestamp(sent + SECOND / 20);
     robot.observer.input(Input::Time(now));
-    assert!(robot.observer.given_until(now).0 < sent);
+    assert!(robot.observer.dispatched_until(now).0 < sent);
     // One of them comes late.
     look(&mut robot, 3);
     assert_eq!(robot.given(), [given(3)]);
     let now = Timestamp(sent + SECOND);
     robot.observer.input(Input::Time(now));
-    assert_eq!(robot.observer.given_until(now), now);
+    assert_eq!(robot.observer.dispatched_until(now), now);
     let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
     assert_eq!(robot.given(), [not_captured]);
     // The end of a capture waits for nothing.
@@ -88,9 +88,11 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
     for now in [now, end] {
         robot.observer.input(Input::Time(now));
         for each in robot.observer.drain().samples {
-            match each.news {
-                News::Sample(sample) => given.push((sample.sequence_number, Some(sample.time.0))),
-                News::Missed(missed) => given.push((missed.first, None)),
+            match each.outcome {
+                SampleOutcome::Sample(sample) => {
+                    given.push((sample.sequence_number, Some(sample.time.0)));
+                }
+                SampleOutcome::Missed(missed) => given.push((missed.first, None)),
             }
         }
     }
@@ -131,7 +133,7 @@ fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_r
         .input(Input::Time(Timestamp(robot.at + SECOND)));
     let mut missed = 0;
     for each in robot.observer.drain().samples {
-        if let News::Missed(each) = each.news {
+        if let SampleOutcome::Missed(each) = each.outcome {
             assert_eq!(each.reason, MissedReason::NotCaptured);
             missed += each.samples;
         }

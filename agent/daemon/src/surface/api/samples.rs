@@ -26,11 +26,12 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::config::Access;
 use crate::config::watch::MAX_DOMAIN;
-use crate::subscriptions::line::{LINES, Line, OfferedFacts, Open, OpenTopic, SAMPLES};
+use crate::subscriptions::line::{line, offered};
 use crate::subscriptions::{
     Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
 };
 use crate::surface::SourceKind;
+use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
 use ros2probe_model::snapshot::Snapshot;
 
 /// Names and globs in one request, and how many characters they and a regular expression have.
@@ -209,14 +210,14 @@ impl Pieces for Stream {
 impl Stream {
     /// The line for it; with what the writer announced where it is the writer's first.
     fn told(&mut self, item: &Item) -> Line {
-        let mut line = Line::from(item);
+        let mut line = line(item);
         if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
             && sample.payload.is_some()
-            && let Some(offered) = &sample.topic.offered
+            && let Some(announced) = &sample.topic.offered
             && self.introduced.len() < WRITERS
             && self.introduced.insert(sample.writer)
         {
-            facts.offered = Some(Box::new(OfferedFacts::from(&**offered)));
+            facts.offered = Some(Box::new(offered(announced)));
         }
         line
     }

@@ -289,7 +289,10 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             vec![
                 domain(domain_id),
                 ("topic", Some(text(&series(naming.as_ref(), topic)))),
-                ("kind", naming.as_ref().map(|naming| text(naming.kind))),
+                (
+                    "kind",
+                    naming.as_ref().map(|naming| text(naming.kind.label())),
+                ),
                 ("role", Some(text(role))),
                 ("endpoint", written(guid)),
                 ("message_type", Some(text(message_type))),

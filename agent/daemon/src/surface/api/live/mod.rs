@@ -26,14 +26,14 @@ use utoipa_axum::routes;
 
 use super::Context;
 use super::body_stream::{Pieces, stream_of};
-use super::events::EventView;
+use super::events::event;
 use super::health::HOST;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::surface::SourceKind;
 use crate::surface::events::Reader;
 use line::{End, Events, Line, Open, Replay};
-use ros2probe_model::snapshot::Passage;
+use ros2probe_model::snapshot::Transport;
 use scene::Scene;
 
 /// Streams at once, of all listeners: fewer than connections, so that requests find one.
@@ -190,7 +190,7 @@ impl Stream {
                 interval_seconds: 1,
                 history_seconds: context.live.history.as_secs(),
                 flags: &values::FLAGS,
-                passages: Passage::ALL.map(Passage::label).into(),
+                passages: Transport::ALL.map(Transport::label).into(),
                 replay,
             };
             Line::Open(open).write(lines);
@@ -212,7 +212,7 @@ impl Stream {
                 list: batch
                     .records
                     .iter()
-                    .map(|record| EventView::new(log, record))
+                    .map(|record| event(log, record))
                     .collect(),
             };
             Line::Events(events).write(lines);

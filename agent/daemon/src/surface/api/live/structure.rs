@@ -9,6 +9,7 @@ use super::super::index::Index;
 use super::line::{Endpoint, Graph, Node, Participant, Topic};
 use crate::watches::{InForce, Origin};
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts};
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Numbers that stand for names.
 #[derive(Debug, Default)]
@@ -116,7 +117,7 @@ impl Ids {
                 facts.domain_id,
                 &facts.name,
                 &facts.dds_name,
-                facts.kind,
+                facts.kind.label(),
                 &facts.message_types,
                 facts.hidden.into(),
                 facts.vanished.into(),
@@ -155,7 +156,7 @@ impl Ids {
             node,
             self.participants.number(participant, round),
             facts.guid,
-            facts.passages,
+            facts.transports,
             &facts.reliability,
             &facts.durability,
         )
@@ -166,7 +167,7 @@ impl Ids {
 pub(super) fn is_shown(topic: &TopicFacts) -> bool {
     !matches!(
         topic.kind,
-        "service_request" | "service_reply" | "discovery"
+        TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery
     )
 }
 

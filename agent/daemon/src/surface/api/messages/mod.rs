@@ -478,7 +478,7 @@ mod tests {
     use super::*;
     use crate::subscriptions::{Caps, Subscriptions};
     use crate::surface::{Board, Settings, SourceKind};
-    use ros2probe_model::payloads::{Given, News, Topic};
+    use ros2probe_model::payloads::{Dispatch, SampleOutcome, Topic};
 
     #[test]
     fn messages_that_wait_beyond_the_bytes_go_and_are_counted() {
@@ -510,9 +510,9 @@ mod tests {
                 sampled: false,
                 payload: Some(vec![7; 1 << 20].into()),
             };
-            let news = News::Sample(Arc::new(sample));
+            let outcome = SampleOutcome::Sample(Arc::new(sample));
             let to = [1].into();
-            all.deliver(vec![Given { to, news }], None);
+            all.deliver(vec![Dispatch { to, outcome }], None);
         }
         assert!(all.facts().queued_bytes <= QUEUE_BYTES);
         let (mut missed, mut kept) = (0, Vec::new());

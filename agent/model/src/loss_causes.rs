@@ -7,6 +7,7 @@
 use std::collections::BTreeMap;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 use super::cause::LossCause;
 use super::size::Size;
@@ -16,19 +17,19 @@ const SAMPLES: usize = 8192;
 /// Runs of pending samples of one receiver.
 const RUNS: usize = 1024;
 /// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
-pub const REASSEMBLY: u64 = 35_000_000_000;
+pub const REASSEMBLY: u64 = 35 * SECOND;
 
 /// Both lists.
 #[derive(Debug, Default)]
-pub struct Deaths {
-    known: BTreeMap<u64, Death>,
+pub struct LossCauses {
+    known: BTreeMap<u64, KnownLoss>,
     /// By the first of each run.
     pending: BTreeMap<u64, Run>,
 }
 
 /// Where a sample, or part of it, died.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub struct Death {
+pub struct KnownLoss {
     /// Where, nearest to the reader.
     pub cause: LossCause,
     /// When the first part of it did.
@@ -41,22 +42,22 @@ struct Run {
     until: Timestamp,
 }
 
-impl Deaths {
+impl LossCauses {
     /// Entries and cap of both lists.
     #[must_use]
     pub fn sizes(&self) -> [Size; 2] {
         // A new list does not compile before it has a place here.
         let Self { known, pending } = self;
         [
-            Size::new("deaths.known", known.len(), SAMPLES),
-            Size::new("deaths.pending", pending.len(), RUNS),
+            Size::new("loss_causes.known", known.len(), SAMPLES),
+            Size::new("loss_causes.pending", pending.len(), RUNS),
         ]
     }
 
     /// Some or all of this sample died; whether an older one had to be forgotten for it.
     pub fn note(&mut self, number: u64, cause: LossCause, at: Timestamp) -> bool {
-        let death = self.known.entry(number).or_insert(Death { cause, at });
-        death.cause = death.cause.max(cause);
+        let known_loss = self.known.entry(number).or_insert(KnownLoss { cause, at });
+        known_loss.cause = known_loss.cause.max(cause);
         let is_full = self.known.len() > SAMPLES;
         if is_full {
             self.known.pop_first();
@@ -65,7 +66,7 @@ impl Deaths {
     }
 
     /// It came after all, or was excused.
-    pub fn forget(&mut self, number: u64) -> Option<Death> {
+    pub fn forget(&mut self, number: u64) -> Option<KnownLoss> {
         if self.known.is_empty() {
             return None;
         }
@@ -85,8 +86,8 @@ impl Deaths {
             if number > next {
                 show(next, number - 1, None);
             }
-            if let Some(death) = self.known.remove(&number) {
-                show(number, number, Some(death.cause));
+            if let Some(known_loss) = self.known.remove(&number) {
+                show(number, number, Some(known_loss.cause));
             }
             next = number + 1;
             if number == last {
@@ -162,8 +163,8 @@ impl Deaths {
 
     /// Takes over what `other` knows.
     pub fn absorb(&mut self, other: Self) {
-        for (number, death) in other.known {
-            self.note(number, death.cause, death.at);
+        for (number, known_loss) in other.known {
+            self.note(number, known_loss.cause, known_loss.at);
         }
     }
 }
@@ -176,9 +177,13 @@ mod tests {
         Timestamp(seconds * 1_000_000_000)
     }
 
-    fn explained(deaths: &mut Deaths, first: u64, last: u64) -> Vec<(u64, u64, Option<LossCause>)> {
+    fn explained(
+        loss_causes: &mut LossCauses,
+        first: u64,
+        last: u64,
+    ) -> Vec<(u64, u64, Option<LossCause>)> {
         let mut runs = Vec::new();
-        deaths.explain(first, last, |first, last, cause| {
+        loss_causes.explain(first, last, |first, last, cause| {
             runs.push((first, last, cause));
         });
         runs
@@ -186,51 +191,51 @@ mod tests {
 
     #[test]
     fn the_cause_nearest_to_the_reader_is_borne() {
-        let mut deaths = Deaths::default();
-        deaths.note(5, LossCause::Reassembly, at(1));
-        deaths.note(5, LossCause::SocketBuffer, at(2));
-        deaths.note(7, LossCause::SocketBuffer, at(2));
-        deaths.note(7, LossCause::Reassembly, at(3));
+        let mut loss_causes = LossCauses::default();
+        loss_causes.note(5, LossCause::Reassembly, at(1));
+        loss_causes.note(5, LossCause::SocketBuffer, at(2));
+        loss_causes.note(7, LossCause::SocketBuffer, at(2));
+        loss_causes.note(7, LossCause::Reassembly, at(3));
         let socket = Some(LossCause::SocketBuffer);
         assert_eq!(
-            explained(&mut deaths, 4, 7),
+            explained(&mut loss_causes, 4, 7),
             [(4, 4, None), (5, 5, socket), (6, 6, None), (7, 7, socket)]
         );
-        assert_eq!(explained(&mut deaths, 4, 7), [(4, 7, None)]);
+        assert_eq!(explained(&mut loss_causes, 4, 7), [(4, 7, None)]);
     }
 
     #[test]
     fn what_is_pending_is_resolved_one_by_one() {
-        let mut deaths = Deaths::default();
-        assert_eq!(deaths.wait(10, 12, at(5)), None);
-        assert_eq!(deaths.wait(13, 13, at(5)), None);
-        assert!(deaths.resolve(11) && !deaths.resolve(11) && !deaths.resolve(14));
-        assert!(deaths.due(at(4)).is_empty());
-        assert_eq!(deaths.due(at(5)), [(10, 10), (12, 13)]);
-        assert!(deaths.due(at(9)).is_empty());
+        let mut loss_causes = LossCauses::default();
+        assert_eq!(loss_causes.wait(10, 12, at(5)), None);
+        assert_eq!(loss_causes.wait(13, 13, at(5)), None);
+        assert!(loss_causes.resolve(11) && !loss_causes.resolve(11) && !loss_causes.resolve(14));
+        assert!(loss_causes.due(at(4)).is_empty());
+        assert_eq!(loss_causes.due(at(5)), [(10, 10), (12, 13)]);
+        assert!(loss_causes.due(at(9)).is_empty());
     }
 
     #[test]
     fn both_lists_are_bounded_and_what_is_pushed_out_is_told() {
-        let mut deaths = Deaths::default();
-        let forgotten =
-            (0..10_000).filter(|number| deaths.note(2 * number, LossCause::SocketBuffer, at(1)));
+        let mut loss_causes = LossCauses::default();
+        let forgotten = (0..10_000)
+            .filter(|number| loss_causes.note(2 * number, LossCause::SocketBuffer, at(1)));
         assert_eq!(forgotten.count(), 10_000 - SAMPLES);
-        let told = (0..2000).filter_map(|number| deaths.wait(2 * number, 2 * number, at(1)));
+        let told = (0..2000).filter_map(|number| loss_causes.wait(2 * number, 2 * number, at(1)));
         assert_eq!(told.count(), 2000 - RUNS);
     }
 
     #[test]
     fn resolving_every_other_sample_of_a_long_run_makes_no_more_runs_than_there_may_be() {
-        let mut deaths = Deaths::default();
-        deaths.wait(1, 100_000, at(1));
-        let resolved = (1..50_000).filter(|number| deaths.resolve(2 * number));
+        let mut loss_causes = LossCauses::default();
+        loss_causes.wait(1, 100_000, at(1));
+        let resolved = (1..50_000).filter(|number| loss_causes.resolve(2 * number));
         assert_eq!(resolved.count(), RUNS - 1);
-        let [_, pending] = deaths.sizes();
+        let [_, pending] = loss_causes.sizes();
         assert_eq!(pending.entries, pending.cap);
         // At the ends of a run there is no split, and a hole makes room for none.
-        assert!(deaths.resolve(1));
-        let left = deaths.due(at(1)).into_iter();
+        assert!(loss_causes.resolve(1));
+        let left = loss_causes.due(at(1)).into_iter();
         let left: u64 = left.map(|(first, last)| last - first + 1).sum();
         assert_eq!(left, 100_000 - RUNS as u64);
     }

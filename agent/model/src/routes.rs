@@ -5,24 +5,24 @@
 
 use std::collections::VecDeque;
 
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
-use super::receivers::{Around, Matched};
+use super::receivers::{GraphView, Matched};
+use super::route::{Destination, Route};
 use super::size::Size;
 use super::snapshot::Direction;
 use super::topic::Topic;
-use super::way::{Place, Way};
 
 /// Ways of one writer.
 const LIMIT: usize = 512;
 /// Moments at which it is known what had left, one a second.
 const MOMENTS: usize = 24;
-const SECOND: u64 = 1_000_000_000;
 
 /// All ways of one writer, sorted.
 #[derive(Debug, Default)]
-pub struct Ways {
-    ways: Vec<Known>,
+pub struct Routes {
+    routes: Vec<KnownRoute>,
     /// The one that was used last.
     last: usize,
     /// Ways given up because of the cap.
@@ -31,13 +31,13 @@ pub struct Ways {
 
 /// One way.
 #[derive(Debug)]
-pub struct Known {
+pub struct KnownRoute {
     /// Which.
-    pub way: Way,
+    pub route: Route,
     /// The participant at its end.
     pub owner: Option<GuidPrefix>,
     /// What was directed to it there, where nothing else tells.
-    told: Option<GuidPrefix>,
+    directed_to: Option<GuidPrefix>,
     /// Whether that participant reads the topic; of a multicast that leaves, whether anybody does.
     pub matched: Matched,
     /// Where its delivery stands, if that was looked up.
@@ -54,21 +54,21 @@ pub struct Known {
     left: VecDeque<(Timestamp, u64)>,
 }
 
-impl Ways {
+impl Routes {
     /// Entries and cap of every list.
     #[must_use]
     pub fn sizes(&self) -> [Size; 2] {
         // A new list does not compile before it has a place here.
         let Self {
-            ways,
+            routes,
             last: _,
             evictions: _,
         } = self;
-        let left = |known: &Known| {
-            let Known {
-                way: _,
+        let left = |known: &KnownRoute| {
+            let KnownRoute {
+                route: _,
                 owner: _,
-                told: _,
+                directed_to: _,
                 matched: _,
                 delivery: _,
                 last_seen: _,
@@ -79,32 +79,32 @@ impl Ways {
             } = known;
             left.len()
         };
-        let left = ways.iter().map(left).max().unwrap_or(0);
+        let left = routes.iter().map(left).max().unwrap_or(0);
         [
-            Size::new("ways.ways", ways.len(), LIMIT),
-            Size::new("ways.left", left, MOMENTS),
+            Size::new("routes.routes", routes.len(), LIMIT),
+            Size::new("routes.left", left, MOMENTS),
         ]
     }
 
     /// All of them.
-    pub fn iter(&self) -> impl Iterator<Item = &Known> {
-        self.ways.iter()
+    pub fn iter(&self) -> impl Iterator<Item = &KnownRoute> {
+        self.routes.iter()
     }
 
     /// All of them.
-    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut Known> {
-        self.ways.iter_mut()
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut KnownRoute> {
+        self.routes.iter_mut()
     }
 
     /// One of them.
     #[must_use]
-    pub fn get(&self, index: usize) -> Option<&Known> {
-        self.ways.get(index)
+    pub fn get(&self, index: usize) -> Option<&KnownRoute> {
+        self.routes.get(index)
     }
 
     /// One of them.
-    pub fn get_mut(&mut self, index: usize) -> Option<&mut Known> {
-        self.ways.get_mut(index)
+    pub fn get_mut(&mut self, index: usize) -> Option<&mut KnownRoute> {
+        self.routes.get_mut(index)
     }
 
     /// Ways given up because of the cap.
@@ -115,41 +115,43 @@ impl Ways {
 
     /// Where this way stands.
     #[must_use]
-    pub fn find(&self, way: &Way) -> Option<usize> {
+    pub fn find(&self, route: &Route) -> Option<usize> {
         if self
-            .ways
+            .routes
             .get(self.last)
-            .is_some_and(|known| known.way == *way)
+            .is_some_and(|known| known.route == *route)
         {
             return Some(self.last);
         }
-        self.ways.binary_search_by_key(way, |known| known.way).ok()
+        self.routes
+            .binary_search_by_key(route, |known| known.route)
+            .ok()
     }
 
     /// Where this way stands, known from now on.
-    pub fn place(
+    pub fn find_or_insert(
         &mut self,
-        way: Way,
+        route: Route,
         now: Timestamp,
-        around: &Around<'_>,
+        graph: &GraphView<'_>,
         topic: Option<&Topic>,
     ) -> usize {
-        if let Some(index) = self.find(&way) {
+        if let Some(index) = self.find(&route) {
             self.last = index;
             return index;
         }
-        if self.ways.len() >= LIMIT {
-            let silent = self.ways.iter().enumerate();
+        if self.routes.len() >= LIMIT {
+            let silent = self.routes.iter().enumerate();
             let oldest = silent.min_by_key(|(_, known)| known.last_seen);
             if let Some(index) = oldest.map(|(index, _)| index) {
-                self.ways.remove(index);
+                self.routes.remove(index);
                 self.evictions += 1;
             }
         }
-        let mut known = Known {
-            way,
+        let mut known = KnownRoute {
+            route,
             owner: None,
-            told: None,
+            directed_to: None,
             matched: Matched::Unknown,
             delivery: None,
             last_seen: now,
@@ -158,63 +160,69 @@ impl Ways {
             has_data: false,
             left: VecDeque::new(),
         };
-        known.resolve(around, topic);
-        let index = self.ways.partition_point(|known| known.way < way);
-        self.ways.insert(index, known);
+        known.resolve(graph, topic);
+        let index = self.routes.partition_point(|known| known.route < route);
+        self.routes.insert(index, known);
         self.last = index;
         index
     }
 
     /// Whether what is sent to this place is seen at sockets.
     #[must_use]
-    pub fn is_at_socket(&self, place: Place) -> bool {
-        let mut ways = self.ways.iter();
-        ways.any(|known| known.at_socket && known.way.place == place)
+    pub fn is_at_socket(&self, destination: Destination) -> bool {
+        let mut routes = self.routes.iter();
+        routes.any(|known| known.at_socket && known.route.destination == destination)
     }
 
     /// Forgets ways.
-    pub fn retain(&mut self, keep: impl FnMut(&Known) -> bool) {
-        self.ways.retain(keep);
+    pub fn retain(&mut self, keep: impl FnMut(&KnownRoute) -> bool) {
+        self.routes.retain(keep);
     }
 
     /// The highest number that has left for this place, and what had left by a moment.
     #[must_use]
-    pub fn leaving(&self, place: Place) -> Option<&Known> {
-        self.find(&Way {
+    pub fn leaving(&self, destination: Destination) -> Option<&KnownRoute> {
+        self.find(&Route {
             direction: Direction::Sent,
             socket: 0,
-            place,
+            destination,
         })
-        .and_then(|index| self.ways.get(index))
+        .and_then(|index| self.routes.get(index))
     }
 }
 
-impl Known {
+impl KnownRoute {
     /// Finds out who is at its end.
-    pub fn resolve(&mut self, around: &Around<'_>, topic: Option<&Topic>) {
-        let is_there = |prefix: &GuidPrefix| around.discovery.participants().contains_key(prefix);
-        self.owner = around
+    pub fn resolve(&mut self, graph: &GraphView<'_>, topic: Option<&Topic>) {
+        let is_there = |prefix: &GuidPrefix| graph.discovery.participants().contains_key(prefix);
+        self.owner = graph
             .receivers
-            .owner(&self.way, around.discovery)
-            .or(self.told.filter(is_there));
+            .owner(&self.route, graph.discovery)
+            .or(self.directed_to.filter(is_there));
         self.delivery = None;
-        let leaves_for_all = self.way.direction == Direction::Sent && self.way.place.is_multicast();
+        let leaves_for_all =
+            self.route.direction == Direction::Sent && self.route.destination.is_multicast();
         self.matched = match self.owner {
             _ if leaves_for_all => match topic {
                 Some(topic) if !topic.readers.is_empty() => Matched::Yes,
                 _ => Matched::Unknown,
             },
-            Some(owner) => around.matched(topic, owner),
+            Some(owner) => graph.matched(topic, owner),
             None => Matched::Unknown,
         };
     }
 
     /// Something was directed to this participant here.
-    pub fn tell(&mut self, prefix: GuidPrefix, around: &Around<'_>, topic: Option<&Topic>) {
-        if self.owner.is_none() && self.told != Some(prefix) {
-            self.told = Some(prefix);
-            self.owner = self.told;
-            self.matched = around.matched(topic, prefix);
+    pub fn note_directed(
+        &mut self,
+        prefix: GuidPrefix,
+        graph: &GraphView<'_>,
+        topic: Option<&Topic>,
+    ) {
+        if self.owner.is_none() && self.directed_to != Some(prefix) {
+            self.directed_to = Some(prefix);
+            self.owner = self.directed_to;
+            self.matched = graph.matched(topic, prefix);
         }
     }
 
@@ -247,14 +255,14 @@ mod tests {
 
     #[test]
     fn what_had_left_by_a_moment_is_remembered_for_a_while() {
-        let mut known = Known {
-            way: Way {
+        let mut known = KnownRoute {
+            route: Route {
                 direction: Direction::Sent,
                 socket: 0,
-                place: Place::default(),
+                destination: Destination::default(),
             },
             owner: None,
-            told: None,
+            directed_to: None,
             matched: Matched::Unknown,
             delivery: None,
             last_seen: Timestamp(0),

@@ -5,7 +5,7 @@
 
 /// What is known in favour of a participant or an endpoint; the first field counts most.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Worth {
+pub struct Priority {
     /// Its topic is watched by its exact name; of a participant, that of one of its endpoints.
     pub watched: bool,
     /// A socket of this host sends for its participant: no forger elsewhere has one.
@@ -14,7 +14,7 @@ pub struct Worth {
     pub sends: bool,
 }
 
-impl Worth {
+impl Priority {
     /// An announcement and nothing else.
     pub const NOTHING: Self = Self {
         watched: false,
@@ -39,19 +39,19 @@ mod tests {
 
     #[test]
     fn a_watched_name_counts_more_than_a_local_socket_and_that_more_than_user_data() {
-        let worth = |watched, local, sends| Worth {
+        let priority = |watched, local, sends| Priority {
             watched,
             local,
             sends,
         };
         let ascending = [
-            Worth::NOTHING,
-            worth(false, false, true),
-            worth(false, true, false),
-            worth(false, true, true),
-            worth(true, false, false),
-            worth(true, false, true),
-            worth(true, true, false),
+            Priority::NOTHING,
+            priority(false, false, true),
+            priority(false, true, false),
+            priority(false, true, true),
+            priority(true, false, false),
+            priority(true, false, true),
+            priority(true, true, false),
         ];
         assert!(ascending.is_sorted());
         assert_eq!(ascending[1].or(ascending[4]), ascending[5]);

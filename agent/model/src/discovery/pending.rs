@@ -7,25 +7,25 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 
-use super::worth::Worth;
+use super::priority::Priority;
 
 /// Entries by key, and in the order in which they go.
 #[derive(Debug)]
-pub(super) struct Waiting<K, T> {
+pub(super) struct PendingTable<K, T> {
     cap: usize,
     entries: BTreeMap<K, Entry<T>>,
-    order: BTreeSet<(Worth, u64, K)>,
+    order: BTreeSet<(Priority, u64, K)>,
     age: u64,
 }
 
 #[derive(Debug)]
 struct Entry<T> {
-    worth: Worth,
+    priority: Priority,
     age: u64,
     value: T,
 }
 
-impl<K: Copy + Ord, T> Waiting<K, T> {
+impl<K: Copy + Ord, T> PendingTable<K, T> {
     /// Empty, for at most `cap` entries.
     pub(super) const fn new(cap: usize) -> Self {
         Self {
@@ -49,38 +49,48 @@ impl<K: Copy + Ord, T> Waiting<K, T> {
 
     /// Puts an entry in place of the one with this key; whether one had to go for that, which is
     /// this one where all others are worth more.
-    pub(super) fn put(&mut self, key: K, worth: Worth, value: T) -> bool {
+    pub(super) fn put(&mut self, key: K, priority: Priority, value: T) -> bool {
         self.remove(&key);
         let is_full = self.entries.len() >= self.cap;
         if is_full {
             match self.order.first().copied() {
-                Some((least, _, oldest)) if least <= worth => self.remove(&oldest),
+                Some((least, _, oldest)) if least <= priority => self.remove(&oldest),
                 _ => return true,
             };
         }
         self.age += 1;
         let age = self.age;
-        self.order.insert((worth, age, key));
-        self.entries.insert(key, Entry { worth, age, value });
+        self.order.insert((priority, age, key));
+        self.entries.insert(
+            key,
+            Entry {
+                priority,
+                age,
+                value,
+            },
+        );
         is_full
     }
 
     /// Takes an entry out.
-    pub(super) fn remove(&mut self, key: &K) -> Option<(Worth, T)> {
+    pub(super) fn remove(&mut self, key: &K) -> Option<(Priority, T)> {
         let entry = self.entries.remove(key)?;
-        self.order.remove(&(entry.worth, entry.age, *key));
-        Some((entry.worth, entry.value))
+        self.order.remove(&(entry.priority, entry.age, *key));
+        Some((entry.priority, entry.value))
     }
 
     /// What this entry is worth.
-    pub(super) fn worth(&self, key: &K) -> Option<Worth> {
-        Some(self.entries.get(key)?.worth)
+    pub(super) fn priority(&self, key: &K) -> Option<Priority> {
+        Some(self.entries.get(key)?.priority)
     }
 
     /// The keys in this range, each with what its entry is worth.
-    pub(super) fn range(&self, keys: RangeInclusive<K>) -> impl Iterator<Item = (K, Worth)> + '_ {
+    pub(super) fn range(
+        &self,
+        keys: RangeInclusive<K>,
+    ) -> impl Iterator<Item = (K, Priority)> + '_ {
         let range = self.entries.range(keys);
-        range.map(|(key, entry)| (*key, entry.worth))
+        range.map(|(key, entry)| (*key, entry.priority))
     }
 
     /// Keeps those that `keep` wants.
@@ -91,11 +101,11 @@ impl<K: Copy + Ord, T> Waiting<K, T> {
     }
 
     /// Asks anew what each is worth.
-    pub(super) fn rate(&mut self, worth: impl Fn(Worth, &T) -> Worth) {
+    pub(super) fn rate(&mut self, priority: impl Fn(Priority, &T) -> Priority) {
         self.order.clear();
         for (key, entry) in &mut self.entries {
-            entry.worth = worth(entry.worth, &entry.value);
-            self.order.insert((entry.worth, entry.age, *key));
+            entry.priority = priority(entry.priority, &entry.value);
+            self.order.insert((entry.priority, entry.age, *key));
         }
     }
 }
@@ -104,36 +114,36 @@ impl<K: Copy + Ord, T> Waiting<K, T> {
 mod tests {
     use super::*;
 
-    const WATCHED: Worth = Worth {
+    const WATCHED: Priority = Priority {
         watched: true,
-        ..Worth::NOTHING
+        ..Priority::NOTHING
     };
 
     #[test]
     fn the_oldest_of_the_least_worth_goes_first_and_nothing_worth_more_than_the_newcomer() {
-        let mut waiting = Waiting::new(3);
+        let mut waiting = PendingTable::new(3);
         assert!(!waiting.put(1, WATCHED, 'a'));
-        assert!(!waiting.put(2, Worth::NOTHING, 'b'));
-        assert!(!waiting.put(3, Worth::NOTHING, 'c'));
-        assert!(waiting.put(4, Worth::NOTHING, 'd'));
+        assert!(!waiting.put(2, Priority::NOTHING, 'b'));
+        assert!(!waiting.put(3, Priority::NOTHING, 'c'));
+        assert!(waiting.put(4, Priority::NOTHING, 'd'));
         assert_eq!(waiting.remove(&2), None);
         assert!(waiting.put(5, WATCHED, 'e') && waiting.put(6, WATCHED, 'f'));
-        assert!(waiting.put(7, Worth::NOTHING, 'g'));
+        assert!(waiting.put(7, Priority::NOTHING, 'g'));
         let left: Vec<_> = waiting.range(0..=9).map(|(key, _)| key).collect();
         assert_eq!((left, waiting.sizes()), (vec![1, 5, 6], (3, 3)));
         // In its own place it makes nobody go.
-        assert!(!waiting.put(5, Worth::NOTHING, 'h'));
-        assert_eq!(waiting.worth(&5), Some(Worth::NOTHING));
+        assert!(!waiting.put(5, Priority::NOTHING, 'h'));
+        assert_eq!(waiting.priority(&5), Some(Priority::NOTHING));
         waiting.rate(|_, value| {
             if *value == 'h' {
                 WATCHED
             } else {
-                Worth::NOTHING
+                Priority::NOTHING
             }
         });
-        assert!(waiting.put(8, Worth::NOTHING, 'i'));
+        assert!(waiting.put(8, Priority::NOTHING, 'i'));
         assert_eq!(
-            (waiting.worth(&1), waiting.worth(&5)),
+            (waiting.priority(&1), waiting.priority(&5)),
             (None, Some(WATCHED))
         );
         waiting.retain(|key, _| *key == 8);

@@ -2,45 +2,53 @@
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Reliability;
+use ros2probe_wire::time::SECOND;
 
-use super::{Stage, Subscribers, is_reader, scene};
+use super::{Subscribers, WriterContext, delivery_context, is_reader};
 use crate::delivery::{Delivery, Receiver, Totals};
 use crate::receivers::{Matched, readers};
-use crate::way::Way;
+use crate::route::Route;
 
-const SECOND: u64 = 1_000_000_000;
 /// A way by which nothing came for so long is forgotten, unless a reader is known at its end.
 const FORGET: u64 = 60 * SECOND;
 
 impl Subscribers {
     /// Settles what has waited long enough and forgets what has been silent for long.
-    pub fn advance(&mut self, stage: &mut Stage<'_>) {
-        self.refresh(stage);
-        let now = stage.now;
+    pub fn advance(&mut self, context: &mut WriterContext<'_>) {
+        self.refresh(context);
+        let now = context.now;
         for delivery in &mut self.deliveries {
-            delivery.advance(&mut scene(&mut self.totals, self.reassembled, stage));
+            delivery.advance(&mut delivery_context(
+                &mut self.totals,
+                self.reassembled,
+                context,
+            ));
         }
-        self.expect(stage, false);
+        self.expect(context, false);
         if now.0.is_multiple_of(SECOND) {
-            self.ways.retain(|known| {
+            self.routes.retain(|known| {
                 known.matched == Matched::Yes || known.last_seen.0.saturating_add(FORGET) > now.0
             });
-            self.drop_orphans(stage);
+            self.drop_orphans(context);
         }
     }
 
     /// Settles everything: nothing more will come.
-    pub fn settle(&mut self, stage: &mut Stage<'_>) {
-        self.expect(stage, true);
+    pub fn settle(&mut self, context: &mut WriterContext<'_>) {
+        self.expect(context, true);
         for delivery in &mut self.deliveries {
-            delivery.settle(&mut scene(&mut self.totals, self.reassembled, stage));
+            delivery.settle(&mut delivery_context(
+                &mut self.totals,
+                self.reassembled,
+                context,
+            ));
         }
     }
 
     /// Settles everything, gives back the room and tells what was counted.
-    pub fn stop(mut self, stage: &mut Stage<'_>) -> Totals {
-        self.settle(stage);
-        stage.room.used = stage.room.used.saturating_sub(self.deliveries.len());
+    pub fn stop(mut self, context: &mut WriterContext<'_>) -> Totals {
+        self.settle(context);
+        context.quota.used = context.quota.used.saturating_sub(self.deliveries.len());
         self.totals
     }
 
@@ -50,19 +58,24 @@ impl Subscribers {
     }
 
     /// Gives up the deliveries that were last heard of by then, at most `count`; how many.
-    pub fn give_up(&mut self, until: Timestamp, count: usize, stage: &mut Stage<'_>) -> usize {
+    pub fn give_up(
+        &mut self,
+        until: Timestamp,
+        count: usize,
+        context: &mut WriterContext<'_>,
+    ) -> usize {
         let mut left = count;
-        self.remove(stage, |delivery| {
+        self.remove(context, |delivery| {
             let goes = left > 0 && delivery.seen().1 <= until;
             left -= usize::from(goes);
             goes
         });
-        stage.room.evictions += (count - left) as u64;
+        context.quota.evictions += (count - left) as u64;
         count - left
     }
 
     /// Looks whether what left this host for a receiver on it has arrived.
-    fn expect(&mut self, stage: &mut Stage<'_>, no_more: bool) {
+    fn expect(&mut self, context: &mut WriterContext<'_>, no_more: bool) {
         if !self.totals.seen[1] || !self.totals.seen[0] {
             return;
         }
@@ -71,26 +84,26 @@ impl Subscribers {
                 return;
             };
             let (main, next) = (delivery.main(), delivery.next());
-            let Some(at) = self.ways.find(&main) else {
+            let Some(at) = self.routes.find(&main) else {
                 continue;
             };
             if main.is_sent() {
-                if let Some(known) = self.ways.get_mut(at).filter(|_| next > 0) {
-                    known.mark(next - 1, stage.now);
+                if let Some(known) = self.routes.get_mut(at).filter(|_| next > 0) {
+                    known.mark(next - 1, context.now);
                 }
                 continue;
             }
             if self
-                .ways
+                .routes
                 .get(at)
                 .is_none_or(|known| known.matched == Matched::No)
             {
                 continue;
             }
-            let Some(leaving) = self.ways.leaving(main.place) else {
+            let Some(leaving) = self.routes.leaving(main.destination) else {
                 continue;
             };
-            let left = self.find(Receiver::Way(leaving.way));
+            let left = self.find(Receiver::Route(leaving.route));
             let Some(left) = left.and_then(|left| self.deliveries.get(left)) else {
                 continue;
             };
@@ -99,68 +112,68 @@ impl Subscribers {
             };
             let alive = match delivery.receiver() {
                 Receiver::Participant(prefix) => {
-                    let participant = stage.around.discovery.participants().get(&prefix);
+                    let participant = context.graph.discovery.participants().get(&prefix);
                     participant.map(|participant| participant.last_seen)
                 }
-                Receiver::Way(_) => None,
+                Receiver::Route(_) => None,
             };
-            let mut scene = scene(&mut self.totals, self.reassembled, stage);
+            let mut context = delivery_context(&mut self.totals, self.reassembled, context);
             let Some(delivery) = self.deliveries.get_mut(index) else {
                 return;
             };
             if no_more {
-                delivery.expect_no_more(newest, &mut scene);
+                delivery.expect_no_more(newest, &mut context);
             } else {
-                delivery.expect(newest, alive, |at| leaving.left_by(at), &mut scene);
+                delivery.expect(newest, alive, |at| leaving.left_by(at), &mut context);
             }
         }
     }
 
     /// What came this way so far was seen on a wire; from now on it is seen at a socket.
-    pub(super) fn uncover(&mut self, way: Way, stage: &mut Stage<'_>) {
+    pub(super) fn uncover(&mut self, route: Route, context: &mut WriterContext<'_>) {
         self.at_socket = true;
-        let place = way.place;
-        let before = self.ways.iter().count();
-        self.ways
-            .retain(|known| known.at_socket || known.way.place != place);
-        if self.ways.iter().count() < before {
-            self.drop_orphans(stage);
+        let destination = route.destination;
+        let before = self.routes.iter().count();
+        self.routes
+            .retain(|known| known.at_socket || known.route.destination != destination);
+        if self.routes.iter().count() < before {
+            self.drop_orphans(context);
         }
     }
 
     /// Finds out anew who is where, if anything changed.
-    pub(super) fn refresh(&mut self, stage: &mut Stage<'_>) {
-        let (around, topic) = (stage.around, stage.topic());
-        if self.generation == around.receivers.generation() {
+    pub(super) fn refresh(&mut self, context: &mut WriterContext<'_>) {
+        let (graph, topic) = (context.graph, context.topic());
+        if self.generation == graph.receivers.generation() {
             return;
         }
-        self.generation = around.receivers.generation();
-        let before = self.ways.iter().count();
-        self.ways
-            .retain(|known| !around.receivers.is_closed(known.way.socket));
-        let closed = before > self.ways.iter().count();
-        for known in self.ways.iter_mut() {
-            known.resolve(&around, topic);
+        self.generation = graph.receivers.generation();
+        let before = self.routes.iter().count();
+        self.routes
+            .retain(|known| !graph.receivers.is_closed(known.route.socket));
+        let closed = before > self.routes.iter().count();
+        for known in self.routes.iter_mut() {
+            known.resolve(&graph, topic);
         }
-        self.identify(stage);
+        self.identify(context);
         if closed {
-            self.drop_orphans(stage);
+            self.drop_orphans(context);
         }
         for delivery in &mut self.deliveries {
             if let Receiver::Participant(prefix) = delivery.receiver()
-                && around.matched(topic, prefix) == Matched::No
+                && graph.matched(topic, prefix) == Matched::No
             {
-                delivery.close(stage.budget);
+                delivery.close(context.budget);
             }
-            delivery.learn(is_best_effort(delivery.receiver(), stage));
+            delivery.learn(is_best_effort(delivery.receiver(), context));
             let appeared = match delivery.receiver() {
                 Receiver::Participant(prefix) => topic.and_then(|topic| {
-                    let known = |guid| around.discovery.endpoints().get(&guid);
+                    let known = |guid| graph.discovery.endpoints().get(&guid);
                     readers(topic, prefix)
                         .filter_map(|guid| Some(known(guid)?.first_seen))
                         .min()
                 }),
-                Receiver::Way(_) => topic.map(|topic| topic.reader_appeared),
+                Receiver::Route(_) => topic.map(|topic| topic.reader_appeared),
             };
             if let Some(at) = appeared.filter(|at| *at > delivery.seen().1) {
                 delivery.open(at);
@@ -171,16 +184,16 @@ impl Subscribers {
     }
 
     /// Puts ways together that turned out to lead to one participant.
-    fn identify(&mut self, stage: &mut Stage<'_>) {
+    fn identify(&mut self, context: &mut WriterContext<'_>) {
         let mut index = 0;
         while let Some(delivery) = self.deliveries.get(index) {
             index += 1;
-            let Receiver::Way(way) = delivery.receiver() else {
+            let Receiver::Route(route) = delivery.receiver() else {
                 continue;
             };
-            let known = self.ways.find(&way).and_then(|at| self.ways.get(at));
+            let known = self.routes.find(&route).and_then(|at| self.routes.get(at));
             let owner = known
-                .filter(|_| !way.is_sent())
+                .filter(|_| !route.is_sent())
                 .and_then(|known| known.owner);
             let Some(owner) = owner else { continue };
             let place = index - 1;
@@ -196,10 +209,13 @@ impl Subscribers {
                 };
                 let gone = self.deliveries.remove(goes);
                 let keeps = keeps - usize::from(goes < keeps);
-                stage.room.used = stage.room.used.saturating_sub(1);
+                context.quota.used = context.quota.used.saturating_sub(1);
                 if let Some(delivery) = self.deliveries.get_mut(keeps) {
                     delivery.identify(owner);
-                    delivery.absorb(gone, &mut scene(&mut self.totals, self.reassembled, stage));
+                    delivery.absorb(
+                        gone,
+                        &mut delivery_context(&mut self.totals, self.reassembled, context),
+                    );
                 }
                 index = 0;
             } else if let Some(delivery) = self.deliveries.get_mut(place) {
@@ -210,45 +226,47 @@ impl Subscribers {
     }
 
     /// Gives up deliveries to which no way leads any more.
-    fn drop_orphans(&mut self, stage: &mut Stage<'_>) {
+    fn drop_orphans(&mut self, context: &mut WriterContext<'_>) {
         let led_to: Vec<_> = self
             .deliveries()
-            .map(|(_, ways)| !ways.is_empty())
+            .map(|(_, routes)| !routes.is_empty())
             .collect();
         for (delivery, is_led_to) in self.deliveries.iter_mut().zip(&led_to) {
             if !is_led_to {
-                delivery.close(stage.budget);
+                delivery.close(context.budget);
             }
         }
         let mut led_to = led_to.into_iter();
-        self.remove(stage, |_| !led_to.next().unwrap_or(false));
+        self.remove(context, |_| !led_to.next().unwrap_or(false));
     }
 
-    fn remove(&mut self, stage: &mut Stage<'_>, mut goes: impl FnMut(&Delivery) -> bool) {
+    fn remove(&mut self, context: &mut WriterContext<'_>, mut goes: impl FnMut(&Delivery) -> bool) {
         let before = self.deliveries.len();
         let (totals, reassembled) = (&mut self.totals, self.reassembled);
         self.deliveries.retain_mut(|delivery| {
             let goes = goes(delivery);
             if goes {
-                delivery.settle(&mut scene(totals, reassembled, stage));
+                delivery.settle(&mut delivery_context(totals, reassembled, context));
             }
             !goes
         });
         let gone = before - self.deliveries.len();
         if gone > 0 {
-            stage.room.used = stage.room.used.saturating_sub(gone);
-            self.ways.iter_mut().for_each(|known| known.delivery = None);
+            context.quota.used = context.quota.used.saturating_sub(gone);
+            self.routes
+                .iter_mut()
+                .for_each(|known| known.delivery = None);
             self.count_open();
         }
     }
 }
 
 /// Whether readers are known there and none of them is reliable.
-pub(super) fn is_best_effort(receiver: Receiver, stage: &Stage<'_>) -> bool {
-    let (Receiver::Participant(prefix), Some(topic)) = (receiver, stage.topic()) else {
+pub(super) fn is_best_effort(receiver: Receiver, context: &WriterContext<'_>) -> bool {
+    let (Receiver::Participant(prefix), Some(topic)) = (receiver, context.topic()) else {
         return false;
     };
-    let endpoints = stage.around.discovery.endpoints();
+    let endpoints = context.graph.discovery.endpoints();
     let known = readers(topic, prefix).filter_map(|guid| endpoints.get(&guid));
     let mut known = known.map(|endpoint| endpoint.qos.reliability == Reliability::RELIABLE);
     known.next() == Some(false) && !known.any(|is_reliable| is_reliable)

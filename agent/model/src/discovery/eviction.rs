@@ -13,14 +13,14 @@
 use ros2probe_wire::{EntityId, Guid, Timestamp};
 
 use super::facts::{Participant, named};
-use super::worth::Worth;
+use super::priority::Priority;
 use super::{Discovery, SECOND};
 use crate::journal::Journal;
 
 /// A participant that was seen over this span is no forgery of the moment.
 const ESTABLISHED: u64 = 2 * SECOND;
 /// One that is not established makes room after this long without a word.
-const DOUBTFUL: u64 = 5 * SECOND;
+const UNESTABLISHED_SILENCE: u64 = 5 * SECOND;
 /// Any participant makes room after this long without a word, whatever its lease: real ones repeat
 /// themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
 pub(super) const FORSAKEN: u64 = 90 * SECOND;
@@ -34,7 +34,7 @@ const FOUND: usize = 64;
 #[derive(Debug, Default)]
 pub(super) struct Victims {
     /// Heard no more, the least worth last.
-    doubtful: Vec<Victim>,
+    silent: Vec<Victim>,
     /// All others, likewise.
     others: Vec<Victim>,
     /// Entries that are worth something without a socket on this host.
@@ -47,7 +47,7 @@ pub(super) struct Victims {
 /// One entry that may go.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Victim {
-    worth: Worth,
+    priority: Priority,
     is_established: bool,
     last_seen: Timestamp,
     /// An endpoint, or a participant with all it has.
@@ -58,7 +58,7 @@ struct Victim {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Newcomer {
     pub(super) guid: Guid,
-    pub(super) worth: Worth,
+    pub(super) priority: Priority,
 }
 
 /// A table that may be full.
@@ -74,51 +74,54 @@ impl Victims {
     /// Entries that were found and are still there to go.
     pub(super) fn len(&self) -> usize {
         let Self {
-            doubtful,
+            silent,
             others,
             claims: _,
             watched_claims: _,
             search_after: _,
         } = self;
-        doubtful.len() + others.len()
+        silent.len() + others.len()
     }
 
     /// Most that there may be.
     pub(super) const CAP: usize = 2 * FOUND;
 
     fn search(&mut self, discovery: &Discovery, table: Table, now: Timestamp) {
-        self.doubtful.clear();
+        self.silent.clear();
         self.others.clear();
         (self.claims, self.watched_claims) = (0, 0);
         let mut visited = 0;
         for (prefix, participant) in &discovery.participants {
             let own = Guid::new(*prefix, EntityId::PARTICIPANT);
-            let worth = participant.worth();
+            let priority = participant.priority();
             visited += 1;
             match table {
                 Table::Endpoints if participant.endpoints.is_empty() => continue,
                 Table::Nodes if participant.nodes.is_empty() => continue,
                 Table::Endpoints => {}
-                Table::Participants | Table::Nodes => self.claim(worth),
+                Table::Participants | Table::Nodes => self.claim(priority),
             }
-            if let Some(worth) = doubtful(participant, now) {
-                self.doubtful.push(Victim::of(participant, worth, own));
+            if let Some(priority) = silence_priority(participant, now) {
+                self.silent.push(Victim::of(participant, priority, own));
                 continue;
             }
             if table != Table::Endpoints {
-                self.others.push(Victim::of(participant, worth, own));
+                self.others.push(Victim::of(participant, priority, own));
                 continue;
             }
             for guid in &participant.endpoints {
                 let endpoint = discovery.endpoints.get(guid);
                 let watched = endpoint.is_some_and(|endpoint| endpoint.watched);
-                let worth = Worth { watched, ..worth };
+                let priority = Priority {
+                    watched,
+                    ..priority
+                };
                 visited += 1;
-                self.claim(worth);
-                self.others.push(Victim::of(participant, worth, *guid));
+                self.claim(priority);
+                self.others.push(Victim::of(participant, priority, *guid));
             }
         }
-        for list in [&mut self.doubtful, &mut self.others] {
+        for list in [&mut self.silent, &mut self.others] {
             if list.len() > FOUND {
                 list.select_nth_unstable(FOUND);
                 list.truncate(FOUND);
@@ -132,41 +135,43 @@ impl Victims {
 
     /// The next entry that goes for a newcomer of this worth.
     fn next(&mut self, discovery: &Discovery, table: Table, newcomer: Newcomer) -> Option<Guid> {
-        let Newcomer { guid, worth } = newcomer;
+        let Newcomer { guid, priority } = newcomer;
         // What was said since the search speaks for an entry.
         let is_silent = |victim: &Victim| {
             let participant = discovery.participants.get(&victim.guid.prefix);
             let heard = participant.map(|participant| participant.last_seen);
             heard == Some(victim.last_seen) && victim.guid.prefix != guid.prefix
         };
-        self.doubtful.truncate(last(&self.doubtful, is_silent));
-        if let Some(victim) = self.doubtful.pop_if(|victim| victim.worth <= worth) {
+        self.silent.truncate(last(&self.silent, is_silent));
+        if let Some(victim) = self.silent.pop_if(|victim| victim.priority <= priority) {
             return Some(victim.guid);
         }
-        let is_same = |victim: &Victim| discovery.worth(victim.guid) == Some(victim.worth);
+        let is_same = |victim: &Victim| discovery.priority(victim.guid) == Some(victim.priority);
         self.others.truncate(last(&self.others, is_same));
-        let claims = match worth.watched {
+        let claims = match priority.watched {
             true => self.watched_claims,
             false => self.claims,
         };
-        let is_trusted = worth.local || claims * 2 < discovery.cap(table);
-        let is_nothing = |victim: &Victim| victim.worth == Worth::NOTHING && !victim.is_established;
-        let goes = |victim: &mut Victim| victim.worth < worth && (is_trusted || is_nothing(victim));
+        let is_trusted = priority.local || claims * 2 < discovery.cap(table);
+        let is_nothing =
+            |victim: &Victim| victim.priority == Priority::NOTHING && !victim.is_established;
+        let goes =
+            |victim: &mut Victim| victim.priority < priority && (is_trusted || is_nothing(victim));
         Some(self.others.pop_if(goes)?.guid)
     }
 
-    fn claim(&mut self, worth: Worth) {
-        let is_claim = worth != Worth::NOTHING && !worth.local;
+    fn claim(&mut self, priority: Priority) {
+        let is_claim = priority != Priority::NOTHING && !priority.local;
         self.claims += usize::from(is_claim);
-        self.watched_claims += usize::from(is_claim && worth.watched);
+        self.watched_claims += usize::from(is_claim && priority.watched);
     }
 }
 
 impl Victim {
-    fn of(participant: &Participant, worth: Worth, guid: Guid) -> Self {
+    fn of(participant: &Participant, priority: Priority, guid: Guid) -> Self {
         let last_seen = participant.last_seen;
         Self {
-            worth,
+            priority,
             is_established: last_seen.0.saturating_sub(participant.first_seen.0) >= ESTABLISHED,
             last_seen,
             guid,
@@ -176,7 +181,7 @@ impl Victim {
 
 impl Discovery {
     /// Gives up an entry of a full table for this newcomer, where one may go.
-    pub(super) fn make_room(&mut self, table: Table, newcomer: Newcomer, now: Timestamp) -> bool {
+    pub(super) fn evict_for(&mut self, table: Table, newcomer: Newcomer, now: Timestamp) -> bool {
         let mut victims = std::mem::take(self.victims(table));
         if now >= victims.search_after {
             victims.search(self, table, now);
@@ -225,29 +230,32 @@ impl Discovery {
     }
 
     /// What an entry is worth that is there.
-    fn worth(&self, guid: Guid) -> Option<Worth> {
-        let worth = self.participants.get(&guid.prefix)?.worth();
+    fn priority(&self, guid: Guid) -> Option<Priority> {
+        let priority = self.participants.get(&guid.prefix)?.priority();
         if guid.entity == EntityId::PARTICIPANT {
-            return Some(worth);
+            return Some(priority);
         }
         let watched = self.endpoints.get(&guid)?.watched;
-        Some(Worth { watched, ..worth })
+        Some(Priority {
+            watched,
+            ..priority
+        })
     }
 }
 
 /// As how much this participant counts if it is heard no more.
-fn doubtful(participant: &Participant, now: Timestamp) -> Option<Worth> {
+fn silence_priority(participant: &Participant, now: Timestamp) -> Option<Priority> {
     let last = participant.last_seen.0;
     let is_silent_for = |span: u64| last.saturating_add(span) <= now.0;
-    let worth = participant.worth();
-    if worth.local {
+    let priority = participant.priority();
+    if priority.local {
         return None;
     }
     if is_silent_for(FORSAKEN) {
-        return Some(Worth::NOTHING);
+        return Some(Priority::NOTHING);
     }
     let is_established = last.saturating_sub(participant.first_seen.0) >= ESTABLISHED;
-    (!is_established && is_silent_for(DOUBTFUL)).then_some(worth)
+    (!is_established && is_silent_for(UNESTABLISHED_SILENCE)).then_some(priority)
 }
 
 /// How many are left when those at the end have gone of which `is_valid` does not hold.

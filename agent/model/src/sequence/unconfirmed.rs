@@ -8,7 +8,7 @@ use ros2probe_wire::Timestamp;
 use super::FAR;
 
 /// So many datagrams make a run believed.
-pub(super) const HANDFUL: u8 = 5;
+pub(super) const CONFIRMATIONS: u8 = 5;
 /// Numbers remembered of one run: a datagram may bring several.
 const KEPT: usize = 32;
 /// Copies of one datagram reach several sockets within this time.
@@ -16,7 +16,7 @@ const COPIES: i64 = 5_000_000;
 
 /// The run, and what HEARTBEAT and GAP say beyond what is believed of them at once.
 #[derive(Debug, Default)]
-pub(super) struct Doubted {
+pub(super) struct UnconfirmedRun {
     run: Run,
     /// Datagrams that continued it since the live run last went on.
     evidence: u8,
@@ -36,7 +36,7 @@ pub struct Run {
     pub(super) gap: (u64, u64),
 }
 
-impl Doubted {
+impl UnconfirmedRun {
     /// Most numbers that there may be.
     pub(super) const CAP: usize = KEPT;
 
@@ -99,8 +99,8 @@ impl Doubted {
         self.run.numbers.contains(&(number, true))
     }
 
-    pub(super) const fn is_believed(&self) -> bool {
-        self.evidence >= HANDFUL
+    pub(super) const fn is_confirmed(&self) -> bool {
+        self.evidence >= CONFIRMATIONS
     }
 
     /// The live run went on: the evidence counts from zero again.
@@ -163,14 +163,14 @@ mod tests {
 
     #[test]
     fn the_oldest_numbers_of_a_long_run_are_forgotten() {
-        let mut doubted = Doubted::default();
+        let mut unconfirmed = UnconfirmedRun::default();
         for number in 1..=100 {
-            assert_eq!(doubted.note(number, Timestamp(1)), (number == 1, true));
+            assert_eq!(unconfirmed.note(number, Timestamp(1)), (number == 1, true));
         }
-        assert_eq!(doubted.len(), Doubted::CAP);
+        assert_eq!(unconfirmed.len(), UnconfirmedRun::CAP);
         // It counts again.
-        assert_eq!(doubted.note(1, Timestamp(1)), (false, true));
-        assert_eq!(doubted.note(100, Timestamp(1)), (false, false));
-        assert_eq!(doubted.evidence, 1);
+        assert_eq!(unconfirmed.note(1, Timestamp(1)), (false, true));
+        assert_eq!(unconfirmed.note(100, Timestamp(1)), (false, false));
+        assert_eq!(unconfirmed.evidence, 1);
     }
 }

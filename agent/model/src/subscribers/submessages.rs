@@ -3,11 +3,11 @@
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
 
-use super::{Stage, Subscribers, is_open, scene};
+use super::{Subscribers, WriterContext, delivery_context, is_open};
 use crate::delivery::Receiver;
 use crate::receivers::Matched;
-use crate::way::Place;
-use crate::ways::Known;
+use crate::route::Destination;
+use crate::routes::KnownRoute;
 
 impl Subscribers {
     /// A HEARTBEAT came this way.
@@ -16,25 +16,26 @@ impl Subscribers {
         index: usize,
         (receiver, matched): (Receiver, Matched),
         heartbeat: Heartbeat<'_>,
-        stage: &mut Stage<'_>,
+        context: &mut WriterContext<'_>,
     ) {
-        let Some(known) = self.ways.get(index) else {
+        let Some(known) = self.routes.get(index) else {
             return;
         };
         // It goes where data goes, unless a reader is known to be there.
         let holds = known.has_data || matched == Matched::Yes;
         let is_meant = heartbeat.record().reader().prefix != GuidPrefix::UNKNOWN;
-        let opens = matched == Matched::Yes && (is_meant || !known.way.place.is_multicast());
+        let opens =
+            matched == Matched::Yes && (is_meant || !known.route.destination.is_multicast());
         let place = match self.find(receiver) {
-            None if opens => self.delivery(index, receiver, stage),
+            None if opens => self.delivery(index, receiver, context),
             found => found,
         };
         let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) else {
             return;
         };
         if is_meant || holds {
-            let mut scene = scene(&mut self.totals, self.reassembled, stage);
-            delivery.heartbeat(heartbeat, &mut scene);
+            let mut context = delivery_context(&mut self.totals, self.reassembled, context);
+            delivery.heartbeat(heartbeat, &mut context);
         }
     }
 
@@ -44,21 +45,21 @@ impl Subscribers {
         index: usize,
         receiver: Receiver,
         gap: Gap<'_>,
-        stage: &mut Stage<'_>,
+        context: &mut WriterContext<'_>,
     ) {
-        let Some(known) = self.ways.get(index) else {
+        let Some(known) = self.routes.get(index) else {
             return;
         };
-        if !known.way.place.is_multicast() && self.open > 0 {
+        if !known.route.destination.is_multicast() && self.open > 0 {
             for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
-                let mut scene = scene(&mut self.totals, self.reassembled, stage);
-                delivery.gap(gap, &mut scene);
+                let mut context = delivery_context(&mut self.totals, self.reassembled, context);
+                delivery.gap(gap, &mut context);
             }
         }
         let place = self.find(receiver);
         if let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) {
-            let mut scene = scene(&mut self.totals, self.reassembled, stage);
-            delivery.gap(gap, &mut scene);
+            let mut context = delivery_context(&mut self.totals, self.reassembled, context);
+            delivery.gap(gap, &mut context);
         }
     }
 
@@ -80,7 +81,7 @@ impl Subscribers {
         for delivery in &mut self.deliveries {
             let below = match delivery.receiver() {
                 Receiver::Participant(receiver) if receiver == prefix => below,
-                Receiver::Way(way) if way.is_open() => self.acknowledgements.floor(|_| true),
+                Receiver::Route(route) if route.is_open() => self.acknowledgements.floor(|_| true),
                 _ => None,
             };
             if let Some(below) = below {
@@ -90,27 +91,27 @@ impl Subscribers {
     }
 
     /// The kernel gave up on some IP fragments of a datagram with this.
-    pub(super) fn not_reassembled(&mut self, sample: Sample<'_>, stage: &mut Stage<'_>) {
+    pub(super) fn not_reassembled(&mut self, sample: Sample<'_>, context: &mut WriterContext<'_>) {
         self.reassembled = true;
         let record = sample.record();
-        let place = Place::of(record);
+        let destination = Destination::of(record);
         let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
         for delivery in &mut self.deliveries {
-            let leads_there = |known: &Known| {
-                !known.way.is_sent()
-                    && known.way.place == place
+            let leads_there = |known: &KnownRoute| {
+                !known.route.is_sent()
+                    && known.route.destination == destination
                     && match delivery.receiver() {
-                        Receiver::Way(way) => known.way == way,
+                        Receiver::Route(route) => known.route == route,
                         Receiver::Participant(prefix) => {
                             known.owner == Some(prefix) && directed.is_none_or(|to| to == prefix)
                         }
                     }
             };
-            if self.ways.iter().any(leads_there) {
+            if self.routes.iter().any(leads_there) {
                 let number = sample.sequence_number();
                 delivery.not_reassembled(
                     number,
-                    &mut scene(&mut self.totals, self.reassembled, stage),
+                    &mut delivery_context(&mut self.totals, self.reassembled, context),
                 );
             }
         }

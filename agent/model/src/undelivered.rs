@@ -10,6 +10,7 @@ use std::collections::VecDeque;
 
 use ros2probe_wire::Record;
 use ros2probe_wire::record::Sample;
+use ros2probe_wire::time::SECOND;
 
 use super::size::Size;
 
@@ -18,16 +19,16 @@ const LIMIT: usize = 4096;
 /// Clock readings of the two reports may be converted this far apart, nanoseconds.
 const SLACK: u64 = 100_000;
 /// Arrivals come within this, or their record was lost.
-const LIFETIME: u64 = 60_000_000_000;
+const LIFETIME: u64 = 60 * SECOND;
 
 /// What waits for its arrival at one receiver.
 #[derive(Debug, Default)]
-pub struct Cancelled {
-    waiting: VecDeque<Cancellation>,
+pub struct Undelivered {
+    waiting: VecDeque<UndeliveredPart>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Cancellation {
+struct UndeliveredPart {
     socket: u64,
     number: u64,
     /// Fragments from `start` to before `end`; of a whole sample 0 and 1.
@@ -37,13 +38,13 @@ struct Cancellation {
     last: u64,
 }
 
-impl Cancelled {
+impl Undelivered {
     /// Entries and cap.
     #[must_use]
     pub fn sizes(&self) -> [Size; 1] {
         // A new list does not compile before it has a place here.
         let Self { waiting } = self;
-        [Size::new("cancelled.waiting", waiting.len(), LIMIT)]
+        [Size::new("undelivered.waiting", waiting.len(), LIMIT)]
     }
 
     /// Whether nothing waits.
@@ -70,7 +71,7 @@ impl Cancelled {
         if is_full {
             self.waiting.pop_front();
         }
-        self.waiting.push_back(Cancellation {
+        self.waiting.push_back(UndeliveredPart {
             socket: record.socket,
             number: sample.sequence_number(),
             start,
@@ -102,7 +103,7 @@ impl Cancelled {
             }
             parts = take_out(&parts, from, to);
             if each.start < from && to < each.end {
-                left.push(Cancellation { start: to, ..*each });
+                left.push(UndeliveredPart { start: to, ..*each });
                 each.end = from;
                 return true;
             }
@@ -176,6 +177,7 @@ mod tests {
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use ros2probe_wire::time::MILLISECOND;
 
     fn fragments(start: u32, count: u32, time: u64, elapsed: u32) -> Record {
         Record {
@@ -190,12 +192,16 @@ mod tests {
         }
     }
 
-    fn note(cancelled: &mut Cancelled, record: &Record) -> bool {
-        cancelled.note(record.sample().unwrap())
+    fn note(undelivered: &mut Undelivered, record: &Record) -> bool {
+        undelivered.note(record.sample().unwrap())
     }
 
-    fn delivered(cancelled: &mut Cancelled, record: &Record, evictions: &mut u64) -> Vec<Record> {
-        cancelled.delivered(record.sample().unwrap(), evictions)
+    fn delivered(
+        undelivered: &mut Undelivered,
+        record: &Record,
+        evictions: &mut u64,
+    ) -> Vec<Record> {
+        undelivered.delivered(record.sample().unwrap(), evictions)
     }
 
     fn ranges(parts: &[Record]) -> Vec<(u32, u32)> {
@@ -203,93 +209,100 @@ mod tests {
         samples.map(range).collect()
     }
 
-    const MILLISECOND: u64 = 1_000_000;
-
     #[test]
     fn what_had_no_room_is_taken_out_of_the_run_that_covers_it_once() {
-        let mut cancelled = Cancelled::default();
-        note(&mut cancelled, &fragments(3, 1, 12 * MILLISECOND, 0));
-        note(&mut cancelled, &fragments(4, 1, 13 * MILLISECOND, 0));
-        note(&mut cancelled, &fragments(8, 2, 17 * MILLISECOND, 0));
+        let mut undelivered = Undelivered::default();
+        note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
+        note(&mut undelivered, &fragments(4, 1, 13 * MILLISECOND, 0));
+        note(&mut undelivered, &fragments(8, 2, 17 * MILLISECOND, 0));
         let run = fragments(1, 10, 20 * MILLISECOND, 10_000_000);
         assert_eq!(
-            ranges(&delivered(&mut cancelled, &run, &mut 0)),
+            ranges(&delivered(&mut undelivered, &run, &mut 0)),
             [(1, 3), (5, 8), (10, 11)]
         );
-        assert!(cancelled.is_empty());
+        assert!(undelivered.is_empty());
         let again = fragments(3, 2, 40 * MILLISECOND, 0);
-        assert_eq!(ranges(&delivered(&mut cancelled, &again, &mut 0)), [(3, 5)]);
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &again, &mut 0)),
+            [(3, 5)]
+        );
     }
 
     #[test]
     fn a_retransmission_is_not_taken_for_the_arrival_that_got_lost_on_its_way_here() {
-        let mut cancelled = Cancelled::default();
-        note(&mut cancelled, &fragments(3, 1, 12 * MILLISECOND, 0));
+        let mut undelivered = Undelivered::default();
+        note(&mut undelivered, &fragments(3, 1, 12 * MILLISECOND, 0));
         let later = fragments(3, 1, 40 * MILLISECOND, 0);
-        assert_eq!(ranges(&delivered(&mut cancelled, &later, &mut 0)), [(3, 4)]);
-        cancelled.expire(13 * MILLISECOND + LIFETIME);
-        assert!(cancelled.is_empty());
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &later, &mut 0)),
+            [(3, 4)]
+        );
+        undelivered.expire(13 * MILLISECOND + LIFETIME);
+        assert!(undelivered.is_empty());
     }
 
     #[test]
     fn a_run_may_end_within_what_had_no_room() {
-        let mut cancelled = Cancelled::default();
+        let mut undelivered = Undelivered::default();
         for fragment in 4..8 {
             let time = u64::from(10 + fragment) * MILLISECOND;
-            note(&mut cancelled, &fragments(fragment, 1, time, 0));
+            note(&mut undelivered, &fragments(fragment, 1, time, 0));
         }
         let first = fragments(1, 5, 15 * MILLISECOND, 4_000_000);
-        assert_eq!(ranges(&delivered(&mut cancelled, &first, &mut 0)), [(1, 4)]);
+        assert_eq!(
+            ranges(&delivered(&mut undelivered, &first, &mut 0)),
+            [(1, 4)]
+        );
         let second = fragments(6, 5, 20 * MILLISECOND, 4_000_000);
         assert_eq!(
-            ranges(&delivered(&mut cancelled, &second, &mut 0)),
+            ranges(&delivered(&mut undelivered, &second, &mut 0)),
             [(8, 11)]
         );
-        assert!(cancelled.is_empty());
+        assert!(undelivered.is_empty());
     }
 
     #[test]
     fn a_whole_sample_for_which_there_was_no_room_did_not_arrive() {
-        let mut cancelled = Cancelled::default();
+        let mut undelivered = Undelivered::default();
         let data = Record {
             kind: kind::DATA,
             ..fragments(0, 0, MILLISECOND, 0)
         };
-        note(&mut cancelled, &data);
+        note(&mut undelivered, &data);
         let elsewhere = Record { socket: 2, ..data };
-        assert_eq!(delivered(&mut cancelled, &elsewhere, &mut 0).len(), 1);
-        assert!(delivered(&mut cancelled, &data, &mut 0).is_empty());
-        assert_eq!(delivered(&mut cancelled, &data, &mut 0).len(), 1);
+        assert_eq!(delivered(&mut undelivered, &elsewhere, &mut 0).len(), 1);
+        assert!(delivered(&mut undelivered, &data, &mut 0).is_empty());
+        assert_eq!(delivered(&mut undelivered, &data, &mut 0).len(), 1);
     }
 
     #[test]
     fn a_storm_stays_bounded() {
-        let mut cancelled = Cancelled::default();
+        let mut undelivered = Undelivered::default();
         for number in 0..10_000 {
             let data = Record {
                 kind: kind::DATA,
                 sequence_number: number,
                 ..Record::default()
             };
-            note(&mut cancelled, &data);
+            note(&mut undelivered, &data);
         }
-        assert!(cancelled.waiting.len() <= LIMIT);
+        assert!(undelivered.waiting.len() <= LIMIT);
     }
 
     #[test]
     fn arrivals_that_take_out_the_middle_of_what_had_no_room_stay_bounded() {
-        let mut cancelled = Cancelled::default();
+        let mut undelivered = Undelivered::default();
         let mut evictions = 0;
         let time = 20 * MILLISECOND;
-        note(&mut cancelled, &fragments(1, 60_000, time, 0));
+        note(&mut undelivered, &fragments(1, 60_000, time, 0));
         for fragment in 1..20_000 {
             delivered(
-                &mut cancelled,
+                &mut undelivered,
                 &fragments(3 * fragment, 1, time, 0),
                 &mut evictions,
             );
         }
-        let [waiting] = cancelled.sizes();
+        let [waiting] = undelivered.sizes();
         assert_eq!(waiting.entries, waiting.cap);
         assert_eq!(evictions, 20_000 - LIMIT as u64);
     }

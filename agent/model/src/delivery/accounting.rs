@@ -4,11 +4,11 @@ use ros2probe_wire::{Guid, Timestamp};
 
 use super::Receiver;
 use crate::cause::LossCause;
-use crate::deaths::Deaths;
 use crate::journal::{DeliveryLoss, Journal};
+use crate::loss_causes::LossCauses;
 use crate::reception::Decision;
+use crate::route::Route;
 use crate::snapshot::{Breakdown, Delivered, Direction};
-use crate::way::Way;
 
 /// What is counted of all deliveries of a writer.
 #[derive(Clone, Debug, Default)]
@@ -46,20 +46,20 @@ impl Totals {
 }
 
 /// What decisions change.
-pub(super) struct Deciding<'a> {
+pub(super) struct Accounting<'a> {
     pub(super) tally: &'a mut Delivered,
-    pub(super) deaths: &'a mut Deaths,
+    pub(super) loss_causes: &'a mut LossCauses,
     pub(super) totals: &'a mut Delivered,
     pub(super) journal: &'a mut Journal,
     pub(super) writer: Guid,
     pub(super) receiver: Receiver,
-    pub(super) main: Way,
+    pub(super) main: Route,
     pub(super) at: Timestamp,
     /// A loss stays pending until then.
     pub(super) until: Option<Timestamp>,
 }
 
-impl Deciding<'_> {
+impl Accounting<'_> {
     pub(super) fn take(&mut self, decision: Decision) {
         if self.main.direction == Direction::Sent {
             return;
@@ -67,14 +67,14 @@ impl Deciding<'_> {
         let (first, last) = match decision {
             Decision::Lost { first, last, .. } => (first, last),
             Decision::Irrelevant(number) => {
-                self.deaths.forget(number);
+                self.loss_causes.forget(number);
                 self.tally.irrelevant += 1;
                 self.totals.irrelevant += 1;
                 return;
             }
         };
         let mut runs = Vec::new();
-        self.deaths.explain(first, last, |first, last, cause| {
+        self.loss_causes.explain(first, last, |first, last, cause| {
             runs.push((first, last, cause));
         });
         for (first, last, cause) in runs {
@@ -93,7 +93,7 @@ impl Deciding<'_> {
         };
         self.tally.pending += last - first + 1;
         self.totals.pending += last - first + 1;
-        if let Some((first, last)) = self.deaths.wait(first, last, until) {
+        if let Some((first, last)) = self.loss_causes.wait(first, last, until) {
             self.conclude(first, last);
         }
     }
@@ -115,10 +115,10 @@ impl Deciding<'_> {
             writer: self.writer,
             participant: match self.receiver {
                 Receiver::Participant(prefix) => Some(prefix),
-                Receiver::Way(_) => None,
+                Receiver::Route(_) => None,
             },
             socket: self.main.socket,
-            destination: self.main.place.socket_address(),
+            destination: self.main.destination.socket_address(),
             cause,
             first,
             last,

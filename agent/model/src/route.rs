@@ -9,14 +9,14 @@ use super::snapshot::Direction;
 
 /// A UDP destination.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default)]
-pub struct Place {
+pub struct Destination {
     /// IPv4-mapped for IPv4.
     pub address: [u8; 16],
     /// Port.
     pub port: u16,
 }
 
-impl Place {
+impl Destination {
     /// Where the record's datagram was sent to.
     #[must_use]
     pub fn of(record: &Record) -> Self {
@@ -45,7 +45,7 @@ impl Place {
     }
 }
 
-impl From<SocketAddr> for Place {
+impl From<SocketAddr> for Destination {
     fn from(address: SocketAddr) -> Self {
         let mapped = match address.ip() {
             IpAddr::V4(ip) => ip.to_ipv6_mapped(),
@@ -60,25 +60,25 @@ impl From<SocketAddr> for Place {
 
 /// One way of a writer's samples.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
-pub struct Way {
+pub struct Route {
     /// Leaving or arriving.
     pub direction: Direction,
     /// Cookie of the receiving socket; 0 when leaving, and on a wire source.
     pub socket: u64,
     /// Where to.
-    pub place: Place,
+    pub destination: Destination,
 }
 
-impl Way {
+impl Route {
     /// That of the record's datagram.
     #[must_use]
     pub fn of(record: &Record) -> Self {
-        let place = Place::of(record);
+        let destination = Destination::of(record);
         if record.flags & flag::OUTGOING != 0 {
             return Self {
                 direction: Direction::Sent,
                 socket: 0,
-                place,
+                destination,
             };
         }
         Self {
@@ -88,12 +88,12 @@ impl Way {
             } else {
                 0
             },
-            place,
+            destination,
         }
     }
 }
 
-impl Way {
+impl Route {
     /// On its way out.
     #[must_use]
     pub fn is_sent(&self) -> bool {
@@ -103,7 +103,7 @@ impl Way {
     /// A multicast that arrives: of itself it tells nothing about who receives it.
     #[must_use]
     pub fn is_open(&self) -> bool {
-        !self.is_sent() && self.place.is_multicast()
+        !self.is_sent() && self.destination.is_multicast()
     }
 }
 
@@ -111,17 +111,23 @@ impl Way {
 mod tests {
     use super::*;
 
-    fn place(address: &str) -> Place {
-        Place::from(address.parse::<SocketAddr>().unwrap())
+    fn destination(address: &str) -> Destination {
+        Destination::from(address.parse::<SocketAddr>().unwrap())
     }
 
     #[test]
     fn a_place_is_written_as_it_was_read() {
         for text in ["10.0.0.2:7411", "239.255.0.1:7401", "[fe80::1]:7411"] {
-            assert_eq!(place(text).socket_address().to_string(), text);
+            assert_eq!(destination(text).socket_address().to_string(), text);
         }
-        assert!(place("239.255.0.1:7401").is_multicast() && place("[ff02::1]:1").is_multicast());
-        assert!(!place("10.0.0.2:7411").is_multicast() && !place("[fe80::1]:1").is_multicast());
+        assert!(
+            destination("239.255.0.1:7401").is_multicast()
+                && destination("[ff02::1]:1").is_multicast()
+        );
+        assert!(
+            !destination("10.0.0.2:7411").is_multicast()
+                && !destination("[fe80::1]:1").is_multicast()
+        );
     }
 
     #[test]
@@ -138,18 +144,18 @@ mod tests {
             flags: flag::HOST,
             ..Record::default()
         };
-        let received = Way::of(&record);
+        let received = Route::of(&record);
         assert_eq!(
             (received.direction, received.socket),
             (Direction::Received, 77)
         );
-        assert_eq!(received.place, place("10.0.0.2:7411"));
-        let sent = Way::of(&Record {
+        assert_eq!(received.destination, destination("10.0.0.2:7411"));
+        let sent = Route::of(&Record {
             flags: flag::HOST | flag::OUTGOING,
             ..record
         });
         assert_eq!((sent.direction, sent.socket), (Direction::Sent, 0));
-        let on_the_wire = Way::of(&Record { flags: 0, ..record });
+        let on_the_wire = Route::of(&Record { flags: 0, ..record });
         assert_eq!(on_the_wire.socket, 0);
     }
 }

@@ -9,15 +9,15 @@ use std::sync::Arc;
 use ros2probe_wire::{Record, Timestamp};
 
 use super::event::{EventKind, Taken};
-use super::payloads::{Given, News};
+use super::payloads::{Dispatch, SampleOutcome};
 use super::snapshot::{DeliveryFacts, EndpointFacts, Measurement, Snapshot, TopicFacts};
 use super::trace::Spans;
 
 /// By how many nanoseconds the calendar has been set forward since the model's time began.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Calendar(i64);
+pub struct WallClock(i64);
 
-impl Calendar {
+impl WallClock {
     /// It was set forward by so many nanoseconds, or back.
     pub const fn set(&mut self, step: i64) {
         self.0 = self.0.saturating_add(step);
@@ -25,84 +25,84 @@ impl Calendar {
 
     /// The model's time at this time of the calendar.
     #[must_use]
-    pub const fn even(self, calendar: Timestamp) -> Timestamp {
-        Timestamp(calendar.0.saturating_add_signed(self.0.saturating_neg()))
+    pub const fn model_time(self, wall_clock: Timestamp) -> Timestamp {
+        Timestamp(wall_clock.0.saturating_add_signed(self.0.saturating_neg()))
     }
 
     /// The calendar's time at this time of the model.
     #[must_use]
-    pub const fn shown(self, even: Timestamp) -> Timestamp {
-        Timestamp(even.0.saturating_add_signed(self.0))
+    pub const fn wall_time(self, model_time: Timestamp) -> Timestamp {
+        Timestamp(model_time.0.saturating_add_signed(self.0))
     }
 
     /// A record in the model's time; `None` = as it is.
     #[must_use]
-    pub fn even_record(self, record: &Record) -> Option<Record> {
-        let time = self.even(Timestamp(record.time)).0;
+    pub fn model_record(self, record: &Record) -> Option<Record> {
+        let time = self.model_time(Timestamp(record.time)).0;
         (self.0 != 0).then_some(Record { time, ..*record })
     }
 
-    pub(super) fn show_snapshot(self, snapshot: &mut Snapshot) {
+    pub(super) fn convert_snapshot(self, snapshot: &mut Snapshot) {
         if self.0 == 0 {
             return;
         }
-        self.show(&mut snapshot.at);
+        self.convert(&mut snapshot.at);
         let diagnosed = snapshot.diagnosed.iter();
         snapshot.diagnosed = diagnosed
-            .map(|since| self.shown(*since))
+            .map(|since| self.wall_time(*since))
             .collect::<Vec<_>>()
             .into();
         for participant in &mut snapshot.participants {
-            self.show(&mut participant.first_seen);
-            self.show(&mut participant.last_seen);
+            self.convert(&mut participant.first_seen);
+            self.convert(&mut participant.last_seen);
         }
         for topic in &mut snapshot.topics {
-            self.show_topic(topic);
+            self.convert_topic(topic);
         }
-        for stranger in &mut snapshot.unknown_writers {
-            self.show(&mut stranger.first_seen);
-            self.show_measurement(&mut stranger.measurement);
+        for unknown_writer in &mut snapshot.unknown_writers {
+            self.convert(&mut unknown_writer.first_seen);
+            self.convert_measurement(&mut unknown_writer.measurement);
         }
     }
 
-    pub(super) fn show_events(self, taken: &mut Taken) {
+    pub(super) fn convert_events(self, taken: &mut Taken) {
         for event in &mut taken.events {
-            self.show(&mut event.at);
+            self.convert(&mut event.at);
             if let EventKind::Silence {
                 last_message: Some(last),
                 ..
             } = &mut event.kind
             {
-                self.show(last);
+                self.convert(last);
             }
         }
     }
 
-    pub(super) fn show_given(self, given: &mut [Given]) {
+    pub(super) fn convert_dispatches(self, given: &mut [Dispatch]) {
         if self.0 == 0 {
             return;
         }
         for each in given {
-            if let News::Sample(sample) = &mut each.news {
-                self.show(&mut Arc::make_mut(sample).time);
+            if let SampleOutcome::Sample(sample) = &mut each.outcome {
+                self.convert(&mut Arc::make_mut(sample).time);
             }
         }
     }
 
-    pub(super) fn show_spans(self, spans: &mut Spans) {
+    pub(super) fn convert_spans(self, spans: &mut Spans) {
         for span in &mut spans.spans {
-            self.show(&mut span.begin);
-            self.show(&mut span.end);
+            self.convert(&mut span.begin);
+            self.convert(&mut span.end);
         }
     }
 
-    fn show_topic(self, topic: &mut TopicFacts) {
+    fn convert_topic(self, topic: &mut TopicFacts) {
         if let Some(measurement) = &mut topic.measurement {
-            self.show_measurement(measurement);
+            self.convert_measurement(measurement);
         }
         let endpoints = topic.publishers.iter_mut().chain(&mut topic.subscriptions);
         for endpoint in endpoints {
-            self.show_endpoint(endpoint);
+            self.convert_endpoint(endpoint);
         }
         for DeliveryFacts {
             first_seen,
@@ -110,28 +110,28 @@ impl Calendar {
             ..
         } in &mut topic.deliveries
         {
-            self.show(first_seen);
-            self.show(last_seen);
+            self.convert(first_seen);
+            self.convert(last_seen);
         }
         for acknowledgement in &mut topic.acknowledgements {
-            self.show(&mut acknowledgement.last_seen);
+            self.convert(&mut acknowledgement.last_seen);
         }
     }
 
-    fn show_endpoint(self, endpoint: &mut EndpointFacts) {
-        self.show(&mut endpoint.first_seen);
+    fn convert_endpoint(self, endpoint: &mut EndpointFacts) {
+        self.convert(&mut endpoint.first_seen);
         if let Some(measurement) = &mut endpoint.measurement {
-            self.show_measurement(measurement);
+            self.convert_measurement(measurement);
         }
     }
 
-    fn show_measurement(self, measurement: &mut Measurement) {
+    fn convert_measurement(self, measurement: &mut Measurement) {
         if let Some(last) = &mut measurement.last_message {
-            self.show(last);
+            self.convert(last);
         }
     }
 
-    const fn show(self, time: &mut Timestamp) {
-        *time = self.shown(*time);
+    const fn convert(self, time: &mut Timestamp) {
+        *time = self.wall_time(*time);
     }
 }

@@ -7,15 +7,15 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use ros2probe_wire::GuidPrefix;
 
+use crate::route::Destination;
 use crate::size::Size;
-use crate::way::Place;
 
 /// All addresses.
 #[derive(Debug)]
-pub(super) struct Places {
-    holders: HashMap<Place, Holder>,
+pub(super) struct AnnouncedAddresses {
+    announcers: HashMap<Destination, Announcer>,
     /// By the age of the announcement.
-    ages: BTreeMap<u64, Place>,
+    ages: BTreeMap<u64, Destination>,
     /// The same ages, by participant.
     own: BTreeSet<(GuidPrefix, u64)>,
     age: u64,
@@ -25,7 +25,7 @@ pub(super) struct Places {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Holder {
+struct Announcer {
     prefix: GuidPrefix,
     previous: Option<GuidPrefix>,
     /// Two participants announce it in turn.
@@ -33,11 +33,11 @@ struct Holder {
     age: u64,
 }
 
-impl Places {
+impl AnnouncedAddresses {
     /// None; at most `limit`, and `each` of one participant.
     pub(super) fn new(limit: usize, each: usize) -> Self {
         Self {
-            holders: HashMap::new(),
+            announcers: HashMap::new(),
             ages: BTreeMap::new(),
             own: BTreeSet::new(),
             age: 0,
@@ -48,9 +48,9 @@ impl Places {
     }
 
     /// This participant announces this address; whether an answer may have changed.
-    pub(super) fn put(&mut self, prefix: GuidPrefix, place: Place) -> bool {
+    pub(super) fn put(&mut self, prefix: GuidPrefix, destination: Destination) -> bool {
         self.age += 1;
-        let before = self.holders.get(&place).copied();
+        let before = self.announcers.get(&destination).copied();
         let (previous, contested) = match before {
             Some(before) if before.prefix == prefix => (before.previous, before.contested),
             Some(before) => (
@@ -64,14 +64,14 @@ impl Places {
             self.own.remove(&(before.prefix, before.age));
         }
         let age = self.age;
-        let holder = Holder {
+        let announcer = Announcer {
             prefix,
             previous,
             contested,
             age,
         };
-        self.holders.insert(place, holder);
-        self.ages.insert(age, place);
+        self.announcers.insert(destination, announcer);
+        self.ages.insert(age, destination);
         self.own.insert((prefix, age));
         let own = || self.own.range((prefix, 0)..=(prefix, u64::MAX));
         let oldest = own().next().filter(|_| own().count() > self.each);
@@ -88,23 +88,25 @@ impl Places {
 
     /// Forgets those of participants that are no more.
     pub(super) fn retain(&mut self, is_there: impl Fn(&GuidPrefix) -> bool) {
-        self.holders.retain(|_, holder| is_there(&holder.prefix));
+        self.announcers
+            .retain(|_, announcer| is_there(&announcer.prefix));
         self.own.retain(|(prefix, _)| is_there(prefix));
-        let holders = &self.holders;
-        self.ages.retain(|_, place| holders.contains_key(place));
+        let announcers = &self.announcers;
+        self.ages
+            .retain(|_, destination| announcers.contains_key(destination));
     }
 
     /// The participant that alone announces this address.
-    pub(super) fn owner(&self, place: &Place) -> Option<GuidPrefix> {
-        let holder = self.holders.get(place)?;
-        (!holder.contested).then_some(holder.prefix)
+    pub(super) fn owner(&self, destination: &Destination) -> Option<GuidPrefix> {
+        let announcer = self.announcers.get(destination)?;
+        (!announcer.contested).then_some(announcer.prefix)
     }
 
     /// Entries and cap of every table.
     pub(super) fn sizes(&self) -> [Size; 4] {
         // A new table does not compile before it has a place here.
         let Self {
-            holders,
+            announcers,
             ages,
             own,
             age: _,
@@ -116,25 +118,25 @@ impl Places {
         let of_one = chunks.chunk_by(|before, after| before == after);
         let of_one = of_one.map(<[_]>::len).max().unwrap_or(0);
         [
-            Size::new("receivers.places", holders.len(), *limit),
-            Size::new("receivers.places.ages", ages.len(), *limit),
-            Size::new("receivers.places.own", own.len(), *limit),
-            Size::new("receivers.places.participant", of_one, *each),
+            Size::new("receivers.addresses", announcers.len(), *limit),
+            Size::new("receivers.addresses.ages", ages.len(), *limit),
+            Size::new("receivers.addresses.own", own.len(), *limit),
+            Size::new("receivers.addresses.participant", of_one, *each),
         ]
     }
 
     /// Entries, cap, and addresses given up because of a cap.
     pub(super) fn size(&self) -> (usize, usize, u64) {
-        (self.holders.len(), self.limit, self.evictions)
+        (self.announcers.len(), self.limit, self.evictions)
     }
 
     fn give_up(&mut self, age: u64) {
-        let holder = self
+        let announcer = self
             .ages
             .remove(&age)
-            .and_then(|place| self.holders.remove(&place));
-        if let Some(holder) = holder {
-            self.own.remove(&(holder.prefix, age));
+            .and_then(|destination| self.announcers.remove(&destination));
+        if let Some(announcer) = announcer {
+            self.own.remove(&(announcer.prefix, age));
             self.evictions += 1;
         }
     }
@@ -147,49 +149,49 @@ mod tests {
     const ALICE: GuidPrefix = GuidPrefix([1; 12]);
     const BOB: GuidPrefix = GuidPrefix([2; 12]);
 
-    fn at(port: u16) -> Place {
-        Place {
+    fn at(port: u16) -> Destination {
+        Destination {
             port,
-            ..Place::default()
+            ..Destination::default()
         }
     }
 
     #[test]
     fn a_participant_whose_address_is_another_each_time_pushes_out_its_own_alone() {
-        let mut places = Places::new(100, 16);
-        places.put(BOB, at(7411));
-        (8000..9000).for_each(|port| assert!(places.put(ALICE, at(port))));
-        assert_eq!(places.size(), (17, 100, 1000 - 16));
-        assert_eq!(places.owner(&at(7411)), Some(BOB));
-        assert_eq!(places.owner(&at(8999)), Some(ALICE));
-        assert_eq!(places.owner(&at(8000)), None);
-        assert_eq!((places.ages.len(), places.own.len()), (17, 17));
+        let mut addresses = AnnouncedAddresses::new(100, 16);
+        addresses.put(BOB, at(7411));
+        (8000..9000).for_each(|port| assert!(addresses.put(ALICE, at(port))));
+        assert_eq!(addresses.size(), (17, 100, 1000 - 16));
+        assert_eq!(addresses.owner(&at(7411)), Some(BOB));
+        assert_eq!(addresses.owner(&at(8999)), Some(ALICE));
+        assert_eq!(addresses.owner(&at(8000)), None);
+        assert_eq!((addresses.ages.len(), addresses.own.len()), (17, 17));
     }
 
     #[test]
     fn of_all_participants_together_the_oldest_address_goes_first() {
-        let mut places = Places::new(4, 2);
+        let mut addresses = AnnouncedAddresses::new(4, 2);
         for number in 0..100 {
             let prefix = GuidPrefix([number; 12]);
-            places.put(prefix, at(number.into()));
-            places.put(BOB, at(7411));
+            addresses.put(prefix, at(number.into()));
+            addresses.put(BOB, at(7411));
         }
-        assert_eq!(places.size(), (4, 4, 97));
-        assert_eq!(places.owner(&at(7411)), Some(BOB));
-        places.retain(|prefix| *prefix == BOB);
-        assert_eq!(places.size().0, 1);
-        assert_eq!((places.ages.len(), places.own.len()), (1, 1));
+        assert_eq!(addresses.size(), (4, 4, 97));
+        assert_eq!(addresses.owner(&at(7411)), Some(BOB));
+        addresses.retain(|prefix| *prefix == BOB);
+        assert_eq!(addresses.size().0, 1);
+        assert_eq!((addresses.ages.len(), addresses.own.len()), (1, 1));
     }
 
     #[test]
     fn an_address_that_two_announce_in_turn_is_nobody_s() {
-        let mut places = Places::new(4, 2);
-        places.put(ALICE, at(1));
-        assert!(places.put(BOB, at(1)));
-        assert_eq!(places.owner(&at(1)), Some(BOB));
-        assert!(!places.put(BOB, at(1)));
-        assert!(places.put(ALICE, at(1)));
-        assert_eq!(places.owner(&at(1)), None);
-        assert_eq!(places.size(), (1, 4, 0));
+        let mut addresses = AnnouncedAddresses::new(4, 2);
+        addresses.put(ALICE, at(1));
+        assert!(addresses.put(BOB, at(1)));
+        assert_eq!(addresses.owner(&at(1)), Some(BOB));
+        assert!(!addresses.put(BOB, at(1)));
+        assert!(addresses.put(ALICE, at(1)));
+        assert_eq!(addresses.owner(&at(1)), None);
+        assert_eq!(addresses.size(), (1, 4, 0));
     }
 }

@@ -22,7 +22,7 @@ const OVERHEAD: usize = 64;
 
 /// The unfinished samples, oldest first.
 #[derive(Debug, Default)]
-pub struct Pieces {
+pub struct DiscoveryFragments {
     samples: VecDeque<Sample>,
     bytes: usize,
     evictions: u64,
@@ -38,7 +38,7 @@ struct Sample {
     bytes: usize,
 }
 
-impl Pieces {
+impl DiscoveryFragments {
     /// Entries, or bytes, and cap of every table.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
@@ -61,8 +61,12 @@ impl Pieces {
             OVERHEAD + fragments.sum::<usize>()
         };
         vec![
-            Size::new("pieces.samples", samples.len(), SAMPLES),
-            Size::new("pieces.bytes", samples.iter().map(held).sum(), BUDGET),
+            Size::new("discovery_fragments.samples", samples.len(), SAMPLES),
+            Size::new(
+                "discovery_fragments.bytes",
+                samples.iter().map(held).sum(),
+                BUDGET,
+            ),
         ]
     }
 
@@ -163,8 +167,12 @@ mod tests {
         fragments
     }
 
-    fn put(pieces: &mut Pieces, record: &Record, bytes: &[u8]) -> Option<Vec<u8>> {
-        pieces.put(data_frag(record), bytes)
+    fn put(
+        discovery_fragments: &mut DiscoveryFragments,
+        record: &Record,
+        bytes: &[u8],
+    ) -> Option<Vec<u8>> {
+        discovery_fragments.put(data_frag(record), bytes)
     }
 
     fn fragment(number: u64, start: u32, count: u32, size: u32) -> Record {
@@ -181,47 +189,66 @@ mod tests {
     #[test]
     fn fragments_in_any_order_and_several_at_once_make_the_payload() {
         let payload: Vec<u8> = (0..=249).collect();
-        let mut pieces = Pieces::default();
+        let mut discovery_fragments = DiscoveryFragments::default();
         assert_eq!(
-            put(&mut pieces, &fragment(1, 3, 1, 250), &payload[200..]),
+            put(
+                &mut discovery_fragments,
+                &fragment(1, 3, 1, 250),
+                &payload[200..]
+            ),
             None
         );
-        assert!(pieces.holds(data_frag(&fragment(1, 1, 1, 250))));
+        assert!(discovery_fragments.holds(data_frag(&fragment(1, 1, 1, 250))));
         assert_eq!(
-            put(&mut pieces, &fragment(1, 1, 2, 250), &payload[..200]),
+            put(
+                &mut discovery_fragments,
+                &fragment(1, 1, 2, 250),
+                &payload[..200]
+            ),
             Some(payload)
         );
-        assert_eq!((pieces.bytes, pieces.samples.len()), (0, 0));
+        assert_eq!(
+            (discovery_fragments.bytes, discovery_fragments.samples.len()),
+            (0, 0)
+        );
     }
 
     #[test]
     fn a_claimed_size_allocates_nothing_and_a_storm_stays_in_the_budget() {
-        let mut pieces = Pieces::default();
+        let mut discovery_fragments = DiscoveryFragments::default();
         assert_eq!(
-            put(&mut pieces, &fragment(1, 1, 1, u32::MAX), &[0; 100]),
+            put(
+                &mut discovery_fragments,
+                &fragment(1, 1, 1, u32::MAX),
+                &[0; 100]
+            ),
             None
         );
         for number in 0..100_000 {
-            put(&mut pieces, &fragment(number, 1, 1, 200_000), &[0; 100]);
+            put(
+                &mut discovery_fragments,
+                &fragment(number, 1, 1, 200_000),
+                &[0; 100],
+            );
         }
-        assert!(pieces.bytes <= BUDGET && pieces.evictions > 0);
+        assert!(discovery_fragments.bytes <= BUDGET && discovery_fragments.evictions > 0);
     }
 
     #[test]
     fn large_samples_that_never_end_keep_within_the_bytes() {
-        let mut pieces = Pieces::default();
+        let mut discovery_fragments = DiscoveryFragments::default();
         for number in 0..1000 {
             put(
-                &mut pieces,
+                &mut discovery_fragments,
                 &fragment(number, 1, 500, 200_000),
                 &[0; 50_000],
             );
         }
-        let [_, bytes] = pieces.sizes().try_into().unwrap();
+        let [_, bytes] = discovery_fragments.sizes().try_into().unwrap();
         assert!(
             (BUDGET * 8 / 10..=BUDGET).contains(&bytes.entries),
             "{bytes:?}"
         );
-        assert!(pieces.evictions > 900);
+        assert!(discovery_fragments.evictions > 900);
     }
 }
