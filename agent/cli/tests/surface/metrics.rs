@@ -171,6 +171,34 @@ fn values_are_what_the_snapshot_says() {
     }
 }
 
+/// Name, cause and value of what is summed by topic.
+const SUMS: [(&str, &str, &str); 12] = [
+    ("ros2_topic_sent_messages_total", "", "1000"),
+    ("ros2_topic_delivered_messages_total", "", "900"),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "before_host",
+        "60",
+    ),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "reassembly",
+        "20",
+    ),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "socket_buffer",
+        "15",
+    ),
+    ("ros2_topic_delivery_pending_messages", "", "1"),
+    ("ros2_topic_delivery_recovered_messages_total", "", "3"),
+    ("ros2_topic_delivery_irrelevant_messages_total", "", "5"),
+    ("ros2_topic_delivery_unmatched_messages_total", "", "4"),
+    ("ros2_topic_acknowledgement_lag_messages", "", "56"),
+    ("ros2_topic_acknowledgement_lag_seconds", "", "2.75"),
+    ("ros2_topic_transit_seconds_count", "", "1000"),
+];
+
 #[test]
 fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
     let snapshot = sample_robot::snapshot(["/points"]);
@@ -187,32 +215,6 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
          ros_node=\"/mapper\",participant=\"{prefix}.000001c1\",process=\"mapper\",pid=\"42\",\
          cgroup=\"/robot.slice\""
     );
-    let sums = [
-        ("ros2_topic_sent_messages_total", "", "1000"),
-        ("ros2_topic_delivered_messages_total", "", "900"),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "before_host",
-            "60",
-        ),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "reassembly",
-            "20",
-        ),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "socket_buffer",
-            "15",
-        ),
-        ("ros2_topic_delivery_pending_messages", "", "1"),
-        ("ros2_topic_delivery_recovered_messages_total", "", "3"),
-        ("ros2_topic_delivery_irrelevant_messages_total", "", "5"),
-        ("ros2_topic_delivery_unmatched_messages_total", "", "4"),
-        ("ros2_topic_acknowledgement_lag_messages", "", "56"),
-        ("ros2_topic_acknowledgement_lag_seconds", "", "2.75"),
-        ("ros2_topic_transit_seconds_count", "", "1000"),
-    ];
     let each = [
         ("ros2_writer_sent_messages_total", &sent, "", "1000"),
         (
@@ -253,7 +255,7 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
         "" => format!("{name}{{{labels}}}"),
         cause => format!("{name}{{{labels},cause=\"{cause}\"}}"),
     };
-    for (name, cause, value) in sums {
+    for (name, cause, value) in SUMS {
         let series = series(name, topic, cause);
         assert_eq!(sample(&asked, &series), Some(value), "{series}\n{asked}");
     }
@@ -268,7 +270,7 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
     let mut plain = settings();
     Arc::make_mut(&mut plain.watches[0]).per_subscriber = false;
     let plain = page(snapshot, plain, Format::Classic);
-    for (name, cause, value) in sums {
+    for (name, cause, value) in SUMS {
         let series = series(name, topic, cause);
         assert_eq!(sample(&plain, &series), Some(value), "{series}");
     }
