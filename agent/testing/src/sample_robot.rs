@@ -4,6 +4,9 @@ use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use ros2probe::agent_facts::{
+    AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
+};
 use ros2probe::model::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
 };
@@ -16,7 +19,6 @@ use ros2probe::model::snapshot::{
     WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe::state::StateFacts;
-use ros2probe::surface::{AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 

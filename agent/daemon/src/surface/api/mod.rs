@@ -54,10 +54,12 @@ use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
 use super::large_responses::LargeResponses;
-use super::snapshot_cell::{SnapshotCell, State};
-use super::{EventLog, LimitFigures, RecordingFigures};
 use crate::config::{Access, Limit};
+use crate::events::EventLog;
+use crate::limit_facts::LimitFigures;
+use crate::recording::RecordingFigures;
 use crate::recording::{Recordings, Snapshots};
+use crate::snapshot_cell::{SnapshotCell, State};
 use crate::subscriptions::Subscriptions;
 use crate::watches::Watches;
 pub use live::Live;

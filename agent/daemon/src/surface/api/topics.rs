@@ -25,8 +25,8 @@ use super::scope::{Domain, Scope, only};
 use super::security::Granted;
 use super::silence::Circumstances;
 use super::watch::expectations;
-use crate::surface::Ability;
-use crate::surface::State as AgentState;
+use crate::agent_facts::Ability;
+use crate::snapshot_cell::State as AgentState;
 use crate::watches::InForce;
 use ros2probe_api::topics::{
     self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
