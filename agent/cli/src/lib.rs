@@ -18,8 +18,8 @@
 pub use ros2probe_bag as bag;
 pub use ros2probe_capture as capture;
 pub use ros2probe_daemon::{
-    config, discover, escape, file, privilege, recording, run, state, subscriptions, surface,
-    watches,
+    agent_facts, config, discover, escape, events, file, limit_facts, privilege, recording, run,
+    settings_cell, snapshot_cell, state, subscriptions, surface, watches,
 };
 pub use ros2probe_message as message;
 pub use ros2probe_model as model;

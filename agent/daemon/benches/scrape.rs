@@ -1,7 +1,9 @@
 //! How long a scrape of a large robot takes: the capture thread never waits for it, but a core does.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use ros2probe_daemon::surface::{Exposition, Format, MetricSources, Settings, SourceKind};
+use ros2probe_daemon::agent_facts::SourceKind;
+use ros2probe_daemon::settings_cell::Settings;
+use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
 use ros2probe_testing::sample_robot;
 
 fn scrape(criterion: &mut Criterion) {

@@ -22,6 +22,7 @@ use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
 use crate::recording::{self, Recordings, Refusal, Snapshots};
 use crate::run::replay::Replay;
 use crate::run::{Outputs, Run, Source};
+use crate::settings_cell::Settings;
 use crate::state::{StateDirectory, StateWriter};
 use crate::subscriptions::{Caps, Subscriptions};
 use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
@@ -29,7 +30,7 @@ use crate::surface::api::reload::Reloads;
 use crate::surface::api::{self, reload};
 use crate::surface::http::Server;
 use crate::surface::otlp::{self, Exporter, Host, SpanQueue, SpanSink};
-use crate::surface::{Exposition, Format, MetricSources, Settings};
+use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
 use crate::{control, memory};
 

@@ -3,6 +3,7 @@
 //! - [`agent::run`] is the life of an agent. [`agent::Components`] composes one, live or replayed.
 //! - [`config`] reads the configuration, [`watches`] merges what is watched.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
+//! - [`snapshot_cell`] holds the latest snapshot, [`events`] what happened, [`limit_facts`] the caps.
 //! - [`surface`] serves snapshots: Prometheus, OTLP, the API and the page.
 //! - [`subscriptions`] and [`recording`] take single messages, into streams and bags.
 //!
@@ -17,16 +18,23 @@
 #![cfg_attr(not(test), forbid(unsafe_code))]
 
 pub mod agent;
+pub mod agent_facts;
 pub mod config;
 mod control;
 pub mod discover;
 pub mod escape;
+pub mod events;
 pub mod file;
+pub mod limit_facts;
 mod logging;
 mod memory;
 pub mod privilege;
 pub mod recording;
 pub mod run;
+mod series_name;
+pub mod settings_cell;
+pub mod snapshot_cell;
+pub mod stability;
 pub mod state;
 pub mod subscriptions;
 mod supervise;

@@ -14,8 +14,11 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use arc_swap::{ArcSwap, ArcSwapOption};
 
 use crate::config::{Limit, ManyGlobs, Watch, Watchlist, check_globs};
+use crate::events::{AgentEvent, EventLog};
+use crate::limit_facts::LimitFigures;
+use crate::settings_cell::SettingsCell;
+use crate::snapshot_cell::CaptureBell;
 use crate::state::StateDirectory;
-use crate::surface::{AgentEvent, CaptureBell, EventLog, LimitFigures, SettingsCell};
 use persistence::WatchWriter;
 pub use persistence::{LoadedWatches, load};
 
@@ -416,7 +419,9 @@ mod tests {
     use std::sync::Barrier;
 
     use super::*;
-    use crate::surface::{Settings, SnapshotCell, SourceKind};
+    use crate::agent_facts::SourceKind;
+    use crate::settings_cell::Settings;
+    use crate::snapshot_cell::SnapshotCell;
 
     #[test]
     fn of_two_clients_that_add_the_same_watch_at_once_one_comes_second() {

@@ -4,10 +4,10 @@ use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros2probe_daemon::state::StateFacts;
-use ros2probe_daemon::surface::{
+use ros2probe_daemon::agent_facts::{
     AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
+use ros2probe_daemon::state::StateFacts;
 use ros2probe_model::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
 };

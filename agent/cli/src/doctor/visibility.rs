@@ -3,7 +3,7 @@
 
 use super::finding::{Area, Finding, Verdict};
 use ros2probe_api::health::Health;
-use ros2probe_daemon::surface::{Ability, AgentFacts};
+use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
 
 const AREA: Area = Area::Sight;
 /// Where an agent says it.

@@ -13,6 +13,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use crate::rp;
+use ros2probe::agent_facts::{AgentFacts, SourceKind};
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
@@ -21,7 +22,7 @@ use ros2probe::model::snapshot::Snapshot;
 use ros2probe::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
 };
-use ros2probe::surface::{AgentFacts, MetricSources, SourceKind};
+use ros2probe::surface::MetricSources;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
@@ -33,9 +34,9 @@ const STRING: &str = "std_msgs::msg::dds_::String_";
 
 /// How a cap stands: how much of it is used, how often it was reached.
 fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
-    let settings = ros2probe::surface::Settings {
+    let settings = ros2probe::settings_cell::Settings {
         limits,
-        ..ros2probe::surface::Settings::default()
+        ..ros2probe::settings_cell::Settings::default()
     };
     let sources = MetricSources::new(SourceKind::Wire, settings);
     let state = sources

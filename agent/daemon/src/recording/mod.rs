@@ -5,6 +5,7 @@
 //! before an incident (`snapshot`). How a bag looks on disk is the business of `ros2probe_bag`.
 
 mod disk_quota;
+mod figures;
 mod filter;
 mod graph;
 mod recorder;
@@ -15,6 +16,7 @@ mod session;
 mod snapshot;
 
 pub use disk_quota::DiskQuota;
+pub use figures::{RecordingFigures, SnapshotFigures};
 pub use filter::{Candidate, Filter, FilterError, FilterOptions};
 pub use graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic, by_name};
 pub use recorder::{Finished, Recorder, Sources};

@@ -20,12 +20,13 @@ use super::recorder::{Finished, Recorder, Sources};
 use super::report::Report;
 use super::session::{self, Activity, Command};
 use crate::config::{Limit, RecordingLimits};
+use crate::events::{AgentEvent, EventLog};
+use crate::limit_facts::{LimitFigures, Slot, Slots};
+use crate::recording::RecordingFigures;
+use crate::snapshot_cell::SnapshotCell;
 use crate::subscriptions::{
     ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
     Subscriptions,
-};
-use crate::surface::{
-    AgentEvent, EventLog, LimitFigures, RecordingFigures, Slot, Slots, SnapshotCell,
 };
 use ros2probe_bag::{Options, Schema, Writer};
 use ros2probe_capture::system::give_back_memory;

@@ -20,9 +20,10 @@ use super::recorder::Recorder;
 use super::sample_ring::SampleRing;
 use super::service::{Recordings, Refusal, causes, default_name, refusal};
 use crate::config::SnapshotSettings;
+use crate::events::AgentEvent;
+use crate::events::Value;
+use crate::recording::SnapshotFigures;
 use crate::subscriptions::{Item, Selection, Subscription};
-use crate::surface::events::Value;
-use crate::surface::{AgentEvent, SnapshotFigures};
 use ros2probe_bag::{Options, Writer};
 
 /// How long orders and events wait at most.

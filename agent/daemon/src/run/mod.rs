@@ -12,11 +12,13 @@ use std::time::{Duration, Instant};
 use ros2probe_wire::{GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
+use crate::events::DropMonitor;
+use crate::events::EventLog;
+use crate::limit_facts::LimitFigures;
+use crate::snapshot_cell::SnapshotCell;
 use crate::state::StateWriter;
 use crate::subscriptions::Subscriptions;
-use crate::surface::events::DropMonitor;
 use crate::surface::otlp::SpanSink;
-use crate::surface::{EventLog, LimitFigures, SnapshotCell};
 use crate::watches::Watches;
 pub use capture_time::CaptureTime;
 use ros2probe_capture::live::{CaptureError, LiveSource};

@@ -11,10 +11,10 @@ use ros2probe_wire::filter::Counter;
 
 use super::RunError;
 use super::replay::Replay;
-use crate::config::CaptureSettings;
-use crate::surface::{
+use crate::agent_facts::{
     Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
+use crate::config::CaptureSettings;
 use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::reassembly::Limits;

@@ -20,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::config::watch::{MAX_GLOB_BYTES, MAX_GLOBS};
 use crate::config::{Watch, check_globs};
-use crate::surface::SnapshotCell;
+use crate::snapshot_cell::SnapshotCell;
 use channel::Channel;
 use retained::Retained;
 use ros2probe_model::payloads::{Dispatch, Sample, SampleOutcome};

@@ -3,7 +3,8 @@ use std::collections::BTreeMap;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 use super::*;
-use crate::surface::{SnapshotCell, SourceKind};
+use crate::agent_facts::SourceKind;
+use crate::snapshot_cell::SnapshotCell;
 
 const LONG: Duration = Duration::from_secs(60);
 

@@ -5,17 +5,17 @@ use std::fmt;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
 use super::catalogue as metric;
-use super::events::EventLog;
-use super::limit_facts::{LimitFacts, LimitFigures};
 use super::metric_sink::{Label, MetricSink};
 use super::otlp::{Exports, Outcome, Reason};
 use super::process::Process;
-use super::recording_facts::{RecordingFigures, SnapshotFigures};
 use super::ros2_metrics::TopicRows;
-use super::settings_cell::Reload;
-use super::snapshot_cell::State;
+use crate::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
+use crate::events::EventLog;
+use crate::limit_facts::{LimitFacts, LimitFigures};
+use crate::recording::{RecordingFigures, SnapshotFigures};
+use crate::settings_cell::Reload;
+use crate::snapshot_cell::State;
 use ros2probe_model::payloads::MissedReason;
 
 /// What runs, where its packets come from, and whether it sees.

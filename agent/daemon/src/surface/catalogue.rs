@@ -8,6 +8,7 @@ mod agent;
 mod delivery;
 mod diagnosis;
 
+use crate::stability::Stability;
 pub(super) use agent::*;
 pub(super) use delivery::*;
 pub(super) use diagnosis::*;
@@ -40,15 +41,6 @@ pub enum Kind {
     Histogram,
     /// Always 1; its labels are the message.
     Info,
-}
-
-/// Promise to users.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stability {
-    /// Changes only with a major version.
-    Stable,
-    /// May change with a minor version; noted in the change log.
-    Experimental,
 }
 
 impl Metric {

@@ -6,18 +6,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use super::agent_facts::SourceKind;
 use super::agent_metrics;
 use super::delivery_metrics::{self, Deliveries};
 use super::diagnosis_metrics;
-use super::events::{AgentEvent, EventLog};
-use super::limit_facts::LimitFigures;
 use super::metric_sink::MetricSink;
 use super::otlp::Exports;
-use super::recording_facts::RecordingFigures;
 use super::ros2_metrics::{self, TopicRows};
-use super::settings_cell::{Settings, SettingsCell};
-use super::snapshot_cell::SnapshotCell;
+use crate::agent_facts::SourceKind;
+use crate::events::{AgentEvent, EventLog};
+use crate::limit_facts::LimitFigures;
+use crate::recording::RecordingFigures;
+use crate::settings_cell::{Settings, SettingsCell};
+use crate::snapshot_cell::SnapshotCell;
 use ros2probe_model::snapshot::Snapshot;
 
 /// What a collection reads. Each part belongs to its writer; only the composition of the agent and the

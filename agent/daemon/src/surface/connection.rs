@@ -14,7 +14,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, Sleep, sleep_until};
 use tokio_util::sync::CancellationToken;
 
-use super::limit_facts::Slot;
+use crate::limit_facts::Slot;
 
 /// A connection without a request is closed after so long; a stream on which nothing can be written
 /// for so long, too.
@@ -355,7 +355,7 @@ mod tests {
 
     use super::*;
     use crate::config::{Limit, Limits};
-    use crate::surface::limit_facts::LimitFigures;
+    use crate::limit_facts::LimitFigures;
 
     /// A crowd, and a way to add a connection to it.
     fn connections() -> (

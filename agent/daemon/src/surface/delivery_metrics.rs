@@ -8,7 +8,7 @@ use std::net::SocketAddr;
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Family, Label, MetricSink, Number};
 use super::ros2_metrics::TopicRow;
-use super::settings_cell::Settings;
+use crate::settings_cell::Settings;
 use ros2probe_model::cause::LossCause;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{

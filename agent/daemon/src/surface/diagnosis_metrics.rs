@@ -6,7 +6,7 @@ use std::fmt;
 
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Label, MetricSink};
-use super::ros2_metrics::series_name;
+use crate::series_name::series_name;
 use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_wire::DomainId;

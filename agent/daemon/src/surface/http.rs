@@ -27,15 +27,15 @@ use super::compressed_text::{Encoding, TextCompressor};
 use super::connection::Connection;
 use super::exposition::{Exposition, Format};
 use super::large_responses::LargeResponses;
-use super::limit_facts::LimitFigures;
 use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;
 use super::serving::{self, Plain};
-use super::snapshot_cell::SnapshotCell;
 #[cfg(feature = "tls")]
 use super::tls::Acceptor;
 use super::web_config::{WebConfig, WebConfigError};
 use crate::config::Limit;
+use crate::limit_facts::LimitFigures;
+use crate::snapshot_cell::SnapshotCell;
 
 const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 <p>Watches the ROS 2 robot on this host from copies of its traffic.

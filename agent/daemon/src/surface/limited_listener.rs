@@ -12,8 +12,8 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::connection::{Connection, Connections};
-use super::limit_facts::{LimitFigures, Slot, Slots};
 use crate::config::Limit;
+use crate::limit_facts::{LimitFigures, Slot, Slots};
 
 /// How long a client that is turned away may take to read why, and how many may do so at once.
 const FAREWELL: Duration = Duration::from_secs(1);

@@ -7,8 +7,9 @@ use std::sync::Arc;
 
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Family, Label, MetricSink, Number};
-use super::settings_cell::Settings;
 use crate::config::Watch;
+use crate::series_name::series_name;
+use crate::settings_cell::Settings;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{
     EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
@@ -124,18 +125,6 @@ impl<'a> TopicRow<'a> {
 
     pub(super) fn measurement(&self) -> Option<&'a Measurement> {
         self.facts.and_then(|facts| facts.measurement.as_deref())
-    }
-}
-
-/// Services and other plumbing keep their DDS names: a request, its reply and a topic may share
-/// their ROS name. A DDS name that looks like a ROS name is marked.
-pub(super) fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
-    match kind {
-        TopicKind::Topic | TopicKind::ActionFeedback | TopicKind::ActionStatus => {
-            Cow::Borrowed(name)
-        }
-        _ if dds_name.starts_with('/') => Cow::Owned(format!("dds:{dds_name}")),
-        _ => Cow::Borrowed(dds_name),
     }
 }
 

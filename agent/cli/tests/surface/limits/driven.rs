@@ -184,14 +184,14 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "KEPT",
-        "agent/daemon/src/surface/events.rs",
-        "agent/daemon/src/surface/events/tests.rs",
+        "agent/daemon/src/events.rs",
+        "agent/daemon/src/events/tests.rs",
         "what_was_overwritten_is_told_to_the_reader_that_missed_it",
     ],
     [
         "MOST",
-        "agent/daemon/src/surface/events.rs",
-        "agent/daemon/src/surface/events/tests.rs",
+        "agent/daemon/src/events.rs",
+        "agent/daemon/src/events/tests.rs",
         "a_storm_is_cut_in_each_second_and_told_in_one_event",
     ],
     [

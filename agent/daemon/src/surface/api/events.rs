@@ -29,8 +29,8 @@ use super::endpoint::texts;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use crate::config::{Watch, Watchlist};
-use crate::surface::EventLog;
-use crate::surface::events::{EVENTS, Position, Reader, Record, Value};
+use crate::events::EventLog;
+use crate::events::{EVENTS, Position, Reader, Record, Value};
 use ros2probe_api::attributes::{self, Attributes};
 use ros2probe_api::events::{self as answers, Lagged};
 
@@ -319,7 +319,7 @@ fn covers(pattern: &str, name: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::AgentEvent;
+    use crate::events::AgentEvent;
 
     fn selection(name: &str, topic: &str) -> Selection {
         let given = |text: &str| (!text.is_empty()).then(|| text.to_owned());

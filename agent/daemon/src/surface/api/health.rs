@@ -10,8 +10,8 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use crate::agent_facts::{Ability, AgentFacts};
 use crate::privilege;
-use crate::surface::agent_facts::{Ability, AgentFacts};
 use crate::surface::otlp::Host;
 use crate::surface::process::Process;
 use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};

@@ -25,12 +25,12 @@ use super::body_stream::{Pieces, stream_of};
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
+use crate::agent_facts::SourceKind;
 use crate::config::Access;
 use crate::subscriptions::line::{line, offered};
 use crate::subscriptions::{
     Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
 };
-use crate::surface::SourceKind;
 use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
 use ros2probe_model::snapshot::Snapshot;
 

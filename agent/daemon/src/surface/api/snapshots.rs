@@ -11,7 +11,7 @@ use utoipa_axum::routes;
 
 use super::Context;
 use super::problem::{Code, Problem, ProblemBody};
-use crate::surface::SnapshotFigures;
+use crate::recording::SnapshotFigures;
 
 /// All snapshots.
 #[derive(Debug, Serialize, ToSchema)]

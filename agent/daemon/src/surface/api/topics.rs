@@ -21,12 +21,12 @@ use super::messages;
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
+use super::reasons::Circumstances;
 use super::scope::{Domain, Scope, only};
 use super::security::Granted;
-use super::silence::Circumstances;
 use super::watch::expectations;
-use crate::surface::Ability;
-use crate::surface::State as AgentState;
+use crate::agent_facts::Ability;
+use crate::snapshot_cell::State as AgentState;
 use crate::watches::InForce;
 use ros2probe_api::topics::{
     self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,

@@ -18,8 +18,8 @@ use prost::Message as _;
 
 use super::client::Request;
 use super::signal_sender::SignalSender;
-use crate::surface::events::EventLog;
-use crate::surface::events::{Batch, Reader, Record, Value};
+use crate::events::EventLog;
+use crate::events::{Batch, Reader, Record, Value};
 
 /// Events that happen together travel together.
 const GATHER: Duration = Duration::from_millis(500);
@@ -149,7 +149,7 @@ fn any(value: &Value) -> AnyValue {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::AgentEvent;
+    use crate::events::AgentEvent;
 
     #[test]
     fn a_record_says_what_the_event_says_with_its_types() {

@@ -17,8 +17,9 @@ use tonic::{Code, Status};
 
 use super::exports::{Exports, Outcome, Reason, Signal};
 use super::{Exporter, Host, Settings};
+use crate::agent_facts::{AgentFacts, SourceKind};
 use crate::config::Config;
-use crate::surface::{self, AgentFacts, MetricSources, SourceKind};
+use crate::surface::MetricSources;
 use ros2probe_model::snapshot::Snapshot;
 
 /// What the receiver does with a request.
@@ -90,7 +91,10 @@ fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, E
     let config = Config::parse(yaml.as_bytes()).unwrap();
     let host = Host::default();
     let settings = Settings::resolve(&config.otlp, &|_| None, &host).unwrap();
-    let sources = MetricSources::new(SourceKind::Replay, surface::Settings::default());
+    let sources = MetricSources::new(
+        SourceKind::Replay,
+        crate::settings_cell::Settings::default(),
+    );
     let agent = AgentFacts {
         finished: true,
         ..AgentFacts::new(SourceKind::Replay, Instant::now())

@@ -8,7 +8,7 @@ use ros2probe_wire::{DomainId, Guid};
 use super::line::{Finding, Severity};
 use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
-use crate::surface::{Ability, AgentFacts, SourceKind};
+use crate::agent_facts::{Ability, AgentFacts, SourceKind};
 use ros2probe_model::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::history::Past;
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};

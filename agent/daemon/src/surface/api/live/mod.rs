@@ -7,7 +7,7 @@
 
 mod findings;
 mod line;
-mod scene;
+mod shared_lines;
 mod structure;
 mod values;
 
@@ -30,11 +30,11 @@ use super::events::event;
 use super::health::HOST;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
-use crate::surface::SourceKind;
-use crate::surface::events::Reader;
+use crate::agent_facts::SourceKind;
+use crate::events::Reader;
 use line::{End, Events, Line, Open, Replay};
 use ros2probe_model::snapshot::Transport;
-use scene::Scene;
+use shared_lines::Scene;
 
 /// Streams at once, of all listeners: fewer than connections, so that requests find one.
 const MAX_TABS: usize = 16;

@@ -479,8 +479,9 @@ mod tests {
     use tokio_util::sync::CancellationToken;
 
     use super::*;
+    use crate::agent_facts::SourceKind;
+    use crate::snapshot_cell::SnapshotCell;
     use crate::subscriptions::{Caps, Subscriptions};
-    use crate::surface::{SnapshotCell, SourceKind};
     use ros2probe_model::payloads::{Dispatch, SampleOutcome, Topic};
 
     #[test]

@@ -10,8 +10,8 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
 
 use super::table::{self, Definition, Severity};
-use crate::surface::SourceKind;
-use crate::surface::ros2_metrics::series_name;
+use crate::agent_facts::SourceKind;
+use crate::series_name::series_name;
 use ros2probe_model::churn;
 use ros2probe_model::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::event::{EventKind, LossBurst, bounded};

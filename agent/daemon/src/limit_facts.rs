@@ -233,7 +233,7 @@ impl Drop for Slot {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::agent_facts::{AgentFacts, SourceKind};
+    use crate::agent_facts::{AgentFacts, SourceKind};
     use ros2probe_model::snapshot::{Snapshot, TableFacts};
 
     #[test]

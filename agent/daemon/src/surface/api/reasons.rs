@@ -4,8 +4,8 @@
 //! alone.
 
 use super::index::Index;
+use crate::agent_facts::SourceKind;
 use crate::config::Watchlist;
-use crate::surface::agent_facts::SourceKind;
 use ros2probe_api::Open;
 use ros2probe_api::topics::{Reason, ReasonCode};
 use ros2probe_model::diagnosis::Diagnosis;

@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 use super::AgentEvent;
-use crate::surface::AgentFacts;
+use crate::agent_facts::AgentFacts;
 
 /// Losses are reported at most this often.
 const PAUSE: Duration = Duration::from_secs(1);
@@ -100,7 +100,7 @@ impl SourceMonitor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::{InterfaceFacts, SourceKind};
+    use crate::agent_facts::{InterfaceFacts, SourceKind};
 
     #[test]
     fn losses_are_told_as_what_came_since_and_at_most_once_a_second() {

@@ -12,8 +12,9 @@ use super::findings::{Circumstances, dropped, findings};
 use super::line::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
 use super::structure::Ids;
 use super::values::{Figures, lost_lately, totals};
-use crate::surface::State;
-use crate::surface::{Ability as Able, SourceKind};
+use crate::agent_facts::Ability as Able;
+use crate::agent_facts::SourceKind;
+use crate::snapshot_cell::State;
 use crate::watches::InForce;
 use ros2probe_model::history::Past;
 

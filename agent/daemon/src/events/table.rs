@@ -3,7 +3,7 @@
 //!
 //! Attributes bear the names of the metrics' labels, so that events and series can be joined.
 
-use crate::surface::catalogue::Stability;
+use crate::stability::Stability;
 
 /// One kind of event.
 #[derive(Debug, PartialEq, Eq)]

@@ -1,0 +1,17 @@
+//! The name of a topic in metrics and events.
+
+use std::borrow::Cow;
+
+use ros2probe_model::topic_kind::TopicKind;
+
+/// The ROS name of a topic. Services and other plumbing keep their DDS names: a request, its reply
+/// and a topic may share their ROS name. A DDS name that looks like a ROS name is marked.
+pub(crate) fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
+    match kind {
+        TopicKind::Topic | TopicKind::ActionFeedback | TopicKind::ActionStatus => {
+            Cow::Borrowed(name)
+        }
+        _ if dds_name.starts_with('/') => Cow::Owned(format!("dds:{dds_name}")),
+        _ => Cow::Borrowed(dds_name),
+    }
+}
