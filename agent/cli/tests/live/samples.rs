@@ -560,7 +560,7 @@ fn given(lines: &mut Lines<'_>, stream: &Stream) -> Result<(u64, u64)> {
     Ok((whole, missed))
 }
 
-/// What `BENCHMARKS.md` says of streams: `cargo test --release --test live samples:: -- --ignored
+/// What `docs/benchmarks-parts.md` says of streams: `cargo test --release --test live samples:: -- --ignored
 /// --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]

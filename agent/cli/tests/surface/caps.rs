@@ -1,4 +1,4 @@
-//! Fixed caps of docs/limits.md, driven over from outside; others have a test beside the constant.
+//! Fixed caps of docs/limits-*.md, driven over from outside; others have a test beside the constant.
 
 use std::fs::File;
 use std::io::{Read as _, Write as _};

@@ -75,7 +75,7 @@ pub(super) struct EventView<'a> {
     /// When it happened, in UTC.
     #[schema(format = DateTime)]
     time: String,
-    /// What it is, as the README lists.
+    /// What it is, as `docs/events.md` lists.
     #[schema(example = "ros2.message.lost")]
     name: &'static str,
     /// `INFO`, `WARN` or `ERROR`.
