@@ -23,7 +23,7 @@ use ros2probe_wire::discovery::{
 };
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::frame::{self, Link};
-use ros2probe_wire::names::TopicKind;
+use ros2probe_wire::names::Demangled;
 use ros2probe_wire::rtps::{InlineQos, Locator, LocatorKind, Payload};
 use ros2probe_wire::{Duration, EntityId, Guid};
 use serde_json::{Value, json};
@@ -124,7 +124,7 @@ impl Found {
     ) {
         match discovery::endpoint(role, vendor, payload, inline_qos).unwrap() {
             Discovery::Alive(endpoint) => {
-                if endpoint.topic.kind() == TopicKind::RosDiscovery && role == Role::Writer {
+                if endpoint.topic.demangle() == Demangled::RosDiscovery && role == Role::Writer {
                     self.discovery_info_writers.insert(endpoint.guid);
                 }
                 self.endpoints.entry(endpoint.guid).or_insert(endpoint);
@@ -313,7 +313,7 @@ fn check_participants(facts: &Value, found: &Found) {
         let domain = theirs["other"]["0x000f"].as_str();
         let ours = participant
             .domain_id
-            .map(|id| id.to_le_bytes().map(|b| format!("{b:02x}")));
+            .map(|id| id.0.to_le_bytes().map(|b| format!("{b:02x}")));
         assert_eq!(
             domain.map(Into::into),
             ours.map(|bytes| bytes.concat()),

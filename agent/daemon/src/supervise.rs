@@ -1,6 +1,7 @@
 //! What goes on around the working thread: signals, reloads, the metrics listener, the service
 //! manager and its watchdog, and an orderly end.
 
+use std::borrow::Cow;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -10,13 +11,14 @@ use crate::config::{Config, ConfigError};
 use crate::privilege::{self, Role, SpawnError, Unprivileged};
 use crate::run::{Run, RunError};
 use crate::surface::api;
-use crate::surface::api::reload::{NotReloaded, Reloaded, Reloads};
+use crate::surface::api::reload::{NotReloaded, Reloads};
 use crate::surface::events::SourceMonitor;
 use crate::surface::http::Server;
 use crate::surface::otlp::Exporter;
 use crate::surface::{Board, Settings};
 use crate::watches::Watches;
 use anyhow::{Context as _, Result, anyhow};
+use ros2probe_api::health::Reloaded;
 use sd_notify::NotifyState;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::oneshot;
@@ -210,7 +212,7 @@ impl Supervisor {
         tracing::info!(watches, "the configuration was reloaded");
         Ok(Reloaded {
             watches,
-            needs_restart,
+            needs_restart: needs_restart.into_iter().map(Cow::Borrowed).collect(),
         })
     }
 }

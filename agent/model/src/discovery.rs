@@ -23,7 +23,7 @@ use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::rtps::Locator;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
 use disposals::Disposals;
 use entity::DiscoveredEntity;
@@ -824,7 +824,7 @@ impl Discovery {
     }
 
     /// A participant's domain is told better than before: all it has moves along.
-    fn move_to(&mut self, prefix: GuidPrefix, domain_id: u32, source: DomainSource) {
+    fn move_to(&mut self, prefix: GuidPrefix, domain_id: DomainId, source: DomainSource) {
         let Some(participant) = self.participants.get_mut(&prefix) else {
             return;
         };
@@ -892,7 +892,7 @@ pub(super) const fn endpoints_of(prefix: GuidPrefix) -> RangeInclusive<Guid> {
 }
 
 /// Whether the DDS topic is watched by its exact name, in this domain or, with `None`, in any.
-fn is_named(watchlist: &Watchlist, domain_id: Option<u32>, topic: &DdsTopic) -> bool {
+fn is_named(watchlist: &Watchlist, domain_id: Option<DomainId>, topic: &DdsTopic) -> bool {
     watchlist.has_names() && Naming::of(topic).is_named_by(domain_id, watchlist)
 }
 

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::churn;
 use super::diagnosis::Diagnosis;
@@ -48,7 +48,7 @@ pub enum EventKind {
         /// How.
         change: churn::Event,
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// Which one.
         guid: Guid,
         /// Its implementation.
@@ -63,7 +63,7 @@ pub enum EventKind {
         /// How.
         change: churn::Event,
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// Which one.
         guid: Guid,
         /// Writer or reader.
@@ -78,7 +78,7 @@ pub enum EventKind {
         /// How.
         change: churn::Event,
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// The participant it lives in.
         participant: Guid,
         /// Fully qualified name.
@@ -89,7 +89,7 @@ pub enum EventKind {
     /// A watched topic stands otherwise than before with its watchlist entry.
     Expectation {
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// ROS name.
         topic: Arc<str>,
         /// The entry's pattern.
@@ -104,7 +104,7 @@ pub enum EventKind {
     /// A watched topic is published and nothing came for longer than its entry allows.
     Silence {
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// ROS name.
         topic: Arc<str>,
         /// The entry's pattern.
@@ -127,7 +127,7 @@ pub struct LossBurst {
     /// Whose.
     pub writer: Guid,
     /// Domain and DDS topic, where the writer was announced.
-    pub topic: Option<(u32, Arc<str>)>,
+    pub topic: Option<(DomainId, Arc<str>)>,
     /// Its node, where that is known.
     pub node: Option<Arc<str>>,
     /// How many.
@@ -287,7 +287,7 @@ impl Events {
     }
 
     /// This writer is no more: its burst, if there is one, was on this topic.
-    pub fn name(&mut self, writer: Guid, domain_id: u32, topic: &Arc<str>) {
+    pub fn name(&mut self, writer: Guid, domain_id: DomainId, topic: &Arc<str>) {
         if let Some(burst) = self.bursts.get_mut(&writer) {
             burst.losses.topic = Some((domain_id, Arc::clone(topic)));
         }
@@ -366,7 +366,7 @@ mod tests {
     fn node(name: &str) -> EventKind {
         EventKind::Node {
             change: churn::Event::Appeared,
-            domain_id: 0,
+            domain_id: DomainId(0),
             participant: guid(1),
             name: name.into(),
         }
@@ -379,10 +379,10 @@ mod tests {
         events.lose(&loss(guid(2), 11, 1, 1));
         events.lose(&loss(guid(1), 12, 9, 9));
         assert!(events.take().events.is_empty());
-        events.name(guid(2), 3, &"rt/points".into());
+        events.name(guid(2), DomainId(3), &"rt/points".into());
         events.end_bursts(|burst| {
             if burst.topic.is_none() {
-                burst.topic = Some((0, "rt/imu".into()));
+                burst.topic = Some((DomainId(0), "rt/imu".into()));
             }
         });
         let losses: Vec<_> = events
@@ -391,10 +391,10 @@ mod tests {
             .into_iter()
             .map(|event| event.kind)
             .collect();
-        let burst = |writer, topic: (u32, &str), count, first, last| {
+        let burst = |writer, (domain_id, name): (u32, &str), count, first, last| {
             EventKind::Loss(LossBurst {
                 writer,
-                topic: Some((topic.0, topic.1.into())),
+                topic: Some((DomainId(domain_id), name.into())),
                 node: None,
                 count,
                 first,

@@ -4,6 +4,7 @@
 //! A second is immutable once it is taken: readers share it with the ring and never hold the
 //! capture up. Rows are bounded in number; seconds of many topics reach back less far.
 
+use ros2probe_wire::DomainId;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
@@ -86,7 +87,7 @@ struct Bfloat16(u16);
 /// Ids of topics by domain and DDS name.
 #[derive(Clone, Debug, Default)]
 struct Names {
-    by_domain: BTreeMap<u32, BTreeMap<Arc<str>, u32>>,
+    by_domain: BTreeMap<DomainId, BTreeMap<Arc<str>, u32>>,
 }
 
 /// What had been counted of a topic by the end of the second before.
@@ -135,7 +136,7 @@ impl History {
     pub fn take<'a>(
         &mut self,
         now: Timestamp,
-        topics: impl Iterator<Item = (u32, &'a Arc<str>, Measurement)>,
+        topics: impl Iterator<Item = (DomainId, &'a Arc<str>, Measurement)>,
     ) {
         if self.seconds.back().is_some_and(|last| now < last.at) {
             // Times would run backwards within a chart.
@@ -209,7 +210,7 @@ impl History {
     }
 
     /// An id for a topic that has none; `None` where as many are named as may be.
-    fn name(&mut self, domain_id: u32, dds_name: &Arc<str>) -> Option<u32> {
+    fn name(&mut self, domain_id: DomainId, dds_name: &Arc<str>) -> Option<u32> {
         if self.names.len() >= self.most {
             self.evictions += 1;
             return None;
@@ -262,7 +263,7 @@ impl Past {
     /// Every second of one topic, the oldest first; `None` while it was not measured.
     pub fn topic(
         &self,
-        domain_id: u32,
+        domain_id: DomainId,
         dds_name: &str,
     ) -> Option<impl Iterator<Item = (Timestamp, Option<Reading>)> + '_> {
         let id = self.names.find(domain_id, dds_name)?;
@@ -275,7 +276,7 @@ impl Past {
 
     /// The id by which [`Second::row`] knows a topic.
     #[must_use]
-    pub fn id(&self, domain_id: u32, dds_name: &str) -> Option<u32> {
+    pub fn id(&self, domain_id: DomainId, dds_name: &str) -> Option<u32> {
         self.names.find(domain_id, dds_name)
     }
 
@@ -373,7 +374,7 @@ impl Bfloat16 {
 }
 
 impl Names {
-    fn find(&self, domain_id: u32, dds_name: &str) -> Option<u32> {
+    fn find(&self, domain_id: DomainId, dds_name: &str) -> Option<u32> {
         self.by_domain.get(&domain_id)?.get(dds_name).copied()
     }
 
@@ -436,7 +437,7 @@ mod tests {
     fn take(history: &mut History, second: u64, topics: &[(&Arc<str>, Measurement)]) {
         let topics = topics
             .iter()
-            .map(|(name, counted)| (0, *name, counted.clone()));
+            .map(|(name, counted)| (DomainId(0), *name, counted.clone()));
         history.take(Timestamp(second * SECOND), topics);
         for size in history.sizes() {
             assert!(size.entries <= size.cap, "{size:?}");
@@ -463,7 +464,7 @@ mod tests {
             &[(&points, counted(20, 3, &[0.001, 0.04]))],
         );
         let past = history.past();
-        let seen: Vec<_> = past.topic(0, "rt/points").unwrap().collect();
+        let seen: Vec<_> = past.topic(DomainId(0), "rt/points").unwrap().collect();
         let rows: Vec<_> = seen
             .iter()
             .map(|(_, reading)| reading.unwrap().row)
@@ -477,7 +478,7 @@ mod tests {
         assert_eq!(seen[1].1.unwrap().rate_hz, Some(10.0));
         assert_eq!(seen[2].1.unwrap().rate_hz, Some(5.0));
         assert_eq!(seen[2].1.unwrap().bandwidth, Some(500.0));
-        assert!(past.topic(1, "rt/points").is_none());
+        assert!(past.topic(DomainId(1), "rt/points").is_none());
     }
 
     #[test]
@@ -496,7 +497,7 @@ mod tests {
             &[(&one, counted(7, 0, &[])), (&other, counted(3, 0, &[]))],
         );
         let past = history.past();
-        let seen: Vec<_> = past.topic(0, "rt/a").unwrap().collect();
+        let seen: Vec<_> = past.topic(DomainId(0), "rt/a").unwrap().collect();
         let messages: Vec<_> = seen
             .iter()
             .map(|(_, reading)| reading.map(|reading| reading.row.messages))
@@ -524,7 +525,9 @@ mod tests {
             .map(|number| name(&number.to_string()))
             .collect();
         for second in 1..=20 {
-            let topics = names.iter().map(|name| (0, name, Measurement::default()));
+            let topics = names
+                .iter()
+                .map(|name| (DomainId(0), name, Measurement::default()));
             history.take(Timestamp(second * SECOND), topics);
         }
         assert_eq!(history.past().seconds().len(), 13);
@@ -545,7 +548,7 @@ mod tests {
         let table = history.table();
         assert!(table.size <= 4 && table.limit == 4, "{table:?}");
         assert_eq!(table.size + table.evictions, 9);
-        assert!(past.topic(0, "8").is_some() && past.topic(0, "0").is_none());
+        assert!(past.topic(DomainId(0), "8").is_some() && past.topic(DomainId(0), "0").is_none());
         assert!(history.before.len() <= 4);
         // More at once than can be named.
         let all: Vec<_> = names

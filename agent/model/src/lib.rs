@@ -62,6 +62,7 @@ pub mod snapshot;
 pub mod sockets;
 pub mod subscribers;
 pub mod topic;
+pub mod topic_kind;
 pub mod trace;
 mod transport;
 pub mod undelivered;

@@ -14,7 +14,7 @@ use ros2probe_wire::record::{Body, Handover, Sample, Verdict, flag};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 
 use super::diagnosis::{self, Examiner};
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin, Priority, endpoints_of};
@@ -34,6 +34,7 @@ use super::selection::SampleRequest;
 use super::size::Size;
 use super::snapshot::{Measurement, Snapshot, WatchState};
 use super::topic::{Naming, Topic, TopicId, Topics, Watched};
+use super::topic_kind::TopicKind;
 use super::trace::{Tracer, WriterDescription};
 use super::transport::{lacks_names, may_share_memory};
 use super::wall_clock::WallClock;
@@ -458,7 +459,10 @@ impl Observer {
     }
 
     /// All that was counted by `now` of each topic that is measured: domain, DDS name and counts.
-    pub fn measured(&self, now: Timestamp) -> impl Iterator<Item = (u32, &Arc<str>, Measurement)> {
+    pub fn measured(
+        &self,
+        now: Timestamp,
+    ) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
         super::report::measured(self, self.wall_clock.model_time(now))
     }
 
@@ -1010,7 +1014,7 @@ impl Observer {
                 let counts = naming(endpoint).is_some_and(|naming| naming.counts);
                 let measured = is_watched && counts;
                 let verdict = match topic.naming.kind {
-                    "discovery" => Verdict::Capture,
+                    TopicKind::Discovery => Verdict::Capture,
                     _ if measured && wants_bytes(topic) => Verdict::Capture,
                     _ if measured => Verdict::Meter,
                     _ => Verdict::Ignore,

@@ -12,7 +12,7 @@ use bytes::Bytes;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{Guid, Timestamp, record};
+use ros2probe_wire::{DomainId, Guid, Timestamp, record};
 
 use super::assembly::Assembly;
 use super::in_order::{Due, InOrder, Progress};
@@ -33,7 +33,7 @@ pub const PAYLOAD_DELAY: u64 = 400 * MILLISECOND;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Topic {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// ROS name, or the DDS name where it follows no ROS convention.
     pub name: Arc<str>,
     /// DDS name.

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{Duration, EntityId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Duration, EntityId, Guid, Timestamp};
 
 use super::discovery::{Discovery, Endpoint, ParticipantProxy};
 use super::observer::Observer;
@@ -178,7 +178,7 @@ fn topic(
 pub(super) fn measured(
     observer: &Observer,
     now: Timestamp,
-) -> impl Iterator<Item = (u32, &Arc<str>, Measurement)> {
+) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
     let topics = observer.topics.iter().map(|(_, topic)| topic);
     let topics = topics.filter(|topic| topic.watched == Watched::Yes);
     topics.filter_map(move |topic| {
@@ -324,7 +324,7 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
     for (watch, fact) in observer.watchlist.watches().iter().zip(&mut facts) {
         if watch.is_literal() && fact.topics.is_empty() && !is_rejected(&watch.pattern) {
             fact.topics.push(WatchedTopicFacts {
-                domain_id: watch.domain_id.unwrap_or(0),
+                domain_id: watch.domain_id.unwrap_or(DomainId(0)),
                 topic: watch.pattern.clone(),
                 state: WatchState::NotPublished,
                 violations: Vec::new(),

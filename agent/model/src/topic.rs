@@ -8,14 +8,15 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::names::{ActionPart, DdsTopic, RosName, TopicKind};
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::names::{DdsTopic, Demangled, RosName};
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::delivery::Totals;
 use super::expectation::Judgement;
 use super::selection::{Depth, SampleRequest};
 use super::size::Size;
 use super::snapshot::Measurement;
+use super::topic_kind::TopicKind;
 use crate::watch::Watchlist;
 
 /// Handle of a topic.
@@ -29,8 +30,8 @@ pub struct Naming {
     pub dds_name: Arc<str>,
     /// ROS name, or the DDS name.
     pub name: Arc<str>,
-    /// Label of what it is.
-    pub kind: &'static str,
+    /// What it is.
+    pub kind: TopicKind,
     /// Hidden by ROS convention.
     pub hidden: bool,
     /// The endpoint serves the topic from beside it, and is not one of its publishers.
@@ -63,7 +64,7 @@ pub struct RequestIds {
 #[derive(Debug)]
 pub struct Topic {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// Names.
     pub naming: Naming,
     /// Live writers.
@@ -98,7 +99,7 @@ pub struct Topic {
 #[derive(Debug, Default)]
 pub struct Topics {
     topics: HashMap<TopicId, Box<Topic>>,
-    index: BTreeMap<(u32, Arc<str>), TopicId>,
+    index: BTreeMap<(DomainId, Arc<str>), TopicId>,
     /// Those without endpoints, by the time when the last one went.
     vanished: BTreeSet<(Timestamp, TopicId)>,
     /// Those of them that hold a measuring place.
@@ -117,13 +118,14 @@ impl Naming {
     /// Of a DDS topic.
     #[must_use]
     pub fn of(topic: &DdsTopic) -> Self {
-        let kind = topic.kind();
-        let (is_buffer, counts) = match kind {
-            TopicKind::CpuBuffer(_) => (true, true),
-            TopicKind::Buffer(_) => (true, false),
+        let demangled = topic.demangle();
+        let kind = TopicKind::of_demangled(&demangled);
+        let (is_buffer, counts) = match demangled {
+            Demangled::CpuBuffer(_) => (true, true),
+            Demangled::Buffer(_) => (true, false),
             _ => (false, true),
         };
-        let named = |name: &RosName, kind: &'static str, dds_name: &DdsTopic| Self {
+        let named = |name: &RosName, dds_name: &DdsTopic| Self {
             dds_name: dds_name.as_str().into(),
             name: name.as_str().into(),
             kind,
@@ -131,19 +133,18 @@ impl Naming {
             is_buffer,
             counts,
         };
-        match &kind {
-            TopicKind::Topic(name) => named(name, topic_label(name), topic),
-            TopicKind::CpuBuffer(name) | TopicKind::Buffer(name) => {
-                named(name, topic_label(name), &DdsTopic::of_topic(name))
+        match &demangled {
+            Demangled::CpuBuffer(name) | Demangled::Buffer(name) => {
+                named(name, &DdsTopic::of_topic(name))
             }
-            TopicKind::ServiceRequest(name) => named(name, "service_request", topic),
-            TopicKind::ServiceReply(name) => named(name, "service_reply", topic),
-            TopicKind::RosDiscovery => Self::verbatim(topic, "discovery"),
-            TopicKind::NotRos => Self::verbatim(topic, "dds"),
+            Demangled::Topic(name)
+            | Demangled::ServiceRequest(name)
+            | Demangled::ServiceReply(name) => named(name, topic),
+            Demangled::RosDiscovery | Demangled::NotRos => Self::verbatim(topic, kind),
         }
     }
 
-    fn verbatim(topic: &DdsTopic, kind: &'static str) -> Self {
+    fn verbatim(topic: &DdsTopic, kind: TopicKind) -> Self {
         let name: Arc<str> = topic.as_str().into();
         Self {
             dds_name: Arc::clone(&name),
@@ -158,9 +159,9 @@ impl Naming {
     /// Watchlist entries that cover it. Entries are about topics: services are covered only by
     /// their DDS names. A hidden topic is covered when an entry names a hidden token itself, so
     /// `/**` is every topic that `ros2 topic list` shows.
-    fn covered_by(&self, domain_id: u32, watchlist: &Watchlist) -> Vec<usize> {
+    fn covered_by(&self, domain_id: DomainId, watchlist: &Watchlist) -> Vec<usize> {
         let mut covering = watchlist.matching(domain_id, self.watched_as());
-        if self.hidden && !self.is_service() {
+        if self.hidden && !self.kind.is_service() {
             let names_hidden = |index: &usize| {
                 watchlist
                     .watches()
@@ -173,17 +174,13 @@ impl Naming {
     }
 
     /// Whether it is watched by its exact name, in this domain or, with `None`, in any.
-    pub(super) fn is_named_by(&self, domain_id: Option<u32>, watchlist: &Watchlist) -> bool {
+    pub(super) fn is_named_by(&self, domain_id: Option<DomainId>, watchlist: &Watchlist) -> bool {
         watchlist.names(domain_id, self.watched_as())
-    }
-
-    fn is_service(&self) -> bool {
-        matches!(self.kind, "service_request" | "service_reply")
     }
 
     /// The name that watches are about.
     fn watched_as(&self) -> &str {
-        if self.is_service() {
+        if self.kind.is_service() {
             &self.dds_name
         } else {
             &self.name
@@ -193,7 +190,7 @@ impl Naming {
     /// Who wants its samples.
     fn requested_by(
         &self,
-        domain_id: u32,
+        domain_id: DomainId,
         sample_requests: &[SampleRequest],
     ) -> Option<RequestIds> {
         let covering = sample_requests
@@ -210,15 +207,6 @@ impl Naming {
             ids: of_depth(Depth::Arrivals),
             payloads: of_depth(Depth::Payloads),
         })
-    }
-}
-
-fn topic_label(name: &RosName) -> &'static str {
-    match name.action() {
-        Some((_, ActionPart::Feedback)) => "action_feedback",
-        Some((_, ActionPart::Status)) => "action_status",
-        _ if name.service_of_events().is_some() => "service_event",
-        _ => "topic",
     }
 }
 
@@ -255,7 +243,7 @@ impl Topics {
 
     /// The topic of this DDS name, or of the topic it stands beside.
     #[must_use]
-    pub fn find(&self, domain_id: u32, naming: &Naming) -> Option<TopicId> {
+    pub fn find(&self, domain_id: DomainId, naming: &Naming) -> Option<TopicId> {
         self.index
             .get(&(domain_id, Arc::clone(&naming.dds_name)))
             .copied()
@@ -345,7 +333,7 @@ impl Topics {
     /// Adds an endpoint; gives its topic and whether the topic is new.
     pub fn join(
         &mut self,
-        domain_id: u32,
+        domain_id: DomainId,
         naming: &Naming,
         guid: Guid,
         role: Role,
@@ -508,7 +496,7 @@ impl Topics {
         }
     }
 
-    fn create(&mut self, domain_id: u32, naming: &Naming) -> TopicId {
+    fn create(&mut self, domain_id: DomainId, naming: &Naming) -> TopicId {
         self.created += 1;
         let id = TopicId(self.created);
         self.index
@@ -607,36 +595,53 @@ mod tests {
     fn the_same_name_in_two_domains_is_two_topics() {
         let mut topics = Topics::default();
         let naming = naming("rt/chatter");
-        let (one, _) = topics.join(0, &naming, guid(1), Role::Writer, Timestamp(1));
-        let (two, _) = topics.join(5, &naming, guid(2), Role::Writer, Timestamp(1));
+        let (one, _) = topics.join(DomainId(0), &naming, guid(1), Role::Writer, Timestamp(1));
+        let (two, _) = topics.join(DomainId(5), &naming, guid(2), Role::Writer, Timestamp(1));
         assert_ne!(one, two);
     }
 
     #[test]
     fn everything_means_what_topic_list_shows() {
         let all = watchlist(&["/**"]);
-        assert_eq!(naming("rt/points").covered_by(0, &all), [0]);
+        assert_eq!(naming("rt/points").covered_by(DomainId(0), &all), [0]);
         assert!(
             naming("rt/fib/_action/feedback")
-                .covered_by(0, &all)
+                .covered_by(DomainId(0), &all)
                 .is_empty()
         );
-        assert!(naming("rq/addRequest").covered_by(0, &all).is_empty());
-        assert!(naming("ros_discovery_info").covered_by(0, &all).is_empty());
+        assert!(
+            naming("rq/addRequest")
+                .covered_by(DomainId(0), &all)
+                .is_empty()
+        );
+        assert!(
+            naming("ros_discovery_info")
+                .covered_by(DomainId(0), &all)
+                .is_empty()
+        );
         let hidden = watchlist(&["/**/_action/feedback", "/fib/_action/status"]);
         assert_eq!(
-            naming("rt/fib/_action/feedback").covered_by(0, &hidden),
+            naming("rt/fib/_action/feedback").covered_by(DomainId(0), &hidden),
             [0]
         );
-        assert_eq!(naming("rt/fib/_action/status").covered_by(0, &hidden), [1]);
+        assert_eq!(
+            naming("rt/fib/_action/status").covered_by(DomainId(0), &hidden),
+            [1]
+        );
     }
 
     #[test]
     fn cpu_buffers_belong_to_the_topic_beside_them() {
         let mut topics = Topics::default();
-        let (main, _) = topics.join(0, &naming("rt/image"), guid(1), Role::Writer, Timestamp(1));
+        let (main, _) = topics.join(
+            DomainId(0),
+            &naming("rt/image"),
+            guid(1),
+            Role::Writer,
+            Timestamp(1),
+        );
         let buffer = naming("rt/image/_buf_cpu");
-        let (same, _) = topics.join(0, &buffer, guid(2), Role::Writer, Timestamp(1));
+        let (same, _) = topics.join(DomainId(0), &buffer, guid(2), Role::Writer, Timestamp(1));
         assert_eq!(main, same);
         assert_eq!(topics.get(main).unwrap().writers, [guid(1)]);
     }
@@ -647,7 +652,13 @@ mod tests {
         let all = watchlist(&["/**"]);
         let mut ids = Vec::new();
         for name in ["rt/a", "rt/b", "rt/c"] {
-            let (id, _) = topics.join(0, &naming(name), guid(1), Role::Writer, Timestamp(1));
+            let (id, _) = topics.join(
+                DomainId(0),
+                &naming(name),
+                guid(1),
+                Role::Writer,
+                Timestamp(1),
+            );
             topics.apply_lists(id, &all, &[], 2, Timestamp(1));
             ids.push(id);
         }
@@ -662,7 +673,13 @@ mod tests {
     #[test]
     fn a_vanished_topic_stays_for_its_grace_period() {
         let mut topics = Topics::default();
-        let (id, _) = topics.join(0, &naming("rt/a"), guid(1), Role::Writer, Timestamp(1));
+        let (id, _) = topics.join(
+            DomainId(0),
+            &naming("rt/a"),
+            guid(1),
+            Role::Writer,
+            Timestamp(1),
+        );
         topics.leave(id, guid(1), Timestamp(100));
         topics.expire(Timestamp(599), 500);
         assert!(topics.get(id).unwrap().is_vanished());

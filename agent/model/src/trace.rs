@@ -12,7 +12,7 @@ use std::sync::Arc;
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::rtps::StatusInfo;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
-use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, Timestamp};
 
 use super::identity::Identity;
 use super::route::Destination;
@@ -93,7 +93,7 @@ pub struct Message {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WriterDescription {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// ROS name.
     pub topic: Arc<str>,
     /// Type.
@@ -599,7 +599,7 @@ mod tests {
 
     fn description() -> WriterDescription {
         WriterDescription {
-            domain_id: 0,
+            domain_id: DomainId(0),
             topic: "/points".into(),
             message_type: "sensor_msgs/msg/PointCloud2".into(),
             reliable: true,

@@ -4,9 +4,8 @@ use ros2probe_testing::bag_readers::read_by_others;
 
 use super::*;
 
-#[test]
-fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
-    let directory = tempfile::tempdir().unwrap();
+/// Every form and compression, by name.
+fn forms() -> [(&'static str, Options); 8] {
     let usual = Options {
         ros_distro: "jazzy".into(),
         ..Options::default()
@@ -18,7 +17,7 @@ fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
         ..storage("none")
     };
     let split = Some(Duration::from_secs(1));
-    let forms = [
+    [
         ("usual", usual.clone()),
         (
             "humble",
@@ -71,8 +70,13 @@ fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
                 ..usual
             },
         ),
-    ];
-    let bags = forms.map(|(name, options)| {
+    ]
+}
+
+#[test]
+fn mcap_and_rosbags_of_python_read_every_form_and_compression() {
+    let directory = tempfile::tempdir().unwrap();
+    let bags = forms().map(|(name, options)| {
         let path = directory.path().join(name);
         bag(&path, options, 40);
         path

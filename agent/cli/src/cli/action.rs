@@ -1,12 +1,13 @@
 //! `rp action`.
 
+use std::borrow::Cow;
 use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use ros2probe::client::Target;
-use ros2probe::ros2::facts::Named;
 use ros2probe::ros2::{action, topic};
+use ros2probe_api::nodes::Named;
 
 use super::events::ActionEcho;
 use super::shared::{Graph, print_or_fail, print_text};
@@ -122,11 +123,11 @@ impl Find {
     }
 }
 
-fn actions(target: &Target) -> Result<Vec<Named>> {
+fn actions(target: &Target) -> Result<Vec<Named<'static>>> {
     let names = Graph::reach(target)?.names()?;
     Ok(action::of_topics(&names.topics).collect())
 }
 
-fn typed(action: &Named) -> (&str, &[String]) {
+fn typed<'a>(action: &'a Named<'a>) -> (&'a str, &'a [Cow<'a, str>]) {
     (&action.name, &action.types)
 }

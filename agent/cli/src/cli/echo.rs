@@ -7,8 +7,8 @@ use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
-use ros2probe::ros2::facts::Topic;
 use ros2probe::ros2::name::full_name;
+use ros2probe_api::topics::Topic;
 use ros2probe_daemon::escape::visible_lines;
 use ros2probe_message::TypeName;
 use ros2probe_message::filter::Filter;
@@ -212,13 +212,13 @@ impl Echo {
     }
 
     /// The type to print messages by; where the topic has several, one has to be named.
-    fn expected(&self, known: &Topic) -> Result<Option<String>> {
+    fn expected(&self, known: &Topic<'_>) -> Result<Option<String>> {
         if self.message_type.is_some() {
             return Ok(self.message_type.clone());
         }
         match known.message_types.as_slice() {
             [] => Ok(None),
-            [one] => Ok(Some(one.clone())),
+            [one] => Ok(Some(one.to_string())),
             several => {
                 let text = format!(
                     "Cannot echo topic '{}', as it contains more than one type: [{}]",
@@ -242,7 +242,7 @@ impl Echo {
 }
 
 /// What explains why nothing may come.
-fn hint(name: &str, known: &Topic, expected: Option<&str>) {
+fn hint(name: &str, known: &Topic<'_>, expected: Option<&str>) {
     let types = &known.message_types;
     if let Some(expected) = expected
         && !types.is_empty()

@@ -9,10 +9,11 @@ use anyhow::Result;
 use bytes::Bytes;
 use clap::Args;
 use ros2probe::client::{Agent, ClientError, Target};
-use ros2probe::ros2::facts::Topic;
 use ros2probe_api::path::encoded;
+use ros2probe_api::problem::Code;
+use ros2probe_api::samples::{Line, Missed, Sample};
+use ros2probe_api::topics::Topic;
 use ros2probe_daemon::escape::{visible, visible_lines};
-use ros2probe_daemon::subscriptions::line::{Line, MissedFacts, SampleFacts};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::Style;
 use ros2probe_message::{Library, Limits, MessageType, Sources, Truncation, decode};
@@ -88,8 +89,8 @@ pub(crate) fn library(target: &Target, directories: Vec<PathBuf>) -> Library {
 
 /// One item of a stream.
 pub(crate) enum StreamItem<'a> {
-    Message(&'a SampleFacts, Bytes),
-    Missed(&'a MissedFacts),
+    Message(&'a Sample, Bytes),
+    Missed(&'a Missed),
     /// Everything up to here was delivered.
     Clock,
 }
@@ -170,11 +171,11 @@ pub(crate) fn follow(
 }
 
 /// What an agent knows of a topic.
-pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<Topic>> {
+pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<Topic<'static>>> {
     let path = encoded(name.strip_prefix('/').unwrap_or(name));
     match agent.get(&format!("/topics/{path}?domain_id={domain_id}")) {
         Ok(topic) => Ok(Some(topic)),
-        Err(error @ ClientError::Refused(_)) if error.is("no-such-topic") => Ok(None),
+        Err(error @ ClientError::Refused(_)) if error.is(Code::NoSuchTopic) => Ok(None),
         Err(error) => Err(error.into()),
     }
 }
@@ -203,7 +204,7 @@ impl Types {
     }
 
     /// The definition that a message was written by; `None` where there is none.
-    pub(crate) fn of(&mut self, sample: &SampleFacts) -> Option<Arc<MessageType>> {
+    pub(crate) fn of(&mut self, sample: &Sample) -> Option<Arc<MessageType>> {
         if let Some(known) = self.writers.get(&sample.writer) {
             return known.clone();
         }
@@ -249,7 +250,7 @@ impl MessageFilter {
         })
     }
 
-    pub(crate) fn passes(&mut self, sample: &SampleFacts, payload: &[u8]) -> Result<bool> {
+    pub(crate) fn passes(&mut self, sample: &Sample, payload: &[u8]) -> Result<bool> {
         let Some(message_type) = self.types.of(sample) else {
             return Ok(false);
         };
@@ -260,7 +261,7 @@ impl MessageFilter {
             }
             Err(error) => {
                 if !std::mem::replace(&mut self.is_told, true) {
-                    let SampleFacts { topic, writer, .. } = sample;
+                    let Sample { topic, writer, .. } = sample;
                     eprintln!(
                         "rp: {}",
                         visible(&format!("{topic} of writer {writer}: {error}"))

@@ -7,11 +7,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use ros2probe::client::{Agent, ClientError};
+use ros2probe_api::Open;
+use ros2probe_api::health::Health;
 use ros2probe_api::path::encoded;
+use ros2probe_api::problem::Code;
+use ros2probe_api::samples::{Missed, MissedReason};
+use ros2probe_api::topics::{Reason, ReasonCode, Topic, TopicList};
 use ros2probe_daemon::escape::visible;
-use ros2probe_daemon::recording::{Graph, GraphTopic, PublishedTopic, UnknownWriterList};
-use ros2probe_daemon::subscriptions::line::{MissedFacts, Reason};
-use serde::Deserialize;
+use ros2probe_daemon::recording::{GraphSnapshot, PublishedTopic};
 
 use super::shared::names_of;
 
@@ -56,30 +59,6 @@ pub(crate) fn end() {
     if let Ok(mut missing) = MISSING.try_lock() {
         missing.report(true);
     }
-}
-
-/// What an agent can see.
-#[derive(Deserialize)]
-struct Health {
-    abilities: Vec<Ability>,
-}
-
-#[derive(Deserialize)]
-struct Ability {
-    ability: String,
-    able: bool,
-}
-
-/// Why a topic is silent.
-#[derive(Deserialize)]
-struct Silence {
-    reasons: Vec<Cause>,
-}
-
-#[derive(Deserialize)]
-struct Cause {
-    code: String,
-    detail: String,
 }
 
 impl<'a> Notes<'a> {
@@ -137,13 +116,13 @@ impl<'a> Notes<'a> {
     }
 
     /// Messages will not come.
-    pub(crate) fn missed(&mut self, missed: &MissedFacts) {
+    pub(crate) fn missed(&mut self, missed: &Missed) {
         let why = match missed.reason {
-            Reason::QueueFull => "were dropped: too slow here",
-            Reason::NotCaptured => "could not be captured",
-            Reason::Unannounced => "were sent before their publisher was announced",
+            MissedReason::QueueFull => "were dropped: too slow here",
+            MissedReason::NotCaptured => "could not be captured",
+            MissedReason::Unannounced => "were sent before their publisher was announced",
             // The verb itself reports what its subscriber lost.
-            Reason::Incomplete | Reason::Lost => return,
+            MissedReason::Incomplete | MissedReason::Lost => return,
         };
         let mut missing = Missing::all();
         missing.add((missed.topic.clone(), why), missed.samples);
@@ -181,14 +160,14 @@ impl<'a> Notes<'a> {
                 continue;
             }
             let path = path(name, self.domain_id);
-            match self.agent.get::<Silence>(&path) {
-                Ok(Silence { reasons }) => {
-                    let why = reasons.iter().find_map(|cause| self.words(cause));
+            match self.agent.get::<Topic<'_>>(&path) {
+                Ok(topic) => {
+                    let why = topic.reasons.iter().find_map(|reason| self.words(reason));
                     if let Some(why) = why {
                         eprintln!("rp: no message on {}: {}", visible(name), visible(&why));
                     }
                 }
-                Err(error @ ClientError::Refused(_)) if error.is("no-such-topic") => {
+                Err(error @ ClientError::Refused(_)) if error.is(Code::NoSuchTopic) => {
                     let detail = error.to_string();
                     eprintln!("rp: no message on {}: {}", visible(name), visible(&detail));
                     names_of(self.agent, self.domain_id)?;
@@ -200,38 +179,45 @@ impl<'a> Notes<'a> {
     }
 
     /// A reason and its remedy; `None` where a message may come at any time.
-    fn words(&self, cause: &Cause) -> Option<String> {
-        let text = match cause.code.as_str() {
-            "no_publisher" => "it has no publisher",
-            "no_subscriber" => {
+    fn words(&self, reason: &Reason) -> Option<String> {
+        let Open::Known(code) = &reason.code else {
+            return None;
+        };
+        let text = match code {
+            ReasonCode::NoPublisher => "it has no publisher",
+            ReasonCode::NoSubscriber => {
                 "it has no subscriber, so its publishers send nothing; rp does not subscribe: start a \
                  subscriber"
             }
-            "encrypted" => "its publisher uses DDS security; its messages may be encrypted",
-            "watch_rejected" => "limits.topics topics are measured already: raise it",
-            "shared_memory" if self.is_replay => {
+            ReasonCode::Encrypted => {
+                "its publisher uses DDS security; its messages may be encrypted"
+            }
+            ReasonCode::WatchRejected => "limits.topics topics are measured already: raise it",
+            ReasonCode::SharedMemory if self.is_replay => {
                 "publisher and subscriber use shared memory, which a capture of the network does not \
                  hold: record on the robot with `rp bag record`"
             }
-            "data_sharing" => {
+            ReasonCode::DataSharing => {
                 "subscribers read the publisher's memory (data sharing), which cannot be observed: \
                  turn data sharing off, or subscribe from another host"
             }
-            "same_process" => {
+            ReasonCode::SameProcess => {
                 "publisher and subscriber share one process; nothing crosses the network: subscribe \
                  from another process"
             }
-            "iceoryx" => {
+            ReasonCode::Iceoryx => {
                 "messages pass through iceoryx, which cannot be observed: turn shared memory off in \
                  Cyclone DDS"
             }
-            "shared_memory" => {
+            ReasonCode::SharedMemory => {
                 return Some(format!(
                     "publisher and subscriber use shared memory, and none was seen there: {SWITCH}"
                 ));
             }
-            "agent_not_ready" | "no_matched_subscriber" | "outside_view" => &cause.detail,
-            _ => return None,
+            ReasonCode::AgentNotReady
+            | ReasonCode::NoMatchedSubscriber
+            | ReasonCode::OutsideView => &reason.detail,
+            ReasonCode::NotWatched | ReasonCode::Quiet => return None,
         };
         Some(text.to_owned())
     }
@@ -246,21 +232,19 @@ impl<'a> Notes<'a> {
 
     /// The named topics, or all of the domain; none where the agent does not answer.
     fn topics(&self) -> Vec<PublishedTopic> {
-        let graph = match self.names.as_slice() {
+        let topics = match self.names.as_slice() {
             [name] => {
-                let topic = self.agent.get::<GraphTopic>(&path(name, self.domain_id));
-                topic.map(Graph::from)
+                let topic = self.agent.get(&path(name, self.domain_id));
+                topic.map(|topic: Topic<'_>| vec![topic])
             }
             _ => {
                 let domain_id = self.domain_id;
                 let path = format!("/topics?domain_id={domain_id}&hidden=true");
-                self.agent.get(&path)
+                self.agent.get(&path).map(|list: TopicList<'_>| list.topics)
             }
         };
-        let mut topics = graph
-            .unwrap_or_default()
-            .into_snapshot(UnknownWriterList::default())
-            .topics;
+        let topics = topics.unwrap_or_default();
+        let mut topics = GraphSnapshot::answered(&topics, Vec::new()).topics;
         topics.retain(|topic| self.names.is_empty() || self.names.contains(&topic.name));
         topics
     }
@@ -301,7 +285,7 @@ impl Missing {
 
 /// Whether the agent sees messages in shared memory, but not each of them.
 pub(crate) fn samples_shared_memory(agent: &Agent) -> bool {
-    let Ok(Health { abilities }) = agent.get("/health") else {
+    let Ok(Health { abilities, .. }) = agent.get("/health") else {
         return false;
     };
     let able = |name: &str| {

@@ -6,7 +6,7 @@ use std::process::{Command, ExitCode, Stdio};
 use anyhow::Result;
 use clap::Args;
 use ros2probe::client::{Agent, Target};
-use serde::Deserialize;
+use ros2probe_api::health::PageToken;
 use serde_json::json;
 
 use super::{Output, UserError};
@@ -36,12 +36,6 @@ pub(crate) struct Page {
     target: Target,
 }
 
-#[derive(Deserialize)]
-struct Token {
-    token: String,
-    address: Option<String>,
-}
-
 impl Page {
     pub(crate) fn ask(self) -> Result<ExitCode> {
         let mut output = Output::new();
@@ -58,7 +52,7 @@ impl Page {
             return Err(UserError(way).into());
         }
         let agent = Agent::reach(&self.target)?;
-        let Token { token, address } = agent.post("/page/token", &json!({}))?;
+        let PageToken { token, address } = agent.post("/page/token", &json!({}))?;
         let Some(address) = address else {
             let reason = "the agent serves no page: api.listen or api.page is off".to_owned();
             return Err(UserError(reason).into());

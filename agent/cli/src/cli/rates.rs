@@ -13,7 +13,7 @@ use ros2probe::ros2::name::full_name;
 use ros2probe::ros2::rates::{Arrival, End, Named, Origin, Quantity, Rates};
 use ros2probe::ros2::{Dialect, Refused};
 use ros2probe_api::path::encoded;
-use ros2probe_daemon::subscriptions::line::{Line, Reason};
+use ros2probe_api::samples::{Line, MissedReason};
 
 use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, library};
 use super::interrupt::INTERRUPTED;
@@ -244,7 +244,10 @@ fn measure(
             }
             Line::Missed(missed) => {
                 // Arrivals are counted without their bytes.
-                if matches!(missed.reason, Reason::QueueFull | Reason::Unannounced) {
+                if matches!(
+                    missed.reason,
+                    MissedReason::QueueFull | MissedReason::Unannounced
+                ) {
                     notes.missed(&missed);
                 }
                 Ok(())

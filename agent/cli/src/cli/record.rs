@@ -15,12 +15,13 @@ use clap::Args;
 use ros2probe::client::{Agent, Outcome, Samples, Target};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::name::full_name;
+use ros2probe_api::participants::ParticipantList;
+use ros2probe_api::topics::TopicList;
 use ros2probe_bag::{self, Form, Options, Storage, Writer};
 use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::recording::{
-    Activity, Command, DiscoveredTopic, Filter, FilterOptions, Finished, Graph, GraphSnapshot,
-    Recorder, SampleRing, Sources, UnknownWriterList, default_name, record, schema,
-    unobserved_lines,
+    Activity, Command, DiscoveredTopic, Filter, FilterOptions, Finished, GraphSnapshot, Recorder,
+    SampleRing, Sources, by_name, default_name, record, schema, unobserved_lines,
 };
 use ros2probe_message::{Library, Sources as Places};
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
@@ -622,15 +623,15 @@ impl<'a> GraphCache<'a> {
     fn ask(&mut self) {
         let graph = self
             .agent
-            .get_within::<Graph>("/topics?hidden=true", GRAPH_PATIENCE);
-        let unknown_writers = self
+            .get_within::<TopicList<'_>>("/topics?hidden=true", GRAPH_PATIENCE);
+        let participants = self
             .agent
-            .get_within::<UnknownWriterList>("/participants", GRAPH_PATIENCE);
-        let (Ok(graph), Ok(unknown_writers)) = (graph, unknown_writers) else {
+            .get_within::<ParticipantList<'_>>("/participants", GRAPH_PATIENCE);
+        let (Ok(graph), Ok(participants)) = (graph, participants) else {
             return;
         };
-        self.known = graph.clone().by_name(self.domain_id);
-        self.graph = graph.into_snapshot(unknown_writers);
+        self.known = by_name(&graph.topics, self.domain_id);
+        self.graph = GraphSnapshot::answered(&graph.topics, participants.unknown_writers);
         self.at = Some(Instant::now());
     }
 }

@@ -1,12 +1,13 @@
 //! `rp service`.
 
+use std::borrow::Cow;
 use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use ros2probe::client::Target;
-use ros2probe::ros2::facts::{Names, ServiceName};
 use ros2probe::ros2::{service, topic};
+use ros2probe_api::names::{Names, ServiceName};
 
 use super::events::ServiceEcho;
 use super::shared::{Graph, Spinning, answer, print_or_fail, print_text};
@@ -142,11 +143,11 @@ impl Info {
     }
 }
 
-fn shown(names: &Names, hidden: bool) -> impl Iterator<Item = &ServiceName> {
+fn shown<'a>(names: &'a Names<'a>, hidden: bool) -> impl Iterator<Item = &'a ServiceName<'a>> {
     let services = names.services.iter();
     services.filter(move |service| hidden || !service.hidden)
 }
 
-fn typed(service: &ServiceName) -> (&str, &[String]) {
+fn typed<'a>(service: &'a ServiceName<'a>) -> (&'a str, &'a [Cow<'a, str>]) {
     (&service.name, &service.types)
 }

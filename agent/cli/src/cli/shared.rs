@@ -8,8 +8,11 @@ use anyhow::Result;
 use clap::Args;
 use ros2probe::client::{Agent, ClientError, Target};
 use ros2probe::ros2::Refused;
-use ros2probe::ros2::facts::{Names, Node, Topic};
+use ros2probe_api::names::Names;
+use ros2probe_api::nodes::Node;
 use ros2probe_api::path::encoded;
+use ros2probe_api::problem::Code;
+use ros2probe_api::topics::Topic;
 use serde::de::DeserializeOwned;
 
 use super::{Output, UserError};
@@ -78,28 +81,28 @@ impl Graph {
     }
 
     /// All names, as [`names_of`] has them.
-    pub(crate) fn names(&self) -> Result<Names> {
+    pub(crate) fn names(&self) -> Result<Names<'static>> {
         names_of(&self.agent, self.domain_id)
     }
 
     /// The topic of this name, if there is one.
-    pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic>> {
-        self.thing("topics", name, "no-such-topic")
+    pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic<'static>>> {
+        self.thing("topics", name, Code::NoSuchTopic)
     }
 
     /// The node of this name, if there is one, with all that is hidden.
-    pub(crate) fn node(&self, name: &str) -> Result<Option<Node>> {
-        self.thing("nodes", name, "no-such-node")
+    pub(crate) fn node(&self, name: &str) -> Result<Option<Node<'static>>> {
+        self.thing("nodes", name, Code::NoSuchNode)
     }
 
-    fn thing<T: DeserializeOwned>(&self, noun: &str, name: &str, code: &str) -> Result<Option<T>> {
+    fn thing<T: DeserializeOwned>(&self, noun: &str, name: &str, code: Code) -> Result<Option<T>> {
         let Some(name) = name.strip_prefix('/').filter(|name| !name.is_empty()) else {
             return Ok(None);
         };
         let hidden = if noun == "nodes" { "&hidden=true" } else { "" };
         let (name, domain_id) = (encoded(name), self.domain_id);
         let path = format!("/{noun}/{name}?domain_id={domain_id}{hidden}");
-        match self.agent.get(&path) {
+        match self.agent.get_visible(&path) {
             Ok(found) => Ok(Some(found)),
             Err(error @ ClientError::Refused(_)) if error.is(code) => Ok(None),
             Err(error) => Err(error.into()),
@@ -111,8 +114,9 @@ impl Graph {
 static EXPLAINED: Once = Once::new();
 
 /// All names in a domain, also hidden ones. Why they are lacking, stderr says once.
-pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
-    let names: Names = agent.get(&format!("/names?domain_id={domain_id}&hidden=true"))?;
+pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
+    let names: Names<'_> =
+        agent.get_visible(&format!("/names?domain_id={domain_id}&hidden=true"))?;
     let others = names.domains.iter().filter(|other| **other != domain_id);
     let others: Vec<String> = others.map(u32::to_string).collect();
     if names.is_empty() && !others.is_empty() {
@@ -129,7 +133,7 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names> {
 
 /// What was announced before the agent, or the capture, began, or not at all: endpoints are announced
 /// once, and to other participants.
-fn late(names: &Names, is_replay: bool) -> Option<String> {
+fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
     let Names {
         participants,
         unknown_writers,

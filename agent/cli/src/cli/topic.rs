@@ -1,12 +1,13 @@
 //! `rp topic`.
 
+use std::borrow::Cow;
 use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use ros2probe::client::Target;
-use ros2probe::ros2::facts::{Names, TopicName};
 use ros2probe::ros2::topic;
+use ros2probe_api::names::{Names, TopicName};
 
 use super::echo::Echo;
 use super::interrupt::INTERRUPTED;
@@ -165,11 +166,11 @@ impl Find {
     }
 }
 
-fn shown(names: &Names, hidden: bool) -> impl Iterator<Item = &TopicName> {
+fn shown<'a>(names: &'a Names<'a>, hidden: bool) -> impl Iterator<Item = &'a TopicName<'a>> {
     let topics = names.topics.iter();
     topics.filter(move |topic| hidden || !topic.hidden)
 }
 
-fn typed(topic: &TopicName) -> (&str, &[String]) {
+fn typed<'a>(topic: &'a TopicName<'a>) -> (&'a str, &'a [Cow<'a, str>]) {
     (&topic.name, &topic.types)
 }

@@ -3,7 +3,7 @@
 use std::io;
 use std::path::PathBuf;
 
-use serde::Deserialize;
+use ros2probe_api::problem::{Code, Problem, URN};
 
 use ros2probe_capture::pcap::PcapError;
 
@@ -128,24 +128,16 @@ pub struct Refusal {
     pub detail: String,
 }
 
-#[derive(Deserialize)]
-struct Body {
-    #[serde(rename = "type")]
-    kind: String,
-    detail: String,
-    #[serde(default)]
-    mistakes: Vec<String>,
-}
-
 impl Refusal {
     /// `None` where the body is not an agent's.
     pub(super) fn read(status: u16, body: &[u8]) -> Option<Self> {
-        let Body {
+        let Problem {
             kind,
             mut detail,
             mistakes,
+            ..
         } = serde_json::from_slice(body).ok()?;
-        let code = kind.strip_prefix("urn:ros2probe:problem:")?.to_owned();
+        let code = kind.strip_prefix(URN)?.to_owned();
         for mistake in mistakes {
             detail = format!("{detail}\n{mistake}");
         }
@@ -160,8 +152,8 @@ impl Refusal {
 impl ClientError {
     /// The agent refused for this reason.
     #[must_use]
-    pub fn is(&self, code: &str) -> bool {
-        matches!(self, Self::Refused(refusal) if refusal.code == code)
+    pub fn is(&self, code: Code) -> bool {
+        matches!(self, Self::Refused(refusal) if refusal.code == code.as_str())
     }
 }
 
@@ -186,7 +178,7 @@ mod tests {
             (refusal.code.as_str(), refusal.status),
             ("no-such-topic", 404)
         );
-        assert!(ClientError::Refused(refusal).is("no-such-topic"));
+        assert!(ClientError::Refused(refusal).is(Code::NoSuchTopic));
         for foreign in [
             &b"404 page not found\n"[..],
             b"{}",

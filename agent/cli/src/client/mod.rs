@@ -21,8 +21,12 @@ use hyper::header::{ACCEPT, AUTHORIZATION, CONTENT_TYPE, HOST};
 use hyper::{Method, Request, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use serde_json::Value;
 use tokio::runtime::Runtime;
 use tokio::time::timeout;
+
+use ros2probe_api::problem::Code;
+use ros2probe_daemon::escape::visible;
 
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
@@ -106,6 +110,17 @@ impl Agent {
     /// The agent is gone, refuses, or answers something else.
     pub fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         self.exchange(Method::GET, path, None, PATIENCE)
+    }
+
+    /// As [`Self::get`], with control characters of all text escaped: names come from the network, and
+    /// go to a terminal.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub fn get_visible<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
+        let answer = self.get(path)?;
+        serde_json::from_value(visible_text(answer))
+            .map_err(|source| self.transport.unreadable(path, source))
     }
 
     /// As [`Self::get`], with an answer within `patience`.
@@ -279,7 +294,7 @@ impl Agent {
         };
         Err(match (status, refusal.code.as_str()) {
             (StatusCode::UNAUTHORIZED, _) => self.transport.unauthorized(self.token.is_some()),
-            (_, "not-found") => self.transport.older(path),
+            (_, code) if code == Code::NotFound.as_str() => self.transport.older(path),
             _ => ClientError::Refused(refusal),
         })
     }
@@ -291,7 +306,39 @@ impl std::fmt::Debug for Agent {
     }
 }
 
+fn visible_text(value: Value) -> Value {
+    match value {
+        Value::String(text) => Value::String(visible(&text).into_owned()),
+        Value::Array(values) => Value::Array(values.into_iter().map(visible_text).collect()),
+        Value::Object(members) => {
+            let members = members.into_iter();
+            let members = members.map(|(name, value)| (name, visible_text(value)));
+            Value::Object(members.collect())
+        }
+        plain => plain,
+    }
+}
+
 /// What has no JSON form would be refused by the agent as an empty body.
 fn json<B: Serialize>(body: &B) -> Bytes {
     serde_json::to_vec(body).unwrap_or_default().into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ros2probe_api::names::{NodeName, TopicName};
+
+    #[test]
+    fn no_name_reaches_a_terminal_with_control_characters() {
+        let node = r#"{"name": "/\u001b[2J\n/é", "instances": 1}"#;
+        let node = visible_text(serde_json::from_str(node).unwrap());
+        let node: NodeName<'_> = serde_json::from_value(node).unwrap();
+        assert_eq!(node.name, "/\\u{1b}[2J\\n/é");
+        let topic = r#"{"name": "/a", "hidden": false, "types": ["a/msg/\u009b1mB"],
+            "publishers": 1, "subscriptions": 0}"#;
+        let topic = visible_text(serde_json::from_str(topic).unwrap());
+        let topic: TopicName<'_> = serde_json::from_value(topic).unwrap();
+        assert_eq!(topic.types, ["a/msg/\\u{9b}1mB"]);
+    }
 }

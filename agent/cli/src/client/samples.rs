@@ -6,10 +6,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::{Agent, ClientError, Lines, Next};
-use ros2probe_daemon::subscriptions::line::{Line, OfferedFacts, Open, Reason, SampleFacts};
+use ros2probe_api::samples::{self, Line, Open};
+use ros2probe_daemon::subscriptions::line::announced;
 use ros2probe_daemon::subscriptions::{Item, Missed, MissedReason, NextItem, Topic};
 use ros2probe_model::discovery::hexadecimal;
 use ros2probe_model::payloads::Sample;
@@ -91,18 +92,18 @@ impl<'a> Samples<'a> {
                     last: facts.last_sequence_number,
                     samples: facts.samples,
                     reason: match facts.reason {
-                        Reason::Incomplete => MissedReason::Incomplete,
-                        Reason::Lost => MissedReason::Lost,
-                        Reason::Unannounced => MissedReason::Unannounced,
-                        Reason::NotCaptured => MissedReason::NotCaptured,
-                        Reason::QueueFull => MissedReason::QueueFull,
+                        samples::MissedReason::Incomplete => MissedReason::Incomplete,
+                        samples::MissedReason::Lost => MissedReason::Lost,
+                        samples::MissedReason::Unannounced => MissedReason::Unannounced,
+                        samples::MissedReason::NotCaptured => MissedReason::NotCaptured,
+                        samples::MissedReason::QueueFull => MissedReason::QueueFull,
                     },
                 }))
             }
         })
     }
 
-    fn writers_topic(&mut self, facts: &SampleFacts) -> Arc<Topic> {
+    fn writers_topic(&mut self, facts: &samples::Sample) -> Arc<Topic> {
         let known = self.writers.get(&facts.writer);
         if let Some(known) = known.filter(|_| facts.offered.is_none()) {
             return Arc::clone(known);
@@ -123,7 +124,7 @@ impl<'a> Samples<'a> {
         domain_id: u32,
         name: &str,
         message_type: Option<&str>,
-        offered: Option<&OfferedFacts>,
+        offered: Option<&samples::Offered>,
     ) -> Arc<Topic> {
         let key = (domain_id, name.to_owned());
         let known = self.topics.get(&key);
@@ -140,18 +141,18 @@ impl<'a> Samples<'a> {
         };
         let message_type = message_type.or_else(opened).unwrap_or_default();
         let topic = Arc::new(Topic {
-            domain_id,
+            domain_id: DomainId(domain_id),
             name: name.into(),
             dds_name: format!("rt{name}").into(),
             message_type: message_type.into(),
-            offered: offered.map(|offered| Arc::new(offered.offered())),
+            offered: offered.map(|offered| Arc::new(announced(offered))),
         });
         self.topics.insert(key, Arc::clone(&topic));
         topic
     }
 }
 
-fn sample(topic: Arc<Topic>, facts: &SampleFacts, payload: bytes::Bytes) -> Sample {
+fn sample(topic: Arc<Topic>, facts: &samples::Sample, payload: bytes::Bytes) -> Sample {
     Sample {
         topic,
         time: time(facts.time_ns),

@@ -6,10 +6,12 @@ use std::net::SocketAddr;
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::path::Path;
 
-use super::answers::{Answers, Health, Limit};
+use super::answers::Answers;
 use super::finding::{Area, Finding, Verdict};
 use super::host_state::HostState;
 use super::privileges::is_installed;
+use ros2probe_api::health::{Health, Limit};
+use ros2probe_api::watches::WatchState;
 use ros2probe_daemon::config::{self, Config, StateChoice};
 
 const AREA: Area = Area::Agent;
@@ -113,7 +115,7 @@ fn version(health: &Health, own: &str) -> Finding {
         Finding::new(AREA, "version", Verdict::Note, sentence)
             .remedy("sudo systemctl restart ros2probe    # starts the installed version")
     };
-    finding.seen(&health.version, format!("{FROM} version"))
+    finding.seen(health.version.as_ref(), format!("{FROM} version"))
 }
 
 fn losses(health: &Health) -> Vec<Finding> {
@@ -203,7 +205,7 @@ fn limits(health: &Health) -> Vec<Finding> {
         let price = price.saturating_mul(twice.saturating_sub(*cap)) as f64 / f64::from(1 << 20);
         finding.configure(format!(
             "limits: {{{key}: {twice}}}    # up to {price:.1} MiB more memory{}",
-            match key.as_str() {
+            match key.as_ref() {
                 "participants" | "endpoints" | "unknown_writers" =>
                     "; forged participants also cause this",
                 "topics" | "watches" => "; or fewer watches",
@@ -284,7 +286,7 @@ fn watches(answers: &Answers) -> Finding {
     }
     let idle: Vec<_> = watches
         .iter()
-        .filter(|watch| watch.state == "waiting")
+        .filter(|watch| watch.state == WatchState::Waiting)
         .map(|watch| watch.topic.as_str())
         .collect();
     match idle.len() {

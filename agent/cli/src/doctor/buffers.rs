@@ -5,9 +5,11 @@
 //! still being read when the next comes; sixteen in reassembly, where what lacks a fragment stays for
 //! as long as `ipfrag_time`. The kernel counts its own overhead, and gives twice what is asked for.
 
-use super::answers::{Answers, Measurement, Topic};
+use super::answers::Answers;
 use super::finding::{Area, Finding, Verdict};
 use super::host_state::{Files, HostState, Unread};
+use ros2probe_api::measurement::Measurement;
+use ros2probe_api::topics::Topic;
 
 const AREA: Area = Area::Buffers;
 const RECEIVE_MAX: Sysctl = Sysctl("net.core.rmem_max");
@@ -98,9 +100,9 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
 }
 
 /// By mean size: of what a topic carries, sizes differ little.
-fn largest(topics: &[Topic]) -> Option<Largest> {
+fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
     let mean = |measured: &Measurement| measured.bytes.checked_div(measured.messages);
-    let of_topic = |topic: &Topic| {
+    let of_topic = |topic: &Topic<'_>| {
         let writers = topic
             .publishers
             .iter()
@@ -113,6 +115,7 @@ fn largest(topics: &[Topic]) -> Option<Largest> {
         .filter_map(|topic| Some((of_topic(topic)?, topic)));
     let (bytes, topic) = sizes.max_by_key(|(bytes, _)| *bytes)?;
     let topic = topic.name.clone();
+    let topic = topic.into_owned();
     Some(Largest { bytes, topic })
 }
 
@@ -235,10 +238,10 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
 
 /// Messages that died in one way.
 fn lost(
-    topics: &[Topic],
+    topics: &[Topic<'_>],
     check: &'static str,
     place: &str,
-    count: impl Fn(&Topic) -> u64,
+    count: impl Fn(&Topic<'_>) -> u64,
     helped: impl Fn(Finding) -> Finding,
 ) -> Option<Finding> {
     let mut lossy: Vec<_> = topics.iter().filter(|topic| count(topic) > 0).collect();
@@ -246,7 +249,7 @@ fn lost(
         return None;
     }
     lossy.sort_by_key(|topic| std::cmp::Reverse(count(topic)));
-    let ratio = |topic: &Topic| {
+    let ratio = |topic: &Topic<'_>| {
         let received = topic.received.map_or(0, |received| received.messages);
         ratio(count(topic), received)
     };

@@ -3,8 +3,10 @@
 
 use std::collections::BTreeMap;
 
-use super::answers::{Answers, Participant, Topic};
+use super::answers::Answers;
 use super::finding::{Area, Finding, Verdict};
+use ros2probe_api::participants::Participant;
+use ros2probe_api::topics::Topic;
 
 const AREA: Area = Area::Graph;
 /// Adds what helps.
@@ -33,7 +35,7 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     findings
 }
 
-fn overview(participants: &[Participant], processes: Option<usize>, topics: usize) -> Finding {
+fn overview(participants: &[Participant<'_>], processes: Option<usize>, topics: usize) -> Finding {
     let report = |verdict, sentence: String| {
         let finding = Finding::new(AREA, "participants", verdict, sentence);
         finding.seen(participants.len().to_string(), "GET /participants")
@@ -83,15 +85,15 @@ fn overview(participants: &[Participant], processes: Option<usize>, topics: usiz
 
 /// The only participant of a domain, with nothing announced: endpoints are announced to other
 /// participants.
-fn is_alone(participant: &Participant, participants: &[Participant]) -> bool {
+fn is_alone(participant: &Participant<'_>, participants: &[Participant<'_>]) -> bool {
     let has_nothing = participant.writers == 0 && participant.readers == 0;
     let others = participants.iter();
     let neighbours = others.filter(|other| other.domain_id == participant.domain_id);
     has_nothing && !participant.secured && neighbours.count() == 1
 }
 
-fn alone(participants: &[Participant]) -> Option<Finding> {
-    let is_alone = |each: &&Participant| is_alone(each, participants);
+fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
+    let is_alone = |each: &&Participant<'_>| is_alone(each, participants);
     let alone: Vec<_> = participants.iter().filter(is_alone).collect();
     let domains: Vec<_> = alone
         .iter()
@@ -112,8 +114,8 @@ fn alone(participants: &[Participant]) -> Option<Finding> {
 }
 
 /// Those that were there before the agent.
-fn names(participants: &[Participant]) -> Option<Finding> {
-    let is_nameless = |each: &&Participant| {
+fn names(participants: &[Participant<'_>]) -> Option<Finding> {
+    let is_nameless = |each: &&Participant<'_>| {
         let has_nothing = each.writers == 0 && each.readers == 0;
         let is_nameless = has_nothing || each.enclave.is_some() && each.nodes.is_empty();
         !each.secured && is_nameless && !is_alone(each, participants)
@@ -133,7 +135,7 @@ fn names(participants: &[Participant]) -> Option<Finding> {
     ))
 }
 
-fn restored(participants: &[Participant]) -> Option<Finding> {
+fn restored(participants: &[Participant<'_>]) -> Option<Finding> {
     let count = participants.iter().filter(|each| each.restored).count();
     if count == 0 {
         return None;
@@ -163,7 +165,7 @@ fn unknown_writers(answers: &Answers) -> Option<Finding> {
     Some(finding.remedy("sudo rp discover --all    # asks their participants to repeat it"))
 }
 
-fn secured(participants: &[Participant]) -> Option<Finding> {
+fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
     let count = participants.iter().filter(|each| each.secured).count();
     if count == 0 {
         return None;
@@ -188,31 +190,34 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         let mut abilities = answers.health.abilities.iter();
         abilities.any(|each| each.able && each.ability == ability)
     };
-    let of = |way: &str| -> Vec<&Topic> {
+    let of = |way: &str| -> Vec<&Topic<'_>> {
         let topics = answers.topics.topics.iter();
         topics
             .filter(|topic| !topic.vanished && way_aside(topic) == Some(way))
             .collect()
     };
     let mut findings = Vec::new();
-    let mut report =
-        |check, verdict, topics: &[&Topic], (verb, words): (&str, &str), remedy: Option<Helps>| {
-            if topics.is_empty() {
-                return;
-            }
-            let s = if topics.len() == 1 { "s" } else { "" };
-            let sentence = format!(
-                "{} {verb}{s} {words}: {}",
-                many(topics.len(), "topic"),
-                listed(topics)
-            );
-            let finding = Finding::new(AREA, check, verdict, sentence);
-            let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
-            findings.push(match remedy {
-                Some(helps) => helps(finding),
-                None => finding,
-            });
-        };
+    let mut report = |check,
+                      verdict,
+                      topics: &[&Topic<'_>],
+                      (verb, words): (&str, &str),
+                      remedy: Option<Helps>| {
+        if topics.is_empty() {
+            return;
+        }
+        let s = if topics.len() == 1 { "s" } else { "" };
+        let sentence = format!(
+            "{} {verb}{s} {words}: {}",
+            many(topics.len(), "topic"),
+            listed(topics)
+        );
+        let finding = Finding::new(AREA, check, verdict, sentence);
+        let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
+        findings.push(match remedy {
+            Some(helps) => helps(finding),
+            None => finding,
+        });
+    };
     let shared = of("shared_memory");
     if able("shared_memory_exact") {
         let words = ("use", "only Fast DDS shared memory; every message is seen");
@@ -273,7 +278,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
 }
 
 /// The way that most pairs use, where none uses the network.
-fn way_aside(topic: &Topic) -> Option<&str> {
+fn way_aside<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
     if topic
         .passages
         .iter()
@@ -286,7 +291,7 @@ fn way_aside(topic: &Topic) -> Option<&str> {
 }
 
 /// Endpoints that should talk and do not.
-fn mismatches(topics: &[Topic]) -> Vec<Finding> {
+fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
     const KINDS: [(&str, &str, &str); 3] = [
         (
             "qos_incompatible",
@@ -305,7 +310,7 @@ fn mismatches(topics: &[Topic]) -> Vec<Finding> {
         ),
     ];
     let find = |(kind, words, remedy): (&'static str, &str, &str)| {
-        let has = |topic: &&Topic| topic.diagnoses.iter().any(|each| each.kind == kind);
+        let has = |topic: &&Topic<'_>| topic.diagnoses.iter().any(|each| each.kind() == kind);
         let found: Vec<_> = topics.iter().filter(has).collect();
         if found.is_empty() {
             return None;
@@ -318,11 +323,11 @@ fn mismatches(topics: &[Topic]) -> Vec<Finding> {
     KINDS.into_iter().filter_map(find).collect()
 }
 
-fn listed(topics: &[&Topic]) -> String {
+fn listed(topics: &[&Topic<'_>]) -> String {
     let names: Vec<_> = topics
         .iter()
         .take(NAMED)
-        .map(|topic| topic.name.as_str())
+        .map(|topic| topic.name.as_ref())
         .collect();
     let names = names.join(", ");
     match topics.len().saturating_sub(NAMED) {

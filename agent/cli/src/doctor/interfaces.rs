@@ -1,8 +1,8 @@
 //! Network interfaces: what DDS can use them for, and which of them the agent looks at.
 
-use super::answers::Health;
 use super::finding::{Area, Finding, Verdict};
 use super::host_state::HostState;
+use ros2probe_api::health::Health;
 
 const AREA: Area = Area::Interfaces;
 const PLACE: &str = "/sys/class/net";
@@ -196,7 +196,7 @@ fn looked_at(agent: &Health) -> Finding {
         .iter()
         .map(|each| each.interface.as_str())
         .collect();
-    let sentence = match agent.source.as_str() {
+    let sentence = match agent.source.as_ref() {
         "host"
             if names
                 .iter()

@@ -1,9 +1,10 @@
 //! What this process, the running agent and the service may do, and what grants the rest. Which
 //! capabilities are needed is `crate::privilege`'s to say.
 
-use super::answers::{Answers, Health};
+use super::answers::Answers;
 use super::finding::{Area, Finding, Verdict};
 use super::host_state::HostState;
+use ros2probe_api::health::Health;
 use ros2probe_daemon::config::{CaptureSettings, ExactChoice, ShmMode};
 use ros2probe_daemon::privilege;
 
@@ -94,9 +95,10 @@ fn containers(answers: &Answers) -> Option<Finding> {
         .abilities
         .iter()
         .any(|each| each.able && each.ability == "shared_memory");
-    let is_container = |group: &String| CONTAINERS.iter().any(|word| group.contains(word));
+    let is_container = |group: &str| CONTAINERS.iter().any(|word| group.contains(word));
     let mut participants = answers.participants.participants.iter();
-    let contained = participants.any(|each| each.cgroup.as_ref().is_some_and(is_container));
+    let contained =
+        participants.any(|each| each.process.cgroup.as_deref().is_some_and(is_container));
     if !looks || !contained || has("CAP_SYS_PTRACE") {
         return None;
     }
@@ -251,7 +253,7 @@ mod tests {
     fn what_the_agent_kept_is_told_and_a_missing_sandbox_with_its_reason() {
         let health = |held: &[&str], reason: Option<&str>| Health {
             capabilities: held.iter().map(|held| (*held).to_owned()).collect(),
-            unfiltered_reason: reason.map(str::to_owned),
+            unfiltered_reason: reason.map(|reason| reason.to_owned().into()),
             ..Health::default()
         };
         let kept = of_agent(&health(&["CAP_SYS_PTRACE"], None));

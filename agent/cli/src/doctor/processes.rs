@@ -6,10 +6,10 @@
 
 use std::collections::BTreeMap;
 
-use super::answers::Participants;
 use super::finding::{Area, Finding, Verdict};
 use super::host_state::{HostState, Unread, base_name};
 use super::variables::{Range, Variables};
+use ros2probe_api::participants::ParticipantList;
 use ros2probe_capture::uprobe::processes::is_library;
 
 const AREA: Area = Area::Processes;
@@ -46,11 +46,13 @@ pub struct Processes {
 impl Processes {
     /// Looks for them. `known`: what the agent says of participants.
     #[must_use]
-    pub fn find(host: &HostState, known: Option<&Participants>) -> Self {
+    pub fn find(host: &HostState, known: Option<&ParticipantList<'_>>) -> Self {
         let mut domains = BTreeMap::new();
         for participant in known.into_iter().flat_map(|known| &known.participants) {
             // Of those with a socket here the number is the process's, and no announced one.
-            if let (Some(id), Some(_)) = (participant.process_id, &participant.cgroup) {
+            if let (Some(id), Some(_)) =
+                (participant.process.process_id, &participant.process.cgroup)
+            {
                 let node = participant.nodes.first().cloned();
                 domains.insert(id, (participant.domain_id, node));
             }
@@ -502,7 +504,7 @@ mod tests {
             ("/proc/21/maps", ""),
         ]);
         assert_eq!(Processes::find(&host, None).count(), 0);
-        let known: Participants = serde_json::from_str(
+        let known: ParticipantList<'_> = serde_json::from_str(
             r#"{"participants":[{"domain_id":4,"process_id":21,"cgroup":"/robot","nodes":["/arm","/hand"]},
             {"domain_id":5,"process_id":22}]}"#,
         )

@@ -1,8 +1,8 @@
 //! What will be seen on this host and what not: as the running agent says of itself, or as a trial
 //! tells where none runs. The reasons are those of `capture`; here they get their consequences.
 
-use super::answers::Health;
 use super::finding::{Area, Finding, Verdict};
+use ros2probe_api::health::Health;
 use ros2probe_daemon::surface::{Ability, AgentFacts};
 
 const AREA: Area = Area::Sight;
@@ -37,7 +37,7 @@ impl Visibility {
             Some((known(&each.ability)?, reason))
         });
         Self {
-            source: health.source.clone(),
+            source: health.source.to_string(),
             source_reason: health.source_reason.clone(),
             able: able.filter_map(|each| known(&each.ability)).collect(),
             reasons: reasons.collect(),

@@ -1,9 +1,13 @@
 //! `ros2 action`: `list` and `info`; `type` and `find` are those of topics. An action is what has a
 //! topic of feedback, as the original sees it.
 
+use std::borrow::Cow;
 use std::fmt::Write as _;
 
-use super::facts::{Endpoint, Named, Topic, TopicName};
+use ros2probe_api::endpoints::Endpoint;
+use ros2probe_api::names::TopicName;
+use ros2probe_api::nodes::Named;
+use ros2probe_api::topics::Topic;
 
 /// What an action's name is followed by.
 const FEEDBACK: &str = "/_action/feedback";
@@ -17,29 +21,29 @@ pub fn feedback_of(name: &str) -> String {
 }
 
 /// Actions among topics, hidden ones included.
-pub fn of_topics(topics: &[TopicName]) -> impl Iterator<Item = Named> {
+pub fn of_topics(topics: &[TopicName<'_>]) -> impl Iterator<Item = Named<'static>> {
     let actions = topics.iter();
     actions.filter_map(|topic| of_name(&topic.name, &topic.types))
 }
 
 /// Actions by the topics of feedback that a node has.
-pub(super) fn of_feedback(topics: &[Named]) -> Vec<Named> {
+pub(super) fn of_feedback(topics: &[Named<'_>]) -> Vec<Named<'static>> {
     let actions = topics.iter();
     actions
         .filter_map(|topic| of_name(&topic.name, &topic.types))
         .collect()
 }
 
-fn of_name(name: &str, types: &[String]) -> Option<Named> {
+fn of_name(name: &str, types: &[Cow<'_, str>]) -> Option<Named<'static>> {
     let name = name.strip_suffix(FEEDBACK)?.to_owned();
     let types = types.iter().filter_map(|each| each.strip_suffix(MESSAGE));
-    let types: Vec<_> = types.map(str::to_owned).collect();
+    let types: Vec<_> = types.map(|each| Cow::Owned(each.to_owned())).collect();
     (!types.is_empty()).then_some(Named { name, types })
 }
 
 /// `action list`.
 #[must_use]
-pub fn list(actions: impl Iterator<Item = Named>, show_types: bool, count: bool) -> String {
+pub fn list<'a>(actions: impl Iterator<Item = Named<'a>>, show_types: bool, count: bool) -> String {
     if count {
         return format!("{}\n", actions.count());
     }
@@ -56,9 +60,9 @@ pub fn list(actions: impl Iterator<Item = Named>, show_types: bool, count: bool)
 
 /// `action info`, by the action's topic of feedback where there is one.
 #[must_use]
-pub fn info(name: &str, feedback: Option<&Topic>, show_types: bool, count: bool) -> String {
+pub fn info(name: &str, feedback: Option<&Topic<'_>>, show_types: bool, count: bool) -> String {
     let mut text = format!("Action: {name}\n");
-    let ends: [(&str, &[Endpoint]); 2] = match feedback {
+    let ends: [(&str, &[Endpoint<'_>]); 2] = match feedback {
         Some(topic) => [
             ("clients", &topic.subscriptions),
             ("servers", &topic.publishers),
@@ -83,7 +87,7 @@ pub fn info(name: &str, feedback: Option<&Topic>, show_types: bool, count: bool)
 }
 
 /// Each node once with its types, in the order of GIDs. Who has no node is none for the original.
-fn nodes(endpoints: &[Endpoint]) -> Vec<(&str, Vec<&str>)> {
+fn nodes<'a>(endpoints: &'a [Endpoint<'_>]) -> Vec<(&'a str, Vec<&'a str>)> {
     let mut endpoints: Vec<_> = endpoints.iter().collect();
     endpoints.sort_unstable_by_key(|endpoint| &endpoint.guid);
     let mut nodes: Vec<(&str, Vec<&str>)> = Vec::new();
@@ -107,15 +111,15 @@ fn nodes(endpoints: &[Endpoint]) -> Vec<(&str, Vec<&str>)> {
 mod tests {
     use super::*;
 
-    fn topic(name: &str, kind: &str) -> TopicName {
+    fn topic(name: &'static str, kind: &'static str) -> TopicName<'static> {
         TopicName {
-            name: name.to_owned(),
-            types: vec![kind.to_owned()],
+            name: name.into(),
+            types: vec![kind.into()],
             ..TopicName::default()
         }
     }
 
-    fn actions() -> impl Iterator<Item = Named> {
+    fn actions() -> impl Iterator<Item = Named<'static>> {
         of_topics(&[
             topic("/chatter", "std_msgs/msg/String"),
             topic("/fib/_action/feedback", "a/action/Fib_FeedbackMessage"),
@@ -135,14 +139,14 @@ mod tests {
 
     #[test]
     fn info_names_nodes_with_their_namespace_once() {
-        let end = |guid: &str, node: Option<&str>| Endpoint {
+        let end = |guid: &str, node: Option<&'static str>| Endpoint {
             guid: guid.to_owned(),
-            node: node.map(str::to_owned),
-            message_type: "a/action/Fib_FeedbackMessage".to_owned(),
+            node: node.map(Cow::Borrowed),
+            message_type: "a/action/Fib_FeedbackMessage".into(),
             ..Endpoint::default()
         };
         let feedback = Topic {
-            name: feedback_of("/fib"),
+            name: feedback_of("/fib").into(),
             publishers: vec![end("02", Some("/robot1/server"))],
             subscriptions: vec![
                 end("04", None),

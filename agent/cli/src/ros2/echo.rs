@@ -12,9 +12,9 @@ pub use field::FieldPath;
 use field::Selected;
 pub use lost::Lost;
 
-use super::facts::Endpoint;
 use super::{Dialect, Refused};
-use ros2probe_daemon::subscriptions::line::SampleFacts;
+use ros2probe_api::endpoints::Endpoint;
+use ros2probe_api::samples::Sample;
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::{self, Style};
 use ros2probe_message::{Decoded, Limits, MessageType, Truncation, Value, csv, decode, python};
@@ -100,7 +100,7 @@ impl Echo {
     /// A field that is not there, or a filter without a value.
     pub fn message(
         &mut self,
-        sample: &SampleFacts,
+        sample: &Sample,
         message_type: Option<&MessageType>,
         payload: &[u8],
     ) -> Result<MessageText, Refused> {
@@ -132,7 +132,7 @@ impl Echo {
     #[must_use]
     pub fn event(
         &mut self,
-        sample: &SampleFacts,
+        sample: &Sample,
         message_type: &MessageType,
         payload: &[u8],
         interface: Option<&str>,
@@ -164,7 +164,7 @@ impl Echo {
 
     fn decode<'a>(
         &mut self,
-        sample: &SampleFacts,
+        sample: &Sample,
         message_type: &'a MessageType,
         payload: &'a [u8],
     ) -> (Option<Decoded<'a>>, String) {
@@ -225,11 +225,7 @@ impl Echo {
             .map_err(|error| Refused(error.to_string()))
     }
 
-    fn print(
-        &self,
-        sample: &SampleFacts,
-        decoded: &Decoded<'_>,
-    ) -> Result<Option<String>, Refused> {
+    fn print(&self, sample: &Sample, decoded: &Decoded<'_>) -> Result<Option<String>, Refused> {
         let message = &decoded.message;
         let mut parts = Vec::with_capacity(self.options.fields.len().max(1));
         for field in &self.options.fields {
@@ -254,7 +250,7 @@ impl Echo {
         Ok(Some(out))
     }
 
-    fn part(&self, out: &mut String, sample: &SampleFacts, part: &Selected<'_>, is_last: bool) {
+    fn part(&self, out: &mut String, sample: &Sample, part: &Selected<'_>, is_last: bool) {
         let Options {
             dialect,
             csv,
@@ -297,8 +293,8 @@ impl Echo {
 
 /// What the original says on stdout where publishers differ in what they offer.
 #[must_use]
-pub fn mixed_offers(publishers: &[Endpoint]) -> String {
-    let some = |offers: &dyn Fn(&Endpoint) -> bool| {
+pub fn mixed_offers(publishers: &[Endpoint<'_>]) -> String {
+    let some = |offers: &dyn Fn(&Endpoint<'_>) -> bool| {
         let count = publishers.iter().filter(|one| offers(one)).count();
         count > 0 && count < publishers.len()
     };
@@ -327,8 +323,8 @@ pub fn mixed_offers(publishers: &[Endpoint]) -> String {
 }
 
 /// Neither middleware numbers what it receives: the original prints `null`.
-fn info_document(sample: &SampleFacts) -> String {
-    let SampleFacts {
+fn info_document(sample: &Sample) -> String {
+    let Sample {
         sequence_number,
         time_ns,
         source_timestamp_ns,
@@ -341,7 +337,7 @@ fn info_document(sample: &SampleFacts) -> String {
     )
 }
 
-fn info_in_line(sample: &SampleFacts) -> String {
+fn info_in_line(sample: &Sample) -> String {
     format!(
         "{},{},{},None,",
         sample.source_timestamp_ns.unwrap_or(0),
@@ -350,7 +346,7 @@ fn info_in_line(sample: &SampleFacts) -> String {
     )
 }
 
-fn info_around(sample: &SampleFacts) -> String {
+fn info_around(sample: &Sample) -> String {
     format!(
         "---Got new message, message info:---\n{{'source_timestamp': {}, 'received_timestamp': {}, \
          'publication_sequence_number': {}, 'reception_sequence_number': None}}\n\

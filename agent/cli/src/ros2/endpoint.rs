@@ -1,9 +1,11 @@
 //! One writer or reader in `topic info -v`.
 
+use std::borrow::Cow;
 use std::fmt::Write as _;
 
+use ros2probe_api::endpoints::{Endpoint, Qos};
+
 use super::Dialect;
-use super::facts::{Endpoint, Qos};
 
 /// What the original calls the node of an endpoint that its participant has not told of yet.
 const UNKNOWN: [&str; 2] = ["_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"];
@@ -14,7 +16,7 @@ const PADDING: usize = 8;
 
 /// The block, without the empty line behind it.
 #[must_use]
-pub fn block(endpoint: &Endpoint, kind: &str, dialect: Dialect) -> String {
+pub fn block(endpoint: &Endpoint<'_>, kind: &str, dialect: Dialect) -> String {
     let mut text = String::new();
     let [name, namespace] = node(endpoint);
     let _ = writeln!(text, "Node name: {name}");
@@ -32,7 +34,7 @@ pub fn block(endpoint: &Endpoint, kind: &str, dialect: Dialect) -> String {
 }
 
 /// Name and namespace of its node.
-fn node(endpoint: &Endpoint) -> [&str; 2] {
+fn node<'a>(endpoint: &'a Endpoint<'_>) -> [&'a str; 2] {
     match (&endpoint.node, &endpoint.enclave) {
         (Some(node), _) => match node.rsplit_once('/') {
             Some(("", name)) => [name, "/"],
@@ -54,7 +56,7 @@ fn gid(guid: &str, dialect: Dialect) -> String {
     bytes.join(".")
 }
 
-fn qos(text: &mut String, qos: &Qos, indent: &str) {
+fn qos(text: &mut String, qos: &Qos<'_>, indent: &str) {
     let lines = [
         ("Reliability", qos.reliability.clone()),
         ("History (Depth)", qos.history.clone()),
@@ -72,10 +74,10 @@ fn qos(text: &mut String, qos: &Qos, indent: &str) {
     }
 }
 
-fn duration(seconds: Option<f64>) -> String {
+fn duration(seconds: Option<f64>) -> Cow<'static, str> {
     match seconds {
-        None => "Infinite".to_owned(),
-        Some(seconds) => format!("{:.0} nanoseconds", seconds * 1e9),
+        None => "Infinite".into(),
+        Some(seconds) => format!("{:.0} nanoseconds", seconds * 1e9).into(),
     }
 }
 
@@ -83,22 +85,22 @@ fn duration(seconds: Option<f64>) -> String {
 mod tests {
     use super::*;
 
-    fn endpoint() -> Endpoint {
+    fn endpoint() -> Endpoint<'static> {
         Endpoint {
             guid: "010f8b216e5c3a0200000000.00001203".to_owned(),
-            node: Some("/robot1/talker".to_owned()),
-            enclave: Some("/".to_owned()),
-            message_type: "std_msgs/msg/String".to_owned(),
-            type_hash: Some("RIHS01_df".to_owned()),
+            node: Some("/robot1/talker".into()),
+            enclave: Some("/".into()),
+            message_type: "std_msgs/msg/String".into(),
+            type_hash: Some("RIHS01_df".into()),
             qos: Qos {
-                reliability: "RELIABLE".to_owned(),
-                durability: "TRANSIENT_LOCAL".to_owned(),
-                history: "KEEP_LAST (10)".to_owned(),
-                deadline_seconds: None,
+                reliability: "RELIABLE".into(),
+                durability: "TRANSIENT_LOCAL".into(),
+                history: "KEEP_LAST (10)".into(),
                 lifespan_seconds: Some(10.0),
-                liveliness: "AUTOMATIC".to_owned(),
-                liveliness_lease_seconds: None,
+                liveliness: "AUTOMATIC".into(),
+                ..Qos::default()
             },
+            ..Endpoint::default()
         }
     }
 
@@ -135,8 +137,8 @@ mod tests {
     fn a_node_that_is_not_known_has_the_placeholder_of_its_participant() {
         let named = |name: Option<&str>, enclave: Option<&str>| {
             let endpoint = Endpoint {
-                node: name.map(str::to_owned),
-                enclave: enclave.map(str::to_owned),
+                node: name.map(Cow::Borrowed),
+                enclave: enclave.map(Cow::Borrowed),
                 ..endpoint()
             };
             node(&endpoint).map(str::to_owned)

@@ -8,7 +8,6 @@ pub mod bag;
 pub mod dialect;
 pub mod echo;
 mod endpoint;
-pub mod facts;
 pub mod name;
 pub mod node;
 pub mod rates;

@@ -22,6 +22,20 @@ pub fn full_name(typed: &str) -> Result<String, Refused> {
     }
 }
 
+/// Any token begins with an underscore: shown only when asked for.
+#[must_use]
+pub fn is_hidden(name: &str) -> bool {
+    name.split('/').any(|token| token.starts_with('_'))
+}
+
+/// A node is hidden by its own name, whatever its namespace is called.
+#[must_use]
+pub fn is_hidden_node(name: &str) -> bool {
+    name.rsplit('/')
+        .next()
+        .is_some_and(|name| name.starts_with('_'))
+}
+
 /// What is wrong, and the character where.
 fn mistake(name: &str) -> Option<(&'static str, usize)> {
     if name.is_empty() {
@@ -53,6 +67,12 @@ fn mistake(name: &str) -> Option<(&'static str, usize)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_node_is_hidden_by_its_own_name_alone() {
+        assert!(is_hidden("/fib/_action/status") && is_hidden("/_a/b") && !is_hidden("/a_/b"));
+        assert!(is_hidden_node("/a/_ros2cli_1") && !is_hidden_node("/_a/b"));
+    }
 
     #[test]
     fn a_relative_name_is_in_the_root() {

@@ -4,7 +4,9 @@ use std::fmt::Write as _;
 
 use super::Refused;
 use super::action;
-use super::facts::{Named, Node, NodeName, is_hidden, is_hidden_node};
+use super::name::{is_hidden, is_hidden_node};
+use ros2probe_api::names::NodeName;
+use ros2probe_api::nodes::{Named, Node};
 
 /// What goes to stdout, and a warning for stderr.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -17,12 +19,12 @@ pub struct NodeText {
 
 /// `node list`.
 #[must_use]
-pub fn list(nodes: &[NodeName], all: bool, count: bool) -> NodeText {
+pub fn list(nodes: &[NodeName<'_>], all: bool, count: bool) -> NodeText {
     let shown = || {
         let shown = nodes
             .iter()
             .filter(|node| all || !is_hidden_node(&node.name));
-        shown.flat_map(|node| std::iter::repeat_n(node.name.as_str(), node.instances))
+        shown.flat_map(|node| std::iter::repeat_n(node.name.as_ref(), node.instances))
     };
     if count {
         // Without the warning, as in the original.
@@ -47,11 +49,11 @@ pub fn list(nodes: &[NodeName], all: bool, count: bool) -> NodeText {
 ///
 /// # Errors
 /// There is none, or it is hidden and hidden ones are not wanted.
-pub fn info(name: &str, node: Option<&Node>, hidden: bool) -> Result<NodeText, Refused> {
+pub fn info(name: &str, node: Option<&Node<'_>>, hidden: bool) -> Result<NodeText, Refused> {
     let node = node.filter(|node| node.name == name && (hidden || !is_hidden_node(name)));
     let node = node.ok_or_else(|| Refused(format!("Unable to find node '{name}'")))?;
     let mut text = format!("{name}\n");
-    let sections: [(&str, &[Named]); 6] = [
+    let sections: [(&str, &[Named<'_>]); 6] = [
         ("Subscribers", &node.subscriptions),
         ("Publishers", &node.publishers),
         ("Service Servers", &node.services),
@@ -84,13 +86,14 @@ pub fn info(name: &str, node: Option<&Node>, hidden: bool) -> Result<NodeText, R
 
 #[cfg(test)]
 mod tests {
-    use super::super::facts::Instance;
     use super::*;
+    use ros2probe_api::nodes::NodeInstance;
 
-    fn names(nodes: &[(&str, usize)]) -> Vec<NodeName> {
-        let node = |(name, instances): &(&str, usize)| NodeName {
-            name: (*name).to_owned(),
+    fn names(nodes: &[(&'static str, usize)]) -> Vec<NodeName<'static>> {
+        let node = |(name, instances): &(&'static str, usize)| NodeName {
+            name: (*name).into(),
             instances: *instances,
+            ..NodeName::default()
         };
         nodes.iter().map(node).collect()
     }
@@ -112,18 +115,18 @@ mod tests {
         assert_eq!(list(&[], false, false).text, "");
     }
 
-    fn named(names: &[(&str, &str)]) -> Vec<Named> {
-        let entry = |(name, types): &(&str, &str)| Named {
+    fn named(names: &[(&str, &'static str)]) -> Vec<Named<'static>> {
+        let entry = |(name, types): &(&str, &'static str)| Named {
             name: (*name).to_owned(),
-            types: vec![(*types).to_owned()],
+            types: vec![(*types).into()],
         };
         names.iter().map(entry).collect()
     }
 
-    fn node(name: &str, instances: usize) -> Node {
+    fn node(name: &'static str, instances: usize) -> Node<'static> {
         Node {
-            name: name.to_owned(),
-            instances: vec![Instance {}; instances],
+            name: name.into(),
+            instances: vec![NodeInstance::default(); instances],
             publishers: named(&[
                 ("/fib/_action/feedback", "a/action/Fib_FeedbackMessage"),
                 ("/rosout", "rcl_interfaces/msg/Log"),

@@ -2,7 +2,8 @@
 
 use std::fmt::Write as _;
 
-use super::facts::ServiceName;
+use ros2probe_api::names::ServiceName;
+
 use super::{Dialect, Refused};
 
 /// Options of `service list`.
@@ -16,7 +17,7 @@ pub struct List {
 
 /// `service list`, of those services that are to be shown.
 #[must_use]
-pub fn list<'a>(services: impl Iterator<Item = &'a ServiceName>, options: List) -> String {
+pub fn list<'a>(services: impl Iterator<Item = &'a ServiceName<'a>>, options: List) -> String {
     if options.count {
         return format!("{}\n", services.count());
     }
@@ -38,13 +39,13 @@ pub fn list<'a>(services: impl Iterator<Item = &'a ServiceName>, options: List) 
 /// There is no such service.
 pub fn info<'a>(
     name: &str,
-    mut services: impl Iterator<Item = &'a ServiceName>,
+    mut services: impl Iterator<Item = &'a ServiceName<'a>>,
     dialect: Dialect,
 ) -> Result<String, Refused> {
     let service = services.find(|service| service.name == name);
     let service = service.ok_or_else(|| Refused(format!("Unknown service '{name}'")))?;
     let types = match service.types.as_slice() {
-        [only] => only.clone(),
+        [only] => only.to_string(),
         several => format!("['{}']", several.join("', '")),
     };
     let servers = if dialect < Dialect::Rolling {
@@ -62,14 +63,15 @@ pub fn info<'a>(
 mod tests {
     use super::*;
 
-    fn services() -> [ServiceName; 2] {
-        let service = |name: &str, hidden| ServiceName {
-            name: name.to_owned(),
+    fn services() -> [ServiceName<'static>; 2] {
+        let service = |name: &'static str, hidden| ServiceName {
+            name: name.into(),
             hidden,
-            types: vec!["a/srv/Add".to_owned()],
+            types: vec!["a/srv/Add".into()],
             request_readers: 2,
             reply_writers: 1,
             reply_readers: 3,
+            ..ServiceName::default()
         };
         [
             service("/add", false),

@@ -1,8 +1,11 @@
 //! `ros2 topic`: `list`, `info`, `type` and `find`.
 
+use std::borrow::Cow;
 use std::fmt::Write as _;
 
-use super::facts::{Topic, TopicName};
+use ros2probe_api::names::TopicName;
+use ros2probe_api::topics::Topic;
+
 use super::{Dialect, Refused, endpoint};
 
 /// Options of `topic list`.
@@ -18,7 +21,7 @@ pub struct List {
 
 /// `topic list`, of those topics that are to be shown.
 #[must_use]
-pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName>, options: List) -> String {
+pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName<'a>>, options: List) -> String {
     let mut text = String::new();
     if options.count {
         let _ = writeln!(text, "{}", topics.count());
@@ -48,7 +51,7 @@ pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName>, options: List) -> S
 /// There is none.
 pub fn info(
     name: &str,
-    topic: Option<&Topic>,
+    topic: Option<&Topic<'_>>,
     verbose: bool,
     dialect: Dialect,
 ) -> Result<String, Refused> {
@@ -76,9 +79,9 @@ pub fn info(
 }
 
 /// One type as it is, several as a Python list.
-fn types(types: &[String]) -> String {
+fn types(types: &[Cow<'_, str>]) -> String {
     match types {
-        [only] => only.clone(),
+        [only] => only.to_string(),
         several => format!("['{}']", several.join("', '")),
     }
 }
@@ -88,7 +91,7 @@ fn types(types: &[String]) -> String {
 #[must_use]
 pub fn type_of<'a>(
     name: &str,
-    mut all: impl Iterator<Item = (&'a str, &'a [String])>,
+    mut all: impl Iterator<Item = (&'a str, &'a [Cow<'a, str>])>,
 ) -> Option<String> {
     let (_, types) = all.find(|(each, _)| *each == name)?;
     Some(types.iter().map(|each| format!("{each}\n")).collect())
@@ -98,7 +101,7 @@ pub fn type_of<'a>(
 #[must_use]
 pub fn find<'a>(
     wanted: &str,
-    all: impl Iterator<Item = (&'a str, &'a [String])>,
+    all: impl Iterator<Item = (&'a str, &'a [Cow<'a, str>])>,
     count: bool,
 ) -> String {
     let found = all.filter(|(_, types)| types.iter().any(|each| each == wanted));
@@ -112,7 +115,7 @@ fn section<'a>(
     text: &mut String,
     title: &str,
     end: &str,
-    topics: impl Iterator<Item = (&'a TopicName, usize)>,
+    topics: impl Iterator<Item = (&'a TopicName<'a>, usize)>,
 ) {
     let _ = writeln!(text, "{title}");
     for (topic, count) in topics.filter(|(_, count)| *count > 0) {
@@ -126,11 +129,12 @@ fn section<'a>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use ros2probe_api::endpoints::Endpoint;
 
-    fn topics() -> Vec<TopicName> {
-        let topic = |name: &str, publishers, subscriptions| TopicName {
-            name: name.to_owned(),
-            types: vec!["std_msgs/msg/String".to_owned()],
+    fn topics() -> Vec<TopicName<'static>> {
+        let topic = |name: &'static str, publishers, subscriptions| TopicName {
+            name: name.into(),
+            types: vec!["std_msgs/msg/String".into()],
             publishers,
             subscriptions,
             ..TopicName::default()
@@ -161,17 +165,17 @@ mod tests {
         assert_eq!(list([].iter(), List::default()), "");
     }
 
-    fn topic(types: &[&str]) -> Topic {
+    fn topic(types: &[&'static str]) -> Topic<'static> {
         Topic {
-            name: "/chatter".to_owned(),
-            message_types: types.iter().map(|each| (*each).to_owned()).collect(),
+            name: "/chatter".into(),
+            message_types: types.iter().map(|each| Cow::Borrowed(*each)).collect(),
             publishers: ["02.03", "01.03"].map(endpoint_of).into(),
-            subscriptions: Vec::new(),
+            ..Topic::default()
         }
     }
 
-    fn endpoint_of(guid: &str) -> super::super::facts::Endpoint {
-        super::super::facts::Endpoint {
+    fn endpoint_of(guid: &str) -> Endpoint<'static> {
+        Endpoint {
             guid: guid.to_owned(),
             ..Default::default()
         }
@@ -227,7 +231,7 @@ mod tests {
         let all = || {
             topics
                 .iter()
-                .map(|topic| (topic.name.as_str(), topic.types.as_slice()))
+                .map(|topic| (topic.name.as_ref(), topic.types.as_slice()))
         };
         assert_eq!(type_of("/rosout", all()).unwrap(), "std_msgs/msg/String\n");
         assert_eq!(type_of("rosout", all()), None);

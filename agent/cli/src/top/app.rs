@@ -8,9 +8,11 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
 use super::Options;
 use super::event_pane::EventPane;
-use super::facts::{Event, Health, Lagged, Topic, Topics};
 use super::row::{Column, Key, Past, Row, Standing, shown_name};
 use super::text::safe;
+use ros2probe_api::events::{Event, Lagged};
+use ros2probe_api::health::Health;
+use ros2probe_api::topics::{TopicDetails, TopicList};
 
 /// What is dropped is called recent for this long.
 const RECENT: Duration = Duration::from_secs(30);
@@ -21,13 +23,13 @@ const SAID: Duration = Duration::from_secs(8);
 #[derive(Debug)]
 pub enum Fact {
     /// All topics.
-    Topics(Box<Topics>),
+    Topics(Box<TopicList<'static>>),
     /// How the agent is.
     Health(Box<Health>),
     /// The selected topic with every detail; `None` when there is no such topic any more.
-    Details(Key, Option<Box<Topic>>),
+    Details(Key, Option<Box<TopicDetails<'static>>>),
     /// Something happened.
-    Event(Box<Event>),
+    Event(Box<Event<'static>>),
     /// Events are missing.
     Lagged(Lagged),
     /// The agent does not answer, and why.
@@ -133,7 +135,7 @@ pub struct App {
     /// Places in `rows` of those that are shown.
     shown: Vec<usize>,
     /// Facts of the selected topic.
-    pub details: Option<Box<Topic>>,
+    pub details: Option<Box<TopicDetails<'static>>>,
     /// The topic that is selected.
     pub selected: Option<Key>,
     /// The latest events.
@@ -284,12 +286,12 @@ impl App {
         }
     }
 
-    fn take_topics(&mut self, topics: &Topics, now: Instant) -> Vec<Command> {
+    fn take_topics(&mut self, topics: &TopicList<'_>, now: Instant) -> Vec<Command> {
         let mut past = std::mem::take(&mut self.past);
         let rows = topics.topics.iter().map(|topic| {
             let key = Key {
                 domain_id: topic.domain_id,
-                dds_name: topic.dds_name.clone(),
+                dds_name: topic.dds_name.to_string(),
             };
             let mut own = past.remove(&key).unwrap_or_default();
             let row = Row::new(topic, &mut own, now);
@@ -531,7 +533,10 @@ impl App {
     /// What the details are headed by.
     #[must_use]
     pub fn selected_name(&self) -> Option<String> {
-        let details = self.details.as_ref().map(|topic| shown_name(topic));
+        let details = self
+            .details
+            .as_ref()
+            .map(|details| shown_name(&details.topic));
         let selected = self.selected.as_ref();
         let row = || self.rows.iter().find(|row| Some(&row.key) == selected);
         details.or_else(|| row().map(|row| row.name.clone()))

@@ -3,10 +3,13 @@
 
 use std::collections::BTreeMap;
 
-use serde_json::{Map, Value};
+use ros2probe_api::Open;
+use ros2probe_api::diagnosis::{Diagnosis, Finding};
+use ros2probe_api::endpoints::Endpoint;
+use ros2probe_api::measurement::{Bucket, Delivered, Distribution, Measurement};
+use ros2probe_api::topics::{ReasonCode, Topic, TopicDetails, Watching};
 
-use super::event_pane::shown;
-use super::facts::{Bucket, Delivered, Distribution, Endpoint, Measurement, Topic, Watching};
+use super::event_pane::{shown, shown_list};
 use super::row::{is_measured, shown_name};
 use super::text::{beginning, bound, bytes, counted, end, rate, ratio, safe, seconds};
 use super::theme::{Kind, Theme};
@@ -21,7 +24,8 @@ pub type Styled = (String, Kind);
 
 /// All lines; longer ones are cut where they are drawn.
 #[must_use]
-pub fn lines(topic: &Topic, width: usize, theme: Theme) -> Vec<Styled> {
+pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styled> {
+    let topic = &details.topic;
     let mut lines = Vec::new();
     let types: Vec<_> = topic.message_types.iter().map(|it| safe(it)).collect();
     let head = format!(
@@ -39,8 +43,13 @@ pub fn lines(topic: &Topic, width: usize, theme: Theme) -> Vec<Styled> {
         lines.push((format!("! {}", diagnosis(finding, topic)), Kind::Problem));
     }
     for reason in &topic.reasons {
-        let kind = match reason.code.as_str() {
-            "not_watched" | "quiet" | "no_subscriber" | "no_publisher" => Kind::Plain,
+        let kind = match reason.code {
+            Open::Known(
+                ReasonCode::NotWatched
+                | ReasonCode::Quiet
+                | ReasonCode::NoSubscriber
+                | ReasonCode::NoPublisher,
+            ) => Kind::Plain,
             _ => Kind::Problem,
         };
         lines.push((format!("why: {}", safe(&reason.detail)), kind));
@@ -52,16 +61,17 @@ pub fn lines(topic: &Topic, width: usize, theme: Theme) -> Vec<Styled> {
         let line = format!("pairs of publisher and subscriber by: {}", ways.join(", "));
         lines.push((line, Kind::Plain));
     }
-    histograms(topic, width, theme, &mut lines);
+    histograms(details, width, theme, &mut lines);
     publishers(topic, theme, &mut lines);
-    subscribers(topic, theme, &mut lines);
-    others(topic, theme, &mut lines);
+    subscribers(details, theme, &mut lines);
+    others(details, theme, &mut lines);
     lines
 }
 
-fn expectation(watch: &Watching) -> Styled {
+fn expectation(watch: &Watching<'_>) -> Styled {
+    let expectations = &watch.expectations;
     let mut expected = Vec::new();
-    match (watch.min_rate_hz, watch.max_rate_hz) {
+    match (expectations.min_rate_hz, expectations.max_rate_hz) {
         (Some(least), Some(most)) => {
             expected.push(format!("{} to {} Hz", bound(least), bound(most)));
         }
@@ -70,9 +80,12 @@ fn expectation(watch: &Watching) -> Styled {
         (None, None) => {}
     }
     let most = [
-        ("loss", watch.max_loss_ratio.map(ratio)),
-        ("latency", watch.max_latency_ms.map(|it| seconds(it / 1e3))),
-        ("silence", watch.max_silence_s.map(seconds)),
+        ("loss", expectations.max_loss_ratio.map(ratio)),
+        (
+            "latency",
+            expectations.max_latency_ms.map(|it| seconds(it / 1e3)),
+        ),
+        ("silence", expectations.max_silence_s.map(seconds)),
     ];
     for (what, most) in most {
         expected.extend(most.map(|most| format!("{what} at most {most}")));
@@ -87,11 +100,11 @@ fn expectation(watch: &Watching) -> Styled {
         _ => "",
     };
     let broken: Vec<_> = watch.violations.iter().map(|it| safe(it)).collect();
-    let state = match (watch.state.as_str(), broken.is_empty()) {
+    let state = match (watch.state.as_ref(), broken.is_empty()) {
         (state, true) => safe(state),
         (state, false) => format!("{}: {}", safe(state), broken.join(", ")),
     };
-    let is_broken = matches!(watch.state.as_str(), "violated" | "silent");
+    let is_broken = matches!(watch.state.as_ref(), "violated" | "silent");
     let line = format!(
         "{} matches watch {}{origin}, {}: {state}",
         if is_broken { '!' } else { '-' },
@@ -108,7 +121,7 @@ fn expectation(watch: &Watching) -> Styled {
     )
 }
 
-fn measured(topic: &Topic, lines: &mut Vec<Styled>) {
+fn measured(topic: &Topic<'_>, lines: &mut Vec<Styled>) {
     let Some(counted) = topic.measurement.as_ref() else {
         lines.push((
             "not measured: press w to count its messages".to_owned(),
@@ -204,48 +217,51 @@ fn causes(it: &Delivered) -> String {
     causes.join(", ")
 }
 
-fn diagnosis(finding: &Map<String, Value>, topic: &Topic) -> String {
-    let value = |key: &str| finding.get(key).map(shown).unwrap_or_default();
-    let who = |key: &str| {
-        let guid = finding.get(key).and_then(Value::as_str).unwrap_or_default();
+fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
+    let name = |guid: &str| {
         let mut all = topic.publishers.iter().chain(&topic.subscriptions);
         let node = all
             .find(|it| it.guid == guid)
             .and_then(|it| it.node.as_deref());
         safe(node.unwrap_or(guid))
     };
-    match value("kind").as_str() {
-        "qos_incompatible" => format!(
+    match finding {
+        Open::Known(Diagnosis::QosIncompatible {
+            writer,
+            reader,
+            policies,
+        }) => format!(
             "{} offers less than {} requests: {}",
-            who("writer"),
-            who("reader"),
-            value("policies")
+            name(writer),
+            name(reader),
+            shown_list(policies)
         ),
-        "type_conflict" => format!(
+        Open::Known(Diagnosis::TypeConflict { types }) => format!(
             "endpoints of different types do not communicate: {}",
-            value("types")
+            shown_list(types)
         ),
-        "type_hash_conflict" => format!(
-            "definitions of {} differ: {}",
-            value("message_type"),
-            value("hashes")
-        ),
-        "unheard_publisher" => {
-            format!(
-                "{} has no matching subscriber ({})",
-                who("writer"),
-                unmatched(&value("reason"))
-            )
+        Open::Known(Diagnosis::TypeHashConflict {
+            message_type,
+            hashes,
+        }) => {
+            let hashes: Vec<_> = hashes.iter().map(|hash| safe(hash)).collect();
+            let message_type = safe(message_type);
+            format!("definitions of {message_type} differ: {}", hashes.join(","))
         }
-        "unfed_subscriber" => {
-            format!(
-                "{} has no matching publisher ({})",
-                who("reader"),
-                unmatched(&value("reason"))
-            )
+        Open::Known(Diagnosis::UnheardPublisher { writer, reason }) => {
+            let reason = safe(unmatched(reason));
+            format!("{} has no matching subscriber ({reason})", name(writer))
         }
-        _ => {
-            let all = finding.iter();
+        Open::Known(Diagnosis::UnfedSubscriber { reader, reason }) => {
+            let reason = safe(unmatched(reason));
+            format!("{} has no matching publisher ({reason})", name(reader))
+        }
+        // Of nodes, not of a topic.
+        Open::Known(Diagnosis::DuplicateNode { .. } | Diagnosis::NodeInSeveralDomains { .. }) => {
+            finding.kind().to_owned()
+        }
+        Open::Unknown(attributes) => {
+            let all = attributes.0.iter();
             let all = all.map(|(key, value)| format!("{}={}", safe(key), shown(value)));
             all.collect::<Vec<_>>().join(" ")
         }
@@ -263,7 +279,8 @@ fn unmatched(reason: &str) -> &str {
     }
 }
 
-fn histograms(topic: &Topic, width: usize, theme: Theme, lines: &mut Vec<Styled>) {
+fn histograms(details: &TopicDetails<'_>, width: usize, theme: Theme, lines: &mut Vec<Styled>) {
+    let topic = &details.topic;
     let measured = topic.measurement.as_ref();
     let title = |what: &str, it: Option<Distribution>| {
         it.map(|it| {
@@ -279,8 +296,8 @@ fn histograms(topic: &Topic, width: usize, theme: Theme, lines: &mut Vec<Styled>
     let between = title("between messages", measured.and_then(|it| it.interarrival));
     let latency = title("latency", measured.and_then(|it| it.latency));
     let both = [
-        (between, &topic.interarrival_buckets),
-        (latency, &topic.latency_buckets),
+        (between, &details.interarrival_buckets),
+        (latency, &details.latency_buckets),
     ];
     let both = both.into_iter().filter_map(|(title, buckets)| {
         let title = title?;
@@ -340,7 +357,7 @@ pub fn bars(buckets: &[Bucket], width: usize, theme: Theme) -> Vec<String> {
     filled.iter().map(line).collect()
 }
 
-fn publishers(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
+fn publishers(topic: &Topic<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     if topic.publishers.is_empty() {
         return;
     }
@@ -376,7 +393,8 @@ fn publishers(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
     }
 }
 
-fn subscribers(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
+fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
+    let topic = &details.topic;
     if topic.subscriptions.is_empty() {
         return;
     }
@@ -389,12 +407,12 @@ fn subscribers(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
     for reader in &topic.subscriptions {
         let mut sum: Option<Delivered> = None;
         let own = |readers: &[String]| readers.contains(&reader.guid);
-        for delivery in &topic.deliveries {
+        for delivery in &details.deliveries {
             if delivery.direction == "received" && own(&delivery.readers) {
                 add(sum.get_or_insert_default(), &delivery.delivered);
             }
         }
-        let acknowledged = topic.acknowledgements.iter();
+        let acknowledged = details.acknowledgements.iter();
         let mut acknowledged = acknowledged.filter(|it| it.reader == reader.guid);
         let behind = acknowledged.next().map(|first| {
             acknowledged.fold(first.missing_messages, |most, it| {
@@ -422,10 +440,10 @@ fn subscribers(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
 }
 
 /// Where messages arrive without a reader that is known, and where they leave to.
-fn others(topic: &Topic, theme: Theme, lines: &mut Vec<Styled>) {
+fn others(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     let mut others: BTreeMap<String, Delivered> = BTreeMap::new();
-    for delivery in &topic.deliveries {
-        let to = match (delivery.direction.as_str(), &delivery.process) {
+    for delivery in &details.deliveries {
+        let to = match (delivery.direction.as_ref(), &delivery.process) {
             ("received", _) if !delivery.readers.is_empty() => continue,
             ("received", Some(process)) => {
                 let id = delivery
@@ -466,12 +484,12 @@ fn add(sum: &mut Delivered, one: &Delivered) {
     sum.pending_messages += one.pending_messages;
 }
 
-fn node(endpoint: &Endpoint, theme: Theme) -> String {
+fn node(endpoint: &Endpoint<'_>, theme: Theme) -> String {
     let name = safe(endpoint.node.as_deref().unwrap_or(&endpoint.guid));
     end(&name, NODE, theme.cut())
 }
 
-fn qos(endpoint: &Endpoint, topic: &Topic) -> String {
+fn qos(endpoint: &Endpoint<'_>, topic: &Topic<'_>) -> String {
     let qos = &endpoint.qos;
     let parts = [&qos.reliability, &qos.durability, &qos.history];
     let parts = parts.into_iter().filter(|part| !part.is_empty());

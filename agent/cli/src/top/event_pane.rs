@@ -1,11 +1,11 @@
 //! What happens to the robot, as lines of the events pane: bounded, oldest first, safe to show.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 
-use serde_json::Value;
-
-use super::facts::{Event, Lagged};
 use super::text::safe;
+use ros2probe_api::attributes::Value;
+use ros2probe_api::events::{Event, Lagged};
 
 /// Events that are kept to scroll through.
 const KEPT: usize = 1_000;
@@ -29,10 +29,10 @@ pub struct EventPane {
 
 impl EventPane {
     /// Takes in one event, unless it is of another domain than this.
-    pub fn add(&mut self, event: &Event, domain_id: Option<u32>) {
-        let own = event.attributes.get("domain_id").and_then(Value::as_u64);
-        if let (Some(own), Some(wanted)) = (own, domain_id)
-            && own != u64::from(wanted)
+    pub fn add(&mut self, event: &Event<'_>, domain_id: Option<u32>) {
+        let own = event.attributes.get("domain_id");
+        if let (Some(Value::Number(own)), Some(wanted)) = (own, domain_id)
+            && *own != u64::from(wanted)
         {
             return;
         }
@@ -55,9 +55,11 @@ impl EventPane {
             }
         }
         // Identities are long and say least.
+        let mut attributes: Vec<_> = event.attributes.0.iter().collect();
+        attributes.sort_unstable_by_key(|(key, _)| key);
         for is_identity in [false, true] {
-            for (key, value) in &event.attributes {
-                let key = key.as_str();
+            for (key, value) in &attributes {
+                let key = key.as_ref();
                 let is_noise = matches!(key, "domain_id" | "kind" | "message_type");
                 let value = shown(value);
                 let is_said = first.contains(&key) || is_noise || value.is_empty();
@@ -107,19 +109,21 @@ fn clock(time: &str) -> String {
 
 /// A value of an event, or of what is wrong with the graph.
 #[must_use]
-pub fn shown(value: &Value) -> String {
+pub fn shown(value: &Value<'_>) -> String {
     match value {
-        Value::String(text) => safe(text),
-        Value::Array(list) => {
-            let items: Vec<_> = list.iter().map(shown).collect();
-            items.join(",")
-        }
-        Value::Number(number) => match number.as_f64() {
-            Some(real) if !number.is_u64() => format!("{real:.3}"),
-            _ => number.to_string(),
-        },
-        other => safe(&other.to_string()),
+        Value::Text(text) => safe(text),
+        Value::List(texts) => shown_list(texts),
+        Value::Number(number) => number.to_string(),
+        Value::Real(real) => format!("{real:.3}"),
+        Value::Unknown(_) => "?".to_owned(),
     }
+}
+
+/// Texts with commas between.
+#[must_use]
+pub fn shown_list(texts: &[Cow<'_, str>]) -> String {
+    let texts: Vec<_> = texts.iter().map(|text| safe(text)).collect();
+    texts.join(",")
 }
 
 #[cfg(test)]
@@ -128,7 +132,7 @@ mod tests {
 
     use super::*;
 
-    fn event(json: Value) -> Event {
+    fn event(json: serde_json::Value) -> Event<'static> {
         serde_json::from_value(json).unwrap()
     }
 
@@ -159,7 +163,7 @@ mod tests {
         }
         news.lag(&Lagged {
             missed: Some(7),
-            reason: "overwritten".to_owned(),
+            reason: "overwritten".into(),
         });
         assert_eq!(news.shown().count(), KEPT);
         news.only_warnings = true;

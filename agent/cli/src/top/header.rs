@@ -91,7 +91,7 @@ fn agent(app: &App) -> String {
         (None, None) => "asking the agent".to_owned(),
         (Some((health, _)), None) if !health.ready => "AGENT NOT READY".to_owned(),
         (Some((health, _)), None) => {
-            let source = match health.source.as_str() {
+            let source = match health.source.as_ref() {
                 "host" => "sees the host's sockets",
                 "wire" => "sees the host's interfaces",
                 "replay" if health.finished => "has replayed its capture to the end",
@@ -183,7 +183,7 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
         ));
     }
     if health.unknown_writers > 0 {
-        let writers = counted(health.unknown_writers, "writer");
+        let writers = counted(health.unknown_writers as u64, "writer");
         warn(format!(
             "{writers} without a known topic: `rp discover` requests their announcements"
         ));

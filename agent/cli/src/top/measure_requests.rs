@@ -15,6 +15,7 @@ use super::poller::Request;
 use super::row::Key;
 use crate::client::{Agent, ClientError, Next};
 use ros2probe_api::path::encoded;
+use ros2probe_api::problem::Code;
 
 /// How often a connection looks whether it is still wanted.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
@@ -68,7 +69,7 @@ impl MeasureRequests {
                 Err(error) => {
                     let status = format!("{name}: {error}");
                     // Somebody else may have removed it; else it is still there.
-                    if !error.is("no-such-watch") {
+                    if !error.is(Code::NoSuchWatch) {
                         self.all.insert(key.clone(), MeasureRequest::Watch(path));
                     }
                     status

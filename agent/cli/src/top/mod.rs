@@ -7,7 +7,6 @@
 mod app;
 mod details;
 mod event_pane;
-mod facts;
 mod header;
 mod help;
 mod measure_requests;

@@ -10,13 +10,15 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 
 use super::app::{Command, Fact};
-use super::facts::{Event, Health, Lagged, Topic, Topics};
 use super::measure_requests::MeasureRequests;
 use super::row::Key;
 use super::server_sent::Messages;
 use super::text::safe;
 use crate::client::{Agent, ClientError};
+use ros2probe_api::events::{Event, Lagged};
+use ros2probe_api::health::Health;
 use ros2probe_api::path::encoded;
+use ros2probe_api::topics::{TopicDetails, TopicList};
 
 /// Pause before a stream of events that broke is opened again.
 const RETRY: Duration = Duration::from_secs(2);
@@ -105,7 +107,7 @@ pub fn ask(
     agent: &Agent,
     domain_id: Option<u32>,
     hidden: bool,
-) -> Result<(Health, Topics), ClientError> {
+) -> Result<(Health, TopicList<'static>), ClientError> {
     let mut query = format!("?hidden={hidden}");
     if let Some(domain_id) = domain_id {
         query.push_str(&format!("&domain_id={domain_id}"));
@@ -154,7 +156,7 @@ impl Poll {
             encoded(&key.dds_name),
             key.domain_id
         );
-        match self.agent.get::<Topic>(&path) {
+        match self.agent.get::<TopicDetails<'_>>(&path) {
             Ok(topic) => self.send(Fact::Details(key, Some(Box::new(topic)))),
             Err(ClientError::Refused(_)) => self.send(Fact::Details(key, None)),
             // The next round tells that the agent is gone.
@@ -231,10 +233,10 @@ fn fact(event: &str, data: &str) -> Option<Fact> {
         let lagged: Lagged = serde_json::from_str(data).ok()?;
         return Some(Fact::Lagged(lagged));
     }
-    let read = serde_json::from_str::<Event>(data).or_else(|_| {
+    let read = serde_json::from_str::<Event<'_>>(data).or_else(|_| {
         // Shown rather than dropped.
         serde_json::from_str::<Value>(data).map(|_| Event {
-            name: safe(event),
+            name: safe(event).into(),
             ..Event::default()
         })
     });

@@ -5,10 +5,10 @@ use std::cmp::Ordering;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
-use serde_json::Value;
-
-use super::facts::{Delivered, Topic};
 use super::text::safe;
+use ros2probe_api::Open;
+use ros2probe_api::measurement::Delivered;
+use ros2probe_api::topics::{ReasonCode, Topic};
 
 /// Losses in the table are of this time, so that an old loss does not hide a new one.
 const WINDOW: Duration = Duration::from_secs(30);
@@ -114,7 +114,7 @@ pub struct Past {
 impl Past {
     /// Lost of those that were sent lately; where nothing was lately, ever. And whether any was lost
     /// lately.
-    fn loss(&mut self, topic: &Topic, now: Instant) -> (Option<f64>, bool) {
+    fn loss(&mut self, topic: &Topic<'_>, now: Instant) -> (Option<f64>, bool) {
         let latest = Counters::of(topic);
         let first = self.notes.front().map(|(_, counters)| *counters);
         let lately = first.and_then(|first| latest.since(first));
@@ -136,7 +136,7 @@ impl Past {
 }
 
 impl Counters {
-    fn of(topic: &Topic) -> Self {
+    fn of(topic: &Topic<'_>) -> Self {
         let measured = topic.measurement.as_ref();
         let received = topic.received.as_ref();
         let delivered = |it: &Delivered| (it.messages, it.lost_messages);
@@ -168,7 +168,7 @@ impl Counters {
 impl Row {
     /// What is shown of `topic`.
     #[must_use]
-    pub fn new(topic: &Topic, past: &mut Past, now: Instant) -> Self {
+    pub fn new(topic: &Topic<'_>, past: &mut Past, now: Instant) -> Self {
         let is_measured = is_measured(topic);
         let measured = topic.measurement.as_ref().filter(|_| is_measured);
         let (loss, is_losing) = match measured {
@@ -181,7 +181,7 @@ impl Row {
         Self {
             key: Key {
                 domain_id: topic.domain_id,
-                dds_name: topic.dds_name.clone(),
+                dds_name: topic.dds_name.to_string(),
             },
             name: shown_name(topic),
             message_type: types.join(", "),
@@ -214,8 +214,8 @@ impl Row {
 
 /// The name people know it by: of a service's topics that is the DDS name.
 #[must_use]
-pub fn shown_name(topic: &Topic) -> String {
-    match topic.kind.as_str() {
+pub fn shown_name(topic: &Topic<'_>) -> String {
+    match topic.kind.as_ref() {
         "service_request" | "service_reply" => safe(&topic.dds_name),
         _ => safe(&topic.name),
     }
@@ -223,36 +223,42 @@ pub fn shown_name(topic: &Topic) -> String {
 
 /// Whether messages are counted now; numbers stay when that ends.
 #[must_use]
-pub fn is_measured(topic: &Topic) -> bool {
+pub fn is_measured(topic: &Topic<'_>) -> bool {
     let mut publishers = topic.publishers.iter();
     topic.measurement.is_some()
         && (!topic.watches.is_empty() || publishers.any(|it| it.measurement.is_some()))
 }
 
 /// The tightest of all that is expected of its rate.
-fn wanted(topic: &Topic) -> (Option<f64>, Option<f64>) {
+fn wanted(topic: &Topic<'_>) -> (Option<f64>, Option<f64>) {
     let watches = || topic.watches.iter();
     (
-        watches().filter_map(|it| it.min_rate_hz).reduce(f64::max),
-        watches().filter_map(|it| it.max_rate_hz).reduce(f64::min),
+        watches()
+            .filter_map(|it| it.expectations.min_rate_hz)
+            .reduce(f64::max),
+        watches()
+            .filter_map(|it| it.expectations.max_rate_hz)
+            .reduce(f64::min),
     )
 }
 
-fn standing(topic: &Topic, is_measured: bool) -> Standing {
+fn standing(topic: &Topic<'_>, is_measured: bool) -> Standing {
     if topic.vanished {
         return Standing::Gone;
     }
     let has = |state: &str| topic.watches.iter().any(|watch| watch.state == state);
     let is_blind = topic.reasons.iter().any(|reason| {
         matches!(
-            reason.code.as_str(),
-            "encrypted"
-                | "shared_memory"
-                | "data_sharing"
-                | "same_process"
-                | "iceoryx"
-                | "outside_view"
-                | "watch_rejected"
+            reason.code,
+            Open::Known(
+                ReasonCode::Encrypted
+                    | ReasonCode::SharedMemory
+                    | ReasonCode::DataSharing
+                    | ReasonCode::SameProcess
+                    | ReasonCode::Iceoryx
+                    | ReasonCode::OutsideView
+                    | ReasonCode::WatchRejected
+            )
         )
     });
     let flows = topic
@@ -271,7 +277,7 @@ fn standing(topic: &Topic, is_measured: bool) -> Standing {
     }
 }
 
-fn problems(topic: &Topic, standing: Standing, is_losing: bool) -> Vec<&'static str> {
+fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'static str> {
     let mut problems = Vec::new();
     let mut say = |word| {
         if !problems.contains(&word) {
@@ -279,7 +285,7 @@ fn problems(topic: &Topic, standing: Standing, is_losing: bool) -> Vec<&'static 
         }
     };
     for violation in topic.watches.iter().flat_map(|watch| &watch.violations) {
-        say(match violation.as_str() {
+        say(match violation.as_ref() {
             "min_rate_hz" => "slow",
             "max_rate_hz" => "fast",
             "max_loss_ratio" => "loss",
@@ -304,13 +310,13 @@ fn problems(topic: &Topic, standing: Standing, is_losing: bool) -> Vec<&'static 
         say("loss");
     }
     for finding in &topic.diagnoses {
-        match finding.get("kind").and_then(Value::as_str) {
-            Some("qos_incompatible") => say("qos"),
-            Some("type_conflict") => say("type"),
-            Some("type_hash_conflict") => say("hash"),
+        match finding.kind() {
+            "qos_incompatible" => say("qos"),
+            "type_conflict" => say("type"),
+            "type_hash_conflict" => say("hash"),
             // Usual: a tool that publishes for whoever may come.
-            Some("unheard_publisher" | "unfed_subscriber") | None => {}
-            Some(_) => say("graph"),
+            "unheard_publisher" | "unfed_subscriber" | "" => {}
+            _ => say("graph"),
         }
     }
     problems
@@ -398,7 +404,7 @@ mod tests {
 
     use super::*;
 
-    fn topic(json: serde_json::Value) -> Topic {
+    fn topic(json: serde_json::Value) -> Topic<'static> {
         serde_json::from_value(json).unwrap()
     }
 
@@ -425,7 +431,7 @@ mod tests {
     fn the_state_names_what_is_wrong() {
         let measured = json!({"messages": 9, "rate_hertz": 9.0});
         let one = json!([{"measurement": measured}]);
-        let state = |watches: Value, diagnoses: Value| {
+        let state = |watches: serde_json::Value, diagnoses: serde_json::Value| {
             let row = row(json!({
                 "publishers": one, "subscriptions": one, "measurement": measured,
                 "watches": watches, "diagnoses": diagnoses,
@@ -470,7 +476,7 @@ mod tests {
             }))
         };
         let mut past = Past::default();
-        let mut seen = |seconds: u64, facts: &Topic| {
+        let mut seen = |seconds: u64, facts: &Topic<'_>| {
             let row = Row::new(facts, &mut past, at(seconds));
             (row.loss, row.problems)
         };

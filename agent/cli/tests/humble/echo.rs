@@ -12,7 +12,7 @@ use ros2probe::message::yaml::Style;
 use ros2probe::message::{Library, Sources};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::echo::{Echo, Options};
-use ros2probe::subscriptions::line::SampleFacts;
+use ros2probe_api::samples::Sample;
 use serde::Deserialize;
 
 /// Processes of the oracle at a time.
@@ -157,8 +157,8 @@ fn parse(words: &[String]) -> Options {
     options
 }
 
-fn sample(message_type: &str) -> SampleFacts {
-    SampleFacts {
+fn sample(message_type: &str) -> Sample {
+    Sample {
         topic: "/topic".to_owned(),
         domain_id: 0,
         message_type: message_type.to_owned(),

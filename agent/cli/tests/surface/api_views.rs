@@ -9,11 +9,26 @@ use std::time::{Duration, Instant};
 
 use crate::rp;
 use flate2::read::MultiGzDecoder;
+use ros2probe_api::Open;
+use ros2probe_api::attributes;
+use ros2probe_api::diagnosis::Finding;
+use ros2probe_api::events::Event;
+use ros2probe_api::graph::Graph;
+use ros2probe_api::health::Health;
+use ros2probe_api::names::Names;
+use ros2probe_api::nodes::{Node, NodeList};
+use ros2probe_api::participants::{ParticipantList, ProcessList};
+use ros2probe_api::problem::{Code, Problem};
+use ros2probe_api::services::{ActionList, ServiceList};
+use ros2probe_api::topics::{History, TopicDetails, TopicList};
+use ros2probe_api::watches::{WatchList, WatchState};
 use ros2probe_testing::local_agent::{self, Answer, LocalAgent, request};
 use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;
 use ros2probe_testing::truth::{self, GraphLine, Scenario};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 /// What a node believes is what was announced half a second ago.
@@ -378,6 +393,95 @@ fn a_mismatch_of_real_participants_is_named_in_the_topic_and_as_a_metric() {
         .lines()
         .filter(|line| line.starts_with("ros2_qos_incompatible_pairs{"));
     assert_eq!(others.count(), 1);
+}
+
+/// Asserts that an answer reads as `T`, which writes the same again.
+fn read_as<T: DeserializeOwned + Serialize>(answer: &Value) -> T {
+    let typed: T = serde_json::from_value(answer.clone()).unwrap();
+    assert_eq!(serde_json::to_value(&typed).unwrap(), *answer);
+    typed
+}
+
+#[test]
+fn each_answer_reads_as_its_type_and_writes_the_same_again() {
+    // Before they say goodbye.
+    let goodbye = 1_795_142_070_000_000_000;
+    let robot = Robot::at(&capture_of("qos-mismatch-2ns"), goodbye, "/**");
+    let topics: TopicList<'_> = read_as(&robot.get("/topics"));
+    let mut topics = topics.topics.iter();
+    assert!(topics.any(|topic| !topic.diagnoses.is_empty()));
+    read_all(&robot);
+
+    let scenario = data("jazzy-cyclonedds/lifecycle-2ns").pop().unwrap();
+    let (_, lines) = scenario.graphs().pop().unwrap();
+    let line = settled(&lines).next().unwrap();
+    let robot = Robot::at(&scenario.capture, line.t + SETTLED, "/**");
+    let actions: ActionList<'_> = read_as(&robot.get("/actions"));
+    assert!(!actions.actions.is_empty());
+    read_all(&robot);
+}
+
+fn read_all(robot: &Robot) {
+    let names: Names<'_> = read_as(&robot.get("/names?hidden=true"));
+    let list: TopicList<'_> = read_as(&robot.get("/topics?hidden=true"));
+    let topics = list.topics.iter();
+    let is_known = |finding: &Finding<'_>| matches!(finding, Open::Known(_));
+    assert!(
+        topics
+            .clone()
+            .flat_map(|topic| &topic.diagnoses)
+            .all(is_known)
+    );
+    let mut reasons = topics.clone().flat_map(|topic| &topic.reasons);
+    assert!(reasons.all(|reason| matches!(reason.code, Open::Known(_))));
+    assert!(topics.clone().any(|topic| topic.measurement.is_some()));
+    for topic in topics.filter(|topic| topic.dds_name.starts_with("rt/")) {
+        let path = format!("/topics{}", topic.name);
+        let details: TopicDetails<'_> = read_as(&robot.get(&path));
+        assert_eq!(details.topic.dds_name, topic.dds_name);
+        let _: History = read_as(&robot.get(&format!("{path}/history")));
+    }
+    let nodes: NodeList<'_> = read_as(&robot.get("/nodes?hidden=true"));
+    assert!(!nodes.nodes.is_empty() && nodes.nodes.len() == names.nodes.len());
+    for node in &nodes.nodes {
+        let _: Node<'_> = read_as(&robot.get(&format!("/nodes{}?hidden=true", node.name)));
+    }
+    let services: ServiceList<'_> = read_as(&robot.get("/services?hidden=true"));
+    assert!(!services.services.is_empty());
+    let participants: ParticipantList<'_> = read_as(&robot.get("/participants"));
+    assert!(!participants.participants.is_empty());
+    let _: ProcessList = read_as(&robot.get("/processes"));
+    let graph: Graph = read_as(&robot.get("/graph?hidden=true"));
+    assert!(
+        graph
+            .edges
+            .iter()
+            .all(|edge| matches!(edge.kind, Open::Known(_)))
+    );
+    let health: Health = read_as(&robot.get("/health"));
+    assert!(health.finished && !health.tables.is_empty() && !health.limits.is_empty());
+    let watches: WatchList = read_as(&robot.get("/watch"));
+    assert_eq!(watches.watches[0].state, WatchState::Measuring);
+    let refused = robot.ask("/topics/nothing");
+    let problem: Problem = read_as(&serde_json::from_str(&refused.body).unwrap());
+    assert!(problem.kind.ends_with(Code::NoSuchTopic.as_str()));
+    assert_eq!(
+        (problem.status, refused.status),
+        (404, Code::NoSuchTopic.status())
+    );
+    let events = robot.ask("/events?after=0&follow=false").body;
+    let data = events
+        .lines()
+        .filter_map(|line| line.strip_prefix("data: "));
+    let data: Vec<Value> = data
+        .map(|data| serde_json::from_str(data).unwrap())
+        .collect();
+    assert!(!data.is_empty());
+    for event in &data {
+        let event: Event<'_> = read_as(event);
+        let mut values = event.attributes.0.iter().map(|(_, value)| value);
+        assert!(values.all(|value| !matches!(value, attributes::Value::Unknown(_))));
+    }
 }
 
 #[test]

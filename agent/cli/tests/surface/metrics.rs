@@ -1,5 +1,6 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
 
+use ros2probe_wire::DomainId;
 use std::collections::BTreeSet;
 use std::net::Ipv4Addr;
 use std::path::Path;
@@ -10,6 +11,7 @@ use ros2probe::config::{Limits, limits_markdown};
 use ros2probe::model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe::model::topic_kind::TopicKind;
 use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe::surface::events;
 use ros2probe::surface::otlp::Signal;
@@ -392,10 +394,10 @@ fn hostile_names_stay_inside_their_label() {
 fn no_series_appears_twice() {
     let mut snapshot = sample_robot::snapshot(["/points", "/points"]);
     let mut dds = sample_robot::topic("/points");
-    (dds.kind, dds.dds_name) = ("dds", "/points".to_owned());
+    (dds.kind, dds.dds_name) = (TopicKind::Dds, "/points".to_owned());
     snapshot.topics.push(dds);
     let mut request = sample_robot::topic("/points");
-    (request.kind, request.dds_name) = ("service_request", "rq/pointsRequest".to_owned());
+    (request.kind, request.dds_name) = (TopicKind::ServiceRequest, "rq/pointsRequest".to_owned());
     snapshot.topics.push(request);
     let nodes = snapshot.nodes.clone();
     snapshot.nodes.extend(nodes);
@@ -417,14 +419,14 @@ fn no_series_appears_twice() {
 #[test]
 fn a_watched_topic_that_nobody_announced_begins_with_zero() {
     let missing = WatchedTopicFacts {
-        domain_id: 0,
+        domain_id: DomainId(0),
         topic: "/cmd_vel".to_owned(),
         state: WatchState::NotPublished,
         violations: Vec::new(),
     };
     let watch = WatchFacts {
         pattern: "/cmd_vel".to_owned(),
-        domain_id: Some(0),
+        domain_id: Some(DomainId(0)),
         topics: vec![missing],
     };
     let snapshot = Snapshot {

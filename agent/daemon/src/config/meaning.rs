@@ -1,5 +1,6 @@
 //! From shape to meaning: what the types and ranges of the shape cannot say.
 
+use ros2probe_wire::DomainId;
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -228,7 +229,7 @@ impl Reader {
         }
         Watch {
             pattern: entry.topic,
-            domain_id: entry.domain,
+            domain_id: entry.domain.map(DomainId),
             expectations: Expectations {
                 min_rate_hz: entry.min_rate_hz,
                 max_rate_hz: entry.max_rate_hz,
@@ -746,7 +747,7 @@ log: debug
         let points = config.watches.get(1).unwrap();
         assert_eq!(
             (points.pattern.as_str(), points.domain_id),
-            ("/points", Some(5))
+            ("/points", Some(DomainId(5)))
         );
         assert_eq!(points.expectations.max_rate_hz, Some(22.5));
         assert!((points.trace - 0.25).abs() < 1e-9);

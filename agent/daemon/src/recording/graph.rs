@@ -1,58 +1,18 @@
 //! What discovery says of topics, as far as a bag or its report says it: from a snapshot within the
-//! agent, from the API's JSON where a client records.
+//! agent, from an agent's answers where a client records.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 
-use serde::Deserialize;
-
-use crate::subscriptions::line::{QosFacts, seconds};
+use crate::subscriptions::line::seconds;
+use ros2probe_api::endpoints::Endpoint;
+use ros2probe_api::participants::UnknownWriter;
+use ros2probe_api::samples::OfferedQos;
+use ros2probe_api::topics::Topic;
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
+use ros2probe_model::topic_kind::TopicKind;
 
 const VOLATILE: &str = "VOLATILE";
-
-/// The API's `/topics`: what is announced of all topics.
-#[derive(Clone, Debug, Default, Deserialize)]
-pub struct Graph {
-    topics: Vec<GraphTopic>,
-}
-
-/// One of them, as the API's `/topics/{topic}` says it, too.
-#[derive(Clone, Debug, Deserialize)]
-pub struct GraphTopic {
-    domain_id: u32,
-    name: String,
-    dds_name: String,
-    kind: String,
-    #[serde(default)]
-    passages: Vec<PassagePairs>,
-    #[serde(default)]
-    measurement: Option<Counted>,
-    #[serde(flatten)]
-    announced: DiscoveredTopic,
-}
-
-#[derive(Clone, Debug, Deserialize)]
-struct PassagePairs {
-    passage: String,
-    pairs: usize,
-}
-
-#[derive(Clone, Copy, Debug, Deserialize)]
-struct Counted {
-    messages: u64,
-}
-
-/// The API's `/participants`: who sends without having been announced.
-#[derive(Clone, Debug, Default, Deserialize)]
-pub struct UnknownWriterList {
-    unknown_writers: Vec<UnknownWriter>,
-}
-
-#[derive(Clone, Debug, Deserialize)]
-struct UnknownWriter {
-    guid: String,
-    measurement: Counted,
-}
 
 /// The graph at one moment, as far as a report compares two of them.
 #[derive(Clone, Debug, Default)]
@@ -82,67 +42,74 @@ pub struct PublishedTopic {
     pub messages: Option<u64>,
 }
 
-impl From<GraphTopic> for Graph {
-    fn from(topic: GraphTopic) -> Self {
-        let topics = vec![topic];
-        Self { topics }
-    }
+/// Topics of one domain, by the names that messages bear: ROS names of topics, else DDS names.
+#[must_use]
+pub fn by_name(topics: &[Topic<'_>], domain_id: u32) -> HashMap<String, DiscoveredTopic> {
+    let topics = topics.iter();
+    let topics = topics.filter(|topic| topic.domain_id == domain_id);
+    let topics = topics.map(|topic| {
+        let name = if is_ros_topic(&topic.kind) {
+            &topic.name
+        } else {
+            &topic.dds_name
+        };
+        (name.to_string(), topic.into())
+    });
+    topics.collect()
 }
 
-impl Graph {
-    /// Of one domain, by the names that messages bear: ROS names of topics, else DDS names.
+impl GraphSnapshot {
+    /// From an agent's answers.
     #[must_use]
-    pub fn by_name(self, domain_id: u32) -> HashMap<String, DiscoveredTopic> {
-        let topics = self.topics.into_iter();
-        let topics = topics.filter(|topic| topic.domain_id == domain_id);
-        let topics = topics.map(|topic| {
-            let name = if is_topic(&topic.kind) {
-                topic.name
-            } else {
-                topic.dds_name
-            };
-            (name, topic.announced)
-        });
-        topics.collect()
-    }
-
-    /// With those who send unannounced.
-    #[must_use]
-    pub fn into_snapshot(self, unknown_writers: UnknownWriterList) -> GraphSnapshot {
-        let topics = self.topics.into_iter();
-        let topics = topics
-            .filter(|topic| is_topic(&topic.kind) && !topic.announced.publishers.is_empty())
-            .map(|topic| {
-                let passages = topic.passages.iter();
-                let passages = passages.map(|each| (each.passage.as_str(), each.pairs));
-                let publishers = topic.announced.publishers.iter();
-                let durable_publishers = publishers.filter(|publisher| publisher.is_durable());
-                PublishedTopic {
-                    domain_id: topic.domain_id,
-                    other_transport: other_transport(passages).map(str::to_owned),
-                    durable_publishers: durable_publishers
-                        .map(|publisher| publisher.guid.clone())
-                        .collect(),
-                    name: topic.name,
-                    message_types: topic.announced.message_types,
-                    subscribed: !topic.announced.subscriptions.is_empty(),
-                    messages: topic.measurement.map(|counted| counted.messages),
-                }
-            });
-        let unknown_writers = unknown_writers.unknown_writers.into_iter();
-        GraphSnapshot {
-            topics: topics.collect(),
+    pub fn answered(topics: &[Topic<'_>], unknown_writers: Vec<UnknownWriter<'_>>) -> Self {
+        let topics = topics.iter();
+        let topics =
+            topics.filter(|topic| is_ros_topic(&topic.kind) && !topic.publishers.is_empty());
+        let unknown_writers = unknown_writers.into_iter();
+        Self {
+            topics: topics.map(PublishedTopic::from).collect(),
             unknown_writers: unknown_writers
-                .map(|stranger| (stranger.guid, stranger.measurement.messages))
+                .map(|writer| (writer.guid, writer.measurement.messages))
                 .collect(),
         }
     }
 }
 
+impl From<&Topic<'_>> for PublishedTopic {
+    fn from(topic: &Topic<'_>) -> Self {
+        let passages = topic.passages.iter();
+        let passages = passages.map(|each| (each.passage.as_ref(), each.pairs));
+        let publishers = topic.publishers.iter();
+        let durable_publishers =
+            publishers.filter(|publisher| publisher.qos.durability != VOLATILE);
+        Self {
+            domain_id: topic.domain_id,
+            name: topic.name.to_string(),
+            message_types: owned(&topic.message_types),
+            subscribed: !topic.subscriptions.is_empty(),
+            other_transport: other_transport(passages).map(str::to_owned),
+            durable_publishers: durable_publishers
+                .map(|publisher| publisher.guid.clone())
+                .collect(),
+            messages: topic.measurement.as_ref().map(|measured| measured.messages),
+        }
+    }
+}
+
+/// Whether ROS names a topic by it; a kind that this version does not know counts as one.
+fn is_ros_topic(kind: &str) -> bool {
+    TopicKind::parse(kind).is_none_or(TopicKind::is_ros_topic)
+}
+
+fn owned(texts: &[Cow<'_, str>]) -> Vec<String> {
+    texts.iter().map(ToString::to_string).collect()
+}
+
 impl From<&Snapshot> for GraphSnapshot {
     fn from(snapshot: &Snapshot) -> Self {
         let topics = snapshot.topics.iter();
-        let topics = topics.filter(|topic| is_topic(topic.kind) && !topic.publishers.is_empty());
+        let topics =
+            topics.filter(|topic| topic.kind.is_ros_topic() && !topic.publishers.is_empty());
         let unknown_writers = snapshot.unknown_writers.iter();
         Self {
             topics: topics.map(PublishedTopic::from).collect(),
@@ -160,7 +127,7 @@ impl From<&TopicFacts> for PublishedTopic {
         let publishers = facts.publishers.iter();
         let durable_publishers = publishers.filter(|publisher| publisher.durability != VOLATILE);
         Self {
-            domain_id: facts.domain_id,
+            domain_id: facts.domain_id.0,
             name: facts.name.clone(),
             message_types: facts.message_types.clone(),
             subscribed: !facts.subscriptions.is_empty(),
@@ -171,14 +138,6 @@ impl From<&TopicFacts> for PublishedTopic {
             messages: facts.measurement.as_ref().map(|measured| measured.messages),
         }
     }
-}
-
-/// Neither half of a service, nor what follows no ROS convention.
-fn is_topic(kind: &str) -> bool {
-    !matches!(
-        kind,
-        "service_request" | "service_reply" | "discovery" | "dds"
-    )
 }
 
 fn other_transport<'a>(
@@ -193,7 +152,7 @@ fn other_transport<'a>(
 }
 
 /// A topic at the moment in which it is taken into a bag.
-#[derive(Clone, Debug, Default, Deserialize)]
+#[derive(Clone, Debug, Default)]
 pub struct DiscoveredTopic {
     /// ROS types announced on it.
     pub message_types: Vec<String>,
@@ -201,22 +160,18 @@ pub struct DiscoveredTopic {
     pub type_hashes: Vec<String>,
     /// Its writers.
     pub publishers: Vec<Publisher>,
-    /// Its readers.
-    pub subscriptions: Vec<Subscriber>,
+    /// It has a reader.
+    pub subscribed: bool,
 }
 
 /// One writer.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug)]
 pub struct Publisher {
     /// GUID as the metrics show it.
     pub guid: String,
     /// What it offers.
-    pub qos: QosFacts,
+    pub qos: OfferedQos,
 }
-
-/// One reader; that there is one is all that matters.
-#[derive(Clone, Debug, Deserialize)]
-pub struct Subscriber {}
 
 impl Publisher {
     /// Late joiners are given its last samples, which were sent before and are sent to them alone.
@@ -232,7 +187,36 @@ impl From<&TopicFacts> for DiscoveredTopic {
             message_types: facts.message_types.clone(),
             type_hashes: facts.type_hashes.clone(),
             publishers: facts.publishers.iter().map(Publisher::from).collect(),
-            subscriptions: facts.subscriptions.iter().map(|_| Subscriber {}).collect(),
+            subscribed: !facts.subscriptions.is_empty(),
+        }
+    }
+}
+
+impl From<&Topic<'_>> for DiscoveredTopic {
+    fn from(topic: &Topic<'_>) -> Self {
+        Self {
+            message_types: owned(&topic.message_types),
+            type_hashes: owned(&topic.type_hashes),
+            publishers: topic.publishers.iter().map(Publisher::from).collect(),
+            subscribed: !topic.subscriptions.is_empty(),
+        }
+    }
+}
+
+impl From<&Endpoint<'_>> for Publisher {
+    fn from(endpoint: &Endpoint<'_>) -> Self {
+        let qos = &endpoint.qos;
+        Self {
+            guid: endpoint.guid.clone(),
+            qos: OfferedQos {
+                reliability: qos.reliability.to_string(),
+                durability: qos.durability.to_string(),
+                history: qos.history.to_string(),
+                deadline_seconds: qos.deadline_seconds,
+                lifespan_seconds: qos.lifespan_seconds,
+                liveliness: qos.liveliness.to_string(),
+                liveliness_lease_seconds: qos.liveliness_lease_seconds,
+            },
         }
     }
 }
@@ -241,7 +225,7 @@ impl From<&EndpointFacts> for Publisher {
     fn from(facts: &EndpointFacts) -> Self {
         Self {
             guid: facts.guid.to_string(),
-            qos: QosFacts {
+            qos: OfferedQos {
                 reliability: facts.reliability.clone(),
                 durability: facts.durability.clone(),
                 history: facts.history.clone(),
@@ -266,9 +250,10 @@ mod tests {
                 "durability": "TRANSIENT_LOCAL", "history": "KEEP_LAST (5)",
                 "deadline_seconds": 0.1, "lifespan_seconds": null, "liveliness": "AUTOMATIC",
                 "liveliness_lease_seconds": null, "ownership": "SHARED", "partitions": []}}]}"#;
-        let announced: DiscoveredTopic = serde_json::from_str(json).unwrap();
+        let topic: Topic<'_> = serde_json::from_str(json).unwrap();
+        let announced = DiscoveredTopic::from(&topic);
         let publisher = &announced.publishers[0];
-        assert!(publisher.is_durable() && announced.subscriptions.len() == 1);
+        assert!(publisher.is_durable() && announced.subscribed);
         assert_eq!(publisher.qos.history, "KEEP_LAST (5)");
     }
 }

@@ -16,9 +16,7 @@ mod snapshot;
 
 pub use disk_quota::DiskQuota;
 pub use filter::{Candidate, Filter, FilterError, FilterOptions};
-pub use graph::{
-    DiscoveredTopic, Graph, GraphSnapshot, GraphTopic, PublishedTopic, UnknownWriterList,
-};
+pub use graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic, by_name};
 pub use recorder::{Finished, Recorder, Sources};
 pub use report::{MissingRun, OtherDomain, Report, TopicReport, UnknownWriters, unobserved_lines};
 pub use sample_ring::SampleRing;

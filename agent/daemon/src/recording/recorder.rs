@@ -16,6 +16,7 @@ use super::filter::{Candidate, Filter, FilterOptions};
 use super::graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic};
 use super::report::{NO_SUBSCRIBER, OtherDomain, Report};
 use super::sample_ring::SampleRing;
+use crate::subscriptions::line::qos;
 use crate::subscriptions::{Item, Topic};
 use ros2probe_bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
@@ -480,7 +481,7 @@ impl<'a> Recorder<'a> {
             name,
             types: &types,
             published: came || !announced.publishers.is_empty(),
-            subscribed: !announced.subscriptions.is_empty(),
+            subscribed: announced.subscribed,
         };
         if !self.filter.takes(&candidate) {
             return Ok(TopicDecision::Excluded);
@@ -490,7 +491,7 @@ impl<'a> Recorder<'a> {
         let type_hash = type_hash.or_else(|| announced.type_hashes.first().cloned());
         let publishers = announced.publishers.iter();
         let offered: BTreeMap<_, _> = publishers
-            .map(|publisher| (publisher.guid.clone(), publisher.qos.qos()))
+            .map(|publisher| (publisher.guid.clone(), qos(&publisher.qos)))
             .collect();
         let mut description = TopicDescription {
             name: name.to_owned(),
@@ -599,6 +600,7 @@ impl std::fmt::Debug for Recorder<'_> {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;
@@ -618,7 +620,7 @@ mod tests {
 
     fn topic(name: &str, message_type: &str) -> Arc<Topic> {
         Arc::new(Topic {
-            domain_id: 0,
+            domain_id: DomainId(0),
             name: name.into(),
             dds_name: format!("rt{name}").into(),
             message_type: message_type.into(),
@@ -646,7 +648,8 @@ mod tests {
             r#"{{"message_types": [], "type_hashes": [], "publishers": {publishers},
                 "subscriptions": []}}"#
         );
-        serde_json::from_str(&json).unwrap()
+        let topic: ros2probe_api::topics::Topic<'_> = serde_json::from_str(&json).unwrap();
+        DiscoveredTopic::from(&topic)
     }
 
     /// A publisher of `/tf_static` that keeps its samples.

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{DomainId, Timestamp};
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
@@ -125,7 +125,7 @@ impl Channel {
         SampleRequest {
             id: self.id,
             selection: Arc::clone(&self.selection),
-            domain_id: self.request.domain_id,
+            domain_id: self.request.domain_id.map(DomainId),
             depth: self.request.depth,
         }
     }

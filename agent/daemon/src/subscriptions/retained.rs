@@ -119,6 +119,7 @@ fn covers(request: &SampleRequest, topic: &Topic) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::qos::{Qos, Role};
     use ros2probe_wire::rtps::VendorId;
     use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
@@ -146,7 +147,7 @@ mod tests {
         };
         Arc::new(Sample {
             topic: Arc::new(Topic {
-                domain_id: 0,
+                domain_id: DomainId(0),
                 name: name.into(),
                 dds_name: format!("rt{name}").into(),
                 message_type: "tf2_msgs/msg/TFMessage".into(),
@@ -185,7 +186,7 @@ mod tests {
         SampleRequest {
             id: 7,
             selection: Arc::new(Selection::all()),
-            domain_id: Some(0),
+            domain_id: Some(DomainId(0)),
             depth: Depth::Payloads,
         }
     }

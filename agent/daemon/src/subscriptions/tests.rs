@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 use super::*;
 use crate::surface::{Settings, SourceKind};
@@ -37,7 +37,7 @@ fn sample(number: u64, payload: Option<usize>) -> Arc<Sample> {
 fn sample_of(topic: &str, number: u64, payload: Option<usize>) -> Arc<Sample> {
     Arc::new(Sample {
         topic: Arc::new(Topic {
-            domain_id: 0,
+            domain_id: DomainId(0),
             name: format!("/{topic}").into(),
             dds_name: format!("rt/{topic}").into(),
             message_type: "a/msg/B".into(),

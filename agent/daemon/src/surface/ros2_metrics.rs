@@ -14,6 +14,8 @@ use ros2probe_model::snapshot::{
     EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
     WatchState,
 };
+use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_wire::DomainId;
 
 /// Unknown writers with series of their own.
 const MAX_UNKNOWN_WRITERS: usize = 32;
@@ -48,10 +50,10 @@ impl<'a> TopicRows<'a> {
     /// Topics that are measured come first; services and other plumbing are shown when measured.
     pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
         let max_topics = settings.limits.topics;
-        let mut rows: BTreeMap<(u32, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
+        let mut rows: BTreeMap<(DomainId, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
         let mut hidden = 0;
         let shown = |facts: &&TopicFacts| {
-            facts.measurement.is_some() || matches!(facts.kind, "topic" | "dds")
+            facts.measurement.is_some() || matches!(facts.kind, TopicKind::Topic | TopicKind::Dds)
         };
         let (measured, others): (Vec<&TopicFacts>, Vec<&TopicFacts>) = snapshot
             .topics
@@ -68,7 +70,7 @@ impl<'a> TopicRows<'a> {
                 rows.insert(
                     key,
                     TopicRow {
-                        domain_id,
+                        domain_id: domain_id.0,
                         name,
                         facts: Some(facts),
                         watched: false,
@@ -96,7 +98,7 @@ impl<'a> TopicRows<'a> {
                 rows.insert(
                     key,
                     TopicRow {
-                        domain_id,
+                        domain_id: domain_id.0,
                         name,
                         facts: None,
                         watched: true,
@@ -127,9 +129,11 @@ impl<'a> TopicRow<'a> {
 
 /// Services and other plumbing keep their DDS names: a request, its reply and a topic may share
 /// their ROS name. A DDS name that looks like a ROS name is marked.
-pub(super) fn series_name<'a>(kind: &str, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
+pub(super) fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
     match kind {
-        "topic" | "action_feedback" | "action_status" => Cow::Borrowed(name),
+        TopicKind::Topic | TopicKind::ActionFeedback | TopicKind::ActionStatus => {
+            Cow::Borrowed(name)
+        }
         _ if dds_name.starts_with('/') => Cow::Owned(format!("dds:{dds_name}")),
         _ => Cow::Borrowed(dds_name),
     }
@@ -137,7 +141,7 @@ pub(super) fn series_name<'a>(kind: &str, name: &'a str, dds_name: &'a str) -> C
 
 /// The graph.
 pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
-    let mut domains: BTreeMap<u32, (usize, usize, usize)> = BTreeMap::new();
+    let mut domains: BTreeMap<DomainId, (usize, usize, usize)> = BTreeMap::new();
     for participant in &snapshot.participants {
         let counts = domains.entry(participant.domain_id).or_default();
         counts.0 += 1;
@@ -147,7 +151,7 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         domains.entry(node.domain_id).or_default().2 += 1;
     }
     if domains.is_empty() {
-        domains.insert(0, (0, 0, 0));
+        domains.insert(DomainId(0), (0, 0, 0));
     }
     sink.family(&metric::PARTICIPANTS, |family| {
         per_domain(family, &domains, |counts| counts.0)
@@ -174,13 +178,16 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         })
     })?;
     sink.family(&metric::TOPICS, |family| {
-        let mut kinds: BTreeMap<(u32, &str), usize> = BTreeMap::new();
+        let mut kinds: BTreeMap<(DomainId, TopicKind), usize> = BTreeMap::new();
         for topic in snapshot.topics.iter().filter(|topic| !topic.vanished) {
             *kinds.entry((topic.domain_id, topic.kind)).or_default() += 1;
         }
         kinds.iter().try_for_each(|((domain_id, kind), count)| {
             family.sample(
-                &[Label::Number((*domain_id).into()), Label::Text(kind)],
+                &[
+                    Label::Number((*domain_id).into()),
+                    Label::Text(kind.label()),
+                ],
                 *count,
             )
         })
@@ -232,7 +239,7 @@ fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
 
 fn per_domain(
     family: &mut Family<'_, '_>,
-    domains: &BTreeMap<u32, (usize, usize, usize)>,
+    domains: &BTreeMap<DomainId, (usize, usize, usize)>,
     count: fn(&(usize, usize, usize)) -> usize,
 ) -> fmt::Result {
     domains.iter().try_for_each(|(domain_id, counts)| {
@@ -455,7 +462,7 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
     family.info(&[
         domain_id,
         topic,
-        Label::Text(facts.kind),
+        Label::Text(facts.kind.label()),
         Label::Text(&message_types),
         Label::Text(&reliability),
         Label::Text(&durability),

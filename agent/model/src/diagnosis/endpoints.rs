@@ -1,5 +1,6 @@
 //! One topic: do its writers and readers understand each other, and has each one somebody?
 
+use ros2probe_wire::DomainId;
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -13,6 +14,7 @@ use super::matching::{self, Offer, Policies, Policy, Verdict};
 use super::{Diagnosis, QosPairs, TopicKey, Unmatched};
 use crate::discovery::{Discovery, Endpoint};
 use crate::topic::Topic;
+use crate::topic_kind::TopicKind;
 
 /// Incompatible pairs listed of one topic.
 const PAIRS_PER_TOPIC: usize = 32;
@@ -23,7 +25,7 @@ const MAX_NAMED: usize = 16;
 #[derive(Debug)]
 pub(super) struct EndpointExaminer<'a> {
     discovery: &'a Discovery,
-    half_known: BTreeSet<u32>,
+    half_known: BTreeSet<DomainId>,
 }
 
 /// An endpoint without a counterpart: a finding once it lasts.
@@ -247,7 +249,7 @@ fn list(
 /// node's `transition_event`, hidden topics, and the topics of services and actions.
 fn is_about_hearing(topic: &Topic) -> bool {
     let naming = &topic.naming;
-    naming.kind == "topic"
+    naming.kind == TopicKind::Topic
         && !naming.hidden
         && !matches!(&*naming.name, "/rosout" | "/parameter_events")
         && !naming.name.ends_with("/transition_event")

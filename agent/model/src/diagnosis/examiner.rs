@@ -5,7 +5,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::endpoints::{EndpointExaminer, UnmatchedEndpoint};
 use super::{Diagnoses, Diagnosis, QosPairs, nodes};
@@ -213,7 +213,7 @@ impl Findings {
 
 /// Domains of which it is known that not everything is known: a ROS participant lives there of
 /// which no endpoint was announced in the agent's hearing, although each has some.
-pub(super) fn half_known(discovery: &Discovery) -> BTreeSet<u32> {
+pub(super) fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
     let participants = discovery.participants().values();
     let silent = participants.filter(|participant| {
         participant.proxy.enclave.is_some() && participant.endpoints.is_empty()
@@ -228,7 +228,7 @@ mod tests {
     #[test]
     fn a_finding_keeps_the_time_when_it_was_found_also_when_it_says_something_else() {
         let duplicate = |node: &str, participants: Vec<Guid>| Diagnosis::DuplicateNode {
-            domain_id: 0,
+            domain_id: DomainId(0),
             node: node.into(),
             participants,
         };

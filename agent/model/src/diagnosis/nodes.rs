@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 use super::Diagnosis;
 use super::examiner::Findings;
@@ -41,7 +41,9 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
             nodes.chunk_by(|one, other| one.participant.domain_id == other.participant.domain_id);
         for nodes in domains.filter(|nodes| nodes.len() > 1) {
             findings.add(Diagnosis::DuplicateNode {
-                domain_id: nodes.first().map_or(0, |each| each.participant.domain_id),
+                domain_id: nodes
+                    .first()
+                    .map_or(DomainId(0), |each| each.participant.domain_id),
                 node: Arc::clone(name),
                 participants: nodes.iter().map(HostedNode::guid).collect(),
             });
@@ -59,7 +61,7 @@ fn several_domains(
     discovery: &Discovery,
     findings: &mut Findings,
 ) {
-    let mut machines: BTreeMap<BTreeSet<IpAddr>, (Guid, BTreeSet<u32>)> = BTreeMap::new();
+    let mut machines: BTreeMap<BTreeSet<IpAddr>, (Guid, BTreeSet<DomainId>)> = BTreeMap::new();
     let unmatched = nodes.len() == 1;
     for placed in nodes {
         let mut domains = placed.domains(discovery);
@@ -82,7 +84,7 @@ fn several_domains(
     }
 }
 
-fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<u32>) -> Diagnosis {
+fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<DomainId>) -> Diagnosis {
     Diagnosis::NodeInSeveralDomains {
         node: Arc::clone(name),
         participant,
@@ -96,7 +98,7 @@ impl HostedNode<'_> {
     }
 
     /// Domains of its participant and of the endpoints it has.
-    fn domains(&self, discovery: &Discovery) -> BTreeSet<u32> {
+    fn domains(&self, discovery: &Discovery) -> BTreeSet<DomainId> {
         let guids = self.node.writers.iter().chain(&self.node.readers);
         // Its own participant's are where the participant is.
         let foreign = guids.filter(|guid| guid.prefix != self.prefix);

@@ -1,5 +1,6 @@
 //! Whom an event of discovery is about, in the forms in which counters, journal and events keep it.
 
+use ros2probe_wire::DomainId;
 use std::sync::Arc;
 
 use ros2probe_wire::Guid;
@@ -11,7 +12,7 @@ use crate::event::{EventKind, bounded, bounded_shared};
 
 /// One participant, endpoint or node.
 pub(super) struct DiscoveredEntity<'a> {
-    pub(super) domain_id: u32,
+    pub(super) domain_id: DomainId,
     pub(super) guid: Guid,
     details: EntityDetails<'a>,
 }
@@ -25,7 +26,7 @@ enum EntityDetails<'a> {
 
 impl<'a> DiscoveredEntity<'a> {
     pub(super) const fn participant(
-        domain_id: u32,
+        domain_id: DomainId,
         guid: Guid,
         proxy: &'a ParticipantProxy,
     ) -> Self {
@@ -47,7 +48,7 @@ impl<'a> DiscoveredEntity<'a> {
     }
 
     /// A node of this participant.
-    pub(super) const fn node(domain_id: u32, participant: Guid, name: &'a Arc<str>) -> Self {
+    pub(super) const fn node(domain_id: DomainId, participant: Guid, name: &'a Arc<str>) -> Self {
         Self {
             domain_id,
             guid: participant,

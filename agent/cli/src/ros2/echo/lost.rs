@@ -1,7 +1,7 @@
 //! Messages that were sent and never came. The original learns of them from its middleware; here the
 //! stream says which ones are lost, as the agent counts them.
 
-use ros2probe_daemon::subscriptions::line::{MissedFacts, Reason};
+use ros2probe_api::samples::{Missed, MissedReason};
 
 /// Counts lost messages.
 #[derive(Debug, Default)]
@@ -12,11 +12,11 @@ pub struct Lost {
 impl Lost {
     /// The stream says that messages will not come; the words for it where they are lost, without a
     /// space and an end of the line where the original has none.
-    pub fn missed(&mut self, missed: &MissedFacts) -> String {
+    pub fn missed(&mut self, missed: &Missed) -> String {
         match missed.reason {
-            Reason::Incomplete | Reason::Lost => {}
+            MissedReason::Incomplete | MissedReason::Lost => {}
             // They were on the wire.
-            Reason::Unannounced | Reason::NotCaptured | Reason::QueueFull => {
+            MissedReason::Unannounced | MissedReason::NotCaptured | MissedReason::QueueFull => {
                 return String::new();
             }
         }
@@ -32,8 +32,8 @@ impl Lost {
 mod tests {
     use super::*;
 
-    fn missed(first: u64, last: u64, reason: Reason) -> MissedFacts {
-        MissedFacts {
+    fn missed(first: u64, last: u64, reason: MissedReason) -> Missed {
+        Missed {
             topic: "/a".to_owned(),
             domain_id: 0,
             writer: "01".to_owned(),
@@ -48,10 +48,10 @@ mod tests {
     fn lost_and_incomplete_messages_add_up_and_what_this_reader_missed_does_not_count() {
         let mut lost = Lost::default();
         let text = "A message was lost!!!\n\ttotal count change:2\n\ttotal count: 2---\n";
-        assert_eq!(lost.missed(&missed(2, 3, Reason::Lost)), text);
-        assert_eq!(lost.missed(&missed(4, 4, Reason::QueueFull)), "");
-        assert_eq!(lost.missed(&missed(5, 5, Reason::NotCaptured)), "");
+        assert_eq!(lost.missed(&missed(2, 3, MissedReason::Lost)), text);
+        assert_eq!(lost.missed(&missed(4, 4, MissedReason::QueueFull)), "");
+        assert_eq!(lost.missed(&missed(5, 5, MissedReason::NotCaptured)), "");
         let text = "A message was lost!!!\n\ttotal count change:1\n\ttotal count: 3---\n";
-        assert_eq!(lost.missed(&missed(6, 6, Reason::Incomplete)), text);
+        assert_eq!(lost.missed(&missed(6, 6, MissedReason::Incomplete)), text);
     }
 }

@@ -1,5 +1,5 @@
 use super::*;
-use crate::ros2::facts::Qos;
+use ros2probe_api::endpoints::Qos;
 
 const SCHEMA: &str = "Header header\nfloat32[] ranges\nfloat64[3] k\nHeader[] more\nstring name\n
 ================================================================================
@@ -18,8 +18,8 @@ fn payload() -> Vec<u8> {
     bytes
 }
 
-fn sample() -> SampleFacts {
-    SampleFacts {
+fn sample() -> Sample {
+    Sample {
         topic: "/a".to_owned(),
         domain_id: 0,
         message_type: "a/msg/B".to_owned(),
@@ -189,10 +189,10 @@ MSG: a/Info\nuint8 event_type\nint64 sequence_number";
 
 #[test]
 fn publishers_that_differ_are_told() {
-    let publisher = |reliability: &str, durability: &str| Endpoint {
+    let publisher = |reliability: &'static str, durability: &'static str| Endpoint {
         qos: Qos {
-            reliability: reliability.to_owned(),
-            durability: durability.to_owned(),
+            reliability: reliability.into(),
+            durability: durability.into(),
             ..Qos::default()
         },
         ..Endpoint::default()

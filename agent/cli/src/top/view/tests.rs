@@ -8,9 +8,10 @@ use ratatui::style::Color;
 use serde_json::{Value, json};
 
 use super::super::app::Fact;
-use super::super::facts::{Health, Topics};
 use super::super::row::{Column, Key};
 use super::*;
+use ros2probe_api::health::Health;
+use ros2probe_api::topics::{TopicDetails, TopicList};
 
 const ASCII: Theme = Theme {
     unicode: false,
@@ -18,7 +19,16 @@ const ASCII: Theme = Theme {
 };
 
 /// A robot with something of everything.
-pub(in crate::top) fn robot() -> Topics {
+pub(in crate::top) fn robot() -> TopicList<'static> {
+    serde_json::from_value(robot_answer()).unwrap()
+}
+
+/// One of its topics with details.
+fn details(number: usize) -> TopicDetails<'static> {
+    serde_json::from_value(robot_answer()["topics"][number].clone()).unwrap()
+}
+
+fn robot_answer() -> Value {
     let measured = |rate: f64, size: f64, lost: u64| {
         json!({
             "messages": 1905, "bytes": 609_600, "lost_messages": lost, "rate_hertz": rate,
@@ -40,7 +50,7 @@ pub(in crate::top) fn robot() -> Topics {
     let points = measured(19.98, 2_720_000.0, 0);
     let camera = measured(4.2, 921_600.0, 0);
     let quiet = measured(0.0, 0.0, 0);
-    let topics = json!({"topics": [
+    json!({"topics": [
         {"domain_id": 0, "name": "/robot1/imu/data", "dds_name": "rt/robot1/imu/data",
             "kind": "topic", "message_types": ["sensor_msgs/msg/Imu"],
             "publishers": [endpoint("01.1", "/robot1/imu_driver", imu.clone())],
@@ -107,8 +117,7 @@ pub(in crate::top) fn robot() -> Topics {
             "dds_name": "rt/\u{1b}[2J\u{1b}[31mevil\u{202e}\r\n", "kind": "dds",
             "message_types": ["\u{1b}]0;owned\u{7}"], "publishers": [],
             "subscriptions": [{"guid": "08.1", "node": "\u{9b}31m"}], "measurement": null},
-    ]});
-    serde_json::from_value(topics).unwrap()
+    ]})
 }
 
 fn health(more: &Value) -> Fact {
@@ -218,7 +227,7 @@ fn the_screens_are_as_they_were_looked_at() {
         domain_id: 0,
         dds_name: "rt/robot1/imu/data".to_owned(),
     };
-    let imu = robot().topics.swap_remove(0);
+    let imu = details(0);
     shown.selected = Some(key.clone());
     shown.holds.insert(key.clone(), MeasuredBy::Session);
     press(&mut shown, "\ne");
@@ -273,10 +282,10 @@ fn nothing_from_the_network_reaches_the_terminal_unescaped() {
     let now = Instant::now();
     let mut shown = app(now);
     let place = robot().topics.len() - 1;
-    let hostile = robot().topics.swap_remove(place);
+    let hostile = details(place);
     let key = Key {
         domain_id: 0,
-        dds_name: hostile.dds_name.clone(),
+        dds_name: hostile.topic.dds_name.to_string(),
     };
     shown.selected = Some(key.clone());
     press(&mut shown, "\ne");
@@ -332,7 +341,7 @@ fn the_selected_topic_stays_on_the_screen() {
     let topics: Vec<_> = (0..100)
         .map(|number| json!({"name": format!("/t{number:02}"), "dds_name": format!("rt/t{number:02}")}))
         .collect();
-    let topics: Topics = serde_json::from_value(json!({"topics": topics})).unwrap();
+    let topics: TopicList<'_> = serde_json::from_value(json!({"topics": topics})).unwrap();
     shown.take(Fact::Topics(Box::new(topics)), now);
     screen(&mut shown, (80, 24), ASCII, now);
     for (keys, name) in [

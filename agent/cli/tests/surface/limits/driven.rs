@@ -443,7 +443,7 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_TABS",
         "agent/daemon/src/surface/api/live/mod.rs",
-        "agent/cli/tests/surface/page.rs",
+        "agent/cli/tests/surface/page/stream.rs",
         "streams_are_limited_and_a_closed_one_is_noticed",
     ],
     [
@@ -455,7 +455,7 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_READERS",
         "agent/daemon/src/surface/api/messages/mod.rs",
-        "agent/cli/tests/surface/page.rs",
+        "agent/cli/tests/surface/page/messages.rs",
         "topics_whose_messages_are_decoded_are_limited",
     ],
     [

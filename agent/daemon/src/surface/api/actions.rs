@@ -1,56 +1,25 @@
 //! `/actions`: each put together from its three services and two topics.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::borrow::Cow;
+use std::collections::BTreeMap;
 
 use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::finding::FindingView;
+use super::finding::diagnosis;
 use super::index::Index;
 use super::parameters::Parameters;
-use super::party::{Parties, PartyView, action, action_type};
+use super::party::{Parties, action, action_type};
 use super::problem::Problem;
 use super::scope::Scope;
+use super::services::sorted;
+use ros2probe_api::services::{Action, ActionList};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
-
-/// Actions.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = ActionList)]
-struct ActionsView<'a> {
-    /// Unix time of the facts.
-    timestamp_seconds: f64,
-    /// By domain and name.
-    actions: Vec<ActionView<'a>>,
-}
-
-/// One action.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Action)]
-struct ActionView<'a> {
-    /// Domain.
-    domain_id: u32,
-    /// ROS name.
-    #[schema(example = "/fibonacci")]
-    name: String,
-    /// ROS types; more than one is a fault.
-    #[schema(value_type = Vec<String>, example = json!(["example_interfaces/action/Fibonacci"]))]
-    types: BTreeSet<&'a str>,
-    /// Who serves.
-    servers: Vec<PartyView<'a>>,
-    /// Who calls: whoever only reads the feedback is not among them.
-    clients: Vec<PartyView<'a>>,
-    /// Its topics and services, by their DDS names.
-    #[schema(value_type = Vec<String>)]
-    parts: Vec<&'a str>,
-    /// What is wrong with them.
-    diagnoses: Vec<FindingView<'a>>,
-}
+use ros2probe_wire::DomainId;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(list))
@@ -62,7 +31,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     path = "/actions",
     tag = "graph",
     params(Scope),
-    responses((status = 200, description = "Actions.", body = ActionsView<'static>))
+    responses((status = 200, description = "Actions.", body = ActionList<'static>))
 )]
 async fn list(
     State(context): State<Context>,
@@ -73,10 +42,10 @@ async fn list(
     let snapshot = state.known();
     let index = Index::new(snapshot);
     let actions = actions(snapshot, scope).into_iter();
-    let answer = ActionsView {
+    let answer = ActionList {
         timestamp_seconds: snapshot.at.seconds(),
         actions: actions
-            .filter_map(|((domain_id, name), parts)| view(domain_id, name, &parts, &index))
+            .filter_map(|((domain_id, name), parts)| view(domain_id.0, name, &parts, &index))
             .collect(),
     };
     Ok(Json(answer).into_response())
@@ -86,7 +55,7 @@ async fn list(
 pub(super) fn actions(
     snapshot: &Snapshot,
     scope: Scope,
-) -> BTreeMap<(u32, String), Vec<&TopicFacts>> {
+) -> BTreeMap<(DomainId, String), Vec<&TopicFacts>> {
     let mut actions: BTreeMap<_, Vec<_>> = BTreeMap::new();
     let admitted = snapshot.topics.iter();
     for topic in admitted.filter(|topic| scope.admits(topic.domain_id)) {
@@ -113,7 +82,7 @@ fn view<'a>(
     name: String,
     parts: &[&'a TopicFacts],
     index: &Index<'a>,
-) -> Option<ActionView<'a>> {
+) -> Option<Action<'a>> {
     let parties = parties(parts);
     if parties.is_empty() {
         return None;
@@ -121,13 +90,16 @@ fn view<'a>(
     let [servers, clients] = parties.views();
     let types = parts.iter().flat_map(|part| &part.message_types);
     let findings = parts.iter().flat_map(|part| index.findings(part));
-    Some(ActionView {
+    Some(Action {
         domain_id,
         name,
-        types: types.filter_map(|each| action_type(each)).collect(),
+        types: sorted(types.filter_map(|each| action_type(each))),
         servers,
         clients,
-        parts: parts.iter().map(|part| part.dds_name.as_str()).collect(),
-        diagnoses: findings.map(|finding| (*finding).into()).collect(),
+        parts: parts
+            .iter()
+            .map(|part| Cow::Borrowed(&*part.dds_name))
+            .collect(),
+        diagnoses: findings.map(|finding| diagnosis(finding)).collect(),
     })
 }

@@ -4,6 +4,8 @@
 //! holds nobody up. What is overwritten before a slow client came to it is told as `lagged`. Streams
 //! are limited in number and end when the agent ends.
 
+use ros2probe_wire::DomainId;
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,22 +15,24 @@ use axum::http::HeaderMap;
 use axum::http::header::CACHE_CONTROL;
 use axum::response::sse::{Event, Sse};
 use axum::response::{IntoResponse, Response};
-use serde::ser::SerializeMap as _;
-use serde::{Deserialize, Serialize, Serializer};
+use serde::Deserialize;
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
-use utoipa::{IntoParams, ToSchema};
+use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
 use super::body_stream::{Pieces, stream_of};
+use super::endpoint::texts;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use crate::config::{Watch, Watchlist};
 use crate::surface::EventLog;
 use crate::surface::events::{EVENTS, Position, Reader, Record, Value};
+use ros2probe_api::attributes::{self, Attributes};
+use ros2probe_api::events::{self as answers, Lagged};
 
 /// Streams at once, of all listeners: fewer than connections, so that requests find one.
 static STREAMS: Semaphore = Semaphore::const_new(MAX_STREAMS);
@@ -63,38 +67,6 @@ struct Selection {
     topic: Option<String>,
     /// Whether to wait for what is to come; `false` ends the stream behind the latest event.
     follow: Option<bool>,
-}
-
-/// One event: the `data` of a message, whose `event` is its name and whose `id` is its id.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Event)]
-pub(super) struct EventView<'a> {
-    /// Where to go on after a break. Belongs to one run of the agent.
-    #[schema(example = "641a2b3c4d5e6-17")]
-    id: String,
-    /// When it happened, in UTC.
-    #[schema(format = DateTime)]
-    time: String,
-    /// What it is, as `docs/events.md` lists.
-    #[schema(example = "ros2.message.lost")]
-    name: &'static str,
-    /// `INFO`, `WARN` or `ERROR`.
-    severity: &'static str,
-    /// What is known of it, by the names of the metrics' labels.
-    #[schema(value_type = Object)]
-    attributes: Attributes<'a>,
-}
-
-#[derive(Debug)]
-struct Attributes<'a>(&'a [(&'static str, Value)]);
-
-/// Events are missing here: the `data` of a message whose `event` is `lagged`.
-#[derive(Debug, Serialize)]
-struct Lagged {
-    /// How many; null when they were of another run of the agent, which nobody remembers.
-    missed: Option<u64>,
-    /// `overwritten` before they could be sent, or `restarted`: the id was of another run.
-    reason: &'static str,
 }
 
 /// What one client wants to see.
@@ -138,7 +110,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     ),
     responses(
         (status = 200, description = "Events, until the client disconnects or the agent stops.",
-            body = EventView<'static>, content_type = "text/event-stream"),
+            body = answers::Event<'static>, content_type = "text/event-stream"),
         (status = 422, description = "No such event name or topic, or an invalid id.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 503, description = "Too many streams, or the agent is shutting down.",
@@ -254,42 +226,37 @@ impl Stream {
 
     fn lag(&mut self, missed: Option<u64>, reason: &'static str) {
         let message = Event::default().event("lagged").id(self.log.id(self.place));
+        let reason = Cow::Borrowed(reason);
         let lagged = Lagged { missed, reason };
         let text = serde_json::to_string(&lagged).unwrap_or_default();
         self.waiting.push_back(message.data(text));
     }
 
     fn text(&self, record: &Record) -> String {
-        let view = EventView::new(&self.log, record);
+        let view = event(&self.log, record);
         // Written to memory, which does not fail.
         serde_json::to_string(&view).unwrap_or_default()
     }
 }
 
-impl<'a> EventView<'a> {
-    pub(super) fn new(log: &EventLog, record: &'a Record) -> Self {
-        Self {
-            id: log.id(record.number),
-            time: record.time(),
-            name: record.definition.name,
-            severity: record.severity.text(),
-            attributes: Attributes(&record.attributes),
-        }
-    }
-}
-
-impl Serialize for Attributes<'_> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(Some(self.0.len()))?;
-        for (name, value) in self.0 {
-            match value {
-                Value::Text(text) => map.serialize_entry(name, text)?,
-                Value::Number(number) => map.serialize_entry(name, number)?,
-                Value::Real(real) => map.serialize_entry(name, real)?,
-                Value::List(list) => map.serialize_entry(name, list)?,
-            }
-        }
-        map.end()
+/// An event, as an answer shows it.
+pub(super) fn event<'a>(log: &EventLog, record: &'a Record) -> answers::Event<'a> {
+    let attributes = record.attributes.iter();
+    let attributes = attributes.map(|(name, value)| {
+        let value = match value {
+            Value::Text(text) => attributes::Value::Text(Cow::Borrowed(text)),
+            Value::Number(number) => attributes::Value::Number(*number),
+            Value::Real(real) => attributes::Value::Real(*real),
+            Value::List(list) => attributes::Value::List(texts(list)),
+        };
+        (Cow::Borrowed(*name), value)
+    });
+    answers::Event {
+        id: log.id(record.number),
+        time: record.time(),
+        name: record.definition.name.into(),
+        severity: record.severity.text().into(),
+        attributes: Attributes(attributes.collect()),
     }
 }
 
@@ -323,7 +290,7 @@ impl Filter {
         named
             && self.topics.as_ref().is_none_or(|topics| {
                 matches!(record.attribute("topic"),
-                    Some(Value::Text(topic)) if !topics.matching(0, topic).is_empty())
+                    Some(Value::Text(topic)) if !topics.matching(DomainId(0), topic).is_empty())
             })
     }
 }

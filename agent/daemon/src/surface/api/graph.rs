@@ -6,88 +6,20 @@ use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
 use ros2probe_wire::{EntityId, Guid};
-use serde::Serialize;
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
 use super::actions::{actions, parties};
 use super::parameters::Parameters;
-use super::party::PartyView;
+use super::party::Parties;
 use super::problem::Problem;
 use super::scope::Scope;
 use super::services::services;
+use ros2probe_api::Open;
+use ros2probe_api::graph::{Edge, EdgeKind, Graph, Vertex, VertexKind};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
-
-/// The graph.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Graph)]
-struct GraphView {
-    /// Unix time of the facts.
-    timestamp_seconds: f64,
-    /// By id.
-    nodes: Vec<Vertex>,
-    /// By source, target and kind.
-    edges: Vec<Edge>,
-}
-
-/// Something that others are joined to.
-#[derive(Debug, Serialize, ToSchema)]
-struct Vertex {
-    /// What edges call it.
-    #[schema(example = "node:0:/robot1/lidar")]
-    id: String,
-    /// What it is.
-    kind: VertexKind,
-    /// Domain.
-    domain_id: u32,
-    /// ROS name; a participant's GUID where a participant has no node.
-    name: String,
-}
-
-/// What a vertex is.
-#[derive(Clone, Copy, Debug, Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-enum VertexKind {
-    /// A ROS node.
-    Node,
-    /// A participant that has endpoints of no node.
-    Participant,
-    /// A topic.
-    Topic,
-    /// A service.
-    Service,
-    /// An action.
-    Action,
-}
-
-/// Who gives something to whom.
-#[derive(Debug, Serialize, ToSchema)]
-struct Edge {
-    /// Id of the vertex it begins at.
-    source: String,
-    /// Id of the vertex it ends at.
-    target: String,
-    /// What it means.
-    kind: EdgeKind,
-    /// Messages a second of a publisher, where they are counted.
-    rate_hertz: Option<f64>,
-}
-
-/// What an edge means. Edges go the way messages and requests go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-enum EdgeKind {
-    /// From a node to a topic.
-    Publishes,
-    /// From a topic to a node.
-    Feeds,
-    /// From a client to a service or action.
-    Calls,
-    /// From a service or action to its server.
-    ServedBy,
-}
+use ros2probe_model::topic_kind::TopicKind;
 
 /// What is drawn so far.
 #[derive(Debug, Default)]
@@ -106,7 +38,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     path = "/graph",
     tag = "graph",
     params(Scope),
-    responses((status = 200, description = "Vertices and edges.", body = GraphView))
+    responses((status = 200, description = "Vertices and edges.", body = Graph))
 )]
 async fn show(
     State(context): State<Context>,
@@ -118,18 +50,18 @@ async fn show(
     Ok(Json(graph(snapshot, scope)).into_response())
 }
 
-fn graph(snapshot: &Snapshot, scope: Scope) -> GraphView {
+fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
     let mut drawing = Drawing::default();
     for node in &snapshot.nodes {
         let is_hidden = node.name.split('/').any(|token| token.starts_with('_'));
         if scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden) {
-            drawing.vertex(VertexKind::Node, node.domain_id, &node.name);
+            drawing.vertex(VertexKind::Node, node.domain_id.0, &node.name);
         }
     }
     for topic in &snapshot.topics {
         let is_topic = !matches!(
             topic.kind,
-            "service_request" | "service_reply" | "discovery"
+            TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery
         );
         let is_shown = scope.admits(topic.domain_id) && (scope.shows_hidden() || !topic.hidden);
         if is_topic && is_shown && !topic.vanished {
@@ -137,12 +69,10 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> GraphView {
         }
     }
     for ((domain_id, name), halves) in services(snapshot, scope) {
-        let [servers, clients] = halves.parties().views();
-        drawing.joint(VertexKind::Service, domain_id, name, &servers, &clients);
+        drawing.joint(VertexKind::Service, domain_id.0, name, &halves.parties());
     }
     for ((domain_id, name), parts) in actions(snapshot, scope) {
-        let [servers, clients] = parties(&parts).views();
-        drawing.joint(VertexKind::Action, domain_id, &name, &servers, &clients);
+        drawing.joint(VertexKind::Action, domain_id.0, &name, &parties(&parts));
     }
     drawing.view(snapshot)
 }
@@ -176,12 +106,12 @@ impl Drawing {
     }
 
     fn topic(&mut self, facts: &TopicFacts) {
-        let domain_id = facts.domain_id;
+        let domain_id = facts.domain_id.0;
         let topic = self.vertex(VertexKind::Topic, domain_id, &facts.name);
-        let whose = |guid: Guid| Guid::new(guid.prefix, EntityId::PARTICIPANT);
+        let participant = |guid: Guid| Guid::new(guid.prefix, EntityId::PARTICIPANT);
         for publisher in &facts.publishers {
-            let who = (publisher.node.as_deref(), whose(publisher.guid));
-            let node = self.party(domain_id, who);
+            let party = (publisher.node.as_deref(), participant(publisher.guid));
+            let node = self.party(domain_id, party);
             let rate = publisher.measurement.as_ref().map(|it| it.rate_hz);
             let key = (node, topic.clone(), EdgeKind::Publishes);
             let sum = self.edges.entry(key).or_default();
@@ -190,47 +120,40 @@ impl Drawing {
             }
         }
         for subscription in &facts.subscriptions {
-            let who = (subscription.node.as_deref(), whose(subscription.guid));
-            let node = self.party(domain_id, who);
+            let party = (subscription.node.as_deref(), participant(subscription.guid));
+            let node = self.party(domain_id, party);
             let key = (topic.clone(), node, EdgeKind::Feeds);
             self.edges.insert(key, None);
         }
     }
 
     /// A service or action, unless nobody is there any more.
-    fn joint(
-        &mut self,
-        kind: VertexKind,
-        domain_id: u32,
-        name: &str,
-        servers: &[PartyView<'_>],
-        clients: &[PartyView<'_>],
-    ) {
-        if servers.is_empty() && clients.is_empty() {
+    fn joint(&mut self, kind: VertexKind, domain_id: u32, name: &str, parties: &Parties<'_>) {
+        if parties.is_empty() {
             return;
         }
         let joint = self.vertex(kind, domain_id, name);
-        for server in servers {
-            let node = self.party(domain_id, server.who());
+        for server in parties.servers.keys() {
+            let node = self.party(domain_id, *server);
             let key = (joint.clone(), node, EdgeKind::ServedBy);
             self.edges.insert(key, None);
         }
-        for client in clients {
-            let node = self.party(domain_id, client.who());
+        for client in parties.clients.keys() {
+            let node = self.party(domain_id, *client);
             let key = (node, joint.clone(), EdgeKind::Calls);
             self.edges.insert(key, None);
         }
     }
 
-    fn view(self, snapshot: &Snapshot) -> GraphView {
+    fn view(self, snapshot: &Snapshot) -> Graph {
         let vertices = self.vertices.into_iter();
         let edges = self.edges.into_iter();
-        GraphView {
+        Graph {
             timestamp_seconds: snapshot.at.seconds(),
             nodes: vertices
                 .map(|(id, (kind, domain_id, name))| Vertex {
                     id,
-                    kind,
+                    kind: Open::Known(kind),
                     domain_id,
                     name,
                 })
@@ -239,7 +162,7 @@ impl Drawing {
                 .map(|((source, target, kind), rate_hertz)| Edge {
                     source,
                     target,
-                    kind,
+                    kind: Open::Known(kind),
                     rate_hertz,
                 })
                 .collect(),

@@ -2,48 +2,13 @@
 
 use axum::Json;
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
-use utoipa::ToSchema;
 
 use super::Context;
 use super::problem::ProblemBody;
 use super::scope::Domain;
 use super::topics::{TopicParameter, find};
 use crate::surface::api::problem::Problem;
-
-/// The last seconds of a topic. Columns have one length; null = not measured then, or no such value
-/// in that second.
-#[derive(Debug, Default, Serialize, ToSchema)]
-#[schema(as = History)]
-pub(super) struct HistoryView {
-    /// ROS name.
-    #[schema(example = "/points")]
-    topic: String,
-    /// Domain.
-    domain_id: u32,
-    /// Time between two rows.
-    interval_seconds: u32,
-    /// Unix time of the facts.
-    timestamp_seconds: f64,
-    /// Unix time at which each second ended, in the source's clock.
-    times: Vec<f64>,
-    /// Messages received whole in each.
-    messages: Vec<Option<u32>>,
-    /// Messages settled as lost in each.
-    lost_messages: Vec<Option<u32>>,
-    /// Messages a second over the 10 s before.
-    rate_hertz: Vec<Option<f64>>,
-    /// Payload bytes a second over the 10 s before.
-    bandwidth_bytes_per_second: Vec<Option<f64>>,
-    /// Median time from the writer's timestamp to the capture.
-    latency_p50_seconds: Vec<Option<f64>>,
-    /// Its 99th percentile.
-    latency_p99_seconds: Vec<Option<f64>>,
-    /// Median time between messages of one writer.
-    interarrival_p50_seconds: Vec<Option<f64>>,
-    /// Its 99th percentile.
-    interarrival_p99_seconds: Vec<Option<f64>>,
-}
+use ros2probe_api::topics::History;
 
 /// The last minutes of a topic
 ///
@@ -56,7 +21,7 @@ pub(super) struct HistoryView {
     tag = "graph",
     params(TopicParameter, Domain),
     responses(
-        (status = 200, description = "Its last minutes.", body = HistoryView),
+        (status = 200, description = "Its last minutes.", body = History),
         (status = 404, description = "No such topic.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "It is in several domains.",
@@ -71,12 +36,12 @@ pub(super) async fn show(
     let state = context.board.state();
     let topic = find(state.known(), name, domain.checked()?)?;
     let past = context.board.past();
-    let mut view = HistoryView {
+    let mut view = History {
         topic: topic.name.clone(),
-        domain_id: topic.domain_id,
+        domain_id: topic.domain_id.0,
         interval_seconds: 1,
         timestamp_seconds: state.known().at.seconds(),
-        ..HistoryView::default()
+        ..History::default()
     };
     let seconds = past.topic(topic.domain_id, &topic.dds_name);
     for (at, reading) in seconds.into_iter().flatten() {

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::{Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::snapshot::{
@@ -10,14 +10,14 @@ use ros2probe_model::snapshot::{
 };
 
 /// A watchlist entry and how a topic stands with it.
-pub(super) type Watching<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
+pub(super) type Standing<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
 
 /// What an answer looks up.
 #[derive(Debug)]
 pub(super) struct Index<'a> {
     participants: HashMap<GuidPrefix, &'a ParticipantFacts>,
-    findings: HashMap<(u32, &'a str), Vec<&'a Diagnosis>>,
-    watches: HashMap<(u32, &'a str), Vec<Watching<'a>>>,
+    findings: HashMap<(DomainId, &'a str), Vec<&'a Diagnosis>>,
+    watches: HashMap<(DomainId, &'a str), Vec<Standing<'a>>>,
 }
 
 /// Endpoints and their topics, by GUID.
@@ -62,7 +62,7 @@ impl<'a> Index<'a> {
 
     /// Entries that cover a topic. A service's requests and replies bear the service's name: they
     /// are covered only when they are measured.
-    pub(super) fn watches(&self, topic: &'a TopicFacts) -> &[Watching<'a>] {
+    pub(super) fn watches(&self, topic: &'a TopicFacts) -> &[Standing<'a>] {
         if topic.measurement.is_none() {
             return &[];
         }

@@ -1,99 +1,25 @@
 //! `/names`: what there is, by name, type and number, without a word on each endpoint: a graph of
 //! a thousand topics in a tenth of what `/topics` says of it.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::borrow::Cow;
+use std::collections::BTreeMap;
 
 use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use super::endpoint::texts;
 use super::parameters::Parameters;
 use super::party::service_type;
 use super::problem::Problem;
 use super::scope::Scope;
-use super::services::{Halves, services};
+use super::services::{Halves, services, sorted};
+use ros2probe_api::names::{Names, NodeName, ServiceName, TopicName};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
-
-/// Names.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Names)]
-struct NamesView<'a> {
-    /// Unix time of the facts.
-    timestamp_seconds: f64,
-    /// Every domain in which somebody is, also where only one was asked for.
-    domains: BTreeSet<u32>,
-    /// How many participants there are.
-    participants: usize,
-    /// Writers that send although their announcement was missed; of no known domain.
-    unknown_writers: usize,
-    /// Nodes by domain and name.
-    nodes: Vec<NodeName<'a>>,
-    /// ROS topics by domain and name; with `hidden=true` also those that actions and introspection
-    /// of services consist of.
-    topics: Vec<TopicName<'a>>,
-    /// Services by domain and name.
-    services: Vec<ServiceName<'a>>,
-}
-
-/// A node's name.
-#[derive(Debug, Serialize, ToSchema)]
-struct NodeName<'a> {
-    /// Domain.
-    domain_id: u32,
-    /// Fully qualified name.
-    #[schema(example = "/robot1/lidar")]
-    name: &'a str,
-    /// Hidden by ROS convention.
-    hidden: bool,
-    /// Nodes that bear it; more than one is a fault.
-    instances: usize,
-}
-
-/// A topic's name.
-#[derive(Debug, Serialize, ToSchema)]
-struct TopicName<'a> {
-    /// Domain.
-    domain_id: u32,
-    /// ROS name.
-    #[schema(example = "/points")]
-    name: &'a str,
-    /// Hidden by ROS convention.
-    hidden: bool,
-    /// ROS types.
-    types: &'a [String],
-    /// How many writers.
-    publishers: usize,
-    /// How many readers.
-    subscriptions: usize,
-}
-
-/// A service's name.
-#[derive(Debug, Serialize, ToSchema)]
-struct ServiceName<'a> {
-    /// Domain.
-    domain_id: u32,
-    /// ROS name.
-    #[schema(example = "/add_two_ints")]
-    name: &'a str,
-    /// Hidden by ROS convention.
-    hidden: bool,
-    /// ROS types.
-    #[schema(value_type = Vec<String>, example = json!(["example_interfaces/srv/AddTwoInts"]))]
-    types: BTreeSet<&'a str>,
-    /// Readers of requests: of servers.
-    request_readers: usize,
-    /// Writers of replies: of servers.
-    reply_writers: usize,
-    /// Writers of requests: of clients.
-    request_writers: usize,
-    /// Readers of replies: of clients.
-    reply_readers: usize,
-}
+use ros2probe_wire::DomainId;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(list))
@@ -105,7 +31,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     path = "/names",
     tag = "graph",
     params(Scope),
-    responses((status = 200, description = "Names.", body = NamesView<'static>))
+    responses((status = 200, description = "Names.", body = Names<'static>))
 )]
 async fn list(
     State(context): State<Context>,
@@ -116,17 +42,17 @@ async fn list(
     Ok(Json(names(state.known(), scope)).into_response())
 }
 
-fn names(snapshot: &Snapshot, scope: Scope) -> NamesView<'_> {
+fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
     let participants = snapshot.participants.iter();
-    let mut nodes: BTreeMap<(u32, &str), usize> = BTreeMap::new();
+    let mut nodes: BTreeMap<(DomainId, &str), usize> = BTreeMap::new();
     for node in &snapshot.nodes {
         *nodes.entry((node.domain_id, &node.name)).or_default() += 1;
     }
     let nodes = nodes.into_iter().map(|((domain_id, name), instances)| {
         let hidden = name.split('/').any(|token| token.starts_with('_'));
         NodeName {
-            domain_id,
-            name,
+            domain_id: domain_id.0,
+            name: Cow::Borrowed(name),
             hidden,
             instances,
         }
@@ -135,22 +61,24 @@ fn names(snapshot: &Snapshot, scope: Scope) -> NamesView<'_> {
         |domain_id, hidden: bool| scope.admits(domain_id) && (!hidden || scope.shows_hidden());
     let topics = snapshot.topics.iter().filter_map(topic);
     let mut topics: Vec<_> = topics
-        .filter(|topic| is_shown(topic.domain_id, topic.hidden))
+        .filter(|topic| is_shown(DomainId(topic.domain_id), topic.hidden))
         .collect();
-    topics.sort_unstable_by_key(|topic| (topic.domain_id, topic.name));
+    topics.sort_unstable_by(|one, other| {
+        (one.domain_id, &one.name).cmp(&(other.domain_id, &other.name))
+    });
     let services = services(snapshot, scope).into_iter();
     let services =
-        services.filter_map(|((domain_id, name), halves)| service(domain_id, name, &halves));
-    NamesView {
+        services.filter_map(|((domain_id, name), halves)| service(domain_id.0, name, &halves));
+    Names {
         timestamp_seconds: snapshot.at.seconds(),
         participants: participants
             .clone()
             .filter(|each| scope.admits(each.domain_id))
             .count(),
         unknown_writers: snapshot.unknown_writers.len(),
-        domains: participants.map(|each| each.domain_id).collect(),
+        domains: participants.map(|each| each.domain_id.0).collect(),
         nodes: nodes
-            .filter(|node| is_shown(node.domain_id, node.hidden))
+            .filter(|node| is_shown(DomainId(node.domain_id), node.hidden))
             .collect(),
         topics,
         services: services.collect(),
@@ -159,16 +87,13 @@ fn names(snapshot: &Snapshot, scope: Scope) -> NamesView<'_> {
 
 /// What `ros2` takes for a topic, while it has an endpoint.
 fn topic(facts: &TopicFacts) -> Option<TopicName<'_>> {
-    let is_topic = matches!(
-        facts.kind,
-        "topic" | "service_event" | "action_feedback" | "action_status"
-    );
+    let is_topic = facts.kind.is_ros_topic();
     let (publishers, subscriptions) = (facts.publishers.len(), facts.subscriptions.len());
     (is_topic && publishers + subscriptions > 0).then_some(TopicName {
-        domain_id: facts.domain_id,
-        name: &facts.name,
+        domain_id: facts.domain_id.0,
+        name: Cow::Borrowed(&facts.name),
         hidden: facts.hidden,
-        types: &facts.message_types,
+        types: texts(&facts.message_types),
         publishers,
         subscriptions,
     })
@@ -189,9 +114,9 @@ fn service<'a>(domain_id: u32, name: &'a str, halves: &Halves<'a>) -> Option<Ser
     let types = halves.topics().flat_map(|topic| &topic.message_types);
     Some(ServiceName {
         domain_id,
-        name,
+        name: Cow::Borrowed(name),
         hidden: halves.topics().any(|topic| topic.hidden),
-        types: types.map(|each| service_type(each)).collect(),
+        types: sorted(types.map(|each| service_type(each))),
         request_readers,
         reply_writers,
         request_writers,

@@ -1,92 +1,29 @@
 //! `/nodes`: ROS nodes with all they publish, subscribe, serve and call, as `ros2 node info` says.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
 
 use axum::Json;
 use axum::extract::State;
 use axum::response::{IntoResponse, Response};
-use ros2probe_wire::Guid;
-use serde::Serialize;
-use utoipa::{IntoParams, ToSchema};
+use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::endpoint::{ProcessView, text};
-use super::finding::FindingView;
+use super::endpoint::process;
+use super::finding::diagnosis;
 use super::index::{Ends, Index};
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
 use super::party::{Side, action, action_type, service_type};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Scope, only};
+use ros2probe_api::diagnosis::Finding;
+use ros2probe_api::nodes::{Named, Node, NodeInstance, NodeList};
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::snapshot::{NodeFacts, Snapshot};
-
-/// Nodes.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = NodeList)]
-struct NodesView<'a> {
-    /// Unix time of the facts.
-    timestamp_seconds: f64,
-    /// By domain and name.
-    nodes: Vec<NodeView<'a>>,
-}
-
-/// One node name. Several nodes of one name in one domain are a fault, and shown as one.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Node)]
-struct NodeView<'a> {
-    /// Domain.
-    domain_id: u32,
-    /// Fully qualified name.
-    #[schema(example = "/robot1/lidar")]
-    name: &'a str,
-    /// Hidden by ROS convention: those of the command line are.
-    hidden: bool,
-    /// Each node of the name; more than one is a fault.
-    instances: Vec<InstanceView<'a>>,
-    /// Topics it publishes.
-    publishers: Vec<NamedView<'a>>,
-    /// Topics it subscribes to.
-    subscriptions: Vec<NamedView<'a>>,
-    /// Services it serves.
-    services: Vec<NamedView<'a>>,
-    /// Services it calls.
-    clients: Vec<NamedView<'a>>,
-    /// Actions it serves.
-    action_servers: Vec<NamedView<'a>>,
-    /// Actions it calls.
-    action_clients: Vec<NamedView<'a>>,
-    /// What is wrong with it; `/topics` says what is wrong with its topics.
-    diagnoses: Vec<FindingView<'a>>,
-}
-
-/// One node of a name.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = NodeInstance)]
-struct InstanceView<'a> {
-    /// Its participant.
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    participant: Guid,
-    /// Implementation.
-    vendor: Option<&'a str>,
-    /// Where it lives.
-    #[serde(flatten)]
-    process: Option<ProcessView<'a>>,
-}
-
-/// A name with its types.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Named)]
-struct NamedView<'a> {
-    /// ROS name.
-    name: String,
-    /// ROS types.
-    #[schema(value_type = Vec<String>)]
-    types: BTreeSet<&'a str>,
-}
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Names with their types, sorted.
 #[derive(Debug, Default)]
@@ -104,7 +41,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     path = "/nodes",
     tag = "graph",
     params(Scope),
-    responses((status = 200, description = "Nodes.", body = NodesView<'static>))
+    responses((status = 200, description = "Nodes.", body = NodeList<'static>))
 )]
 async fn list(
     State(context): State<Context>,
@@ -120,7 +57,7 @@ async fn list(
             scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden(&node.name))
         })
     });
-    let answer = NodesView {
+    let answer = NodeList {
         timestamp_seconds: snapshot.at.seconds(),
         nodes: nodes.filter_map(|nodes| desk.node(nodes)).collect(),
     };
@@ -134,7 +71,7 @@ async fn list(
     tag = "graph",
     params(NodeParameter, Scope),
     responses(
-        (status = 200, description = "The node.", body = NodeView<'static>),
+        (status = 200, description = "The node.", body = Node<'static>),
         (status = 404, description = "No such node.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "It is in several domains.",
@@ -203,7 +140,7 @@ impl<'a> Desk<'a> {
         }
     }
 
-    fn node(&self, nodes: &'a [NodeFacts]) -> Option<NodeView<'a>> {
+    fn node(&self, nodes: &'a [NodeFacts]) -> Option<Node<'a>> {
         let first = nodes.first()?;
         let [mut publishers, mut subscriptions] = [Names::default(), Names::default()];
         let [mut services, mut clients] = [Names::default(), Names::default()];
@@ -229,7 +166,7 @@ impl<'a> Desk<'a> {
                 continue;
             }
             match (topic.kind, side) {
-                ("service_request" | "service_reply", Some(side)) => {
+                (TopicKind::ServiceRequest | TopicKind::ServiceReply, Some(side)) => {
                     let names = match side {
                         Side::Server => &mut services,
                         Side::Client => &mut clients,
@@ -240,9 +177,9 @@ impl<'a> Desk<'a> {
                 _ => subscriptions.add(&topic.name, Some(message_type)),
             }
         }
-        Some(NodeView {
-            domain_id: first.domain_id,
-            name: &first.name,
+        Some(Node {
+            domain_id: first.domain_id.0,
+            name: Cow::Borrowed(&first.name),
             hidden: is_hidden(&first.name),
             instances: nodes.iter().map(|node| self.instance(node)).collect(),
             publishers: publishers.views(),
@@ -255,16 +192,16 @@ impl<'a> Desk<'a> {
         })
     }
 
-    fn instance(&self, node: &'a NodeFacts) -> InstanceView<'a> {
+    fn instance(&self, node: &'a NodeFacts) -> NodeInstance<'a> {
         let participant = self.index.participant(node.participant);
-        InstanceView {
-            participant: node.participant,
-            vendor: participant.map(|participant| participant.vendor.as_str()),
-            process: participant.map(|participant| (&participant.process).into()),
+        NodeInstance {
+            participant: node.participant.to_string(),
+            vendor: participant.map(|participant| Cow::Borrowed(&*participant.vendor)),
+            process: participant.map(|participant| process(&participant.process)),
         }
     }
 
-    fn findings(&self, own: &NodeFacts) -> Vec<FindingView<'a>> {
+    fn findings(&self, own: &NodeFacts) -> Vec<Finding<'a>> {
         let found = self.snapshot.diagnoses.list.iter();
         let about = found.filter(|finding| match finding {
             Diagnosis::DuplicateNode {
@@ -275,7 +212,7 @@ impl<'a> Desk<'a> {
             }
             _ => false,
         });
-        about.map(Into::into).collect()
+        about.map(diagnosis).collect()
     }
 }
 
@@ -290,10 +227,13 @@ impl<'a> Names<'a> {
         }
     }
 
-    fn views(self) -> Vec<NamedView<'a>> {
+    fn views(self) -> Vec<Named<'a>> {
         let views = self.0.into_iter();
         views
-            .map(|(name, types)| NamedView { name, types })
+            .map(|(name, types)| Named {
+                name,
+                types: types.into_iter().map(Cow::Borrowed).collect(),
+            })
             .collect()
     }
 }

@@ -1,15 +1,18 @@
 //! The OpenAPI document: made of what the routes say of themselves, completed with what holds for
 //! all of them. It is checked in as `config/openapi.json`; a test compares.
 
+use std::collections::BTreeSet;
 use std::sync::LazyLock;
 
 use axum::http::header::CONTENT_TYPE;
 use axum::response::IntoResponse;
+use serde_json::Value;
 use utoipa::OpenApi;
 use utoipa::openapi::path::Operation;
 use utoipa::openapi::security::{Http, HttpAuthScheme, SecurityScheme};
 use utoipa::openapi::{
-    ContentBuilder, PathItem, Ref, RefOr, Required, ResponseBuilder, SecurityRequirement,
+    ContentBuilder, Object, PathItem, Ref, RefOr, Required, ResponseBuilder, Schema,
+    SecurityRequirement,
 };
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -74,8 +77,12 @@ pub fn document() -> utoipa::openapi::OpenApi {
         // The router's mark for a parameter that may hold slashes.
         document.paths.paths.insert(path.replace("{*", "{"), item);
     }
-    let scheme = SecurityScheme::Http(Http::new(HttpAuthScheme::Bearer));
+    let bodies = request_bodies(&document);
     let components = document.components.get_or_insert_default();
+    for (name, schema) in &mut components.schemas {
+        complete_schema(schema, !bodies.contains(name));
+    }
+    let scheme = SecurityScheme::Http(Http::new(HttpAuthScheme::Bearer));
     components.add_security_scheme("token", scheme);
     let none = SecurityRequirement::default();
     let token = SecurityRequirement::new("token", [] as [&str; 0]);
@@ -108,6 +115,77 @@ fn complete(operation: &mut Operation) {
         responses
             .entry(status.to_owned())
             .or_insert(RefOr::T(response));
+    }
+}
+
+/// Schemas of what clients send.
+fn request_bodies(document: &utoipa::openapi::OpenApi) -> BTreeSet<String> {
+    let mut names = BTreeSet::new();
+    let bodies = serde_json::to_value(&document.paths).unwrap_or_default();
+    let schemas = serde_json::to_value(&document.components).unwrap_or_default();
+    let mut waiting = Vec::new();
+    let paths = bodies.as_object().into_iter().flatten();
+    let operations = paths.flat_map(|(_, item)| item.as_object().into_iter().flatten());
+    waiting.extend(operations.filter_map(|(_, operation)| operation.get("requestBody")));
+    while let Some(value) = waiting.pop() {
+        match value {
+            Value::Object(object) => waiting.extend(object.values()),
+            Value::Array(array) => waiting.extend(array),
+            Value::String(text) => {
+                let name = text.strip_prefix("#/components/schemas/");
+                if let Some(name) = name.filter(|name| names.insert((*name).to_owned())) {
+                    waiting.extend(schemas.pointer(&format!("/schemas/{name}")));
+                }
+            }
+            _ => {}
+        }
+    }
+    names
+}
+
+/// Sorts the properties. A client reads an answer's field that an older agent does not send as its
+/// default; the document is about this agent, which sends all of them.
+fn complete_schema(schema: &mut RefOr<Schema>, is_answer: bool) {
+    let items = match schema {
+        RefOr::T(Schema::Object(object)) => {
+            if is_answer {
+                require_all(object);
+            }
+            object.properties.sort_keys();
+            return;
+        }
+        RefOr::T(Schema::AllOf(all)) => &mut all.items,
+        RefOr::T(Schema::OneOf(one)) => &mut one.items,
+        _ => return,
+    };
+    for item in items {
+        if is_answer {
+            take_default(item);
+        }
+        complete_schema(item, is_answer);
+    }
+}
+
+/// Makes properties with a default required, unless it is null.
+fn require_all(object: &mut Object) {
+    let defaults = object.properties.values_mut().map(take_default);
+    let defaults: Vec<_> = defaults.collect();
+    if defaults.iter().all(Option::is_none) {
+        return;
+    }
+    let names = object.properties.keys().zip(defaults);
+    let required = names.filter(|(_, default)| !matches!(default, Some(Value::Null)));
+    object.required = required.map(|(name, _)| name.clone()).collect();
+}
+
+fn take_default(schema: &mut RefOr<Schema>) -> Option<Value> {
+    match schema {
+        RefOr::Ref(reference) => reference.default.take(),
+        RefOr::T(Schema::Object(object)) => object.default.take(),
+        RefOr::T(Schema::Array(array)) => array.default.take(),
+        RefOr::T(Schema::AllOf(all)) => all.default.take(),
+        RefOr::T(Schema::OneOf(one)) => one.default.take(),
+        RefOr::T(_) => None,
     }
 }
 

@@ -1,30 +1,15 @@
 //! Who serves and who calls: the ends of services and actions, as their topics show them.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 use ros2probe_wire::names::{ActionPart, RosName};
 use ros2probe_wire::{EntityId, Guid};
-use serde::Serialize;
-use utoipa::ToSchema;
 
-use super::endpoint::{text, texts};
+use super::endpoint::printed;
+use ros2probe_api::services::Party;
 use ros2probe_model::snapshot::TopicFacts;
-
-/// A node, or a participant without one, at one end of a service or action.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Party)]
-pub(super) struct PartyView<'a> {
-    /// The node, when `ros_discovery_info` told.
-    node: Option<&'a str>,
-    /// Its participant.
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    participant: Guid,
-    /// Its writers and readers there.
-    #[serde(serialize_with = "texts")]
-    #[schema(value_type = Vec<String>)]
-    endpoints: Vec<Guid>,
-}
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Which end of a service or action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,18 +23,25 @@ pub(super) enum Side {
 /// Both ends, each party once.
 #[derive(Debug, Default)]
 pub(super) struct Parties<'a> {
-    servers: BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>,
-    clients: BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>,
+    pub(super) servers: Endpoints<'a>,
+    pub(super) clients: Endpoints<'a>,
 }
+
+/// Endpoints by node and participant.
+type Endpoints<'a> = BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>;
 
 impl Side {
     /// Of a writer or reader of this topic: a server reads requests and writes all else.
     pub(super) fn of(topic: &TopicFacts, is_writer: bool) -> Option<Self> {
         match (topic.kind, is_writer) {
-            ("service_request", false) | ("service_reply", true) => Some(Self::Server),
-            ("service_request", true) | ("service_reply", false) => Some(Self::Client),
+            (TopicKind::ServiceRequest, false) | (TopicKind::ServiceReply, true) => {
+                Some(Self::Server)
+            }
+            (TopicKind::ServiceRequest, true) | (TopicKind::ServiceReply, false) => {
+                Some(Self::Client)
+            }
             // Whoever reads feedback may be a client, or only curious.
-            ("action_feedback" | "action_status", true) => Some(Self::Server),
+            (TopicKind::ActionFeedback | TopicKind::ActionStatus, true) => Some(Self::Server),
             _ => None,
         }
     }
@@ -77,27 +69,20 @@ impl<'a> Parties<'a> {
     }
 
     /// Servers and clients, by node and participant.
-    pub(super) fn views(self) -> [Vec<PartyView<'a>>; 2] {
+    pub(super) fn views(self) -> [Vec<Party<'a>>; 2] {
         [self.servers, self.clients].map(|parties| {
             let views = parties
                 .into_iter()
                 .map(|((node, participant), mut endpoints)| {
                     endpoints.sort_unstable();
-                    PartyView {
-                        node,
-                        participant,
-                        endpoints,
+                    Party {
+                        node: node.map(Cow::Borrowed),
+                        participant: participant.to_string(),
+                        endpoints: printed(&endpoints),
                     }
                 });
             views.collect()
         })
-    }
-}
-
-impl PartyView<'_> {
-    /// Its node, or its participant.
-    pub(super) const fn who(&self) -> (Option<&str>, Guid) {
-        (self.node, self.participant)
     }
 }
 
@@ -111,7 +96,7 @@ pub(super) fn service_type(message_type: &str) -> &str {
 /// The action that a topic or service is a part of.
 pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
     match topic.kind {
-        "topic" | "service_event" | "discovery" | "dds" => None,
+        TopicKind::Topic | TopicKind::ServiceEvent | TopicKind::Discovery | TopicKind::Dds => None,
         _ => RosName::parse(&topic.name).ok()?.action(),
     }
 }

@@ -9,48 +9,17 @@ use std::time::SystemTime;
 
 use axum::Json;
 use axum::extract::State;
-use serde::Serialize;
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
 use super::problem::{Code, Problem};
 use crate::surface::process::Usage;
+use ros2probe_api::participants::{ProcessList, ProcessUsage};
 use ros2probe_model::snapshot::Snapshot;
 
 /// Processes that are read for one answer.
 const MAX_PROCESSES: usize = 512;
-
-/// Processes of participants on this host.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = ProcessList)]
-struct ProcessesView {
-    /// Unix time of the reading, by this host's clock.
-    timestamp_seconds: f64,
-    /// By process id.
-    processes: Vec<UsageView>,
-    /// Processes of which the kernel shows the agent nothing: see `ProtectProc=` of its unit.
-    unreadable: usize,
-}
-
-/// What a process has used.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = ProcessUsage)]
-struct UsageView {
-    /// Its id, in the agent's process namespace.
-    process_id: u32,
-    /// Its name.
-    process: String,
-    /// CPU time so far; what two readings differ by, over the time between them, is its share.
-    cpu_seconds: f64,
-    /// Resident memory.
-    memory_bytes: u64,
-    /// Threads.
-    threads: u32,
-    /// Unix time of its start.
-    started_timestamp_seconds: Option<f64>,
-}
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(list))
@@ -61,9 +30,9 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     get,
     path = "/processes",
     tag = "graph",
-    responses((status = 200, description = "Processes of this host.", body = ProcessesView))
+    responses((status = 200, description = "Processes of this host.", body = ProcessList))
 )]
-async fn list(State(context): State<Context>) -> Result<Json<ProcessesView>, Problem> {
+async fn list(State(context): State<Context>) -> Result<Json<ProcessList>, Problem> {
     let ids = local(context.board.state().known());
     let read = tokio::task::spawn_blocking(move || read(ids)).await;
     read.map(Json)
@@ -83,7 +52,7 @@ fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<String>> {
     ids
 }
 
-fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessesView {
+fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessList {
     let mut unreadable = 0;
     let mut processes = Vec::new();
     for (process_id, name) in ids.into_iter().take(MAX_PROCESSES) {
@@ -91,7 +60,7 @@ fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessesView {
             unreadable += 1;
             continue;
         };
-        processes.push(UsageView {
+        processes.push(ProcessUsage {
             process_id,
             process: name.unwrap_or(usage.name),
             cpu_seconds: usage.cpu_seconds,
@@ -101,7 +70,7 @@ fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessesView {
         });
     }
     let now = SystemTime::UNIX_EPOCH.elapsed().unwrap_or_default();
-    ProcessesView {
+    ProcessList {
         timestamp_seconds: now.as_secs_f64(),
         processes,
         unreadable,
@@ -112,12 +81,13 @@ fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessesView {
 mod tests {
     use super::*;
     use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::{Guid, Timestamp};
 
     fn participant(id: u32, cgroup: Option<&str>) -> ParticipantFacts {
         ParticipantFacts {
             guid: Guid::default(),
-            domain_id: 0,
+            domain_id: DomainId(0),
             vendor: String::new(),
             enclave: None,
             process: ProcessFacts {

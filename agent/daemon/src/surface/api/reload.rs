@@ -2,13 +2,13 @@
 
 use axum::Json;
 use axum::extract::State;
-use serde::Serialize;
 use tokio::sync::{mpsc, oneshot};
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
+use ros2probe_api::health::Reloaded;
+
 use super::problem::{Code, Problem, ProblemBody};
 
 /// Asks whoever owns the configuration.
@@ -21,16 +21,6 @@ pub struct Reloads(mpsc::Receiver<Answer>);
 
 /// Where the outcome goes.
 pub type Answer = oneshot::Sender<Result<Reloaded, NotReloaded>>;
-
-/// The configuration was taken over.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, ToSchema)]
-pub struct Reloaded {
-    /// Watches in force, of every origin.
-    pub watches: usize,
-    /// Changed keys that take effect only after a restart.
-    #[schema(value_type = Vec<String>)]
-    pub needs_restart: Vec<&'static str>,
-}
 
 /// The configuration stays what it was.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -4,6 +4,7 @@
 //! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
 //! and is told, on a replay it is waited for. It holds nobody else up.
 
+use ros2probe_wire::DomainId;
 use std::collections::HashSet;
 use std::time::Duration;
 
@@ -25,12 +26,12 @@ use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::config::Access;
-use crate::config::watch::MAX_DOMAIN;
-use crate::subscriptions::line::{LINES, Line, OfferedFacts, Open, OpenTopic, SAMPLES};
+use crate::subscriptions::line::{line, offered};
 use crate::subscriptions::{
     Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
 };
 use crate::surface::SourceKind;
+use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
 use ros2probe_model::snapshot::Snapshot;
 
 /// Names and globs in one request, and how many characters they and a regular expression have.
@@ -128,8 +129,11 @@ async fn samples(
         granted.require(Access::All)?;
     }
     let domain_id = wanted.domain_id;
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
-        let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > DomainId::MAX.0) {
+        let detail = format!(
+            "domain_id is {domain_id}, must be at most {}",
+            DomainId::MAX
+        );
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
     let is_replay = context.board.state().agent.source == SourceKind::Replay;
@@ -209,14 +213,14 @@ impl Pieces for Stream {
 impl Stream {
     /// The line for it; with what the writer announced where it is the writer's first.
     fn told(&mut self, item: &Item) -> Line {
-        let mut line = Line::from(item);
+        let mut line = line(item);
         if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
             && sample.payload.is_some()
-            && let Some(offered) = &sample.topic.offered
+            && let Some(announced) = &sample.topic.offered
             && self.introduced.len() < WRITERS
             && self.introduced.insert(sample.writer)
         {
-            facts.offered = Some(Box::new(OfferedFacts::from(&**offered)));
+            facts.offered = Some(Box::new(offered(announced)));
         }
         line
     }
@@ -281,14 +285,14 @@ fn topics(
     most: usize,
 ) -> Vec<OpenTopic> {
     let topics = snapshot.topics.iter().filter(|topic| {
-        domain_id.is_none_or(|wanted| wanted == topic.domain_id)
+        domain_id.is_none_or(|wanted| wanted == topic.domain_id.0)
             && selection.covers(topic.kind, &topic.name, &topic.dds_name, topic.hidden)
     });
     topics
         .take(most)
         .map(|topic| OpenTopic {
             topic: topic.name.clone(),
-            domain_id: topic.domain_id,
+            domain_id: topic.domain_id.0,
             types: topic.message_types.clone(),
         })
         .collect()

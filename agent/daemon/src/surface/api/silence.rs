@@ -3,57 +3,13 @@
 //! Reasons come from facts that are told elsewhere too; nothing is guessed from a missing number
 //! alone.
 
-use serde::Serialize;
-use utoipa::ToSchema;
-
 use super::index::Index;
 use crate::config::Watchlist;
 use crate::surface::agent_facts::SourceKind;
+use ros2probe_api::Open;
+use ros2probe_api::topics::{Reason, ReasonCode};
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::snapshot::{EndpointFacts, Measurement, Snapshot, TopicFacts, Transport};
-
-/// One reason.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Reason)]
-pub(super) struct ReasonView {
-    /// Which one.
-    code: Cause,
-    /// In words.
-    detail: String,
-}
-
-/// Why nothing, or not everything, is seen of a topic.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-#[schema(as = ReasonCode)]
-enum Cause {
-    /// The agent does not see the robot at the moment.
-    AgentNotReady,
-    /// Nobody publishes it.
-    NoPublisher,
-    /// Nobody subscribes: most writers send nothing then.
-    NoSubscriber,
-    /// There are subscriptions, and none matches a publisher.
-    NoMatchedSubscriber,
-    /// A publisher's participant uses DDS security: messages may be encrypted.
-    Encrypted,
-    /// Nobody asked for it to be measured.
-    NotWatched,
-    /// It is watched, but `limits.topics` are measured already.
-    WatchRejected,
-    /// All its endpoints are on other hosts, and the agent looks at this host's sockets.
-    OutsideView,
-    /// Messages go through Fast DDS's shared memory, and none was seen there.
-    SharedMemory,
-    /// Subscribers read the publisher's history in memory: invisible.
-    DataSharing,
-    /// Publishers and subscribers are in one process: invisible.
-    SameProcess,
-    /// Messages go through Cyclone DDS's iceoryx: invisible.
-    Iceoryx,
-    /// All is as it should be, and no message was seen, or none lately.
-    Quiet,
-}
 
 /// What reasons are looked for in, besides the topic.
 #[derive(Debug)]
@@ -70,30 +26,38 @@ pub(super) struct Circumstances<'a> {
 
 impl<'a> Circumstances<'a> {
     /// Every reason there is; none for a topic whose messages are counted.
-    pub(super) fn reasons(&self, topic: &'a TopicFacts) -> Vec<ReasonView> {
+    pub(super) fn reasons(&self, topic: &'a TopicFacts) -> Vec<Reason> {
         let mut reasons = Vec::new();
-        let mut say = |code, detail: String| reasons.push(ReasonView { code, detail });
+        let mut say = |code, detail: String| {
+            reasons.push(Reason {
+                code: Open::Known(code),
+                detail,
+            });
+        };
         if let Some(reason) = &self.unready {
-            say(Cause::AgentNotReady, reason.clone());
+            say(ReasonCode::AgentNotReady, reason.clone());
         }
         let is_connected = match (topic.publishers.len(), topic.subscriptions.len()) {
             (0, _) if topic.vanished => {
-                say(Cause::NoPublisher, "its last endpoint is gone".to_owned());
+                say(
+                    ReasonCode::NoPublisher,
+                    "its last endpoint is gone".to_owned(),
+                );
                 false
             }
             (0, subscriptions) => {
                 let detail = format!("no publishers, {subscriptions} subscribed");
-                say(Cause::NoPublisher, detail);
+                say(ReasonCode::NoPublisher, detail);
                 false
             }
             (_, 0) => {
                 let detail = "no subscribers: most writers send nothing".to_owned();
-                say(Cause::NoSubscriber, detail);
+                say(ReasonCode::NoSubscriber, detail);
                 false
             }
             (_, _) => match self.unmatched(topic) {
                 Some(detail) => {
-                    say(Cause::NoMatchedSubscriber, detail);
+                    say(ReasonCode::NoMatchedSubscriber, detail);
                     false
                 }
                 None => true,
@@ -101,7 +65,7 @@ impl<'a> Circumstances<'a> {
         };
         if let Some(secured) = self.secured(topic) {
             let detail = format!("participant {secured} uses DDS security");
-            say(Cause::Encrypted, detail);
+            say(ReasonCode::Encrypted, detail);
         }
         match topic.measurement.as_deref() {
             None => {
@@ -114,9 +78,9 @@ impl<'a> Circumstances<'a> {
                 } else if self.is_elsewhere(topic) {
                     let detail = "publishers and subscribers are on other hosts; capture.source: \
                         wire sees traffic that passes this host";
-                    say(Cause::OutsideView, detail.to_owned());
+                    say(ReasonCode::OutsideView, detail.to_owned());
                 } else {
-                    say(Cause::Quiet, self.quiet(measured));
+                    say(ReasonCode::Quiet, self.quiet(measured));
                 }
             }
             Some(_) => {}
@@ -167,28 +131,28 @@ impl<'a> Circumstances<'a> {
         Some(secured.guid)
     }
 
-    fn unwatched(&self, topic: &'a TopicFacts) -> (Cause, String) {
-        let name = match topic.kind {
-            "service_request" | "service_reply" => &topic.dds_name,
-            _ => &topic.name,
+    fn unwatched(&self, topic: &'a TopicFacts) -> (ReasonCode, String) {
+        let name = match topic.kind.is_service() {
+            true => &topic.dds_name,
+            false => &topic.name,
         };
         let is_covered = !self.watchlist.matching(topic.domain_id, name).is_empty();
         if is_covered && !topic.hidden {
             let detail = "limits.topics topics are measured already, or it was watched just now";
-            return (Cause::WatchRejected, detail.to_owned());
+            return (ReasonCode::WatchRejected, detail.to_owned());
         }
         let detail = match name.strip_prefix('/') {
             Some(path) => format!("not measured: POST /watch/{path}"),
             None => "not measured: add it to the configuration".to_owned(),
         };
-        (Cause::NotWatched, detail)
+        (ReasonCode::NotWatched, detail)
     }
 
     /// How messages pass, if no pair of publisher and subscriber uses the network.
-    fn aside(&self, topic: &TopicFacts) -> Option<(Cause, String)> {
-        let transports = topic.transports.iter();
-        let most = transports.clone().max_by_key(|count| count.pairs)?;
-        if transports
+    fn aside(&self, topic: &TopicFacts) -> Option<(ReasonCode, String)> {
+        let passages = topic.transports.iter();
+        let most = passages.clone().max_by_key(|count| count.pairs)?;
+        if passages
             .clone()
             .any(|count| count.transport == Transport::Network)
         {
@@ -199,24 +163,24 @@ impl<'a> Circumstances<'a> {
             Transport::Network => return None,
             Transport::SharedMemory if self.looks_at_memory => {
                 let how = "messages pass through shared memory; none was seen lately";
-                (Cause::SharedMemory, detail(how))
+                (ReasonCode::SharedMemory, detail(how))
             }
             Transport::SharedMemory => {
                 let how = "messages pass through shared memory, which this agent does not read";
-                (Cause::SharedMemory, detail(how))
+                (ReasonCode::SharedMemory, detail(how))
             }
             Transport::DataSharing => {
                 let how = "subscribers read the publisher's history in memory (data sharing)";
-                (Cause::DataSharing, detail(how))
+                (ReasonCode::DataSharing, detail(how))
             }
             Transport::SameProcess => (
-                Cause::SameProcess,
+                ReasonCode::SameProcess,
                 detail(
                     "publisher and subscriber share \
                 one process",
                 ),
             ),
-            Transport::Iceoryx => (Cause::Iceoryx, detail("messages pass through iceoryx")),
+            Transport::Iceoryx => (ReasonCode::Iceoryx, detail("messages pass through iceoryx")),
         })
     }
 

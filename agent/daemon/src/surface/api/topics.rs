@@ -1,201 +1,40 @@
 //! `/topics`: what is known of topics, and why nothing is known where it is nothing.
 
+use std::borrow::Cow;
 use std::time::Instant;
 
 use axum::Json;
 use axum::extract::{Extension, State};
 use axum::http::Uri;
 use axum::response::{IntoResponse, Response};
-use ros2probe_wire::Guid;
-use serde::Serialize;
-use utoipa::{IntoParams, ToSchema};
+use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::endpoint::{EndpointView, text, texts};
-use super::finding::FindingView;
+use super::endpoint::{endpoint, printed, texts};
+use super::finding::diagnosis;
 use super::history;
-use super::index::{Index, Watching};
-use super::measured::{BreakdownView, BucketView, DeliveredView, MeasurementView, buckets};
+use super::index::{Index, Standing};
+use super::measured::{breakdown, buckets, delivered, measurement};
 use super::messages;
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::{Domain, Scope, only};
 use super::security::Granted;
-use super::silence::{Circumstances, ReasonView};
-use super::watch::ExpectationsView;
+use super::silence::Circumstances;
+use super::watch::expectations;
 use crate::surface::Ability;
 use crate::surface::board::State as BoardState;
 use crate::watches::InForce;
+use ros2probe_api::topics::{
+    self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
+};
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts, Transport,
 };
-
-/// Topics.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = TopicList)]
-struct TopicsView<'a> {
-    /// Unix time of the facts.
-    timestamp_seconds: f64,
-    /// By domain and DDS name.
-    topics: Vec<TopicView<'a>>,
-}
-
-/// One topic.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Topic)]
-struct TopicView<'a> {
-    /// Domain.
-    domain_id: u32,
-    /// ROS name; the DDS name where it follows no ROS convention.
-    #[schema(example = "/points")]
-    name: &'a str,
-    /// DDS name.
-    #[schema(example = "rt/points")]
-    dds_name: &'a str,
-    /// What it is to ROS: `topic`, `service_request`, `service_reply`, `service_event`,
-    /// `action_feedback`, `action_status`, `discovery` or `dds`.
-    kind: &'a str,
-    /// Hidden by ROS convention.
-    hidden: bool,
-    /// Its last endpoint has gone; it is shown for some minutes more.
-    vanished: bool,
-    /// ROS types announced on it; more than one is a fault.
-    message_types: &'a [String],
-    /// RIHS01 hashes announced on it.
-    type_hashes: &'a [String],
-    /// Its writers.
-    publishers: Vec<EndpointView<'a>>,
-    /// Its readers.
-    subscriptions: Vec<EndpointView<'a>>,
-    /// Watches that cover it, and how it stands with what they expect.
-    watches: Vec<WatchingView<'a>>,
-    /// Sum over its writers; null while it is not watched.
-    measurement: Option<MeasurementView>,
-    /// What reached receivers on this host, each counted.
-    received: Option<DeliveredView>,
-    /// What was seen leaving this host, once for each destination.
-    sent: Option<DeliveredView>,
-    /// Where messages spent their time on this host.
-    breakdown: Option<BreakdownView>,
-    /// Pairs of its publishers and subscribers by how messages pass between them.
-    passages: Vec<PassageView>,
-    /// What is wrong with it.
-    diagnoses: Vec<FindingView<'a>>,
-    /// Why it is silent, or why nothing is counted; empty where messages are counted.
-    reasons: Vec<ReasonView>,
-}
-
-/// One topic with every way its messages go.
-#[derive(Debug, Serialize, ToSchema)]
-struct TopicDetails<'a> {
-    #[serde(flatten)]
-    topic: TopicView<'a>,
-    /// Times between consecutive messages of one writer, in buckets.
-    interarrival_buckets: Vec<BucketView>,
-    /// Times from the writer's timestamp to the capture, in buckets.
-    latency_buckets: Vec<BucketView>,
-    /// Every receiver and destination of its writers.
-    deliveries: Vec<DeliveryView<'a>>,
-    /// Every reliable reader that acknowledges.
-    acknowledgements: Vec<AcknowledgementView<'a>>,
-}
-
-/// Pairs of publisher and subscriber between which messages pass in one way.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Transport)]
-struct PassageView {
-    /// `network`; `shared_memory`, of which samples are seen; `data_sharing`, `same_process` or
-    /// `iceoryx`, which are not seen.
-    #[schema(value_type = String)]
-    passage: &'static str,
-    /// How many pairs.
-    pairs: usize,
-    /// Of `shared_memory`, how it is seen just now: `exact`, every message in the process that sends
-    /// it; `close`, by as many looks as `capture.shm.reading_cpu_percent` allows, because its samples
-    /// are read; `sampled`, by fewer looks; `none`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
-    view: Option<&'static str>,
-}
-
-/// A watch that covers the topic.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Watching)]
-struct WatchingView<'a> {
-    /// Its name or glob.
-    watch: &'a str,
-    /// The domain it is for; null for every domain.
-    watch_domain_id: Option<u32>,
-    /// Who asked for it: `config`, `command_line` or `api`; null when it has just gone.
-    origin: Option<&'static str>,
-    /// How the topic stands: `ok`, `violated`, `silent`, `not_published` or `no_subscriber`.
-    state: &'static str,
-    /// Expectations that are broken.
-    violations: &'a [&'static str],
-    /// What it expects of the topic.
-    #[serde(flatten)]
-    expectations: ExpectationsView,
-}
-
-/// One writer's messages to one receiver, or to a destination where they leave.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Delivery)]
-struct DeliveryView<'a> {
-    /// Whose messages.
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    writer: Guid,
-    /// `sent` or `received`.
-    direction: &'static str,
-    /// Address and port.
-    #[schema(value_type = String, example = "10.0.0.2:7411")]
-    destination: std::net::SocketAddr,
-    /// The receiver: participant, process or socket; empty where nothing tells receivers apart.
-    subscriber: &'a str,
-    /// Readers of the topic in that participant.
-    #[serde(serialize_with = "texts")]
-    #[schema(value_type = Vec<String>)]
-    readers: &'a [Guid],
-    /// Their nodes.
-    nodes: &'a [String],
-    /// Process of the socket.
-    process_id: Option<u32>,
-    /// Its name.
-    process: Option<&'a str>,
-    /// Its control group.
-    cgroup: Option<&'a str>,
-    /// What became of the messages.
-    delivered: DeliveredView,
-}
-
-/// What one reliable reader acknowledged to one writer.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Acknowledgement)]
-struct AcknowledgementView<'a> {
-    /// To whom.
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    writer: Guid,
-    /// By whom.
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    reader: Guid,
-    /// The reader's node.
-    node: Option<&'a str>,
-    /// All messages up to this sequence number.
-    acknowledged_sequence_number: u64,
-    /// Messages it asked for in its last ACKNACK.
-    missing_messages: u64,
-    /// Messages it asked for again, every request counted.
-    requested_messages: u64,
-    /// Messages that exist and are not acknowledged.
-    lag_messages: u64,
-    /// Age of the oldest of them; null when it is too old to know.
-    lag_seconds: Option<f64>,
-}
+use ros2probe_model::topic_kind::TopicKind;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -211,7 +50,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     path = "/topics",
     tag = "graph",
     params(Scope),
-    responses((status = 200, description = "Topics.", body = TopicsView<'static>))
+    responses((status = 200, description = "Topics.", body = TopicList<'static>))
 )]
 async fn list(
     State(context): State<Context>,
@@ -221,10 +60,10 @@ async fn list(
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let desk = Desk::new(&state, &in_force);
     let topics = desk.snapshot.topics.iter().filter(|topic| {
-        let is_plain = matches!(topic.kind, "topic" | "dds") && !topic.hidden;
+        let is_plain = matches!(topic.kind, TopicKind::Topic | TopicKind::Dds) && !topic.hidden;
         scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
     });
-    let answer = TopicsView {
+    let answer = TopicList {
         timestamp_seconds: desk.snapshot.at.seconds(),
         topics: topics.map(|topic| desk.topic(topic)).collect(),
     };
@@ -350,10 +189,7 @@ pub(super) struct TopicParameter {
 
 /// By the ROS name of a topic; services and what is not ROS by their DDS names.
 fn is_called(topic: &TopicFacts, name: &str) -> bool {
-    let is_ros_topic = !matches!(
-        topic.kind,
-        "service_request" | "service_reply" | "discovery" | "dds"
-    );
+    let is_ros_topic = topic.kind.is_ros_topic();
     is_ros_topic && topic.name == name || name.strip_prefix('/') == Some(topic.dds_name.as_str())
 }
 
@@ -385,34 +221,34 @@ impl<'a> Desk<'a> {
         }
     }
 
-    fn topic(&self, facts: &'a TopicFacts) -> TopicView<'a> {
+    fn topic(&self, facts: &'a TopicFacts) -> Topic<'a> {
         let index = &self.circumstances.index;
-        let endpoint = |facts| EndpointView::new(facts, index);
+        let endpoint = |facts| endpoint(facts, index);
         let findings = index.findings(facts).iter();
         let watches = index.watches(facts).iter();
-        let passages = facts.transports.iter().map(|count| PassageView {
-            passage: count.transport.label(),
+        let passages = facts.transports.iter().map(|count| topics::Passage {
+            passage: count.transport.label().into(),
             pairs: count.pairs,
-            view: (count.transport == Transport::SharedMemory).then(|| self.view(facts)),
+            view: (count.transport == Transport::SharedMemory).then(|| self.view(facts).into()),
         });
-        TopicView {
-            domain_id: facts.domain_id,
-            name: &facts.name,
-            dds_name: &facts.dds_name,
-            kind: facts.kind,
+        Topic {
+            domain_id: facts.domain_id.0,
+            name: Cow::Borrowed(&facts.name),
+            dds_name: Cow::Borrowed(&facts.dds_name),
+            kind: Cow::Borrowed(facts.kind.label()),
             hidden: facts.hidden,
             vanished: facts.vanished,
-            message_types: &facts.message_types,
-            type_hashes: &facts.type_hashes,
+            message_types: texts(&facts.message_types),
+            type_hashes: texts(&facts.type_hashes),
             publishers: facts.publishers.iter().map(endpoint).collect(),
             subscriptions: facts.subscriptions.iter().map(endpoint).collect(),
             watches: watches.map(|watching| self.watching(*watching)).collect(),
-            measurement: facts.measurement.as_deref().map(Into::into),
-            received: facts.received.as_deref().map(Into::into),
-            sent: facts.sent.as_deref().map(Into::into),
-            breakdown: facts.breakdown.as_deref().map(Into::into),
+            measurement: facts.measurement.as_deref().map(measurement),
+            received: facts.received.as_deref().map(delivered),
+            sent: facts.sent.as_deref().map(delivered),
+            breakdown: facts.breakdown.as_deref().map(breakdown),
             passages: passages.collect(),
-            diagnoses: findings.map(|finding| (*finding).into()).collect(),
+            diagnoses: findings.map(|finding| diagnosis(finding)).collect(),
             reasons: self.circumstances.reasons(facts),
         }
     }
@@ -437,53 +273,52 @@ impl<'a> Desk<'a> {
             topic: self.topic(facts),
             interarrival_buckets: measured.map_or_else(Vec::new, |it| buckets(&it.interarrival)),
             latency_buckets: measured.map_or_else(Vec::new, |it| buckets(&it.source_latency)),
-            deliveries: facts.deliveries.iter().map(Into::into).collect(),
-            acknowledgements: acknowledgements.map(Into::into).collect(),
+            deliveries: facts.deliveries.iter().map(delivery).collect(),
+            acknowledgements: acknowledgements.map(acknowledgement).collect(),
         }
     }
 
-    fn watching(&self, (watch, topic): Watching<'a>) -> WatchingView<'a> {
-        let entry = self.in_force.find(&watch.pattern, watch.domain_id);
-        WatchingView {
-            watch: &watch.pattern,
-            watch_domain_id: watch.domain_id,
-            origin: entry.map(|entry| entry.origin.label()),
-            state: topic.state.label(),
-            violations: &topic.violations,
-            expectations: entry
-                .map_or_else(Default::default, |entry| (&entry.watch.expectations).into()),
-        }
-    }
-}
-
-impl<'a> From<&'a DeliveryFacts> for DeliveryView<'a> {
-    fn from(facts: &'a DeliveryFacts) -> Self {
-        Self {
-            writer: facts.writer,
-            direction: facts.direction.label(),
-            destination: facts.destination,
-            subscriber: &facts.subscriber,
-            readers: &facts.readers,
-            nodes: &facts.nodes,
-            process_id: facts.process_id,
-            process: facts.process.as_deref(),
-            cgroup: facts.cgroup.as_deref(),
-            delivered: (&facts.delivered).into(),
+    fn watching(&self, (watch, topic): Standing<'a>) -> Watching<'a> {
+        let entry = self
+            .in_force
+            .find(&watch.pattern, watch.domain_id.map(|id| id.0));
+        Watching {
+            watch: Cow::Borrowed(&watch.pattern),
+            watch_domain_id: watch.domain_id.map(|id| id.0),
+            origin: entry.map(|entry| entry.origin.label().into()),
+            state: topic.state.label().into(),
+            violations: texts(&topic.violations),
+            expectations: entry.map_or_else(Default::default, |entry| {
+                expectations(&entry.watch.expectations)
+            }),
         }
     }
 }
 
-impl<'a> From<&'a AcknowledgementFacts> for AcknowledgementView<'a> {
-    fn from(facts: &'a AcknowledgementFacts) -> Self {
-        Self {
-            writer: facts.writer,
-            reader: facts.reader,
-            node: facts.node.as_deref(),
-            acknowledged_sequence_number: facts.acknowledged,
-            missing_messages: facts.missing,
-            requested_messages: facts.requested,
-            lag_messages: facts.lag_samples,
-            lag_seconds: facts.lag_seconds,
-        }
+fn delivery(facts: &DeliveryFacts) -> Delivery<'_> {
+    Delivery {
+        writer: facts.writer.to_string(),
+        direction: facts.direction.label().into(),
+        destination: facts.destination.to_string(),
+        subscriber: Cow::Borrowed(&facts.subscriber),
+        readers: printed(&facts.readers),
+        nodes: texts(&facts.nodes),
+        process_id: facts.process_id,
+        process: facts.process.as_deref().map(Cow::Borrowed),
+        cgroup: facts.cgroup.as_deref().map(Cow::Borrowed),
+        delivered: delivered(&facts.delivered),
+    }
+}
+
+fn acknowledgement(facts: &AcknowledgementFacts) -> Acknowledgement<'_> {
+    Acknowledgement {
+        writer: facts.writer.to_string(),
+        reader: facts.reader.to_string(),
+        node: facts.node.as_deref().map(Cow::Borrowed),
+        acknowledged_sequence_number: facts.acknowledged,
+        missing_messages: facts.missing,
+        requested_messages: facts.requested,
+        lag_messages: facts.lag_samples,
+        lag_seconds: facts.lag_seconds,
     }
 }

@@ -3,6 +3,7 @@
 //! A watch is known by its topic, a name or a glob as in the configuration file, and its domain.
 //! POST adds and never changes what is there; PUT adds or replaces.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 
 use axum::Json;
@@ -10,8 +11,8 @@ use axum::extract::{DefaultBodyLimit, State};
 use axum::http::StatusCode;
 use axum::http::header::LOCATION;
 use axum::response::{IntoResponse, Response};
-use serde::{Deserialize, Serialize};
-use utoipa::{IntoParams, ToSchema};
+use serde::Deserialize;
+use utoipa::IntoParams;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -20,190 +21,14 @@ use super::body::Body;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
-use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
-use crate::watches::{Done, Entry, Origin, Refused};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts, WatchFacts, WatchState, WatchedTopicFacts};
-
-/// What is watched.
-#[derive(Debug, Serialize, ToSchema)]
-struct WatchList {
-    /// Those of the configuration, of the command line, and then of clients, as they came.
-    watches: Vec<WatchView>,
-}
-
-/// One watch.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Watch)]
-struct WatchView {
-    /// ROS name or glob.
-    #[schema(example = "/points")]
-    topic: String,
-    /// Only in this domain; every domain when it is null.
-    #[schema(minimum = 0, maximum = 232)]
-    domain_id: Option<u32>,
-    /// Who asked for it.
-    origin: OriginView,
-    /// What has become of it.
-    state: Stage,
-    /// Series per writer and subscriber.
-    per_subscriber: bool,
-    /// The part of the messages of which spans are exported.
-    #[schema(minimum = 0, maximum = 1)]
-    trace: f64,
-    /// `last`: the last message of each transient-local writer is kept for recordings that begin later.
-    retain: RetainView,
-    #[serde(flatten)]
-    expectations: ExpectationsView,
-    /// The topics it covers now, and a name that does not exist yet.
-    topics: Vec<TopicView>,
-}
-
-/// What is kept of a topic's messages for recordings that begin later.
-#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize, ToSchema)]
-#[schema(as = Retain)]
-#[serde(rename_all = "lowercase")]
-enum RetainView {
-    /// Nothing.
-    #[default]
-    None,
-    /// The last one of each writer that keeps its own for late joiners (transient local).
-    Last,
-}
-
-impl From<Retain> for RetainView {
-    fn from(retain: Retain) -> Self {
-        match retain {
-            Retain::None => Self::None,
-            Retain::Last => Self::Last,
-        }
-    }
-}
-
-impl From<RetainView> for Retain {
-    fn from(view: RetainView) -> Self {
-        match view {
-            RetainView::None => Self::None,
-            RetainView::Last => Self::Last,
-        }
-    }
-}
-
-/// What should hold for each topic; what is left out is not expected.
-#[derive(Clone, Copy, Debug, Default, Serialize, ToSchema)]
-pub(super) struct ExpectationsView {
-    /// At least this many messages a second.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
-    min_rate_hz: Option<f64>,
-    /// At most this many messages a second.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
-    max_rate_hz: Option<f64>,
-    /// At most this part of the messages may be lost, 0 to 1.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
-    max_loss_ratio: Option<f64>,
-    /// Longest time from the writer's timestamp to the capture, in milliseconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
-    max_latency_ms: Option<f64>,
-    /// Longest time without a message, in seconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
-    max_silence_s: Option<f64>,
-}
-
-/// Who asked for a watch.
-#[derive(Clone, Copy, Debug, Serialize, ToSchema)]
-#[schema(as = Origin)]
-#[serde(rename_all = "snake_case")]
-enum OriginView {
-    /// The configuration file.
-    Config,
-    /// `--watch`.
-    CommandLine,
-    /// A client of this API.
-    Api,
-}
-
-/// What has become of a watch.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-enum Stage {
-    /// Taken over with the next packets.
-    Starting,
-    /// No such topic yet: it is measured as soon as it appears.
-    Waiting,
-    /// Its topics are measured.
-    Measuring,
-    /// There is such a topic, but `limits.topics` are measured already.
-    Rejected,
-}
-
-/// A watched topic.
-#[derive(Debug, Serialize, ToSchema)]
-struct TopicView {
-    /// Domain.
-    domain_id: u32,
-    /// ROS name.
-    topic: String,
-    /// How it stands with what is expected.
-    state: TopicState,
-    /// Expectations that are broken.
-    #[schema(value_type = Vec<String>)]
-    violations: Vec<&'static str>,
-    /// Messages counted while it was watched.
-    messages: u64,
-    /// Messages a second over the last window.
-    rate_hertz: f64,
-}
-
-/// How a topic stands with what is expected of it.
-#[derive(Clone, Copy, Debug, Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-enum TopicState {
-    /// All expectations hold.
-    Ok,
-    /// One is broken.
-    Violated,
-    /// Nothing came for longer than `max_silence_s`.
-    Silent,
-    /// Nobody publishes it.
-    NotPublished,
-    /// Nobody subscribes to it.
-    NoSubscriber,
-}
-
-/// How a topic is to be watched. Every field may be left out, and so may the body.
-#[derive(Clone, Copy, Debug, Default, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields, default)]
-struct WatchRequest {
-    /// Only in this domain; every domain when left out. The same as the query's.
-    #[schema(minimum = 0, maximum = 232)]
-    domain_id: Option<u32>,
-    /// Series per writer and subscriber of each covered topic, besides those per topic.
-    per_subscriber: bool,
-    /// The part of each covered topic's messages of which spans are exported, 0 to 1.
-    #[schema(minimum = 0, maximum = 1)]
-    trace: f64,
-    /// `last`: keep the last message of each transient-local writer for recordings that begin later.
-    retain: RetainView,
-    /// At least this many messages a second.
-    #[schema(minimum = 0, maximum = 1_000_000)]
-    min_rate_hz: Option<f64>,
-    /// At most this many messages a second.
-    #[schema(minimum = 0, maximum = 1_000_000)]
-    max_rate_hz: Option<f64>,
-    /// At most this part of the messages may be lost, 0 to 1.
-    #[schema(minimum = 0, maximum = 1)]
-    max_loss_ratio: Option<f64>,
-    /// Longest time from the writer's timestamp to the capture, in milliseconds.
-    #[schema(minimum = 0, maximum = 3_600_000)]
-    max_latency_ms: Option<f64>,
-    /// Longest time without a message, in seconds.
-    #[schema(minimum = 0.001, maximum = 604_800)]
-    max_silence_s: Option<f64>,
-}
+use crate::config::watch::{self, Watch, check_pattern, check_trace};
+use crate::watches::{self, Done, Entry, Refused};
+use ros2probe_api::watches::{
+    Expectations, Origin, Retain, TopicState, WatchList, WatchRequest, WatchState, WatchedTopic,
+};
+use ros2probe_api::{Open, watches as answers};
+use ros2probe_model::snapshot::{self, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts};
+use ros2probe_wire::DomainId;
 
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -218,8 +43,11 @@ impl Domain {
     /// Refuses a domain that cannot be.
     fn checked(self) -> Result<Self, Problem> {
         match self.domain_id {
-            Some(domain_id) if domain_id > MAX_DOMAIN => {
-                let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+            Some(domain_id) if domain_id > DomainId::MAX.0 => {
+                let detail = format!(
+                    "domain_id is {domain_id}, must be at most {}",
+                    DomainId::MAX
+                );
                 Err(Problem::new(Code::MalformedRequest, detail))
             }
             _ => Ok(self),
@@ -257,7 +85,7 @@ async fn list(State(context): State<Context>) -> Json<WatchList> {
     tag = "watch",
     params(TopicParameter, Domain),
     responses(
-        (status = 200, description = "The watch.", body = WatchView),
+        (status = 200, description = "The watch.", body = answers::Watch),
         (status = 404, description = "It is not watched.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -266,7 +94,7 @@ async fn show(
     State(context): State<Context>,
     Name(topic): Name,
     Parameters(domain): Parameters<Domain>,
-) -> Result<Json<WatchView>, Problem> {
+) -> Result<Json<answers::Watch>, Problem> {
     let domain = domain.checked()?;
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let entry = in_force.find(&topic, domain.domain_id);
@@ -284,8 +112,8 @@ async fn show(
     params(TopicParameter, Domain),
     request_body = WatchRequest,
     responses(
-        (status = 200, description = "It is watched just so already.", body = WatchView),
-        (status = 201, description = "It is watched from now on.", body = WatchView,
+        (status = 200, description = "It is watched just so already.", body = answers::Watch),
+        (status = 201, description = "It is watched from now on.", body = answers::Watch,
             headers(("location" = String, description = "Path of the watch."))),
         (status = 409, description = "It is watched with other settings, or the limit of watches \
             is reached.",
@@ -315,8 +143,8 @@ async fn add(
     params(TopicParameter, Domain),
     request_body = WatchRequest,
     responses(
-        (status = 200, description = "It is watched just so.", body = WatchView),
-        (status = 201, description = "It is watched from now on.", body = WatchView,
+        (status = 200, description = "It is watched just so.", body = answers::Watch),
+        (status = 201, description = "It is watched from now on.", body = answers::Watch,
             headers(("location" = String, description = "Path of the watch."))),
         (status = 409, description = "The configuration lists it with other settings, or the \
             limit of watches is reached.",
@@ -393,12 +221,13 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         }
         (one, other) => one.or(other),
     };
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > DomainId::MAX.0) {
         return invalid(format!(
-            "domain_id is {domain_id}, must be between 0 and {MAX_DOMAIN}"
+            "domain_id is {domain_id}, must be between 0 and {}",
+            DomainId::MAX
         ));
     }
-    let expectations = Expectations {
+    let expectations = watch::Expectations {
         min_rate_hz: settings.min_rate_hz,
         max_rate_hz: settings.max_rate_hz,
         max_loss_ratio: settings.max_loss_ratio,
@@ -409,11 +238,14 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
     match expectations.check().and_then(|()| check_trace(trace)) {
         Ok(()) => Ok(Watch {
             pattern: topic,
-            domain_id,
+            domain_id: domain_id.map(DomainId),
             expectations,
             per_subscriber: settings.per_subscriber,
             trace,
-            retain: settings.retain.into(),
+            retain: match settings.retain {
+                Retain::None => watch::Retain::None,
+                Retain::Last => watch::Retain::Last,
+            },
         }),
         Err(mistake) => invalid(mistake),
     }
@@ -424,13 +256,16 @@ fn answer(
     watch: &Watch,
     done: Result<Done, Refused>,
 ) -> Result<Response, Problem> {
-    let done = done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id))?;
+    let done =
+        done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id.map(|id| id.0)))?;
     let in_force = context.watches.in_force();
     // Gone again already: somebody else removes while this one adds.
-    let entry = in_force.find(&watch.pattern, watch.domain_id).cloned();
+    let entry = in_force
+        .find(&watch.pattern, watch.domain_id.map(|id| id.0))
+        .cloned();
     let entry = entry.unwrap_or_else(|| Entry {
         watch: Arc::new(watch.clone()),
-        origin: Origin::Api,
+        origin: watches::Origin::Api,
     });
     let state = context.board.state();
     // What is on the board of a new one was of another one, if anything.
@@ -455,7 +290,9 @@ fn location(watch: &Watch) -> String {
 
 fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
     let detail = match refused {
-        Refused::Given { by: Origin::Config } => {
+        Refused::Given {
+            by: watches::Origin::Config,
+        } => {
             format!("{topic} is listed in the configuration file: change it there and reload")
         }
         Refused::Given { by } => format!("{topic} is given by {}", by.phrase()),
@@ -482,7 +319,7 @@ fn unknown(topic: &str, domain_id: Option<u32>) -> Problem {
     Problem::new(Code::NoSuchWatch, detail)
 }
 
-fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
+fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> answers::Watch {
     let watch = &entry.watch;
     let facts = snapshot.and_then(|snapshot| {
         let mut all = snapshot.watches.iter();
@@ -492,72 +329,78 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> WatchView {
         Some((snapshot, all.find(same)?))
     });
     let topics = facts.map_or_else(Vec::new, |(snapshot, facts)| topics(snapshot, facts));
-    let stage = match facts {
-        None => Stage::Starting,
-        Some((snapshot, facts)) => stage(watch, snapshot, facts),
+    let state = match facts {
+        None => WatchState::Starting,
+        Some((snapshot, facts)) => state(watch, snapshot, facts),
     };
-    WatchView {
+    answers::Watch {
         topic: watch.pattern.clone(),
-        domain_id: watch.domain_id,
-        origin: match entry.origin {
-            Origin::Config => OriginView::Config,
-            Origin::CommandLine => OriginView::CommandLine,
-            Origin::Api => OriginView::Api,
-        },
-        state: stage,
+        domain_id: watch.domain_id.map(|id| id.0),
+        origin: Open::Known(match entry.origin {
+            watches::Origin::Config => Origin::Config,
+            watches::Origin::CommandLine => Origin::CommandLine,
+            watches::Origin::Api => Origin::Api,
+        }),
+        state: Open::Known(state),
         per_subscriber: watch.per_subscriber,
         trace: watch.trace,
-        retain: watch.retain.into(),
-        expectations: (&watch.expectations).into(),
+        retain: match watch.retain {
+            watch::Retain::None => Retain::None,
+            watch::Retain::Last => Retain::Last,
+        },
+        expectations: expectations(&watch.expectations),
         topics,
     }
 }
 
-impl From<&Expectations> for ExpectationsView {
-    fn from(expectations: &Expectations) -> Self {
-        Self {
-            min_rate_hz: expectations.min_rate_hz,
-            max_rate_hz: expectations.max_rate_hz,
-            max_loss_ratio: expectations.max_loss_ratio,
-            max_latency_ms: expectations.max_latency_ms,
-            max_silence_s: expectations.max_silence_s,
-        }
+pub(super) fn expectations(expectations: &watch::Expectations) -> Expectations {
+    Expectations {
+        min_rate_hz: expectations.min_rate_hz,
+        max_rate_hz: expectations.max_rate_hz,
+        max_loss_ratio: expectations.max_loss_ratio,
+        max_latency_ms: expectations.max_latency_ms,
+        max_silence_s: expectations.max_silence_s,
     }
 }
 
-fn stage(watch: &Watch, snapshot: &Snapshot, facts: &WatchFacts) -> Stage {
-    let measured = |topic: &str, domain_id: u32| {
+fn state(watch: &Watch, snapshot: &Snapshot, facts: &WatchFacts) -> WatchState {
+    let measured = |topic: &str, domain_id: DomainId| {
         let mut topics = snapshot.topics.iter();
         topics.any(|facts| facts.domain_id == domain_id && facts.name == topic)
     };
     let mut covered = facts.topics.iter();
     if covered.any(|topic| measured(&topic.topic, topic.domain_id)) {
-        Stage::Measuring
+        WatchState::Measuring
     } else if watch.is_literal() && facts.topics.is_empty() {
-        Stage::Rejected
+        WatchState::Rejected
     } else {
-        Stage::Waiting
+        WatchState::Waiting
     }
 }
 
-fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<TopicView> {
+fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<WatchedTopic> {
     let topic = |watched: &WatchedTopicFacts| {
         let same = |facts: &&TopicFacts| {
             facts.domain_id == watched.domain_id && facts.name == watched.topic
         };
         let mut measurement = snapshot.topics.iter().filter(same);
         let measurement = measurement.find_map(|facts| facts.measurement.as_deref());
-        TopicView {
-            domain_id: watched.domain_id,
+        WatchedTopic {
+            domain_id: watched.domain_id.0,
             topic: watched.topic.clone(),
-            state: match watched.state {
-                WatchState::Ok => TopicState::Ok,
-                WatchState::Violated => TopicState::Violated,
-                WatchState::Silent => TopicState::Silent,
-                WatchState::NotPublished => TopicState::NotPublished,
-                WatchState::NoSubscriber => TopicState::NoSubscriber,
-            },
-            violations: watched.violations.clone(),
+            state: Open::Known(match watched.state {
+                snapshot::WatchState::Ok => TopicState::Ok,
+                snapshot::WatchState::Violated => TopicState::Violated,
+                snapshot::WatchState::Silent => TopicState::Silent,
+                snapshot::WatchState::NotPublished => TopicState::NotPublished,
+                snapshot::WatchState::NoSubscriber => TopicState::NoSubscriber,
+            }),
+            violations: watched
+                .violations
+                .iter()
+                .copied()
+                .map(Cow::Borrowed)
+                .collect(),
             messages: measurement.map_or(0, |measured| measured.messages),
             rate_hertz: measurement.map_or(0.0, |measured| measured.rate_hz),
         }

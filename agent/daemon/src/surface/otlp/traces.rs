@@ -227,6 +227,7 @@ fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use std::sync::Arc;
 
     use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, Timestamp};
@@ -244,7 +245,7 @@ mod tests {
                 sequence_number: 42,
                 trace_id: Message::identity(writer, 42),
                 description: Arc::new(WriterDescription {
-                    domain_id: 5,
+                    domain_id: DomainId(5),
                     topic: "/points".into(),
                     message_type: "sensor_msgs/msg/PointCloud2".into(),
                     reliable: true,

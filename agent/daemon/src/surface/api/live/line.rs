@@ -8,7 +8,7 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::super::endpoint::text;
-use super::super::events::EventView;
+use ros2probe_api::events::Event;
 
 /// One line: an object with one member.
 #[derive(Debug, Serialize, ToSchema)]
@@ -246,7 +246,7 @@ pub(in super::super) struct Events<'a> {
     /// Events that were overwritten before they could be sent.
     pub missed: u64,
     /// The others, in the form of `/events`.
-    pub list: Vec<EventView<'a>>,
+    pub list: Vec<Event<'a>>,
 }
 
 /// Figures.

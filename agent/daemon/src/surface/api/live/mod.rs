@@ -26,7 +26,7 @@ use utoipa_axum::routes;
 
 use super::Context;
 use super::body_stream::{Pieces, stream_of};
-use super::events::EventView;
+use super::events::event;
 use super::health::HOST;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
@@ -212,7 +212,7 @@ impl Stream {
                 list: batch
                     .records
                     .iter()
-                    .map(|record| EventView::new(log, record))
+                    .map(|record| event(log, record))
                     .collect(),
             };
             Line::Events(events).write(lines);

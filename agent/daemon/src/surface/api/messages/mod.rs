@@ -248,7 +248,9 @@ pub(super) async fn follow(
         let detail = format!("{MAX_READERS} topics are being read, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
-    let opened = context.subscriptions.open(request(choice, topic.domain_id));
+    let opened = context
+        .subscriptions
+        .open(request(choice, topic.domain_id.0));
     let subscription = opened.map_err(|refused: Refused| {
         Problem::new(Code::TooManySubscriptions, refused.to_string())
     })?;
@@ -472,6 +474,7 @@ fn write(lines: &mut Vec<u8>, line: &Line) {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
     use tokio_util::sync::CancellationToken;
 
@@ -492,7 +495,7 @@ mod tests {
         let choice = Choice::parse("/points").unwrap();
         let mut subscription = all.open(request(choice, 0)).unwrap();
         let topic = Arc::new(Topic {
-            domain_id: 0,
+            domain_id: DomainId(0),
             name: "/points".into(),
             dds_name: "rt/points".into(),
             message_type: "a/msg/B".into(),

@@ -21,10 +21,9 @@ use axum::routing::get;
 use axum::{Json, Router};
 use flate2::Compression;
 use flate2::write::GzEncoder;
+use ros2probe_api::health::PageToken;
 use ros2probe_page::File;
-use serde::Serialize;
 use sha2::{Digest as _, Sha256};
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -83,17 +82,6 @@ struct Served {
 struct Forms {
     tag: String,
     packed: Bytes,
-}
-
-/// Grants a page all rights.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = PageToken)]
-struct TokenView {
-    /// Sent as `Authorization: Bearer`; valid until the agent ends, or until 16 newer ones are given.
-    token: String,
-    /// Where the page is served on the agent's host; null where it is not.
-    #[schema(example = "http://localhost:17401/")]
-    address: Option<String>,
 }
 
 impl Page {
@@ -227,12 +215,12 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     post,
     path = "/page/token",
     tag = "agent",
-    responses((status = 200, description = "A new token.", body = TokenView))
+    responses((status = 200, description = "A new token.", body = PageToken))
 )]
-async fn token(State(context): State<Context>) -> Result<Json<TokenView>, Problem> {
+async fn token(State(context): State<Context>) -> Result<Json<PageToken>, Problem> {
     let token = context.page.tokens.mint();
     let token = token.map_err(|error| Problem::new(Code::StorageRefuses, error.to_string()))?;
-    Ok(Json(TokenView {
+    Ok(Json(PageToken {
         token,
         address: context.page.address(),
     }))
